@@ -1,8 +1,8 @@
 """hdbridge: a CANopen CiA-402 master that makes a harmonic-drive axis point where it is told.
 
-These names are the library's front door; docs/api.md describes each, and they change only with a note in the
-changelog. Each is loaded when it is first used: importing hdbridge costs nothing. All else may change without
-notice.
+These names are the library's public interface. docs/api.md describes each, and they change only with a note
+in the changelog. Each is loaded on first use, so importing hdbridge costs nothing. Everything else may change
+without notice.
 """
 
 from __future__ import annotations
@@ -96,7 +96,7 @@ _MODULES: Final = MappingProxyType(
         "simulated": "simulated",
     }
 )
-"""Where the names are, but for the errors."""
+"""Modules of the names, except the errors."""
 
 
 def __getattr__(name: str) -> Any:
@@ -112,7 +112,7 @@ def __dir__() -> list[str]:
 
 
 class _FrontDoor(ModuleType):
-    """Keeps `hdbridge.simulated` the function: importing the module of that name would put it there."""
+    """Keeps `hdbridge.simulated` the function, because importing the module of that name would replace it."""
 
     def __setattr__(self, name: str, value: Any) -> None:
         if not (isinstance(value, ModuleType) and name in __all__):

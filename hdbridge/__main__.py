@@ -1,16 +1,16 @@
-"""The entry of the command line: ``hdbridge``, or ``python -m hdbridge``."""
+"""Entry point of the command line: ``hdbridge``, or ``python -m hdbridge``."""
 
 import os
 import sys
 
-# The matrices here are small: threads of the linear algebra cost more than they give, on a busy machine
-# several times the work. Whoever wants them sets these variables.
+# The matrices here are small: threads in linear algebra cost more than they gain, on a busy computer several
+# times the work. Users who want threads set these variables.
 for _threads in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
     os.environ.setdefault(_threads, "1")
 
 
 def main() -> None:
-    """Run it; Ctrl-C while it still loads is no error in hdbridge."""
+    """Runs the command line; Ctrl-C during loading is not an error in hdbridge."""
     try:
         from hdbridge.cli import main as run  # noqa: PLC0415 - loading takes a second, in which Ctrl-C may come
 

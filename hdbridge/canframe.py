@@ -1,4 +1,4 @@
-"""The message of every cycle, cheap to make and to copy, for both ends of the bus."""
+"""CAN message of the control cycle, cheap to create and to copy, for both ends of the bus."""
 
 from __future__ import annotations
 
@@ -7,18 +7,19 @@ from can.typechecking import Channel
 
 
 class DataFrame(can.Message):
-    """A data frame with an 11-bit identifier, nothing else; not to be changed once it is sent.
+    """Data frame with an 11-bit identifier; not to be modified after sending.
 
-    A bus of python-can takes it as any message. Its virtual bus makes a deep copy for each receiver.
+    A python-can bus accepts it like any message. python-can's virtual bus makes a deep copy for each
+    receiver.
     """
 
     __slots__ = ()
-    # What never differs is said once, of all of them.
+    # Constant attributes are stored once, in the class.
     is_extended_id = is_remote_frame = is_error_frame = False
     is_fd = bitrate_switch = error_state_indicator = False
 
     def __init__(self, can_id: int, data: bytes | bytearray, channel: Channel | None = None) -> None:
-        # What the base class makes of the same, without asking for what cannot be.
+        # The same as the base class does, without checking for impossible cases.
         self.arbitration_id = can_id
         self.data = bytearray(data)
         self.dlc = len(data)

@@ -1,18 +1,18 @@
-"""Every error that hdbridge raises on purpose, and the exit status that a command gives it.
+"""Intentional errors of hdbridge, and the exit status of a command for each.
 
     HdbridgeError
     ├── InputError        2   a file, option or value is wrong: nothing was written, nothing moved
-    ├── BusError          3   the CAN interface cannot be opened, or it went away
-    │   └── BusInUseError     another master is heard on it, or holds its lock: nothing was sent
-    ├── DriveError        4   the drive is absent, refuses, is not the one expected, or reports a fault
+    ├── BusError          3   the CAN interface cannot be opened, or went away
+    │   └── BusInUseError     another master is heard on it or holds its lock: nothing was sent
+    ├── DriveError        4   the drive is absent, refuses, is not the expected one, or reports a fault
     │   ├── SdoError          an object could not be read or written
-    │   ├── IdentityError     object 1018h, the ratio or the direction is not what the axis file says
-    │   └── TransitionError   a CiA-402 transition that is not allowed, or did not come about in time
+    │   ├── IdentityError     object 1018h, the ratio or the direction differs from the axis file
+    │   └── TransitionError   a CiA-402 transition is not allowed, or did not happen in time
     ├── SafetyStop        5   the supervision stopped the axis while it ran (quick stop, latched)
-    ├── OutputError       6   a result could not be written (a full disk); what was measured was printed
-    └── DaemonError       7   the daemon is not reached, or does not do this for this client now
-        ├── LeaseError        who asks does not hold the right to move
-        └── RefusedError      the axis is in the wrong state for it, or busy
+    ├── OutputError       6   a result could not be written (a full disk); the measured figures were printed
+    └── DaemonError       7   the daemon cannot be reached, or refuses this client now
+        ├── LeaseError        the client does not hold the right to move
+        └── RefusedError      the axis is in the wrong state for the request, or busy
 
 A message says what is wrong, where (file:line:column, node and object), what was expected, and what to do.
 Exit status 1 is an error in hdbridge itself; 130 is Ctrl-C.
@@ -21,11 +21,11 @@ Exit status 1 is an error in hdbridge itself; 130 is Ctrl-C.
 from typing import ClassVar, Final
 
 RESET: Final = "'hdbridge reset PROFILE', or 'hdbridge ctl reset AXIS' if a daemon holds the drive"
-"""The command that resets a fault; every message that asks for a reset names it."""
+"""The commands that reset a fault; every message that asks for a reset names them."""
 
 
 class HdbridgeError(Exception):
-    """Base of all errors raised on purpose; its text is one line that a person can act on."""
+    """Base class of all intentional errors; its text is one line with advice."""
 
     exit_status: ClassVar[int] = 1
 
@@ -43,11 +43,11 @@ class BusError(HdbridgeError):
 
 
 class BusInUseError(BusError):
-    """Somebody else masters the bus. Nothing was sent."""
+    """Another master uses the bus. Nothing was sent."""
 
 
 class DriveError(HdbridgeError):
-    """The drive is absent, refuses, is not the one expected, or reports a fault."""
+    """The drive is absent, refuses, is not the expected one, or reports a fault."""
 
     exit_status = 4
 
@@ -61,7 +61,7 @@ class IdentityError(DriveError):
 
 
 class TransitionError(DriveError):
-    """A CiA-402 transition is not allowed in the present state, or did not come about in time."""
+    """A CiA-402 transition is not allowed in the present state, or did not happen in time."""
 
 
 class SafetyStop(HdbridgeError):  # noqa: N818 - it says what happened
@@ -70,26 +70,26 @@ class SafetyStop(HdbridgeError):  # noqa: N818 - it says what happened
     exit_status = 5
 
     def __init__(self, text: str, hint: str = "") -> None:
-        """``text`` says what happened, ``hint`` what a person does about it."""
+        """``text`` describes the event, ``hint`` gives advice."""
         super().__init__(f"{text}; {hint}" if hint else text)
         self.text, self.hint = text, hint
 
 
 class OutputError(HdbridgeError):
-    """A file could not be written after all, such as on a full disk; the old one stands."""
+    """A file could not be written after all, for example on a full disk; the old one remains."""
 
     exit_status = 6
 
 
 class DaemonError(HdbridgeError):
-    """The daemon is not reached, or does not do this for this client now. Nothing moved for it."""
+    """The daemon cannot be reached, or refuses this client now. The request moved nothing."""
 
     exit_status = 7
 
 
 class LeaseError(DaemonError):
-    """Who asks does not hold the right to move."""
+    """The client does not hold the right to move."""
 
 
 class RefusedError(DaemonError):
-    """The axis is in the wrong state for it, or busy with something else."""
+    """The axis is in the wrong state for the request, or busy with something else."""

@@ -1,7 +1,7 @@
-"""A simulated CiA-402 drive for a test: pytest's fixture ``hdbridge_drive``; an example is in docs/ci.md.
+"""Simulated CiA-402 drive for tests: pytest's fixture ``hdbridge_drive``; docs/ci.md has an example.
 
-pytest loads this file in every run of an environment that hdbridge is installed in. So it imports nothing
-but pytest; what simulates is loaded by the first test that asks for a drive.
+pytest loads this file in every run of an environment with hdbridge installed. It therefore imports only
+pytest; the simulation is loaded by the first test that uses a drive.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ _HELP: Final = {
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    """Add ``--hdbridge-...`` and the same keys to the ini file."""
+    """Adds ``--hdbridge-...`` and the same keys to the ini file."""
     group = parser.getgroup("hdbridge", "simulated CiA-402 drive (fixture hdbridge_drive)")
     for name, what in _HELP.items():
         help_text = f"{what}; default {_DEFAULTS[name]}" if _DEFAULTS[name] else what
@@ -36,7 +36,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Make the marker known."""
+    """Registers the marker."""
     config.addinivalue_line(
         "markers",
         f"{MARKER}(profile='demo', bus='virtual', seed=0, truth=None, firmware={{}}): the drive that the "
@@ -61,9 +61,9 @@ def hdbridge_drive(request: pytest.FixtureRequest) -> Iterator[SimulatedDrive]:
         yield drive
 
 
-@pytest.hookimpl(hookwrapper=True)  # the form that older versions of pytest know as well
+@pytest.hookimpl(hookwrapper=True)  # also known to older versions of pytest
 def pytest_runtest_makereport(item: pytest.Item) -> Generator[None, Any, None]:
-    """Put what the drive went through into the report of a test that failed."""
+    """Adds the drive's history to the report of a failed test."""
     report: pytest.TestReport = (yield).get_result()
     drive = getattr(item, "funcargs", {}).get(FIXTURE)
     if drive is not None and report.when == "call" and report.failed:
@@ -71,9 +71,10 @@ def pytest_runtest_makereport(item: pytest.Item) -> Generator[None, Any, None]:
 
 
 def _wanted(request: pytest.FixtureRequest) -> dict[str, Any]:
-    """What the marker, the command line, the ini file and the defaults say, in this order.
+    """Collects the settings from the marker, the command line, the ini file and the defaults, in this order.
 
-    Each wins over the next. A relative path starts from the test's folder, the present one, the ini file's.
+    Each takes precedence over the next. A relative path starts at the test's folder, the present one, or the
+    ini file's.
     """
     config = request.config
     marks: dict[str, Any] = {}
@@ -102,7 +103,7 @@ def _wanted(request: pytest.FixtureRequest) -> dict[str, Any]:
 
 
 def _seed(value: Any) -> Any:
-    """As a number where it is one; what else it is, is complained about later."""
+    """Converts to an integer if possible; other values are reported later."""
     try:
         return int(value) if isinstance(value, str) else value
     except ValueError:

@@ -1,7 +1,7 @@
-"""A simulated axis in one line: for a first try, for a test, for a script that shall run on a desk.
+"""A simulated axis in one line, for a first try, a test, or a script that runs without hardware.
 
 with simulated(axis) as drive:          # a real one: open_bus(axis.bus) as bus, Drive(bus, axis) as drive
-drive.boot()
+    drive.boot()
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ if TYPE_CHECKING:
 
 @contextmanager
 def simulated(axis: AxisConfig, truth: Path | str | None = None, seed: int = 0) -> Iterator[Drive]:
-    """The drive of an axis, simulated in this process and faster than real time; not booted yet.
+    """Yields the drive of an axis, simulated in this process and faster than real time; not booted yet.
 
-    ``truth`` says what the axis is like (docs/truth-file.md): without it the ``twin.yaml`` that lies next to
-    the axis file, or else the ``truth.yaml``. The same truth and seed give the same frames, bit for bit.
-    InputError where there is no truth, or it is wrong.
+    ``truth`` describes the axis (docs/truth-file.md); the default is the ``twin.yaml`` next to the axis file,
+    or else the ``truth.yaml``. The same truth and seed give the same frames, bit for bit. Raises `InputError`
+    if there is no truth, or it is wrong.
     """
-    # Loaded here: who masters a real drive needs no simulated one.
+    # Loaded here, because a master of a real drive needs no simulation.
     from hdbridge.drive import Drive  # noqa: PLC0415
     from hdbridge.files.profile import Profile  # noqa: PLC0415
     from hdbridge.sim.lockstep import simulated_bench  # noqa: PLC0415

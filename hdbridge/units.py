@@ -1,17 +1,17 @@
-"""The units that the whole project speaks, and the constants between them.
+"""Units of the project, and the constants between them.
 
-Angles are degrees, multi-turn, never wrapped. Errors of the gear are arcseconds *at the load*. A name
-carries its unit (``motor_deg``, ``offset_arcsec``, ``cycle_s``).
+Angles are degrees, multi-turn, never wrapped. Gear errors are arcseconds *at the load*. A name contains its
+unit (``motor_deg``, ``offset_arcsec``, ``cycle_s``).
 """
 
 import math
 from typing import Final
 
 ARCSEC_PER_DEG: Final = 3600.0
-"""Arcseconds in a degree."""
+"""Arcseconds per degree."""
 
 DEG_PER_TURN: Final = 360.0
-"""Degrees in a turn."""
+"""Degrees per turn."""
 
 _UNITS: Final = {
     "arcsec_per_kiloturn": "arcsec/kiloturn",
@@ -37,12 +37,12 @@ _UNITS: Final = {
 
 
 def unit_of(name: str) -> str:
-    """The unit that a parameter's name ends with; 1 where it has none."""
+    """Returns the unit at the end of a parameter's name; 1 if there is none."""
     return _UNITS.get(_ending(name), "1")
 
 
 def without_unit(name: str) -> str:
-    """A parameter's name without its unit."""
+    """Returns a parameter's name without its unit."""
     return name.removesuffix("_" + _ending(name))
 
 
@@ -51,7 +51,7 @@ def _ending(name: str) -> str:
 
 
 def figure(value: float, digits: int = 4) -> str:
-    """A number for people, with so many digits; no exponent from a ten-thousandth to a million."""
+    """Formats a number with ``digits`` significant digits; no exponent from a ten-thousandth to a million."""
     if not 1e-4 <= abs(value) < 1e6:
         return f"{value:.{digits}g}"
     decimals = digits - 1 - math.floor(math.log10(abs(value)))
@@ -60,7 +60,9 @@ def figure(value: float, digits: int = 4) -> str:
 
 
 def with_interval(value: float, half_width: float) -> tuple[str, str]:
-    """A number and half the width of its interval; that has two digits, the number as many decimals."""
+    """Formats a number and half the width of its interval: the latter with two digits, both with the same
+    decimals.
+    """
     if not (math.isfinite(half_width) and half_width > 0.0):
         return figure(value), figure(half_width)
     last = math.floor(math.log10(half_width)) - 1

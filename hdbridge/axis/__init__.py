@@ -1,4 +1,4 @@
-"""The axis file: drive, bus, encoders, measured channels and gear, and the limits of motion."""
+"""Axis file: drive, bus, encoders, measured channels, gear, and motion limits."""
 
 from hdbridge.axis.channels import LoadTorque, Temperature
 from hdbridge.axis.config import (

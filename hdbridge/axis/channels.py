@@ -1,7 +1,7 @@
-"""What a drive can tell the control loop in addition to its encoders: the axis file's optional channels.
+"""Optional measured channels of the axis file, in addition to the encoders.
 
-Each is an object of the drive that comes by PDO, with its unit, the range in which a reading is believed, and
-how long the last one is held. `hdbridge.drive.channels` follows them on line.
+Each is an object of the drive that arrives by PDO, with its unit, its plausible range, and the time for which
+the last reading is held. `hdbridge.drive.channels` follows them on line.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ HoldMs = Annotated[
 
 
 class Scale(NamedTuple):
-    """A quantity is ``at_zero + per_count * counts``; it is believed from ``least`` to ``greatest``."""
+    """Linear scale ``at_zero + per_count * counts``, with the plausible range ``least`` to ``greatest``."""
 
     per_count: float
     at_zero: float
@@ -31,7 +31,7 @@ class Scale(NamedTuple):
 
 
 class ChannelSource(Strict):
-    """The object of the drive that carries a channel."""
+    """Object of the drive that carries a channel."""
 
     index: int = Field(ge=0x1000, le=0xFFFF, description="index of the object")
     subindex: int = Field(0, ge=0, le=255, description="sub-index of the object")
@@ -42,7 +42,7 @@ class ChannelSource(Strict):
 
 
 class LoadTorque(Strict):
-    """The torque on the load: from a sensor at its flange, or what the drive knows of it."""
+    """Torque on the load, from a sensor at its flange or from the drive."""
 
     source: ChannelSource = Field(description="the object that tells it")
     newton_metres_per_count: float = Field(gt=0, le=1e6, description="torque at the load per count")
@@ -57,13 +57,13 @@ class LoadTorque(Strict):
 
     @property
     def scale(self) -> Scale:
-        """Newton metres at the load, positive forward."""
+        """Scale to newton metres at the load, positive forward."""
         limit = self.maximum_nm
         return Scale(self.direction * self.newton_metres_per_count, 0.0, -limit, limit)
 
 
 class Temperature(Strict):
-    """The temperature of the gear."""
+    """Temperature of the gear."""
 
     source: ChannelSource = Field(description="the object that tells it")
     celsius_per_count: float = Field(gt=0, le=1000, description="degrees Celsius per count")
@@ -91,12 +91,12 @@ class Temperature(Strict):
 
     @property
     def scale(self) -> Scale:
-        """Degrees Celsius."""
+        """Scale to degrees Celsius."""
         return Scale(self.celsius_per_count, self.celsius_at_zero, self.minimum_celsius, self.maximum_celsius)
 
 
 class Quantity(Strict):
-    """Any other channel of the table, in its unit there."""
+    """Any other measured channel, in its unit."""
 
     source: ChannelSource = Field(description="the object that tells it")
     per_count: float = Field(ge=-1e6, le=1e6, description="its unit per count")
@@ -108,19 +108,19 @@ class Quantity(Strict):
 
     @property
     def scale(self) -> Scale:
-        """In its unit."""
+        """Scale to the channel's unit."""
         return Scale(self.per_count, self.at_zero, self.minimum, self.maximum)
 
 
 MeasuredChannel = LoadTorque | Temperature | Quantity
 BY_KEY: Final = {each.axis_key: each for each in MEASURED if each.axis_key}
-"""The channels that the axis file can have, by their key there."""
+"""Channels that the axis file can have, by their key there."""
 
 OWN_KEYS: Final = frozenset({"load_torque", "temperature"})
 if TYPE_CHECKING:
 
     class OtherChannels(Strict):
-        """The channels of the table that `AxisConfig` does not spell out."""
+        """Measured channels that `AxisConfig` does not declare explicitly."""
 
 else:
     OtherChannels = create_model(

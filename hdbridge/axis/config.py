@@ -1,7 +1,7 @@
-"""The axis file: which drive on which bus, its encoders and gear, and the limits within which it may move.
+"""Axis file: drive and bus, encoders and gear, and the motion limits.
 
-``profiles/NAME/axis.yaml`` is written by a person and never rewritten by the program. Everything in it is
-checked before anything moves; a complaint names file, line and column.
+``profiles/NAME/axis.yaml`` is written by the user and never rewritten by the program. Its whole content is
+checked before anything moves; an error names file, line and column.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ Unsigned32 = Annotated[int, Field(ge=0, le=0xFFFF_FFFF)]
 
 
 class _Part(Strict):
-    """A mapping of the file: frozen, no unknown keys, finite numbers."""
+    """Mapping in the file: immutable, no unknown keys, finite numbers."""
 
 
 class BusConfig(_Part):
@@ -45,7 +45,7 @@ class BusConfig(_Part):
 
 
 class Identity(_Part):
-    """The drive's identity object, 1018h; what is left out is not compared."""
+    """Identity object of the drive, 1018h; omitted values are not compared."""
 
     vendor_id: Unsigned32 = Field(description="1018h:01")
     product_code: Unsigned32 = Field(description="1018h:02")
@@ -147,14 +147,14 @@ class DriveConfig(_Part):
 
     @property
     def interpolation_period(self) -> tuple[int, int]:
-        """60C2h: mantissa (:01) and exponent (:02) of the period in seconds."""
+        """Value of 60C2h: mantissa (:01) and exponent (:02) of the period in seconds."""
         period = _interpolation_period(self.cycle_ms)
         assert period is not None  # validated
         return period
 
 
 class Teeth(_Part):
-    """Numbers of teeth of the gear, to check its ratio."""
+    """Tooth counts of the gear, to check its ratio."""
 
     flexspline: int = Field(ge=10, le=10_000, description="teeth of the flexspline, zf")
     circular_spline: int = Field(ge=11, le=10_000, description="teeth of the circular spline, zc")
@@ -202,7 +202,7 @@ class Gear(_Part):
 
 
 class Limits(_Part):
-    """What the axis may do; all at the load."""
+    """Motion limits of the axis, all at the load."""
 
     position_min_deg: float = Field(description="lowest position")
     position_max_deg: float = Field(description="highest position")
@@ -222,12 +222,12 @@ class Limits(_Part):
         return self
 
     def contains(self, position_deg: float) -> bool:
-        """Whether a load position is permitted (NaN is not)."""
+        """Returns True if a load position is permitted (NaN is not)."""
         return self.position_min_deg <= position_deg <= self.position_max_deg
 
 
 class CompensationConfig(_Part):
-    """How far and how fast the compensation may move the target."""
+    """Limits of the compensation's changes to the target."""
 
     maximum_arcsec: float = Field(300.0, gt=0, le=36_000, description="largest correction, at the load")
     slew_arcsec_s: float = Field(
@@ -237,7 +237,7 @@ class CompensationConfig(_Part):
 
 
 class RealtimeConfig(_Part):
-    """How the master's process runs on its machine while it moves the axis over a real bus."""
+    """Scheduling of the master's process while it moves the axis over a real bus."""
 
     priority: int = Field(
         50, ge=0, le=99, description="SCHED_FIFO priority of the control loop; 0: that of ordinary work"
@@ -286,13 +286,15 @@ class AxisConfig(OtherChannels):
 
     @classmethod
     def load(cls, path: Path | str) -> Self:
-        """Read an axis file, or the one in a profile's folder; InputError with file:line:column."""
+        """Reads an axis file, or the one in a profile's folder; raises `InputError` with file:line:column."""
         path = Path(path)
         return cls._from_document(read_yaml(path / "axis.yaml" if path.is_dir() else path))
 
     @classmethod
     def from_text(cls, text: str, path: Path | str = "axis.yaml") -> Self:
-        """An axis file's text; ``path`` names it in complaints and says where its EDS may lie."""
+        """Reads an axis file's text; ``path`` names it in messages, and its folder is searched
+        for the EDS.
+        """
         return cls._from_document(document_from_text(text, path))
 
     @classmethod
@@ -356,12 +358,14 @@ class AxisConfig(OtherChannels):
 
     @property
     def channels(self) -> dict[str, MeasuredChannel]:
-        """The measured channels that the axis has, by their key."""
+        """Measured channels of the axis, by their key."""
         given = {key: getattr(self, key) for key in BY_KEY}
         return {key: channel for key, channel in given.items() if channel is not None}
 
     def on_bus(self, **changes: str | int | None) -> Self:
-        """The same axis on another bus (keys of `BusConfig`); options stay only with their interface."""
+        """Returns the axis on another bus (keys of `BusConfig`); options are kept only for the same
+        interface.
+        """
         bus = {**self.bus.model_dump(), **changes}
         if bus["interface"] != self.bus.interface:
             bus.update(options={})
@@ -369,11 +373,13 @@ class AxisConfig(OtherChannels):
 
     @property
     def path(self) -> Path:
-        """The file that this axis was read from."""
+        """File that this axis was read from."""
         return self._document.path if self._document is not None else Path("axis.yaml")
 
     def states(self, key: str) -> bool:
-        """The file states a key (``drive.halt_option``) rather than leaving it to its default."""
+        """Returns True if the file states a key (``drive.halt_option``) instead of leaving it
+        to its default.
+        """
         part: object = self
         for name in key.split("."):
             if not isinstance(part, Strict) or name not in part.model_fields_set:
@@ -382,10 +388,10 @@ class AxisConfig(OtherChannels):
         return True
 
     def where(self, key: str) -> str:
-        """Where a key stands, for a complaint: ``axis.yaml:12:3: drive.node_id``.
+        """Returns the location of a key for messages: ``axis.yaml:12:3: drive.node_id``.
 
-        A key that the file leaves to its default has the place of the mapping that it belongs into; an axis
-        that was not read from a file has no line.
+        A key that is left to its default has the location of its parent mapping. An axis that was not read
+        from a file has no line.
         """
         if self._document is None:
             return f"{self.path}: {key}"
@@ -394,12 +400,12 @@ class AxisConfig(OtherChannels):
 
     @property
     def is_from_file(self) -> bool:
-        """The axis was read from a file, so its EDS file is known."""
+        """True if the axis was read from a file, so that its EDS file is known."""
         return self._eds_path is not None
 
     @property
     def eds_path(self) -> Path:
-        """The drive's EDS file, absolute; InputError where the axis was not read from a file and has none."""
+        """Absolute path of the drive's EDS file; raises `InputError` if the axis was not read from a file."""
         if self._eds_path is None:
             raise InputError(f"axis '{self.name}' was not read from a file: its EDS file is not known")
         return self._eds_path
@@ -415,7 +421,7 @@ def _interpolation_period(cycle_ms: float) -> tuple[int, int] | None:
 
 
 def _teeth_for(ratio: float, difference: int, teeth: Teeth) -> str:
-    """Which teeth a ratio needs, for the output that the file states and the same difference of teeth."""
+    """Returns the tooth counts that a ratio needs, for the stated output and the same difference of teeth."""
     held = round(ratio * difference)
     for more in (difference, 2, 1):
         held = round(ratio * more)

@@ -1,4 +1,4 @@
-"""The axis file's encoders: what they count, and where the load encoder's reading comes from."""
+"""Encoders of the axis file: their scaling, and the source of the load encoder's reading."""
 
 from __future__ import annotations
 
@@ -17,20 +17,20 @@ INT32_MAX = 2**31 - 1
 
 @dataclass(frozen=True, slots=True)
 class Scale:
-    """From an encoder's counts to degrees of its shaft and back.
+    """Conversion between an encoder's counts and degrees of its shaft.
 
-    For the control cycle: to look up what a model of pydantic has takes longer than to compute with it.
+    Made for the control cycle, in which pydantic's attribute look-up would take longer than the computation.
     """
 
     direction: int
     counts_per_turn: int
 
     def counts(self, deg: float) -> float:
-        """The reading, in (fractional) counts, at an angle of the shaft in degrees."""
+        """Returns the (fractional) counts at a shaft angle in degrees."""
         return self.direction * deg * self.counts_per_turn / 360.0
 
     def degrees(self, counts: float) -> float:
-        """The angle of the shaft in degrees at a reading."""
+        """Returns the shaft angle in degrees at a reading in counts."""
         return self.direction * counts * 360.0 / self.counts_per_turn
 
 
@@ -46,15 +46,15 @@ class Encoder(Strict):
 
     @property
     def scale(self) -> Scale:
-        """Its counts and degrees."""
+        """Conversion between counts and degrees."""
         return Scale(self.direction, self.counts_per_turn)
 
     def counts(self, deg: float) -> float:
-        """`Scale.counts`."""
+        """Converts degrees to counts; see `Scale.counts`."""
         return self.scale.counts(deg)
 
     def degrees(self, counts: float) -> float:
-        """`Scale.degrees`."""
+        """Converts counts to degrees; see `Scale.degrees`."""
         return self.scale.degrees(counts)
 
     @property
@@ -64,11 +64,11 @@ class Encoder(Strict):
 
 
 class MotorEncoder(Encoder):
-    """The encoder of the motor, which the drive closes its loop on (6064h, 607Ah)."""
+    """The encoder of the motor, with which the drive closes its loop (6064h, 607Ah)."""
 
 
 class Source(Strict):
-    """The object that carries the load encoder's reading."""
+    """Object that carries the load encoder's reading."""
 
     WRAPS: ClassVar[dict[str, int]] = {"int32": 2**32, "uint32": 2**32, "int16": 2**16, "uint16": 2**16}
 
@@ -100,11 +100,11 @@ class Source(Strict):
 
     @property
     def wraps_at_counts(self) -> int:
-        """The reading is known modulo this many counts."""
+        """Modulus of the reading, in counts."""
         return self.range_counts or self.WRAPS[self.type]
 
 
 class LoadEncoder(Encoder):
-    """The encoder at the load, which says how true the axis points."""
+    """The encoder at the load, which measures the positioning error."""
 
     source: Source = Field(default_factory=Source, description="where its reading comes from")

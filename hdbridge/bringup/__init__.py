@@ -1,10 +1,10 @@
-"""Bring-up of an axis: what answers on the bus, and whether it is and does what the axis file says."""
+"""Bring-up of an axis: nodes on the bus, and checks of the axis against its axis file."""
 
 from typing import Final
 
 LISTEN_S: Final = 1.0
-"""A scan listens for so long before it asks."""
+"""Time that a scan listens before it sends requests; s."""
 ASK_TIMEOUT_S: Final = 0.02
-"""Time for a node's first answer to a scan; one that has answered once gets longer for the rest."""
+"""Time for a node's first answer to a scan, s; a node that has answered once gets longer for the rest."""
 TORQUE_PERCENT: Final = 50.0
-"""Most motor torque of `doctor`, of the rated one."""
+"""Default motor torque limit of `doctor`, percent of the rated torque."""

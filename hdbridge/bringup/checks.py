@@ -1,4 +1,4 @@
-"""A list of checks run in order: what a check is, what it can say, and which ones it needs before it."""
+"""List of checks run in order: a check, its outcomes, and the checks it depends on."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ Figure = float | int | str | bool | None
 
 
 class Outcome(Enum):
-    """How a check ended."""
+    """Outcome of a check."""
 
     PASS = "pass"
     FAIL = "fail"
@@ -23,32 +23,33 @@ class Outcome(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """What one check found."""
+    """Result of one check."""
 
     outcome: Outcome
     measured: str
-    """What was found, in words, with figures and units."""
+    """Measured result as text, with figures and units."""
     remedies: tuple[str, ...] = ()
-    """On failure: lines of the axis file to change (``file:line:column: key: found, expected``), or what to
-    do; the likeliest first."""
+    """On failure: lines of the axis file to change (``file:line:column: key: found, expected``) or actions,
+    the likeliest first.
+    """
     figures: Mapping[str, Figure] = field(default_factory=dict)
-    """The same for machines, units in the names."""
+    """Measured figures as data, with units in the names."""
     error: type[HdbridgeError] = DriveError
-    """Kind of the failure; it decides the exit status."""
+    """Error class of the failure, which decides the exit status."""
 
 
 def passed(measured: str, **figures: Figure) -> Verdict:
-    """The check passed."""
+    """Returns a pass."""
     return Verdict(Outcome.PASS, measured, (), figures)
 
 
 def failed(measured: str, *remedies: str, **figures: Figure) -> Verdict:
-    """The check failed, and what to do about it."""
+    """Returns a failure with its remedies."""
     return Verdict(Outcome.FAIL, measured, remedies, figures)
 
 
 def not_possible(why: str) -> Verdict:
-    """The check could not be made."""
+    """Returns the verdict of a check that could not be made."""
     return Verdict(Outcome.NOT_POSSIBLE, why)
 
 
@@ -57,14 +58,14 @@ class Check(Generic[P]):
     """One row of a list of checks."""
 
     name: str
-    """One word, for machines."""
+    """One word that identifies the check in data."""
     title: str
-    """What is checked, in a few words."""
+    """Subject of the check, in a few words."""
     run: Callable[[P], Verdict]
     needs: tuple[str, ...] = ()
     """Names of checks that must have passed before."""
     moves: bool = False
-    """Whether power is switched on."""
+    """True if the check switches power on."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,7 +76,7 @@ class Row(Generic[P]):
     verdict: Verdict
 
     def as_dict(self) -> dict[str, Any]:
-        """For machines."""
+        """Returns the row as data."""
         return {
             "name": self.check.name,
             "title": self.check.title,
@@ -93,11 +94,11 @@ def run_checks(
     permitted: Callable[[], str | None] = lambda: None,
     tell: Callable[[Row[P]], None] = lambda _: None,
 ) -> list[Row[P]]:
-    """Run the checks in order; ``tell`` receives each row as soon as it is there.
+    """Runs the checks in order; ``tell`` receives each row as soon as it is complete.
 
-    A check whose needs have not passed is not possible. ``permitted`` is asked once, before the first check
-    that moves: a text is the reason why nothing may move. An error that hdbridge raises on purpose is a
-    failure of the check in which it was raised; every other one passes through.
+    A check whose dependencies have not passed is not possible. ``permitted`` is called once, before the first
+    check that moves the axis; a returned text is the reason why nothing may move. A `HdbridgeError` is a
+    failure of the check that raised it; all other exceptions pass through.
     """
     rows: list[Row[P]] = []
     outcomes: dict[str, Outcome] = {}

@@ -1,4 +1,4 @@
-"""What the checks of a bring-up work on: the axis file, the bus, the drive, and what was found so far."""
+"""State shared by the checks of a bring-up: axis file, bus, drive, and results so far."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ if TYPE_CHECKING:
     from hdbridge.control.cycle import Feedback
 
 Connect = Callable[["AxisConfig"], AbstractContextManager[tuple["can.BusABC", Clock]]]
-"""Opens an axis's bus and gives the clock that goes with it."""
+"""Opens an axis's bus and returns it with its clock."""
 Interruptible = Callable[[], AbstractContextManager[Callable[[], bool]]]
-"""A block in which an interrupt is only a wish, which the yielded function tells."""
+"""Context that defers interrupts; the function that it yields reports if there was one."""
 
 
 class BringUpContext:
     """One axis under examination; a context manager that leaves the drive off and the bus closed.
 
-    ``load`` reads the axis file, ``connect`` opens its bus: both are checks, so they come as functions.
-    ``torque_percent`` limits every motion, of the rated torque, besides the axis file's own limit.
-    ``force`` speaks even where another master is heard on the bus.
+    ``load`` reads the axis file and ``connect`` opens its bus; both are checks, so they are passed as
+    functions. ``torque_percent`` limits every motion, percent of the rated torque, in addition to the axis
+    file's own limit. With ``force``, frames are sent even if another master is heard on the bus.
     """
 
     def __init__(
@@ -47,13 +47,13 @@ class BringUpContext:
         self.torque_percent = torque_percent
         self.interruptible = interruptible
         self.began_deg = 0.0
-        """Motor angle at which the axis stood before it was moved."""
+        """Motor angle before the axis was moved, degrees."""
         self.noise_arcsec = 0.0
-        """Of the load encoder at rest."""
+        """Noise of the load encoder at rest, arcsec."""
         self.confirmed: set[str] = set()
         """Keys of the axis file that the drive's own objects confirm."""
         self.out: list[Feedback] = []
-        """Feedback of the long move forth, and of the stand at its end."""
+        """Feedback of the long forward move, and of the standstill at its end."""
         self.rest_begins = 0
         self._connect = connect
         self._force = force
@@ -63,21 +63,21 @@ class BringUpContext:
         self._drive: Drive | None = None
 
     def __enter__(self) -> Self:
-        """Nothing is opened yet."""
+        """Returns the context; opens nothing yet."""
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Leave the drive switched off, close the bus."""
+        """Leaves the drive switched off and closes the bus."""
         self._stack.__exit__(kind, error, trace)
 
     def admit(self, axis: AxisConfig, od: ObjectDictionary) -> None:
-        """The axis file and the EDS have been read."""
+        """Stores the axis file and the EDS after they have been read."""
         self._axis, self._od = axis, od
 
     def connect(self) -> None:
-        """Open the bus; nothing is sent yet. Raises `BusError`."""
+        """Opens the bus; sends nothing yet. Raises `BusError`."""
         bus, clock = self._stack.enter_context(self._connect(self.axis))
         self._drive = self._stack.enter_context(Drive(bus, self.axis, clock, self._od, force=self._force))
 
@@ -94,12 +94,14 @@ class BringUpContext:
         return self._drive
 
     def boot(self) -> Drive:
-        """The drive, booted anew and switched off, a fault of an earlier check reset."""
+        """Reboots the drive, leaves it switched off and resets a fault left by an earlier
+        check; returns it.
+        """
         report = self.drive.boot()
         if report.state in (State.FAULT, State.FAULT_REACTION_ACTIVE):
             self.drive.fault_reset()
         return self.drive
 
     def slow(self, interrupted: Callable[[], bool]) -> SlowAxis:
-        """The axis for slow motion, freshly booted and still switched off."""
+        """Returns the axis for slow motion, freshly booted and still switched off."""
         return SlowAxis(self.boot(), self.torque_percent, interrupted)

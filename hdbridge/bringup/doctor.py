@@ -1,4 +1,4 @@
-"""The doctor's list: every check of a bring-up, in order. A new check is a function and a row."""
+"""Checks of `doctor`, in order. A new check is a function and a row."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the figures of the other checks mean: pure judgement, apart from how they were measured."""
+"""Judgement of the measured figures, separate from their measurement. Pure."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 def judge_rest(axis: AxisConfig, motor: Sequence[int], load: Sequence[int]) -> Verdict:
-    """Do both encoders rest while nothing is powered, and how noisy are they?"""
+    """Checks that both encoders stand still without power, and measures their noise."""
     motor_deg = 360.0 / axis.motor_encoder.counts_per_turn
     load_arcsec = axis.load_encoder.resolution_arcsec
     motor_span, load_span = max(motor) - min(motor), max(load) - min(load)
@@ -52,7 +52,9 @@ def judge_rest(axis: AxisConfig, motor: Sequence[int], load: Sequence[int]) -> V
 def judge_channels(
     axis: AxisConfig, readings: Mapping[str, float | None], waited_s: float, rest: Verdict
 ) -> Verdict:
-    """The verdict on rest, with what load torque and temperature tell; None: nothing that is believed."""
+    """Extends the verdict on rest by the load torque and temperature channels; None means no plausible
+    reading.
+    """
     text, figures, remedies = rest.measured, dict(rest.figures), list(rest.remedies)
     for key, value in readings.items():
         channel = axis.channels[key]
@@ -70,7 +72,7 @@ def judge_channels(
 
 
 def judge_hold(axis: AxisConfig, before: Turned, readings: Sequence[Turned]) -> Verdict:
-    """Did enabling the drive at rest move anything?"""
+    """Checks that enabling the drive at rest caused no movement."""
     counts = axis.motor_encoder.counts_per_turn
     motor = max(abs(each.motor_counts - before.motor_counts) for each in readings)
     load = max(abs(each.load_counts - before.load_counts) for each in readings)
@@ -88,7 +90,7 @@ def judge_hold(axis: AxisConfig, before: Turned, readings: Sequence[Turned]) -> 
 
 
 def judge_nudge(axis: AxisConfig, asked_counts: float, out_counts: float, back_counts: float) -> Verdict:
-    """Did the motor do a very small move as asked, and come back?"""
+    """Checks that the motor followed a very small move, out and back."""
     figures = {"asked_counts": asked_counts, "out_counts": out_counts, "back_counts": back_counts}
     degrees = abs(axis.motor_encoder.degrees(asked_counts))
     went = f"went {out_counts:+.0f} and {back_counts:+.0f} counts"
@@ -107,7 +109,7 @@ def judge_nudge(axis: AxisConfig, asked_counts: float, out_counts: float, back_c
 
 
 def judge_following(axis: AxisConfig, errors_counts: Sequence[int]) -> Verdict:
-    """How much of the following error window does a slow move need?"""
+    """Compares the following error of a slow move with the window."""
     worst = max(map(abs, errors_counts))
     worst_deg = abs(axis.motor_encoder.degrees(worst))
     allowed = axis.drive.following_error_deg
@@ -125,7 +127,7 @@ def judge_following(axis: AxisConfig, errors_counts: Sequence[int]) -> Verdict:
 
 
 def judge_torque(axis: AxisConfig, torques_permille: Sequence[float], limit_percent: float) -> Verdict:
-    """How much torque does a slow move need, of what it was allowed?"""
+    """Compares the torque of a slow move with its limit."""
     worst = max(map(abs, torques_permille)) / 10.0
     text = f"at most {worst:.1f} % of the rated torque, allowed {limit_percent:g} %"
     figures = {
@@ -146,7 +148,7 @@ def judge_torque(axis: AxisConfig, torques_permille: Sequence[float], limit_perc
 def judge_settling(
     axis: AxisConfig, load_counts: Sequence[int], period_s: float, noise_arcsec: float
 ) -> Verdict:
-    """How long after the end of a move the load came to rest; ``load_counts`` begin at that end."""
+    """Measures the settling time of the load; ``load_counts`` start at the end of the move."""
     tail = load_counts[-max(len(load_counts) // 5, 2) :]
     final = fmean(tail)
     band = max(2.0, (5.0 + 5.0 * noise_arcsec) / axis.load_encoder.resolution_arcsec)
@@ -167,9 +169,9 @@ def judge_settling(
 def judge_stop(
     axis: AxisConfig, speed_deg_s: float, distance_deg: float, time_s: float, what: str, reaction_s: float
 ) -> Verdict:
-    """Did the axis stop in the time and travel that its ramp allows? ``reaction_s`` may pass before braking.
+    """Checks that the axis stopped within the time and travel that its ramp allows.
 
-    Speed and distance are the motor's.
+    Speed and distance are the motor's. ``reaction_s`` may pass before braking starts.
     """
     deceleration = axis.limits.acceleration_deg_s2 * axis.gear.ratio
     cycles_s = 3.0 * axis.drive.cycle_s + reaction_s

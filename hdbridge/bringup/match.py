@@ -1,4 +1,4 @@
-"""Which of the nodes found is the one that the axis file means, and what to write into an axis file. Pure."""
+"""Assignment of scanned nodes to an axis file, and suggested lines for an axis file. Pure."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ if TYPE_CHECKING:
 
 
 def identity_matches(axis: AxisConfig, node: Node) -> bool:
-    """Whether the node's identity is the one that the axis file demands."""
+    """Returns True if the node's identity is the one that the axis file demands."""
     wanted = axis.drive.identity.model_dump(exclude_none=True)
     return all(node.identity.get(name) == value for name, value in wanted.items())
 
 
 def compare(axis: AxisConfig, scan: Scan) -> tuple[bool, list[str]]:
-    """Whether the axis file's drive is there; if not, what to change, a line each."""
+    """Returns True if the axis file's drive was found; else False and one line for each thing to change."""
     there = scan.node(axis.drive.node_id)
     if there is not None and there.answers and there.usable and identity_matches(axis, there):
         return True, []
@@ -61,7 +61,7 @@ def _identity_lines(axis: AxisConfig, node: Node) -> list[str]:
 
 
 def axis_lines(node: Node) -> list[str]:
-    """Lines for an axis file, to copy: what the node says of itself."""
+    """Returns lines for an axis file, from the node's own objects."""
     if node.profile == 406:
         return _encoder_lines(node)
     identity = ", ".join(f"{name}: {value:#x}" for name, value in node.identity.items())

@@ -1,4 +1,4 @@
-"""The checks under power: enable at rest, a nudge, a motor turn each way, and the ways in which it stops."""
+"""Checks under power: enable at rest, a nudge, a motor turn each way, and every way to stop."""
 
 from __future__ import annotations
 
@@ -32,11 +32,11 @@ _OFF: Final = (State.SWITCH_ON_DISABLED, State.NOT_READY_TO_SWITCH_ON)
 _DRIVES_DOING: Final = frozenset(
     {Fault.DROPPED_OUT, Fault.DRIVE_FAULT, Fault.NMT_CHANGE, Fault.LOST_TPDO, Fault.EMERGENCY}
 )
-"""What a drive that stops by itself looks like to the master's supervision."""
+"""Faults that the master's supervision sees when a drive stops on its own."""
 
 
 def hold(context: BringUpContext) -> Verdict:
-    """Power comes, the axis stays where it is."""
+    """Checks that the axis stays in place when power comes."""
     with context.interruptible() as interrupted:
         slow = context.slow(interrupted)
         positions = context.drive.read_positions()
@@ -50,7 +50,7 @@ def hold(context: BringUpContext) -> Verdict:
 
 
 def nudge(context: BringUpContext) -> Verdict:
-    """Two degrees of the motor, forth and back."""
+    """Moves the motor two degrees, out and back."""
     with context.interruptible() as interrupted:
         slow = context.slow(interrupted)
         with slow.enabled():
@@ -71,7 +71,7 @@ def nudge(context: BringUpContext) -> Verdict:
 
 
 def turn(context: BringUpContext) -> Verdict:
-    """A turn of the motor each way: which way and how far both encoders go."""
+    """Moves the motor one turn each way and compares direction and travel of both encoders."""
     with context.interruptible() as interrupted:
         slow = context.slow(interrupted)
         with slow.enabled():
@@ -92,14 +92,14 @@ def turn(context: BringUpContext) -> Verdict:
 
 
 def following(context: BringUpContext) -> Verdict:
-    """The following error of that move."""
+    """Judges the following error of that move."""
     if not context.out:
         return not_possible(_NOT_MOVED)
     return judge_following(context.axis, [each.demand_counts - each.motor_counts for each in context.out])
 
 
 def torque(context: BringUpContext) -> Verdict:
-    """The torque of that move."""
+    """Judges the torque of that move."""
     if not context.out:
         return not_possible(_NOT_MOVED)
     if objects.TORQUE_ACTUAL in layouts(context.axis).absent:
@@ -109,7 +109,7 @@ def torque(context: BringUpContext) -> Verdict:
 
 
 def settling(context: BringUpContext) -> Verdict:
-    """How the load came to rest after it."""
+    """Judges how the load settled after that move."""
     if len(context.out) <= context.rest_begins:
         return not_possible(_NOT_MOVED)
     resting = [each.load_counts for each in context.out[context.rest_begins :]]
@@ -117,7 +117,7 @@ def settling(context: BringUpContext) -> Verdict:
 
 
 def quick_stop(context: BringUpContext) -> Verdict:
-    """A quick stop in slow motion: travel, time, and the state after it."""
+    """Quick-stops a slow motion and judges travel, time and final state."""
     with context.interruptible() as interrupted:
         slow = context.slow(interrupted)
         with slow.enabled():
@@ -140,7 +140,7 @@ def quick_stop(context: BringUpContext) -> Verdict:
 
 
 def heartbeat(context: BringUpContext) -> Verdict:
-    """The master's heartbeat stays away in slow motion: the drive has to stop by itself."""
+    """Withholds the master's heartbeat during slow motion: the drive must stop on its own."""
     axis, sdo = context.axis, context.drive.sdo
     has_timer = _timer(context) is not None
     if not sdo.has(objects.HEARTBEAT_CONSUMER.index, objects.HEARTBEAT_CONSUMER.sub):
@@ -171,7 +171,7 @@ def heartbeat(context: BringUpContext) -> Verdict:
 
 
 def set_points(context: BringUpContext) -> Verdict:
-    """SYNC and set-points stay away in slow motion while the heartbeat goes on: the drive has to stop."""
+    """Withholds SYNC and set-points during slow motion while the heartbeat continues: the drive must stop."""
     axis, sdo = context.axis, context.drive.sdo
     timer = _timer(context)
     if timer is None:
@@ -193,7 +193,7 @@ def set_points(context: BringUpContext) -> Verdict:
 
 
 def switched_off(context: BringUpContext) -> Verdict:
-    """It boots again after all that, and is left switched off."""
+    """Checks that the drive boots again, and leaves it switched off."""
     drive = context.boot()
     word = drive.sdo.fetch(objects.STATUSWORD)
     state = decode(word)
@@ -204,7 +204,7 @@ def switched_off(context: BringUpContext) -> Verdict:
 
 
 def _timer(context: BringUpContext) -> int | None:
-    """Communication parameter of an RPDO of the cycle that has an event timer; None if none has."""
+    """Returns the communication parameter of a cyclic RPDO with an event timer; None if there is none."""
     used = (objects.RPDO_COMMUNICATION + layout.number - 1 for layout in context.drive.image.rpdos)
     return next((each for each in used if context.drive.sdo.has(each, 5)), None)
 
@@ -221,7 +221,7 @@ def _plan(context: BringUpContext, slow: SlowAxis) -> TravelPlan:
 
 
 def _far_from(context: BringUpContext, slow: SlowAxis) -> float:
-    """Where to move to for a stop on the way: back to where the axis stood at first, or away from there."""
+    """Returns the target of a move to be stopped: back to the initial position, or away from it."""
     if abs(slow.place_deg - context.began_deg) > BACK_FROM_DEG:
         return context.began_deg
     return slow.place_deg + _plan(context, slow).span_deg
@@ -232,7 +232,7 @@ def _between(start: Turned, end: Turned) -> Turned:
 
 
 def _noticed(context: BringUpContext) -> str:
-    """What to do about a drive that says that it lost its master, and goes on."""
+    """Returns advice for a drive that reports the loss of its master and continues."""
     axis = context.axis
     option = axis.drive.quick_stop_option
     again = (

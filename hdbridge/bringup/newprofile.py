@@ -1,4 +1,4 @@
-"""A profile's folder to begin with: a copy of a bundled one, or what a drive on the bus says of itself."""
+"""New profile folder: a copy of a bundled one, or the data of a drive on the bus."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _TO_FILL_IN = {
     },
     "gear": {"ratio": "0         # fill in: motor turns per load turn"},
 }
-"""What an axis file needs and the drive may not say: `hdbridge check` stops at what is left."""
+"""Required keys of an axis file that the drive may not provide; `hdbridge check` stops at unfilled ones."""
 _TAIL = """
 # At the load. Begin with little; `hdbridge doctor` moves within these.
 limits:
@@ -39,10 +39,10 @@ limits:
 
 
 def copy_bundled(source: str, folder: Path) -> list[Path]:
-    """The files of a bundled profile in a new folder, the axis named after it; what was written."""
+    """Copies a bundled profile into a new folder, names the axis after it, and returns the written files."""
     name = _axis_name(folder)
     origin = bundled_profile(source)
-    # A model is bound to the axis by its name: the copy's model is the copy's.
+    # A model is bound to the axis by its name, so the copied model gets the new name.
     own = {"axis.yaml": (rb"(?m)^name: .*$", "name: "), "model.yaml": (rb"(?m)^  axis: .*$", "  axis: ")}
     files = {each: (origin / each).read_bytes() for each in FILES if (origin / each).is_file()}
     for each, (line, key) in own.items():
@@ -52,7 +52,7 @@ def copy_bundled(source: str, folder: Path) -> list[Path]:
 
 
 def write_scanned(folder: Path, bus: BusConfig, node: Node, eds: Path | None) -> list[Path]:
-    """An axis file of what a drive says of itself, and its EDS next to it; what was written."""
+    """Writes an axis file from the drive's own data and copies its EDS; returns the written files."""
     text = axis_text(_axis_name(folder), bus, node, eds.name if eds else "FILE.eds")
     if eds is not None and not eds.is_file():
         raise InputError(f"{eds}: there is no such file; expected the EDS file of the drive")
@@ -63,7 +63,7 @@ def write_scanned(folder: Path, bus: BusConfig, node: Node, eds: Path | None) ->
 
 
 def axis_text(name: str, bus: BusConfig, node: Node, eds_name: str) -> str:
-    """The text of an axis file; what nobody can know but a person is marked ``fill in``."""
+    """Returns the text of an axis file; values that only the user knows are marked ``fill in``."""
     said = _sections(axis_lines(node))
     for section, keys in _TO_FILL_IN.items():
         lines = said.setdefault(section, [])

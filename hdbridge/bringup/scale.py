@@ -1,9 +1,9 @@
-"""Do both encoders, their directions and the ratio fit what was measured? If not, which key is wrong? Pure.
+"""Consistency of encoder counts, directions and gear ratio with a measured turn; finds the wrong key. Pure.
 
-They are judged by one ratio: load counts per motor count. It is the quotient of three
-keys of the axis file and two directions, so a wrong one cannot be computed from it; it can be *inferred*:
-from what the drive and the teeth confirm, and from what is usual (counts taken for lines, a ratio of the
-other output of the gear, round numbers).
+They are judged by a single ratio, load counts per motor count. It is the quotient of three keys of the axis
+file and two directions, so a wrong one cannot be computed from it. It can be *inferred* from the values that
+the drive and the teeth confirm, and from common mistakes and values (counts confused with lines, the other
+output of the gear, round numbers).
 """
 
 from __future__ import annotations
@@ -18,15 +18,15 @@ if TYPE_CHECKING:
     from hdbridge.axis import AxisConfig
 
 TOOTH_SHARE: Final = 0.35
-"""A ratio is distinguished from its neighbour (N and N + 1 differ by 1/N) if it errs by less than this."""
+"""Maximum error of a ratio, as a share of the distance to its neighbour (N and N + 1 differ by 1/N)."""
 CLOSE_SHARE: Final = 0.001
-"""How true a turn of the motor shows the ratio where nothing is wrong with the gear: 26 arcsec at N = 50."""
+"""Accuracy with which a motor turn shows the ratio of a sound gear: 26 arcsec at N = 50."""
 DEAD_SHARE: Final = 0.02
-"""A load encoder that moves by less than this share of what is expected does not move."""
+"""A load encoder that moves less than this share of the expected travel counts as not moving."""
 USUAL_RATIOS: Final = frozenset(
     each + output for each in (30, 50, 60, 64, 72, 80, 88, 100, 110, 120, 128, 160, 200) for output in (0, 1)
 )
-"""Ratios in which harmonic gears are sold, with the flexspline or the circular spline as the output."""
+"""Commercial ratios of harmonic gears, with the flexspline or the circular spline as the output."""
 
 LOAD_COUNTS: Final = "load_encoder.counts_per_turn"
 MOTOR_COUNTS: Final = "motor_encoder.counts_per_turn"
@@ -35,7 +35,7 @@ SOURCE: Final = "load_encoder.source"
 
 
 class Turned(NamedTuple):
-    """How far both encoders turned between two stands that were approached from the same side, in counts."""
+    """Travel of both encoders between two standstills approached from the same side; counts."""
 
     motor_counts: float
     load_counts: float
@@ -43,23 +43,25 @@ class Turned(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Accusation:
-    """A key of the axis file that would explain what was measured."""
+    """Key of the axis file whose value would explain the measurement."""
 
     key: str
     found: float
     expected: float
     weight: float
-    """How much speaks for it, against the others."""
+    """Weight of the evidence, relative to the other keys."""
     why: str
 
     def text(self, axis: AxisConfig) -> str:
-        """``axis.yaml:31:3: load_encoder.counts_per_turn: found 2880000, expected 11520000 (...)``."""
+        """For example ``axis.yaml:31:3: load_encoder.counts_per_turn: found 2880000, expected 11520000
+        (...)``.
+        """
         where = axis.where(self.key)
         return f"{where}: found {_plain(self.found)}, expected {_plain(self.expected)} ({self.why})"
 
 
 def expected_load_per_motor(axis: AxisConfig) -> float:
-    """Load counts per motor count by the axis file, with sign."""
+    """Returns the signed load counts per motor count according to the axis file."""
     motor, load = axis.motor_encoder, axis.load_encoder
     return (load.direction * load.counts_per_turn) / (
         motor.direction * motor.counts_per_turn * axis.gear.ratio
@@ -69,7 +71,7 @@ def expected_load_per_motor(axis: AxisConfig) -> float:
 def judge_turn(
     axis: AxisConfig, forward: Turned, backward: Turned, confirmed: frozenset[str] = frozenset()
 ) -> Verdict:
-    """Do the directions, both encoders' counts and the ratio fit what was measured both ways?
+    """Checks directions, counts of both encoders and ratio against moves in both directions.
 
     ``confirmed`` are the keys that the drive's own objects confirm.
     """
@@ -139,9 +141,9 @@ def _direction(axis: AxisConfig) -> list[str]:
 def accuse(
     axis: AxisConfig, factor: float, tolerance: float, confirmed: frozenset[str] = frozenset()
 ) -> list[Accusation]:
-    """The keys that explain that the load encoder moves ``factor`` times as far as expected; likeliest first.
+    """Returns the keys that explain a load travel of ``factor`` times the expected one, the likeliest first.
 
-    ``tolerance`` is how well the factor is known, relative.
+    ``tolerance`` is the relative uncertainty of the factor.
     """
     load, motor = axis.load_encoder.counts_per_turn, axis.motor_encoder.counts_per_turn
     rows = [
@@ -181,7 +183,7 @@ def _ratio(axis: AxisConfig, wanted: float, tolerance: float) -> Accusation:
             return Accusation(RATIO, found, other, 4.0, f"the output is the other one: teeth.output {held}")
     whole = round(wanted)
     if whole >= 1 and abs(whole / wanted - 1.0) <= tolerance:
-        # Teeth that give the ratio of the file speak for it.
+        # Teeth that give the ratio of the file are evidence for it.
         less = 1.0 if teeth is not None else 0.0
         if abs(whole - found) == 1.0:
             return Accusation(RATIO, found, whole, 3.5 - less, "the other output of the same gear")
@@ -194,7 +196,7 @@ def _ratio(axis: AxisConfig, wanted: float, tolerance: float) -> Accusation:
 
 
 def _roundest(value: float) -> int:
-    """The number with the fewest digits that is close; a power of two where there is one."""
+    """Returns the close number with the fewest digits, or a power of two if there is one."""
     power = 2 ** round(math.log2(value)) if value >= 1.0 else 1
     if abs(power / value - 1.0) <= CLOSE_SHARE:
         return power

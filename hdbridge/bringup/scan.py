@@ -1,7 +1,7 @@
-"""What answers on a CAN bus. It listens first, then asks each node id, and writes nothing.
+"""Scan of a CAN bus: listens first, then queries each node id, and writes nothing.
 
-Only SDO read requests are sent (and an SDO abort where one was not answered). A node that somebody else is
-talking to by SDO is left alone: a second client on the same channel would spoil the other's transfer.
+Only SDO read requests are sent (and an SDO abort if one was not answered). A node that is busy with another
+SDO client is left alone, because a second client on the same channel would spoil its transfer.
 """
 
 from __future__ import annotations
@@ -33,11 +33,11 @@ PROFILES: Final[dict[int, str]] = {
     418: "battery",
     419: "battery charger",
 }
-"""Device profiles of CiA, as the low half of object 1000h names them."""
+"""Device profiles of CiA, by the low half of object 1000h."""
 MODES: Final[dict[int, str]] = {
     0: "PP", 1: "VL", 2: "PV", 3: "TQ", 5: "HM", 6: "IP", 7: "CSP", 8: "CSV", 9: "CST",
 }  # fmt: skip
-"""Bits of 6502h and the modes of operation that they stand for."""
+"""Modes of operation by their bit in 6502h."""
 _NAMES: Final = ((0x1008, "device"), (0x1009, "hardware"), (0x100A, "software"))
 _SCALING: Final = (
     objects.ENCODER_INCREMENTS,
@@ -48,23 +48,23 @@ _SCALING: Final = (
     *objects.additional_resolution(1),
 )
 ENCODER_UNITS_PER_TURN: Final = Address(0x6001, 0, IntegerType.UINT32, "measuring units per revolution")
-"""CiA 406."""
+"""Object of CiA 406."""
 
 
 @dataclass(slots=True)
 class Node:
-    """One node as far as it showed itself."""
+    """One node, as far as it is known."""
 
     node_id: int
     nmt_state: int | None = None
-    """Byte of its last heartbeat; None where it sends none."""
+    """Byte of its last heartbeat; None if it sends none."""
     answers: bool = False
-    """Whether it answered an SDO request."""
+    """True if it answered an SDO request."""
     busy: bool = False
-    """Another SDO client was talking to it, so it was not asked."""
+    """True if another SDO client was using it, so that it was not queried."""
     device_type: int | None = None
     identity: dict[str, int] = field(default_factory=dict)
-    """Keys of ``drive.identity``; what the node lacks is left out."""
+    """Identity by the keys of ``drive.identity``; objects that the node lacks are missing."""
     names: dict[str, str] = field(default_factory=dict)
     """Device name, hardware and software version."""
     modes: int | None = None
@@ -74,12 +74,12 @@ class Node:
 
     @property
     def profile(self) -> int | None:
-        """Device profile, 402 for a drive; None where it is not known."""
+        """Device profile, 402 for a drive; None if it is not known."""
         return None if self.device_type is None else self.device_type & 0xFFFF
 
     @property
     def kind(self) -> str:
-        """What it is, in words."""
+        """Kind of device, as text."""
         if self.profile is None:
             return "not asked: another SDO client is talking to it" if self.busy else "unknown"
         return (
@@ -88,7 +88,7 @@ class Node:
 
     @property
     def state(self) -> str:
-        """NMT state in words."""
+        """NMT state, as text."""
         if self.nmt_state is None:
             return "no heartbeat; it answers, so it is not stopped" if self.answers else "no heartbeat"
         try:
@@ -103,31 +103,31 @@ class Node:
 
     @property
     def usable(self) -> bool:
-        """A CiA-402 drive with a cyclic position mode, or one that does not say which modes it has."""
+        """True for a CiA-402 drive with a cyclic position mode, or with unknown modes."""
         return self.profile == objects.DEVICE_PROFILE_402 and (self.modes is None or self.cyclic is not None)
 
     @property
     def cyclic(self) -> str | None:
-        """The value of ``drive.mode`` for this drive; None if it has neither mode, or does not say."""
+        """Value of ``drive.mode`` for this drive; None if it has neither mode or does not report them."""
         has = [name for name, each in CYCLIC.items() if (self.modes or 0) & each.mode.supported_bit]
         return has[0] if has else None
 
 
 @dataclass(frozen=True, slots=True)
 class Scan:
-    """What a scan found."""
+    """Result of a scan."""
 
     nodes: tuple[Node, ...]
     remarks: tuple[str, ...] = ()
-    """What else was heard that matters: other masters, other SDO clients."""
+    """Other observations that matter: other masters, other SDO clients."""
 
     def node(self, node_id: int) -> Node | None:
-        """The node with that id, where one was seen."""
+        """Returns the node with that id, or None."""
         return next((each for each in self.nodes if each.node_id == node_id), None)
 
 
 class _Hearing:
-    """Takes every frame that comes and notes whose it is."""
+    """Takes every frame and records its sender."""
 
     def __init__(self, link: Link) -> None:
         self.link = link
@@ -184,11 +184,11 @@ def scan_bus(
     progress: Callable[[float], None] = lambda _: None,
     force: bool = False,
 ) -> Scan:
-    """Listen for ``listen_s``, then ask every node id for its device type, and those that answer for more.
+    """Listens for ``listen_s``, then queries the device type of every node id, and more of those that answer.
 
-    ``progress`` receives the share done. Raises `BusInUseError` before anything is sent when another master
-    is heard (a request may stop the axis that it moves), and listens for as long as that takes; ``force``
-    asks all the same. Raises `BusError` when the interface fails.
+    ``progress`` receives the share done. Raises `BusInUseError` before anything is sent if another master is
+    heard, because a request may stop the axis that it moves; it listens for as long as that detection takes.
+    ``force`` skips the detection. Raises `BusError` if the interface fails.
     """
     force = force or link.private
     ear = _Hearing(link)
@@ -217,7 +217,7 @@ def _ask(ear: _Hearing, node_id: int, timeout_s: float) -> Node:
     try:
         node.device_type = sdo.fetch(objects.DEVICE_TYPE)
     except SdoAbortError:
-        pass  # it is there and refuses the one object that every node has
+        pass  # it is present and refuses the one object that every node has
     except SdoError:
         return node
     node.answers = True
@@ -248,4 +248,4 @@ def _fetch(sdo: SdoClient, address: Address) -> int | None:
     try:
         return sdo.read(address.index, address.sub, address.type)
     except SdoError:
-        return None  # not every node has it
+        return None  # optional object

@@ -1,7 +1,7 @@
-"""Slow, short, torque-limited motion of an axis that is not trusted yet, in raw encoder counts.
+"""Slow, short, torque-limited motion of an unverified axis, in raw encoder counts.
 
-Each `enabled` block switches power on at rest and, on every way out, brings the axis to rest and switches it
-off again. Everything runs in the control cycle with all its supervision.
+Each `enabled` block switches power on at rest, and on every exit brings the axis to rest and switches it off
+again. Everything runs in the control cycle with full supervision.
 """
 
 from __future__ import annotations
@@ -35,27 +35,27 @@ if TYPE_CHECKING:
     from hdbridge.axis import AxisConfig
 
 MOTOR_SPEED_DEG_S: Final = 120.0
-"""Speed of the moves, degrees of the motor per second, where the limits allow four times as much."""
+"""Speed of the moves, motor degrees per second, if the limits allow four times as much."""
 LEAD_DEG: Final = 45.0
-"""Motor travel before a stand that is measured, so that the gear's hysteresis is on the same side."""
+"""Motor travel before a measured standstill, which puts the gear's hysteresis on the same side."""
 MARGIN_DEG: Final = 1.0
-"""Motor travel that is left to the limits of the axis."""
+"""Motor travel kept clear of the axis limits, degrees."""
 LEAST_TRAVEL_DEG: Final = 20.0
 STILL_CYCLES: Final = 3
 
 
 class TravelPlan(NamedTuple):
-    """Where the axis goes from where it stands, in degrees of the motor, with sign."""
+    """Planned travel from the present position, signed motor degrees."""
 
     lead_deg: float
     span_deg: float
-    """Whole turns of the motor where there is room: what repeats with them then cancels out."""
+    """Whole motor turns if the limits allow, so that periodic errors cancel out."""
 
 
 def plan_travel(axis: AxisConfig, here_deg: float) -> TravelPlan | None:
-    """The travel from a motor angle, to the side with more room; None where there is too little.
+    """Returns the travel from a motor angle, to the side with more space; None if there is too little.
 
-    One motor turn, and more where the ratio is so high that it could not be distinguished from its neighbour.
+    One motor turn, or more if the ratio is too high to be distinguished from its neighbour in one.
     """
     limits, ratio = axis.limits, axis.gear.ratio
     ahead = limits.position_max_deg * ratio - here_deg - MARGIN_DEG
@@ -73,7 +73,7 @@ def plan_travel(axis: AxisConfig, here_deg: float) -> TravelPlan | None:
 
 
 class QuietLink(Link):
-    """A link that withholds some identifiers, as a master that has died would."""
+    """Link that withholds some identifiers, like a master that has died."""
 
     __slots__ = ("muted", "sent_s", "unheard", "withheld")
 
@@ -81,20 +81,20 @@ class QuietLink(Link):
         super().__init__(bus, clock)
         self.muted: set[int] = set()
         self.sent_s: dict[int, float] = {}
-        """When each identifier was last really sent."""
+        """Time at which each identifier was last actually sent; s."""
         self.unheard: set[int] = set()
         """Identifiers that are received but not passed on."""
         self.withheld: list[Frame] = []
-        """The frames with those."""
+        """Withheld frames with those identifiers."""
 
     def recv(self, deadline_s: float) -> Frame | None:
-        """Receive, without the frames of `unheard`."""
+        """Receives a frame, skipping those in `unheard`."""
         while (frame := super().recv(deadline_s)) is not None and frame.can_id in self.unheard:
             self.withheld.append(frame)
         return frame
 
     def send(self, can_id: int, data: bytes) -> None:
-        """Send, unless the identifier is muted."""
+        """Sends a frame unless its identifier is muted."""
         if can_id not in self.muted:
             super().send(can_id, data)
             self.sent_s[can_id] = self.now()
@@ -102,25 +102,25 @@ class QuietLink(Link):
 
 @dataclass(frozen=True, slots=True)
 class Silence:
-    """What the drive did when something of the master went silent."""
+    """Reaction of the drive to a silent master."""
 
     noticed_after_s: float | None
-    """From the last frame to the drive's reaction; None where there was none in the time it had."""
+    """Time from the last frame to the drive's reaction, s; None if there was none within its time-out."""
     event: Event | None
-    """What the master's supervision saw first, where it ran on."""
+    """First event of the master's supervision, if it kept running."""
     statusword: int
-    """Of the drive, when it stood."""
+    """Statusword of the drive at standstill."""
     stands: bool
     distance_deg: float
-    """Motor travel from the last frame until it stood."""
+    """Motor travel from the last frame to standstill, degrees."""
     emergencies: tuple[Emergency, ...] = ()
-    """What the drive said of it."""
+    """Emergency messages that the drive sent about it."""
     resumed: bool = False
-    """It went into the quick stop, and back to 'operation enabled' by the master's own controlword."""
+    """True if it entered the quick stop and left it again by the master's own controlword."""
 
 
 class SlowAxis:
-    """An axis in slow motion. ``interrupted`` is asked in each cycle; a yes stops the axis."""
+    """Axis in slow motion. ``interrupted`` is called in each cycle; True stops the axis."""
 
     def __init__(self, drive: Drive, torque_percent: float, interrupted: Callable[[], bool]) -> None:
         self.axis = drive.axis
@@ -144,7 +144,7 @@ class SlowAxis:
 
     @contextmanager
     def enabled(self) -> Iterator[Feedback]:
-        """Power on at rest, off again at the end; gives the first feedback under power."""
+        """Switches power on at rest and off again at the end; yields the first feedback under power."""
         drive, power = self._drive, self.image.power
         if drive.can_set(objects.MAX_TORQUE):
             drive.sdo.store(objects.MAX_TORQUE, round(10.0 * self.torque_percent))
@@ -156,7 +156,7 @@ class SlowAxis:
             yield feedback
             self._rest()
         except BaseException:
-            # Whatever went wrong, Ctrl-C included: first the axis stops, then the error goes on its way.
+            # On any failure, Ctrl-C included, the axis is stopped before the error propagates.
             with suppress(HdbridgeError):
                 self._rest()
             with suppress(HdbridgeError):
@@ -169,7 +169,7 @@ class SlowAxis:
             self.stop()
 
     def stop(self) -> list[Feedback]:
-        """Quick stop, cycle by cycle, until the motor stands; the feedback of these cycles."""
+        """Quick-stops, cycle by cycle, until the motor stands; returns the feedback of these cycles."""
         power = self.image.power
         power.quick_stop()
         seen: list[Feedback] = []
@@ -187,19 +187,19 @@ class SlowAxis:
 
     @property
     def place_deg(self) -> float:
-        """The motor angle that is aimed at."""
+        """Target motor angle, degrees."""
         return self._place_deg
 
     def sit(self, duration_s: float) -> list[Feedback]:
-        """Let cycles pass where the axis is, with or without power."""
+        """Runs cycles without motion, with or without power; returns their feedback."""
         return [self._tick(None) for _ in range(math.ceil(duration_s / self.cycle.period_s))]
 
     def travel(self, motor_deg: float, least_s: float = 0.0) -> list[Feedback]:
-        """Move to a motor angle, slowly; the feedback of each cycle."""
+        """Moves slowly to a motor angle; returns the feedback of each cycle."""
         return list(self._follow(motor_deg, least_s))
 
     def stand(self, duration_s: float = 0.4) -> Turned:
-        """Stand, and give where both encoders are: the mean over the last quarter."""
+        """Stands still and returns the mean position of both encoders over the last quarter."""
         seen = self.sit(duration_s)
         tail = seen[-max(len(seen) // 4, 1) :]
         return Turned(
@@ -207,7 +207,7 @@ class SlowAxis:
         )
 
     def speed_deg_s(self, way_deg: float, least_s: float = 0.0) -> float:
-        """Speed of a move over ``way_deg`` of the motor, that is to last at least ``least_s``."""
+        """Returns the speed of a move over ``way_deg`` of the motor that is to last at least ``least_s``."""
         limits = self.axis.limits
         speed = min(MOTOR_SPEED_DEG_S, 0.25 * limits.velocity_deg_s * self.axis.gear.ratio)
         return min(speed, abs(way_deg) / least_s) if least_s > 0.0 else speed
@@ -245,7 +245,9 @@ class SlowAxis:
     # -- stops --------------------------------------------------------------------------------------------
 
     def stop_on_the_way(self, motor_deg: float) -> tuple[float, float, float]:
-        """Move, and quick stop half-way: the speed then, travel and time of the stop (motor degrees, s)."""
+        """Moves and quick-stops half-way; returns the speed before, and travel and time of the stop (motor
+        degrees, s).
+        """
         moved = self._half_way(self._follow(motor_deg), motor_deg)
         speed = self._measured_speed(moved)
         stopping = self.stop()
@@ -255,7 +257,7 @@ class SlowAxis:
         return speed, way, (rest + 1) * self.cycle.period_s
 
     def lose_heartbeat(self, motor_deg: float, patience_s: float) -> tuple[float, Silence]:
-        """Move, and half-way keep the master's heartbeat back while all else goes on: speed and what came."""
+        """Moves and withholds the master's heartbeat from half-way on; returns the speed and the reaction."""
         moving = self._follow(motor_deg, 2.0 * patience_s + 1.0)
         moved = self._half_way(moving, motor_deg)
         speed = self._measured_speed(moved)
@@ -264,7 +266,7 @@ class SlowAxis:
         last_s = self.link.sent_s.get(identifier, self.link.now())
         muted_s = self.link.now()
         self.link.muted.add(identifier)
-        # The emergency message would make this master stop the axis, before the drive shows what it does.
+        # The emergency message would make this master stop the axis before the drive's own reaction shows.
         self.link.unheard.add(COB_EMCY + self.axis.drive.node_id)
         noticed_s: float | None = None
         try:
@@ -272,7 +274,7 @@ class SlowAxis:
                 if self.link.now() - muted_s > patience_s:
                     break
         except SafetyStop:
-            pass  # what it was, `supervision.stop` says
+            pass  # `supervision.stop` holds the cause
         finally:
             self.link.muted.discard(identifier)
             self.link.unheard.clear()
@@ -294,7 +296,9 @@ class SlowAxis:
         )
 
     def lose_set_points(self, motor_deg: float, patience_s: float) -> tuple[float, Silence]:
-        """Move, and half-way send neither SYNC nor set-points any more; the heartbeat goes on."""
+        """Moves and stops sending SYNC and set-points half-way; the heartbeat continues. Returns speed and
+        reaction.
+        """
         moved = self._half_way(self._follow(motor_deg), motor_deg)
         speed, start, drive = self._measured_speed(moved), moved[-1], self._drive
         last_s = self.link.now()
@@ -313,7 +317,7 @@ class SlowAxis:
         return speed, result
 
     def _half_way(self, moving: Iterator[Feedback], motor_deg: float) -> Sequence[Feedback]:
-        """Move as far as half of the travel, at full speed then; ``moving`` has more to give."""
+        """Moves to the middle of the travel, where it has full speed; ``moving`` is not exhausted."""
         begin = self._place_deg
         seen: list[Feedback] = []
         for feedback in moving:
@@ -337,7 +341,7 @@ class SlowAxis:
         event: Event | None,
         pause: Callable[[float], None],
     ) -> Silence:
-        """By SDO, as the drive may send no PDOs any more: where it is, and whether it stands."""
+        """Reads position and standstill by SDO, because the drive may have stopped sending PDOs."""
         sdo, clock = self._drive.sdo, self.link.clock
         last = sdo.fetch(objects.POSITION_ACTUAL)
         stands = False

@@ -1,4 +1,4 @@
-"""The checks that need no power: files, bus, node, identity, EDS, scaling, boot-up, encoders at rest."""
+"""Checks that need no power: files, bus, node, identity, EDS, scaling, boot-up, encoders at rest."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ REST_S: Final = 1.0
 
 
 def files(context: BringUpContext) -> Verdict:
-    """The axis file and the EDS can be read, and every value of the boot-up fits its object."""
+    """Reads the axis file and the EDS, and checks that every boot-up value fits its object."""
     axis = context.load()
     od = load_eds(axis.eds_path, axis.drive.node_id)
     rows, left = plan(axis, od), left_to_drive(axis, od)
@@ -50,7 +50,7 @@ def files(context: BringUpContext) -> Verdict:
 
 
 def bus(context: BringUpContext) -> Verdict:
-    """The bus opens, and nobody else masters it."""
+    """Opens the bus and checks that no other master uses it."""
     context.connect()
     context.drive.listen()
     link = context.drive.link
@@ -58,7 +58,7 @@ def bus(context: BringUpContext) -> Verdict:
 
 
 def answers(context: BringUpContext) -> Verdict:
-    """The node answers; where it does not, whoever else does."""
+    """Checks that the node answers; if it does not, lists the nodes that do."""
     axis, drive = context.axis, context.drive
     try:
         where = axis.where("drive.node_id")
@@ -85,7 +85,7 @@ def answers(context: BringUpContext) -> Verdict:
 
 
 def identity(context: BringUpContext) -> Verdict:
-    """It is the drive that the axis file means, and has the mode that is needed."""
+    """Checks that it is the drive of the axis file and supports the required mode."""
     axis, sdo = context.axis, context.drive.sdo
     found = {
         name: sdo.fetch(address)
@@ -100,7 +100,7 @@ def identity(context: BringUpContext) -> Verdict:
 
 
 def eds(context: BringUpContext) -> Verdict:
-    """The EDS describes this drive: the objects that are used exist, with the type that it says."""
+    """Checks the EDS against the drive: the objects used exist and have the stated type."""
     axis, drive = context.axis, context.drive
     where = axis.where("drive.eds")
     wrong: list[str] = []
@@ -136,7 +136,7 @@ def eds(context: BringUpContext) -> Verdict:
 
 
 def _listed(context: BringUpContext) -> Iterator[tuple[int, int]]:
-    """The objects to look at: those that are used, as far as the EDS lists them."""
+    """Yields the objects to check: those that are used and that the EDS lists."""
     axis, sdo = context.axis, context.drive.sdo
     target = context.drive.image.cyclic.target
     for address in (
@@ -159,7 +159,7 @@ def _listed(context: BringUpContext) -> Iterator[tuple[int, int]]:
 
 
 def units(context: BringUpContext) -> Verdict:
-    """The drive counts as the axis file says, by every object that says something about it."""
+    """Compares every object that defines the drive's scaling with the axis file."""
     axis, sdo = context.axis, context.drive.sdo
 
     def read(*addresses: Address) -> dict[Address, int]:
@@ -184,7 +184,7 @@ def units(context: BringUpContext) -> Verdict:
 
 
 def boot(context: BringUpContext) -> Verdict:
-    """The boot-up writes its plan and reads every object back."""
+    """Boots the drive: writes the plan and reads every object back."""
     drive = context.boot()
     report = drive.report
     assert report is not None
@@ -197,7 +197,9 @@ def boot(context: BringUpContext) -> Verdict:
 
 
 def rest(context: BringUpContext) -> Verdict:
-    """Both encoders come with every SYNC, and rest while the power is off; other channels tell something."""
+    """Checks that both encoders arrive with every SYNC and stand still without power, and reads
+    the channels.
+    """
     drive = context.drive
     with context.interruptible() as interrupted:
         positions = drive.read_positions()

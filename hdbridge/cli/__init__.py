@@ -1,9 +1,9 @@
-"""The command line: one entry point, `hdbridge`; each command is one file and a thin layer over the library.
+"""Command line: one entry point, `hdbridge`; each command is one file and a thin layer over the library.
 
 Exit status: 0 done; 1 an error in hdbridge itself; 2 bad input (nothing was written, nothing moved); 3 the
-bus; 4 the drive; 5 the supervision stopped the axis; 6 a result could not be written (what was measured is
-printed); 7 the daemon is not reached, or does not do this for this client now; 130 Ctrl-C (the axis was
-stopped, the record kept).
+bus; 4 the drive; 5 the supervision stopped the axis; 6 a result could not be written (the measured figures
+are printed); 7 the daemon cannot be reached, or refuses this client now; 130 Ctrl-C (the axis was stopped,
+the record kept).
 """
 
 from __future__ import annotations
@@ -32,32 +32,34 @@ PANELS: Final = {
     },
     "Before the first move": {
         "setup": "Set up an axis in one sitting: bus, axis file, checks, calibration, model, first move.",
-        "new": "Make the folder of an axis: a copy of a bundled profile, or what a drive on the bus says of "
-        "itself.",
-        "check": "Read the files of an axis or of a machine; say what they mean, or what is wrong and where.",
+        "new": "Make the folder of an axis: a copy of a bundled profile, or from the data of a drive on the "
+        "bus.",
+        "check": "Check the files of an axis or of a machine; report what they mean, or what is wrong and "
+        "where.",
         "scan": "List the nodes on a CAN bus: what they are, their identity, their state, and lines for an "
         "axis file.",
         "doctor": "Check an axis before its first long motion: files, bus, drive, encoders, directions, "
         "ratio, stops.",
         "sdo": "Read or write an object of the drive by SDO, typed by its EDS.",
-        "latency": "Measure how late this machine wakes up; print the histogram and the cycle time that it "
-        "carries.",
+        "latency": "Measure timer latency; print its histogram and the shortest cycle that this computer "
+        "sustains.",
     },
     "The model of an axis": {
         "calibrate": "Measure an axis by a plan, fit its model, test it on the axis, and keep it as pending.",
         "measure": "Move an axis by a plan and keep the recording, for diagnose, twin and fit.",
-        "fit": "Fit a model to recordings; say how sure each parameter is, and what the data cannot tell.",
-        "report": "Fit a recording again and tell its result; no axis is needed, nothing moves.",
-        "diagnose": "Compare records with a model; name what the model lacks, or say what cannot be told.",
-        "improve": "Say what the active model lacks, extend it, step with both, and keep the better one as "
+        "fit": "Fit a model to recordings; report parameter intervals and what the data cannot determine.",
+        "report": "Fit a recording again and report the result; needs no axis and moves nothing.",
+        "diagnose": "Compare records with a model; name the causes that it lacks and those that cannot be "
+        "separated.",
+        "improve": "Diagnose the active model, extend it, step with both, and keep the better one as "
         "pending.",
-        "twin": "Teach the simulated drive an axis from recordings; say what it got wrong, and keep the "
-        "twin as pending.",
-        "model": "The models of an axis: the active one, one that waits, and every one that there was.",
+        "twin": "Fit the simulated drive to recordings of an axis; report its errors, and keep the twin as "
+        "pending.",
+        "model": "Manage the models of an axis: the active one, a pending one, and all earlier ones.",
     },
     "Day and night": {
-        "run": "Hold the drives of a machine, day and night, and take load angles from clients.",
-        "ctl": "Ask a daemon that runs: look, move, stop, compensate, run procedures.",
+        "run": "Run the daemon: hold the drives of a machine and take load angles from clients.",
+        "ctl": "Control a running daemon: look, move, stop, compensate, run procedures.",
         "record": "Flight recordings and bus logs: list, mend, and make records for fit and diagnose.",
         "install-service": "Show, write or remove the systemd files that run a machine's daemon from the "
         "start of the computer.",
@@ -66,22 +68,23 @@ PANELS: Final = {
         "move": "Move the load to one angle or to several, compensated by the active model, and hold the "
         "last.",
         "reset": "Reset a fault of the drive when its cause is gone; power stays off.",
-        "home": "Home the drive by a method of its own (CiA 402, mode HM); print where the axis then is.",
+        "home": "Home the drive by one of its own methods (CiA 402, mode HM); print the position of the "
+        "axis.",
         "step": "Step the axis both ways under each compensation scheme; print what the load encoder "
         "measured.",
         "motion": "Run the axis at several speeds; print the ripple of the load without and with "
         "compensation.",
     },
 }
-"""Every command, under the heading that `hdbridge --help` gives it, and what it says of it there.
+"""Every command under its heading in `hdbridge --help`, with its summary there.
 
-The command itself is the file of that name in this folder. It says the same, and is imported for its own help
-or to be run; what it computes with it loads when it runs.
+The command is the file of that name in this folder, with the same summary. It is imported only for its own
+help or to be run, and it imports what it computes with when it runs.
 """
 
 
 def load(name: str) -> typer.Typer:
-    """Import a command: an app with nothing but what its file registers, which checks its outputs first."""
+    """Imports a command; returns an app with only that command, which checks its outputs before it runs."""
     guarded = import_module(f"{__name__}.outputs").guarded
     loaded = typer.Typer(rich_markup_mode="markdown")
     import_module(f"{__name__}.{name.replace('-', '_')}").register(loaded)
@@ -93,7 +96,7 @@ def load(name: str) -> typer.Typer:
 
 
 class _LoadedToRun(TyperGroup):
-    """Puts the real command in the place of what only stands in the overview."""
+    """Command group that replaces the placeholders of the overview by the real commands."""
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
         name, _, rest = super().resolve_command(ctx, args)
@@ -103,7 +106,7 @@ class _LoadedToRun(TyperGroup):
 
 @cache
 def _built(name: str) -> Any:
-    """The command with its options; once, where a process runs it more often."""
+    """Returns the command with its options; cached, because a process may run it several times."""
     return usage.strict(get_group(load(name)).commands[name])
 
 
@@ -123,7 +126,7 @@ app = typer.Typer(
 
 
 def _in_overview() -> None:
-    """What stands there for a command that is not imported."""
+    """Placeholder for a command that has not been imported."""
 
 
 for _panel, _commands in PANELS.items():
@@ -139,18 +142,20 @@ def _tell_version(asked: bool) -> None:
 
 @app.callback()
 def _hdbridge(
-    version: Annotated[  # noqa: ARG001 - its callback has told it by then
+    version: Annotated[  # noqa: ARG001 - its callback has printed it by then
         bool, typer.Option("--version", help="Print the version and exit.", callback=_tell_version)
     ] = False,
     verbose: Annotated[
         int,
         typer.Option(
-            "--verbose", "-v", count=True, help="Tell what is done on the bus; -vv: every SDO transfer."
+            "--verbose", "-v", count=True, help="Report actions on the bus; -vv: every SDO transfer."
         ),
     ] = 0,
     log: Annotated[
         Path | None,
-        typer.Option("--log", metavar="FILE", help="Append all that -vv tells, a JSON object per line."),
+        typer.Option(
+            "--log", metavar="FILE", help="Append everything that -vv reports, one JSON object per line."
+        ),
     ] = None,
 ) -> None:
     """Make a harmonic-drive axis point where it is told: a CANopen master that knows its gear.
@@ -163,8 +168,8 @@ def _hdbridge(
 
 
 def main() -> None:
-    """Run the command line; errors raised on purpose are one line and their exit status."""
-    for name in ("stdout", "stderr"):  # closed by who started it: printed to nobody
+    """Runs the command line; an error of hdbridge becomes one line and its exit status."""
+    for name in ("stdout", "stderr"):  # closed by the parent process: output is discarded
         if getattr(sys, name) is None:
             setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: PTH123, SIM115
     for stream in (sys.stdout, sys.stderr):
@@ -184,7 +189,7 @@ def main() -> None:
         status = InputError.exit_status
     except typer.Abort:
         status = 130
-    except (BrokenPipeError, SystemExit):  # `hdbridge ... | head`, which typer makes an exit of
+    except (BrokenPipeError, SystemExit):  # `hdbridge ... | head`, which typer turns into an exit
         _close_output()
         status = 0
     except OSError as error:
@@ -198,7 +203,7 @@ def main() -> None:
 
 
 def _close_output() -> None:
-    """What is left in the buffer cannot be written, and must not fail again when the process ends."""
+    """Discards the output buffer, which cannot be written and must not fail again at exit."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 

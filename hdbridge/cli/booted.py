@@ -1,4 +1,4 @@
-"""A drive ready to be measured: connected, booted, and stopped in good order at Ctrl-C."""
+"""A drive ready for measurement: connected, booted, and stopped in an orderly way at Ctrl-C."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ def booted(
     seed: int,
     force: bool,
 ) -> Iterator[tuple[Drive, Callable[[], bool]]]:
-    """The booted drive, and a function that tells whether somebody wishes to end.
+    """Yields the booted drive, and a function that reports a request to end.
 
-    ``force`` speaks even where another master is heard.
+    With ``force``, frames are sent even if another master is heard.
     """
     from hdbridge.drive.drive import Drive
 

@@ -1,4 +1,4 @@
-"""``hdbridge calibrate``: from a bare axis to a model that waits to be committed."""
+"""``hdbridge calibrate``: from a bare axis to a model that is pending."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
 
 def register(app: typer.Typer) -> None:
-    """Add the command."""
+    """Adds the command."""
     app.command("calibrate")(command)
 
 
@@ -58,7 +58,7 @@ def command(
 
     The axis moves within the limits of its axis file, without compensation. Everything measured is kept;
     Ctrl-C stops the axis, and --resume goes on. The model is pending until `hdbridge model commit PROFILE`.
-    One that does not improve on data that it has not seen is not offered.
+    A model that does not improve on held-out data is not offered.
     """
     from hdbridge.calibration import calibrate
     from hdbridge.calibration.motion import motion_test_s
@@ -70,7 +70,7 @@ def command(
     work = Measurement.asked(axis, plan, out, resume)
     test_s = validation_s(work.plan, axis)
     if work.plan.validation.motion:
-        with suppress(InputError):  # too little travel: the calibration says so, and does without
+        with suppress(InputError):  # too little travel: the calibration reports it and skips the test
             test_s += motion_test_s(axis)
     work.announce(f"{test_s / 60:.1f} min to test the model")
     with work.booted(files, simulate=simulate, truth=truth, seed=seed, force=force) as (drive, interrupted):
@@ -91,7 +91,7 @@ def command(
 def report(
     result: Calibration, folder: Path, files: Profile, json_file: Path | None, html_file: Path | None
 ) -> None:
-    """Tell the result, and what comes next."""
+    """Writes and prints the result and the next steps."""
     from hdbridge.cli.calibration_output import (
         print_calibration,
         print_next,

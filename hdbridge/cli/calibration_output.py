@@ -1,4 +1,4 @@
-"""What `calibrate`, `fit` and `report` print of a result."""
+"""Printed results of `calibrate`, `fit` and `report`."""
 
 from __future__ import annotations
 
@@ -17,11 +17,13 @@ if TYPE_CHECKING:
     from hdbridge.calibration.result import Offer
 
 TAKEN_OFF = 0.95
-"""What was fitted in addition to a model (a delay, load orders) is told where this share is left, or less."""
+"""Share of the residual up to which the part fitted in addition to a model (a delay, load orders) is
+reported.
+"""
 
 
 def print_calibration(result: Calibration) -> None:
-    """Parameters with intervals, held-out figures, what the data cannot say, the stepping test."""
+    """Prints parameters with intervals, held-out figures, undetermined parameters and the stepping test."""
     from hdbridge.model.difference import diff
     from hdbridge.units import figure, unit_of, with_interval
 
@@ -43,7 +45,7 @@ def print_calibration(result: Calibration) -> None:
             each.effect,
             escape(each.parameter),
             *((value, half_width) if each.identifiable else (f"({figure(each.value)})", "not known")),
-            # With a model before, the table has no room for a column that the names tell already.
+            # With a previous model there is no space for the unit column; the names contain the units.
             ("-" if was is None else with_interval(was, each.half_width)[0])
             if before
             else unit_of(each.parameter),
@@ -82,7 +84,7 @@ def print_calibration(result: Calibration) -> None:
 
 
 def write_calibration_page(path: Path, result: Calibration) -> None:
-    """The result as a self-contained page."""
+    """Writes the result as a self-contained page."""
     from hdbridge.report.calibration import calibration_page
     from hdbridge.report.page import render
 
@@ -90,12 +92,12 @@ def write_calibration_page(path: Path, result: Calibration) -> None:
 
 
 def print_page(path: Path) -> None:
-    """Where the page is."""
+    """Prints the path of the page."""
     console.print(f"report: {path}", soft_wrap=True)
 
 
 def print_next(offer: Offer | None, profile: Profile) -> None:
-    """What a person does with a pending model."""
+    """Prints the commands for a pending model."""
     if offer is not None and offer.made:
         console.print(
             f"pending: {offer.pending}\nreview it: hdbridge model diff {profile.axis.parent}\n"
@@ -110,7 +112,7 @@ def _title(result: Calibration) -> str:
 
 
 def print_stepping(checked: Validation) -> None:
-    """The stepping test with the model before and with the new one, next to the floor of the axis."""
+    """Prints the stepping test with the previous and the new model, next to the floor of the axis."""
     print_steps("Stepping test: load error at rest, arcsec", (checked.before, checked.after))
     print_worse("stepping", checked.worse)
     _print_accuracy(checked)
@@ -125,14 +127,14 @@ def print_stepping(checked: Validation) -> None:
 
 
 def print_steps(title: str, tests: Iterable[Stepped]) -> None:
-    """Scatter and mean of stepping tests, a line each."""
+    """Prints scatter and mean of stepping tests, one line each."""
     from hdbridge.cli.scattertable import print_scatter
 
     print_scatter(title, "with", ((each.model, (each.cw, each.ccw, each.pooled)) for each in tests))
 
 
 def print_worse(test: str, ways: Iterable[str]) -> None:
-    """What got worse in one direction."""
+    """Prints what got worse in one direction."""
     for each in ways:
         console.print(f"{test}: {each}", style="bold", soft_wrap=True)
 

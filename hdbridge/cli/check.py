@@ -1,4 +1,4 @@
-"""``hdbridge check``: are the files of an axis, or of a machine, right?"""
+"""``hdbridge check``: checks the files of an axis or of a machine."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ CheckedArgument = Annotated[
 
 
 def register(app: typer.Typer) -> None:
-    """Add the command."""
+    """Adds the command."""
     app.command("check")(check)
 
 
 def check(profile: CheckedArgument, model: ModelOption = None, json_file: JsonOption = None) -> None:
-    """Read the files of an axis or of a machine; say what they mean, or what is wrong and where."""
+    """Check the files of an axis or of a machine; report what they mean, or what is wrong and where."""
     from hdbridge.axis import AxisConfig
     from hdbridge.daemon.machine import Machine, machine_file
 
@@ -58,7 +58,7 @@ def check(profile: CheckedArgument, model: ModelOption = None, json_file: JsonOp
 
 
 def _check_bus(bus: BusConfig, where: str) -> None:
-    """Refuses an interface that python-can does not know; a channel may be that of another computer."""
+    """Refuses an interface that python-can does not know; a channel may belong to another computer."""
     from hdbridge.drive.link import absent_interface, check_interface
 
     check_interface(bus.interface, f"{where}.interface")
@@ -88,7 +88,7 @@ def _print(facts: dict[str, str]) -> None:
 
 
 class _Report:
-    """What the files of one axis mean."""
+    """Content of one axis's files, for reports."""
 
     def __init__(self, axis: AxisConfig, model: Path | None) -> None:
         from hdbridge.control.bench import compensation_for
@@ -136,11 +136,11 @@ class _Report:
         }
 
     def document(self) -> dict[str, Any]:
-        """For machines."""
+        """Returns the report as data."""
         return {**self.facts, **self.rows}
 
     def print(self) -> None:
-        """For a person."""
+        """Prints the report."""
         _print(self.facts)
         for name, rows in self.rows.items():
             for row in rows:

@@ -1,4 +1,4 @@
-"""``hdbridge demo``: the main job on a simulated axis, in one command."""
+"""``hdbridge demo``: the whole workflow on a simulated axis, in one command."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 def register(app: typer.Typer) -> None:
-    """Add the command."""
+    """Adds the command."""
     app.command("demo")(demo)
 
 
@@ -33,7 +33,7 @@ def demo(
     """Step a simulated axis 240 times each way under four compensation schemes.
 
     A CANopen master boots and enables a simulated CiA-402 drive over python-can's virtual bus and steps it
-    in a SYNC-driven loop; the load encoder says how well it points. It takes half a minute to two. Table,
+    in a SYNC-driven loop; the load encoder shows the positioning error. It takes half a minute to two. Table,
     JSON, records and a page go to FOLDER.
     """
     from hdbridge.cli.step import print_result, run_comparison, write_page

@@ -1,4 +1,4 @@
-"""``hdbridge diagnose``: what the model gets wrong, and why."""
+"""``hdbridge diagnose``: errors of a model and their causes."""
 
 from __future__ import annotations
 
@@ -34,11 +34,11 @@ if TYPE_CHECKING:
     from hdbridge.records.recording import Recording
 
 WORTH_TELLING = 0.01
-"""A coordinate that less of the difference goes with is not printed."""
+"""Minimum share of the difference for a coordinate to be printed."""
 
 
 def register(app: typer.Typer) -> None:
-    """Add the command."""
+    """Adds the command."""
     app.command("diagnose")(run)
 
 
@@ -82,14 +82,14 @@ def run(
         typer.Option(
             "--plan",
             metavar="PLAN.yaml",
-            help="Without records: what this plan could detect and distinguish.",
+            help="Without records: causes that this plan could detect and separate.",
         ),
     ] = None,
 ) -> None:
-    """Compare records with a model; name what the model lacks, or say what cannot be told.
+    """Compare records with a model; name the causes that it lacks and those that cannot be separated.
 
-    With --plan and no record: which causes the planned procedures could detect, down to how many
-    arcseconds, and which they could not tell apart.
+    With --plan and no record: the causes that the planned procedures could detect, the detection limit of
+    each in arcseconds, and the causes that they could not separate.
     """
     from hdbridge.analysis.diagnosis import diagnose
     from hdbridge.analysis.identifiability import plan_report
@@ -144,7 +144,7 @@ def run(
     single = {"--model": model, "--axis": axis, "--from": begin, "--to": end}
     said += [word for name, text in single.items() if text for word in (name, text)]
     document = result.as_dict()
-    # Files first: who reads the tables may have had enough of them (`| head`).
+    # Files first, because the reader of the tables may close the pipe (`| head`).
     write_json(json_file, document)
     if html_file is not None:
         page = diagnosis_page(
@@ -162,7 +162,7 @@ def run(
 
 
 def print_diagnosis(result: Diagnosis) -> None:
-    """Verdict, findings, the next experiments, and what was not named."""
+    """Prints verdict, findings, next experiments, and causes that were not named."""
     _say(result.verdict())
     if result.findings:
         table = Table("cause", "probability", "size, arcsec", "held out, arcsec rms")
@@ -182,7 +182,7 @@ def print_diagnosis(result: Diagnosis) -> None:
 
 
 def _details(finding: Finding) -> Iterator[str]:
-    """What is known of a finding in addition to its line in the table; nothing where there is no more."""
+    """Yields what is known of a finding beyond its line in the table."""
     said = [f"{name} {_number(each)}" for name, each in finding.parameters.items()]
     if finding.aliases:
         said.insert(0, f"it may also be: {', '.join(finding.aliases)}")
@@ -203,7 +203,7 @@ def _number(parameter: Parameter) -> str:
 
 
 def _say(line: str) -> None:
-    """A line as it is: whole in a pipe, and nothing in it is markup."""
+    """Prints a line unwrapped and without markup."""
     console.print(line, markup=False, soft_wrap=True)
 
 

@@ -1,4 +1,4 @@
-"""``hdbridge doctor``: is the axis what its file says, and does it stop?"""
+"""``hdbridge doctor``: checks that the drive matches its axis file and that it stops on command."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ LEFT_OUT = "left out by --no-motion"
 
 
 def register(app: typer.Typer) -> None:
-    """Add the command."""
+    """Adds the command."""
     app.command("doctor")(doctor)
 
 
@@ -76,11 +76,11 @@ def doctor(
 ) -> None:
     """Check an axis before its first long motion: files, bus, drive, encoders, directions, ratio, stops.
 
-    Each line is one check. Where one fails, the line of the axis file to change stands under it, or what to
-    do.
+    Each line is one check. Under a failed check stands the line of the axis file to change, or what to do.
 
     Exit status 0 when all checks passed, 4 when one failed or motion was not confirmed; 2 when the first
-    failure is a file, 3 when it is the bus. This is no safety function: an emergency stop stays in hardware.
+    failure is a file, 3 when it is the bus. This is not a safety function: the emergency stop must be in
+    hardware.
     """
     from hdbridge.bringup.checks import run_checks
     from hdbridge.bringup.context import BringUpContext
@@ -131,7 +131,7 @@ def doctor(
 def _confirm(torque_percent: float) -> bool:
     try:
         return typer.confirm(_WARNING.format(torque=torque_percent), err=True)
-    except typer.Abort:  # no terminal, end of input
+    except typer.Abort:  # no terminal, or end of input
         notes.print("")
         return False
 

@@ -1,7 +1,7 @@
-"""What hdbridge does on the bus, for whoever has to find out why: on standard error, or as lines of JSON.
+"""Event log of hdbridge's actions on the bus: on standard error, or as lines of JSON.
 
-The library tells events through `logging`: a name, and a dictionary of facts. None is logged within the
-control cycle; what happened there is logged when the axis rests.
+The library reports events through `logging`: a name and a dictionary of facts. Nothing is logged within the
+control cycle; its events are logged when the axis is at rest.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ _ROOT = logging.getLogger("hdbridge")
 
 
 _given: tuple[int, Path | None] = (0, None)
-"""What was asked for: how much on standard error, and the file."""
+"""Requested settings: verbosity on standard error, and the file."""
 
 
 def begin(verbose: int, path: Path | None) -> None:
-    """Tell events from now on; InputError where the file cannot be written."""
+    """Starts reporting events; raises `InputError` if the file cannot be written."""
     global _given  # noqa: PLW0603 - the handlers are the process's as well
     _given = verbose, path
     _ROOT.propagate = False
@@ -42,12 +42,12 @@ def begin(verbose: int, path: Path | None) -> None:
 
 
 def tell(event: str, **facts: object) -> None:
-    """An event of the command line itself."""
+    """Reports an event of the command line itself."""
     logging.getLogger(__name__).debug(event, facts)
 
 
 def handed_over() -> tuple[int, Path | None]:
-    """What was asked for, to a command that logs in its own way: here nothing is told any more."""
+    """Returns the settings to a command with its own logging, and stops reporting here."""
     for each in tuple(_ROOT.handlers):
         _ROOT.removeHandler(each)
         each.close()
@@ -56,7 +56,7 @@ def handed_over() -> tuple[int, Path | None]:
 
 
 def end(exit_status: int) -> int:
-    """The last event; nothing is told after it. The exit status: another, where only the log failed."""
+    """Reports the last event and stops; returns the exit status, changed only if just the log failed."""
     tell("end", exit_status=exit_status)
     for each in tuple(_ROOT.handlers):
         _ROOT.removeHandler(each)

@@ -1,4 +1,4 @@
-"""``hdbridge fit``: a model from recordings alone, hdbridge's own or anybody's CSV files."""
+"""``hdbridge fit``: a model from recordings alone, hdbridge's own or any CSV files."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from hdbridge.files.profile import Profile
 
 
 def register(app: typer.Typer) -> None:
-    """Add the command."""
+    """Adds the command."""
     app.command("fit")(command)
 
 
@@ -67,11 +67,11 @@ def command(
     json_file: JsonOption = None,
     html_file: HtmlOption = None,
 ) -> None:
-    """Fit a model to recordings; say how sure each parameter is, and what the data cannot tell.
+    """Fit a model to recordings; report parameter intervals and what the data cannot determine.
 
     A CSV file needs a time, a motor angle and a load angle (multi-turn); the commanded motor angle helps.
     They are called `time_s`, `motor_position_deg`, `load_position_deg` and `motor_target_deg`, or as
-    `--columns` and `--units` say. Nothing is activated: a fit that shall be used goes to a profile by --out.
+    `--columns` and `--units` say. Nothing is activated: to use a fit, write it to a profile with --out.
     A model that is worse on held-out data than the one given by --model, or than none, is not written.
     """
     from hdbridge.axis import AxisConfig

@@ -1,4 +1,4 @@
-"""``hdbridge home``: let the drive find its zero."""
+"""``hdbridge home``: homing by the drive."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ from hdbridge.cli.options import (
 from hdbridge.files.profile import Profile
 
 TOWARDS_SWITCH = 0.1
-"""Of the axis's highest speed."""
+"""Share of the axis's velocity limit."""
 TOWARDS_ZERO = 0.02
 
 
 def register(app: typer.Typer) -> None:
-    """Add the command."""
+    """Adds the command."""
     app.command("home")(home)
 
 
@@ -73,9 +73,9 @@ def home(
     force: ForceOption = False,
     json_file: JsonOption = None,
 ) -> None:
-    """Home the drive by a method of its own (CiA 402, mode HM); print where the axis then is.
+    """Home the drive by one of its own methods (CiA 402, mode HM); print the position of the axis.
 
-    The drive moves by itself, within the speeds given. Ctrl-C stops it (exit status 130). A model belongs to
+    The drive plans the motion, within the given speeds. Ctrl-C stops it (exit status 130). A model belongs to
     the zero that the axis had when it was calibrated: an absolute encoder needs no homing.
     """
     from hdbridge.drive.drive import Drive

@@ -1,4 +1,6 @@
-"""``hdbridge improve``: diagnose a drive, extend its model, step again, keep the better model as pending."""
+"""``hdbridge improve``: diagnoses a drive, extends its model, steps again, keeps the better
+model as pending.
+"""
 
 from __future__ import annotations
 
@@ -38,11 +40,11 @@ if TYPE_CHECKING:
     from hdbridge.model import TransmissionModel
 
 LEFT_OF_FLOOR = 1.5
-"""A stepping test this far above its floor has something left to find."""
+"""Ratio of a stepping test to its floor above which a further cause is suspected."""
 
 
 def register(app: typer.Typer) -> None:
-    """Add the command."""
+    """Adds the command."""
     app.command("improve")(command)
 
 
@@ -66,12 +68,10 @@ def command(
     unwrap: UnwrapOption = None,
     auto: Annotated[
         bool,
-        typer.Option(
-            "--auto", help="Let the axis run further experiments where causes are not distinguished."
-        ),
+        typer.Option("--auto", help="Let the axis run further experiments if causes cannot be separated."),
     ] = False,
     rounds: Annotated[
-        int, typer.Option("--rounds", min=1, max=20, help="With --auto: so many experiments at most.")
+        int, typer.Option("--rounds", min=1, max=20, help="With --auto: maximum number of experiments.")
     ] = 3,
     out: Annotated[Path | None, out_option("Where the recordings go"), Kind.FOLDER] = None,
     resume: Annotated[
@@ -86,11 +86,11 @@ def command(
     json_file: JsonOption = None,
     html_file: HtmlOption = None,
 ) -> None:
-    """Say what the active model lacks, extend it, step with both, and keep the better one as pending.
+    """Diagnose the active model, extend it, step with both, and keep the better one as pending.
 
     The axis moves within the limits of its axis file; everything measured is kept, Ctrl-C stops the axis.
-    Where nothing is found, or nothing that can be compensated, or where the axis does not point better
-    with the extended model, nothing is proposed. The model is used after `hdbridge model commit PROFILE`.
+    No model is proposed if nothing is found, if nothing found can be compensated, or if the extended model
+    does not improve positioning. The model is used after `hdbridge model commit PROFILE`.
     """
     from hdbridge.cli.measuring import Measurement, phases
     from hdbridge.improvement import Source, improve
@@ -128,7 +128,7 @@ def command(
 def report(
     result: Improvement, folder: Path, files: Profile, json_file: Path | None, html_file: Path | None
 ) -> None:
-    """Tell the result, and what comes next."""
+    """Writes and prints the result and the next steps."""
     from hdbridge.calibration.validation import worse_ways
     from hdbridge.cli.calibration_output import (
         print_next,
@@ -173,7 +173,7 @@ def report(
 
 
 def write_page(path: Path, result: Improvement) -> None:
-    """The diagnosis with the stepping test, as a self-contained page."""
+    """Writes the diagnosis with the stepping test as a self-contained page."""
     from hdbridge.report.diagnosis import diagnosis_page
     from hdbridge.report.page import render
 

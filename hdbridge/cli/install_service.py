@@ -1,4 +1,4 @@
-"""``hdbridge install-service``: the files with which systemd runs the daemon."""
+"""``hdbridge install-service``: the systemd files for the daemon."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 def register(app: typer.Typer) -> None:
-    """Add the command."""
+    """Adds the command."""
     app.command("install-service")(install_service)
 
 

@@ -1,4 +1,4 @@
-"""Ctrl-C as a wish, not a shot: the control cycle ends its period, stops the axis, and only then gives up."""
+"""Ctrl-C requests a controlled stop: the control cycle ends its period and stops the axis first."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ from types import FrameType
 
 @contextmanager
 def deferred_interrupt() -> Iterator[Callable[[], bool]]:
-    """Within the block a signal to end only sets a flag, which the yielded function tells.
+    """Defers signals to end: within the block they only set a flag, which the yielded function reports.
 
-    So a terminal that is closed (SIGHUP) stops the axis in order, as does SIGQUIT. What is ignored from the
-    start (`nohup`) stays ignored.
+    A closed terminal (SIGHUP) or SIGQUIT thus also stops the axis in an orderly way. A signal that was
+    ignored from the start (`nohup`) stays ignored. The third signal interrupts at once.
     """
     wishes = 0
 
     def note(_number: int, _frame: FrameType | None) -> None:
         nonlocal wishes
         wishes += 1
-        if wishes >= 3:  # somebody insists: whatever hangs shall end
+        if wishes >= 3:  # the user insists: end even if something hangs
             raise KeyboardInterrupt
 
     before = {

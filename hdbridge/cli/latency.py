@@ -1,4 +1,4 @@
-"""``hdbridge latency``: which cycle time does this machine carry?"""
+"""``hdbridge latency``: timer latency, and the shortest cycle that this computer sustains."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 def register(app: typer.Typer) -> None:
-    """Add the command."""
+    """Adds the command."""
     app.command("latency")(latency)
 
 
@@ -32,9 +32,9 @@ def latency(
     ] = True,
     json_file: JsonOption = None,
 ) -> None:
-    """Measure how late this machine wakes up; print the histogram and the cycle time that it carries.
+    """Measure timer latency; print its histogram and the shortest cycle that this computer sustains.
 
-    Run it on the machine that will drive the axis, with its usual load, for minutes rather than seconds.
+    Run it on the computer that will control the axis, under its usual load, for minutes rather than seconds.
     """
     from hdbridge.control.latency import CANDIDATES_S, measure
     from hdbridge.control.realtime import prepare_realtime

@@ -1,4 +1,4 @@
-"""``hdbridge measure``: a recording of an axis by a plan, and nothing made of it."""
+"""``hdbridge measure``: a recording of an axis by a plan, without a fit."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from hdbridge.files.profile import Profile
 
 
 def register(app: typer.Typer) -> None:
-    """Add the command."""
+    """Adds the command."""
     app.command("measure")(command)
 
 
@@ -52,8 +52,8 @@ def command(
 ) -> None:
     """Move an axis by a plan and keep the recording, for diagnose, twin and fit.
 
-    The axis moves as in a calibration, within the limits of its axis file and without compensation; no model
-    is fitted and none changes. Ctrl-C stops the axis, and --resume goes on.
+    The axis moves as in a calibration, within the limits of its axis file and without compensation. No model
+    is fitted or changed. Ctrl-C stops the axis, and --resume goes on.
     """
     from hdbridge.calibration import measure
     from hdbridge.cli.measuring import Measurement, phases

@@ -1,4 +1,4 @@
-"""What the commands that measure by a plan share: its options, what is asked of it, how far they are."""
+"""Shared parts of the commands that measure by a plan: options, the measurement, progress."""
 
 from __future__ import annotations
 
@@ -30,31 +30,32 @@ PlanOption = Annotated[
 
 
 def out_option(help_: str) -> Any:
-    """`--out`: where a new recording goes."""
+    """Returns the option `--out`, the folder of a new recording."""
     return typer.Option("--out", metavar="FOLDER", help=f"{help_}; else recordings/AXIS-DATE-TIME.")
 
 
 def resume_option(help_: str) -> Any:
-    """`--resume`: which recording goes on."""
+    """Returns the option `--resume`, the recording to continue."""
     return typer.Option("--resume", metavar="FOLDER", help=help_)
 
 
 @dataclass(frozen=True, slots=True)
 class Measurement:
-    """A plan that is to be measured into a folder, or the rest of one that was begun there."""
+    """Plan to be measured into a folder, or the rest of one that was begun there."""
 
     axis: AxisConfig
     plan: Plan
     folder: Path
     date: datetime
     journal: Journal | None
-    """Of the recording that goes on."""
+    """Journal of the recording to continue; None for a new one."""
 
     @classmethod
     def asked(cls, axis: AxisConfig, plan: str, out: Path | None, resume: Path | None) -> Self:
-        """As the options say; InputError where they contradict each other, or the recording or the axis.
+        """Creates the measurement from the options; raises `InputError` if they contradict each other or the
+        recording.
 
-        The folder is made here: a place that cannot be written is refused before a drive is connected.
+        Also creates the folder, so that an unwritable location is refused before a drive is connected.
         """
         from hdbridge.calibration import Journal
         from hdbridge.calibration.measure import outlook
@@ -73,7 +74,7 @@ class Measurement:
         return cls(axis, journal.plan, resume, date, journal)
 
     def announce(self, after: str = "") -> None:
-        """Tell what is left of the plan and how long that takes; ``after``: what comes then."""
+        """Prints what is left of the plan and its duration; ``after`` describes what follows."""
         from hdbridge.calibration.measure import outlook
 
         done = self.journal.done if self.journal else ()
@@ -88,7 +89,7 @@ class Measurement:
         )
 
     def begun(self, drive: Drive, simulated_seed: int | None) -> Journal:
-        """The journal that goes on, else a new one of this booted drive."""
+        """Returns the journal to continue, else a new one for this booted drive."""
         from hdbridge.calibration import start_journal
 
         if self.journal is not None:
@@ -100,7 +101,7 @@ class Measurement:
     def booted(
         self, profile: Profile, *, simulate: bool, truth: Path | None, seed: int, force: bool
     ) -> Iterator[tuple[Drive, Callable[[], bool]]]:
-        """The drive, as of `hdbridge.cli.booted`, while nobody else measures this axis."""
+        """Yields the drive as `hdbridge.cli.booted` does, and locks the axis against other measurements."""
         from hdbridge.cli.booted import booted
         from hdbridge.model.store import measuring
 
@@ -114,7 +115,7 @@ class Measurement:
 
 @contextmanager
 def _kept_in(folder: Path) -> Iterator[None]:
-    """Say where the record is when the measurement does not come to its end; a folder left empty goes."""
+    """Prints the location of the record if the measurement fails; removes an empty folder."""
     try:
         yield
     except BaseException:
@@ -128,7 +129,7 @@ def _kept_in(folder: Path) -> Iterator[None]:
 
 @contextmanager
 def phases() -> Iterator[Callable[[str, float, float], None]]:
-    """A progress bar for each phase: what is told of one total, in seconds, is one phase."""
+    """Yields a progress function with one bar per phase; a phase is identified by its total duration, s."""
     with progress_bar() as bar:
         bars: dict[float, int] = {}
 

@@ -1,4 +1,4 @@
-"""``hdbridge model``: the history of an axis's model, or its twin: look, compare, commit, go back."""
+"""``hdbridge model``: the history of an axis's model or twin: look, compare, commit, go back."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ TwinOption = Annotated[bool, typer.Option("--twin", help="The twins of the axis 
 
 
 def register(app: typer.Typer) -> None:
-    """Add the commands."""
+    """Adds the commands."""
     group = typer.Typer(
-        help="The models of an axis: the active one, one that waits, and every one that there was.",
+        help="Manage the models of an axis: the active one, a pending one, and all earlier ones.",
         no_args_is_help=True,
         rich_markup_mode="markdown",
     )
@@ -137,7 +137,7 @@ def _store(twin: bool) -> Store[Any]:
 
 
 def _rows(before: Any, after: Any) -> list[Difference]:
-    """The differences of two models, or of two twins; ``before`` may be None."""
+    """Returns the differences of two models or of two twins; ``before`` may be None."""
     if isinstance(after, TransmissionModel):
         return diff(before or after.only(()), after)
     from hdbridge.twin import difference
@@ -146,7 +146,9 @@ def _rows(before: Any, after: Any) -> list[Difference]:
 
 
 def _folder(profile: str) -> Path:
-    """The folder with the models of an axis; InputError unless it has an axis file, valid or not."""
+    """Returns the folder with an axis's models; raises `InputError` unless it has an axis file,
+    valid or not.
+    """
     axis = Profile.find(profile).axis
     data = read_yaml(axis).data
     if not (isinstance(data, dict) and str(data.get("schema")).startswith("hdbridge.axis/")):
@@ -159,7 +161,7 @@ def _now() -> datetime:
 
 
 def _print_diff(title: str, rows: Sequence[Difference]) -> None:
-    """Effect by effect; without the columns of a model before where there was none."""
+    """Prints the differences effect by effect; without the columns of a previous model if there was none."""
     compared = any(row.before is not None for row in rows if row.effect)
     table = Table(title=title, title_justify="left")
     table.add_column("parameter")
@@ -182,7 +184,7 @@ def _names(version: Version[Any]) -> set[str]:
 
 
 def _cells(row: Difference) -> tuple[str, str, str, str]:
-    """Before, after, change and half width."""
+    """Returns before, after, change and half width, formatted."""
     change: Any = ""
     if row.changed and isinstance(row.before, int | float) and isinstance(row.after, int | float):
         change = row.after - row.before
@@ -193,7 +195,7 @@ def _cells(row: Difference) -> tuple[str, str, str, str]:
 
 
 def _cell(value: Any, half_width: float | None) -> tuple[str, str]:
-    """A value, and half its interval: to the digits of that, else four."""
+    """Formats a value and half its interval: to the interval's digits, else to four."""
     if isinstance(value, float):
         return (figure(value), "-") if half_width is None else with_interval(value, half_width)
     return "-" if value is None else escape(str(value)), "-" if half_width is None else figure(half_width, 2)

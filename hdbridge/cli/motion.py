@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
 
 def register(app: typer.Typer) -> None:
-    """Add the command."""
+    """Adds the command."""
     app.command("motion")(motion)
 
 
@@ -64,7 +64,7 @@ def motion(
 ) -> None:
     """Run the axis at several speeds; print the ripple of the load without and with compensation.
 
-    Measures how the axis answers a correction in motion, and makes up for it.
+    Measures the response of the axis to a correction in motion, and compensates for it.
     """
     from hdbridge.calibration.motion import motion_test, motion_test_s
     from hdbridge.cli.booted import booted
@@ -107,7 +107,7 @@ def motion(
 
 
 def print_motion(result: MotionTest) -> None:
-    """The result for a person."""
+    """Prints the result."""
     table = Table(title="Ripple of the load at constant speed, rms arcsec", title_justify="left")
     for name in ("deg/s", "none", "static", "removed", "filtered", "removed", "orders faded out"):
         table.add_column(name, justify="left" if "orders" in name else "right")

@@ -1,4 +1,4 @@
-"""``hdbridge move``: the load to an angle, compensated, and hold it there."""
+"""``hdbridge move``: moves the load to an angle, compensated, and holds it there."""
 
 from __future__ import annotations
 
@@ -37,11 +37,11 @@ if TYPE_CHECKING:
     from hdbridge.procedures.stepping import Standing
 
 KEPT_S = 60.0
-"""While it is held only the last minute of samples is kept."""
+"""Duration of the samples kept while the axis holds; s."""
 
 
 def register(app: typer.Typer) -> None:
-    """Add the command."""
+    """Adds the command."""
     app.command("move", context_settings={"ignore_unknown_options": True})(move)
 
 
@@ -51,7 +51,7 @@ def move(
         list[float], typer.Argument(metavar="ANGLE...", help="Load angles in degrees, one after the other.")
     ],
     relative: Annotated[
-        bool, typer.Option("--relative", help="Each angle counts from where the axis stood before it.")
+        bool, typer.Option("--relative", help="Each angle is relative to the previous position.")
     ] = False,
     velocity_deg_s: Annotated[
         float | None,
@@ -68,7 +68,7 @@ def move(
     model: ModelOption = None,
     compensated: Annotated[
         bool,
-        typer.Option("--compensated/--uncompensated", help="By the active model, where there is one."),
+        typer.Option("--compensated/--uncompensated", help="Use the active model, if there is one."),
     ] = True,
     simulate: SimulateOption = False,
     truth: TruthOption = None,
@@ -81,8 +81,8 @@ def move(
     """Move the load to one angle or to several, compensated by the active model, and hold the last.
 
     Each move is limited in speed, acceleration and jerk by the axis file, and refused before anything moves
-    where it would leave the limits. Ctrl-C on the way stops the axis (exit status 130); while it holds, it
-    ends the command in good order. Then power is off: what hangs on the axis needs a brake.
+    if it would leave the limits. Ctrl-C on the way stops the axis (exit status 130); while it holds, it
+    ends the command in good order. Power is then switched off: a suspended load needs a brake.
     """
     from hdbridge.cli.booted import booted
     from hdbridge.control.bench import Bench, axis_view, compensation_for
@@ -98,7 +98,7 @@ def move(
     note_clamped(axis.limits, velocity_deg_s=velocity_deg_s)
     with booted(axis, files, simulate=simulate, truth=truth, seed=seed, force=force) as (drive, interrupted):
         if simulate and hold_s is None:
-            hold_s = 0.0  # nobody sees a simulated axis stand
+            hold_s = 0.0  # a simulated axis need not hold
         hold = Hold(math.inf if hold_s is None else hold_s, released=interrupted)
         stands_deg = drive.read_positions().motor_deg / axis.gear.ratio
         targets_deg = _absolute(angles_deg, stands_deg) if relative else angles_deg
@@ -126,14 +126,14 @@ def move(
 
 
 def _tell_where_it_stands(drive: Drive) -> None:
-    """After it was stopped on the way; nothing where the drive cannot be asked any more."""
+    """Prints the position after a stop on the way; nothing if the drive does not answer any more."""
     with suppress(HdbridgeError):
         stands_deg = drive.read_positions().motor_deg / drive.axis.gear.ratio
         notes.print(f"stopped on the way, at {stands_deg:.4f} deg by the motor encoder; power is off")
 
 
 def _model(files: Profile, given: Path | None, ratio: float, *, compensated: bool) -> TransmissionModel:
-    """The model that compensates; one without effects where there is none, or none is wanted."""
+    """Returns the compensating model; one without effects if there is none or none is wanted."""
     from hdbridge.model import TransmissionModel
 
     if not compensated:

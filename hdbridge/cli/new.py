@@ -1,4 +1,4 @@
-"""``hdbridge new``: a profile's folder to begin with."""
+"""``hdbridge new``: a new profile folder."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 class Source(Enum):
-    """What a new profile is made of."""
+    """Origin of a new profile."""
 
     DEMO = "demo"
     ARTICLE = "article"
@@ -25,7 +25,7 @@ class Source(Enum):
 
 
 def register(app: typer.Typer) -> None:
-    """Add the command."""
+    """Adds the command."""
     app.command("new")(new)
 
 
@@ -50,10 +50,10 @@ def new(
     ] = None,
     json_file: JsonOption = None,
 ) -> None:
-    """Make the folder of an axis: a copy of a bundled profile, or what a drive on the bus says of itself.
+    """Make the folder of an axis: a copy of a bundled profile, or from the data of a drive on the bus.
 
     With `--from scan --interface socketcan --channel can0` the axis file has the drive's identity, encoders
-    and gear, as far as it tells them; what is left to fill in is marked, and `hdbridge check` stops there.
+    and gear, as far as it reports them; missing values are marked, and `hdbridge check` stops there.
     Nothing is moved. An existing folder with files in it is refused.
     """
     from hdbridge.axis import AxisConfig

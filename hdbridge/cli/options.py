@@ -1,4 +1,4 @@
-"""What several commands share: options, profiles, progress, results for machines."""
+"""Shared parts of several commands: options, profiles, progress, JSON results."""
 
 from __future__ import annotations
 
@@ -30,16 +30,18 @@ if TYPE_CHECKING:
 
 
 class _Console(Console):
-    """One whose reader may go away (`| head`): the command goes on, and what it prints then is nobody's."""
+    """Console whose reader may close the pipe (`| head`): the command continues and its output
+    is discarded.
+    """
 
     def on_broken_pipe(self) -> None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), self.file.fileno())
 
 
 console = _Console(highlight=False)
-"""Tables for people: standard output."""
+"""Tables, on standard output."""
 notes = _Console(stderr=True, highlight=False)
-"""Progress and remarks: standard error, so that they do not get into a pipe."""
+"""Progress and remarks, on standard error, so that they stay out of a pipe."""
 
 
 ProfileArgument = Annotated[
@@ -69,7 +71,7 @@ TruthOption = Annotated[
     typer.Option(
         "--truth",
         metavar="TRUTH.yaml",
-        help="What the simulated axis is like; else the profile's twin, or its truth file.",
+        help="Description of the simulated axis; else the profile's twin, or its truth file.",
     ),
 ]
 SeedOption = Annotated[int, typer.Option("--seed", help="Seed of the simulated axis.")]
@@ -79,7 +81,7 @@ InterfaceOption = Annotated[
 ChannelOption = Annotated[str | None, typer.Option("--channel", help="Channel, instead of the axis file's.")]
 ForceOption = Annotated[
     bool,
-    typer.Option("--force", help="Speak even where another master is heard on the bus, or has its lock."),
+    typer.Option("--force", help="Send even if another master is heard on the bus or holds its lock."),
 ]
 ColumnsOption = Annotated[
     list[str] | None,
@@ -108,7 +110,7 @@ UnwrapOption = Annotated[
 ]
 JsonOption = Annotated[
     Path | None,
-    typer.Option("--json", metavar="FILE", help="Write the result for machines; - is standard output."),
+    typer.Option("--json", metavar="FILE", help="Write the result as JSON; - is standard output."),
     Kind.JSON,
 ]
 HtmlOption = Annotated[
@@ -124,7 +126,9 @@ def load_recordings(
     units: list[str] | None = None,
     unwrap: list[str] | None = None,
 ) -> dict[Path, Recording]:
-    """Recording folders and CSV files by their path; says what was assumed of files of other programs."""
+    """Loads recording folders and CSV files, by path; prints the assumptions about files of
+    other programs.
+    """
     from hdbridge.analysis.checks import check_once
     from hdbridge.records.recording import Recording
 
@@ -137,9 +141,9 @@ def load_recordings(
 
 
 def model_file(text: str) -> Path:
-    """Model file that an option names, directly or through the profile whose active model it is.
+    """Returns the model file that an option names, directly or through a profile with an active model.
 
-    InputError if there is neither, and if the profile has no model yet.
+    Raises `InputError` if there is neither, or if the profile has no model yet.
     """
     path = Path(text)
     if path.is_file() and path.name != "axis.yaml":
@@ -163,9 +167,9 @@ def model_file(text: str) -> Path:
 
 
 def compensating_model(files: Profile, profile: str, model: Path | None, otherwise: str = "") -> Path:
-    """Model file to compensate with: the one given, else the profile's; InputError if that has none.
+    """Returns the model file to compensate with: the given one, else the profile's.
 
-    ``otherwise`` is what can be done without a model.
+    Raises `InputError` if there is none; ``otherwise`` is added as an alternative without a model.
     """
     if model is None and not files.model.exists():
         raise InputError(
@@ -176,7 +180,7 @@ def compensating_model(files: Profile, profile: str, model: Path | None, otherwi
 
 
 def check_bus_options(interface: str | None, channel: str | None, *, simulate: bool) -> None:
-    """Refuse a simulated drive on a bus that is named: it would not be used."""
+    """Refuses a bus option for a simulated drive, which would not use it."""
     if simulate and (interface is not None or channel is not None):
         raise InputError(
             "--simulate has a bus of its own in this process: leave out --interface and --channel; a "
@@ -187,7 +191,7 @@ def check_bus_options(interface: str | None, channel: str | None, *, simulate: b
 def load_axis(
     profile: Profile, interface: str | None, channel: str | None, *, simulate: bool = False
 ) -> AxisConfig:
-    """The axis file, with the bus replaced where options say so."""
+    """Loads the axis file, with the bus replaced by the options."""
     from hdbridge.axis import AxisConfig
     from hdbridge.drive.link import check_interface
 
@@ -207,9 +211,9 @@ def load_axis(
 def connected(
     axis: AxisConfig, profile: Profile, *, simulate: bool, truth: Path | None, seed: int, force: bool
 ) -> Iterator[tuple[can.BusABC, Clock]]:
-    """The axis's bus and the clock that goes with it: a simulated drive's, or the real ones.
+    """Yields the axis's bus and its clock: those of a simulated drive, or the real ones.
 
-    ``force`` opens the bus even where another process of this machine masters it.
+    With ``force``, the bus is opened even if another process on this computer masters it.
     """
     from hdbridge.control.realtime import prepare_realtime
     from hdbridge.drive.link import open_bus
@@ -240,7 +244,7 @@ def connected(
 
 
 def simulated_by(profile: Profile, truth: Path | None) -> Path:
-    """The file that says what the simulated axis is; where that is its twin, it is said."""
+    """Returns the file that describes the simulated axis; prints a note if it is the axis's twin."""
     plant = truth or profile.simulated
     if plant == profile.twin:
         notes.print(f"simulated by the axis's twin, {plant}", markup=False, soft_wrap=True)
@@ -248,9 +252,9 @@ def simulated_by(profile: Profile, truth: Path | None) -> Path:
 
 
 def note_clamped(limits: Any, **wanted: float | None) -> None:
-    """Reports each wanted velocity or acceleration that is above the axis's limit, which is used instead.
+    """Reports each velocity or acceleration above the axis's limit, which is used instead.
 
-    ``limits`` has the attributes that are named: ``velocity_deg_s``, ``acceleration_deg_s2``.
+    ``limits`` must have the attributes that are named: ``velocity_deg_s``, ``acceleration_deg_s2``.
     """
     for name, value in wanted.items():
         limit = getattr(limits, name)
@@ -265,7 +269,7 @@ def note_clamped(limits: Any, **wanted: float | None) -> None:
 
 
 class _TimeColumn(ProgressColumn):
-    """What is left of a task while it runs, what it took when it is done."""
+    """Remaining time of a running task, total time of a finished one."""
 
     def render(self, task: Task) -> Text:
         if task.finished or task.time_remaining is None:
@@ -281,7 +285,7 @@ def _clock(duration_s: float) -> str:
 
 @contextmanager
 def progress_bar() -> Iterator[Progress]:
-    """A bar with the time left, on standard error; plain lines where that is no terminal."""
+    """Yields a progress bar with the time left, on standard error; plain lines if that is not a terminal."""
     columns = (
         TextColumn("{task.description}"),
         BarColumn(),
@@ -293,15 +297,15 @@ def progress_bar() -> Iterator[Progress]:
 
 
 def print_table(table: Table) -> None:
-    """Prints a table whole; into a pipe or a file always as one table."""
+    """Prints a table uncropped; always as one table into a pipe or a file."""
     for each in fitted(table):
         console.print(each, crop=False)
 
 
 def fitted(table: Table) -> list[Table]:
-    """The table at its natural width; on a narrow terminal several, each with the first column.
+    """Returns the table at its natural width; on a narrow terminal several, each with the first column.
 
-    No figure is cut.
+    No figure is cut off.
     """
     first, *rest = table.columns
     parts: list[Table] = []
@@ -321,7 +325,7 @@ def _natural_width(table: Table) -> int:
 
 
 def _part(table: Table, columns: list[Column]) -> Table:
-    """The same rows with these columns only."""
+    """Returns the same rows with these columns only."""
     part = Table(title=table.title, title_justify=table.title_justify)
     for each in columns:
         part.add_column(each.header, justify=each.justify, overflow="fold")
@@ -332,13 +336,13 @@ def _part(table: Table, columns: list[Column]) -> Table:
 
 
 def write_json(path: Path | None, result: dict[str, Any]) -> None:
-    """The result for machines, where asked for."""
+    """Writes the JSON result if requested."""
     if path is not None:
         write_result(path, json.dumps(result, indent=2, allow_nan=False) + "\n")
 
 
 def write_result(path: Path, text: str) -> None:
-    """A result's file; where it cannot be written, that is said when everything is printed."""
+    """Writes a result file; a failure is reported after everything has been printed."""
     with writing():
         write_atomically(path, text)
         if not is_stream(path):

@@ -1,7 +1,7 @@
-"""The outputs of every command: declared by their options, checked in one place before the command runs.
+"""Outputs of every command: declared by their options, checked in one place before the command runs.
 
 An option that writes carries its `Kind` in its annotation, `Annotated[Path | None, typer.Option(...),
-Kind.JSON]`. Whatever else a command is given that names a file or folder counts as an input.
+Kind.JSON]`. Every other file or folder that a command is given counts as an input.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ STANDARD_OUTPUT = Path("/dev/stdout")
 
 
 def guarded(command: Callable[..., Any]) -> Callable[..., Any]:
-    """The command, refused where an output would destroy something; ``-`` is the standard output.
+    """Wraps a command so that it is refused if an output would destroy something; ``-`` is standard output.
 
-    Where a result goes to the standard output, what is printed for a person goes to the standard error. A
-    result that cannot be written after all (a full disk) ends the command when everything is printed.
+    If a result goes to standard output, text for people goes to standard error. If a result cannot be written
+    after all (a full disk), the command fails after everything has been printed.
     """
     options = dict(_options(command))
     declared = {name: (option, kind) for name, (option, kind) in options.items() if kind is not None}
@@ -67,7 +67,7 @@ def guarded(command: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def _check_truths(given: Path | list[Path] | None) -> None:
-    """Reads the truth files: a wrong one is refused before folders are made for results."""
+    """Loads the truth files, so that a wrong one is refused before folders are made for results."""
     if given:
         from hdbridge.sim.truth import Truth
 
@@ -77,7 +77,7 @@ def _check_truths(given: Path | list[Path] | None) -> None:
 
 @contextmanager
 def _naming(options: Mapping[str, tuple[str, Kind | None]]) -> Iterator[None]:
-    """Replaces the parameter in an error of the library by the option that a person has typed."""
+    """Replaces the parameter name in an error of the library by the option that the user typed."""
     try:
         yield
     except InputError as problem:
@@ -88,7 +88,7 @@ def _naming(options: Mapping[str, tuple[str, Kind | None]]) -> Iterator[None]:
 
 
 def _options(command: Callable[..., Any]) -> Iterator[tuple[str, tuple[str, Kind | None]]]:
-    """By parameter: the option that a person types, and what it writes; None for one that writes nothing."""
+    """Yields for each parameter its option and the kind of its output, None if it writes nothing."""
     hints = typing.get_type_hints(command, include_extras=True)
     for name in inspect.signature(command).parameters:
         metadata = getattr(hints[name], "__metadata__", ())
@@ -99,7 +99,7 @@ def _options(command: Callable[..., Any]) -> Iterator[tuple[str, tuple[str, Kind
 def _option(name: str, metadata: tuple[Any, ...]) -> str:
     for info in metadata:
         if isinstance(info, OptionInfo):
-            # In an Annotated hint the first name stands where else a default would.
+            # In an Annotated hint the first name is stored in place of the default.
             for each in (info.default, *(info.param_decls or ())):
                 if isinstance(each, str) and each.startswith("--"):
                     return each

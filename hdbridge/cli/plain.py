@@ -1,4 +1,4 @@
-"""What a terminal or a file cannot show in its encoding is written by something that it can."""
+"""Replacement of characters that the output encoding cannot represent."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ HANDLER: Final = "hdbridge.plain"
 _PLAIN: Final = str.maketrans(
     {"σ": "s", "±": "~", "→": ">", "°": " ", "²": "2", "µ": "u", "–": "-", "…": "~"}
 )
-"""One for one, so that a table stays straight."""
+"""One character for one, so that a table stays aligned."""
 
 
 def _replaced(error: UnicodeError) -> tuple[str, int]:

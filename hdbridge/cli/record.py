@@ -36,12 +36,12 @@ OutOption = Annotated[
     ),
 ]
 AllStatesOption = Annotated[
-    bool, typer.Option("--all-states", help="Also samples in which the axis was not enabled.")
+    bool, typer.Option("--all-states", help="Include samples in which the axis was not enabled.")
 ]
 
 
 def register(app: typer.Typer) -> None:
-    """Add the commands."""
+    """Adds the commands."""
     group = typer.Typer(
         help="Flight recordings and bus logs: list, mend, and make records for fit and diagnose.",
         no_args_is_help=True,
@@ -80,7 +80,7 @@ def info(
     flight: Annotated[Path, typer.Argument(metavar="FILE.mcap", help="A flight recording.")],
     json_file: JsonOption = None,
 ) -> None:
-    """Tell what a recording holds: machine, axes, models, cycles that are missing, events."""
+    """Report the content of a recording: machine, axes, models, missing cycles, events."""
     need_extra()
     import numpy as np
 
@@ -129,7 +129,7 @@ def info(
 
 
 def mend(flights: FlightsArgument) -> None:
-    """Finish recordings that were cut off (kill, power): whole up to their last second.
+    """Repair recordings that were cut off (kill, power): complete up to their last second.
 
     The daemon does this itself when it starts. One that is being written is refused.
     """
@@ -164,8 +164,8 @@ def export(
 ) -> None:
     """Make a record of one axis, as `fit` and `diagnose` read it.
 
-    Nothing is rounded or interpolated. Where cycles are missing, or the axis was not enabled, a new part
-    begins: a recording folder has a file for each part. Of a CSV file there can be only one part.
+    Nothing is rounded or interpolated. A new part begins if cycles are missing or the axis was not enabled:
+    a recording folder has a file for each part, and a CSV file can hold only one.
     """
     out = _checked_out(out)
     recording, used = read_flights(flights, axis, begin, end, all_states=all_states)

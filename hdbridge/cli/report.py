@@ -1,4 +1,4 @@
-"""``hdbridge report``: the report of a calibration again, from its recording."""
+"""``hdbridge report``: the report of a calibration, again from its recording."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from hdbridge.cli.options import HtmlOption, JsonOption, write_json
 
 
 def register(app: typer.Typer) -> None:
-    """Add the command."""
+    """Adds the command."""
     app.command("report")(command)
 
 
@@ -22,7 +22,7 @@ def command(
     json_file: JsonOption = None,
     html_file: HtmlOption = None,
 ) -> None:
-    """Fit a recording again and tell its result; no axis is needed, nothing moves."""
+    """Fit a recording again and report the result; needs no axis and moves nothing."""
     from hdbridge.calibration import concluded
     from hdbridge.cli.calibration_output import print_calibration, print_page, write_calibration_page
 

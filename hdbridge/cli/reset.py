@@ -1,4 +1,4 @@
-"""``hdbridge reset``: reset a fault of the drive."""
+"""``hdbridge reset``: resets a fault of the drive."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from hdbridge.files.profile import Profile
 
 
 def register(app: typer.Typer) -> None:
-    """Add the command."""
+    """Adds the command."""
     app.command("reset")(reset)
 
 

@@ -25,11 +25,11 @@ if TYPE_CHECKING:
     from hdbridge.daemon.start import Simulation
 
 _EXTRA = ("fastapi", "uvicorn", "websockets", "mcap", "prometheus_client")
-"""What the extra ``daemon`` brings."""
+"""Packages of the extra ``daemon``."""
 
 
 def register(app: typer.Typer) -> None:
-    """Add the command."""
+    """Adds the command."""
     app.command("run")(run)
 
 
@@ -44,7 +44,9 @@ def run(
     truth: Annotated[
         list[Path] | None,
         typer.Option(
-            "--truth", metavar="TRUTH.yaml", help="What the simulated axes are like, once for each in order."
+            "--truth",
+            metavar="TRUTH.yaml",
+            help="Description of each simulated axis, once for each in order.",
         ),
     ] = None,
     seed: SeedOption = 0,
@@ -58,15 +60,15 @@ def run(
     ] = 8402,
     force: ForceOption = False,
 ) -> None:
-    """Hold the drives of a machine, day and night, and take load angles from clients.
+    """Run the daemon: hold the drives of a machine and take load angles from clients.
 
-    It opens the bus and an API (`hdbridge ctl`, the page, `hdbridge.client`), and moves nothing by itself:
+    It opens the bus and an API (`hdbridge ctl`, the page, `hdbridge.client`), and moves nothing on its own:
     a client enables an axis. SIGTERM, Ctrl-C and SIGHUP stop the axes in order and end it (exit status 0);
     a second one stops them at the quick-stop ramp.
 
     Exit status: 0 ended in order, 1 a process of it died again and again, 2 bad input, 3 the bus cannot be
-    opened or has another master, 7 another daemon has the API's address. A fault of a drive ends nothing: it
-    is told to clients, and latched.
+    opened or has another master, 7 another daemon has the API's address. A fault of a drive does not end the
+    daemon: it is reported to clients, and latched.
     """
     check_bus_options(interface, channel, simulate=simulate)
     if lacking := [name for name in _EXTRA if find_spec(name) is None]:

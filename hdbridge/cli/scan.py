@@ -1,4 +1,4 @@
-"""``hdbridge scan``: what answers on the bus."""
+"""``hdbridge scan``: the nodes on the bus."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
 
 def register(app: typer.Typer) -> None:
-    """Add the command."""
+    """Adds the command."""
     app.command("scan")(scan)
 
 
@@ -45,7 +45,7 @@ def scan(
         str | None,
         typer.Argument(
             metavar="PROFILE",
-            help="Whose bus, and which drive is expected there. Without it: --interface and --channel.",
+            help="Axis with the bus to scan and the drive to expect. Without it: --interface and --channel.",
         ),
     ] = None,
     interface: InterfaceOption = None,
@@ -69,7 +69,7 @@ def scan(
 ) -> None:
     """List the nodes on a CAN bus: what they are, their identity, their state, and lines for an axis file.
 
-    It listens, and asks nothing where another master is heard: a request may stop the axis that it moves.
+    It listens first and sends nothing if another master is heard: a request may stop the axis that it moves.
     Then it reads a few objects of every node id from 1 to 127. It writes no object, sends no NMT
     command and enables nothing; a node that another SDO client is talking to is left alone.
 

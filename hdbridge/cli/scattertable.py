@@ -1,4 +1,4 @@
-"""The table of stepping tests: scatter and mean of the load error at rest, each way and pooled."""
+"""Table of stepping tests: scatter and mean of the load error at rest, each way and pooled."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 def print_scatter(
     title: str, first: str, rows: Iterable[tuple[str, tuple[Scatter, Scatter, Scatter]]]
 ) -> None:
-    """A line for each test: what the column ``first`` says of it, then its CW, CCW and pooled figures."""
+    """Prints a line for each test: its name in the column ``first``, then its CW, CCW and pooled figures."""
     table = Table(title=title, title_justify="left")
     table.add_column(first)
     for direction in ("CW", "CCW", "pooled"):

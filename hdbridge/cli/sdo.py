@@ -1,4 +1,4 @@
-"""``hdbridge sdo``: read or write one object of a drive, by the type that its EDS gives it."""
+"""``hdbridge sdo``: reads or writes one object of a drive, by the type in its EDS."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ ObjectArgument = Annotated[
 
 
 def register(app: typer.Typer) -> None:
-    """Add the commands."""
+    """Adds the commands."""
     group = typer.Typer(
         help="Read or write an object of the drive by SDO, typed by its EDS.",
         no_args_is_help=True,
@@ -116,7 +116,7 @@ def put(
 def _drive(
     axis: AxisConfig, files: Profile, *, simulate: bool, truth: Path | None, seed: int, force: bool
 ) -> Iterator[Drive]:
-    """The drive, not booted: its objects are read and written as they are."""
+    """Yields the drive without booting it: its objects are accessed as they are."""
     from hdbridge.drive.drive import Drive
 
     with (

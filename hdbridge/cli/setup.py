@@ -1,4 +1,4 @@
-"""``hdbridge setup``: from a wired drive to a compensated axis, by one ordinary command after another."""
+"""``hdbridge setup``: from a wired drive to a compensated axis, by a sequence of ordinary commands."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from hdbridge.errors import BusError, DriveError, HdbridgeError, InputError
 from hdbridge.files.atomic import write_atomically
 
 STATE: Final = "setup.json"
-"""File in the axis's folder: the steps that are done, and for which axis file."""
+"""File in the axis's folder with the completed steps, each bound to a version of the axis file."""
 DOCTOR: Final = "doctor.json"
 RECORDING: Final = "setup-calibration"
 QUESTIONS: Final = (
@@ -33,7 +33,7 @@ QUESTIONS: Final = (
     ("limits.acceleration_deg_s2", "highest acceleration of the load, deg/s2"),
     ("limits.torque_percent", "highest motor torque, percent of the rated torque"),
 )
-"""Keys that a person has to know, or at least to confirm."""
+"""Keys that the user has to know or at least confirm."""
 _FILL_IN: Final = "# fill in"
 _UP: Final = 1
 """IFF_UP of linux/if.h, in the flags of an interface."""
@@ -41,7 +41,7 @@ _REMEDY: Final = re.compile(r"axis\.yaml:\d+:\d+: ([a-z_.]+): found (\S+), expec
 
 
 def register(app: typer.Typer) -> None:
-    """Add the command."""
+    """Adds the command."""
     app.command("setup")(setup)
 
 
@@ -92,7 +92,7 @@ def setup(
 
 @dataclass
 class _State:
-    """Steps that are done: each with the digest of the axis file for which it was."""
+    """Completed steps, each with the digest of the axis file that it was done for."""
 
     simulated: bool = False
     seed: int = 0
@@ -100,7 +100,7 @@ class _State:
 
 
 class _Setup:
-    """One set-up, and how far it is."""
+    """A set-up and its progress."""
 
     def __init__(self, folder: Path, *, simulate: bool, seed: int, yes: bool) -> None:
         self._folder, self._yes = folder, yes
@@ -119,7 +119,7 @@ class _Setup:
         node_id: int | None,
         eds: Path | None,
     ) -> None:
-        """The axis file, from what the drive reports."""
+        """Creates the axis file from the data of the drive."""
         if (self._folder / "axis.yaml").exists():
             return
         if self._state.simulated:
@@ -139,7 +139,7 @@ class _Setup:
         self._run("new", self._folder, "--from", "scan", *options)
 
     def ask_facts(self) -> None:
-        """The keys of the axis file that a person has to know."""
+        """Asks for the keys of the axis file that only the user knows."""
         path = self._folder / "axis.yaml"
         if "facts" in self._state.done:
             return
@@ -154,7 +154,7 @@ class _Setup:
         self._finish("facts")
 
     def examine(self) -> None:
-        """The files, then the drive: until the doctor finds nothing."""
+        """Checks the files, then the drive, until the doctor finds nothing."""
         while True:
             self._run("check", self._folder)
             if self._is_done("doctor"):
@@ -173,7 +173,7 @@ class _Setup:
             return
 
     def measure_latency(self) -> None:
-        """Can this computer keep the cycle? A simulated drive does not need it to."""
+        """Checks that this computer sustains the cycle; skipped for a simulated drive."""
         if self._state.simulated or self._is_done("latency"):
             return
         from hdbridge.axis import AxisConfig
@@ -184,7 +184,7 @@ class _Setup:
         self._finish("latency")
 
     def calibrate(self, plan: str) -> None:
-        """Measure, fit, and test the model on the axis."""
+        """Measures, fits, and tests the model on the axis."""
         if self._is_done("calibrate"):
             return
         self._confirm("The calibration moves the axis within its limits for some minutes. Move now?")
@@ -195,7 +195,7 @@ class _Setup:
         self._finish("calibrate")
 
     def commit(self) -> None:
-        """Compare the new model with the one before, and make it the active one."""
+        """Compares the new model with the previous one and makes it the active one."""
         if self._is_done("commit"):
             return
         from hdbridge.model.store import MODELS, PENDING
@@ -212,7 +212,7 @@ class _Setup:
         self._finish("commit")
 
     def move(self) -> None:
-        """The first compensated move."""
+        """Makes the first compensated move."""
         if self._is_done("move"):
             return
         from hdbridge.axis import AxisConfig
@@ -226,7 +226,7 @@ class _Setup:
         self._finish("move")
 
     def tell_next(self) -> None:
-        """The page of the calibration, and the commands for every day."""
+        """Prints the page of the calibration and the commands for daily use."""
         how = " --simulate" if self._state.simulated else ""
         console.print(
             f"\nthe axis is set up. Its page: {self._folder / RECORDING / 'report.html'}\n"
@@ -243,7 +243,7 @@ class _Setup:
         return ("--simulate", "--seed", str(self._state.seed)) if self._state.simulated else ()
 
     def _run(self, *arguments: object) -> None:
-        """Print a command of hdbridge and run it. Raises its error."""
+        """Prints a command of hdbridge and runs it. Raises its error."""
         from hdbridge.cli import app
 
         words = [str(each) for each in arguments]
@@ -260,7 +260,7 @@ class _Setup:
         return str(typer.prompt(question[:1].upper() + question[1:], default=default, err=True))
 
     def _confirm(self, question: str) -> None:
-        """Go on only with a yes. Raises typer.Exit with status 130 after a no."""
+        """Continues only after a yes. Raises `typer.Exit` with status 130 after a no."""
         if self._yes:
             return
         if not sys.stdin.isatty():
@@ -269,7 +269,7 @@ class _Setup:
             raise typer.Exit(130)
 
     def _mended(self) -> bool:
-        """Change the key that the doctor accuses first, if the person agrees."""
+        """Changes the key that the doctor suspects first, if the user agrees."""
         checks = json.loads((self._folder / DOCTOR).read_text(encoding="utf-8"))["checks"]
         remedies = [remedy for check in checks for remedy in check.get("remedies", ())]
         match = next(filter(None, map(_REMEDY.search, remedies)), None)
@@ -305,7 +305,7 @@ def _read(path: Path) -> _State:
 
 
 def _check_interface(interface: str, channel: str, bitrate_bps: int | None) -> None:
-    """`BusError` with the command that brings it up, if a SocketCAN interface is missing or down."""
+    """Raises `BusError` with the command that brings it up, if a SocketCAN interface is missing or down."""
     if interface != "socketcan":
         return
     flags = Path(f"/sys/class/net/{channel}/flags")
@@ -317,7 +317,9 @@ def _check_interface(interface: str, channel: str, bitrate_bps: int | None) -> N
 
 
 def value_of(text: str, key: str) -> tuple[str, bool] | None:
-    """Value of ``section.key`` in the text of an axis file, and whether it is marked to be filled in."""
+    """Returns the value of ``section.key`` in the text of an axis file, and True if it is marked to be filled
+    in.
+    """
     match = _line(key).search(text)
     if match is None:
         return None
@@ -325,7 +327,7 @@ def value_of(text: str, key: str) -> tuple[str, bool] | None:
 
 
 def with_value(text: str, key: str, value: str) -> str:
-    """The text with another value of ``section.key``; comments and order stay, the mark goes."""
+    """Returns the text with another value of ``section.key``; keeps comments and order, removes the mark."""
 
     def replaced(match: re.Match[str]) -> str:
         comment = "" if _FILL_IN in match["comment"] else match["comment"]

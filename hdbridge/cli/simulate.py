@@ -1,4 +1,4 @@
-"""``hdbridge simulate``: the simulated drive by itself, in real time, on any bus."""
+"""``hdbridge simulate``: the simulated drive on its own, in real time, on any bus."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from hdbridge.files.profile import Profile
 
 
 def register(app: typer.Typer) -> None:
-    """Add the command."""
+    """Adds the command."""
     app.command("simulate")(simulate)
 
 
@@ -34,7 +34,8 @@ def simulate(
     interface: InterfaceOption = None,
     channel: ChannelOption = None,
     duration_s: Annotated[
-        float | None, typer.Option("--duration", min=0.0, help="Stop after so many seconds; else at Ctrl-C.")
+        float | None,
+        typer.Option("--duration", min=0.0, help="Stop after this many seconds; else at Ctrl-C."),
     ] = None,
 ) -> None:
     """Run the simulated drive of a profile on its bus, in real time, until Ctrl-C.

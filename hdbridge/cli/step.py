@@ -45,7 +45,7 @@ if TYPE_CHECKING:
 
 
 def register(app: typer.Typer) -> None:
-    """Add the command."""
+    """Adds the command."""
     app.command("step")(step)
 
 
@@ -80,7 +80,7 @@ def step(
 ) -> None:
     """Step the axis both ways under each compensation scheme; print what the load encoder measured.
 
-    The article's four schemes, and the whole model where it has more than their two parts.
+    Uses the article's four schemes, and the whole model if it has more than their two parts.
     """
     from hdbridge.control.bench import axis_view
     from hdbridge.model import TransmissionModel
@@ -92,7 +92,7 @@ def step(
     stepping = Stepping(count=count, step_deg=step_deg, start_deg=start_deg)
     rehearse(stepping, axis_view(axis), start_deg)  # refused before anything is connected
     chosen: Path | None = None
-    if model is not None or not scheme or set(scheme) != {Scheme.NONE}:  # compensating nothing needs no model
+    if model is not None or not scheme or set(scheme) != {Scheme.NONE}:  # no compensation needs no model
         chosen = compensating_model(files, profile, model, ", or step without one: --scheme none")
 
     def tell(comparison: Comparison) -> None:
@@ -131,9 +131,10 @@ def run_comparison(
     record: Path | None = None,
     tell: Callable[[Comparison], None],
 ) -> None:
-    """Connect, boot and compare, with a progress bar; each scheme's record is kept as soon as it is there.
+    """Connects, boots and compares, with a progress bar; keeps each scheme's record as soon as it is
+    complete.
 
-    ``tell`` receives the result, also of a test that was stopped: then that of the schemes that are done.
+    ``tell`` receives the result, also of an interrupted test: then that of the completed schemes.
     """
     from hdbridge.cli.booted import booted
     from hdbridge.control.bench import compensation_for
@@ -182,7 +183,7 @@ def run_comparison(
             if scheme not in begun:
                 begun.add(scheme)
                 bar.reset(bars[scheme])  # its time begins now
-                for each in bars.values():  # none is shown of a test that is refused
+                for each in bars.values():  # none is shown for a refused test
                     bar.update(each, visible=True)
             bar.update(bars[scheme], completed=share)
 
@@ -203,7 +204,7 @@ def run_comparison(
 def _told_when_stopped(
     axis: AxisConfig, done: dict[Scheme, Run[SteppingOutcome]], tell: Callable[[Comparison], None]
 ) -> Iterator[None]:
-    """Tell what the schemes before have given when a test does not come to its end."""
+    """Reports the results of the completed schemes if a test is interrupted."""
     from hdbridge.evaluation.comparison import Comparison
 
     try:
@@ -215,7 +216,7 @@ def _told_when_stopped(
 
 
 def print_result(axis: AxisConfig, comparison: Comparison) -> None:
-    """The result for a person."""
+    """Prints the result."""
     from hdbridge.cli.scattertable import print_scatter
 
     print_scatter(
@@ -243,7 +244,7 @@ def write_page(
     *,
     simulated_seed: int | None,
 ) -> None:
-    """The result as a self-contained page; it says what was stepped, when, and by which model."""
+    """Writes the result as a self-contained page, with what was stepped, when, and by which model."""
     from hdbridge.report.page import render
     from hdbridge.report.stepping import stepping_page
 

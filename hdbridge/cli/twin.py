@@ -1,4 +1,4 @@
-"""``hdbridge twin``: what the simulated drive gets wrong about an axis, and what it learns of it."""
+"""``hdbridge twin``: errors of the simulated drive about an axis, and the fit that corrects them."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 
 
 def register(app: typer.Typer) -> None:
-    """Add the command."""
+    """Adds the command."""
     app.command("twin")(command)
 
 
@@ -50,7 +50,7 @@ def command(
         typer.Argument(metavar="RECORDING...", help="Recording folders or CSV files, in their order."),
     ],
     check: Annotated[
-        bool, typer.Option("--check", help="Only say what has changed since the profile's twin was made.")
+        bool, typer.Option("--check", help="Only report what has changed since the profile's twin was made.")
     ] = False,
     compare: Annotated[
         bool, typer.Option("--compare", help="Only compare the simulation as it is with the recordings.")
@@ -58,7 +58,7 @@ def command(
     truth: TruthOption = None,
     afresh: Annotated[
         bool,
-        typer.Option("--afresh", help="Begin from usual values, whatever the profile says of the plant."),
+        typer.Option("--afresh", help="Start from typical values, regardless of the profile's plant."),
     ] = False,
     columns: ColumnsOption = None,
     units: UnitsOption = None,
@@ -66,11 +66,11 @@ def command(
     json_file: JsonOption = None,
     html_file: HtmlOption = None,
 ) -> None:
-    """Teach the simulated drive an axis from recordings; say what it got wrong, and keep the twin as pending.
+    """Fit the simulated drive to recordings of an axis; report its errors, and keep the twin as pending.
 
-    The recordings' commands run through the simulated drive once more. It is what the profile's twin or truth
-    file says, else what is usual, and errs as the active model says. Friction, inertia, spring, loops and
-    delays are fitted until it does as the axis did. `--simulate` uses the twin after
+    The recordings' commands are replayed on the simulated drive. It starts from the profile's twin or truth
+    file, else from typical values, with the transmission error of the active model. Friction, inertia,
+    spring, loops and delays are fitted until it behaves as the axis did. `--simulate` uses the twin after
     `hdbridge model commit PROFILE --twin`.
     """
     from hdbridge.axis import AxisConfig
@@ -95,7 +95,7 @@ def command(
 
 
 def _give(report: TwinReport, json_file: Path | None, html_file: Path | None) -> None:
-    """Files first: who reads the tables may have had enough of them (`| head`)."""
+    """Writes files first, because the reader of the tables may close the pipe (`| head`)."""
     from hdbridge.report.page import render
     from hdbridge.report.twin import twin_page
 
@@ -127,7 +127,7 @@ def _learned(
     begun: Translation,
     facts: list[tuple[str, str]],
 ) -> TwinReport:
-    """Fit, and keep the twin as pending where it is better on legs that the fit has not seen."""
+    """Fits, and keeps the twin as pending if it is better on held-out legs."""
     from datetime import datetime
 
     from hdbridge.model.store import measuring
@@ -161,7 +161,7 @@ def _learned(
 
 
 def _values(before: Truth, after: Truth) -> list[Learned]:
-    """What was fitted, as it was assumed and as it is."""
+    """Returns the fitted values, before and after."""
     from hdbridge.report.twin import Learned
     from hdbridge.twin.parameters import PARAMETERS, value_in
     from hdbridge.twin.thermal import THERMAL
@@ -175,7 +175,7 @@ def _values(before: Truth, after: Truth) -> list[Learned]:
 
 
 def _named(twin: Twin) -> list[Named]:
-    """Causes, sets that the motion cannot tell apart, and what is left."""
+    """Returns causes, parameter sets that the motion cannot separate, and the unexplained residual."""
     from hdbridge.report.twin import Named
 
     named = [Named(each.cause, each.text.removeprefix(f"{each.cause}: ")) for each in twin.findings]
@@ -187,7 +187,7 @@ def _named(twin: Twin) -> list[Named]:
 
 
 def _left(twin: Twin) -> list[Named]:
-    """What is left. Of a twin that is no better than what it began with that is all that can be told."""
+    """Returns the unexplained residual, which is all there is to report about a twin that is no better."""
     from hdbridge.report.twin import Named
 
     return [
@@ -203,7 +203,7 @@ def _left(twin: Twin) -> list[Named]:
 def _check(
     files: Profile, axis: AxisConfig, recording: Recording, json_file: Path | None, html_file: Path | None
 ) -> None:
-    """Say in one sentence what has changed since the profile's twin was made."""
+    """Reports in one sentence what has changed since the profile's twin was made."""
     from hdbridge.twin.check import check
     from hdbridge.twin.kept import KeptTwin
 
@@ -235,7 +235,7 @@ def _check(
 
 
 def _joined(axis: AxisConfig, recordings: dict[Path, Recording]) -> Recording:
-    """All recordings as one; InputError if one is not of this axis, or has no command."""
+    """Returns all recordings as one; raises `InputError` if one is not of this axis or has no command."""
     from hdbridge.analysis.checks import check_records
     from hdbridge.records.recording import Recording
 
@@ -256,7 +256,9 @@ def _joined(axis: AxisConfig, recordings: dict[Path, Recording]) -> Recording:
 
 
 def _beginning(files: Profile, axis: AxisConfig, truth: Path | None, *, afresh: bool) -> Translation:
-    """The simulation as it is: what the profile says of the plant, erring as the active model says."""
+    """Returns the initial simulation: the profile's plant, with the transmission error of the
+    active model.
+    """
     from hdbridge.model import TransmissionModel
     from hdbridge.sim.truth import Truth
     from hdbridge.twin.translation import translate
@@ -297,7 +299,7 @@ def _facts(
 
 
 def as_dict(report: TwinReport) -> dict[str, Any]:
-    """The result for machines, ``hdbridge.twin/1``."""
+    """Returns the result as data, ``hdbridge.twin/1``."""
     return {
         "schema": "hdbridge.twin/1",
         "axis": report.axis,
@@ -322,7 +324,7 @@ def as_dict(report: TwinReport) -> dict[str, Any]:
 
 
 def print_report(report: TwinReport) -> None:
-    """The verdict and the figures of the whole record."""
+    """Prints the verdict and the figures of the whole record."""
     from hdbridge.report.twin import title_of, verdict
     from hdbridge.twin.comparison import ALL
 

@@ -1,4 +1,4 @@
-"""A command line that is refused, in the one line that every error of hdbridge is."""
+"""Refused command lines, reported in the one-line form of every hdbridge error."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ import typer
 from hdbridge.errors import InputError
 
 UsageError: Any = typer.BadParameter.__mro__[1]
-"""What is wrong with a command line. typer has it from click or brings its own; it exports only an heir."""
+"""Error of a wrong command line. typer takes it from click or brings its own, and exports only a subclass."""
 _PLACES = ("PROFILE", "MACHINE")
 """Metavars of parameters that take a path or the name of a bundled profile."""
 _KINDS = {"int": "an integer", "float": "a number", "bool": "true or false"}
 
 
 def refusal(error: Any) -> str:
-    """One line: the option, what was found, what is expected, and where all of them are listed."""
+    """Returns one line: the option, its value, the expected value, and where all options are listed."""
     from hdbridge.files.expectation import one_line
 
     context = getattr(error, "ctx", None)
@@ -35,7 +35,7 @@ def refusal(error: Any) -> str:
 def strict(command: Any) -> Any:
     """Makes a command refuse values that typer accepts: empty texts, NaN and infinity, impossible paths.
 
-    Checked before the command runs and before its outputs are; InputError in one line.
+    They are checked before the command runs and before its outputs are; raises a one-line `InputError`.
     """
     for each in getattr(command, "commands", {}).values():
         strict(each)
@@ -57,7 +57,7 @@ def _checked(param: Any, convert: Callable[[Any, Any], Any], context: Any, value
             raise _wrong(param, context, each, f"a number{limits}")
         if isinstance(each, Path) or (isinstance(each, str) and param.metavar in _PLACES):
             try:
-                os.stat(each)  # noqa: PTH116 - asked for its errors
+                os.stat(each)  # noqa: PTH116 - called for its errors
             except OSError as problem:
                 if problem.errno not in {errno.ENOENT, errno.ENOTDIR, errno.EACCES}:
                     raise _wrong(param, context, each, f"a path ({problem.strerror})") from None
@@ -72,12 +72,12 @@ def _wrong(param: Any, context: Any, found: object, expected: str) -> InputError
 
 
 def asks_for_help(error: Any) -> bool:
-    """Whether the line only lacks a command, and the error's text is the help."""
+    """Returns True if only a command is missing, so that the error's text is the help."""
     return type(error).__name__ == "NoArgsIsHelpError"
 
 
 def _about_value(error: Any) -> str | None:
-    """Of a value that does not suit its option: what was found and expected, as of a key in a file."""
+    """Describes a wrong option value: found and expected, like a key in a file. None for other errors."""
     param, cause = getattr(error, "param", None), error.__cause__
     if param is None or not hasattr(cause, "errors"):
         return None
@@ -96,7 +96,7 @@ def _about_value(error: Any) -> str | None:
 
 
 def _about_line(error: Any) -> str:
-    """Of a line that has too much or too little."""
+    """Describes a line with too many or too few arguments."""
     from hdbridge.files.expectation import nearest
 
     message = str(error.format_message()).strip().rstrip(".")
@@ -120,7 +120,7 @@ def _about_line(error: Any) -> str:
 
 
 def _name(param: Any) -> str:
-    """As it is typed: --count, PROFILE."""
+    """Returns the parameter as it is typed: --count, PROFILE."""
     if param.param_type_name == "option":
         return str(max(param.opts, key=len))
     return str(param.metavar or param.name.upper()).removesuffix("...").strip("[]{}")

@@ -3,7 +3,7 @@
 The maximum length on the wire of a frame with s data bytes, including all stuff bits that the bit-stuffing
 rule allows and three bits of interframe space, is
 
-  g + 8 s + 13 + floor((g + 8 s - 1) / 4) bits,    g = 34 with 11-bit identifiers
+    g + 8 s + 13 + floor((g + 8 s - 1) / 4) bits,    g = 34 with 11-bit identifiers
 
 (R. I. Davis, A. Burns, R. J. Bril, J. J. Lukkien: Controller Area Network (CAN) schedulability analysis:
 Refuted, revisited and revised. Real-Time Systems 35 (2007) 239-272). g counts the bits of the header and of

@@ -2,11 +2,11 @@
 
 A drive with free mappings gets
 
-  TPDO1 180h+id  statusword, position, torque        8 bytes
-  TPDO2 280h+id  load encoder, position demand       8 bytes (4 if the load encoder has its own node id)
-  TPDO3 380h+id  load torque, temperature            if the axis has them; length of its objects
-  TPDO4 480h+id  temperature                         if it comes less often than the load torque
-  RPDO1 200h+id  controlword, target                 6 bytes
+    TPDO1 180h+id  statusword, position, torque        8 bytes
+    TPDO2 280h+id  load encoder, position demand       8 bytes (4 if the load encoder has its own node id)
+    TPDO3 380h+id  load torque, temperature            if the axis has them; length of its objects
+    TPDO4 480h+id  temperature                         if it comes less often than the load torque
+    RPDO1 200h+id  controlword, target                 6 bytes
 
 A read-only mapping is used as it is if it carries a needed object; the remaining objects go into the other
 PDOs. Position demand and torque are left out if the drive cannot send them. A load encoder with its own node

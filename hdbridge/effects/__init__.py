@@ -1,4 +1,4 @@
-"""The catalogue: one cause of transmission error per file, found by its name."""
+"""Catalogue of causes: one cause of transmission error per file, looked up by name."""
 
 from hdbridge.effects.amplitude_drift import AmplitudeDrift
 from hdbridge.effects.backlash import Backlash
@@ -86,19 +86,21 @@ CATALOGUE: dict[str, type[Effect]] = {
         LocalDefect,
     )
 }
-"""Every effect by its canonical name."""
+"""All effects by canonical name."""
 
 
 def causes() -> tuple[str, ...]:
-    """Names of the causes that a diagnosis can find in addition to the two basic parts of a model."""
+    """Returns the names of the causes that a diagnosis can find in addition to the two basic parts of a
+    model.
+    """
     return tuple(name for name in CATALOGUE if name not in BASIC)
 
 
 def register(kind: type[Effect]) -> type[Effect]:
-    """Add a kind of effect to the catalogue of this process; a decorator for effects of one's own.
+    """Adds a kind of effect to the catalogue of this process; a decorator for custom effects.
 
-    From then on model files may hold it, a fit and a compensation use it, and a diagnosis can find it.
-    InputError where the name is taken by another kind.
+    Model files may then contain it, fits and compensation use it, and a diagnosis can find it. Raises
+    `InputError` if another kind has the same name.
     """
     if CATALOGUE.get(kind.name, kind) is not kind:
         raise InputError(
@@ -110,12 +112,12 @@ def register(kind: type[Effect]) -> type[Effect]:
 
 
 def withdraw(kind: type[Effect]) -> None:
-    """Take a kind of effect out of the catalogue again."""
+    """Removes a kind of effect from the catalogue."""
     CATALOGUE.pop(kind.name, None)
 
 
 def aliases_of(name: str) -> tuple[str, ...]:
-    """The causes that this one can be taken for, whichever of the two says so, in the catalogue's order."""
+    """Returns the causes that can be confused with this one, by either's declaration, in catalogue order."""
     own = CATALOGUE[name].about.aliases if name in CATALOGUE else ()
     return tuple(other for other, kind in CATALOGUE.items() if other in own or name in kind.about.aliases)
 

@@ -1,4 +1,4 @@
-"""Ripple and friction change with temperature."""
+"""Temperature dependence of ripple and friction."""
 
 from __future__ import annotations
 
@@ -32,9 +32,9 @@ from hdbridge.effects.warmth import Warmed, WarmthState
 
 
 class AmplitudeDrift(Linear, Warmed):
-    """w (ripple S(theta_M) + friction H): ripple and loop of the model follow the gear's warmth w.
+    """w (ripple S(theta_M) + friction H): the model's ripple and loop change with the gear's warmth w.
 
-    A ripple that grows with torque too does so warm and cold alike: what torque adds is warmed as well.
+    Growth of the ripple with torque is the same warm or cold: the torque-dependent part is scaled as well.
     """
 
     name: ClassVar[str] = "amplitude_drift"
@@ -65,7 +65,7 @@ class AmplitudeDrift(Linear, Warmed):
         "friction_percent_per_k": -0.5,
         "tau_s": 1800.0,
     }
-    """Half a per cent per kelvin, the loop falling."""
+    """Growth of 0.5 % per kelvin, with a falling loop."""
 
     orders: Orders
     loop: Annotated[Loop, Field(description="the model's loop")]
@@ -81,7 +81,7 @@ class AmplitudeDrift(Linear, Warmed):
 
     @classmethod
     def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[AmplitudeDrift]:
-        """By the temperature where that changes, else by time."""
+        """Yields effects driven by temperature if it changes, else by time."""
         if has_orders(base) and has_loop(base):
             for driven_by, tau_s in cls.lags(observations):
                 yield cls(
@@ -90,7 +90,7 @@ class AmplitudeDrift(Linear, Warmed):
                 )  # fmt: skip
 
     def scales(self) -> tuple[Part, Effect]:
-        """Loop or ripple, whichever changes by more."""
+        """Returns loop or ripple, whichever changes more."""
         ripple = math.sqrt(0.5 * sum(each.amplitude_arcsec**2 for each in self.orders))
         friction = abs(self.friction_percent_per_k * self.loop.offset_arcsec)
         if abs(self.ripple_percent_per_k) * ripple <= friction:
@@ -100,7 +100,9 @@ class AmplitudeDrift(Linear, Warmed):
     def retold(
         self, now: Sequence[Effect], given: Sequence[Effect], observations: Observations
     ) -> tuple[Effect, ...] | None:
-        """Counted from the temperature at which the rest of the model is nearest to what was ``given``."""
+        """Re-expresses the drift at the reference temperature that brings the rest of the model nearest to
+        ``given``.
+        """
         temperature = observations.motion.measured.get(Channel.TEMPERATURE)
         if temperature is None or self.driven_by != "temperature":
             return None
@@ -123,12 +125,12 @@ class AmplitudeDrift(Linear, Warmed):
         )
 
     def needs(self) -> frozenset[Channel]:
-        """Those of the warmth, and the torque where the orders grow with it."""
+        """Returns the warmth's channels, and the torque if the orders grow with it."""
         load = self.under_load
         return super().needs() | (frozenset() if load is None else {Channel(load.torque)})
 
     def columns(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
-        """One per cent per kelvin of ripple and of loop, shape (n, 2)."""
+        """Returns the effect of 1 % per kelvin on ripple and on loop, shape (n, 2)."""
         orders = ripple(motion.motor_deg, phasors(self.orders))
         if self.under_load is not None:
             orders = orders * self.under_load.factor(motion, self.name)
@@ -137,11 +139,13 @@ class AmplitudeDrift(Linear, Warmed):
         return columns
 
     def tracker(self, start: Start = Start.VIRGIN) -> Tracker:
-        """On-line tracker; in thermal equilibrium at its first moment."""
+        """Returns an on-line tracker, in thermal equilibrium at its first moment."""
         return _Tracker(self, self.loop.law().tracker(start))
 
     def gentle_tracker(self, start: Start, fall_arcsec_per_deg: float) -> Tracker | None:
-        """Where the load lags: of a loop that at the highest warmth falls no steeper than that."""
+        """If the load lags, returns a tracker whose loop, at the highest warmth, falls no more steeply than
+        this.
+        """
         left = fall_arcsec_per_deg - self.ripple_fall()
         if not self.loop_share() or left <= 0.0:
             return None
@@ -149,26 +153,26 @@ class AmplitudeDrift(Linear, Warmed):
         return None if loop is None else _Tracker(self, loop)
 
     def bound_arcsec(self) -> float:
-        """At the highest warmth."""
+        """Bound at the highest warmth."""
         ripple = abs(self.ripple_percent_per_k) * sum(each.amplitude_arcsec for each in self.orders)
         ripple *= self._most()
         return 0.01 * self.limit_k * (ripple + abs(self.friction_percent_per_k * self.loop.offset_arcsec))
 
     def slope_bound_arcsec_per_deg(self) -> float:
-        """The ripple's steepest fall; no bound where the loop changes: it falls as steeply as the loop rises.
+        """Steepest fall of the ripple; infinite if the loop changes, because the effect falls as steeply as
+        the loop rises.
 
-        Added to the model's loop, of which it takes only a share, the sum does not fall:
-        `combine.fall_bound`.
+        It takes only a share of the model's loop, so the sum of both does not fall: see `combine.fall_bound`.
         """
         return self.ripple_fall() if not self.friction_percent_per_k else math.inf
 
     def ripple_fall(self) -> float:
-        """The ripple's steepest fall alone, arcsec per motor degree."""
+        """Returns the steepest fall of the ripple alone, arcsec per motor degree."""
         slope = sum(each.order * each.amplitude_arcsec for each in self.orders)
         return 0.01 * self.limit_k * RAD_PER_DEG * abs(self.ripple_percent_per_k) * slope * self._most()
 
     def loop_share(self) -> float:
-        """The largest share of the loop that it may take away."""
+        """Returns the largest share of the loop that the effect can remove."""
         return 0.01 * abs(self.friction_percent_per_k) * self.limit_k
 
     def _most(self) -> float:
@@ -192,7 +196,7 @@ class _Tracker(Tracker):
 
     @property
     def memory_deg(self) -> float:
-        """The loop's."""
+        """Memory of the loop."""
         return self._loop.memory_deg
 
     def peek(self, motor_deg: float, moment: Moment) -> float:

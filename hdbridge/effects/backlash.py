@@ -1,4 +1,4 @@
-"""A dead zone behind the gear: a loose key, a worn coupling, a gear stage on the output."""
+"""Dead zone behind the gear: a loose key, a worn coupling, a gear stage on the output."""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ _SOFTNESS = 1.25
 
 
 class Backlash(Linear):
-    """-gap / 2 times the stop operator of the motor angle: the load lags by half the gap, on either side.
+    """-gap / 2 times the stop operator of the motor angle: the load lags by half the gap on either side.
 
-    In an ideal gap the load rests while the motor crosses ``gap N / 3600`` degrees, and then the total has no
-    inverse: many motor angles give one load angle. `crossing_deg` may be larger (a soft contact). The
-    compensation takes a gap that is steeper than it can invert for a softer one (`gentle_tracker`), and then
-    makes the motor jump most of the gap at once.
+    In an ideal gap the load stands still while the motor crosses ``gap N / 3600`` degrees, and the total has
+    no inverse, because many motor angles give one load angle. `crossing_deg` may be larger (a soft contact).
+    If a gap is too steep to invert, the compensation treats it as a softer one (`gentle_tracker`) and makes
+    the motor jump most of the gap at once.
     """
 
     name: ClassVar[str] = "backlash"
@@ -67,7 +67,7 @@ class Backlash(Linear):
     )
     shape: ClassVar[tuple[Shape, ...]] = (Shape("crossing_deg", 0.02, 20.0, logarithmic=True),)
     ordinary_arcsec: ClassVar[float] = 1.0
-    """Half a gap of two arcsec: no more than an elastic loop of another shape leaves in its place."""
+    """Half a gap of 2 arcsec, as much as an elastic loop of another shape can leave as a residual."""
     linear: ClassVar[tuple[str, ...]] = ("gap_arcsec",)
 
     gap_arcsec: Annotated[float, Field(ge=0, le=3600, description="width of the dead zone, at the load")]
@@ -77,36 +77,39 @@ class Backlash(Linear):
 
     @classmethod
     def of_gap(cls, gap_arcsec: float, ratio: float, softness: float = _SOFTNESS) -> Self:
-        """A gap that takes ``softness`` times its ideal motor angle; from 1.25 on it has an inverse."""
+        """Returns a gap that takes ``softness`` times its ideal motor angle; from 1.25 on it is
+        invertible.
+        """
         return cls(gap_arcsec=gap_arcsec, crossing_deg=_crossing_deg(gap_arcsec, ratio, softness))
 
     @classmethod
     def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[Backlash]:  # noqa: ARG003
-        """From a hard contact to a soft one."""
+        """Yields gaps from a hard contact to a soft one."""
         yield from (cls(gap_arcsec=1.0, crossing_deg=each) for each in (0.05, 0.15, 0.4, 1.0, 2.5, 6.0))
 
     def unidentifiable(self, observations: Observations) -> str:
-        """It shows at reversals only."""
+        """Requires reversals, because only they show backlash."""
         return "" if observations.reversals >= 2 else "no reversal in which play would show"
 
     def tidied(self, ratio: float) -> Self:
-        """As wide as an inverse needs.
+        """Widens the crossing to the angle that an inverse needs.
 
-        The load rests while the motor crosses; noise lets a fit make that angle smaller than it can be.
+        The load stands still while the motor crosses, but noise lets a fit return a smaller angle than is
+        possible.
         """
         crossing = _crossing_deg(self.gap_arcsec, ratio)
         return self.fitted(self.coefficients(), {"crossing_deg": max(crossing, self.crossing_deg)})
 
     def columns(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
-        """A gap of one arcsec, shape (n, 1)."""
+        """Returns the effect of a gap of 1 arcsec, shape (n, 1)."""
         return (-0.5 * stop(motion.motor_deg, self.crossing_deg, start))[:, np.newaxis]
 
     def tracker(self, start: Start = Start.VIRGIN) -> Tracker:
-        """On-line tracker; its first `advance` only says where the motor stands."""
+        """Returns an on-line tracker; its first `advance` only sets the motor position."""
         return _Tracker(-0.5 * self.gap_arcsec, Stop(self.crossing_deg, start))
 
     def gentle_tracker(self, start: Start, fall_arcsec_per_deg: float) -> Tracker | None:
-        """One of a gap that takes more motor angle to cross."""
+        """Returns the tracker of a gap that takes a larger motor angle to cross."""
         crossing = max(self.crossing_deg, self.gap_arcsec / fall_arcsec_per_deg)
         return _Tracker(-0.5 * self.gap_arcsec, Stop(crossing, start))
 
@@ -115,17 +118,17 @@ class Backlash(Linear):
         return 0.5 * self.gap_arcsec
 
     def slope_bound_arcsec_per_deg(self) -> float:
-        """The gap over the angle that crosses it."""
+        """Gap divided by its crossing angle."""
         return self.gap_arcsec / self.crossing_deg
 
     @classmethod
     def candidate(cls, ratio: float, base: Sequence[Effect] = ()) -> Self:  # noqa: ARG003
-        """A gap of 10 arcsec."""
+        """Returns a gap of 10 arcsec."""
         return cls.of_gap(10.0, ratio)
 
 
 def _crossing_deg(gap_arcsec: float, ratio: float, softness: float = _SOFTNESS) -> float:
-    """Motor angle that crosses a gap, ``softness`` times that of an ideal one, degrees."""
+    """Returns the crossing angle of a gap, ``softness`` times the ideal one; motor degrees."""
     return max(softness * gap_arcsec * ratio / ARCSEC_PER_DEG, 1e-6)
 
 

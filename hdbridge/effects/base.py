@@ -1,16 +1,16 @@
-"""What an effect is: one physical cause of transmission error, written once.
+"""Base class of effects: one physical cause of transmission error, written once.
 
 From one description an effect is predicted over a whole record (vectorised), tracked on line (sample by
 sample, in plain floats), fitted (columns that are linear in its coefficients, for given shape parameters),
-proposed for a record, and named as a cause. Batch and on-line give the same numbers; `tests/effects` holds
-every effect to it.
+proposed for a record, and named as a cause. Batch and on-line results are equal; `tests/effects` verifies
+this for every effect.
 
 An effect is a frozen pydantic model: its fields are the parameters of the model file, with the unit in the
 name, a physical range and a description. Nothing here does any I/O.
 
-Speed, acceleration and direction are channels like any other: they are those of the *uncompensated* command
+Speed, acceleration and direction are channels like any other. They are those of the *uncompensated* command
 (`kinematics.py` defines them once), so an effect that depends on them does not depend on the angle that the
-inverse is trying out. Otherwise one cycle's correction would be differenced into the next one's.
+inverse is trying. Otherwise the correction of one cycle would be differenced into the next.
 """
 
 from __future__ import annotations
@@ -88,99 +88,107 @@ __all__ = [
 ]
 
 GRID: Final[Mapping[int, int]] = {1: 6, 2: 4, 3: 3}
-"""Values of each shape that the default proposals try, by the number of shapes."""
+"""Grid points per shape parameter in the default proposals, by the number of shape parameters."""
 
 
 class Effect(Strict, ABC):
-    """One cause of transmission error with its parameters."""
+    """A cause of transmission error with its parameters."""
 
     name: ClassVar[str]
-    """The canonical name: in model files, findings and tests."""
+    """Canonical name, used in model files, findings and tests."""
     about: ClassVar[Cause]
     channels: ClassVar[frozenset[Channel]] = frozenset()
-    """What it needs in addition to the motor angle as a rule; an instance's own needs: `needs`."""
+    """Channels usually needed in addition to the motor angle; `needs` gives those of an instance."""
     compensable: ClassVar[Compensable]
-    """Whether the load really moves so, and can be told in advance; see `is_compensable`."""
+    """Statement whether the load really moves accordingly and predictably; see `is_compensable`."""
     replaces: ClassVar[str] = ""
-    """Name of the effect in whose place it stands in a model, where it does not add to the others."""
+    """Name of the effect that it replaces in a model, if it does not add to the others."""
     part: ClassVar[Part | None] = None
-    """The part of a model that it is."""
+    """Part of a model that it constitutes."""
     changes: ClassVar[Part | None] = None
-    """The part of a model that it is a change of, where it is no addition to it."""
+    """Part of a model that it modifies, if it is not an addition."""
     carries: ClassVar[Mapping[Part, str]] = {}
-    """The parts that it carries a copy of, because it scales them, and the field that holds each."""
+    """Parts that it carries a copy of, because it scales them, and the field that holds each."""
     usual: ClassVar[int] = 1
-    """So many nearly equal ones an axis may have; more are one thing that is none of them. At 1 there is no
-    second.
+    """Maximum number of similar instances on one axis; more point to a single cause outside the catalogue. At
+    1 there is never a second.
     """
     nonnegative: ClassVar[bool] = False
-    """Whether no coefficient can be negative."""
+    """True if no coefficient can be negative."""
     curved: ClassVar[bool] = False
-    """Whether its columns depend on its coefficients: nearly linear, so that one fits, and fits again."""
+    """True if its columns depend on its coefficients, so that a linear fit must be iterated."""
     sought: ClassVar[Sought | None] = None
-    """Its form, where no grid covers the places at which it may be: of its first shapes."""
+    """Form for a matched-filter search over its first shape parameters, if no grid covers the possible
+    locations.
+    """
     ordinary_arcsec: ClassVar[float] = 0.0
-    """Peak that any healthy axis has of it, or of what cannot be distinguished from it."""
+    """Peak amplitude that any healthy axis has, of this cause or of one that cannot be
+    distinguished from it.
+    """
     incidental: ClassVar[frozenset[str]] = frozenset()
-    """Names of coefficients that are no evidence of it: what they stand for is there without it, too."""
+    """Names of coefficients that are no evidence for the cause, because they are also non-zero without it."""
     inexact: ClassVar[float] = 0.0
-    """Share of its square by which a real one may differ from the law here, in the form of a smaller one of
-    its kind."""
+    """Tolerance for deviations from the law here: share of its power that may appear as a smaller instance of
+    its kind.
+    """
     shape: ClassVar[tuple[Shape, ...]] = ()
-    """Its non-linear parameters; all others are spoken for by `columns`."""
+    """Non-linear parameters; `columns` covers all others."""
     typical: ClassVar[Mapping[str, Any]] = {}
-    """Parameters of typical size, for `candidate`."""
+    """Typical parameters, for `candidate`."""
     drifting: ClassVar[tuple[str, ...]] = ()
-    """The parameters that wear and temperature move in months of work, and that no fault of the load encoder
-    alone imitates: all of those that `columns` speaks for, or none.
+    """Parameters that wear and temperature change over months and that no load encoder fault alone imitates.
+
+    Either all parameters that `columns` covers, or none.
     """
 
     @abstractmethod
     def predict(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
-        """Error in arcsec at the load for each sample, shape (n,)."""
+        """Returns the error at the load for each sample, arcsec, shape (n,)."""
 
     @abstractmethod
     def tracker(self, start: Start = Start.VIRGIN) -> Tracker:
-        """A fresh on-line tracker of this effect; same numbers as `predict`."""
+        """Returns a new on-line tracker of this effect, with the same results as `predict`."""
 
     @abstractmethod
     def columns(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
-        """Regressors, shape (n, p), for this effect's shape parameters: predict = columns @ coefficients."""
+        """Returns the regressors for the present shape parameters, shape (n, p): predict = columns @
+        coefficients.
+        """
 
     @abstractmethod
     def coefficients(self) -> FloatArray:
-        """The linear coefficients, arcsec, shape (p,), in the order of `columns`."""
+        """Returns the linear coefficients in the order of `columns`, arcsec, shape (p,)."""
 
     @abstractmethod
     def fitted(self, coefficients: FloatArray, shape: Mapping[str, float] | None = None) -> Self:
-        """This effect with other coefficients, and other shape parameters where given."""
+        """Returns this effect with other coefficients and, if given, other shape parameters."""
 
     @abstractmethod
     def bound_arcsec(self) -> float:
-        """A bound on the absolute error, arcsec."""
+        """Returns a bound on the absolute error, arcsec."""
 
     @abstractmethod
     def slope_bound_arcsec_per_deg(self) -> float:
-        """A bound on how steeply the error can *fall* with the motor angle, arcsec per motor degree.
+        """Returns a bound on how steeply the error can *fall* with the motor angle, arcsec per motor degree.
 
-        The compensation can invert a sum of effects while this stays below the gear's own slope of
-        3600 / N. Hysteresis only ever rises along its path, so its bound is zero.
+        The compensation can invert a sum of effects if this stays below the gear's own slope of 3600 / N.
+        Hysteresis only rises along its path, so its bound is zero.
         """
 
     def gentle_tracker(self, start: Start, fall_arcsec_per_deg: float) -> Tracker | None:
-        """A tracker that falls nowhere steeper than that, for the inverse; None where there is none.
+        """Returns a tracker for the inverse that falls no more steeply than this, or None if there is none.
 
-        Play has one: on either side of it the error is what it is, and how the load gets across, within a
-        fraction of a motor degree, hardly matters.
+        Backlash has one: the error on either side of the gap is known, and the path of the load across it,
+        within a fraction of a motor degree, hardly matters.
         """
         return None
 
     @classmethod
     def candidate(cls, ratio: float, base: Sequence[Effect] = ()) -> Self:
-        """One of typical size for a gear of this ratio, to start a fit or a plan from.
+        """Returns an effect of typical size for a gear ratio, as the start of a fit or a plan.
 
         An effect that carries orders or a loop (because it modulates them) takes them from the effects in
-        ``base``, or typical ones where these have none.
+        ``base``, or typical ones if there are none.
         """
         values = {**cls.typical, **cls._carried(base)}
         if "ratio" in cls.model_fields:
@@ -189,17 +197,18 @@ class Effect(Strict, ABC):
 
     @classmethod
     def _carried(cls, base: Sequence[Effect]) -> dict[str, Any]:  # noqa: ARG003
-        """Parameters that are copies of what a model has."""
+        """Returns the parameters that are copies of parts of a model."""
         return {}
 
-    # --- what it is like in a record
+    # --- properties in a record
 
     @classmethod
     def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[Self]:
-        """Effects of this kind that a record with the model ``base`` may be screened for, over their shapes.
+        """Yields effects of this kind to screen a record for, given the model ``base``, over their shape
+        parameters.
 
-        Their coefficients are of no account. As a rule a grid over the ranges of `shape`, around `candidate`;
-        nothing where the model lacks a part that it would scale.
+        Their coefficients are arbitrary. The default is a grid over the ranges of `shape`, around
+        `candidate`; nothing if the model lacks a part that the effect would scale.
         """
         if not set(cls.carries) <= {each.part for each in base} | {Part.GROWTH}:
             return
@@ -212,22 +221,24 @@ class Effect(Strict, ABC):
 
     @classmethod
     def at_lines(cls, periods_per_turn: int) -> Iterator[Self]:  # noqa: ARG003
-        """Those that can be a line of so many periods per turn of the load; of what is sought as one."""
+        """Yields the effects that can appear as a spectral line at this many periods per load turn, for
+        `Sought.LINE`.
+        """
         return iter(())
 
     def implausible(self, observations: Observations) -> str:
-        """Why this very effect cannot be, whatever a fit says, in words; else empty."""
+        """Returns the reason why this instance is physically impossible, whatever a fit says; else empty."""
         return ""
 
     def unidentifiable(self, observations: Observations) -> str:
-        """Why such a record cannot tell this very effect from another cause, in words; else empty.
+        """Returns the reason why such a record cannot separate this instance from another cause; else empty.
 
-        It is not named there, but it may be an alias of what is.
+        It is then not named, but it may be listed as an alias of the named cause.
         """
         return ""
 
     def coordinate(self, motion: Motion, ratio: float) -> Coordinate:
-        """What it depends on, over which a picture shows it; as a rule its first channel."""
+        """Returns the quantity that the effect depends on, for plots; by default its first channel."""
         needs = self.needs()
         for channel in MEASURED:
             if channel in needs:
@@ -244,53 +255,60 @@ class Effect(Strict, ABC):
         return over.since_reversal(motion) if self.tracker().memory_deg else over.motor_angle(motion)
 
     def shows(self, motion: Motion) -> Stretch | None:
-        """Where it must be seen by itself, if that is not everywhere."""
+        """Returns the samples at which it must be visible on its own; None for all."""
         return None
 
     def changing(self, motion: Motion) -> FloatArray | None:
-        """What it would add if its coefficient changed by one along the way or next to it, a column per place
-        of change, shape (n, k), of an effect of one piece; None where that is no contradiction to it.
+        """Returns the change of the prediction if the coefficient changed by one along the record or next to
+        it.
+
+        One column per location of a change, shape (n, k), for an effect with one piece; None if such a change
+        does not contradict the effect.
         """
         return None
 
     def scales(self) -> tuple[Part, Effect] | None:
-        """The part of a model that it scales, where a picture can show it as a growth of that."""
+        """Returns the part of a model that it scales, if a plot can show it as growth of that part."""
         return None
 
     def pieces(self) -> tuple[Self, ...]:
-        """What it is made of: one order, one step each."""
+        """Returns its components, for example one order or one step each."""
         return (self,)
 
     def joined(self, other: Effect) -> Self | None:
-        """One effect that is both; None where the two stand side by side."""
+        """Returns one effect that combines both; None if the two stay separate."""
         return None
 
     def largest_piece_arcsec(self) -> float:
-        """Amplitude of the largest of its parts over all that it may do, seen or not; 0 where all is seen."""
+        """Returns the amplitude of the largest component over its full range, observed or not; 0 if all is
+        observed.
+        """
         return 0.0
 
     def left_in_mean(self, order: int) -> float:
-        """Share of an order of the motor that is left in the mean over both directions."""
+        """Returns the share of a motor order that remains in the mean over both directions."""
         return 1.0
 
     def waves(self) -> tuple[tuple[float, float, float], ...]:
-        """Of a sum of waves of the motor angle: periods per turn, amplitude (arcsec), phase (degrees)."""
+        """Returns its waves of the motor angle: periods per turn, amplitude (arcsec), phase (degrees)."""
         return ()
 
     def named_coefficients(self) -> tuple[Coefficient, ...]:
-        """What reports and files call its coefficients."""
+        """Returns the names of its coefficients for reports and files."""
         return tuple(
             Coefficient(f"coefficient_{i + 1}_arcsec", (i,), ()) for i in range(len(self.coefficients()))
         )
 
     @classmethod
     def of_change(cls, before: Effect, now: Effect) -> Self | None:  # noqa: ARG003
-        """This cause, where it can be what has made ``now`` of ``before``; see `changes`."""
+        """Returns this cause if it can explain a change of ``before`` into ``now``, else None;
+        see `changes`.
+        """
         return None
 
     @classmethod
     def unmeasured(cls, ratio: float) -> Effect | None:  # noqa: ARG003
-        """What it looks like where its channel was not measured; None where that is nothing in particular."""
+        """Returns its appearance if its channel was not measured; None if there is no characteristic one."""
         return None
 
     def retold(
@@ -299,39 +317,43 @@ class Effect(Strict, ABC):
         given: Sequence[Effect],
         observations: Observations,
     ) -> tuple[Effect, ...] | None:
-        """``now``, of which it is one, told by another convention so that the parts are nearest to the
-        model's, ``given``; None where there is nothing to be told otherwise.
+        """Returns ``now``, which contains this effect, reparametrised so that its parts are nearest to
+        ``given``.
+
+        None if there is no alternative parametrisation.
         """
         return None
 
     def found_in(self, effects: Sequence[Effect]) -> Effect:
-        """It as a model has it; itself where the model has none."""
+        """Returns the model's instance of this effect, or itself if the model has none."""
         return next((each for each in effects if type(each) is type(self)), self)
 
     def tidied(self, ratio: float) -> Self:
-        """As it goes into a model of this ratio."""
+        """Returns the effect as it is stored in a model of this ratio."""
         return self
 
     def law_discrepancy(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
-        """How a real one may differ from the law here, arcsec, a column per standard deviation, (n, k)."""
+        """Returns possible deviations of a real effect from this law, arcsec, one column per standard
+        deviation, (n, k).
+        """
         return np.empty((len(motion), 0))
 
-    # --- what it is in a file
+    # --- file representation
 
     def parameters(self) -> dict[str, Any]:
-        """The parameters as the model file has them."""
+        """Returns the parameters as stored in the model file."""
         return self.model_dump(mode="json")
 
     def needs(self) -> frozenset[Channel]:
-        """The channels that this very effect needs, as its parameters have it."""
+        """Returns the channels that this instance needs, given its parameters."""
         return self.channels
 
     def is_compensable(self) -> bool:
-        """Whether the compensation should make up for this very effect."""
+        """Returns True if the compensation should correct this instance."""
         return self.compensable.possible
 
     def violations(self) -> list[str]:
-        """Parameters outside their physical ranges, in words; `fitted` does not refuse them."""
+        """Describes the parameters outside their physical ranges, which `fitted` does not refuse."""
         try:
             type(self).model_validate(self.parameters())
         except ValidationError as error:
@@ -342,38 +364,38 @@ class Effect(Strict, ABC):
 
 
 class Linear(Effect):
-    """Base for effects whose coefficients simply are some of their parameters: `linear` names them.
+    """Base class of effects whose coefficients are some of their parameters, listed in `linear`.
 
-    `columns` is all that is left to write, in the unit of the parameters.
+    A subclass only has to define `columns`, in the units of these parameters.
     """
 
     linear: ClassVar[tuple[str, ...]]
-    """The parameters that the error is linear in, in the order of the columns."""
+    """Parameters that the error is linear in, in the order of the columns."""
 
     def predict(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
-        """Error in arcsec, shape (n,)."""
+        """Returns the error in arcsec, shape (n,)."""
         error: FloatArray = self.columns(motion, start) @ self.coefficients()
         return error
 
     def coefficients(self) -> FloatArray:
-        """The linear parameters, in their units."""
+        """Returns the linear parameters in their units."""
         return np.array([getattr(self, each) for each in self.linear], dtype=np.float64)
 
     def named_coefficients(self) -> tuple[Coefficient, ...]:
-        """By the parameters."""
+        """Returns the coefficients named by their parameters."""
         return tuple(Coefficient(each, (i,), (each,)) for i, each in enumerate(self.linear))
 
     def fitted(self, coefficients: FloatArray, shape: Mapping[str, float] | None = None) -> Self:
-        """Other linear parameters, and other shape parameters where given."""
+        """Returns the effect with other linear parameters and, if given, other shape parameters."""
         values = dict(zip(self.linear, map(float, coefficients), strict=True))
         return self.model_copy(update={**values, **dict(shape or {})})
 
 
 def unmet(effects: Iterable[Effect], available: frozenset[Channel]) -> dict[str, frozenset[Channel]]:
-    """Per effect the channels that it needs and that are not there; empty when all is well.
+    """Returns the missing channels of each effect; empty if all are available.
 
-    ``available`` is `Motion.available()` for a record, or what a control loop can supply. On line nothing
-    complains later: a `Moment` has defaults, so ask before the axis moves.
+    ``available`` is `Motion.available()` for a record, or the channels that a control loop can supply. Check
+    before the axis moves: on line a missing channel raises no error, because a `Moment` has defaults.
     """
     lacking = {each.name: each.needs() - available for each in effects}
     return {name: channels for name, channels in lacking.items() if channels}

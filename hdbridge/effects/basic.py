@@ -1,4 +1,4 @@
-"""The two parts that a calibration gives every model: the ripple over the motor's turn, the elastic loop."""
+"""The two basic parts of every calibrated model: motor-synchronous ripple and elastic loop."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ from hdbridge.effects.orders import orders_from
 from hdbridge.effects.synchronous import Synchronous
 
 BASIC: Final = frozenset({Synchronous.name, Hysteresis.name})
-"""Their names."""
+"""Names of the two basic parts."""
 USUAL_LOOP: Final[Effect] = Hysteresis(offset_arcsec=40.0, width_deg=20.0, exponent=1.8)
-"""A loop to start a fit from."""
+"""Initial loop for a fit."""
 
 
 def ripple(numbers: Iterable[int]) -> Effect:
-    """The ripple of these orders of the motor, all of amplitude zero, to start a fit from."""
+    """Returns a ripple with these motor orders at zero amplitude, as the start of a fit."""
     return Synchronous(orders=orders_from(numbers, 0.0))
 
 
 def is_ripple(effect: Effect) -> bool:
-    """Whether an effect is a model's ripple, and not orders in addition to it."""
+    """Returns True if an effect is the model's ripple rather than additional orders."""
     return isinstance(effect, Synchronous)

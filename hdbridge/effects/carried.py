@@ -1,9 +1,8 @@
-"""What an effect carries of the model that it modulates: orders of the synchronous part, their growth, the
-loop.
+"""Parts of a model that a modulating effect carries: synchronous orders, their growth with torque, the loop.
 
-An effect such as `torque_modulation` says "the synchronous part grows with torque". So that it can be
-predicted, tracked and read on its own, it carries a copy of the part that it modulates, taken from the model
-when it is made; `combine.refreshed` keeps the copy in step.
+An effect such as `torque_modulation` states that the synchronous part grows with torque. To be predicted,
+tracked and read on its own, it carries a copy of the part that it modulates, taken from the model when it is
+created; `combine.refreshed` keeps the copy up to date.
 """
 
 from __future__ import annotations
@@ -23,7 +22,7 @@ from hdbridge.strictness import Strict
 
 
 class Loop(Strict):
-    """The elastic loop that is modulated: the parameters of `hysteresis`, and which law it follows."""
+    """The modulated elastic loop: parameters of `hysteresis`, and the law it follows."""
 
     offset_arcsec: Annotated[
         float, Field(ge=-3600, le=3600, description="half the height, at the load; negative where it lags")
@@ -33,20 +32,20 @@ class Loop(Strict):
     memory: Annotated[bool, Field(description="with return-point memory (hysteresis_memory)")] = False
 
     def law(self) -> Hysteresis | HysteresisMemory:
-        """The effect with these parameters."""
+        """Returns the effect with these parameters."""
         kind = HysteresisMemory if self.memory else Hysteresis
-        # Within a fit it may be out of its range, as what it was copied from.
+        # During a fit it may be out of its range, like the effect it was copied from.
         return kind.model_construct(
             offset_arcsec=self.offset_arcsec, width_deg=self.width_deg, exponent=self.exponent
         )
 
 
 TYPICAL_LOOP = Loop(offset_arcsec=40.0, width_deg=20.0, exponent=1.6)
-"""A published gear of ratio 50 (Table 2 of the article that hdbridge implements)."""
+"""Loop of a published gear of ratio 50 (Table 2 of the article that hdbridge implements)."""
 
 
 def loop_of(base: Iterable[Effect]) -> Loop:
-    """The loop of a model's elastic law, whichever it is; a typical one where it has none."""
+    """Returns the loop of a model's elastic law, of either kind; a typical one if it has none."""
     for each in base:
         if isinstance(each, Hysteresis | HysteresisMemory):
             return Loop.model_construct(**each.parameters(), memory=isinstance(each, HysteresisMemory))
@@ -54,7 +53,7 @@ def loop_of(base: Iterable[Effect]) -> Loop:
 
 
 def orders_of(base: Iterable[Effect]) -> tuple[MotorOrder, ...]:
-    """The orders of a model's synchronous part; typical ones where it has none."""
+    """Returns the orders of a model's synchronous part; typical ones if it has none."""
     for each in base:
         if isinstance(each, Synchronous) and each.orders:
             return each.orders
@@ -62,17 +61,17 @@ def orders_of(base: Iterable[Effect]) -> tuple[MotorOrder, ...]:
 
 
 def has_loop(base: Iterable[Effect]) -> bool:
-    """Whether a model has a loop that could be scaled."""
+    """Returns True if a model has a loop that can be scaled."""
     return any(each.part is Part.LOOP for each in base)
 
 
 def has_orders(base: Iterable[Effect]) -> bool:
-    """Whether a model has a ripple that could be scaled."""
+    """Returns True if a model has a ripple that can be scaled."""
     return any(isinstance(each, Synchronous) and each.orders for each in base)
 
 
 def growth_of(base: Iterable[Effect]) -> TorqueGrowth | None:
-    """The growth of a model's orders with torque; None where they do not grow."""
+    """Returns the growth of a model's orders with torque, or None."""
     for each in base:
         if isinstance(each, TorqueGrowth):
             return TorqueGrowth(**{name: getattr(each, name) for name in TorqueGrowth.model_fields})

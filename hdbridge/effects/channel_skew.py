@@ -1,4 +1,4 @@
-"""The two encoders are not sampled at the same instant."""
+"""Time skew between the samples of the two encoders."""
 
 from __future__ import annotations
 
@@ -29,11 +29,11 @@ from hdbridge.units import ARCSEC_PER_DEG
 
 
 class ChannelSkew(Linear):
-    """delay omega_L + second alpha_L / 2: the load encoder, read later than the motor's, is farther on.
+    """delay omega_L + second alpha_L / 2: the load encoder, sampled later than the motor's, reads farther on.
 
-    A pure delay has second = delay^2. It is a parameter of its own because the speed is a difference over a
-    sample, delayed by half a step, and a delay is rarely a whole number of samples: without it the rest would
-    be taken for an inertial wind-up.
+    A pure delay has second = delay^2. It is a separate parameter because the speed is a difference over a
+    sample, delayed by half a step, and a delay is rarely a whole number of samples. Without it the residual
+    would be attributed to inertial wind-up.
     """
 
     name: ClassVar[str] = "channel_skew"
@@ -62,9 +62,9 @@ class ChannelSkew(Linear):
         False, "it is an error of the measurement; to compensate it would make the load lag or lead"
     )
     ordinary_arcsec: ClassVar[float] = 1.0
-    """No two encoders are read at the same instant."""
+    """No two encoders are sampled at exactly the same instant."""
     incidental: ClassVar[frozenset[str]] = frozenset({"second_order_ms2"})
-    """The load's own wind-up goes with it."""
+    """Includes the load's own wind-up."""
     linear: ClassVar[tuple[str, ...]] = ("delay_ms", "second_order_ms2")
     typical: ClassVar[Mapping[str, Any]] = {"delay_ms": 0.5, "second_order_ms2": 0.25}
 
@@ -90,33 +90,33 @@ class ChannelSkew(Linear):
 
     @classmethod
     def of_delay(cls, delay_ms: float, ratio: float) -> Self:
-        """A pure delay."""
+        """Returns a pure delay."""
         return cls(ratio=ratio, delay_ms=delay_ms, second_order_ms2=delay_ms * delay_ms)
 
     @classmethod
     def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[ChannelSkew]:  # noqa: ARG003
-        """The one there is."""
+        """Yields the single candidate."""
         yield cls(ratio=observations.ratio, delay_ms=1.0, second_order_ms2=1.0)
 
     def columns(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
-        """One millisecond, and one of its square, shape (n, 2)."""
+        """Returns the effect of 1 ms and of 1 ms^2, shape (n, 2)."""
         speed = np.clip(speed_of(motion, self.name), -self.limit_deg_s, self.limit_deg_s)
         acceleration = np.clip(acceleration_of(motion, self.name), -self.limit_deg_s2, self.limit_deg_s2)
         gain = ARCSEC_PER_DEG / self.ratio
         return np.column_stack([1e-3 * gain * speed, 0.5e-6 * gain * acceleration])
 
     def tracker(self, start: Start = Start.VIRGIN) -> Tracker:
-        """On-line tracker; speed and acceleration come with the moment."""
+        """Returns an on-line tracker; speed and acceleration come from the moment."""
         return _Tracker(self)
 
     def bound_arcsec(self) -> float:
-        """At the highest speed and acceleration."""
+        """Bound at the highest speed and acceleration."""
         speed = 1e-3 * abs(self.delay_ms) * self.limit_deg_s
         acceleration = 0.5e-6 * abs(self.second_order_ms2) * self.limit_deg_s2
         return ARCSEC_PER_DEG / self.ratio * (speed + acceleration)
 
     def slope_bound_arcsec_per_deg(self) -> float:
-        """Zero: the speed is the command's, whatever angle is asked about."""
+        """Zero, because the speed is the command's, independent of the angle."""
         return 0.0
 
 

@@ -1,4 +1,6 @@
-"""How effects go together in one model: extend, keep carried parts in step, what may be compensated."""
+"""Combination of effects in one model: extension, updating of carried parts, choice of
+compensable effects.
+"""
 
 from __future__ import annotations
 
@@ -20,11 +22,12 @@ _LAWS = (Hysteresis, HysteresisMemory)
 
 
 def extended(effects: Iterable[Effect], new: Effect) -> tuple[Effect, ...]:
-    """The effects of a model with a new one.
+    """Returns the effects of a model extended by a new one.
 
-    It takes the place of one of the same name, or of the one that it replaces (`hysteresis_memory` replaces
-    `hysteresis`, and the other way round); changed hysteresis parameters go into the model's own loop;
-    everything else is added. What other effects carry of the changed one follows (`refreshed`).
+    The new effect replaces one of the same name or the one that it replaces by definition
+    (`hysteresis_memory` replaces `hysteresis`, and vice versa). Changed hysteresis parameters go into the
+    model's own loop. Everything else is added. Copies of the changed part in other effects are updated
+    (`refreshed`).
     """
     given = list(effects)
     if isinstance(new, HysteresisParameters):
@@ -40,17 +43,17 @@ def extended(effects: Iterable[Effect], new: Effect) -> tuple[Effect, ...]:
 
 
 def refreshed(effects: Iterable[Effect]) -> tuple[Effect, ...]:
-    """The same effects; those that carry orders or a loop carry what the model now has.
+    """Returns the effects with the copies of orders and loop that they carry updated to the present model.
 
-    The orders are those of the synchronous part and of orders that were added to it: what changes a tooth
-    error changes all of it. Where the model has no synchronous part, the orders stay as they are.
+    The orders are those of the synchronous part and of added motor orders, because a change of the tooth
+    error changes all of it. If the model has no synchronous part, the orders stay as they are.
     """
     given = tuple(effects)
     loop = loop_of(given) if any(isinstance(each, _LAWS) for each in given) else None
     series = [each for each in given if isinstance(each, Synchronous | MotorOrders)]
     orders: tuple[MotorOrder, ...] | None = None
     if any(isinstance(each, Synchronous) for each in series):
-        # Of an order that stands twice, the synchronous part's: a fit tells no shares of it.
+        # For an order that occurs twice, the synchronous part's is used: a fit cannot separate their shares.
         by_number = {order.order: order for each in reversed(series) for order in each.orders}
         orders = tuple(by_number[number] for number in sorted(by_number))
     growth = growth_of(given)
@@ -72,9 +75,9 @@ def _refreshed(
 
 
 def in_place(effect: Effect, kinds: Iterable[type[Effect]]) -> tuple[Effect, ...]:
-    """What can stand in the place of an effect, with its parameters; see `Effect.replaces`.
+    """Returns the alternatives that can replace an effect, with its parameters; see `Effect.replaces`.
 
-    A fit may have led them out of their ranges: as with `fitted`, `violations` says so.
+    A fit may have moved these out of their ranges; `violations` reports it, as for `fitted`.
     """
     return tuple(
         kind.model_construct(**effect.parameters())
@@ -84,16 +87,16 @@ def in_place(effect: Effect, kinds: Iterable[type[Effect]]) -> tuple[Effect, ...
 
 
 def compensable(effects: Iterable[Effect]) -> tuple[Effect, ...]:
-    """The effects that a compensation should make up for: real motions of the load that can be foreseen."""
+    """Returns the effects that a compensation should correct: real, predictable motions of the load."""
     return tuple(each for each in effects if each.is_compensable())
 
 
 def fall_bound(effects: Iterable[Effect]) -> float:
-    """A bound on how steeply the *sum* can fall, arcsec per motor degree.
+    """Returns a bound on how steeply the *sum* can fall, arcsec per motor degree.
 
-    The sum of the effects' own bounds, but for one case: what takes a share from the model's loop falls as
-    steeply as the loop rises, and as long as no more than the whole loop is taken, the sum still rises. (That
-    of a loop in which the load lags may fall without bound in either direction.)
+    This is the sum of the effects' own bounds, with one exception. An effect that removes a share of the
+    model's loop falls as steeply as the loop rises, and while no more than the whole loop is removed, the sum
+    still rises. (An effect on a loop in which the load lags may fall without bound in either direction.)
     """
     given = tuple(effects)
     left = {
@@ -117,7 +120,7 @@ def _key(loop: Loop) -> tuple[object, ...]:
 
 
 def conflicts(effects: Iterable[Effect], ratio: float) -> tuple[str, ...]:
-    """Why these effects cannot be of one model with this gear ratio, in words; empty when they can."""
+    """Returns the reasons why these effects cannot form one model with this gear ratio; empty if they can."""
     given = tuple(effects)
     names = {each.name for each in given}
     return (

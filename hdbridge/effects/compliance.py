@@ -31,10 +31,10 @@ from hdbridge.effects.orders import orders_from
 from hdbridge.effects.torque import TorqueChannel, TorqueLimit
 
 ARCSEC_PER_RAD = 648_000.0 / np.pi
-"""A stiffness of K Nm/rad is a compliance of ARCSEC_PER_RAD / K arcsec/Nm."""
+"""Conversion constant: a stiffness of K Nm/rad is a compliance of ARCSEC_PER_RAD / K arcsec/Nm."""
 
 SOFTER = 1.05
-"""A zone may come out so much softer than the one before it by noise alone."""
+"""Factor by which noise alone may make a zone softer than the one before it."""
 
 _Softness = Annotated[float, Field(ge=0, le=1000)]
 
@@ -42,7 +42,7 @@ _Softness = Annotated[float, Field(ge=0, le=1000)]
 class Compliance(Linear):
     """sense * (c1, c2, c3 per Nm in the zones up to T1, up to T2, beyond); c = 206265 / K.
 
-    Written in compliances because the error is linear in them: c1 = 206265 / K1 arcsec/Nm with K1 in Nm/rad.
+    Written in compliances, because the error is linear in them: c1 = 206265 / K1 arcsec/Nm with K1 in Nm/rad.
     """
 
     name: ClassVar[str] = "compliance"
@@ -100,7 +100,7 @@ class Compliance(Linear):
 
     @classmethod
     def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[Compliance]:  # noqa: ARG003
-        """A straight spring, and springs that stiffen once or twice within the torques of the record."""
+        """Yields a linear spring, and springs that stiffen once or twice within the torques of the record."""
         largest = top(observations.motion, Channel.LOAD_TORQUE)
         if largest:
             beyond = (1e4, 2e4)
@@ -112,22 +112,24 @@ class Compliance(Linear):
                 )  # fmt: skip
 
     def implausible(self, observations: Observations) -> str:
-        """A gear's spring stiffens with torque; a zone that the record does not reach has no compliance."""
+        """Requires that the spring stiffens with torque; a zone that the record does not reach has no
+        compliance.
+        """
         zones = [each for each in self.coefficients().tolist() if each != 0.0]
         stiffens = all(later <= SOFTER * earlier for earlier, later in pairwise(zones))
         return "" if stiffens else "a gear's spring does not soften with torque"
 
     @classmethod
     def unmeasured(cls, ratio: float) -> Effect:
-        """Under a mass off centre the torque goes once around with the load."""
+        """Returns load order 1, because with an off-centre mass the torque goes round once with the load."""
         return LoadOrders(ratio=ratio, orders=orders_from([1]))
 
     def needs(self) -> frozenset[Channel]:
-        """The torque channel."""
+        """Returns the torque channel."""
         return frozenset({Channel(self.torque)})
 
     def columns(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
-        """The torque's part in each of the three zones, signed, shape (n, 3)."""
+        """Returns the signed part of the torque in each of the three zones, shape (n, 3)."""
         given = motion.channel(Channel(self.torque), self.name)
         torque = np.minimum(np.abs(given), self.limit_nm)
         low, high = self.torque1_nm, self.torque2_nm
@@ -142,18 +144,20 @@ class Compliance(Linear):
         return signed
 
     def fitted(self, coefficients: FloatArray, shape: Mapping[str, float] | None = None) -> Self:
-        """Other compliances; where their sum is negative the sense turns: a torque's sign is a convention."""
+        """Returns other compliances; if their sum is negative the sense flips, because a torque's sign is a
+        convention.
+        """
         values = np.asarray(coefficients, dtype=np.float64)
         turned = values.sum() < 0.0
         effect = super().fitted(-values if turned else values, shape)
         return effect.model_copy(update={"sense": -self.sense}) if turned else effect
 
     def tracker(self, start: Start = Start.VIRGIN) -> Tracker:
-        """On-line tracker; it has no state."""
+        """Returns a stateless on-line tracker."""
         return _Tracker(self)
 
     def bound_arcsec(self) -> float:
-        """The wind-up at the highest torque."""
+        """Wind-up at the highest torque."""
         low, high, most = self.torque1_nm, self.torque2_nm, self.limit_nm
         return (
             abs(self.c1_arcsec_per_nm) * min(most, low)
@@ -162,11 +166,11 @@ class Compliance(Linear):
         )
 
     def slope_bound_arcsec_per_deg(self) -> float:
-        """Zero: it depends on the torque, not on the motor angle."""
+        """Zero, because it depends on the torque, not on the motor angle."""
         return 0.0
 
     def stiffness_nm_per_rad(self) -> tuple[float, float, float]:
-        """K1, K2, K3 as catalogues give them; infinite where a compliance is zero."""
+        """Returns K1, K2, K3 as in catalogues; infinite for a compliance of zero."""
         first, second, third = (ARCSEC_PER_RAD / each if each else np.inf for each in self.coefficients())
         return float(first), float(second), float(third)
 

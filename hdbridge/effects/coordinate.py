@@ -1,4 +1,4 @@
-"""The quantities that an error may depend on, along a motion: for pictures, and for what has no name yet."""
+"""Quantities along a motion that an error may depend on: for plots, and for unexplained residuals."""
 
 from __future__ import annotations
 
@@ -15,52 +15,52 @@ from hdbridge.units import DEG_PER_TURN
 POINTS_PER_BIN: Final = 8
 LEAST_BINS: Final = 2
 SAME: Final = 1e-6
-"""A quantity that varies by less than this share of itself is one value, rounded."""
+"""Relative range below which a quantity counts as constant, because of rounding."""
 NOTHING: Final = 1e-9
-"""... and so is one that varies by no more than this in its unit."""
+"""Absolute range below which a quantity counts as constant, in its unit."""
 SMALLEST_WAY_DEG: Final = 0.01
 SMALLEST_TIME_S: Final = 0.01
-"""Less than this since a reversal counts as this, so that a logarithm can be taken."""
+"""Minimum time since a reversal, s, so that a logarithm can be taken."""
 
 
 class Spacing(Enum):
-    """How the bins over a coordinate lie."""
+    """Spacing of the bins over a coordinate."""
 
     EVEN = "even"
     FILLED = "filled"
-    """With equally many points in each: for what mostly keeps to a few values, like a speed."""
+    """Equal numbers of points per bin, for quantities that mostly take a few values, such as a speed."""
     LOGARITHMIC = "logarithmic"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Coordinate:
-    """A quantity along a motion."""
+    """Quantity along a motion."""
 
     name: str
     unit: str
     values: FloatArray
-    """One per sample, shape (n,)."""
+    """One value per sample, shape (n,)."""
     both_ways: bool = False
-    """Whether forward and backward are looked at apart."""
+    """True if forward and backward motion are shown separately."""
     spacing: Spacing = Spacing.EVEN
     bins: int = 72
-    """At most; fewer where there are not `POINTS_PER_BIN` points for each."""
+    """Maximum number of bins; fewer if there are not `POINTS_PER_BIN` points for each."""
 
     @property
     def label(self) -> str:
-        """Name and unit, for an axis."""
+        """Name and unit, for a plot axis."""
         return f"{self.name}, {self.unit}" if self.unit else self.name
 
     def at(self, rows: BoolArray | IntArray) -> Coordinate:
-        """The same at some of the samples."""
+        """Returns the coordinate at some of the samples."""
         return replace(self, values=self.values[rows])
 
     def varies(self) -> bool:
-        """Whether it has more than one value, but for rounding."""
+        """Returns True if it has more than one value, apart from rounding."""
         return bool(np.ptp(self.values) > SAME * np.max(np.abs(self.values)) + NOTHING)
 
     def edges(self) -> FloatArray:
-        """Of the bins, shape (b + 1,), rising; two equal ones where there is but one value."""
+        """Returns the bin edges, ascending, shape (b + 1,); two equal ones if there is only one value."""
         low, high = float(np.min(self.values)), float(np.max(self.values))
         bins = min(self.bins, max(len(self.values) // POINTS_PER_BIN, LEAST_BINS))
         if self.spacing is Spacing.FILLED:
@@ -70,29 +70,29 @@ class Coordinate:
         return np.linspace(low, high, bins + 1)
 
     def numbers(self) -> IntArray:
-        """The bin of each point, shape (m,)."""
+        """Returns the bin of each point, shape (m,)."""
         edges = self.edges()
         found = np.searchsorted(edges, self.values, "right") - 1
         return np.asarray(np.clip(found, 0, max(len(edges) - 2, 0)), dtype=np.intp)
 
 
 def motor_angle(motion: Motion) -> Coordinate:
-    """Within one turn of the motor."""
+    """Returns the angle within one turn of the motor."""
     return Coordinate("motor angle", "deg", np.mod(motion.motor_deg, DEG_PER_TURN), both_ways=True)
 
 
 def load_angle(motion: Motion, ratio: float) -> Coordinate:
-    """Within one turn of the load."""
+    """Returns the angle within one turn of the load."""
     return Coordinate("load angle", "deg", np.mod(motion.motor_deg / ratio, DEG_PER_TURN), both_ways=True)
 
 
 def position(motion: Motion, ratio: float) -> Coordinate:
-    """Of the load, over all its turns."""
+    """Returns the load position over all its turns."""
     return Coordinate("position", "deg of the load", motion.motor_deg / ratio, both_ways=True)
 
 
 def speed(motion: Motion) -> Coordinate:
-    """Of the motor, signed; `time` where it is not known."""
+    """Returns the signed motor speed; `time` if it is not known."""
     values = motion.motor_speed_deg_s
     if values is None:
         return time(motion)
@@ -100,7 +100,7 @@ def speed(motion: Motion) -> Coordinate:
 
 
 def acceleration(motion: Motion) -> Coordinate:
-    """Of the motor; `time` where it is not known."""
+    """Returns the motor acceleration; `time` if it is not known."""
     values = motion.motor_acceleration_deg_s2
     if values is None:
         return time(motion)
@@ -110,7 +110,7 @@ def acceleration(motion: Motion) -> Coordinate:
 
 
 def time(motion: Motion) -> Coordinate:
-    """On the record's clock; the sample's number where there is none."""
+    """Returns the time on the record's clock; the sample number if there is none."""
     values = motion.time_s
     if values is None:
         return Coordinate("sample", "", np.arange(len(motion), dtype=np.float64), bins=100)
@@ -118,7 +118,7 @@ def time(motion: Motion) -> Coordinate:
 
 
 def measured(motion: Motion, channel: Channel) -> Coordinate:
-    """A measured channel; `time` where it was not measured."""
+    """Returns a measured channel; `time` if it was not measured."""
     values = motion.measured.get(channel)
     if values is None:
         return time(motion)
@@ -127,21 +127,21 @@ def measured(motion: Motion, channel: Channel) -> Coordinate:
 
 
 def since_reversal(motion: Motion) -> Coordinate:
-    """Motor angle since the axis last reversed or the record began."""
+    """Returns the motor angle since the last reversal or the start of the record."""
     angle, last = motion.motor_deg, _last_reversal(motion)
     away = np.abs(angle - angle[last])
     return _logarithmic("motor angle since the last reversal", "deg", away, SMALLEST_WAY_DEG)
 
 
 def time_since_reversal(motion: Motion) -> Coordinate:
-    """The time that has passed since then."""
+    """Returns the time since the last reversal or the start of the record."""
     clock = time(motion).values
     since = np.maximum(clock - clock[_last_reversal(motion)], 0.0)
     return _logarithmic("time since the last reversal", "s", since, SMALLEST_TIME_S)
 
 
 def since_change(motion: Motion) -> Coordinate:
-    """Time since the axis last stopped, started or reversed; `time` where the speed is not known."""
+    """Returns the time since the axis last stopped, started or reversed; `time` if the speed is not known."""
     if motion.motor_speed_deg_s is None:
         return time(motion)
     clock = time(motion).values

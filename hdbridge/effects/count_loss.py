@@ -1,4 +1,4 @@
-"""Counts lost by an encoder, or a tooth jumped: a step at one time that stays."""
+"""Counts lost by an encoder, or a tooth jumped: a persistent step at one time."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from hdbridge.effects.path import away_from_reversals
 from hdbridge.strictness import Strict
 
 NEAR_S, LEAST_NEAR = 1.0, 5
-"""Next to a step: so long, and so many samples at least."""
+"""Neighbourhood of a step: duration in seconds, and minimum number of samples."""
 
 
 class Step(Strict):
@@ -67,9 +67,9 @@ class CountLoss(Effect):
     usual: ClassVar[int] = 2
     sought: ClassVar[Sought | None] = Sought.STEP
     inexact: ClassVar[float] = 0.03
-    """Something slow leaves small steps next to a large one."""
+    """Slow effects leave small steps next to a large one."""
     typical: ClassVar[Mapping[str, Any]] = {"steps": (Step(time_s=0.0, size_arcsec=10.0),)}
-    """One step of ten arcsec at time zero."""
+    """One step of 10 arcsec at time zero."""
 
     steps: Annotated[
         tuple[Step, ...], Field(min_length=1, max_length=100, description="losses: time_s, size_arcsec each")
@@ -77,21 +77,25 @@ class CountLoss(Effect):
 
     @classmethod
     def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[CountLoss]:  # noqa: ARG003
-        """One in the middle of the record, as an example."""
+        """Yields one step in the middle of the record, as an example."""
         if observations.motion.time_s is not None:
             middle = float(np.quantile(observations.motion.time_s, 0.5))
             yield cls(steps=(Step(time_s=middle, size_arcsec=1.0),))
 
     def unidentifiable(self, observations: Observations) -> str:
-        """On an axis that is nowhere twice, a step in time may as well be one at a place."""
+        """Requires reversals: on an axis that never revisits a position, a step in time may be one in
+        position.
+        """
         return "" if observations.reversals >= 2 else "a step in time may as well be one at a place"
 
     def shows(self, motion: Motion) -> Stretch | None:
-        """Away from reversals, where a loop of another shape leaves steps."""
+        """Returns the samples away from reversals, where a loop of another shape leaves no steps."""
         return away_from_reversals(motion)
 
     def changing(self, motion: Motion) -> FloatArray:
-        """Steps before and after it, within the time in which nothing slow goes far: it is there at once."""
+        """Returns steps before and after it, within a time in which slow effects barely change: a real one is
+        sudden.
+        """
         time_s = motion.channel(Channel.TIME, self.name)
         first = int(np.searchsorted(time_s, self.steps[0].time_s))
         near = max(LEAST_NEAR, round(NEAR_S / float(np.median(np.diff(time_s)))))
@@ -99,43 +103,43 @@ class CountLoss(Effect):
         return np.column_stack([number >= first - near, number >= first + near]).astype(np.float64)
 
     def pieces(self) -> tuple[Self, ...]:
-        """One step each."""
+        """Returns one effect per step."""
         return tuple(self.model_copy(update={"steps": (each,)}) for each in self.steps)
 
     def joined(self, other: Effect) -> Self | None:
-        """With the steps of another one."""
+        """Returns the effect with the steps of both."""
         if not isinstance(other, CountLoss):
             return None
         steps = tuple(sorted((*self.steps, *other.steps), key=lambda each: each.time_s))
         return self.model_copy(update={"steps": steps})
 
     def named_coefficients(self) -> tuple[Coefficient, ...]:
-        """The sizes."""
+        """Returns the names of the step sizes."""
         return tuple(
             Coefficient(f"step_{i + 1}_size_arcsec", (i,), ("steps", i, "size_arcsec"))
             for i in range(len(self.steps))
         )
 
     def predict(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
-        """Error in arcsec, shape (n,)."""
+        """Returns the error in arcsec, shape (n,)."""
         error: FloatArray = self.columns(motion, start) @ self.coefficients()
         return error
 
     def tracker(self, start: Start = Start.VIRGIN) -> Tracker:
-        """On-line tracker; it has no state but the clock's."""
+        """Returns an on-line tracker; it depends only on the clock."""
         return _Tracker([(each.time_s, each.size_arcsec) for each in self.steps])
 
     def columns(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
-        """A unit step per loss, shape (n, steps)."""
+        """Returns a unit step per loss, shape (n, steps)."""
         time_s = motion.channel(Channel.TIME, self.name)
         return (time_s[:, np.newaxis] >= [each.time_s for each in self.steps]).astype(np.float64)
 
     def coefficients(self) -> FloatArray:
-        """The sizes, arcsec."""
+        """Returns the step sizes, arcsec."""
         return np.array([each.size_arcsec for each in self.steps])
 
     def fitted(self, coefficients: FloatArray, shape: Mapping[str, float] | None = None) -> Self:
-        """Other sizes; ``time_s`` in ``shape`` moves the last step."""
+        """Returns other step sizes; ``time_s`` in ``shape`` moves the last step."""
         times = [each.time_s for each in self.steps]
         if shape and "time_s" in shape:
             times[-1] = float(shape["time_s"])
@@ -146,11 +150,11 @@ class CountLoss(Effect):
         return self.model_copy(update={"steps": steps})
 
     def bound_arcsec(self) -> float:
-        """Sum of the sizes."""
+        """Sum of the absolute sizes."""
         return sum(abs(each.size_arcsec) for each in self.steps)
 
     def slope_bound_arcsec_per_deg(self) -> float:
-        """Zero: it depends on time alone."""
+        """Zero, because it depends on time alone."""
         return 0.0
 
 

@@ -1,4 +1,4 @@
-"""Relaxation after a stop: what has been strained in motion lets go slowly."""
+"""Creep: slow relaxation of strain after a stop."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from hdbridge.effects.recurrence import recurrence
 from hdbridge.strictness import Strict
 
 RESTS = 3.0
-"""It is known by its bend: its shortest time constant is at most so many times the longest rest."""
+"""Maximum ratio of the shortest time constant to the longest rest; beyond it the curvature is not visible."""
 
 
 class Relaxation(Strict):
@@ -46,10 +46,11 @@ class Relaxation(Strict):
 
 
 class Creep(Effect):
-    """Sum of A_j y_j; in motion y_j goes to the direction, at rest to zero.
+    """Sum of A_j y_j; y_j approaches the direction in motion, and zero at rest.
 
-    In motion the time constant is ``build_up`` tau_j. 1 is a linear viscoelastic element (short moves strain
-    it little); well below 1 each move strains it fully, and after each stop there is A_j exp(-t / tau_j).
+    In motion the time constant is ``build_up`` tau_j. A value of 1 is a linear viscoelastic element (short
+    moves strain it little); well below 1 each move strains it fully, and after each stop there is A_j exp(-t
+    / tau_j).
     """
 
     name: ClassVar[str] = "creep"
@@ -92,57 +93,57 @@ class Creep(Effect):
 
     @classmethod
     def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[Creep]:  # noqa: ARG003
-        """One exponential each; what is found is put together afterwards."""
+        """Yields single exponentials; those found are combined afterwards."""
         for tau_s in (0.3, 1.0, 3.0, 10.0, 30.0, 100.0):
             for build_up in (0.03, 0.3, 1.0):
                 yield cls(parts=(Relaxation(amplitude_arcsec=1.0, tau_s=tau_s),), build_up=build_up)
 
     def unidentifiable(self, observations: Observations) -> str:
-        """What takes far longer than any rest is not known to end with it."""
+        """Requires a time constant comparable to a rest, because a much slower one need not end with it."""
         if min(each.tau_s for each in self.parts) <= RESTS * longest_rest_s(observations.motion):
             return ""
         return "no rest is long enough to see it bend"
 
     def shows(self, motion: Motion) -> Stretch:
-        """At rest: in motion it may be part of what depends on the speed."""
+        """Returns the samples at rest; in motion it may be part of a speed-dependent effect."""
         return Stretch(standing_s(motion) > 0.0, "not seen at rest")
 
     def coordinate(self, motion: Motion, ratio: float) -> Coordinate:
-        """Time since the axis last stopped or started."""
+        """Returns the time since the axis last stopped or started."""
         return over.since_change(motion)
 
     def pieces(self) -> tuple[Self, ...]:
-        """One exponential each."""
+        """Returns one effect per exponential."""
         return tuple(self.model_copy(update={"parts": (each,)}) for each in self.parts)
 
     def joined(self, other: Effect) -> Self | None:
-        """With the exponentials of another one."""
+        """Returns the effect with the exponentials of both."""
         if not isinstance(other, Creep):
             return None
         return self.model_copy(update={"parts": (*self.parts, *other.parts)})
 
     def largest_piece_arcsec(self) -> float:
-        """The largest amplitude: exponentials may cancel."""
+        """Returns the largest amplitude, because exponentials may cancel."""
         return max(abs(each.amplitude_arcsec) for each in self.parts)
 
     def named_coefficients(self) -> tuple[Coefficient, ...]:
-        """The amplitudes."""
+        """Returns the names of the amplitudes."""
         return tuple(
             Coefficient(f"part_{i + 1}_amplitude_arcsec", (i,), ("parts", i, "amplitude_arcsec"))
             for i in range(len(self.parts))
         )
 
     def predict(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
-        """Error in arcsec, shape (n,)."""
+        """Returns the error in arcsec, shape (n,)."""
         error: FloatArray = self.columns(motion, start) @ self.coefficients()
         return error
 
     def tracker(self, start: Start = Start.VIRGIN) -> Tracker:
-        """On-line tracker; fully relaxed at its first moment."""
+        """Returns an on-line tracker, fully relaxed at its first moment."""
         return _Tracker([(each.amplitude_arcsec, each.tau_s) for each in self.parts], self.build_up)
 
     def columns(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
-        """y_j of each exponential, shape (n, parts)."""
+        """Returns y_j of each exponential, shape (n, parts)."""
         time_s = motion.channel(Channel.TIME, self.name)
         going = np.sign(speed_of(motion, self.name))
         step = np.maximum(np.diff(time_s, prepend=time_s[:1]), 0.0)
@@ -154,11 +155,13 @@ class Creep(Effect):
         return columns
 
     def coefficients(self) -> FloatArray:
-        """The amplitudes, arcsec."""
+        """Returns the amplitudes, arcsec."""
         return np.array([each.amplitude_arcsec for each in self.parts])
 
     def fitted(self, coefficients: FloatArray, shape: Mapping[str, float] | None = None) -> Self:
-        """Other amplitudes, and other time constants (``tau_s`` scales them all) and build-up where given."""
+        """Returns other amplitudes and, if given, other time constants (``tau_s`` scales them all) and
+        build-up.
+        """
         given = dict(shape or {})
         scale = given.pop("tau_s", self.parts[0].tau_s) / self.parts[0].tau_s
         parts = tuple(
@@ -168,16 +171,16 @@ class Creep(Effect):
         return self.model_copy(update={"parts": parts, **given})
 
     def bound_arcsec(self) -> float:
-        """Sum of the amplitudes."""
+        """Sum of the absolute amplitudes."""
         return sum(abs(each.amplitude_arcsec) for each in self.parts)
 
     def slope_bound_arcsec_per_deg(self) -> float:
-        """Zero: it depends on time and on the command's direction."""
+        """Zero, because it depends on time and on the command's direction."""
         return 0.0
 
 
 class _Tracker(Tracker):
-    """State: y_j and the time they are of."""
+    """State: y_j and the time they refer to."""
 
     __slots__ = ("_amplitudes", "_build_up", "_rates", "_strains", "_time")
 

@@ -1,4 +1,4 @@
-"""What an effect says of itself in tables: its words, its shapes, the part of a model that it is."""
+"""Descriptive tables of an effect: texts, shape parameters, and its part in a model."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from hdbridge.effects.motion import BoolArray
 
 
 class Part(Enum):
-    """A part of a model that other effects may scale, and so carry a copy of."""
+    """Part of a model that other effects may scale and therefore carry a copy of."""
 
     ORDERS = "ripple"
     """Orders of the motor angle."""
@@ -21,7 +21,7 @@ class Part(Enum):
 
 
 class Sought(Enum):
-    """The form of an effect whose place is found among all places at once, by a matched filter."""
+    """Form of an effect that a matched filter searches for at all locations simultaneously."""
 
     STEP = "a step in time"
     BUMP = "a bump at one load angle"
@@ -30,22 +30,22 @@ class Sought(Enum):
 
     @property
     def is_line(self) -> bool:
-        """Whether it is one sharp line of a spectrum, which nothing smooth resembles."""
+        """True for one sharp spectral line, which nothing smooth resembles."""
         return self in {Sought.TONE, Sought.LINE}
 
 
 class Moves(Enum):
-    """From where a local step improves a shape parameter."""
+    """Range from which a local step improves a shape parameter."""
 
     ANYWHERE = "anywhere"
     NEARBY = "nearby"
-    """Only from next to its best value, which has to be searched for."""
+    """Only from near its optimum, which must be found by a search."""
     NEVER = "never"
-    """The error does not depend on it smoothly."""
+    """The error does not depend smoothly on it."""
 
 
 class Experiment(NamedTuple):
-    """A measurement that separates a cause from another one."""
+    """Measurement that separates two causes."""
 
     minutes: float
     words: str
@@ -53,19 +53,19 @@ class Experiment(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Shape:
-    """A parameter that the effect is *not* linear in, with the range in which a fit may look for it."""
+    """Parameter that the effect is *not* linear in, with the range in which a fit searches."""
 
     name: str
     lower: float
     upper: float
     logarithmic: bool = False
-    """True where the fit should step in the logarithm (widths, time constants)."""
+    """True if the fit should step in the logarithm (widths, time constants)."""
     moves: Moves = Moves.ANYWHERE
     is_frequency: bool = False
-    """Whether it counts periods in time: how finely it is known depends on how long the record is."""
+    """True if it counts periods in time, so that its resolution depends on the length of the record."""
 
     def grid(self, points: int) -> tuple[float, ...]:
-        """So many values over its range, evenly spaced (in the logarithm where it is one)."""
+        """Returns ``points`` values over its range, evenly spaced (logarithmically if it is logarithmic)."""
         if points < 2:
             return (
                 math.sqrt(self.lower * self.upper) if self.logarithmic else 0.5 * (self.lower + self.upper),
@@ -78,33 +78,35 @@ class Shape:
 
 @dataclass(frozen=True, slots=True)
 class Cause:
-    """The effect in words, for reports and the generated page of the catalogue."""
+    """Texts about an effect, for reports and the generated page of the catalogue."""
 
     title: str
-    """A short name in the field's own terms."""
+    """Short name in standard terms."""
     equation: str
     """The law in plain text."""
     signature: str
-    """What one sees in a record."""
+    """Visible symptom in a record."""
     consequence: str
-    """What it does to the axis."""
+    """Consequence for the axis."""
     remedy: str
-    """What a person can do about it."""
+    """Advice to the user."""
     experiment: str
-    """The measurement that separates it from its look-alikes."""
+    """Measurement that separates it from similar causes."""
     aliases: tuple[str, ...] = ()
-    """Names of the causes it can be taken for."""
+    """Names of the causes it can be confused with."""
     source: str = ""
-    """Where the equation comes from."""
+    """Source of the equation."""
     size: str = ""
-    """How large it typically is."""
+    """Typical size."""
     apart: Mapping[str, Experiment] = field(default_factory=dict)
-    """By the name of another cause: the measurement that separates the two. Either of them may say it."""
+    """Measurement that separates it from another cause, by that cause's name. Either of the two may declare
+    it.
+    """
 
 
 @dataclass(frozen=True, slots=True)
 class Compensable:
-    """Whether the compensation should make up for an effect, and why (not)."""
+    """Decision whether the compensation should correct an effect, with the reason."""
 
     possible: bool
     why: str
@@ -112,21 +114,21 @@ class Compensable:
 
 @dataclass(frozen=True, slots=True)
 class Coefficient:
-    """What one coefficient, or a cosine with its sine, is called."""
+    """Name and place of one coefficient, or of a cosine with its sine."""
 
     name: str
-    """The parameter's, with the unit; of a cosine and a sine what stands before amplitude and phase."""
+    """Name of the parameter with its unit; for a cosine and sine the prefix of amplitude and phase."""
     columns: tuple[int, ...]
-    """Its place among the coefficients; of a cosine and a sine both."""
+    """Its column; both columns for a cosine and sine."""
     path: tuple[str | int, ...]
-    """Where the parameter stands in `Effect.parameters`; of a cosine and a sine where both do."""
+    """Path of the parameter in `Effect.parameters`; for a cosine and sine the path of their parent."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Stretch:
-    """Samples at which an effect must show if it is there at all, whatever else acts elsewhere."""
+    """Samples at which an effect must be visible if it is present, whatever else acts elsewhere."""
 
     rows: BoolArray
-    """Shape (n,)."""
+    """Mask of the samples, shape (n,)."""
     otherwise: str
-    """In words, what it is when it does not."""
+    """Reason to reject the effect if it is not visible there, for messages."""

@@ -1,4 +1,4 @@
-"""The synchronous part shifts with the direction of travel: other flanks of the teeth carry."""
+"""Shift of the synchronous part with the direction of travel, because other tooth flanks carry."""
 
 from __future__ import annotations
 
@@ -29,17 +29,19 @@ from hdbridge.effects.kinematics import direction_of
 from hdbridge.effects.orders import RAD_PER_DEG, Orders, horner, phasors, ripple
 
 STEEPEST = 3.0
-"""Of k shift = 72 deg: from there to 108 deg an order's mean is less than a third of the tooth error's."""
+"""Limit of tan(k shift), reached at k shift = 72 deg; up to 108 deg the mean is under a third
+of the order.
+"""
 
 
 class DirectionPhase(Effect):
-    """The part odd in direction of a tooth error T(theta_M + d shift), S being the mean over both flanks.
+    """Direction-odd part of a tooth error T(theta_M + d shift), S being the mean over both flanks.
 
-    An order A_k of the tooth error is A_k cos(k shift) in the mean, which is what the model's synchronous
-    part has, because that was fitted over both directions; and it is A_k sin(k shift) in the odd part. So the
-    odd part is tan(k shift) times the mean's order, a quarter of its turn ahead. The tangent is held at
-    `STEEPEST`: beyond, hardly anything of an order is left in the mean. One angle shifts all orders: a free
-    amplitude per order would be many parameters for one cause.
+    An order A_k of the tooth error appears as A_k cos(k shift) in the mean, which is the model's synchronous
+    part because that was fitted over both directions, and as A_k sin(k shift) in the odd part. The odd part
+    is therefore tan(k shift) times the mean's order, a quarter of its period ahead. The tangent is limited to
+    `STEEPEST`, beyond which hardly anything of an order is left in the mean. One angle shifts all orders: a
+    free amplitude per order would be many parameters for one cause.
     """
 
     name: ClassVar[str] = "direction_phase"
@@ -64,7 +66,7 @@ class DirectionPhase(Effect):
     carries: ClassVar[Mapping[Part, str]] = {Part.ORDERS: "orders"}
     curved: ClassVar[bool] = True
     typical: ClassVar[Mapping[str, Any]] = {"shift_deg": 1.0}
-    """A shift of one degree of the base's orders."""
+    """A shift of 1 degree of the base's orders."""
 
     orders: Orders
     shift_deg: Annotated[
@@ -74,37 +76,39 @@ class DirectionPhase(Effect):
 
     @classmethod
     def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[DirectionPhase]:  # noqa: ARG003
-        """From no shift on."""
+        """Yields a start at zero shift."""
         if has_orders(base):
             yield cls(orders=orders_of(base), shift_deg=0.0)
 
     def left_in_mean(self, order: int) -> float:
-        """Flanks that are a shift apart have a mean that is less than either, by the cosine of the shift."""
+        """Returns the cosine of the shift, because the mean of two shifted flanks is smaller than either."""
         return math.cos(order * math.radians(self.shift_deg))
 
     def named_coefficients(self) -> tuple[Coefficient, ...]:
-        """The shift."""
+        """Returns the name of the shift."""
         return (Coefficient("shift_deg", (0,), ("shift_deg",)),)
 
     def predict(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
-        """Error in arcsec, shape (n,)."""
+        """Returns the error in arcsec, shape (n,)."""
         return self.columns(motion, start)[:, 0] * self.shift_deg
 
     def tracker(self, start: Start = Start.VIRGIN) -> Tracker:
-        """On-line tracker; the direction comes with the moment."""
+        """Returns an on-line tracker; the direction comes from the moment."""
         return _Tracker(tuple(self.shift_deg * each for each in self._odd()), start.value)
 
     def columns(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
-        """Per degree of shift, *at the present shift*, shape (n, 1): nearly linear, so fit, and fit again."""
+        """Returns the effect per degree of shift *at the present shift*, shape (n, 1); nearly linear, so
+        iterate the fit.
+        """
         error: FloatArray = direction_of(motion, start) * ripple(motion.motor_deg, self._odd())
         return error[:, np.newaxis]
 
     def coefficients(self) -> FloatArray:
-        """The shift, degrees of the motor."""
+        """Returns the shift, motor degrees."""
         return np.array([self.shift_deg])
 
     def fitted(self, coefficients: FloatArray, shape: Mapping[str, float] | None = None) -> Self:
-        """Another shift."""
+        """Returns the effect with another shift."""
         return self.model_copy(update={"shift_deg": float(coefficients[0])})
 
     def bound_arcsec(self) -> float:
@@ -121,7 +125,9 @@ class DirectionPhase(Effect):
         return {"orders": orders_of(base)}
 
     def _odd(self) -> tuple[complex, ...]:
-        """Phasors of the odd part per degree of shift: j A_k tan(k shift) / shift exp(j phi_k)."""
+        """Returns the phasors of the odd part per degree of shift: j A_k tan(k shift) / shift
+        exp(j phi_k).
+        """
         given = phasors(self.orders)
         highest = len(given) - 1
         return tuple(1j * each * self._tangent(highest - i) for i, each in enumerate(given))

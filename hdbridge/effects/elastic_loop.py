@@ -1,12 +1,12 @@
-"""What the laws of the elastic loop share: offset, width and exponent, and the branch.
+"""Common base of the elastic-loop laws: offset, width and exponent, and the branch.
 
-The error is the offset times a loop of unit height (`_unit`), which is what one law has and another has not.
+The error is the offset times a loop of unit height (`_unit`), in which the laws differ.
 
-The offset has a sign. Positive: the load is ahead in the direction of motion, and the error rises along
-the path. Negative: the load lags, as it does behind friction at the load, and the error falls along the path.
-Then the load stands still until the gear has wound up in the other direction, so the fall is at most the
+The offset has a sign. Positive: the load leads in the direction of motion, and the error rises along the
+path. Negative: the load lags, as it does behind friction at the load, and the error falls along the path. In
+that case the load stands still until the gear has wound up in the other direction, so the fall is at most the
 gear's own slope, 3600 / N arcsec per motor degree. Just after a reversal the formula is steeper; there the
-inverse takes it with a slope that it can invert (`gentle_tracker`).
+inverse uses a slope that it can invert (`gentle_tracker`).
 """
 
 from __future__ import annotations
@@ -34,10 +34,10 @@ from hdbridge.effects.path import once
 
 
 def rise(xi: FloatArray, n: float) -> FloatArray:
-    """The branch g(xi): 0 at 0, 1 with zero slope at 1 and beyond.
+    """Returns the branch g(xi): 0 at 0, 1 with zero slope at 1 and beyond.
 
     g(xi) = (xi^(n-1) - (n-1) xi) / (2-n), and xi (1 - ln xi) for n = 2; written with expm1 so that it is
-    exact on both sides of n = 2 and through it.
+    exact at n = 2 and on both sides of it.
     """
     clipped = np.minimum(xi, 1.0)
     result = np.zeros_like(clipped)
@@ -50,7 +50,9 @@ def rise(xi: FloatArray, n: float) -> FloatArray:
 
 
 def rise_at(xi: float, n: float, steepest: float = math.inf) -> float:
-    """`rise` for one number, in plain floats for the control loop; nowhere above ``steepest`` times xi."""
+    """Returns `rise` for one number, in plain floats for the control loop, limited to
+    ``steepest`` times xi.
+    """
     if xi <= 0.0:
         return 0.0
     if xi >= 1.0:
@@ -62,7 +64,7 @@ def rise_at(xi: float, n: float, steepest: float = math.inf) -> float:
 
 
 class ElasticLoop(Effect):
-    """Base for laws of a loop between plus and minus the offset, homogeneous in it."""
+    """Base class of laws of a loop between plus and minus the offset, proportional to the offset."""
 
     compensable: ClassVar[Compensable] = Compensable(
         True, "the load really moves so, and the command says where it reverses"
@@ -75,7 +77,7 @@ class ElasticLoop(Effect):
     """A published gear of ratio 50."""
     part: ClassVar[Part | None] = Part.LOOP
     drifting: ClassVar[tuple[str, ...]] = ("offset_arcsec",)
-    """Preload settles, grease and friction change; width and exponent keep their shape."""
+    """Preload settles, grease and friction change; width and exponent stay."""
 
     offset_arcsec: Annotated[
         float,
@@ -89,36 +91,36 @@ class ElasticLoop(Effect):
     exponent: Annotated[float, Field(gt=1, le=6, description="shape n of the branch")]
 
     def predict(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
-        """Error in arcsec, shape (n,)."""
+        """Returns the error in arcsec, shape (n,)."""
         return self.offset_arcsec * self._loop(motion.motor_deg, start)
 
     def columns(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
-        """The loop of unit offset, shape (n, 1)."""
+        """Returns the loop of unit offset, shape (n, 1)."""
         return self._loop(motion.motor_deg, start)[:, np.newaxis]
 
     def coefficients(self) -> FloatArray:
-        """The offset, arcsec, shape (1,)."""
+        """Returns the offset, arcsec, shape (1,)."""
         return np.array([self.offset_arcsec])
 
     def named_coefficients(self) -> tuple[Coefficient, ...]:
-        """The offset."""
+        """Returns the name of the offset."""
         return (Coefficient("offset_arcsec", (0,), ("offset_arcsec",)),)
 
     def fitted(self, coefficients: FloatArray, shape: Mapping[str, float] | None = None) -> Self:
-        """Another offset, and another width and exponent where given."""
+        """Returns another offset and, if given, another width and exponent."""
         return self.model_copy(update={"offset_arcsec": float(coefficients[0]), **dict(shape or {})})
 
     def bound_arcsec(self) -> float:
-        """The offset's size."""
+        """Absolute offset."""
         return abs(self.offset_arcsec)
 
     def tracker(self, start: Start = Start.VIRGIN) -> Tracker:
-        """On-line tracker; its first `advance` only says where the motor stands."""
+        """Returns an on-line tracker; its first `advance` only sets the motor position."""
         return self._tracker(start, self.width_deg, math.inf)
 
     def slope_bound_arcsec_per_deg(self) -> float:
-        """Zero where the load leads: along its path the error only rises. Where it lags, the slope at a
-        reversal, which is without bound for exponents up to 2.
+        """Zero if the load leads, because the error only rises along its path. If it lags: the slope at a
+        reversal, which is unbounded for exponents up to 2.
         """
         if self.offset_arcsec >= 0.0:
             return 0.0
@@ -126,7 +128,7 @@ class ElasticLoop(Effect):
         return -2.0 * self.offset_arcsec / self.width_deg * (n - 1.0) / (n - 2.0) if n > 2.0 else math.inf
 
     def gentle_tracker(self, start: Start, fall_arcsec_per_deg: float) -> Tracker | None:
-        """Of a load that lags: the same branch, from each reversal on no steeper than that."""
+        """If the load lags, returns the same branch with its slope after each reversal limited to this."""
         if self.offset_arcsec >= 0.0:
             return None
         height = -2.0 * self.offset_arcsec
@@ -135,10 +137,10 @@ class ElasticLoop(Effect):
 
     @abstractmethod
     def _tracker(self, start: Start, width_deg: float, steepest: float) -> Tracker:
-        """A tracker with this width, whose branch rises by no more than ``steepest`` per width."""
+        """Returns a tracker with this width whose branch rises by at most ``steepest`` per width."""
 
     def _loop(self, motor_deg: FloatArray, start: Start) -> FloatArray:
-        """`_unit`, worked out once for all that carry this loop."""
+        """Returns `_unit`, computed once for all effects that carry this loop."""
         if not len(motor_deg):
             return np.empty(0)
         key = (self.name, self.width_deg, self.exponent, start)
@@ -146,4 +148,4 @@ class ElasticLoop(Effect):
 
     @abstractmethod
     def _unit(self, motor_deg: FloatArray, start: Start) -> FloatArray:
-        """The loop for an offset of one, shape (n,)."""
+        """Returns the loop for an offset of one, shape (n,)."""

@@ -1,4 +1,4 @@
-"""Errors that repeat with the wave generator's turn relative to the flexspline, which turns backwards."""
+"""Orders of the wave generator relative to the flexspline, which turns backwards."""
 
 from __future__ import annotations
 
@@ -40,13 +40,13 @@ class FlexsplineOrders(OrderSeries):
 
     @classmethod
     def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[FlexsplineOrders]:
-        """Orders 1 to 8, one each; what is found is put together afterwards."""
+        """Yields orders 1 to 8 one by one; those found are combined afterwards."""
         ratio = observations.ratio
         for number in missing_orders(cls(ratio=ratio, orders=orders_from(range(1, 9))), base):
             yield cls(ratio=ratio, orders=orders_from([number]))
 
     def coordinate(self, motion: Motion, ratio: float) -> Coordinate:
-        """The wave generator's angle, seen from the flexspline."""
+        """Returns the wave generator's angle relative to the flexspline."""
         angle = np.mod(motion.motor_deg * (1.0 + 1.0 / ratio), DEG_PER_TURN)
         return Coordinate("angle of the wave generator to the flexspline", "deg", angle)
 

@@ -1,7 +1,7 @@
-"""The nonlinear-elastic part: hysteresis of the flexspline after each reversal of the motor.
+"""Nonlinear-elastic part: hysteresis of the flexspline after each reversal of the motor.
 
-The law is the rolling-friction law of the transmission-error literature, made exact in three places where it
-is usually left open:
+The law is the rolling-friction law of the transmission-error literature, made exact in three places that are
+usually left open:
 
 * At a reversal the error is continuous: each branch starts from the value that the last one reached, and
   rises by ``2 offset g(xi)`` along the new direction until it meets the offset.
@@ -9,8 +9,8 @@ is usually left open:
   be a relay that jumps by twice the offset at each reversal.)
 * At rest the last direction holds.
 
-For 1 < n <= 2 the slope at the reversal is infinite, so a measured, quantised angle must not be fed in: one
-encoder count of chatter is several arcseconds. Drive it from the command.
+For 1 < n <= 2 the slope at the reversal is infinite, so a measured, quantised angle must not be used as
+input: one encoder count of chatter is several arcseconds. Drive it with the command.
 """
 
 from __future__ import annotations
@@ -35,7 +35,9 @@ from hdbridge.effects.path import path_of
 
 
 class Hysteresis(ElasticLoop):
-    """Continuous branches ``theta_rev + sgn 2 offset g(|theta_M - theta_M,rev| / width)``, to the offset."""
+    """Continuous branches ``theta_rev + sgn 2 offset g(|theta_M - theta_M,rev| / width)``, up
+    to the offset.
+    """
 
     name: ClassVar[str] = "hysteresis"
     about: ClassVar[Cause] = Cause(
@@ -56,7 +58,7 @@ class Hysteresis(ElasticLoop):
 
     @classmethod
     def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[Hysteresis]:  # noqa: ARG003
-        """Narrow, usual and wide, for a model without a loop."""
+        """Yields a narrow, a typical and a wide loop for a model without one."""
         if all(each.part is not Part.LOOP for each in base):
             for width in (3.0, 20.0, 60.0):
                 yield cls(offset_arcsec=1.0, width_deg=width, exponent=1.6)
@@ -65,7 +67,9 @@ class Hysteresis(ElasticLoop):
         return _HysteresisTracker(self.offset_arcsec, width_deg, self.exponent, start, steepest)
 
     def _unit(self, motor_deg: FloatArray, start: Start) -> FloatArray:
-        """The loop for an offset of one: a loop over the reversals, then all samples at once."""
+        """Returns the loop for an offset of one: a Python loop over the reversals, then all
+        samples at once.
+        """
         path = path_of(motor_deg, start)
         value = float(start.value)
         values = []
@@ -79,7 +83,7 @@ class Hysteresis(ElasticLoop):
         first = path.turning[0] + 1
         result = np.full(len(motor_deg), float(start.value))
         result[first:] = path.sense
-        # Only the samples that are less than the width away from the turn are not saturated.
+        # Only samples closer to the reversal than the width are not saturated.
         way_deg = np.abs(path.away_deg)
         near = np.flatnonzero(way_deg < self.width_deg)
         sense, begun = path.sense[near], np.repeat(values, path.lengths)[near]
@@ -93,8 +97,9 @@ class Hysteresis(ElasticLoop):
 
 
 class _HysteresisTracker(Tracker):
-    """State: the present branch (where it began, from which value, in which direction), the last angle, and
-    the value there; values are those of a loop of unit offset.
+    """State: the present branch (starting angle, starting value, direction), the last angle and its value.
+
+    Values are those of a loop of unit offset.
     """
 
     __slots__ = (
@@ -116,7 +121,7 @@ class _HysteresisTracker(Tracker):
 
     @property
     def memory_deg(self) -> float:
-        """From side to side it takes the width."""
+        """The width, which is the angle from side to side."""
         return self._width
 
     def peek(self, motor_deg: float, moment: Moment) -> float:
@@ -133,7 +138,7 @@ class _HysteresisTracker(Tracker):
             origin, value, virgin = last, self._value, self._virgin and self._sign == 0
         xi = abs(motor_deg - origin) / self._width
         if xi >= 1.0:
-            return float(sign)  # where every branch ends
+            return float(sign)  # end of every branch
         if virgin:
             height = rise_at(2.0 * xi, self._exponent, self._steepest)
         else:

@@ -1,19 +1,19 @@
-"""The elastic loop with return-point memory: an inner loop that closes is forgotten, the outer one goes on.
+"""Elastic loop with return-point memory: a closed inner loop is forgotten and the outer branch continues.
 
-The plain law (`hysteresis`) begins a new branch at each reversal and knows nothing of those before. Real
-friction in a mesh remembers: once a small excursion has been undone, the path goes on as if it had never
-been. This law has the same branch, offset, width and exponent, with Masing's rules:
+The plain law (`hysteresis`) begins a new branch at each reversal and forgets the earlier ones. Real friction
+in a mesh remembers: once a small excursion has been undone, the path continues as if it had never happened.
+This law has the same branch, offset, width and exponent, with Masing's rules:
 
 * from a reversal the branch is the virgin curve scaled by two,
   value_rev + sgn 2 offset g(|theta - theta_rev| / width);
-* when it comes back to the angle of the reversal before, the small loop is closed and both reversals are
-  forgotten: the path goes on along the branch on which it was before;
+* on return to the angle of the preceding reversal, the small loop is closed and both reversals are
+  forgotten: the path continues along the branch that it was on before;
 * the virgin curve is sgn offset g(2 |theta - theta_0| / width), which saturates at half the width.
 
 g is concave, so the same law is a Prandtl-Ishlinskii sum of stop operators with thresholds up to half the
 width.
 
-**In a model it stands in place of `hysteresis`** (`replaces`), not in addition: as a difference it would fall
+**In a model it replaces `hysteresis`** (`replaces`) instead of adding to it: as a difference it would fall
 infinitely steeply where the plain law rises, and would have to repeat the plain law's parameters.
 """
 
@@ -32,11 +32,13 @@ from hdbridge.effects.hysteresis import Hysteresis
 from hdbridge.effects.path import path_of
 
 _DEPTH = 200
-"""Reversals remembered; beyond it the innermost loop is forgotten early (a fraction of its own height)."""
+"""Number of remembered reversals; beyond it the innermost loop is forgotten early (a fraction
+of its height).
+"""
 
 
 class HysteresisMemory(ElasticLoop):
-    """Masing's rules over the branch of `Hysteresis`; stands in its place."""
+    """Masing's rules over the branch of `Hysteresis`; replaces it in a model."""
 
     name: ClassVar[str] = "hysteresis_memory"
     replaces: ClassVar[str] = "hysteresis"
@@ -61,27 +63,29 @@ class HysteresisMemory(ElasticLoop):
 
     @classmethod
     def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[HysteresisMemory]:  # noqa: ARG003
-        """The model's loop by this law, or by the other one."""
+        """Yields the model's plain loop under this law."""
         for each in base:
             if isinstance(each, Hysteresis):
                 yield cls(**each.parameters())
 
     @classmethod
     def of_change(cls, before: Effect, now: Effect) -> HysteresisMemory | None:
-        """Where another law had been taken for it."""
+        """Returns this cause if a different hysteresis law explains the change."""
         return now if isinstance(now, cls) and not isinstance(before, cls) else None
 
     @classmethod
     def _carried(cls, base: Sequence[Effect]) -> dict[str, Any]:
-        """The parameters of the model's plain law, else typical ones."""
+        """Returns the parameters of the model's plain law, else none."""
         for each in base:
             if isinstance(each, Hysteresis):
                 return each.parameters()
         return {}
 
     def _unit(self, motor_deg: FloatArray, start: Start) -> FloatArray:
-        """The loop for an offset of one: a loop over reversals, then all samples at once."""
-        # A saturated start is a direction, but what counts here is where the motion really turns.
+        """Returns the loop for an offset of one: a Python loop over the reversals, then all
+        samples at once.
+        """
+        # A saturated start is a direction, but only true reversals of the motion count here.
         path = path_of(motor_deg, start)
         turning, signs = path.turning, path.signs
         memory = _Memory(self.width_deg, self.exponent, float(motor_deg[0]), start.value)
@@ -108,12 +112,12 @@ class HysteresisMemory(ElasticLoop):
 
 
 def _reached(motor_deg: FloatArray, angle: float, begin: int, end: int, sign: int) -> int:
-    """First index at which a stretch that runs in direction ``sign`` has reached ``angle``."""
+    """Returns the first index at which a stretch in direction ``sign`` has reached ``angle``."""
     return bisect_left(motor_deg, sign * angle, begin, end, key=lambda each: sign * each)
 
 
 class _Segment(NamedTuple):
-    """A piece of path on one branch: value + sign (1 if virgin else 2) g(...), limited to one."""
+    """Segment of the path on one branch: value + sign (1 if virgin else 2) g(...), limited to one."""
 
     angle: float
     value: float
@@ -122,10 +126,10 @@ class _Segment(NamedTuple):
 
 
 class _Memory:
-    """The reversals that count, for a loop of unit offset; the outermost first.
+    """Remembered reversals of a loop of unit offset, outermost first.
 
-    ``_points`` holds pairs of angle and value; the last is where the present branch began, the one before it
-    where it closes. Empty: on the virgin curve through ``_origin`` in direction ``_sign``.
+    ``_points`` holds pairs of angle and value; the last is the start of the present branch, the one before it
+    is where the branch closes. If empty: on the virgin curve through ``_origin`` in direction ``_sign``.
     """
 
     __slots__ = ("_exponent", "_origin", "_points", "_sign", "_steepest", "_width")
@@ -142,16 +146,18 @@ class _Memory:
         self._origin = angle - 0.5 * start * width
 
     def branch(self, depth: int, sign: int) -> tuple[_Segment, float | None]:
-        """The branch at this depth, and the angle at which it closes."""
+        """Returns the branch at this depth, and the angle at which it closes (None for the virgin curve)."""
         if depth < 2:
             return _Segment(self._origin, 0.0, sign, True), None
         angle, value = self._points[depth - 1]
         return _Segment(angle, value, sign, False), self._points[depth - 2][0]
 
     def value_at(self, last: float, value: float, angle: float, sign: int) -> float:
-        """Value after going straight from ``last`` (where it is ``value``) to ``angle``; changes nothing."""
+        """Returns the value after a straight move from ``last`` (with ``value``) to ``angle``; changes
+        nothing.
+        """
         depth = len(self._points)
-        if sign == -self._sign:  # a reversal here: its own first branch, closing where the last one began
+        if sign == -self._sign:  # a reversal: first its own branch, which closes where the last one began
             if depth > _DEPTH:
                 depth -= 2
             closing = self._points[depth - 1][0] if depth else 2.0 * self._origin - last
@@ -168,14 +174,16 @@ class _Memory:
             depth -= 2
 
     def move(self, last: float, value: float, angle: float, sign: int) -> float:
-        """Go straight from ``last`` to ``angle``, keep what counts and return the value there."""
+        """Moves straight from ``last`` to ``angle``, updates the memory and returns the value there."""
         *_, (_, segment) = self._go(last, value, angle, sign)
         reached = self._on(segment, angle)
         self._settle(angle, reached, sign)
         return reached
 
     def walk(self, last: float, angle: float, sign: int) -> Iterator[tuple[float | None, _Segment]]:
-        """`move` for a record: the pieces of the path, each with the angle at which the next begins."""
+        """Does the same as `move` for a record; yields the segments of the path, each with the angle at which
+        it closes.
+        """
         value = self._value_here(last)
         segment = _Segment(0.0, 0.0, 0, False)
         for closing, segment in self._go(last, value, angle, sign):
@@ -205,11 +213,11 @@ class _Memory:
                 return
             yield closing, segment
             del points[-2:]
-            if len(points) < 2:  # back on the virgin curve: its mirror point is of no use any more
+            if len(points) < 2:  # back on the virgin curve: its mirror point is no longer needed
                 points.clear()
 
     def _settle(self, angle: float, value: float, sign: int) -> None:
-        """Saturated, nothing is left to remember."""
+        """Clears the memory at saturation."""
         if value == float(sign):
             self._points.clear()
             self._origin = angle - 0.5 * sign * self._width
@@ -241,7 +249,7 @@ class _MemoryTracker(Tracker):
 
     @property
     def memory_deg(self) -> float:
-        """From side to side it takes the width; then all inner loops are forgotten."""
+        """The width, which is the angle from side to side; after it all inner loops are forgotten."""
         return self._width
 
     def peek(self, motor_deg: float, moment: Moment) -> float:

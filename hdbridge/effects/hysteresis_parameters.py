@@ -1,4 +1,4 @@
-"""The elastic loop has changed: another offset, width or exponent than the model has."""
+"""Changed elastic loop: another offset, width or exponent than in the model."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ from hdbridge.effects.hysteresis import Hysteresis
 
 
 class HysteresisParameters(Effect):
-    """The loop with new parameters less the loop with the model's (`base`).
+    """Loop with new parameters minus the loop with the model's parameters (`base`).
 
     It names a change. When a model is extended by it, it does not become an entry of its own: the model's
-    loop takes over the new parameters (`combine.extended`). As an entry of its own it would
-    predict the same, but a difference of loops falls infinitely steeply where the old one rises, so that the
-    compensation cannot invert it.
+    loop takes the new parameters (`combine.extended`). A separate entry would predict the same, but a
+    difference of loops falls infinitely steeply where the old one rises, so the compensation could not invert
+    it.
     """
 
     name: ClassVar[str] = "hysteresis_parameters"
@@ -63,7 +63,7 @@ class HysteresisParameters(Effect):
 
     @classmethod
     def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[HysteresisParameters]:  # noqa: ARG003
-        """The model's loop, wider."""
+        """Yields the model's loop with a larger width."""
         if any(each.part is Part.LOOP for each in base):
             loop = loop_of(base)
             now = loop.model_dump(exclude={"memory"}) | {"width_deg": 1.6 * loop.width_deg}
@@ -71,55 +71,57 @@ class HysteresisParameters(Effect):
 
     @classmethod
     def of_change(cls, before: Effect, now: Effect) -> HysteresisParameters | None:
-        """Other parameters of one law."""
+        """Returns this cause if the parameters of one law have changed."""
         if before.part is not Part.LOOP or not isinstance(now, type(before)):
             return None
         return cls(base=loop_of([before]), **loop_of([now]).model_dump(exclude={"memory"}))
 
     def found_in(self, effects: Sequence[Effect]) -> Effect:
-        """From the loop that it was to the loop that the model has."""
+        """Returns the change from its own base to the loop that the model has."""
         return self.model_copy(update=loop_of(effects).model_dump(exclude={"memory"}))
 
     def changed(self) -> Loop:
-        """The loop as it is now."""
+        """Returns the loop with the new parameters."""
         return self.base.model_copy(
             update={each: getattr(self, each) for each in ("offset_arcsec", "width_deg", "exponent")}
         )
 
     def predict(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
-        """Error in arcsec, shape (n,)."""
+        """Returns the error in arcsec, shape (n,)."""
         return self.changed().law().predict(motion, start) - self.base.law().predict(motion, start)
 
     def tracker(self, start: Start = Start.VIRGIN) -> Tracker:
-        """On-line tracker of the difference."""
+        """Returns an on-line tracker of the difference."""
         return _Tracker(self.changed().law().tracker(start), self.base.law().tracker(start))
 
     def columns(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
-        """The loops of unit offset, new and old, shape (n, 2)."""
+        """Returns the loops of unit offset, new and old, shape (n, 2)."""
         new, old = self.changed().law(), self.base.law()
         return np.hstack([new.columns(motion, start), old.columns(motion, start)])
 
     def coefficients(self) -> FloatArray:
-        """The new offset, and less the old one."""
+        """Returns the new offset and minus the old one, arcsec."""
         return np.array([self.offset_arcsec, -self.base.offset_arcsec])
 
     def fitted(self, coefficients: FloatArray, shape: Mapping[str, float] | None = None) -> Self:
-        """Other offsets, and another new width and exponent where given."""
+        """Returns other offsets and, if given, another new width and exponent."""
         base = self.base.model_copy(update={"offset_arcsec": -float(coefficients[1])})
         update = {"offset_arcsec": float(coefficients[0]), "base": base, **dict(shape or {})}
         return self.model_copy(update=update)
 
     def bound_arcsec(self) -> float:
-        """Sum of the offsets' sizes."""
+        """Sum of the absolute offsets."""
         return abs(self.offset_arcsec) + abs(self.base.offset_arcsec)
 
     def slope_bound_arcsec_per_deg(self) -> float:
-        """No bound: where a loop that is taken off sets out infinitely steeply, the difference falls so."""
+        """Infinite if a loop is subtracted that starts infinitely steeply, because the difference then falls
+        as steeply.
+        """
         return math.inf if self.base.offset_arcsec > 0.0 or self.offset_arcsec < 0.0 else 0.0
 
     @classmethod
     def _carried(cls, base: Sequence[Effect]) -> dict[str, Any]:
-        """An offset larger by a fifth."""
+        """Returns an offset increased by 20 %."""
         loop = loop_of(base)
         changed = {**loop.model_dump(exclude={"memory"}), "offset_arcsec": 1.2 * loop.offset_arcsec}
         return {"base": loop, **changed}
@@ -134,7 +136,7 @@ class _Tracker(Tracker):
 
     @property
     def memory_deg(self) -> float:
-        """The longer of the two loops'."""
+        """The longer memory of the two loops."""
         return max(self._new.memory_deg, self._old.memory_deg)
 
     def peek(self, motor_deg: float, moment: Moment) -> float:

@@ -1,4 +1,4 @@
-"""Wind-up of the gear by the load's own inertia while it accelerates."""
+"""Wind-up of the gear by the load's own inertia during acceleration."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from hdbridge.units import ARCSEC_PER_DEG
 
 
 class InertialWindup(Linear):
-    """-(J / K) alpha_L: the load lags while it is sped up."""
+    """-(J / K) alpha_L: the load lags while it is accelerated."""
 
     name: ClassVar[str] = "inertial_windup"
     channels: ClassVar[frozenset[Channel]] = frozenset({Channel.ACCELERATION})
@@ -62,18 +62,19 @@ class InertialWindup(Linear):
 
     @classmethod
     def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[InertialWindup]:  # noqa: ARG003
-        """The one there is."""
+        """Yields the single candidate."""
         yield cls(ratio=observations.ratio, inertia_over_stiffness_s2=1e-5)
 
     def columns(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
-        """J / K of one second squared, shape (n, 1)."""
+        """Returns the effect of J / K = 1 s^2, shape (n, 1)."""
         limit = self.limit_deg_s2
         acceleration = np.clip(acceleration_of(motion, self.name), -limit, limit)
         return (-ARCSEC_PER_DEG / self.ratio * acceleration)[:, np.newaxis]
 
     def law_discrepancy(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
-        """The next term of the resonance that this law is far below: by J / K times the second derivative
-        of its wind-up the load swings beyond it, shape (n, 1).
+        """Returns the next term of the resonance, which this law neglects, shape (n, 1).
+
+        The load swings beyond the wind-up by J / K times the second time derivative of the wind-up.
         """
         beyond = np.zeros(len(motion))
         step_s = 0.0 if motion.time_s is None else float(np.median(np.diff(motion.time_s)))
@@ -83,16 +84,16 @@ class InertialWindup(Linear):
         return beyond[:, np.newaxis]
 
     def tracker(self, start: Start = Start.VIRGIN) -> Tracker:
-        """On-line tracker; acceleration comes with the moment."""
+        """Returns an on-line tracker; acceleration comes from the moment."""
         gain = -ARCSEC_PER_DEG / self.ratio * self.inertia_over_stiffness_s2
         return _Tracker(gain, self.limit_deg_s2)
 
     def bound_arcsec(self) -> float:
-        """The wind-up at the highest acceleration."""
+        """Wind-up at the highest acceleration."""
         return ARCSEC_PER_DEG / self.ratio * abs(self.inertia_over_stiffness_s2) * self.limit_deg_s2
 
     def slope_bound_arcsec_per_deg(self) -> float:
-        """Zero: the acceleration is the command's, whatever angle is asked about."""
+        """Zero, because the acceleration is the command's, independent of the angle."""
         return 0.0
 
 

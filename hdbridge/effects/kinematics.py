@@ -7,9 +7,9 @@ Backward differences over the samples' own time steps:
     d[i] = sign(theta[i] - theta[i-1]), held at rest
 
 A time step of zero gives a speed of zero. On line the angle is the uncompensated command (N times the load
-target): what the compensation adds is far slower than the motion, and feeding it back would difference each
-cycle's correction into the next. A record that knows its speed better (from the procedure, or smoothed from
-the load encoder) gives it in `Motion`, and then it is taken as it is.
+target): the compensation is far slower than the motion, and feeding it back would difference each cycle's
+correction into the next. If a record has a better speed (from the procedure, or smoothed from the load
+encoder), `Motion` holds it and it is used directly.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ from hdbridge.effects.base import AT_REST, MEASURED, Channel, FloatArray, Moment
 
 
 def speed_of(motion: Motion, effect: str) -> FloatArray:
-    """Motor speed in degrees of the motor per second, shape (n,)."""
+    """Returns the motor speed, motor degrees per second, shape (n,)."""
     if motion.motor_speed_deg_s is not None:
         return motion.motor_speed_deg_s
     return _differences(motion.motor_deg, _time(motion, effect, Channel.SPEED))
 
 
 def acceleration_of(motion: Motion, effect: str) -> FloatArray:
-    """Motor acceleration in degrees of the motor per second squared, shape (n,)."""
+    """Returns the motor acceleration, motor degrees per second squared, shape (n,)."""
     if motion.motor_acceleration_deg_s2 is not None:
         return motion.motor_acceleration_deg_s2
     time_s = _time(motion, effect, Channel.ACCELERATION)
@@ -39,7 +39,7 @@ def acceleration_of(motion: Motion, effect: str) -> FloatArray:
 
 
 def direction_of(motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
-    """Direction of the last motion, -1 or 1, held at rest; before the first motion what ``start`` says."""
+    """Returns the direction of the last motion, -1 or 1, held at rest; ``start`` before the first motion."""
     if motion.motor_speed_deg_s is not None:
         signs = np.sign(motion.motor_speed_deg_s)
     else:
@@ -63,7 +63,9 @@ def _differences(values: FloatArray, time_s: FloatArray) -> FloatArray:
 
 
 class Observer:
-    """Makes the `Moment` of each control cycle from the command; the on-line side of this file."""
+    """Builds the `Moment` of each control cycle from the command: the on-line counterpart of the functions
+    above.
+    """
 
     __slots__ = ("_angle", "_count", "_direction", "_speed", "_time")
 
@@ -80,9 +82,10 @@ class Observer:
         measured: tuple[float, ...] = AT_REST,
         load_deg: float = 0.0,
     ) -> Moment:
-        """One call per cycle; ``motor_deg`` is the uncompensated command, N times the load target.
+        """Returns the moment of a cycle; call once per cycle.
 
-        ``measured`` is `Moment.measured`.
+        ``motor_deg`` is the uncompensated command, N times the load target; ``measured`` is
+        `Moment.measured`.
         """
         speed = acceleration = 0.0
         if self._count:
@@ -100,7 +103,7 @@ class Observer:
 
 
 def moments(motion: Motion) -> Iterator[Moment]:
-    """A record as the control loop would have seen it, sample by sample (channels not there: defaults)."""
+    """Yields a record's moments as the control loop would have seen them (defaults for missing channels)."""
     here = motion.available()
     zeros = np.zeros(len(motion))
     known = [motion.measured.get(each, zeros + each.at_rest).tolist() for each in MEASURED]

@@ -1,4 +1,6 @@
-"""Errors that repeat with every turn of the load: the load encoder's run-out, or the spline's pitch."""
+"""Errors that repeat with every turn of the load: eccentricity of the load encoder, or pitch of
+the spline.
+"""
 
 from __future__ import annotations
 
@@ -70,13 +72,13 @@ class LoadOrders(OrderSeries):
 
     @classmethod
     def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[LoadOrders]:
-        """Orders 1 to 4, one each; what is found is put together afterwards."""
+        """Yields orders 1 to 4 one by one; those found are combined afterwards."""
         ratio = observations.ratio
         for number in missing_orders(cls(ratio=ratio, orders=orders_from(range(1, 5))), base):
             yield cls(ratio=ratio, orders=orders_from([number]))
 
     def coordinate(self, motion: Motion, ratio: float) -> Coordinate:
-        """The load's angle."""
+        """Returns the load angle."""
         return replace(over.load_angle(motion, ratio), bins=120)
 
     def turns_per_motor_turn(self) -> float:
@@ -84,5 +86,5 @@ class LoadOrders(OrderSeries):
         return 1.0 / self.ratio
 
     def is_compensable(self) -> bool:
-        """Only where it is known that the load moves so."""
+        """Returns True only if the gear is known to be the origin, so that the load really moves."""
         return self.origin == "gear"

@@ -1,4 +1,4 @@
-"""A bump at one load angle: a damaged tooth."""
+"""Bump at one load angle: a damaged tooth."""
 
 from __future__ import annotations
 
@@ -34,11 +34,11 @@ from hdbridge.units import DEG_PER_TURN
 
 PASSES = 3
 OTHER_SPEED = 1.5
-"""It must have been met so often, and in both directions or at speeds that differ by this factor."""
+"""Minimum number of passes, which must be in both directions or at speeds that differ by this factor."""
 
 
 FORM = 0.07
-"""Share of its height by which a real one differs from the formula."""
+"""Share of its height by which a real bump deviates from the formula."""
 
 
 class LocalDefect(Linear):
@@ -70,10 +70,10 @@ class LocalDefect(Linear):
     usual: ClassVar[int] = 2
     sought: ClassVar[Sought | None] = Sought.BUMP
     inexact: ClassVar[float] = 0.15
-    """No damaged tooth makes just this bump."""
+    """The bump of a real damaged tooth never has exactly this form."""
     linear: ClassVar[tuple[str, ...]] = ("height_arcsec",)
     typical: ClassVar[Mapping[str, Any]] = {"height_arcsec": 5.0, "centre_deg": 0.0, "half_width_deg": 3.6}
-    """Five arcsec, a tooth of 3.6 degrees wide."""
+    """Height of 5 arcsec, tooth half width of 3.6 degrees."""
 
     ratio: Ratio
     height_arcsec: Annotated[float, Field(ge=-3600, le=3600, description="height of the bump")]
@@ -84,23 +84,25 @@ class LocalDefect(Linear):
 
     @classmethod
     def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[LocalDefect]:  # noqa: ARG003
-        """A tooth in the middle of the travel, as an example."""
+        """Yields a tooth in the middle of the travel, as an example."""
         load = float(np.median(observations.motion.motor_deg)) / observations.ratio
         yield cls(
             ratio=observations.ratio, height_arcsec=1.0, centre_deg=load % DEG_PER_TURN, half_width_deg=3.6
         )
 
     def unidentifiable(self, observations: Observations) -> str:
-        """Passes that are all alike cannot distinguish a place from a moment of the move."""
+        """Requires varied passes, because identical ones cannot separate a location from a moment of the
+        move.
+        """
         return "" if self._is_met(observations) else "not passed often enough, or always alike"
 
     def _is_met(self, observations: Observations) -> bool:
-        """Whether the axis went over the place several times, in both directions or at different speeds."""
+        """Returns True if the axis passed the location several times, both ways or at different speeds."""
         motion = observations.motion
         if motion.motor_speed_deg_s is None or motion.time_s is None:
             return False
         turns = (motion.motor_deg / self.ratio - self.centre_deg) / DEG_PER_TURN
-        # Between two records the axis may have jumped over it: faster than it ever went.
+        # Between two records the axis may have skipped it, which shows as a speed that it never reached.
         steps, moved = np.diff(motion.time_s), np.abs(np.diff(motion.motor_deg))
         real = moved <= 3.0 * float(np.max(np.abs(motion.motor_speed_deg_s))) * steps
         speed = motion.motor_speed_deg_s[np.flatnonzero((np.diff(np.floor(turns)) != 0.0) & real)]
@@ -111,25 +113,27 @@ class LocalDefect(Linear):
         return both or float(np.max(fast)) > OTHER_SPEED * float(np.min(fast))
 
     def shows(self, motion: Motion) -> Stretch | None:
-        """Away from reversals, where a loop of another shape leaves bumps that lie at one angle too."""
+        """Returns the samples away from reversals, where a loop of another shape leaves no bumps at a fixed
+        angle.
+        """
         return away_from_reversals(motion)
 
     def changing(self, motion: Motion) -> FloatArray:
-        """The bumps next to it: a damaged tooth has none, and a wave has one to either side."""
+        """Returns the neighbouring bumps: a damaged tooth has none, a wave has one on either side."""
         apart = 2.0 * self.half_width_deg
         beside = [self.model_copy(update={"centre_deg": self.centre_deg + each}) for each in (-apart, apart)]
         return np.hstack([each.columns(motion) for each in beside])
 
     def coordinate(self, motion: Motion, ratio: float) -> Coordinate:
-        """The load's angle."""
+        """Returns the load angle."""
         return replace(over.load_angle(motion, ratio), bins=120)
 
     def columns(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
-        """A bump of one arcsec, shape (n, 1)."""
+        """Returns a bump of 1 arcsec, shape (n, 1)."""
         return self._bump(motion, self.half_width_deg)[:, np.newaxis]
 
     def law_discrepancy(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
-        """A sharper top, or a wider foot, shape (n, 2)."""
+        """Returns a sharper top and a wider foot, shape (n, 2)."""
         widths = (0.5 * self.half_width_deg, 2.0 * self.half_width_deg)
         return FORM * self.height_arcsec * np.column_stack([self._bump(motion, each) for each in widths])
 
@@ -142,15 +146,15 @@ class LocalDefect(Linear):
         return bump
 
     def tracker(self, start: Start = Start.VIRGIN) -> Tracker:
-        """On-line tracker; it has no state."""
+        """Returns a stateless on-line tracker."""
         return _Tracker(self)
 
     def bound_arcsec(self) -> float:
-        """The height."""
+        """Absolute height."""
         return abs(self.height_arcsec)
 
     def slope_bound_arcsec_per_deg(self) -> float:
-        """The flank's steepest place."""
+        """Slope at the steepest point of the flank."""
         return 0.5 * math.pi * abs(self.height_arcsec) / self.half_width_deg / self.ratio
 
 

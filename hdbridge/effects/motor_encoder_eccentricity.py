@@ -1,4 +1,4 @@
-"""The motor encoder's disc runs out of true: the motor stands where the encoder is wrong about it."""
+"""Eccentricity of the motor encoder disc, whose reading error becomes a real motor position error."""
 
 from __future__ import annotations
 
@@ -45,14 +45,14 @@ class MotorEncoderEccentricity(OrderSeries):
         observations: Observations,  # noqa: ARG003
         base: Sequence[Effect],  # noqa: ARG003
     ) -> Iterator[MotorEncoderEccentricity]:
-        """Both orders, whether the model has them or not: they are of one disc."""
+        """Yields both orders, whether or not the model has them, because they come from one disc."""
         yield cls(orders=orders_from((1, 2)))
 
     @classmethod
     def of_change(cls, before: Effect, now: Effect) -> MotorEncoderEccentricity | None:
-        """Changed orders 1 and 2 of the model."""
+        """Returns this cause if orders 1 and 2 of the model have changed."""
         return cls._change(before, now)
 
     def turns_per_motor_turn(self) -> float:
-        """One: the disc is on the motor shaft."""
+        """One, because the disc is on the motor shaft."""
         return 1.0

@@ -1,4 +1,4 @@
-"""Further orders of the motor angle, in addition to those that the synchronous part of the model has."""
+"""Additional orders of the motor angle that the model's synchronous part lacks."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from hdbridge.effects.orders import HIGHEST_MOTOR_ORDER, OrderSeries, missing_or
 
 
 class MotorOrders(OrderSeries):
-    """Sum of A_k cos(k theta_M + phi_k) over orders that the model does not have."""
+    """Sum of A_k cos(k theta_M + phi_k) over orders that the model lacks."""
 
     name: ClassVar[str] = "motor_order"
     about: ClassVar[Cause] = Cause(
@@ -35,28 +35,28 @@ class MotorOrders(OrderSeries):
     compensable: ClassVar[Compensable] = Compensable(True, "the load really moves so, and it repeats")
     part: ClassVar[Part | None] = Part.ORDERS
     usual: ClassVar[int] = 4
-    """A worn bearing of the wave generator has several."""
+    """A worn wave generator bearing has several."""
     drifting: ClassVar[tuple[str, ...]] = ("orders",)
-    """As the synchronous part's."""
+    """The same as for the synchronous part."""
 
     def turns_per_motor_turn(self) -> float:
-        """One: it counts on the motor angle itself."""
+        """One, because the orders refer to the motor angle itself."""
         return 1.0
 
     @classmethod
     def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[MotorOrders]:  # noqa: ARG003
-        """One order each; what is found is put together afterwards."""
+        """Yields single orders; those found are combined afterwards."""
         for number in missing_orders(cls(orders=orders_from(range(1, HIGHEST_MOTOR_ORDER + 1))), base):
             yield cls(orders=orders_from([number]))
 
     @classmethod
     def of_change(cls, before: Effect, now: Effect) -> MotorOrders | None:
-        """Changed orders of the model."""
+        """Returns this cause if the model's orders have changed."""
         return cls._change(before, now)
 
     @classmethod
     def _carried(cls, base: Sequence[Effect]) -> dict[str, Any]:
-        """Those of orders 1 to 12 that the model does not have."""
+        """Returns those of orders 1 to 12 that the model lacks."""
         present = {order.order for each in base if isinstance(each, OrderSeries)
                    if each.turns_per_motor_turn() == 1.0 for order in each.orders}  # fmt: skip
         return {"orders": orders_from(k for k in range(1, 13) if k not in present)}

@@ -1,4 +1,4 @@
-"""What an effect may know of a record before anything is fitted: enough to propose itself, or to decline."""
+"""Properties of a record that an effect may use before any fit, to propose itself or to decline."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from hdbridge.effects.motion import Channel, Motion
 from hdbridge.effects.path import standing_s
 
 TOP: Final = 0.98
-"""Quantile of a channel's size that counts as its largest: single readings may be wrong."""
+"""Quantile of a channel's magnitude that counts as its maximum, because single readings may be wrong."""
 
 
 class Observations(Protocol):
-    """A record, as an effect sees it."""
+    """A record as seen by an effect."""
 
     @property
     def motion(self) -> Motion:
-        """What drove the axis."""
+        """Motion of the axis."""
         ...
 
     @property
@@ -28,28 +28,28 @@ class Observations(Protocol):
 
     @property
     def period_s(self) -> float:
-        """Median time between samples."""
+        """Median time between samples, s."""
         ...
 
     @property
     def reversals(self) -> int:
-        """Turns of the motor with travel on both sides."""
+        """Number of motor reversals with travel on both sides."""
         ...
 
     @property
     def motor_count_arcsec(self) -> float:
-        """One count of the motor encoder, at the load."""
+        """One count of the motor encoder at the load, arcsec."""
         ...
 
 
 def top_speed_deg_s(motion: Motion) -> float:
-    """The highest motor speed but for single samples; one turn a second where it is not known."""
+    """Returns the highest motor speed, ignoring outliers; one turn per second if the speed is not known."""
     speed = motion.motor_speed_deg_s
     return 360.0 if speed is None else float(np.quantile(np.abs(speed), 0.99))
 
 
 def top(motion: Motion, channel: Channel) -> float:
-    """The largest size of a measured channel; 0 where it was not measured, or never changes."""
+    """Returns the largest magnitude of a measured channel; 0 if it was not measured or never changes."""
     values = motion.measured.get(channel)
     if values is None or not float(np.ptp(values)) > 0.0:
         return 0.0
@@ -57,10 +57,10 @@ def top(motion: Motion, channel: Channel) -> float:
 
 
 def duration_s(motion: Motion) -> float:
-    """From the first to the last sample; 0 without a clock."""
+    """Returns the time from the first to the last sample, s; 0 without a clock."""
     return 0.0 if motion.time_s is None else float(np.ptp(motion.time_s))
 
 
 def longest_rest_s(motion: Motion) -> float:
-    """How long the axis stands still at most."""
+    """Returns the duration of the longest standstill, s."""
     return float(np.max(standing_s(motion), initial=0.0))

@@ -1,4 +1,4 @@
-"""Series of harmonics over an angle that turns with the motor: what all effects of orders share."""
+"""Harmonic series over an angle that turns with the motor: common base of all order effects."""
 
 from __future__ import annotations
 
@@ -27,8 +27,9 @@ from hdbridge.strictness import Strict
 
 RAD_PER_DEG = math.pi / 180.0
 HIGHEST_MOTOR_ORDER: Final = 24
-"""Orders of the motor that are looked for: six times the strongest one of a strain wave gear, order 4 (two
-contacts, two encoders' or bearings' harmonics of each)."""
+"""Highest motor order searched for: six times the strongest one of a strain wave gear, order 4 (two contacts,
+and harmonics of each from encoders or bearings).
+"""
 _ComplexArray = np.ndarray[tuple[int], np.dtype[np.complex128]]
 _Phasor = TypeVar("_Phasor", complex, _ComplexArray)
 
@@ -47,11 +48,11 @@ Orders = Annotated[
 
 
 class OrderSeries(Effect):
-    """Sum of A_k cos(k c theta_M + phi_k), where c says which angle the orders count on."""
+    """Sum of A_k cos(k c theta_M + phi_k), with c the turns of the reference angle per motor turn."""
 
     usual: ClassVar[int] = 2
     few: ClassVar[frozenset[int]] = frozenset()
-    """The orders that make sense, where only few do."""
+    """Permitted orders, if only a few make physical sense."""
 
     orders: Orders
 
@@ -67,27 +68,27 @@ class OrderSeries(Effect):
 
     @abstractmethod
     def turns_per_motor_turn(self) -> float:
-        """c: periods of order 1 per motor turn."""
+        """Returns c, the periods of order 1 per motor turn."""
 
     def predict(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
-        """Error in arcsec, shape (n,)."""
+        """Returns the error in arcsec, shape (n,)."""
         error: FloatArray = horner(phasors(self.orders), turn_of(self._scale() * motion.motor_deg)).real
         return error
 
     def tracker(self, start: Start = Start.VIRGIN) -> Tracker:
-        """On-line tracker; it has no state."""
+        """Returns a stateless on-line tracker."""
         return OrderTracker(phasors(self.orders), self._scale())
 
     def columns(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
-        """For each order its cosine and its sine, shape (n, 2 * orders)."""
+        """Returns cosine and sine of each order, shape (n, 2 * orders)."""
         return cosines_and_sines(self._scale() * motion.motor_deg, [each.order for each in self.orders])
 
     def coefficients(self) -> FloatArray:
-        """A cos(phi) and -A sin(phi) of each order, arcsec."""
+        """Returns A cos(phi) and -A sin(phi) of each order, arcsec."""
         return coefficients_of(self.orders)
 
     def fitted(self, coefficients: FloatArray, shape: Mapping[str, float] | None = None) -> Self:
-        """The same orders with amplitudes and phases from cosine and sine coefficients."""
+        """Returns the same orders with amplitudes and phases from cosine and sine coefficients."""
         return self.model_copy(update={"orders": orders_fitted(self.orders, coefficients)})
 
     def bound_arcsec(self) -> float:
@@ -99,15 +100,15 @@ class OrderSeries(Effect):
         return self._scale() * sum(each.order * each.amplitude_arcsec for each in self.orders)
 
     def shows(self, motion: Motion) -> Stretch | None:
-        """Away from reversals, where a loop of another shape leaves bumps that repeat with the angle too."""
+        """Returns the samples away from reversals, where a loop of another shape leaves no periodic bumps."""
         return away_from_reversals(motion)
 
     def pieces(self) -> tuple[Self, ...]:
-        """One order each."""
+        """Returns one effect per order."""
         return tuple(self.model_copy(update={"orders": (each,)}) for each in self.orders)
 
     def joined(self, other: Effect) -> Self | None:
-        """With the orders of another series over the same angle."""
+        """Returns the effect with the orders of two series over the same angle."""
         if other.name != self.name or not isinstance(other, OrderSeries):
             return None
         own = {each.order for each in self.orders}
@@ -116,26 +117,28 @@ class OrderSeries(Effect):
         return self.model_copy(update={"orders": orders})
 
     def largest_piece_arcsec(self) -> float:
-        """The largest amplitude: on an arc of its turn an order shows only a part of it."""
+        """Returns the largest amplitude, because on an arc of its turn an order shows only in part."""
         return max((each.amplitude_arcsec for each in self.orders), default=0.0)
 
     def waves(self) -> tuple[tuple[float, float, float], ...]:
-        """Its orders."""
+        """Returns its orders."""
         turns = self.turns_per_motor_turn()
         return tuple((each.order * turns, each.amplitude_arcsec, each.phase_deg) for each in self.orders)
 
     def named_coefficients(self) -> tuple[Coefficient, ...]:
-        """Amplitude and phase of each order."""
+        """Returns the names of amplitude and phase of each order."""
         return named_orders(self.orders)
 
     def tidied(self, ratio: float) -> Self:
-        """Without orders of no amplitude, whose phases mean nothing."""
+        """Removes orders without amplitude, whose phases have no meaning."""
         orders = tuple(each for each in self.orders if each.amplitude_arcsec > 1e-6)
         return self.model_copy(update={"orders": orders})
 
     @classmethod
     def _change(cls, before: Effect, now: Effect) -> Self | None:
-        """The orders by which two series of the motor's orders differ, as orders of this kind."""
+        """Returns the difference of two series of motor orders, as orders of this kind; None if there is
+        none.
+        """
         if not isinstance(before, OrderSeries) or not isinstance(now, type(before)):
             return None
         numbers = [each.order for each in before.orders]
@@ -149,7 +152,7 @@ class OrderSeries(Effect):
 
 
 def missing_orders(series: OrderSeries, base: Iterable[Effect]) -> Iterable[int]:
-    """The orders of a series that no series over the same angle in ``base`` has."""
+    """Returns the orders of a series that no series over the same angle in ``base`` has."""
     turns = series.turns_per_motor_turn()
     present = {
         order.order
@@ -161,7 +164,7 @@ def missing_orders(series: OrderSeries, base: Iterable[Effect]) -> Iterable[int]
 
 
 def named_orders(orders: Iterable[MotorOrder]) -> tuple[Coefficient, ...]:
-    """Names of cosine and sine of each order."""
+    """Returns the names of cosine and sine of each order."""
     return tuple(
         Coefficient(f"order_{each.order}_", (2 * i, 2 * i + 1), ("orders", i))
         for i, each in enumerate(orders)
@@ -169,12 +172,12 @@ def named_orders(orders: Iterable[MotorOrder]) -> tuple[Coefficient, ...]:
 
 
 def orders_from(numbers: Iterable[int], amplitude_arcsec: float = 1.0) -> tuple[MotorOrder, ...]:
-    """Harmonics of one amplitude and phase zero, to start a fit from."""
+    """Returns harmonics of one amplitude and zero phase, as the start of a fit."""
     return tuple(MotorOrder(order=each, amplitude_arcsec=amplitude_arcsec, phase_deg=0.0) for each in numbers)
 
 
 def cosines_and_sines(angle_rad: FloatArray, numbers: Sequence[int]) -> FloatArray:
-    """Columns cos(k angle), sin(k angle) for each k, shape (n, 2 * len(numbers))."""
+    """Returns columns cos(k angle), sin(k angle) for each k, shape (n, 2 * len(numbers))."""
     result = np.empty((2 * len(numbers), len(angle_rad))).T
     for at, number in enumerate(numbers):
         angle = number * angle_rad
@@ -184,7 +187,7 @@ def cosines_and_sines(angle_rad: FloatArray, numbers: Sequence[int]) -> FloatArr
 
 
 def coefficients_of(orders: Iterable[MotorOrder]) -> FloatArray:
-    """A cos(phi) and -A sin(phi) of each order, in the order of `cosines_and_sines`."""
+    """Returns A cos(phi) and -A sin(phi) of each order, in the order of `cosines_and_sines`."""
     pairs = [
         (each.amplitude_arcsec * math.cos(phase), -each.amplitude_arcsec * math.sin(phase))
         for each in orders
@@ -194,10 +197,10 @@ def coefficients_of(orders: Iterable[MotorOrder]) -> FloatArray:
 
 
 def orders_fitted(orders: Sequence[MotorOrder], coefficients: FloatArray) -> tuple[MotorOrder, ...]:
-    """The same orders with the amplitudes and phases that the coefficients say."""
+    """Returns the same orders with amplitudes and phases from the coefficients."""
     pairs = np.asarray(coefficients, dtype=np.float64).reshape(len(orders), 2)
     return tuple(
-        MotorOrder.model_construct(  # not validated: a fit may stray, `Effect.violations` tells
+        MotorOrder.model_construct(  # not validated: a fit may leave the range (`violations`)
             order=each.order,
             amplitude_arcsec=math.hypot(cosine, sine),
             phase_deg=math.degrees(math.atan2(-sine, cosine)),
@@ -207,13 +210,13 @@ def orders_fitted(orders: Sequence[MotorOrder], coefficients: FloatArray) -> tup
 
 
 def phasors(orders: Iterable[MotorOrder]) -> tuple[complex, ...]:
-    """Complex amplitudes from the highest order down to order 0, for `horner`."""
+    """Returns the complex amplitudes from the highest order down to order 0, for `horner`."""
     given = {each.order: cmath.rect(each.amplitude_arcsec, math.radians(each.phase_deg)) for each in orders}
     return tuple(given.get(order, 0j) for order in range(max(given, default=0), -1, -1))
 
 
 def ripple(motor_deg: FloatArray, amplitudes: tuple[complex, ...]) -> FloatArray:
-    """The orders of the motor together, arcsec, shape (n,); ``amplitudes`` as `phasors` has them."""
+    """Returns the sum of motor orders, arcsec, shape (n,); ``amplitudes`` as from `phasors`."""
 
     def make() -> FloatArray:
         return np.ascontiguousarray(horner(amplitudes, turn_of(RAD_PER_DEG * motor_deg)).real)
@@ -222,7 +225,9 @@ def ripple(motor_deg: FloatArray, amplitudes: tuple[complex, ...]) -> FloatArray
 
 
 def turn_of(angle_rad: FloatArray) -> _ComplexArray:
-    """exp(j angle), shape (n,): by a cosine and a sine, several times faster than numpy's complex one."""
+    """Returns exp(j angle), shape (n,), from cosine and sine, several times faster than numpy's
+    complex one.
+    """
     result = np.empty(len(angle_rad), dtype=np.complex128)
     np.cos(angle_rad, out=result.real)
     np.sin(angle_rad, out=result.imag)
@@ -230,9 +235,9 @@ def turn_of(angle_rad: FloatArray) -> _ComplexArray:
 
 
 def horner(amplitudes: tuple[complex, ...], turn: _Phasor) -> _Phasor:
-    """Polynomial in ``turn`` = exp(j theta), for one angle or for a whole record.
+    """Evaluates the polynomial in ``turn`` = exp(j theta), for one angle or for a whole record.
 
-    One exponential and a few multiplications per order is several times faster in the control loop than a
+    One exponential and a few multiplications per order are several times faster in the control loop than a
     cosine per order, and the same lines serve a record.
     """
     total = 0.0 * turn
@@ -242,7 +247,7 @@ def horner(amplitudes: tuple[complex, ...], turn: _Phasor) -> _Phasor:
 
 
 class OrderTracker(Memoryless):
-    """A series of harmonics on line; ``scale`` is radians of order 1 per motor degree."""
+    """On-line tracker of a series of harmonics; ``scale`` is radians of order 1 per motor degree."""
 
     __slots__ = ("_highest", "_lower", "_scale")
 
@@ -251,8 +256,8 @@ class OrderTracker(Memoryless):
         self._scale = scale
 
     def peek(self, motor_deg: float, moment: Moment) -> float:
-        """Error in arcsec at this motor angle."""
-        # `horner`, written out: it is asked several times in each control cycle.
+        """Returns the error at this motor angle, arcsec."""
+        # `horner`, inlined because it is called several times in each control cycle.
         turn = cmath.rect(1.0, self._scale * motor_deg)
         total = self._highest
         for amplitude in self._lower:

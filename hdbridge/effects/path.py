@@ -1,4 +1,4 @@
-"""A path of the motor cut where it reverses: what loops, dead zones and memory are made of."""
+"""Motor path divided at its reversals: the basis of loops, dead zones and memory."""
 
 from __future__ import annotations
 
@@ -13,32 +13,35 @@ from hdbridge.effects.described import Stretch
 from hdbridge.effects.motion import FloatArray, IntArray, Motion, Start
 
 LOOP_DEG: Final = 60.0
-"""Motor angle after a reversal within which an elastic loop is felt: three times the width of a published
-gear's loop."""
+"""Motor angle after a reversal within which an elastic loop is noticeable: three times the width of a
+published gear's loop.
+"""
 
 KEPT_BYTES: Final = 24_000_000
-"""Memory for quantities of every sample that are kept beside a path: three of a million samples."""
+"""Memory for cached per-sample quantities of a path, bytes: three of a million samples."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Path:
-    """A motor angle cut at its reversals; see `branches`."""
+    """Motor angle divided at its reversals; see `branches`."""
 
     turning: tuple[int, ...]
     signs: tuple[int, ...]
     lengths: IntArray
-    """Samples of each branch."""
+    """Number of samples of each branch."""
     steps_deg: FloatArray
     """Signed angle of each branch."""
     away_deg: FloatArray
-    """Of the samples after the first of ``turning``: signed angle from the turn that began their branch."""
+    """Signed angle from the reversal that began the branch, for the samples after the first of
+    ``turning``.
+    """
     sense: FloatArray
-    """Their direction."""
+    """Direction of the same samples."""
     _kept: dict[object, FloatArray] = field(default_factory=dict)
 
     @classmethod
     def of(cls, motor_deg: FloatArray, start: Start) -> Path:
-        """Take an angle of at least one sample apart."""
+        """Divides an angle of at least one sample."""
         turning, signs = branches(motor_deg, start)
         angles, lengths = motor_deg[turning], np.diff(turning)
         away = motor_deg[turning[0] + 1 :] - np.repeat(angles[:-1], lengths)
@@ -46,7 +49,7 @@ class Path:
         return cls(tuple(turning), tuple(signs), lengths, np.diff(angles), away, sense)
 
     def once(self, key: object, make: Callable[[], FloatArray]) -> FloatArray:
-        """The quantity ``key``, made only where it is not kept."""
+        """Returns the quantity ``key``; computes it only if it is not cached."""
         found = self._kept.pop(key, None)
         if found is None:
             found = make()
@@ -58,11 +61,11 @@ class Path:
 
 
 _PATHS: dict[tuple[int, bool], tuple[weakref.ref[FloatArray], Path]] = {}
-"""By the identity of the angle's array, as long as that is there."""
+"""Cache by the identity of the angle's array, for the lifetime of that array."""
 
 
 def path_of(motor_deg: FloatArray, start: Start) -> Path:
-    """`Path.of`; kept for an array that cannot be written to, of which a fit asks it a thousand times."""
+    """Returns `Path.of`, cached for read-only arrays, because a fit asks for it a thousand times."""
     if motor_deg.flags.writeable:
         return Path.of(motor_deg, start)
     key = (id(motor_deg), start is Start.VIRGIN)
@@ -75,10 +78,11 @@ def path_of(motor_deg: FloatArray, start: Start) -> Path:
 
 
 def once(motor_deg: FloatArray, start: Start, key: object, make: Callable[[], FloatArray]) -> FloatArray:
-    """What several effects work out from the same angle, by what it depends on besides; not to be written to.
+    """Returns a read-only quantity that several effects compute from the same angle, by a key of its
+    dependencies.
 
-    The elastic loop and the ripple are those of the model, of each effect that scales them, and of each
-    derivative by what these add to them. Kept for an array that cannot be written to.
+    The elastic loop and the ripple occur in the model, in each effect that scales them, and in each
+    derivative with respect to that scaling. Cached for read-only arrays.
     """
     if motor_deg.flags.writeable or not len(motor_deg):
         return make()
@@ -86,10 +90,10 @@ def once(motor_deg: FloatArray, start: Start, key: object, make: Callable[[], Fl
 
 
 def branches(motor_deg: FloatArray, start: Start = Start.VIRGIN) -> tuple[list[int], list[int]]:
-    """Indices between which the motor moves in one direction (rest included), and that direction.
+    """Returns the indices between which the motor moves in one direction (rest included), and the directions.
 
-    Returns ``turning`` of length b + 1 (first index, each turning point, last index) and ``signs`` of length
-    b. A saturated start counts as a direction: going on in it begins no new branch worth telling apart.
+    ``turning`` has length b + 1 (first index, each turning point, last index) and ``signs`` length b. A
+    saturated start counts as a direction: continuing in it begins no new branch.
     """
     steps = np.diff(motor_deg)
     moving = np.flatnonzero(steps)
@@ -106,7 +110,7 @@ def branches(motor_deg: FloatArray, start: Start = Start.VIRGIN) -> tuple[list[i
 
 
 def since_reversal_deg(motor_deg: FloatArray) -> FloatArray:
-    """Motor angle since the axis last reversed (or began), degrees, shape (n,)."""
+    """Returns the motor angle since the last reversal (or the start), degrees, shape (n,)."""
     turning, _ = branches(motor_deg)
     result = np.zeros(len(motor_deg))
     if len(turning) > 1:
@@ -116,13 +120,13 @@ def since_reversal_deg(motor_deg: FloatArray) -> FloatArray:
 
 
 def away_from_reversals(motion: Motion) -> Stretch:
-    """Where no elastic loop is felt, whatever its shape."""
+    """Returns the samples at which no elastic loop is noticeable, whatever its shape."""
     rows = since_reversal_deg(motion.motor_deg) > LOOP_DEG
     return Stretch(rows, "seen only where the axis reverses")
 
 
 def standing_s(motion: Motion) -> FloatArray:
-    """Time since the axis came to rest, seconds, shape (n,); 0 in motion, and at unknown speed."""
+    """Returns the time since the axis came to rest, s, shape (n,); 0 in motion and at unknown speed."""
     if motion.motor_speed_deg_s is None or motion.time_s is None:
         return np.zeros(len(motion))
     moving = motion.motor_speed_deg_s != 0.0

@@ -1,4 +1,4 @@
-"""The stop operator: follows the motor, limited to plus or minus one; the building block of dead zones."""
+"""Stop operator: follows the motor, limited to plus or minus one; the building block of dead zones."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from hdbridge.effects.path import path_of
 
 
 def stop(motor_deg: FloatArray, width_deg: float, start: Start) -> FloatArray:
-    """s[i] = clip(s[i-1] + 2 (theta[i] - theta[i-1]) / width, -1, 1), shape (n,); linear time.
+    """Returns s[i] = clip(s[i-1] + 2 (theta[i] - theta[i-1]) / width, -1, 1), shape (n,); linear time.
 
-    Between two reversals nothing is lost by clipping only once, so only the reversals are a loop.
+    Between two reversals it suffices to clip once, so only the reversals need a Python loop.
     """
     if not len(motor_deg):
         return np.empty(0)
@@ -32,7 +32,7 @@ def stop(motor_deg: FloatArray, width_deg: float, start: Start) -> FloatArray:
 
 
 class Stop:
-    """The same on line: `at` asks, `to` moves."""
+    """On-line stop operator: `at` evaluates, `to` moves."""
 
     __slots__ = ("_angle", "_gain", "_value")
 
@@ -47,14 +47,14 @@ class Stop:
         return 2.0 / self._gain
 
     def at(self, motor_deg: float) -> float:
-        """Value after going straight to ``motor_deg``; changes nothing."""
+        """Returns the value after a straight move to ``motor_deg``; changes nothing."""
         if self._angle is None:
             return self._value
         value = self._value + self._gain * (motor_deg - self._angle)
         return 1.0 if value > 1.0 else -1.0 if value < -1.0 else value
 
     def to(self, motor_deg: float) -> float:
-        """Move to ``motor_deg`` and return the value there."""
+        """Moves to ``motor_deg`` and returns the value there."""
         self._value = self.at(motor_deg)
         self._angle = motor_deg
         return self._value

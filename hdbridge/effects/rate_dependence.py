@@ -1,4 +1,4 @@
-"""The elastic loop grows with speed: friction rises with the logarithm of the sliding rate."""
+"""Growth of the elastic loop with speed: friction rises with the logarithm of the sliding rate."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from hdbridge.effects.observations import top_speed_deg_s
 
 
 class RateDependence(Linear):
-    """growth log10(1 + |v| / reference) H: nothing at rest, ``growth`` per decade above the reference."""
+    """growth log10(1 + |v| / reference) H: zero at rest, ``growth`` per decade above the reference."""
 
     name: ClassVar[str] = "rate_dependence"
     channels: ClassVar[frozenset[Channel]] = frozenset({Channel.SPEED})
@@ -53,7 +53,7 @@ class RateDependence(Linear):
     carries: ClassVar[Mapping[Part, str]] = {Part.LOOP: "loop"}
     linear: ClassVar[tuple[str, ...]] = ("growth_percent",)
     typical: ClassVar[Mapping[str, Any]] = {"growth_percent": 10.0, "reference_deg_s": 30.0}
-    """Ten per cent per decade."""
+    """10 % per decade."""
 
     loop: Annotated[Loop, Field(description="the model's loop")]
     growth_percent: Annotated[float, Field(ge=0, le=200, description="growth per decade of speed")]
@@ -64,7 +64,7 @@ class RateDependence(Linear):
 
     @classmethod
     def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[RateDependence]:
-        """Growing from far below the speeds of the record on, and from nearly there."""
+        """Yields growth from far below the speeds of the record, and from just below them."""
         fastest = top_speed_deg_s(observations.motion)
         if has_loop(base):
             for share in (0.02, 0.2):
@@ -74,43 +74,45 @@ class RateDependence(Linear):
                 )  # fmt: skip
 
     def coordinate(self, motion: Motion, ratio: float) -> Coordinate:
-        """The speed, whichever way."""
+        """Returns the absolute speed."""
         speed = np.abs(speed_of(motion, self.name))
         return Coordinate("speed, forward or backward", "motor deg/s", speed, spacing=Spacing.FILLED)
 
     def scales(self) -> tuple[Part, Effect]:
-        """The loop."""
+        """Returns the loop."""
         return Part.LOOP, self.loop.law()
 
     def columns(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
-        """A growth of one per cent, shape (n, 1)."""
+        """Returns the effect of 1 % growth, shape (n, 1)."""
         speed = np.minimum(np.abs(speed_of(motion, self.name)), self.limit_deg_s)
         rate = np.log1p(speed / self.reference_deg_s) * (0.01 / math.log(10.0))
         return (rate * self.loop.law().predict(motion, start))[:, np.newaxis]
 
     def tracker(self, start: Start = Start.VIRGIN) -> Tracker:
-        """On-line tracker; speed comes with the moment."""
+        """Returns an on-line tracker; speed comes from the moment."""
         return _Tracker(self, self.loop.law().tracker(start))
 
     def bound_arcsec(self) -> float:
-        """The growth at the highest speed."""
+        """Growth at the highest speed."""
         return self._most() * abs(self.loop.offset_arcsec)
 
     def slope_bound_arcsec_per_deg(self) -> float:
-        """Zero: a growing loop only rises along its path. One that shrinks, or in which the load lags, falls
-        as steeply as the loop sets out.
+        """Zero for a growing loop, which only rises along its path. A shrinking loop, or one in which the
+        load lags, falls as steeply as the loop starts.
         """
         return 0.0 if self.growth_percent * self.loop.offset_arcsec >= 0.0 else math.inf
 
     def gentle_tracker(self, start: Start, fall_arcsec_per_deg: float) -> Tracker | None:
-        """Where the load lags: of a loop that at the highest speed falls no steeper than that."""
+        """If the load lags, returns a tracker whose loop, at the highest speed, falls no more steeply than
+        this.
+        """
         if self.growth_percent <= 0.0:
             return None
         loop = self.loop.law().gentle_tracker(start, fall_arcsec_per_deg / self._most())
         return None if loop is None else _Tracker(self, loop)
 
     def _most(self) -> float:
-        """The share of the loop at the highest speed."""
+        """Returns the share of the loop at the highest speed."""
         return 0.01 * self.growth_percent * math.log10(1.0 + self.limit_deg_s / self.reference_deg_s)
 
     @classmethod
@@ -129,7 +131,7 @@ class _Tracker(Tracker):
 
     @property
     def memory_deg(self) -> float:
-        """The loop's."""
+        """Memory of the loop."""
         return self._loop.memory_deg
 
     def peek(self, motor_deg: float, moment: Moment) -> float:

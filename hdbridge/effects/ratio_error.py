@@ -1,4 +1,4 @@
-"""The gear ratio is not the one that the model has."""
+"""Gear ratio that differs from the model's."""
 
 from __future__ import annotations
 
@@ -49,46 +49,48 @@ class RatioError(Linear):
     )
     linear: ClassVar[tuple[str, ...]] = ("ramp_arcsec_per_turn",)
     typical: ClassVar[Mapping[str, Any]] = {"ramp_arcsec_per_turn": 2.592}
-    """A hundredth of a per cent of a ratio of 50."""
+    """0.01 % of a ratio of 50."""
 
     ramp_arcsec_per_turn: Annotated[float, Field(ge=-1e6, le=1e6, description="ramp per motor turn")]
     limit_deg: Annotated[float, Field(gt=0, le=1e9, description="motor angle beyond which it is held")] = 1e6
 
     def true_ratio(self, ratio: float) -> float:
-        """The ratio that would leave no ramp, where the model has ``ratio``."""
+        """Returns the ratio that would leave no ramp, for a model with ``ratio``."""
         return 1.0 / (1.0 / ratio + self.ramp_arcsec_per_turn / (DEG_PER_TURN * ARCSEC_PER_DEG))
 
     @classmethod
     def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[RatioError]:  # noqa: ARG003
-        """The one there is."""
+        """Yields the single candidate."""
         yield cls(ramp_arcsec_per_turn=1.0)
 
     def coordinate(self, motion: Motion, ratio: float) -> Coordinate:
-        """The load's angle over all turns."""
+        """Returns the load angle over all turns."""
         return over.position(motion, ratio)
 
     def changing(self, motion: Motion) -> FloatArray:
-        """Bends at a third and at two thirds of the travel: a wrong ratio has the same slope everywhere."""
+        """Returns bends at one third and two thirds of the travel: a wrong ratio has the same slope
+        everywhere.
+        """
         angle = motion.motor_deg
         low, span = float(np.min(angle)), float(np.ptp(angle))
         bends = [np.maximum(angle - low - share * span, 0.0) for share in (1.0 / 3.0, 2.0 / 3.0)]
         return np.column_stack(bends) / DEG_PER_TURN
 
     def columns(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
-        """One arcsec per motor turn, shape (n, 1)."""
+        """Returns the effect of 1 arcsec per motor turn, shape (n, 1)."""
         angle = np.clip(motion.motor_deg, -self.limit_deg, self.limit_deg)
         return (angle / DEG_PER_TURN)[:, np.newaxis]
 
     def tracker(self, start: Start = Start.VIRGIN) -> Tracker:
-        """On-line tracker; it has no state."""
+        """Returns a stateless on-line tracker."""
         return _Tracker(self.ramp_arcsec_per_turn / DEG_PER_TURN, self.limit_deg)
 
     def bound_arcsec(self) -> float:
-        """The ramp at the limit."""
+        """Ramp at the limit."""
         return abs(self.ramp_arcsec_per_turn) / DEG_PER_TURN * self.limit_deg
 
     def slope_bound_arcsec_per_deg(self) -> float:
-        """The ramp, where it falls."""
+        """Slope of the ramp, if it falls."""
         return max(-self.ramp_arcsec_per_turn, 0.0) / DEG_PER_TURN
 
 

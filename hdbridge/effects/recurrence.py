@@ -1,4 +1,4 @@
-"""First-order lags over a whole record: the exact step of an exponential, evenly sampled or not."""
+"""First-order lags over a whole record: the exact exponential step, for any sampling."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from hdbridge.effects.base import FloatArray
 
 
 def recurrence(decay: FloatArray, drive: FloatArray, first: float) -> FloatArray:
-    """y[0] = first, y[i] = decay[i] y[i-1] + drive[i]; shape (n,), linear time, any decay in [0, 1].
+    """Returns y[0] = first, y[i] = decay[i] y[i-1] + drive[i]; shape (n,), linear time, any decay in [0, 1].
 
-    That is a system of equations with two diagonals, the main one of ones: forward substitution (BLAS).
+    This is a bidiagonal system with a unit main diagonal, solved by forward substitution (BLAS).
     """
     from scipy.linalg.blas import dtbsv  # noqa: PLC0415 - a model is read and compensated without scipy
 
@@ -25,7 +25,9 @@ def recurrence(decay: FloatArray, drive: FloatArray, first: float) -> FloatArray
 
 
 def lagged(values: FloatArray, time_s: FloatArray, tau_s: float) -> FloatArray:
-    """First-order lag of a sampled quantity, held between samples; in equilibrium at the first."""
+    """Returns the first-order lag of a sampled quantity, held between samples; in equilibrium at the first
+    one.
+    """
     if not len(values):
         return np.empty(0)
     decay = np.exp(-np.maximum(np.diff(time_s, prepend=time_s[:1]), 0.0) / tau_s)

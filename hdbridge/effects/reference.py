@@ -1,8 +1,8 @@
-"""The temperature that a drift of amplitudes is counted from.
+"""Reference temperature of an amplitude drift.
 
-Ripple and loop that grow with warmth can be told at any temperature: amplitudes and growth at another one are
-others, and the sum is the same. It is told where the amplitudes are those of the model. At any other
-temperature the drift would look like a change of the model's own orders, or of its loop, in addition to it.
+Ripple and loop that grow with warmth can be expressed at any temperature: amplitudes and growth differ, and
+the sum is the same. The reference is chosen so that the amplitudes are those of the model. At any other
+temperature the drift would come with an apparent change of the model's own orders or loop.
 """
 
 from __future__ import annotations
@@ -22,25 +22,25 @@ from hdbridge.effects.rate_dependence import RateDependence
 from hdbridge.effects.synchronous import Synchronous
 
 REACH_K: Final = 30.0
-"""A model was measured at a temperature that is at most so far away from those of the record."""
+"""Maximum difference between the temperature of the model's calibration and those of the record; K."""
 
 
 @dataclass(frozen=True, slots=True)
 class Told:
-    """A model as it is at another temperature."""
+    """A model re-expressed at another reference temperature."""
 
     warmer_k: float
-    """Above the former reference."""
+    """Temperature above the former reference, K."""
     orders: FloatArray
     """Cosines and sines, arcsec."""
     offsets: FloatArray
-    """Of the loops that it has, arcsec."""
+    """Offsets of its loops, arcsec."""
     per_ripple: float
     per_loop: float
-    """A share of the former ripple, or loop, as a share of this one."""
+    """Factors that convert a share of the former ripple or loop into a share of the present one."""
 
     def counted(self, effect: Effect) -> Effect:
-        """An effect of the model, or one that is told as a share of it."""
+        """Re-expresses an effect of the model, or one that is given as a share of it."""
         if isinstance(effect, Synchronous):
             return effect.fitted(self.orders)
         if isinstance(effect, Hysteresis | HysteresisMemory):
@@ -57,12 +57,13 @@ def nearest(
     now: Sequence[Effect],
     given: Sequence[Effect],
 ) -> Told | None:
-    """The model ``now`` at the temperature at which it is nearest to the one ``given``.
+    """Returns ``now`` re-expressed at the temperature at which it is nearest to ``given``; None if
+    impossible.
 
-    ``growth_percent`` is that of ripple and loop per kelvin.
+    ``growth_percent`` is the growth of ripple and of loop per kelvin.
     """
     numbers = {order.order for each in now if isinstance(each, Synchronous) for order in each.orders}
-    # A fit that has not settled carries other orders than it has: growth is that of what is carried.
+    # A fit that has not settled may carry other orders than the model has: growth refers to the carried ones.
     ripple = coefficients_of(each for each in carried if each.order in numbers)
     loops = np.full(len(_offsets(now)), loop.offset_arcsec)
     if len(ripple) != len(_orders(now)):

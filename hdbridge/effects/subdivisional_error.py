@@ -1,4 +1,4 @@
-"""The load encoder interpolates between its lines, and its sine signals are not perfect sines."""
+"""Interpolation error of the load encoder, whose sine signals are not perfect sines."""
 
 from __future__ import annotations
 
@@ -43,14 +43,14 @@ from hdbridge.units import ARCSEC_PER_DEG, DEG_PER_TURN
 
 _HARMONICS = (1, 2, 4)
 LEAST_LINES = 256
-"""An encoder that interpolates has at least so many."""
+"""Minimum line count of an encoder that interpolates."""
 
 
 class SubdivisionalError(Effect):
     """Sum over k = 1, 2, 4 of A_k cos(k lines theta_L + phi_k).
 
-    The load angle has to be the predicted one, error included: a line is often only a few hundred arcsec
-    wide, so motor angle / N is not good enough; and the measured angle's own noise would invent the effect.
+    The load angle must be the predicted one, error included. A line is often only a few hundred arcsec wide,
+    so motor angle / N is not accurate enough, and the noise of the measured angle would imitate the effect.
     """
 
     name: ClassVar[str] = "subdivisional_error"
@@ -77,7 +77,7 @@ class SubdivisionalError(Effect):
     usual: ClassVar[int] = 2
     sought: ClassVar[Sought | None] = Sought.LINE
     typical: ClassVar[Mapping[str, Any]] = {"lines_per_turn": 9000, "orders": orders_from(_HARMONICS, 0.5)}
-    """9000 lines, as an example: the line count is a matter of search or of the data sheet."""
+    """9000 lines, as an example; the real line count comes from a search or the data sheet."""
 
     lines_per_turn: Annotated[int, Field(ge=16, le=10_000_000, description="signal periods per load turn")]
     orders: Orders
@@ -96,14 +96,14 @@ class SubdivisionalError(Effect):
         observations: Observations,
         base: Sequence[Effect],  # noqa: ARG003
     ) -> Iterator[SubdivisionalError]:
-        """One of as many lines as the record's samples lie within, as an example."""
+        """Yields one whose line spans a few samples of the record, as an example."""
         step_deg = float(np.median(np.abs(np.diff(observations.motion.motor_deg)))) / observations.ratio
         lines = round(DEG_PER_TURN / max(2.7 * step_deg, 0.02))
         yield cls(lines_per_turn=max(lines, 1800), orders=orders_from([1]))
 
     @classmethod
     def at_lines(cls, lines_per_turn: int) -> Iterator[SubdivisionalError]:
-        """Those of which this many periods per turn of the load can be one line."""
+        """Yields the effects of which this many periods per load turn can be a spectral line."""
         for numbers in ((1,), _HARMONICS):
             yield cls(lines_per_turn=lines_per_turn, orders=orders_from(numbers))
         for part in (2, 4):
@@ -112,39 +112,39 @@ class SubdivisionalError(Effect):
                 yield cls(lines_per_turn=lines_per_turn // part, orders=orders_from(few))
 
     def shows(self, motion: Motion) -> Stretch | None:
-        """Away from reversals, where a loop of another shape leaves bumps."""
+        """Returns the samples away from reversals, where a loop of another shape leaves no bumps."""
         return away_from_reversals(motion)
 
     def coordinate(self, motion: Motion, ratio: float) -> Coordinate:
-        """The load's angle within a line."""
+        """Returns the load angle within a line."""
         line_deg = DEG_PER_TURN / self.lines_per_turn
         load = motion.load_deg if motion.load_deg is not None else motion.motor_deg / ratio
         name = f"load angle within a division of {line_deg * ARCSEC_PER_DEG:.4g} arcsec"
         return Coordinate(name, "arcsec", np.mod(load, line_deg) * ARCSEC_PER_DEG, bins=48)
 
     def named_coefficients(self) -> tuple[Coefficient, ...]:
-        """Amplitude and phase of each order."""
+        """Returns the names of amplitude and phase of each order."""
         return named_orders(self.orders)
 
     def predict(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
-        """Error in arcsec, shape (n,)."""
+        """Returns the error in arcsec, shape (n,)."""
         error: FloatArray = horner(phasors(self.orders), np.exp(1j * self._angle(motion))).real
         return error
 
     def tracker(self, start: Start = Start.VIRGIN) -> Tracker:
-        """On-line tracker; the load angle comes with the moment."""
+        """Returns an on-line tracker; the load angle comes from the moment."""
         return _Tracker(phasors(self.orders), RAD_PER_DEG * self.lines_per_turn)
 
     def columns(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
-        """For each order its cosine and its sine, shape (n, 2 * orders)."""
+        """Returns cosine and sine of each order, shape (n, 2 * orders)."""
         return cosines_and_sines(self._angle(motion), [each.order for each in self.orders])
 
     def coefficients(self) -> FloatArray:
-        """A cos(phi) and -A sin(phi) of each order, arcsec."""
+        """Returns A cos(phi) and -A sin(phi) of each order, arcsec."""
         return coefficients_of(self.orders)
 
     def fitted(self, coefficients: FloatArray, shape: Mapping[str, float] | None = None) -> Self:
-        """Other amplitudes and phases; another line count where given in ``shape``."""
+        """Returns other amplitudes and phases and, if given in ``shape``, another line count."""
         update = {"orders": orders_fitted(self.orders, coefficients), **dict(shape or {})}
         return self.model_copy(update=update)
 
@@ -153,7 +153,9 @@ class SubdivisionalError(Effect):
         return sum(each.amplitude_arcsec for each in self.orders)
 
     def slope_bound_arcsec_per_deg(self) -> float:
-        """Zero: the load angle is the predicted one of the moment, whatever angle is asked about."""
+        """Zero, because the load angle is the moment's predicted one, independent of the motor
+        angle tried.
+        """
         return 0.0
 
     def _angle(self, motion: Motion) -> FloatArray:

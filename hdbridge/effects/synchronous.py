@@ -1,4 +1,4 @@
-"""The synchronous part: errors that repeat with every turn of the motor (the wave generator)."""
+"""Synchronous part: errors that repeat with every turn of the motor (the wave generator)."""
 
 from __future__ import annotations
 
@@ -42,9 +42,9 @@ class Synchronous(OrderSeries):
 
     @classmethod
     def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[Synchronous]:  # noqa: ARG003
-        """None: its orders are read off a spectrum."""
+        """Yields none, because its orders are read from a spectrum."""
         return iter(())
 
     def turns_per_motor_turn(self) -> float:
-        """One: it counts on the motor angle itself."""
+        """One, because the orders refer to the motor angle itself."""
         return 1.0

@@ -1,4 +1,4 @@
-"""What grows with torque: the channel, its limit, and a growth of the ripple."""
+"""Growth with torque: the torque channel, its limit, and the growth of the ripple."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ TorqueLimit = Annotated[
 
 
 def beyond_limit(effects: Iterable[object], motion: Motion) -> tuple[str, ...]:
-    """In words, the effects that are held because a record's torque goes beyond their range."""
+    """Describes the effects that are clamped because a record's torque exceeds their range."""
     lines = []
     for each in effects:
         name, limit_nm = getattr(each, "torque", None), getattr(each, "limit_nm", None)
@@ -45,7 +45,7 @@ def beyond_limit(effects: Iterable[object], motion: Motion) -> tuple[str, ...]:
 
 
 class TorqueGrowth(Strict):
-    """A growth of amplitudes with torque, of which `torque_modulation` has the fields too."""
+    """Growth of amplitudes with torque; `torque_modulation` has the same fields."""
 
     growth_percent_per_nm: Annotated[
         float, Field(ge=-1000, le=1000, description="growth of the amplitudes per Nm of the torque channel")
@@ -55,24 +55,26 @@ class TorqueGrowth(Strict):
     limit_nm: TorqueLimit = 100.0
 
     def load_nm(self, motion: Motion, effect: str) -> FloatArray:
-        """The torque that counts, shape (n,); InputError, naming the effect, where it was not measured."""
+        """Returns the effective torque, Nm, shape (n,); raises `InputError` naming ``effect`` if it is
+        missing.
+        """
         torque = np.clip(motion.channel(Channel(self.torque), effect), -self.limit_nm, self.limit_nm)
         return np.asarray(torque if self.signed else np.abs(torque))
 
     def load_at_nm(self, moment: Moment) -> float:
-        """The torque that counts at one moment."""
+        """Returns the effective torque at one moment, Nm."""
         torque = moment.measured[_SLOT[self.torque]]
         torque = min(max(torque, -self.limit_nm), self.limit_nm)
         return torque if self.signed else abs(torque)
 
     def factor(self, motion: Motion, effect: str) -> FloatArray:
-        """What the amplitudes are multiplied by, shape (n,)."""
+        """Returns the factor of the amplitudes, shape (n,)."""
         return np.asarray(1.0 + 0.01 * self.growth_percent_per_nm * self.load_nm(motion, effect))
 
     def factor_at(self, moment: Moment) -> float:
-        """The same at one moment."""
+        """Returns the factor of the amplitudes at one moment."""
         return 1.0 + 0.01 * self.growth_percent_per_nm * self.load_at_nm(moment)
 
     def most(self) -> float:
-        """The largest growth, as a share."""
+        """Returns the largest growth, as a share."""
         return 0.01 * abs(self.growth_percent_per_nm) * self.limit_nm

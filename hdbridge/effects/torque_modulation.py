@@ -1,4 +1,4 @@
-"""The synchronous part grows with load: the mesh deflects, and the wave generator's ripple with it."""
+"""Growth of the synchronous part with load, because the mesh deflects."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from hdbridge.effects.torque import TorqueGrowth
 
 
 class TorqueModulation(TorqueGrowth, Linear):
-    """growth |T| S(theta_M): all carried orders grow alike; carry fewer to let fewer grow."""
+    """growth |T| S(theta_M): all carried orders grow alike; to let fewer grow, carry fewer."""
 
     name: ClassVar[str] = "torque_modulation"
     channels: ClassVar[frozenset[Channel]] = frozenset({Channel.LOAD_TORQUE})
@@ -59,23 +59,23 @@ class TorqueModulation(TorqueGrowth, Linear):
     carries: ClassVar[Mapping[Part, str]] = {Part.ORDERS: "orders"}
     linear: ClassVar[tuple[str, ...]] = ("growth_percent_per_nm",)
     typical: ClassVar[Mapping[str, Any]] = {"growth_percent_per_nm": 1.0}
-    """One per cent per Nm of all orders."""
+    """1 % per Nm for all orders."""
 
     orders: Orders
 
     @classmethod
     def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[TorqueModulation]:
-        """With the torque and with its size, over the range that the record has."""
+        """Yields growth with the torque and with its magnitude, over the range of the record."""
         largest = top(observations.motion, Channel.LOAD_TORQUE)
         if not largest or not has_orders(base):
             return
-        # Beyond its limit an effect is held: the record's torques have to lie within.
+        # Beyond its limit an effect is clamped, so the record's torques must lie within.
         limit = max(TorqueGrowth.model_fields["limit_nm"].default, 2.0 * largest)
         for signed in (False, True):
             yield cls(orders=orders_of(base), growth_percent_per_nm=1.0, signed=signed, limit_nm=limit)
 
     def coordinate(self, motion: Motion, ratio: float) -> Coordinate:
-        """The torque, or its size."""
+        """Returns the torque, or its magnitude."""
         channel = Channel(self.torque)
         torque, name = motion.channel(channel, self.name), channel.title
         if self.signed:
@@ -83,29 +83,29 @@ class TorqueModulation(TorqueGrowth, Linear):
         return Coordinate(f"{name}, either direction", "Nm", np.abs(torque), spacing=Spacing.FILLED)
 
     def scales(self) -> tuple[Part, Effect]:
-        """The ripple."""
+        """Returns the ripple."""
         return Part.ORDERS, MotorOrders(orders=self.orders)
 
     def needs(self) -> frozenset[Channel]:
-        """The torque channel."""
+        """Returns the torque channel."""
         return frozenset({Channel(self.torque)})
 
     def columns(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
-        """A growth of one per cent per Nm, shape (n, 1)."""
+        """Returns the effect of a growth of 1 % per Nm, shape (n, 1)."""
         orders = ripple(motion.motor_deg, phasors(self.orders))
         column: FloatArray = 0.01 * self.load_nm(motion, self.name) * orders
         return column[:, np.newaxis]
 
     def tracker(self, start: Start = Start.VIRGIN) -> Tracker:
-        """On-line tracker; it has no state."""
+        """Returns a stateless on-line tracker."""
         return _Tracker(self)
 
     def bound_arcsec(self) -> float:
-        """The ripple's growth at the highest torque."""
+        """Growth of the ripple at the highest torque."""
         return self.most() * sum(each.amplitude_arcsec for each in self.orders)
 
     def slope_bound_arcsec_per_deg(self) -> float:
-        """The slope of the ripple's growth at the highest torque."""
+        """Slope of the ripple's growth at the highest torque."""
         return self.most() * RAD_PER_DEG * sum(each.order * each.amplitude_arcsec for each in self.orders)
 
     @classmethod

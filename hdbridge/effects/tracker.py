@@ -1,4 +1,4 @@
-"""An effect on line: asked about an angle as often as one likes, moved on once per cycle."""
+"""On-line evaluation of an effect: queried at any angle any number of times, advanced once per cycle."""
 
 from __future__ import annotations
 
@@ -8,36 +8,38 @@ from hdbridge.effects.motion import Moment
 
 
 class Tracker(ABC):
-    """An effect followed on line.
+    """On-line state of an effect.
 
-    `peek` answers "what would the error be at this motor angle, coming from the present state" as often as
-    it is asked; only `advance` moves the state on.
+    `peek` returns the error at a motor angle reached from the present state, as often as it is called. Only
+    `advance` changes the state.
     """
 
     __slots__ = ()
 
     @property
     def memory_deg(self) -> float:
-        """Motor angle that, run in one direction, makes the state independent of where it began.
+        """Motor angle that, run in one direction, makes the state independent of the start.
 
-        0 where the path is not remembered at all. Memory of time (creep, warmth) does not count.
+        0 if the path is not remembered at all. Memory in time (creep, warmth) does not count.
         """
         return 0.0
 
     @abstractmethod
     def peek(self, motor_deg: float, moment: Moment) -> float:
-        """Error in arcsec at the load if the motor moved straight to ``motor_deg``; changes nothing."""
+        """Returns the error at the load if the motor moved straight to ``motor_deg``, arcsec; changes
+        nothing.
+        """
 
     @abstractmethod
     def advance(self, motor_deg: float, moment: Moment) -> float:
-        """Move to ``motor_deg``, keep the new state and return the error in arcsec at the load."""
+        """Moves to ``motor_deg``, keeps the new state and returns the error at the load, arcsec."""
 
 
 class Memoryless(Tracker):
-    """Base for the trackers of effects without state: to advance is to peek."""
+    """Base class of trackers without state, for which `advance` equals `peek`."""
 
     __slots__ = ()
 
     def advance(self, motor_deg: float, moment: Moment) -> float:
-        """Same as `peek`."""
+        """Returns the same as `peek`."""
         return self.peek(motor_deg, moment)

@@ -28,20 +28,22 @@ from hdbridge.effects.kinematics import speed_of
 from hdbridge.effects.observations import top_speed_deg_s
 
 STRAIGHT = 20.0
-"""A drag whose shear speed is so many times the fastest there was differs from a straight line by less than
-this part of itself."""
+"""Ratio of shear speed to top speed above which the drag deviates from a straight line by less than 1/20."""
 
 
 EXPONENT = 0.58
-"""Standard deviation of the exponent of speed over shear speed. It lies between 0, an oil that does not thin,
-and 1, a paste that yields at one stress: so far from the law's 1, rms, if all are as likely."""
+"""Standard deviation of the exponent of speed over shear speed.
+
+It lies between 0, an oil without shear thinning, and 1, a paste with a yield stress: this is the rms distance
+from the law's 1 if all values are equally likely.
+"""
 
 
 class VelocityWindup(Linear):
-    """-(coulomb sgn(v) + viscous v / (1 + |v| / shear)): drag over stiffness; none of it at rest.
+    """-(coulomb sgn(v) + viscous v / (1 + |v| / shear)): drag over stiffness; zero at rest.
 
-    What remains of the dry friction at rest belongs to the elastic loop. The viscous part falls off with
-    shear: at the shear speed it is half of what it would be, far above it is constant.
+    Dry friction that remains at rest belongs to the elastic loop. The viscous part thins with shear: at the
+    shear speed it is half of the linear value, and far above it is constant.
     """
 
     name: ClassVar[str] = "velocity_windup"
@@ -63,14 +65,14 @@ class VelocityWindup(Linear):
     )
     shape: ClassVar[tuple[Shape, ...]] = (Shape("shear_deg_s", 10.0, 100_000.0, logarithmic=True),)
     nonnegative: ClassVar[bool] = True
-    """A drag never pushes. One that is not there would come out on either side of zero by chance."""
+    """A drag never pushes. An absent one would otherwise come out on either side of zero by chance."""
     linear: ClassVar[tuple[str, ...]] = ("coulomb_arcsec", "viscous_arcsec_s_per_deg")
     typical: ClassVar[Mapping[str, Any]] = {
         "coulomb_arcsec": 3.0,
         "viscous_arcsec_s_per_deg": 0.015,
         "shear_deg_s": 1000.0,
     }
-    """About ten arcsec at 1000 motor degrees per second."""
+    """About 10 arcsec at 1000 motor degrees per second."""
 
     coulomb_arcsec: Annotated[
         float, Field(ge=0, le=3600, description="dry drag over stiffness, while it moves")
@@ -87,7 +89,7 @@ class VelocityWindup(Linear):
 
     @classmethod
     def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[VelocityWindup]:  # noqa: ARG003
-        """Bent below, at and above the speeds of the record."""
+        """Yields drags that bend below, at and above the speeds of the record."""
         fastest = top_speed_deg_s(observations.motion)
         for share in (0.15, 1.0, 6.0):
             yield cls(
@@ -95,10 +97,10 @@ class VelocityWindup(Linear):
             )
 
     def unidentifiable(self, observations: Observations) -> str:
-        """One that does not bend is a delayed sample.
+        """Requires curvature, because a linear drag is indistinguishable from a delayed sample.
 
-        The dry part of such a drag is what counts leave: a command in whole counts is followed at a fixed
-        part of one, with the sign of the direction.
+        A small dry part is no evidence either: it can come from quantisation, because a command in whole
+        counts is followed with a fixed fraction of a count, with the sign of the direction.
         """
         speed = observations.motion.motor_speed_deg_s
         if speed is None or self.coulomb_arcsec > 0.5 * observations.motor_count_arcsec:
@@ -108,28 +110,28 @@ class VelocityWindup(Linear):
         return "a straight line in speed is a delay, not a drag"
 
     def columns(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
-        """Dry and viscous, shape (n, 2)."""
+        """Returns the dry and the viscous part, shape (n, 2)."""
         speed = np.clip(speed_of(motion, self.name), -self.limit_deg_s, self.limit_deg_s)
         return -np.column_stack([np.sign(speed), speed / (1.0 + np.abs(speed) / self.shear_deg_s)])
 
     def law_discrepancy(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
-        """The shear's exponent, which is one here, shape (n, 1)."""
+        """Returns the derivative with respect to the shear exponent, which is 1 here, shape (n, 1)."""
         speed = np.clip(speed_of(motion, self.name), -self.limit_deg_s, self.limit_deg_s)
         share = np.abs(speed) / self.shear_deg_s
         bent = share * np.log(np.maximum(share, 1e-300)) / (1.0 + share) ** 2
         return (EXPONENT * self.viscous_arcsec_s_per_deg * speed * bent)[:, np.newaxis]
 
     def tracker(self, start: Start = Start.VIRGIN) -> Tracker:
-        """On-line tracker; speed comes with the moment."""
+        """Returns an on-line tracker; speed comes from the moment."""
         return _Tracker(self)
 
     def bound_arcsec(self) -> float:
-        """The wind-up at the highest speed."""
+        """Wind-up at the highest speed."""
         viscous = self.limit_deg_s / (1.0 + self.limit_deg_s / self.shear_deg_s)
         return abs(self.coulomb_arcsec) + abs(self.viscous_arcsec_s_per_deg) * viscous
 
     def slope_bound_arcsec_per_deg(self) -> float:
-        """Zero: the speed is the command's, whatever angle is asked about."""
+        """Zero, because the speed is the command's, independent of the angle."""
         return 0.0
 
 

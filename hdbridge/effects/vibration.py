@@ -1,4 +1,4 @@
-"""A vibration at a fixed frequency in time: a fan, a pump, a neighbouring machine, a resonance."""
+"""Vibration at a fixed frequency in time: a fan, a pump, a neighbouring machine, a resonance."""
 
 from __future__ import annotations
 
@@ -62,9 +62,11 @@ class Vibration(Effect):
     usual: ClassVar[int] = 2
     sought: ClassVar[Sought | None] = Sought.TONE
     inexact: ClassVar[float] = 0.03
-    """No source keeps its frequency and amplitude exactly, and the gear's loop answers with others."""
+    """No source keeps its frequency and amplitude exactly, and the gear's loop responds at
+    other frequencies.
+    """
     typical: ClassVar[Mapping[str, Any]] = {"frequency_hz": 50.0, "amplitude_arcsec": 1.0, "phase_deg": 0.0}
-    """One arcsec at 50 Hz, as an example: the frequency is a matter of search."""
+    """1 arcsec at 50 Hz, as an example; the real frequency comes from a search."""
 
     frequency_hz: Annotated[float, Field(gt=0, le=1e5, description="frequency")]
     amplitude_arcsec: Annotated[float, Field(ge=0, le=3600, description="amplitude at the load")]
@@ -74,40 +76,40 @@ class Vibration(Effect):
 
     @classmethod
     def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[Vibration]:  # noqa: ARG003
-        """A fast one that the record can show, as an example."""
+        """Yields a fast vibration that the record can resolve, as an example."""
         fast_hz = 0.137 / max(observations.period_s, 1e-6)
         yield cls(frequency_hz=min(max(fast_hz, 0.3), 40.0), amplitude_arcsec=1.0, phase_deg=0.0)
 
     def coordinate(self, motion: Motion, ratio: float) -> Coordinate:
-        """Time within a period."""
+        """Returns the time within a period."""
         period_s = 1.0 / self.frequency_hz
         within = 1e3 * np.mod(motion.channel(Channel.TIME, self.name), period_s)
         return Coordinate(f"time within a period of {1e3 * period_s:.4g} ms", "ms", within, bins=48)
 
     def named_coefficients(self) -> tuple[Coefficient, ...]:
-        """Amplitude and phase."""
+        """Returns the names of amplitude and phase."""
         return (Coefficient("", (0, 1), ()),)
 
     def predict(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
-        """Error in arcsec, shape (n,)."""
+        """Returns the error in arcsec, shape (n,)."""
         error: FloatArray = self.amplitude_arcsec * np.cos(self._angle(motion) + math.radians(self.phase_deg))
         return error
 
     def tracker(self, start: Start = Start.VIRGIN) -> Tracker:
-        """On-line tracker; it has no state but the clock's."""
+        """Returns an on-line tracker; it depends only on the clock."""
         return _Tracker(self)
 
     def columns(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
-        """Cosine and sine, shape (n, 2)."""
+        """Returns cosine and sine, shape (n, 2)."""
         return cosines_and_sines(self._angle(motion), (1,))
 
     def coefficients(self) -> FloatArray:
-        """A cos(phase) and -A sin(phase), arcsec."""
+        """Returns A cos(phase) and -A sin(phase), arcsec."""
         phase = math.radians(self.phase_deg)
         return self.amplitude_arcsec * np.array([math.cos(phase), -math.sin(phase)])
 
     def fitted(self, coefficients: FloatArray, shape: Mapping[str, float] | None = None) -> Self:
-        """Another amplitude and phase, and another frequency where given."""
+        """Returns another amplitude and phase and, if given, another frequency."""
         cosine, sine = (float(each) for each in coefficients)
         update = {
             "amplitude_arcsec": math.hypot(cosine, sine),
@@ -121,7 +123,7 @@ class Vibration(Effect):
         return self.amplitude_arcsec
 
     def slope_bound_arcsec_per_deg(self) -> float:
-        """Zero: it depends on time alone."""
+        """Zero, because it depends on time alone."""
         return 0.0
 
     def _angle(self, motion: Motion) -> FloatArray:

@@ -1,4 +1,4 @@
-"""How warm the gear is: what the drifts are driven by."""
+"""Warmth of the gear, which drives the drifts."""
 
 from __future__ import annotations
 
@@ -23,18 +23,19 @@ from hdbridge.effects.observations import duration_s
 from hdbridge.effects.recurrence import lagged
 
 VARIES_K: Final = 0.3
-"""A temperature that changes by less drives nothing that could be seen."""
+"""Minimum temperature change with a visible effect; K."""
 QUICK_S: Final = (2.0, 15.0)
 SLOW_S: Final = (60.0, 240.0, 600.0, 1500.0, 4000.0)
 _TEMPERATURE = SLOT[Channel.TEMPERATURE]
 
 
 class Warmed(Effect):
-    """Base for effects that follow the gear's warmth: a temperature excess in kelvin, as a first-order lag.
+    """Base class of effects that follow the gear's warmth: a temperature excess in kelvin, as a first-order
+    lag.
 
-    Driven by the temperature channel: the gear follows the sensor with the time constant, in equilibrium
-    at the first sample; warmth is what it is above the reference. Where there is no sensor, driven by time:
-    the gear warms up from a cold start at the first sample, by ``warm_up_k`` in the end.
+    Driven by the temperature channel, the gear follows the sensor with the time constant, in equilibrium at
+    the first sample; warmth is the excess over the reference. Without a sensor it is driven by time: the gear
+    warms up from a cold start at the first sample, finally by ``warm_up_k``.
     """
 
     channels: ClassVar[frozenset[Channel]] = frozenset({Channel.TIME})
@@ -57,10 +58,10 @@ class Warmed(Effect):
 
     @classmethod
     def lags(cls, observations: Observations) -> Iterator[tuple[Literal["temperature", "time"], float]]:
-        """What may drive it in a record, and with which time constants (s).
+        """Yields the possible drivers in a record and their time constants (s).
 
-        A sensor on the gear itself is hardly ahead of it. Without one, what settles within a minute is creep,
-        and what takes far longer than the record is a straight line.
+        A sensor on the gear itself hardly leads it. Without a sensor, a change that settles within a minute
+        is creep, and one that takes far longer than the record is a straight line.
         """
         temperature = observations.motion.measured.get(Channel.TEMPERATURE)
         if temperature is not None and float(np.ptp(temperature)) > VARIES_K:
@@ -70,11 +71,11 @@ class Warmed(Effect):
             yield from (("time", each) for each in SLOW_S if each <= longest)
 
     def needs(self) -> frozenset[Channel]:
-        """Time, and temperature where it is driven by it."""
+        """Returns time, and temperature if driven by it."""
         return self.channels | ({Channel.TEMPERATURE} if self.driven_by == "temperature" else frozenset())
 
     def warmth(self, motion: Motion) -> FloatArray:
-        """Warmth in kelvin, shape (n,)."""
+        """Returns the warmth in kelvin, shape (n,)."""
         time_s = motion.channel(Channel.TIME, self.name)
         if self.driven_by == "time":
             warmth = self.warm_up_k * -np.expm1(-(time_s - time_s[:1]) / self.tau_s)
@@ -85,7 +86,7 @@ class Warmed(Effect):
 
 
 class WarmthState:
-    """The same on line: `at` asks, `to` moves."""
+    """On-line warmth: `at` evaluates, `to` advances."""
 
     __slots__ = ("_by_time", "_final", "_limit", "_reference", "_start", "_tau", "_temperature", "_time")
 
@@ -99,7 +100,7 @@ class WarmthState:
         self._time = self._temperature = 0.0
 
     def at(self, moment: Moment) -> float:
-        """Warmth at this moment, kelvin; changes nothing."""
+        """Returns the warmth at this moment, kelvin; changes nothing."""
         if self._by_time:
             since = 0.0 if self._start is None else moment.time_s - self._start
             warmth = -self._final * math.expm1(-since / self._tau)
@@ -108,7 +109,7 @@ class WarmthState:
         return min(max(warmth, -self._limit), self._limit)
 
     def to(self, moment: Moment) -> float:
-        """Move on to this moment and return the warmth."""
+        """Advances to this moment and returns the warmth, kelvin."""
         warmth = self.at(moment)
         self._temperature = self._followed(moment)
         if self._start is None:

@@ -32,8 +32,8 @@ class Wear(Linear):
     """(growth / 2) (run / 1000)^exponent s: a loop whose height grows with the motor turns run.
 
     Growth is signed: a loop that widens in the sense of the elastic one is positive, a growing gap (the load
-    lags) negative. Steady wear has the exponent one; while a gear runs in it wears fast at first and then
-    less, with one below. Within the first turn the height grows in proportion: no power law holds there.
+    lags) negative. Steady wear has exponent 1; running-in, fast at first and then slower, an exponent below
+    1. Within the first turn the height grows linearly, because no power law holds there.
     """
 
     name: ClassVar[str] = "wear"
@@ -59,7 +59,7 @@ class Wear(Linear):
     )
     linear: ClassVar[tuple[str, ...]] = ("growth_arcsec_per_kiloturn",)
     typical: ClassVar[Mapping[str, Any]] = {"growth_arcsec_per_kiloturn": 1.0, "width_deg": 2.0}
-    """One arcsec per thousand turns, crossed in two degrees."""
+    """1 arcsec per thousand turns, crossed in 2 degrees."""
 
     growth_arcsec_per_kiloturn: Annotated[
         float, Field(ge=-1000, le=1000, description="growth of the loop's height in the first 1000 turns")
@@ -77,18 +77,18 @@ class Wear(Linear):
 
     @classmethod
     def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[Wear]:  # noqa: ARG003
-        """From a gap to a loop as wide as the elastic one."""
+        """Yields widths from that of a gap to that of the elastic loop."""
         yield from (cls(growth_arcsec_per_kiloturn=1.0, width_deg=each) for each in (0.5, 4.0, 20.0))
 
     def coordinate(self, motion: Motion, ratio: float) -> Coordinate:
-        """The motor's turns since the record began."""
+        """Returns the motor turns since the record began."""
         run = np.cumsum(np.abs(np.diff(motion.motor_deg, prepend=motion.motor_deg[:1]))) / DEG_PER_TURN
         return Coordinate("motor turns run", "", run, both_ways=True, bins=20)
 
     def columns(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
-        """A growth of one arcsec in 1000 turns, shape (n, 1)."""
+        """Returns the effect of a growth of 1 arcsec in 1000 turns, shape (n, 1)."""
         angle = motion.motor_deg
-        # Its derivative by the width asks for the same growth again.
+        # The derivative with respect to the width uses the same growth.
         key = (self.name, self.turns_before, self.turns_limit, self.exponent)
         half = once(angle, start, key, lambda: self._growth(angle))
         column: FloatArray = half * stop(angle, self.width_deg, start)
@@ -101,41 +101,41 @@ class Wear(Linear):
         return np.asarray(0.5 * _kiloturns(1.0, self.exponent) * share)
 
     def after(self, turns: float) -> Self:
-        """The same when the motor has run so many turns more."""
+        """Returns the effect after the motor has run this many more turns."""
         return self.model_copy(update={"turns_before": self.turns_before + turns})
 
     def tracker(self, start: Start = Start.VIRGIN) -> Tracker:
-        """On-line tracker; its first `advance` only says where the motor stands."""
+        """Returns an on-line tracker; its first `advance` only sets the motor position."""
         return _Tracker(self, start, math.inf)
 
     def gentle_tracker(self, start: Start, fall_arcsec_per_deg: float) -> Tracker | None:
-        """One that takes as much motor angle for the crossing as the present height asks for."""
+        """Returns a tracker whose crossing takes as much motor angle as the present height requires."""
         if self.growth_arcsec_per_kiloturn >= 0.0:
             return None
         crossing = fall_arcsec_per_deg - self._fastest_growth()
         return _Tracker(self, start, crossing) if crossing > 0.0 else None
 
     def bound_arcsec(self) -> float:
-        """The height at the limit."""
+        """Height at the limit."""
         return abs(self._half(self.turns_limit))
 
     def slope_bound_arcsec_per_deg(self) -> float:
-        """The crossing at full height (where it crosses downwards), and the growth with the travel."""
+        """Slope of a downward crossing at full height, plus the growth with travel."""
         crossing = max(-2.0 * self._half(self.turns_limit) / self.width_deg, 0.0)
         return crossing + self._fastest_growth()
 
     def _half(self, turns: float) -> float:
-        """Half the height after so many turns, arcsec, signed."""
+        """Returns half the height after this many turns, arcsec, signed."""
         return 0.5 * self.growth_arcsec_per_kiloturn * _kiloturns(turns, self.exponent)
 
     def _fastest_growth(self) -> float:
-        """Half the height's growth where it is fastest, arcsec per motor degree."""
+        """Returns the fastest growth of half the height, arcsec per motor degree."""
         late = self.exponent * math.pow(max(self.turns_limit, 1.0), self.exponent - 1.0)
         return abs(self._half(1.0)) * max(1.0, self.exponent, late) / DEG_PER_TURN
 
 
 def _kiloturns(turns: float, exponent: float) -> float:
-    """The height's share of that of the first thousand turns."""
+    """Returns the height relative to that of the first thousand turns."""
     return math.pow(1e-3, exponent) * (turns if turns < 1.0 else math.pow(turns, exponent))
 
 
@@ -145,7 +145,7 @@ class _Tracker(Tracker):
     __slots__ = ("_angle", "_before", "_distance", "_fall", "_gain", "_half", "_limit", "_value")
 
     def __init__(self, effect: Wear, start: Start, fall_arcsec_per_deg: float) -> None:
-        """``fall_arcsec_per_deg``: no crossing is steeper."""
+        """``fall_arcsec_per_deg`` limits the slope of the crossing."""
         self._half = effect._half
         self._gain = 2.0 / effect.width_deg
         self._fall = fall_arcsec_per_deg
@@ -157,7 +157,7 @@ class _Tracker(Tracker):
 
     @property
     def memory_deg(self) -> float:
-        """Motor angle of a full crossing at the limit's height; the distance run is taken from the file."""
+        """Motor angle of a full crossing at the maximum height; the distance run comes from the file."""
         return max(2.0 / self._gain, 2.0 * abs(self._half(self._limit)) / self._fall)
 
     def peek(self, motor_deg: float, moment: Moment) -> float:
@@ -170,7 +170,7 @@ class _Tracker(Tracker):
         return half * self._value
 
     def _at(self, motor_deg: float) -> tuple[float, float, float]:
-        """Distance run, half the height and the stop operator's value at an angle."""
+        """Returns the distance run, half the height and the stop operator's value at an angle."""
         step = 0.0 if self._angle is None else motor_deg - self._angle
         distance = self._distance + abs(step)
         half = self._half(min(self._before + distance / DEG_PER_TURN, self._limit))

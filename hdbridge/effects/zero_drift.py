@@ -1,4 +1,4 @@
-"""The zero moves with temperature: housing, encoder mount and gear grow unevenly."""
+"""Zero shift with temperature, because housing, encoder mount and gear expand differently."""
 
 from __future__ import annotations
 
@@ -65,34 +65,34 @@ class ZeroDrift(Linear, Warmed):
     )
     linear: ClassVar[tuple[str, ...]] = ("drift_arcsec_per_k",)
     typical: ClassVar[Mapping[str, Any]] = {"drift_arcsec_per_k": 1.0, "tau_s": 1800.0}
-    """One arcsec per kelvin within half an hour."""
+    """1 arcsec per kelvin, with a time constant of half an hour."""
 
     drift_arcsec_per_k: Annotated[float, Field(ge=-1000, le=1000, description="shift per kelvin")]
 
     @classmethod
     def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[ZeroDrift]:  # noqa: ARG003
-        """By the temperature where that changes, else by time."""
+        """Yields effects driven by temperature if it changes, else by time."""
         for driven_by, tau_s in cls.lags(observations):
             yield cls(drift_arcsec_per_k=1.0, tau_s=tau_s, driven_by=driven_by)
 
     def coordinate(self, motion: Motion, ratio: float) -> Coordinate:
-        """Time: how a zero has moved since the record began."""
+        """Returns the time, to show how the zero has moved since the record began."""
         return over.time(motion)
 
     def columns(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
-        """One arcsec per kelvin, shape (n, 1)."""
+        """Returns the effect of 1 arcsec per kelvin, shape (n, 1)."""
         return self.warmth(motion)[:, np.newaxis]
 
     def tracker(self, start: Start = Start.VIRGIN) -> Tracker:
-        """On-line tracker; in equilibrium at its first moment."""
+        """Returns an on-line tracker, in equilibrium at its first moment."""
         return _Tracker(self.drift_arcsec_per_k, WarmthState(self))
 
     def bound_arcsec(self) -> float:
-        """At the highest warmth."""
+        """Bound at the highest warmth."""
         return abs(self.drift_arcsec_per_k) * self.limit_k
 
     def slope_bound_arcsec_per_deg(self) -> float:
-        """Zero: it depends on temperature and time."""
+        """Zero, because it depends on temperature and time."""
         return 0.0
 
 

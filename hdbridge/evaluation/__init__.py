@@ -1,1 +1,1 @@
-"""What a test says: figures of a stepping test, several schemes side by side, accuracy by ISO 230-2."""
+"""Evaluation of tests: figures of a stepping test, comparison of schemes, accuracy by ISO 230-2."""

@@ -1,9 +1,9 @@
-"""What a machine-tool engineer asks of an axis: accuracy and repeatability as ISO 230-2 defines them.
+"""Accuracy and repeatability of an axis as defined by ISO 230-2.
 
 The standard test approaches m targets P_i from both directions, n times each (n = 5; for a rotary axis up to
 360 degrees at least 3 targets to 90 degrees, 5 to 180, 8 beyond, none a multiple of the pitch of a periodic
-error). The positioning deviation is x_ij = P_ij - P_i, the arrow says from where the target was approached.
-All definitions are those of ISO 230-2:2014, clause 3, for expanded results without measurement uncertainty.
+error). The positioning deviation is x_ij = P_ij - P_i; the arrow gives the direction of approach. All
+definitions are those of ISO 230-2:2014, clause 3, for expanded results without measurement uncertainty.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ MINIMUM_RUNS = 2
 
 @dataclass(frozen=True, slots=True)
 class AxisAccuracy:
-    """The figures of a rotary axis by ISO 230-2:2014; all in arcsec."""
+    """Figures of a rotary axis by ISO 230-2:2014; all in arcsec."""
 
     accuracy: float
     """A, bi-directional: largest of mean + 2 s minus smallest of mean - 2 s, over both directions."""
     accuracy_forward: float
-    """A (arrow up): the same of the forward approaches."""
+    """A (arrow up): the same for the forward approaches."""
     accuracy_backward: float
-    """A (arrow down): the same of the backward approaches."""
+    """A (arrow down): the same for the backward approaches."""
     repeatability: float
     """R, bi-directional: largest max(2 s_i forward + 2 s_i backward + |B_i|; 4 s_i of either)."""
     repeatability_forward: float
@@ -50,10 +50,10 @@ class AxisAccuracy:
     """M: largest minus smallest of the bi-directional means (mean of both directions) of the targets."""
     targets: int
     runs: int
-    """Approaches of each target from each direction (the smallest number of any)."""
+    """Approaches of each target from each direction (the smallest number)."""
 
     def as_dict(self) -> dict[str, float]:
-        """For JSON: names with their unit."""
+        """Returns the figures for JSON, with units in the names."""
         counts = {"targets", "runs"}
         return {
             each.name if each.name in counts else f"{each.name}_arcsec": getattr(self, each.name)
@@ -67,11 +67,11 @@ def axis_accuracy(
     forward: Sequence[bool] | np.ndarray[tuple[int], np.dtype[np.bool_]],
     same_deg: float = 1e-6,
 ) -> AxisAccuracy:
-    """Figures from any number of approaches, in any order; arrays of shape (approaches,).
+    """Computes the figures from any number of approaches, in any order; arrays of shape (approaches,).
 
-    ``deviation_arcsec`` is the actual position minus the target, ``forward`` whether it was approached in the
-    positive direction. Targets closer than ``same_deg`` are one. InputError where a target was not approached
-    at least `MINIMUM_RUNS` times from each direction: a standard deviation needs them.
+    ``deviation_arcsec`` is the actual position minus the target, ``forward`` is True for approaches in the
+    positive direction. Targets closer than ``same_deg`` are one. Raises `InputError` if a target was not
+    approached at least `MINIMUM_RUNS` times from each direction, because a standard deviation needs them.
     """
     target = np.asarray(target_deg, dtype=np.float64)
     deviation = np.asarray(deviation_arcsec, dtype=np.float64)
@@ -125,7 +125,7 @@ def axis_accuracy(
 def _statistics(
     group: np.ndarray[tuple[int], np.dtype[np.intp]], deviation: FloatArray, count: int
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Runs, mean and standard deviation (n - 1) at each target."""
+    """Returns runs, mean and standard deviation (n - 1) at each target."""
     runs = np.bincount(group, minlength=count).astype(np.float64)
     mean = np.bincount(group, deviation, count) / np.maximum(runs, 1.0)
     squares = np.bincount(group, (deviation - mean[group]) ** 2, count)

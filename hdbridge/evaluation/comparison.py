@@ -1,4 +1,4 @@
-"""The stepping test under each compensation scheme, one after the other on one axis."""
+"""Stepping test under each compensation scheme, one after the other on one axis."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from hdbridge.records.record import Record
 
 @dataclass(frozen=True, slots=True)
 class Comparison:
-    """What the stepping test gave under each scheme."""
+    """Results of the stepping test under each scheme."""
 
     results: dict[Scheme, SchemeResult]
     runs: dict[Scheme, Run[SteppingOutcome]]
@@ -28,17 +28,17 @@ class Comparison:
 
     @classmethod
     def of(cls, axis: AxisConfig, runs: dict[Scheme, Run[SteppingOutcome]]) -> Comparison:
-        """Of the runs that came to their end."""
+        """Evaluates the completed runs."""
         floor = quantisation_floor_arcsec(axis.motor_encoder.counts_per_turn, axis.gear.ratio)
         return cls({scheme: SchemeResult.of(run.outcome) for scheme, run in runs.items()}, runs, floor)
 
     @property
     def survived(self) -> tuple[str, ...]:
-        """A line for each scheme whose test went on in spite of something."""
+        """One line for each scheme whose test continued despite tolerated faults."""
         return tuple(lines((f"'{scheme.value}'", run.survived) for scheme, run in self.runs.items()))
 
     def as_dict(self) -> dict[str, Any]:
-        """The contract of ``hdbridge step --json``."""
+        """Returns the document of ``hdbridge step --json``."""
         return {
             "schema": "hdbridge.stepping/1",
             **{scheme.value: result.as_dict() for scheme, result in self.results.items()},
@@ -58,12 +58,13 @@ def compare_schemes(
     finished: Callable[[Scheme, Run[SteppingOutcome]], None] = lambda *_: None,
     stopped: Callable[[Scheme, Record], None] = lambda *_: None,
 ) -> Comparison:
-    """Run the stepping test under each scheme on a booted drive; it is enabled for each and disabled after.
+    """Runs the stepping test under each scheme on a booted drive, which is enabled for each and disabled
+    after it.
 
-    ``progress`` receives the share of the present scheme that is done; ``finished`` each run as it ends, and
-    ``stopped`` what one had measured that did not come to its end, so that nothing measured is lost.
+    ``progress`` receives the completed share of the present scheme, ``finished`` each completed run, and
+    ``stopped`` the measurements of an interrupted one, so that nothing measured is lost.
     """
-    # All of them first: what cannot be compensated is refused before anything moves.
+    # All of them first, so that an impossible compensation is refused before anything moves.
     compensations = {scheme: compensation_for(drive.axis, scheme.of(model)) for scheme in schemes}
     runs: dict[Scheme, Run[SteppingOutcome]] = {}
     for scheme, compensation in compensations.items():

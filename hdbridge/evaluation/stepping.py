@@ -1,4 +1,4 @@
-"""What a stepping test says: scatter and mean per direction and pooled, and the floor under it."""
+"""Figures of a stepping test: scatter and mean per direction and pooled, and the quantisation floor."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 class Scheme(Enum):
-    """Which parts of the model the compensation uses."""
+    """Parts of the model that the compensation uses."""
 
     NONE = "none"
     SYNCHRONOUS = "synchronous"
@@ -27,7 +27,7 @@ class Scheme(Enum):
     EXTENDED = "extended"
 
     def of(self, model: TransmissionModel) -> TransmissionModel:
-        """The model with this scheme's effects only."""
+        """Returns the model with only this scheme's effects."""
         match self:
             case Scheme.NONE:
                 return model.only(())
@@ -40,7 +40,9 @@ class Scheme(Enum):
 
     @staticmethod
     def offered_by(model: TransmissionModel) -> tuple[Scheme, ...]:
-        """The article's four, and `EXTENDED` where the model has more than the two parts."""
+        """Returns the article's four schemes, and `EXTENDED` if the model has more than the two
+        basic parts.
+        """
         four = (Scheme.NONE, Scheme.SYNCHRONOUS, Scheme.HYSTERESIS, Scheme.BOTH)
         more = any(each.name not in {"synchronous", "hysteresis"} for each in model.effects)
         return (*four, Scheme.EXTENDED) if more else four
@@ -55,14 +57,14 @@ class Scatter:
 
     @classmethod
     def of(cls, errors_arcsec: Sequence[float]) -> Scatter:
-        """Population standard deviation, as the literature's 3 sigma has it."""
+        """Uses the population standard deviation, as is usual for 3 sigma in the literature."""
         errors = np.asarray(errors_arcsec)
         return cls(3.0 * float(np.std(errors)), float(np.mean(errors)))
 
 
 @dataclass(frozen=True, slots=True)
 class SchemeResult:
-    """One scheme's stepping test."""
+    """Stepping test of one scheme."""
 
     cw: Scatter
     ccw: Scatter
@@ -71,13 +73,15 @@ class SchemeResult:
 
     @classmethod
     def of(cls, outcome: SteppingOutcome) -> SchemeResult:
-        """Statistics per direction, and of both directions together."""
+        """Computes the statistics per direction, and of both directions together."""
         cw = [each.error_arcsec for each in outcome.cw]
         ccw = [each.error_arcsec for each in outcome.ccw]
         return cls(Scatter.of(cw), Scatter.of(ccw), Scatter.of(cw + ccw), outcome)
 
     def as_dict(self) -> dict[str, Any]:
-        """The contract of ``hdbridge step --json``; ``steps`` has each step's target and error, in order."""
+        """Returns the part of ``hdbridge step --json``; ``steps`` has each step's target and
+        error, in order.
+        """
         scatter = {
             name: {"three_sigma_arcsec": part.three_sigma_arcsec, "mean_arcsec": part.mean_arcsec}
             for name, part in (("cw", self.cw), ("ccw", self.ccw), ("pooled", self.pooled))
@@ -93,9 +97,10 @@ class SchemeResult:
 
 
 def quantisation_floor_arcsec(motor_counts_per_turn: float, ratio: float) -> float:
-    """Three sigma at the load of a motor target rounded to whole counts: a uniform error of one count.
+    """Returns three sigma at the load of a motor target rounded to whole counts: a uniform error of one
+    count.
 
-    No compensation by motor targets can point better than this, however good its model.
+    No compensation by motor targets can be more accurate, however good its model.
     """
     count = DEG_PER_TURN * ARCSEC_PER_DEG / (motor_counts_per_turn * ratio)
     return 3.0 * count / math.sqrt(12.0)

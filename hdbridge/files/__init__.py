@@ -1,1 +1,1 @@
-"""Files: strict YAML and CSV, atomic writing, what comes with hdbridge, and what is said of a wrong one."""
+"""Files: strict YAML and CSV, atomic writing, bundled files, and the error messages about wrong ones."""

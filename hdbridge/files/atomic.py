@@ -1,7 +1,7 @@
-"""Files that are either the old one or the new one, whatever happens while they are written.
+"""Atomic file writing: a file has either its old or its new content, whatever interrupts the write.
 
-Pipes and character devices hold nothing that could be kept: they are written straight through, and never
-replaced by a file.
+Pipes and character devices hold nothing that could be kept: they are written directly, and never replaced by
+a file.
 """
 
 from __future__ import annotations
@@ -24,17 +24,18 @@ _DESCRIPTOR = re.compile(r"/(?:dev|proc/self)/fd/(\d+)")
 
 
 def write_atomically(path: Path | str, content: str | bytes) -> None:
-    """Replace the file's content, text as UTF-8: temporary file next to it, fsync, rename, fsync the folder.
+    """Replaces a file's content (text as UTF-8): temporary file in the same folder, fsync, rename, fsync of
+    the folder.
 
     A reader, or a power cut, finds the old content or the new one. Pipes and character devices are written
-    straight through. OutputError when the place cannot be written; the old file then stands.
+    directly. Raises `OutputError` if the location cannot be written; the old file then remains.
     """
     data = content.encode() if isinstance(content, str) else content
     try:
         if is_stream(path):
             _write_through(Path(path), data)
             return
-        target = Path(path).resolve()  # through a link, or the rename would replace the link
+        target = Path(path).resolve()  # resolves links, or the rename would replace the link
         with _temporary(target) as descriptor:
             try:
                 os.ftruncate(descriptor, 0)
@@ -49,16 +50,16 @@ def write_atomically(path: Path | str, content: str | bytes) -> None:
             os.fsync(folder)
         finally:
             os.close(folder)
-    except BrokenPipeError:  # who reads has had enough
+    except BrokenPipeError:  # the reader closed the pipe
         raise
     except OSError as problem:
         raise OutputError(f"{path}: cannot be written: {problem.strerror}") from None
 
 
 def check_writable(path: Path | str) -> None:
-    """InputError unless a file may be written there: for before a long measurement, instead of after it.
+    """Raises `InputError` unless a file can be written here; call it before a long measurement.
 
-    It is tried out: a file system that is read-only, and a name that is too long, are noticed too.
+    It tries the write, so that a read-only file system or a name that is too long is detected too.
     """
     try:
         if is_stream(path):
@@ -84,7 +85,7 @@ def check_writable(path: Path | str) -> None:
         _try_out(target)
     except OSError as problem:
         raise InputError(f"{path}: cannot be written: {problem.strerror}") from None
-    except RuntimeError:  # Python 3.11 and 3.12 say it so
+    except RuntimeError:  # Python 3.11 and 3.12 report it this way
         raise InputError(f"{path}: cannot be written: its links go round in a circle") from None
 
 
@@ -94,7 +95,9 @@ def _try_out(target: Path) -> None:
 
 
 def descriptor_of(path: Path | str) -> int | None:
-    """The number of the open file of this process that a path like ``/dev/stdout`` or ``/dev/fd/3`` names."""
+    """Returns the number of this process's open file that a path like ``/dev/stdout`` or ``/dev/fd/3`` names,
+    or None.
+    """
     if str(path) in _STANDARD:
         return _STANDARD.index(str(path))
     found = _DESCRIPTOR.fullmatch(str(path))
@@ -102,11 +105,13 @@ def descriptor_of(path: Path | str) -> int | None:
 
 
 def is_stream(path: Path | str) -> bool:
-    """Whether it is written straight through: a pipe, a character device, an open file of this process."""
+    """Returns True if a path is written directly: a pipe, a character device, an open file of
+    this process.
+    """
     if descriptor_of(path) is not None:
         return True
     try:
-        mode = os.stat(path).st_mode  # noqa: PTH116 - through links such as those in /proc, which do not resolve
+        mode = os.stat(path).st_mode  # noqa: PTH116 - follows links such as those in /proc, which do not resolve
     except OSError:
         return False
     return stat.S_ISFIFO(mode) or stat.S_ISCHR(mode)
@@ -114,7 +119,7 @@ def is_stream(path: Path | str) -> bool:
 
 def _write_through(path: Path, data: bytes) -> None:
     number = descriptor_of(path)
-    if number == 1:  # after what was printed, not before it
+    if number == 1:  # after printed text, not before it
         sys.stdout.flush()
         buffer = getattr(sys.stdout, "buffer", None)
         if buffer is not None:
@@ -138,7 +143,9 @@ def _write_all(descriptor: int, data: bytes) -> None:
 
 
 def make_folder(path: Path | str) -> Path:
-    """The folder, with its parents where they are missing. InputError where it cannot be made or written."""
+    """Creates a folder with its parents and returns it; raises `InputError` if it cannot be created or
+    written.
+    """
     folder = Path(path)
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -154,8 +161,9 @@ def make_folder(path: Path | str) -> Path:
 def write_folder(folder: Path, files: Mapping[str, bytes]) -> list[Path]:
     """Writes a new folder with these files, all or none of them; returns their paths.
 
-    InputError if the folder is not empty or cannot be made; OutputError if the files cannot be written, as on
-    a full disk. After an error nothing is left, not even parents that were made for the folder.
+    Raises `InputError` if the folder is not empty or cannot be created, `OutputError` if the files cannot be
+    written, as on a full disk. After an error nothing is left, not even parents that were created for the
+    folder.
     """
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise InputError(f"{folder}: already exists; expected a new folder, nothing was written")
@@ -178,9 +186,9 @@ def write_folder(folder: Path, files: Mapping[str, bytes]) -> list[Path]:
 
 
 def new_folder(path: Path) -> Path:
-    """A folder that was not there before: this one, else the next free number behind its name.
+    """Creates a folder that did not exist: this one, else the name with the next free number.
 
-    Two processes that ask at one time get two folders.
+    Two concurrent processes get two folders.
     """
     make_folder(path.parent)
     for number in itertools.count(1):
@@ -201,10 +209,10 @@ def _temporary_name(target: Path) -> Path:
 
 @contextmanager
 def _temporary(target: Path) -> Iterator[int]:
-    """The one temporary file of a target, locked.
+    """Yields the descriptor of the single temporary file of a target, locked.
 
-    Its name is fixed, so that a killed writer leaves nothing behind but what the next one overwrites. Of two
-    writers the second waits for the lock; by then the first has renamed the file, so it looks again.
+    Its name is fixed, so that a killed writer leaves only a file that the next one overwrites. A second
+    writer waits for the lock; by then the first has renamed the file, so it opens the file again.
     """
     name = _temporary_name(target)
     while True:

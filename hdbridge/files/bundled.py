@@ -1,6 +1,6 @@
-"""Where the profiles and EDS files that come with hdbridge lie.
+"""Location of the profiles and EDS files that come with hdbridge.
 
-In an installed wheel that is ``hdbridge/_bundled``; in a working copy they are the folders ``eds`` and
+In an installed wheel they are in ``hdbridge/_bundled``, in a working copy in the folders ``eds`` and
 ``profiles`` next to the package.
 """
 
@@ -16,7 +16,7 @@ _PACKAGE = Path(__file__).resolve().parents[1]
 
 
 def bundled_folder(kind: Literal["eds", "profiles"], package: Path = _PACKAGE) -> Path:
-    """The folder of bundled EDS files or profiles; it need not exist in a broken installation."""
+    """Returns the folder of bundled EDS files or profiles; it may be missing in a broken installation."""
     installed = package / "_bundled" / kind
     beside = package.parent / kind
     working_copy = (package.parent / "pyproject.toml").is_file() and beside.is_dir()
@@ -24,7 +24,7 @@ def bundled_folder(kind: Literal["eds", "profiles"], package: Path = _PACKAGE) -
 
 
 def bundled_profile(name: str) -> Path:
-    """The folder of a bundled profile; InputError names those that there are and the nearest."""
+    """Returns the folder of a bundled profile; raises `InputError` with the existing ones and the nearest."""
     folder = bundled_folder("profiles")
     if name and (folder / name / "axis.yaml").is_file():
         return folder / name

@@ -1,9 +1,9 @@
-"""Columns of numbers in a CSV file, as any program writes it; written to read back the same.
+"""Columns of numbers in a CSV file of any program; what is written reads back the same.
 
-A header line names the columns; one row per sample. Separators, decimal commas, comments, lines before the
-header, a row of units under it, the encoding and gzip are recognised, and reported as remarks. A file that
-numpy's parser takes costs about two microseconds per row; anything else is read row by row, to find out what
-is wrong with it, or to keep a column of text.
+A header line names the columns, followed by one row per sample. Separators, decimal commas, comments, lines
+before the header, a row of units under it, the encoding and gzip are recognised and reported as remarks. A
+file that numpy's parser accepts costs about two microseconds per row; any other is read row by row, to locate
+its error or to keep a column of text.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from hdbridge.files.regular import open_regular
 
 FloatArray = NDArray[np.float64]
 Column = NDArray[Any]
-"""A column: float64, or text if it holds something else than numbers."""
+"""A column: float64, or text if it contains anything but numbers."""
 
 MAXIMUM_BYTES = 2 << 30
 _GZIP_MAGIC = b"\x1f\x8b"
@@ -42,9 +42,9 @@ _PIECE_BYTES = 1 << 20
 _SEPARATORS: Final = {",": "commas", ";": "semicolons", "\t": "tabs", "|": "bars", " ": "spaces"}
 _HEAD_BYTES = 1 << 16
 _HEAD_ROWS = 100
-"""Number of rows in which the header is searched."""
+"""Number of rows that are searched for the header."""
 _SAMPLED = 20
-"""Rows of data that are looked at for decimal commas."""
+"""Number of data rows that are examined for decimal commas."""
 _COMMENT = re.compile(rb"(?:^|(?<=[\r\n]))([ \t]*(?:#|%|//)[ \t]*)([^\r\n]*)")
 _DECIMAL_COMMA = re.compile(r"\s*[+-]?\d*,\d+(?:[eE][+-]?\d+)?\s*$")
 _CLOCK = re.compile(r"(\d{1,2}):(\d{2}):(\d{2})(?:[.,](\d+))?$")
@@ -55,14 +55,14 @@ _DAY_S: Final = 86_400.0
 
 @dataclass(frozen=True, slots=True)
 class _Layout:
-    """Where the columns of a file are, and how its rows are written."""
+    """Positions of the columns in a file, and the format of its rows."""
 
     names: tuple[str, ...]
-    """Of the columns in order; one without a name has its number, counted from 1."""
+    """Names of the columns in order; one without a name has its number, counted from 1."""
     header_line: int
-    """The line of the header; 0 if the file has none."""
+    """Line of the header; 0 if the file has none."""
     first_line: int
-    """Lines before the first row of data."""
+    """Number of lines before the first row of data."""
     separator: str
     decimal_comma: bool = False
     units: tuple[str, ...] = ()
@@ -71,40 +71,40 @@ class _Layout:
 
 
 class CsvFile:
-    """A CSV file whose layout is known; `read` gives its columns.
+    """CSV file with a known layout; `read` returns its columns.
 
     ``wanted`` are names of columns that the caller needs, or numbers (1 is the first): the header is the line
-    that has them. InputError names the file, and the line if there is one.
+    that contains them. Raises `InputError` with the file and, if there is one, the line.
     """
 
     def __init__(self, path: Path, wanted: Collection[str] = ()) -> None:
         self.path = path
         content, encoding = _content(path)
-        self._held: bytes | None = content  # until it is read: a stream gives it only once
+        self._held: bytes | None = content  # kept until it is read, because a stream can be read only once
         self._layout = found = _layout(path, content, wanted)
         said = ("comments left out" if _commented(content) else "", encoding)
         self.remarks: tuple[str, ...] = (*found.remarks, *filter(None, said))
-        """What was assumed of how the file is written, in words; `read` may add one. Empty for plain CSV."""
+        """Assumptions about the file's format, as text; `read` may add one. Empty for plain CSV."""
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The names of the columns, in the order of the file; a column without a name has its number."""
+        """Names of the columns, in the order of the file; a column without a name has its number."""
         return self._layout.names
 
     @property
     def header_line(self) -> int:
-        """The line of the header; 0 if the first line holds numbers."""
+        """Line of the header; 0 if the first line holds numbers."""
         return self._layout.header_line
 
     @property
     def units(self) -> dict[str, str]:
-        """The cell of each column in a row of units under the header; empty without one."""
+        """Cell of each column in a row of units under the header; empty without one."""
         return dict(zip(self.names, self._layout.units, strict=False))
 
     def find(self, column: str) -> str | None:
-        """The name of a column that is given by name or by number; None if there is no such column.
+        """Returns the name of a column given by name or by number; None if there is no such column.
 
-        InputError if two columns have the name.
+        Raises `InputError` if two columns have the name.
         """
         if self.names.count(column) > 1:
             raise _wrong(
@@ -118,11 +118,11 @@ class CsvFile:
         return None
 
     def read(self, finite: Collection[str] = (), times: Collection[str] = ()) -> dict[str, Column]:
-        """The columns by name, in the order of the file.
+        """Returns the columns by name, in the order of the file.
 
-        Columns of ``finite`` must hold finite numbers throughout; those of ``times`` may hold ISO times or
-        times of day, which become seconds since the first. Others are kept: as numbers if they are (an empty
-        cell is NaN), else as text. Of columns with the same name the first is kept.
+        Columns of ``finite`` must hold only finite numbers; those of ``times`` may hold ISO times or times of
+        day, which become seconds since the first. Others are kept: as numbers if possible (an empty cell is
+        NaN), else as text. Of columns with the same name the first is kept.
         """
         content = self._text()
         self._held = None
@@ -137,11 +137,11 @@ class CsvFile:
         return columns
 
     def line_of_row(self, row: int) -> int:
-        """The line of the file (the first is 1) with a row of data (the first is row 0)."""
+        """Returns the file's line (the first is 1) of a row of data (the first is row 0)."""
         return self._line_of(self._text(), row)
 
     def _text(self) -> bytes:
-        """The text with blank lines for its comments, and one tab for the spaces between two columns."""
+        """Returns the text with comments blanked and the spaces between two columns replaced by one tab."""
         content = _content(self.path)[0] if self._held is None else self._held
         if _commented(content):
             content = _COMMENT.sub(b"", content)
@@ -163,7 +163,7 @@ class CsvFile:
         return "\t" if self._layout.separator == " " else self._layout.separator
 
     def _fast(self, content: bytes) -> dict[str, Column] | None:
-        """All columns by numpy's parser; None if it finds something that is not a number, or a ragged row."""
+        """Reads all columns with numpy's parser; returns None for a non-number or a ragged row."""
         layout = self._layout
         if not _lines(content, layout.first_line).readline().strip():
             return None
@@ -187,7 +187,7 @@ class CsvFile:
         return self._named([np.ascontiguousarray(column) for column in table])
 
     def _slow(self, content: bytes, finite: Collection[str], times: Collection[str]) -> dict[str, Column]:
-        """All columns, row by row; InputError at the first row that is wrong."""
+        """Reads all columns row by row; raises `InputError` at the first wrong row."""
         rows: list[list[str]] = []
         lines: list[int] = []
         for row, line in self._rows(content):
@@ -221,7 +221,7 @@ class CsvFile:
         return named
 
     def _rows(self, content: bytes) -> Iterator[tuple[list[str], int]]:
-        """The rows of data with their lines, each with a cell for every column."""
+        """Yields the rows of data with their lines, each with a cell for every column."""
         layout, count = self._layout, len(self.names)
         paired = layout.decimal_comma and layout.separator == ","
         for cells, at in _parsed(self.path, _lines(content, layout.first_line), self._delimiter):
@@ -236,7 +236,7 @@ class CsvFile:
 
 
 def csv_text(columns: Mapping[str, Column]) -> Iterator[str]:
-    """The file's text, piece by piece; a number has as many digits as it takes to read back the same."""
+    """Yields the file's text in pieces; a number has as many digits as it needs to read back the same."""
     yield ",".join(map(_cell, columns)) + "\n"
     rows = len(next(iter(columns.values()), ()))
     for first in range(0, rows, _ROWS_AT_ONCE):
@@ -248,7 +248,7 @@ def csv_text(columns: Mapping[str, Column]) -> Iterator[str]:
 
 
 def write_columns(path: Path, columns: Mapping[str, Column]) -> None:
-    """Write the file atomically, compressed if its name ends in ``.gz``; same columns, same bytes."""
+    """Writes the file atomically, compressed if its name ends in ``.gz``; same columns, same bytes."""
     content = io.BytesIO()
     if path.suffix == ".gz":
         with gzip.GzipFile("", "wb", _GZIP_LEVEL, content, mtime=0) as file:
@@ -268,7 +268,9 @@ def _wrong(text: str) -> InputError:
 
 
 def _content(path: Path) -> tuple[bytes, str]:
-    """The file's text in UTF-8 without a byte-order mark, decompressed; the encoding, if it was another."""
+    """Returns the file's text, decompressed, in UTF-8 without byte-order mark, and its encoding if it was
+    another.
+    """
     try:
         with open_regular(path) as plain:
             content = _bounded(plain)
@@ -306,7 +308,7 @@ def _content(path: Path) -> tuple[bytes, str]:
 
 
 def _bounded(file: BinaryIO | gzip.GzipFile) -> bytes:
-    """All of it, or a piece more than is allowed; `read` in one go would take the memory that it may need."""
+    """Reads at most one piece more than is allowed; a single `read` could take far more memory."""
     content = io.BytesIO()
     while content.tell() <= MAXIMUM_BYTES and (piece := file.read(_PIECE_BYTES)):
         content.write(piece)
@@ -318,7 +320,7 @@ def _commented(content: bytes) -> bool:
 
 
 def _lines(content: bytes, skipped: int = 0) -> io.TextIOWrapper:
-    """The lines of the file, ends and all, without the first few."""
+    """Opens the content as lines, with their line ends, after the first ``skipped`` lines."""
     lines = io.TextIOWrapper(io.BytesIO(content), encoding="utf-8", newline="")
     for _ in range(skipped):
         lines.readline()
@@ -327,7 +329,7 @@ def _lines(content: bytes, skipped: int = 0) -> io.TextIOWrapper:
 
 @dataclass(frozen=True, slots=True)
 class _Line:
-    """A line near the beginning of the file that is not blank."""
+    """Non-blank line near the beginning of the file."""
 
     number: int
     text: str
@@ -355,14 +357,16 @@ def _head(content: bytes) -> list[_Line]:
 
 
 def _layout(path: Path, content: bytes, wanted: Collection[str]) -> _Layout:
-    """Separator and header: the line with most of the ``wanted`` names, else the one above the numbers."""
+    """Finds separator and header: the line with most of the ``wanted`` names, else the one
+    above the numbers.
+    """
     head = _head(content)
     rows = [line for line in head if not line.comment]
     if not rows:
         raise _wrong(f"{path}: the file is empty; expected a header line and one row per sample")
     separator, header = _named_header(head, wanted) or _guessed_header(head)
     data = [line for line in rows if header is None or line.number > header.number]
-    if header is None:  # what is above the numbers belongs to nothing
+    if header is None:  # lines above the numbers belong to no column
         data = data[next((at for at, line in enumerate(data) if _holds_numbers(line, separator)), 0) :]
     first = [line.cells(separator) for line in data[:_SAMPLED]]
     cells = header.cells(separator) if header else [""] * len(first[0])
@@ -403,7 +407,7 @@ def _layout(path: Path, content: bytes, wanted: Collection[str]) -> _Layout:
 
 
 def _named_header(head: Sequence[_Line], wanted: Collection[str]) -> tuple[str, _Line] | None:
-    """The separator, and the line that has most of the names; None if no line has any."""
+    """Returns the separator and the line that contains most of the names; None if no line contains any."""
     found = [
         (len(set(wanted).intersection(line.cells(separator))), not line.comment, -line.number, separator)
         for line in head
@@ -416,7 +420,9 @@ def _named_header(head: Sequence[_Line], wanted: Collection[str]) -> tuple[str, 
 
 
 def _guessed_header(head: Sequence[_Line]) -> tuple[str, _Line | None]:
-    """The separator that gives most cells of numbers, and the line of names above them, if there is one."""
+    """Returns the separator that gives most number cells, and the line of names above them, if
+    there is one.
+    """
     best: tuple[int, str, _Line | None] | None = None
     for separator in _SEPARATORS:
         rows = [line for line in head if not line.comment]
@@ -445,13 +451,13 @@ def _holds_numbers(line: _Line, separator: str) -> bool:
 
 
 def _numbers(line: _Line, separator: str) -> int:
-    """Cells that are numbers or times."""
+    """Counts the cells that are numbers or times."""
     cells = line.cells(separator)
     return sum(_is_number(cell, separator != ",") or _moment(cell) is not None for cell in cells)
 
 
 def _is_row_of_units(first: Sequence[str], second: Sequence[str], needed: Sequence[int]) -> bool:
-    """Words in each needed column, and numbers or times in the row below."""
+    """Returns True for words in each needed column with numbers or times in the row below."""
     if max(needed) >= min(len(first), len(second)):
         return False
 
@@ -463,7 +469,7 @@ def _is_row_of_units(first: Sequence[str], second: Sequence[str], needed: Sequen
 
 
 def _is_paired(cells: Sequence[str], count: int) -> bool:
-    """Each value is two cells: its decimal comma looks like a separator."""
+    """Returns True if each value takes two cells, because its decimal comma looks like a separator."""
     whole, part = cells[::2], cells[1::2]
     return (
         count > 1
@@ -474,7 +480,7 @@ def _is_paired(cells: Sequence[str], count: int) -> bool:
 
 
 def _parsed(path: Path, lines: io.TextIOWrapper, delimiter: str) -> Iterator[tuple[list[str], int]]:
-    """The rows that are not blank, each with the number of its last line."""
+    """Yields the non-blank rows, each with the number of its last line."""
     reader = csv.reader(lines, delimiter=delimiter)
     try:
         for row in reader:
@@ -485,7 +491,7 @@ def _parsed(path: Path, lines: io.TextIOWrapper, delimiter: str) -> Iterator[tup
 
 
 def _column(cells: Sequence[str], *, blanks: bool, comma: bool) -> Column:
-    """Numbers, if all cells are (blank ones are NaN, if that is allowed), else text."""
+    """Returns numbers if all cells are numbers (blank ones become NaN if allowed), else text."""
     texts = (
         [cell.replace(",", ".") if _DECIMAL_COMMA.match(cell) else cell for cell in cells] if comma else cells
     )
@@ -493,7 +499,7 @@ def _column(cells: Sequence[str], *, blanks: bool, comma: bool) -> Column:
         numbers = [float(cell) if cell or not blanks else math.nan for cell in texts]
     except ValueError:
         return np.array(cells, dtype=np.str_)
-    if any("_" in cell for cell in texts):  # Python's float takes 1_000; CSV has no such numbers
+    if any("_" in cell for cell in texts):  # Python's float accepts 1_000; CSV has no such numbers
         return np.array(cells, dtype=np.str_)
     return np.array(numbers, dtype=np.float64)
 
@@ -503,9 +509,9 @@ def _is_number(cell: str, comma: bool = False) -> bool:
 
 
 def _seconds(cells: Sequence[str]) -> FloatArray | None:
-    """Seconds since the first of ISO times or times of day; None if one cell is neither.
+    """Returns seconds since the first of ISO times or times of day; None if a cell is neither.
 
-    Times of day without a date go on past midnight.
+    Times of day without a date continue past midnight.
     """
     moments = [moment for cell in cells if (moment := _moment(cell)) is not None]
     if not moments or len(moments) < len(cells):
@@ -519,14 +525,14 @@ def _seconds(cells: Sequence[str]) -> FloatArray | None:
 
 
 class _Moment(NamedTuple):
-    """A time: whole seconds, and the rest."""
+    """A time: whole seconds, and the fraction."""
 
     whole: int
     part: float
 
 
 def _moment(cell: str) -> _Moment | None:
-    """An ISO time, or a time of day; None if the text is neither."""
+    """Parses an ISO time or a time of day; None if the text is neither."""
     text = cell.strip()
     if clock := _CLOCK.match(text):
         hours, minutes, seconds = (int(each) for each in clock.groups()[:3])

@@ -1,7 +1,7 @@
 """EDS and DCF files (CiA 306) as vendors ship them: a front end for canopen's reader.
 
 canopen reads a well-formed file in UTF-8. Here any file is decoded, and its names, numbers and compact
-descriptions are brought into the one form that canopen takes. A value that cannot be read is reported with
+descriptions are brought into the form that canopen accepts. A value that cannot be read is reported with
 line, section and key: as an `InputError` if an object cannot be described without it, else in `Eds.unread`.
 """
 
@@ -36,7 +36,7 @@ _BITS: Final = {
     datatypes.INTEGER8: 8, datatypes.INTEGER16: 16, datatypes.INTEGER24: 24, datatypes.INTEGER32: 32,
     datatypes.INTEGER40: 40, datatypes.INTEGER48: 48, datatypes.INTEGER56: 56, datatypes.INTEGER64: 64,
 }  # fmt: skip
-"""Signed types: a file may give their values in two's complement."""
+"""Signed types, whose values a file may give in two's complement."""
 _VALUES: Final = ("LowLimit", "HighLimit", "DefaultValue", "ParameterValue")
 _LARGEST_COMPACT: Final = 254
 _PDOS: Final = 512
@@ -49,15 +49,15 @@ _COMPACT_ENTRIES: Final = 64
 
 
 class Eds(NamedTuple):
-    """An EDS or DCF file."""
+    """Content of an EDS or DCF file."""
 
     dictionary: ObjectDictionary
     unread: tuple[str, ...]
-    """Values that could not be read and count as not given: one line each, with line, section and key."""
+    """Values that could not be read and count as missing: one line each, with line, section and key."""
 
 
 def read_eds(path: Path | str, node_id: int) -> Eds:
-    """Read an EDS or DCF file for a node; `InputError` in one line if it cannot be read."""
+    """Reads an EDS or DCF file for a node; raises a one-line `InputError` if it cannot be read."""
     path = Path(path)
     try:
         if path.stat().st_size > MAX_BYTES:
@@ -71,7 +71,7 @@ def read_eds(path: Path | str, node_id: int) -> Eds:
 
 
 def shared_eds(path: Path | str, node_id: int) -> Eds:
-    """As `read_eds`, read once for each state of the file: not to be changed."""
+    """Returns the same as `read_eds`, cached for each state of the file; not to be modified."""
     path = Path(path)
     try:
         modified_ns = path.stat().st_mtime_ns
@@ -86,7 +86,7 @@ def _read_as_of(_: int, path: Path, node_id: int) -> Eds:
 
 
 def decode(data: bytes) -> str:
-    """Text of a file in UTF-8, UTF-16 (with or without byte order mark) or Windows-1252."""
+    """Decodes a file in UTF-8, UTF-16 (with or without byte-order mark) or Windows-1252."""
     for mark, encoding in (
         (b"\xef\xbb\xbf", "utf-8"),
         (b"\xff\xfe", "utf-16-le"),
@@ -111,20 +111,20 @@ class _Key(NamedTuple):
 
 
 class _Section:
-    """A section: its name as written, its line, and its keys in capitals."""
+    """Section: its name as written, its line, and its keys in capitals."""
 
     def __init__(self, name: str, line: int) -> None:
         self.name, self.line = name, line
         self.keys: dict[str, _Key] = {}
 
     def get(self, key: str) -> str:
-        """Value of a key, empty if there is none."""
+        """Returns the value of a key; empty if there is none."""
         found = self.keys.get(key.upper())
         return found.value if found is not None else ""
 
 
 class _Reader:
-    """One file on its way to canopen."""
+    """Converts one file to the form that canopen reads."""
 
     def __init__(self, path: Path, text: str) -> None:
         self._path = path
@@ -155,7 +155,9 @@ class _Reader:
     # -- lines --------------------------------------------------------------------------------------------
 
     def _split(self, text: str) -> None:
-        """Sections and keys by line. Of two keys with one name the first holds, as in Windows itself."""
+        """Splits the text into sections and keys. Of two equal keys the first counts, as in
+        Windows itself.
+        """
         section = None
         end = text.find(_DOS_END)
         for number, raw in enumerate(re.split(r"\r\n|\n|\r", text[:end] if end >= 0 else text), start=1):
@@ -185,7 +187,7 @@ class _Reader:
     # -- values -------------------------------------------------------------------------------------------
 
     def _number(self, section: _Section, key: str, default: int | None = None) -> int:
-        """A number that an object cannot do without; ``default`` if the key is absent or empty."""
+        """Returns a number that an object requires; ``default`` if the key is absent or empty."""
         text, line = section.keys.get(key.upper(), _Key("", section.line))
         value = _integer(text)
         if value is None and text == "" and default is not None:
@@ -195,7 +197,7 @@ class _Reader:
         return value
 
     def _value(self, section: _Section, key: str, data_type: int) -> str | None:
-        """A value as canopen reads it; None if there is none, or none that can be read."""
+        """Returns a value as canopen reads it; None if there is none or it cannot be read."""
         text = section.get(key)
         if text == "" or data_type not in _INTEGERS:
             return text or None
@@ -220,7 +222,7 @@ class _Reader:
     # -- objects ------------------------------------------------------------------------------------------
 
     def _objects(self) -> dict[int, dict[int | None, _Section]]:
-        """The sections of each object: None is the object itself, the others are its sub-indices."""
+        """Returns the sections of each object: None is the object itself, the others are its sub-indices."""
         objects: dict[int, dict[int | None, _Section]] = {}
         for name, section in self._sections.items():
             match = _OBJECT.fullmatch(name)
@@ -308,13 +310,13 @@ class _Reader:
         return int(value != 0)
 
     def _own_type(self, number: int) -> int:
-        """The type behind a type of the file's own, as CANFestival writes them; bytes if there is none."""
+        """Returns the base type of a custom type, as CANFestival writes them; bytes if there is none."""
         section = self._sections.get(f"{number:X}SUB1")
         value = _integer(section.get("DefaultValue")) if section is not None else None
         return value if value is not None and 0 < value <= _LAST_STANDARD_TYPE else datatypes.DOMAIN
 
     def _spelt_out(self, index: int, section: _Section, count: int) -> Iterator[tuple[int, _Section]]:
-        """The members of an object that CompactSubObj describes in one."""
+        """Yields the members of an object that CompactSubObj describes collectively."""
         if not 0 < count <= _LARGEST_COMPACT:
             line = section.keys["COMPACTSUBOBJ"].line
             found = section.get("CompactSubObj")
@@ -339,7 +341,7 @@ class _Reader:
             yield sub, member
 
     def _add_compact_pdos(self, objects: dict[int, dict[int | None, _Section]]) -> None:
-        """The PDOs that CompactPDO describes: as many as the device has beyond those with sections."""
+        """Adds the PDOs that CompactPDO describes: as many as the device has beyond those with sections."""
         mask = self._device_number("CompactPDO") or 0
         if not mask & 0x3F:
             return
@@ -386,7 +388,7 @@ def _compact_mapping(device: _Section) -> Iterator[tuple[int, _Section]]:
 
 
 def _made(name: str, of: _Section, keys: Mapping[str, str]) -> _Section:
-    """A section that the file describes in another one."""
+    """Creates a section that the file describes within another one."""
     section = _Section(of.name, of.line)
     section.keys = {
         key.upper(): _Key(value, of.line) for key, value in (("ParameterName", name), *keys.items())
@@ -395,7 +397,7 @@ def _made(name: str, of: _Section, keys: Mapping[str, str]) -> _Section:
 
 
 def _integer(text: str) -> int | None:
-    """A decimal (leading zeros or not) or hexadecimal number; None if it is neither."""
+    """Parses a decimal number (leading zeros allowed) or a hexadecimal one; None if it is neither."""
     match = _NUMBER.fullmatch(text)
     if match is None:
         return None
@@ -404,7 +406,7 @@ def _integer(text: str) -> int | None:
 
 
 def _bounds(low: str | None, high: str | None) -> bool:
-    """Limits that leave no choice, such as 0 and 0, mean that there are none."""
+    """Returns False for limits that leave no choice, such as 0 and 0, which mean that there are none."""
     least, greatest = _integer(low or ""), _integer(high or "")
     return least is None or greatest is None or least < greatest
 

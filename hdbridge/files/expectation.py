@@ -1,4 +1,4 @@
-"""What a field of a pydantic model expects, in words: for complaints and for reference pages."""
+"""Expected value of a pydantic model's field, as text for error messages and reference pages."""
 
 from __future__ import annotations
 
@@ -17,20 +17,20 @@ _PLAIN: dict[Any, str] = {int: "an integer", float: "a number", str: "text", boo
 
 @dataclass(frozen=True, slots=True)
 class Field:
-    """A place in a model: its type, its constraints and its description."""
+    """Place in a model: its type, its constraints and its description."""
 
     annotation: Any
     metadata: tuple[Any, ...] = ()
     description: str = ""
 
     def types(self) -> Iterator[Any]:
-        """The members of its type, with unions and annotations taken apart, None left out."""
+        """Yields the members of its type, with unions and annotations resolved and None left out."""
         for member in _members(self.annotation):
             if member is not type(None):
                 yield member
 
     def values(self) -> list[Any]:
-        """The values that it accepts, where there is a closed set of them."""
+        """Returns the values that it accepts, if the set is closed."""
         found: list[Any] = []
         for member in self.types():
             if get_origin(member) is Literal:
@@ -40,35 +40,35 @@ class Field:
         return found
 
     def choices(self) -> list[str]:
-        """The texts among its `values`."""
+        """Returns the texts among its `values`."""
         return [each for each in self.values() if isinstance(each, str)]
 
 
 def nearest(word: str, choices: Sequence[str]) -> str | None:
-    """The choice that ``word`` was probably meant to be."""
+    """Returns the choice that ``word`` probably means, or None."""
     close = difflib.get_close_matches(word.lower(), [each.lower() for each in choices], n=1, cutoff=0.6)
     return next((each for each in choices if close and each.lower() == close[0]), None)
 
 
 def one_line(text: str) -> str:
-    """A text as one line, whatever it holds: line breaks and other unprintable characters are escaped."""
+    """Returns a text as one line: line breaks and other unprintable characters are escaped."""
     return "".join(each if each.isprintable() else ascii(each)[1:-1] for each in text)
 
 
 def key_of(name: str, field: FieldInfo) -> str:
-    """A field's key in the file."""
+    """Returns a field's key in the file."""
     return field.alias or name
 
 
 def field_names(model: type[BaseModel], at: Sequence[str | int]) -> list[str]:
-    """The keys that a mapping at a location may have."""
+    """Returns the keys that a mapping at a location may have."""
     place = field_at(model, at)
     models = [each for each in place.types() if _is_model(each)] if place else []
     return [key_of(name, field) for each in models for name, field in each.model_fields.items()]
 
 
 def field_at(model: type[BaseModel], at: Sequence[str | int]) -> Field | None:
-    """The field at a location of a model, or None where the model leaves it open."""
+    """Returns the field at a location of a model; None if the model leaves it open."""
     here: Field | None = Field(model)
     for step in at:
         if here is None:
@@ -139,7 +139,7 @@ def _members(annotation: Any) -> Iterator[Any]:
 
 
 def _unioned(annotation: Any) -> tuple[Any, ...]:
-    """The members of a union with their annotations, nothing for other types."""
+    """Returns the members of a union with their annotations; empty for other types."""
     return get_args(annotation) if get_origin(annotation) in {Union, types.UnionType} else ()
 
 
@@ -151,7 +151,7 @@ def _member(place: Field, key: str) -> Field | None:
                     return Field(field.annotation, tuple(field.metadata), field.description or "")
         elif get_origin(member) is dict:
             return _annotated(get_args(member)[1])
-    # pydantic puts the name of a union's member into its locations; it is no step of ours
+    # pydantic includes the name of a union's member in its locations; it is not a step in the file
     return place if len(list(place.types())) > 1 else None
 
 

@@ -1,6 +1,6 @@
-"""An event as a line: in words for a person, a JSON object for a machine.
+"""Log line of an event: text for people, a JSON object for programs.
 
-The library tells events through `logging`: the message is the event's name, its argument a dictionary of
+The library reports events through `logging`: the message is the event's name, its argument a dictionary of
 facts.
 """
 
@@ -13,7 +13,7 @@ from datetime import datetime
 
 
 class ForPeople(logging.Formatter):
-    """``12:30:01.250 sdo write  node=1 object=6060h:00 value=8``"""
+    """Formats text such as ``12:30:01.250 sdo write  node=1 object=6060h:00 value=8``."""
 
     def format(self, record: logging.LogRecord) -> str:
         facts = " ".join(f"{name}={value}" for name, value in _facts(record).items())
@@ -21,7 +21,7 @@ class ForPeople(logging.Formatter):
 
 
 class ForMachines(logging.Formatter):
-    """A JSON object: date, level, where, event, and the event's facts."""
+    """Formats a JSON object: date, level, logger, event, and the event's facts."""
 
     def format(self, record: logging.LogRecord) -> str:
         about = {
@@ -34,7 +34,9 @@ class ForMachines(logging.Formatter):
 
 
 class LogFile(logging.FileHandler):
-    """Ends, with one line, where its disk is full: the axis is worth more than its log."""
+    """Log file that stops, with one message, when its disk is full, because the axis matters more than its
+    log.
+    """
 
     failed = False
 

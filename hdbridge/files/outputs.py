@@ -1,8 +1,8 @@
-"""Where results may go: never over what a person, or another command, would miss.
+"""Permitted locations of results, so that no output overwrites anything of value.
 
-A result may replace a result of its own kind, and nothing else: no input of the command, no other output, no
-file that makes a folder a profile or a recording. Pipes and character devices are written straight through
-(`write_atomically`); sockets, disks and folders are refused. All of it is checked before anything moves.
+A result may replace a result of its own kind and nothing else: no input of the command, no other output, no
+file that makes a folder a profile or a recording. Pipes and character devices are written directly
+(`write_atomically`); sockets, disks and folders are refused. Everything is checked before anything moves.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ _HEAD_BYTES: Final = 4096
 
 
 class Kind(Enum):
-    """What an output is; a file is known by how it begins."""
+    """Kind of an output, with the pattern that the beginning of such a file matches."""
 
     JSON = r'\s*\{\s*"schema": "hdbridge\.'
     PAGE = r"(?s).*<!doctype html>"
@@ -35,7 +35,7 @@ class Kind(Enum):
 
     @property
     def words(self) -> str:
-        """For complaints."""
+        """Name of the kind, for messages."""
         return {
             Kind.JSON: "a result of hdbridge",
             Kind.PAGE: "a page",
@@ -46,10 +46,10 @@ class Kind(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Output:
-    """One place that a command writes to."""
+    """One location that a command writes to."""
 
     option: str
-    """What names it, for complaints: ``--json``."""
+    """Option that names it, for messages: ``--json``."""
     path: Path
     kind: Kind
 
@@ -65,7 +65,7 @@ _SAMPLES: Final = (".csv", ".csv.gz")
 
 
 def check_outputs(outputs: Sequence[Output], inputs: Iterable[Path] = ()) -> None:
-    """InputError unless each output can be written and nothing is lost by it.
+    """Raises `InputError` unless each output can be written without losing anything.
 
     ``inputs`` are the files and folders that the command reads.
     """
@@ -118,7 +118,7 @@ def _check_file(
 
 
 def _check_belongs_to_no_folder(output: Output) -> None:
-    """Of a profile or a recording only a pending model may be written, or a first one."""
+    """Refuses to write a file of a profile or a recording, except a pending model or a first one."""
     path = _resolved(output.path)
     folder, name = path.parent, path.name.casefold()
     profile = folder.parent if folder.name.casefold() in _HISTORIES else folder
@@ -144,7 +144,7 @@ def _check_belongs_to_no_folder(output: Output) -> None:
 
 
 def _check_folder(output: Output, inputs: Sequence[Path]) -> None:
-    """A folder for measurements is new or empty: what was measured is never replaced."""
+    """Checks that a folder for measurements is new or empty, because measured data are never replaced."""
     folder = output.path
     with suppress(OSError):
         if folder.is_dir():
@@ -174,7 +174,7 @@ def _check_folder(output: Output, inputs: Sequence[Path]) -> None:
 
 
 def _redirected() -> list[tuple[str, os.stat_result]]:
-    """The files that the shell reads from and writes to for this process."""
+    """Returns the regular files that the shell has redirected for this process."""
     found = []
     for descriptor, name in enumerate(("standard input", "standard output", "standard error")):
         with suppress(OSError):
@@ -185,9 +185,9 @@ def _redirected() -> list[tuple[str, os.stat_result]]:
 
 
 def _same(one: Path, other: Path) -> bool:
-    """Whether two paths name one file: by links of either kind, by another spelling, by other case.
+    """Returns True if two paths name one file: by links of either kind, or by another spelling or case.
 
-    Of files that are not there yet case is no difference: on some file systems it is none.
+    For files that do not exist yet, case is ignored, because some file systems ignore it.
     """
     mine, its = descriptor_of(one), descriptor_of(other)
     if mine is not None or its is not None:
@@ -204,13 +204,15 @@ def _same(one: Path, other: Path) -> bool:
 
 
 def _endless(path: Path) -> bool:
-    """A character device takes what it is given; several outputs may share one."""
+    """Returns True for a character device, which accepts anything and may be shared by several outputs."""
     found = _status(path)
     return found is not None and stat.S_ISCHR(found.st_mode) and descriptor_of(path) is None
 
 
 def _status(path: Path) -> os.stat_result | None:
-    """Of what would be written: ``missing/../file`` is the file, although no such path can be opened."""
+    """Returns the status of the file to be written: ``missing/../file`` is the file, although it cannot be
+    opened.
+    """
     try:
         return _resolved(path).stat()
     except OSError:
@@ -237,9 +239,9 @@ _failures: ContextVar[list[OutputError] | None] = ContextVar("failures", default
 
 @contextmanager
 def failures_deferred() -> Iterator[list[OutputError]]:
-    """Within the block a result that cannot be written ends nothing: yields the list of what went wrong.
+    """Defers write failures of results within the block; yields the list of errors.
 
-    After a measurement the figures are printed first; a full disk shall not take them along.
+    After a measurement the figures are printed first, so that a full disk does not lose them.
     """
     failed: list[OutputError] = []
     token = _failures.set(failed)
@@ -251,7 +253,7 @@ def failures_deferred() -> Iterator[list[OutputError]]:
 
 @contextmanager
 def writing() -> Iterator[None]:
-    """A result is written in the block: its OutputError waits, where somebody defers failures."""
+    """Context of writing a result: its `OutputError` is deferred if an outer block defers failures."""
     try:
         yield
     except OutputError as error:
@@ -259,7 +261,7 @@ def writing() -> Iterator[None]:
 
 
 def defer(error: OutputError) -> None:
-    """Keep the error for the end, where somebody defers failures, else raise it."""
+    """Keeps the error for later if an outer block defers failures, else raises it."""
     failed = _failures.get()
     if failed is None:
         raise error

@@ -1,4 +1,4 @@
-"""The files of one axis, found from what a person types or a machine file says."""
+"""Files of one axis, found from user input or a machine file."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ TWIN_NAME: Final = "twin.yaml"
 
 @dataclass(frozen=True, slots=True)
 class Profile:
-    """The files of one axis."""
+    """Files of one axis."""
 
     axis: Path
     model: Path
@@ -22,22 +22,25 @@ class Profile:
 
     @property
     def folder(self) -> Path:
-        """Where the axis file lies, and with it the history of its models."""
+        """Folder of the axis file and of the history of its models."""
         return self.axis.parent
 
     @property
     def twin(self) -> Path:
-        """The twin's file, which may not be there."""
+        """File of the twin, which may not exist."""
         return self.folder / TWIN_NAME
 
     @property
     def simulated(self) -> Path:
-        """What the simulated drive of this axis is: its twin where there is one, else the truth file."""
+        """File that describes the simulated drive of this axis: its twin if there is one, else the truth
+        file.
+        """
         return self.twin if self.twin.is_file() else self.truth
 
     @classmethod
     def find(cls, text: str, base: Path = Path()) -> Profile:
-        """From a folder, an axis file, or the name of a bundled profile; InputError where it is neither.
+        """Finds a profile by folder, axis file, or name of a bundled profile; raises `InputError` if there is
+        none.
 
         ``base`` is the folder that a relative path starts from.
         """

@@ -1,4 +1,4 @@
-"""Opens regular files only: a command that opened a named pipe would wait for its writer."""
+"""Opens regular files only, because opening a named pipe would wait for its writer."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from hdbridge.files.atomic import descriptor_of
 
 
 def open_regular(path: Path) -> BinaryIO:
-    """Opens a file for reading; OSError if it is a named pipe, a device or a folder.
+    """Opens a file for reading; raises `OSError` for a named pipe, a device or a folder.
 
     Open files of this process (``/dev/stdin``, and ``/dev/fd/3`` of ``<(command)``) may be of any kind.
     """
     if descriptor_of(path) is None:
-        mode = os.stat(path).st_mode  # noqa: PTH116 - through links such as those in /proc
+        mode = os.stat(path).st_mode  # noqa: PTH116 - follows links such as those in /proc
         if stat.S_ISDIR(mode):
             raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), os.fspath(path))
         if not stat.S_ISREG(mode):

@@ -1,9 +1,9 @@
-"""Strict YAML: what stands in a file is read exactly, or refused in one line that says where and why.
+"""Strict YAML: a file is read exactly, or refused in one line that gives the place and the reason.
 
 The dialect is the core schema of YAML 1.2 (so `off` and `2025-01-31` are text, `1e-3` is a number and `0x402`
-an integer), one document of plain mappings, lists and scalars: no tags, anchors or aliases, no key twice, and
-limits on size and depth. Content is validated by a pydantic model, in pydantic's strict mode; every complaint
-becomes ``file:line:column: key.path: what is wrong; expected ...; did you mean 'nearest'?``.
+an integer), one document of plain mappings, lists and scalars: no tags, anchors or aliases, no duplicate
+keys, and limits on size and depth. A pydantic model validates the content in pydantic's strict mode; every
+error becomes ``file:line:column: key.path: what is wrong; expected ...; did you mean 'nearest'?``.
 """
 
 from __future__ import annotations
@@ -36,12 +36,12 @@ M = TypeVar("M", bound=BaseModel)
 
 
 def load_yaml(path: Path | str, model: type[M]) -> M:
-    """The file's content as an instance of ``model``; InputError with file, line and column otherwise."""
+    """Loads a file as an instance of ``model``; raises `InputError` with file, line and column."""
     return read_yaml(path).validate(model)
 
 
 def read_yaml(path: Path | str) -> Document:
-    """The file as plain data with positions, not yet validated."""
+    """Reads a file as plain data with positions, not yet validated."""
     path = Path(path)
     try:
         with open_regular(path) as file:
@@ -62,14 +62,14 @@ def read_yaml(path: Path | str) -> Document:
 
 
 def document_from_text(text: str, path: Path | str) -> Document:
-    """YAML text as a document; ``path`` only names it in complaints."""
+    """Parses YAML text as a document; ``path`` only names it in messages."""
     path = Path(path)
     return Document(path, compose(text, path))
 
 
 @dataclass(frozen=True, slots=True)
 class Document:
-    """One YAML document: its data, and where each value stands."""
+    """One YAML document: its data, and the position of each value."""
 
     path: Path
     root: Node
@@ -80,40 +80,40 @@ class Document:
         return self.root.value
 
     def validate(self, model: type[M], at: Location = ()) -> M:
-        """The value at a location as an instance of ``model``."""
+        """Returns the value at a location as an instance of ``model``."""
         value = self._node(at).value
         try:
-            # JSON, because pydantic's strict mode for JSON knows that a file has lists and text where a
-            # model has tuples and enums; in Python mode strictness would refuse them.
+            # JSON, because pydantic's strict JSON mode accepts lists and text for tuples and enums, and
+            # strict Python mode would refuse them.
             return model.model_validate_json(json.dumps(value), strict=True)
         except ValidationError as problem:
             errors = problem.errors(include_url=False, include_input=False)
             raise FileError(*self._complaints(model, at, errors)) from None
 
     def error(self, at: Location, message: str, *, key: bool = False) -> FileError:
-        """A complaint about the value (or the key) at a location."""
+        """Returns an error about the value (or the key) at a location."""
         return FileError(self._line(at, message, key=key))
 
     def position(self, at: Location) -> tuple[int, int]:
-        """Line and column of the key at a location, or of the innermost one around it that there is."""
+        """Returns line and column of the key at a location, or of the innermost existing one around it."""
         node = self._node(at, key=True)
         return node.line, node.column
 
     def _complaints(self, model: type[BaseModel], at: Location, errors: list[ErrorDetails]) -> list[str]:
         schema = [each for each in errors if each["loc"] == ("schema",)]
-        if schema:  # whatever else is wrong follows from it being another kind of file
+        if schema:  # all other errors follow from the wrong kind of file
             errors = schema
         unknown = {each["loc"][:-1]: each["loc"][-1] for each in errors if each["type"] == "extra_forbidden"}
         rows = []
         for error in errors:
             if error["type"] == "too_short" and any(
                 each["loc"][: len(error["loc"])] == error["loc"] != each["loc"] for each in errors
-            ):  # it counts only items without a fault of their own
+            ):  # it counts only items without an error of their own
                 continue
             place, message, key = self._complaint(model, at, error)
             if error["type"] == "missing" and place in unknown:
                 close = nearest(str(unknown[place]), [str(error["loc"][-1])])
-                if close:  # one slip of the pen, already told as the unknown key
+                if close:  # a single typing error, already reported as the unknown key
                     continue
             node = self._node(at + place, key=key)
             line = self._line(at + place, message, key=key)
@@ -123,7 +123,7 @@ class Document:
     def _complaint(
         self, model: type[BaseModel], at: Location, error: ErrorDetails
     ) -> tuple[Location, str, bool]:
-        """Location, message, and whether the key is meant rather than its value."""
+        """Returns location, message, and True if the key is meant rather than its value."""
         place, kind = error["loc"], error["type"]
         if kind == "extra_forbidden":
             names = field_names(model, place[:-1])
@@ -150,15 +150,15 @@ class Document:
         return f"{where}: {keys}: {message}" if keys else f"{where}: {message}"
 
     def _node(self, at: Location, *, key: bool = False) -> Node:
-        """The value at a location, or its key, or the innermost value around it that there is."""
+        """Returns the value at a location, or its key, or the innermost existing value around it."""
         kept, values = self._walk(at)
         around = values[-2].children if key and len(values) > 1 else None
         return around[str(kept[-1])][0] if isinstance(around, dict) else values[-1]
 
     def _walk(self, at: Location) -> tuple[Location, list[Node]]:
-        """The steps that exist in the file, and the values on the way, the root first.
+        """Returns the steps that exist in the file, and the values along them, the root first.
 
-        Others are left out: pydantic puts the names of a union's members into its locations.
+        Other steps are left out: pydantic includes the names of a union's members in its locations.
         """
         kept: Location = ()
         values = [self.root]
@@ -175,12 +175,12 @@ class Document:
 
 
 def wrong(message: str, *at: str | int) -> PydanticCustomError:
-    """For validators: a complaint about a part (``at``) of the value being validated, without a prefix."""
+    """Creates an error for validators about a part (``at``) of the validated value, without a prefix."""
     return PydanticCustomError("hdbridge", "{message}", {"message": message, "at": at})
 
 
 def dotted(at: Location) -> str:
-    """A location as a person writes it: ``effects[0].parameters.width_deg``."""
+    """Formats a location the way a person writes it: ``effects[0].parameters.width_deg``."""
     text = "".join(f"[{step}]" if isinstance(step, int) else f".{step}" for step in at)
     return text.removeprefix(".")
 
@@ -191,22 +191,22 @@ def _hint(word: str, choices: Sequence[str]) -> str:
 
 
 class Hex(int):
-    """An integer that is written in hexadecimal: object indices, vendor and product numbers."""
+    """Integer that is written in hexadecimal: object indices, vendor and product numbers."""
 
 
 class Line(list[Any]):
-    """A list that is written in one line: a row of a table, an interval."""
+    """List that is written in one line: a row of a table, an interval."""
 
 
 class _Dumper(yaml.SafeDumper):
-    """Quotes whatever either dialect, 1.1 or 1.2, would read as something other than text."""
+    """YAML dumper that quotes any text that either dialect, 1.1 or 1.2, would read as something else."""
 
     def ignore_aliases(self, data: Any) -> bool:
-        """Write values out each time; aliases are refused on reading."""
+        """Disables aliases, which are refused on reading."""
         return True
 
     def increase_indent(self, flow: bool = False, indentless: bool = False) -> None:
-        """Indent the items of a list under its key."""
+        """Indents the items of a list under its key."""
         super().increase_indent(flow, False)
 
 
@@ -225,12 +225,12 @@ _Dumper.add_representer(
 
 
 def _text(dumper: _Dumper, text: str) -> yaml.ScalarNode:
-    """In double quotes where other styles would fold or lose line breaks and marks of Unicode."""
+    """Uses double quotes if other styles would fold or lose line breaks and Unicode marks."""
     return dumper.represent_scalar("tag:yaml.org,2002:str", text, style='"' if _BREAKS.search(text) else None)
 
 
 def _plain(dumper: _Dumper, data: Any) -> yaml.Node:
-    """Numbers and arrays of numpy, and enums, as what they hold."""
+    """Writes numpy numbers and arrays, and enums, as plain values."""
     value = data.tolist() if hasattr(data, "tolist") else getattr(data, "value", data)
     return dumper.represent_undefined(data) if type(value) is type(data) else dumper.represent_data(value)
 
@@ -241,7 +241,9 @@ _Dumper.add_multi_representer(object, _plain)
 
 
 def dump_yaml(data: Any) -> str:
-    """Plain data (dicts, lists, scalars) as YAML: in block style but for `Line`, in order, numbers exact."""
+    """Returns plain data (dicts, lists, scalars) as YAML: block style except for `Line`, in order, numbers
+    exact.
+    """
     text: str = yaml.dump(
         data, Dumper=_Dumper, sort_keys=False, allow_unicode=True, default_flow_style=False, width=100000
     )

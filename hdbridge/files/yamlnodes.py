@@ -1,7 +1,7 @@
-"""From YAML text to values that know where they stand: the strict dialect that hdbridge reads.
+"""Parses YAML text into values with positions, in the strict dialect that hdbridge reads.
 
 One document of plain mappings, lists and scalars by the core schema of YAML 1.2: no tags, anchors or aliases,
-no key twice, and a limit on depth.
+no duplicate keys, and a limit on depth.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ _CONVERSIONS: tuple[tuple[re.Pattern[str], Callable[[str], int | float]], ...] =
 
 
 class FileError(InputError):
-    """A file is wrong. The text is the first complaint; `details` has every one, a line each."""
+    """A file is wrong. The text is the first error; `details` has all of them, one line each."""
 
     def __init__(self, *texts: str) -> None:
         lines = tuple(map(one_line, texts))
@@ -51,25 +51,25 @@ class FileError(InputError):
 
 @dataclass(frozen=True, slots=True)
 class Node:
-    """A value of the file with its position (line and column count from 1)."""
+    """Value of the file with its position (line and column count from 1)."""
 
     line: int
     column: int
     value: Any
     """Plain Python: dict, list, str, int, float, bool or None."""
     found: str
-    """The value in words, as a complaint shows it."""
+    """The value as text, for error messages."""
     children: dict[str, tuple[Node, Node]] | list[Node] | None = None
-    """Of a mapping: key -> (key's node, value's node)."""
+    """Children; for a mapping: key -> (key's node, value's node)."""
 
 
 def compose(text: str, path: Path) -> Node:
-    """The document in a YAML text; ``path`` only names it in complaints (`FileError`)."""
+    """Returns the root node of a YAML text; ``path`` only names it in messages (`FileError`)."""
     return _Composer(text, path).document()
 
 
 class _Composer:
-    """Builds nodes from parser events, refusing what a configuration has no use for."""
+    """Builds nodes from parser events, and refuses features that a configuration does not need."""
 
     def __init__(self, text: str, path: Path) -> None:
         self._path = path
@@ -97,7 +97,7 @@ class _Composer:
             raise self._not_yaml(self._in_better_words() or problem) from None
 
     def _in_better_words(self) -> yaml.YAMLError | None:
-        """The complaint of the pure parser: it says it better, and alike on every machine."""
+        """Returns the error of the pure-Python parser, which is clearer and the same on every computer."""
         try:
             for _ in yaml.parse(self._text, Loader=yaml.SafeLoader):
                 pass

@@ -1,12 +1,12 @@
-"""Improvement: closing the loop on a drive.
+"""Improvement: diagnosis, extension and trial of a model on a drive.
 
     diagnose     a recording, measured by a plan or given, against the active model
-    further      what is left open: the shortest experiment of the machine that distinguishes it
-    extension    the extended model, without what cannot be told in advance
-    trial        stepping with the active and with the extended model, in turns
-    improve      all of it, to a pending model
+    further      the shortest experiment of the axis that separates the remaining alternatives
+    extension    the extended model, without unpredictable effects
+    trial        stepping with the active and the extended model, in turns
+    improve      all steps, up to a pending model
 
-Drive and dates come in; nothing here knows whether the drive is simulated.
+Drive and dates are passed in; nothing here depends on whether the drive is simulated.
 """
 
 from hdbridge.improvement.extension import Extension, extension_of

@@ -1,6 +1,6 @@
-"""What the axis can do by itself to learn more: the experiments that `choose` has to choose from.
+"""Experiments that the axis can run on its own to learn more; `choose` selects from them.
 
-Which of them separates a pair of causes is not written here but predicted (`analysis.identifiability`).
+The causes that an experiment separates are not listed here but predicted (`analysis.identifiability`).
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ _CLOSER: Final = {
     "torque": "load-turn-at-two-speeds",
     "time": "reference-pose",
 }
-"""By what something unexplained depends on: the experiment that looks closer at it."""
+"""Experiment for something unexplained, by the coordinate that it depends on."""
 
 
 def _sweep(speed: float, **length: float) -> dict[str, Any]:
@@ -76,7 +76,7 @@ _MACHINE: Final[dict[str, tuple[str, tuple[dict[str, Any], ...]]]] = {
 
 
 def machine_plans() -> dict[str, Plan]:
-    """What the axis can do by itself to learn more, by name; ``about`` says it in words."""
+    """Returns the experiments that the axis can run on its own, by name; ``about`` describes each."""
     return {
         name: Plan.model_validate(
             {"schema": "hdbridge.plan/1", "name": name, "about": words, "procedures": procedures}
@@ -86,5 +86,5 @@ def machine_plans() -> dict[str, Plan]:
 
 
 def machine_for_unexplained(lives_in: str) -> str:
-    """Name of the experiment of `machine_plans` that looks closer at something unexplained."""
+    """Returns the name of the experiment in `machine_plans` that investigates something unexplained."""
     return _CLOSER[depends_on(lives_in)]

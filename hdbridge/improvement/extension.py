@@ -1,4 +1,6 @@
-"""What of a diagnosis goes into the model that is proposed, and what it is distinguished from."""
+"""Selection of the findings that enter the proposed model, and of the causes that they must be separated
+from.
+"""
 
 from __future__ import annotations
 
@@ -16,38 +18,39 @@ from hdbridge.units import DEG_PER_TURN
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Extension:
-    """The extended model, and which findings the compensation makes up for."""
+    """Extended model, and the findings that the compensation corrects."""
 
     model: TransmissionModel
     carried: tuple[Finding, ...]
-    """Findings that the compensation makes up for."""
+    """Findings that the compensation corrects."""
     left: tuple[str, ...]
-    """What is found and not compensated, with the reason."""
+    """Findings that are not compensated, each with the reason."""
 
     refused: tuple[str, ...] = ()
-    """Changes within the model that must not be offered, with the reason; they cannot be left out of it."""
+    """Changes within the model that must not be offered, with the reason; they cannot be removed from it."""
 
     @property
     def improves(self) -> bool:
-        """Whether all that the model is changed by gains on data that the fit has not seen."""
+        """True if every change of the model improves held-out data."""
         return bool(self.carried) and not self.refused
 
     def gains(self) -> list[tuple[str, Gain]]:
-        """Of what is carried: cause, and what it gains on held-out data."""
+        """Returns the held-out gain of each compensated finding, by cause."""
         return [(each.cause, each.gain) for each in self.carried if each.gain is not None]
 
 
 def extension_of(
     diagnosis: Diagnosis, active: TransmissionModel, rivals: Mapping[str, Sequence[str]] | None = None
 ) -> Extension:
-    """The diagnosis's extended model without what is tied to the time of its record.
+    """Returns the diagnosis's extended model without effects bound to the time of its record.
 
-    A lost count or the phase of a vibration says nothing of tomorrow. What is not compensated but repeats
-    (orders of the load of unknown origin) stays in the model, where a person can state its origin. Wear goes
-    on from the turns that the motor has run by the end of the record.
-    What does not gain on held-out data, or may be nothing (`Finding.refusal`), is left out.
-    ``rivals`` are the causes that each has not been distinguished from (`further.untold`): where one of
-    them must not be compensated, what was found is left out too, for it may well be that one.
+    A lost count or the phase of a vibration has no predictive value. Repeatable effects that are not
+    compensated (orders of the load of unknown origin) stay in the model, where the user can state their
+    origin. Wear continues from the turns that the motor has run by the end of the record. Findings without a
+    gain on held-out data, or that may be nothing (`Finding.refusal`), are left out.
+
+    ``rivals`` are the causes from which each has not been separated (`further.untold`). If one of them must
+    not be compensated, the finding is left out too, because it may be that one.
     """
     known = {each.name for each in active.effects}
     reasons = {id(each): _why_not(each, (rivals or {}).get(each.cause, ())) for each in diagnosis.findings}
@@ -78,17 +81,17 @@ def extension_of(
 
 
 def named(findings: Sequence[Finding]) -> str:
-    """Causes with their look-alikes and probabilities, in words."""
+    """Lists causes with their alternatives and probabilities, as text."""
     return ", ".join(f"{alternatives(each)} {each.probability:.2f}" for each in findings)
 
 
 def alternatives(finding: Finding) -> str:
-    """A cause and what it could also be, in words."""
+    """Returns a cause with its alternatives, as text."""
     return " or ".join((finding.cause, *finding.aliases))
 
 
 def _turns_run(diagnosis: Diagnosis) -> float:
-    """Motor turns of the record."""
+    """Returns the motor turns of the record."""
     return float(np.sum(np.abs(np.diff(diagnosis.traces.motion.motor_deg)))) / DEG_PER_TURN
 
 
@@ -97,14 +100,14 @@ def _of_its_time(effect: Effect) -> bool:
 
 
 def _why_not(finding: Finding, rivals: Sequence[str]) -> str:
-    """Why the compensation does not make up for a finding; empty where it does."""
+    """Returns the reason why the compensation does not correct a finding; empty if it does."""
     if finding.cause == "unexplained":
         return (
             f"unexplained, depends on the {finding.lives_in or 'time'}: no law of the catalogue to compensate"
         )
     if refused := finding.refusal():
         return f"{finding.cause} is not offered: {refused}"
-    # A change of a part that the model has already needs no effect of its own.
+    # A change of an existing part of the model needs no effect of its own.
     if finding.effect is not None and not finding.effect.is_compensable():
         return f"{finding.cause} is not compensated: {CATALOGUE[finding.cause].compensable.why}"
     for rival in rivals:

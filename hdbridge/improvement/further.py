@@ -1,4 +1,4 @@
-"""What the axis can do by itself to tell apart what a diagnosis leaves open."""
+"""Further experiments of the axis that separate what a diagnosis leaves open."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ class Choice:
 
     plan: Plan
     duration_s: float
-    """At an ideal axis."""
+    """Duration on an ideal axis."""
     tells: tuple[str, ...]
-    """What it is predicted to tell, in words."""
+    """Alternatives that it is predicted to separate, as text."""
 
     def as_dict(self) -> dict[str, Any]:
-        """For machines."""
+        """Returns the choice as data."""
         return {
             "experiment": self.plan.name,
             "about": self.plan.about,
@@ -39,10 +39,10 @@ class Choice:
 def untold(
     diagnosis: Diagnosis, model: TransmissionModel, view: AxisView, plans: Sequence[Plan] = ()
 ) -> dict[str, tuple[str, ...]]:
-    """Per cause that was found, the other causes that it has not been distinguished from.
+    """Returns for each cause found the other causes from which it has not been separated.
 
-    Those are its aliases in the diagnosis, and what none of the ``plans`` by which was measured can
-    distinguish from it: on a short travel a load order is a ramp, and one of the two always fits a little
+    These are its aliases in the diagnosis, and those that none of the ``plans`` used for measuring can
+    separate from it: on a short travel a load order is a ramp, and one of the two always fits slightly
     better.
     """
     reports = [plan_report(each, model, view.limits)["identifiability"] for each in plans]
@@ -67,11 +67,11 @@ def choose(
     view: AxisView,
     done: Collection[str] = (),
 ) -> Choice | None:
-    """The experiment, not ``done`` yet, predicted to distinguish causes from most of their ``rivals``; of
-    several the shortest.
+    """Returns the experiment, not ``done`` yet, predicted to separate most causes from their ``rivals``; of
+    several, the shortest.
 
-    Where none does but something is unexplained: the experiment that looks closer at what it depends on. None
-    where the machine can learn no more by itself.
+    If none does but something is unexplained: the experiment that investigates the coordinate it depends on.
+    None if the axis cannot learn more on its own.
     """
     menu = sorted(
         ((_duration_s(plan, view), plan) for name, plan in machine_plans().items() if name not in done),
@@ -104,7 +104,7 @@ def choose(
 
 
 def advice(diagnosis: Diagnosis) -> tuple[str, ...]:
-    """For whatever is still open, what a person can do about it."""
+    """Returns advice to the user for each open question."""
     return tuple(
         dict.fromkeys(
             f"{alternatives(each)}: {each.experiment}"
@@ -115,7 +115,7 @@ def advice(diagnosis: Diagnosis) -> tuple[str, ...]:
 
 
 def _separates(report: dict[str, Any], one: str, other: str, peak_arcsec: float) -> bool:
-    """Whether the plan by itself would see the cause at its size, and not take it for the other."""
+    """Returns True if the plan alone would detect the cause at its size and not confuse it with the other."""
     seen = report[one]
     limit = seen["detection_limit_arcsec"]
     if not seen["detectable"] or limit is None or limit > peak_arcsec:

@@ -1,4 +1,4 @@
-"""The whole way, from a booted drive to a pending model that points better."""
+"""Complete workflow, from a booted drive to a pending model that improves positioning."""
 
 from __future__ import annotations
 
@@ -40,19 +40,19 @@ Progress = Callable[[str, float, float], None]
 
 @dataclass(frozen=True, slots=True)
 class Source:
-    """What is diagnosed: a plan to be run (its journal), or recordings that are there."""
+    """Data for the diagnosis: a plan to be run (its journal), or existing recordings."""
 
     plan: Plan
-    """Its stepping test is the trial's, also where recordings are given."""
+    """Plan whose stepping test the trial uses, also for given recordings."""
     folder: Path
-    """Where everything new goes."""
+    """Folder for everything new."""
     journal: Journal | None = None
     given: Mapping[Path, Recording] = field(default_factory=dict)
     independent_zeros: bool = False
-    """The encoders' zeros were lost between the given recordings."""
+    """True if the encoders' zeros were lost between the given recordings."""
 
 
-@left_realtime()  # a fit takes its time; a bench goes back for each motion
+@left_realtime()  # a fit takes time; a bench returns to real time for each motion
 def improve(
     drive: Drive | Rig,
     source: Source,
@@ -65,13 +65,12 @@ def improve(
     interrupted: Callable[[], bool] = lambda: False,
     tell: Callable[[str], None] = lambda _: None,
 ) -> Improvement:
-    """Diagnose, extend, step with both models, and propose the better one to the profile.
+    """Diagnoses, extends, steps with both models, and proposes the better one to the profile.
 
-    ``profile`` is the folder of axis.yaml, ``active`` its model; ``tell`` receives a line for each step. With
-    ``rounds`` the axis runs so many further experiments at most, while something is left to tell apart.
-    Nothing is proposed where nothing is found, where what is found cannot be compensated, or where the
-    model does not gain on held-out data and in stepping. InputError where model or recordings are not of this
-    axis and drive.
+    ``profile`` is the folder of axis.yaml, ``active`` its model; ``tell`` receives a line for each step. The
+    axis runs up to ``rounds`` further experiments while causes remain to be separated. Nothing is proposed if
+    nothing is found, if nothing found can be compensated, or if the model does not gain on held-out data and
+    in stepping. Raises `InputError` if model or recordings belong to another axis or drive.
     """
     active.check_bound_to(drive.axis, drive.identity)
     bench = _Bench(drive, date, progress, interrupted)
@@ -121,7 +120,7 @@ def improve(
 
 @dataclass(frozen=True, slots=True)
 class _Bench:
-    """What every measurement here is run with."""
+    """Common settings of all measurements here."""
 
     drive: Drive | Rig
     date: datetime
@@ -129,13 +128,15 @@ class _Bench:
     interrupted: Callable[[], bool]
 
     def run(self, journal: Journal) -> bool:
-        """Measure what is missing; whether an encoder may have lost its zero between its tasks."""
+        """Measures what is missing; returns True if an encoder may have lost its zero between tasks."""
         measure(self.drive, journal, progress=self.progress, interrupted=self.interrupted)
         return len({each.session for each in tasks_of(journal.recording())}) > 1
 
 
 def _begin(source: Source, bench: _Bench) -> tuple[dict[Path, Recording], bool]:
-    """The recordings that are diagnosed first, and if an encoder may have lost its zero between them."""
+    """Returns the recordings to diagnose first, and True if an encoder may have lost its zero
+    between them.
+    """
     if source.journal is not None:
         apart = bench.run(source.journal)
         return {source.journal.folder: source.journal.recording()}, apart
@@ -145,7 +146,7 @@ def _begin(source: Source, bench: _Bench) -> tuple[dict[Path, Recording], bool]:
 
 
 def _plans_of(source: Source, given: Iterable[Recording]) -> list[Plan]:
-    """The plans by which was measured, as far as they are known."""
+    """Returns the plans used for measuring, as far as they are known."""
     if source.journal is not None:
         return [source.journal.plan]
     return [Plan.model_validate(each.notes["plan"]) for each in given if "plan" in each.notes]
@@ -171,7 +172,7 @@ def _journal(
     active: TransmissionModel,
     plans: Sequence[Plan],
 ) -> tuple[Journal | None, tuple[str, ...]]:
-    """The next experiment's: one that was begun before, or the one that is worth most now."""
+    """Returns the journal of the next experiment: one begun earlier, or the most useful one now."""
     axis = bench.drive.axis
     if (folder / ABOUT_NAME).exists():
         journal = Journal.open(folder)
@@ -191,7 +192,7 @@ def _concluded(
     recording: Recording,
     tell: Callable[[str], None],
 ) -> Improvement:
-    """With the trial, where one is worth its time, and the offer."""
+    """Adds the trial, if it is worth its time, and the offer."""
     extension, drive = result.extension, bench.drive
     if not extension.carried:
         return replace(result, offer=Offer(False, f"nothing proposed: {'; '.join(extension.left)}"))
@@ -254,7 +255,7 @@ def _provenance(result: Improvement, recording: Recording) -> dict[str, Any]:
 
 
 def _kept(folder: Path, result: Improvement) -> Improvement:
-    """Result and models next to the recording; nothing where nothing new was measured."""
+    """Saves result and models next to the recording, unless nothing new was measured."""
     if folder.is_dir() and any(folder.iterdir()):
         with writing():
             if result.diagnosis.findings:

@@ -1,4 +1,4 @@
-"""What an improvement says, as plain values; `Improvement.as_dict` is the document for machines."""
+"""Result of an improvement as plain values; `Improvement.as_dict` is the JSON document."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ class Round:
     about: str
     recording: str
     tells: tuple[str, ...]
-    """What it was predicted to tell; empty where it was there already."""
+    """Alternatives that it was predicted to separate; empty if it existed already."""
     found: tuple[str, ...]
-    """The findings after it, each with what it could also be."""
+    """Findings after it, each with its alternatives."""
 
     def as_dict(self) -> dict[str, Any]:
-        """For machines."""
+        """Returns the round as data."""
         return {
             "experiment": self.experiment,
             "about": self.about,
@@ -39,30 +39,30 @@ class Round:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Improvement:
-    """Diagnosed, extended, tried out; and whether the model is offered for commit."""
+    """Result of diagnosis, extension and trial, with the decision about the offer."""
 
     axis: str
     recordings: tuple[str, ...]
     date: str | None
-    """When the first was recorded, ISO 8601."""
+    """Date of the first recording, ISO 8601."""
     plan: str
     active: TransmissionModel
     diagnosis: Diagnosis
     extension: Extension
     untold: Mapping[str, tuple[str, ...]]
-    """Per cause that was found, the other causes that it has not been distinguished from."""
+    """For each cause found, the other causes from which it has not been separated."""
     rounds: tuple[Round, ...]
     further: Choice | None
-    """What the axis could do by itself to learn more."""
+    """Experiment that the axis could run on its own to learn more."""
     advice: tuple[str, ...]
-    """What a person can do about what is still open."""
+    """Advice to the user about open questions."""
     trial: Trial | None
     offer: Offer
     survived: tuple[str, ...] = ()
-    """A line for each file that was measured in spite of something."""
+    """One line for each file that was measured despite tolerated faults."""
 
     def as_dict(self) -> dict[str, Any]:
-        """The contract of ``--json``: schema ``hdbridge.improvement/1``."""
+        """Returns the document of ``--json``: schema ``hdbridge.improvement/1``."""
         trial = (
             self.trial.as_dict() if self.trial else {"stepping": None, "small_steps": None, "improves": None}
         )

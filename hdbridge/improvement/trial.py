@@ -1,4 +1,4 @@
-"""Does the axis point better with the extended model? Stepping with both, in turns."""
+"""Trial of an extended model: stepping with both models in turns, to see if positioning improves."""
 
 from __future__ import annotations
 
@@ -26,25 +26,25 @@ from hdbridge.procedures.small_steps import SmallSteps
 from hdbridge.procedures.stepping import Stepping, SteppingOutcome
 
 PIECES = 4
-"""Parts of the travel; in each both models step, so that a drift is the same for both."""
+"""Parts of the travel; both models step in each, so that a drift affects both equally."""
 SMALL_STEPS = 40
 DEFAULT_WIDTH_DEG = 20.0
-"""Reach of the small steps where the model has no hysteresis; motor degrees."""
+"""Reach of the small steps if the model has no hysteresis; motor degrees."""
 _WORDS = ("the active model", "the extended model")
 
 
 @dataclass(frozen=True, slots=True)
 class Trial:
-    """What stepping gave with the active and with the extended model, at the load encoder."""
+    """Results of stepping with the active and the extended model, at the load encoder."""
 
     stepping: Validation
-    """Steps longer than the hysteresis is wide, over the plan's travel."""
+    """Steps longer than the width of the hysteresis, over the plan's travel."""
     small: tuple[Stepped, Stepped]
-    """Steps shorter than it is wide, about one pose: before and after."""
+    """Steps shorter than that width, about one pose: before and after."""
 
     @property
     def improves(self) -> bool:
-        """Whether the axis points better in one of the two tests and in neither worse, beyond chance."""
+        """True if positioning improves in one of the two tests and worsens in neither, beyond chance."""
         gains = [
             _gain(self.stepping.before, self.stepping.after),
             _gain(*self.small),
@@ -53,17 +53,19 @@ class Trial:
 
     @property
     def worse(self) -> tuple[str, ...]:
-        """What got worse in one direction of either test, in words."""
+        """Descriptions of what got worse in one direction of either test."""
         small = (f"small steps {each}" for each in worse_ways(*self.small))
         return (*self.stepping.worse, *small)
 
     @property
     def of_floor(self) -> float:
-        """Three sigma of the stepping test with the extended model over what the axis could do at best."""
+        """Ratio of the stepping test's three sigma with the extended model to the best possible
+        on this axis.
+        """
         return self.stepping.after.pooled.three_sigma_arcsec / self.stepping.floor.three_sigma_arcsec
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain data; ``stepping`` is that of a calibration."""
+        """Returns plain data; ``stepping`` is that of a calibration."""
         before, after = self.small
         return {
             "stepping": self.stepping.as_dict(),
@@ -87,10 +89,10 @@ def try_out(
     progress: Callable[[str, float, float], None] = lambda *_: None,
     interrupted: Callable[[], bool] = lambda: False,
 ) -> Trial:
-    """Step a booted drive's axis with both models, part of the travel by part, in turns.
+    """Steps a booted drive's axis with both models in turns, one part of the travel after the other.
 
-    Each run's samples go to ``folder``, also when it is stopped. InputError, before anything moves, where the
-    axis lacks a channel that the model's compensation needs.
+    Each run's samples go to ``folder``, also if it is interrupted. Raises `InputError`, before anything
+    moves, if the axis lacks a channel that the model's compensation needs.
     """
     axis = drive.axis
     compensations = [compensation_for(axis, each) for each in (active, model)]
@@ -114,7 +116,7 @@ def try_out(
 
 
 def trial_s(plan: Plan, axis: AxisConfig, active: TransmissionModel) -> float:
-    """How long it takes at an ideal axis."""
+    """Returns the duration on an ideal axis."""
     view = axis_view(axis)
     middle = 0.5 * (axis.limits.position_min_deg + axis.limits.position_max_deg)
     procedures = _procedures(plan, view, active)
@@ -124,7 +126,7 @@ def trial_s(plan: Plan, axis: AxisConfig, active: TransmissionModel) -> float:
 def _procedures(
     plan: Plan, view: AxisView, active: TransmissionModel
 ) -> list[tuple[str, Stepping | SmallSteps]]:
-    """The plan's stepping test in parts, and the small steps last."""
+    """Returns the plan's stepping test in parts, and the small steps last."""
     whole = plan.stepping(view)
     count = max(whole.count // PIECES, 2)
     pieces = [
@@ -156,7 +158,7 @@ def _together(outcomes: Sequence[SteppingOutcome]) -> SteppingOutcome:
 
 
 def _gain(before: Stepped, after: Stepped) -> float:
-    """By how many of its standard errors the mean square about the mean has fallen; both stood at the same
+    """Returns the decrease of the mean square about the mean, in standard errors; both stood at the same
     places.
     """
     squares = []

@@ -1,4 +1,4 @@
-"""The transmission model: a gear ratio and a sum of effects; its file, its history, its differences."""
+"""Transmission model: a gear ratio and a sum of effects; its file, its history, its differences."""
 
 from hdbridge.model.transmission import ModelTracker, TransmissionModel
 

@@ -1,4 +1,4 @@
-"""What a model, or a twin, is bound to: the axis, the gear and the drive that it was made of."""
+"""Binding of a model or twin to its axis, gear and drive."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from hdbridge.model.file import Provenance
 
 
 def binding(axis: AxisConfig, identity: Identity | None = None) -> dict[str, Any]:
-    """What binds a model to an axis: entries of its provenance."""
+    """Returns the provenance entries that bind a model to an axis."""
     return {
         "axis": axis.name,
         "drive": (identity or axis.drive.identity).model_dump(exclude_none=True),
@@ -27,10 +27,12 @@ def check_binding(
     noun: str,
     instead: str,
 ) -> None:
-    """Refuse (InputError) what is of another drive, axis or gear; ``noun`` is what complaints call it.
+    """Raises `InputError` if a model or twin belongs to another drive, axis or gear; ``noun`` names it in
+    messages.
 
-    ``identity`` is what the drive answered; without it the axis file's is taken. What the provenance or the
-    drive leaves open is not compared, and neither is the revision: new firmware does not change a gear.
+    ``identity`` is the one read from the drive, by default that of the axis file. Values that the provenance
+    or the drive leaves open are not compared, and neither is the revision, because new firmware does not
+    change a gear.
     """
     bound = Provenance.model_validate(provenance)
 

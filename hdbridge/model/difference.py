@@ -1,4 +1,4 @@
-"""What changed between two models, parameter by parameter. Pure."""
+"""Differences between two models, parameter by parameter. Pure."""
 
 from __future__ import annotations
 
@@ -9,29 +9,29 @@ from hdbridge.model import TransmissionModel
 
 
 class Difference(NamedTuple):
-    """One parameter in two models; None where a model does not have it."""
+    """One parameter in two models; None if a model lacks it."""
 
     effect: str
     """Name of the effect; empty for the ratio."""
     parameter: str
-    """With its unit; of a list by its order or number: ``orders[2].amplitude_arcsec``."""
+    """Name with its unit; in a list by its order or number: ``orders[2].amplitude_arcsec``."""
     before: Any
     after: Any
     half_width: float | None
-    """Half width of its 95 % interval in the later model (else the earlier), if it is known."""
+    """Half width of its 95 % interval in the later model (else the earlier), if known."""
 
     @property
     def changed(self) -> bool:
-        """Whether the two differ at all."""
+        """True if the two differ."""
         return bool(self.before != self.after)
 
 
 def diff(before: TransmissionModel, after: TransmissionModel) -> list[Difference]:
-    """All parameters of both models, in the order of the files, changed or not."""
+    """Returns all parameters of both models in file order, changed or not."""
     old, new = dict(_parameters(before)), dict(_parameters(after))
     widths = {**dict(_half_widths(before)), **dict(_half_widths(after))}
     keys = list(dict.fromkeys([*old, *new]))
-    # What only the later model has stands with the rest of its effect.
+    # Parameters that only the later model has are placed with the rest of their effect.
     effects = list(dict.fromkeys(effect for effect, _ in keys))
     keys.sort(key=lambda key: effects.index(key[0]))
     return [Difference(*key, old.get(key), new.get(key), widths.get(key)) for key in keys]
@@ -52,7 +52,7 @@ def _half_widths(model: TransmissionModel) -> Iterator[tuple[tuple[str, str], fl
 
 
 def flat(value: Any, name: str = "") -> Iterator[tuple[str, Any]]:
-    """Leaves of nested parameters; the items of a list go by their ``order``, where they have one."""
+    """Yields the leaves of nested parameters; list items are named by their ``order`` if they have one."""
     if isinstance(value, dict):
         for key, inner in value.items():
             yield from flat(inner, f"{name}.{key}" if name else key)

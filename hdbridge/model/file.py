@@ -1,4 +1,4 @@
-"""The model file: its schema, how it is read with complaints that name the place, how it is written."""
+"""Model file: schema, reading with errors that give the place, and writing."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ _HEADER = "# The transmission model of an axis, written by hdbridge. docs/files.
 
 
 class GearOfModel(Strict):
-    """The gear that a model was measured on."""
+    """Gear that a model was measured on."""
 
     ratio: float = Field(gt=0, le=1000, description="N: motor turns per load turn")
     teeth: Teeth | None = Field(None, description="numbers of teeth")
 
 
 class Provenance(Strict):
-    """Where a model comes from and what it is bound to; further keys are kept as they are."""
+    """Origin and binding of a model; unknown keys are kept as they are."""
 
     model_config = ConfigDict(defer_build=True, frozen=True, extra="allow")
 
@@ -50,7 +50,7 @@ class EffectEntry(BaseModel):
 
 
 class ModelFile(BaseModel):
-    """The model file as it stands; the parameters are checked by the effect that they belong to."""
+    """Content of a model file; each effect checks its own parameters."""
 
     schema_: Literal["hdbridge.model/1"] = Field(alias="schema", description="kind and version of this file")
     ratio: float = Field(gt=0, le=1000, description="N: motor turns per load turn")
@@ -60,7 +60,7 @@ class ModelFile(BaseModel):
 
 
 class Content(NamedTuple):
-    """What a model file says."""
+    """Validated content of a model file."""
 
     ratio: float
     effects: tuple[Effect, ...]
@@ -70,7 +70,7 @@ class Content(NamedTuple):
 
 
 def content_of(document: Document) -> Content:
-    """Read a model file's document; InputError with file:line:column and the nearest right name."""
+    """Reads a model file's document; raises `InputError` with file:line:column and the nearest valid name."""
     file = document.validate(ModelFile)
     effects: list[Effect] = []
     uncertainty: dict[str, dict[str, Any]] = {}
@@ -92,7 +92,7 @@ def document_of(
     provenance: Mapping[str, Any],
     response: Response | None = None,
 ) -> dict[str, Any]:
-    """The content of a model file as plain data."""
+    """Returns the content of a model file as plain data."""
     entries = [
         {"effect": each.name, "parameters": each.parameters()}
         | ({"uncertainty": dict(uncertainty[each.name])} if uncertainty.get(each.name) else {})
@@ -107,7 +107,7 @@ def document_of(
 
 
 def text_of(document: Mapping[str, Any]) -> str:
-    """The text of a model file; it reads back exactly."""
+    """Returns the text of a model file; it reads back exactly."""
     data = dict(document)
     if "provenance" in data:
         data["provenance"] = _hexadecimal(data["provenance"])
@@ -117,9 +117,9 @@ def text_of(document: Mapping[str, Any]) -> str:
 
 
 def content_of_document(data: Mapping[str, Any]) -> Content:
-    """Reads `document_of`, which this program has made: fast enough for the control loop.
+    """Reads the result of `document_of`, fast enough for the control loop.
 
-    KeyError or ValueError for anything else.
+    Raises `KeyError` or `ValueError` for anything else.
     """
     entries = data["effects"]
     return Content(
@@ -155,7 +155,7 @@ def _effect(document: Document, number: int, entry: EffectEntry, before: list[st
 
 
 def _hexadecimal(provenance: Mapping[str, Any]) -> dict[str, Any]:
-    """The drive's identity in hexadecimal, as data sheets have it."""
+    """Returns the provenance with the drive's identity in hexadecimal, as in data sheets."""
     data = dict(provenance)
     if isinstance(data.get("drive"), Mapping):
         data["drive"] = {
@@ -165,7 +165,7 @@ def _hexadecimal(provenance: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _in_lines(data: Mapping[str, Any]) -> dict[str, Any]:
-    """The same with each list in one line."""
+    """Returns the data with each list in one line."""
     return {
         name: Line(value)
         if isinstance(value, list)

@@ -1,7 +1,7 @@
-"""Response of an axis to its correction in motion, and the filter that makes up for it.
+"""Response of an axis to its correction in motion, and the filter that compensates for it.
 
-At rest the load answers a correction fully. In motion servo, command filter and interpolation change its
-amplitude and phase. `Response` has the measured points and the filter weights computed from them;
+At rest the load follows a correction fully. In motion servo, command filter and interpolation change its
+amplitude and phase. `Response` holds the measured points and the filter weights computed from them;
 `hdbridge.analysis.response` computes both.
 """
 
@@ -17,9 +17,9 @@ from hdbridge.strictness import Strict
 class LeadFilter(Strict):
     """Weights of the correction along the path, from the near future to the past.
 
-    Near standstill the filter fades out: what is left of the move in it would let the motor turn back. Weight
-    j applies to the correction of the load target ``lead_cycles - j / per_cycle`` cycles ahead. The weights
-    sum to 1, so that nothing changes at rest.
+    Near standstill the filter fades out, because the rest of the move in it would make the motor turn back.
+    Weight j applies to the correction of the load target ``lead_cycles - j / per_cycle`` cycles ahead. The
+    weights sum to 1, so that nothing changes at rest.
     """
 
     lead_cycles: int = Field(ge=0, le=50, description="how far ahead the first weight lies, in cycles")

@@ -1,17 +1,17 @@
-"""The models of a profile: the active one, one that waits to be committed, and every one that there was.
+"""Models of a profile: the active one, a pending one, and all earlier ones.
 
-    profiles/NAME/axis.yaml           written by a person
-                  model.yaml          the active model, the one that commands use
+    profiles/NAME/axis.yaml           written by the user
+                  model.yaml          the active model, used by the commands
                   pending.yaml        proposed by a calibration or diagnosis, not yet committed
                   history/0001.yaml   each version that was ever active, byte for byte
                   history/log.yaml    what was activated when, and why
 
-Twins are kept alike, in files of their own names (`hdbridge.twin.kept`): what is said of models here holds
-for whatever a `Store` keeps.
+Twins are stored in the same way under their own file names (`hdbridge.twin.kept`); everything said of models
+here applies to any content of a `Store`.
 
-Each file is replaced atomically, in such an order that a kill at any moment leaves a usable profile: a
-version is in the history before it becomes active, and the log is written last. Which version is active is
-not noted anywhere, so it cannot be noted wrongly: it is the one whose bytes model.yaml has.
+Each file is replaced atomically, in an order such that a kill at any moment leaves a usable profile: a
+version is in the history before it becomes active, and the log is written last. The active version is not
+recorded anywhere, so the record cannot be wrong: it is the one whose bytes model.yaml has.
 
 The date of each step is passed in.
 """
@@ -64,12 +64,12 @@ class LogFile(BaseModel):
 
 
 class Kept(Protocol):
-    """What a store keeps: something with a provenance that binds it to an axis and its drive."""
+    """Content of a store: something with a provenance that binds it to an axis and its drive."""
 
     @property
     def provenance(self) -> Mapping[str, Any]: ...
     def told(self, **provenance: Any) -> Self:
-        """The same, with this in its provenance."""
+        """Returns the same content with these entries added to its provenance."""
         ...
 
     def save(self, path: Path | str) -> None: ...
@@ -83,44 +83,44 @@ K = TypeVar("K", bound=Kept)
 
 @dataclass(frozen=True, slots=True)
 class Version(Generic[K]):
-    """A version of what is kept."""
+    """A stored version."""
 
     number: int | None
-    """None for the pending model, and for an active one that was put there or edited by hand."""
+    """None for the pending model, and for an active one that was copied there or edited by hand."""
     path: Path
     active: bool
     date: str
-    """When it was made, as its file says."""
+    """Date of creation according to its file."""
     reason: str
     content: K
     activations: tuple[Activation, ...] = ()
 
     @property
     def name(self) -> str:
-        """As commands call it: its number, ``pending`` or ``active``."""
+        """Name for commands: its number, ``pending`` or ``active``."""
         return str(self.number) if self.number else ACTIVE if self.active else PENDING
 
 
 @dataclass(frozen=True, slots=True)
 class Store(Generic[K]):
-    """What is kept of one kind in a profile's folder."""
+    """All versions of one kind of content in a profile's folder."""
 
     noun: str
-    """What complaints call one."""
+    """Name of the kind, for messages."""
     active: str
-    """Name of the active one's file."""
+    """File name of the active version."""
     pending: str
-    """Name of the pending one's file."""
+    """File name of the pending version."""
     history: str
     """Name of the folder with all versions."""
     first: str
-    """What to do where there is none, for complaints."""
+    """Advice if there is none, for messages."""
     command: str
-    """The command that prints the log."""
+    """Command that prints the log."""
     load: Callable[[Path], K]
 
     def log(self, profile: Path) -> list[Version[K]]:
-        """Every version: the pending one, an active one that is not in the history, newest first.
+        """Returns all versions, newest first: pending, an active one outside the history, and the history.
 
         Another process, such as the daemon, may commit the pending one meanwhile.
         """
@@ -146,7 +146,9 @@ class Store(Generic[K]):
         return versions
 
     def find(self, profile: Path, name: str) -> Version[K]:
-        """One by name: ``active``, ``pending`` or a version's number; InputError says which there are."""
+        """Returns a version by name: ``active``, ``pending`` or a number; raises `InputError` with the
+        existing names.
+        """
         versions = self.log(profile)
         for version in versions:
             if name in {version.name, f"{version.number:04d}" if version.number else ""} or (
@@ -167,10 +169,9 @@ class Store(Generic[K]):
         date: datetime,
         identity: Identity | None = None,
     ) -> Path:
-        """Keep one as pending, bound to the profile's axis and the drive that answered.
+        """Stores content as pending, bound to the profile's axis and the drive's identity; returns the file.
 
-        It takes the place of another pending one. Returns the file. InputError where it is of another gear
-        ratio.
+        Replaces another pending one. Raises `InputError` if the gear ratio differs.
         """
         axis = AxisConfig.load(profile)
         content.check_ratio(axis)
@@ -180,9 +181,9 @@ class Store(Generic[K]):
         return profile / self.pending
 
     def commit(self, profile: Path, date: datetime, identity: Identity | None = None) -> int:
-        """Make the pending one the active one; returns its number.
+        """Makes the pending version active; returns its number.
 
-        ``identity`` is what the drive answers now; InputError where it, the axis or the gear is another.
+        ``identity`` is the present one of the drive. Raises `InputError` if it, the axis or the gear differs.
         """
         pending = profile / self.pending
         with _locked(profile):
@@ -195,7 +196,7 @@ class Store(Generic[K]):
         return number
 
     def discard(self, profile: Path) -> None:
-        """Throw the pending one away; InputError when there is none."""
+        """Deletes the pending version; raises `InputError` if there is none."""
         with _locked(profile):
             try:
                 (profile / self.pending).unlink()
@@ -205,7 +206,7 @@ class Store(Generic[K]):
     def activate(
         self, profile: Path, version: int, reason: str, date: datetime, identity: Identity | None = None
     ) -> int:
-        """Make a version of the history the active one; the one before stays in the history."""
+        """Makes a version of the history active; the previous one stays in the history."""
         path = self._history(profile).get(version)
         if path is None:
             numbers = ", ".join(map(str, sorted(self._history(profile)))) or f"none yet, {self.first}"
@@ -215,7 +216,7 @@ class Store(Generic[K]):
             return self._activate(profile, path.read_bytes(), "activate", reason, date)
 
     def rollback(self, profile: Path, reason: str, date: datetime, identity: Identity | None = None) -> int:
-        """Undo the last activation that is not undone yet; returns the number that is active now."""
+        """Undoes the last activation that is not undone yet; returns the number of the version now active."""
         with _locked(profile):
             active = _bytes(profile / self.active)
             earlier = undone(
@@ -230,13 +231,13 @@ class Store(Generic[K]):
             return self._activate(profile, path.read_bytes(), "rollback", reason, date)
 
     def _activate(self, profile: Path, content: bytes, action: Action, reason: str, date: datetime) -> int:
-        """History first, then the active one, the log last."""
+        """Writes the history first, then the active version, the log last."""
         activations = self._activations(profile)
         before = _bytes(profile / self.active)
         if before is not None and before != content and self._number(profile, before) is None:
             try:
                 self.load(profile / self.active)
-            except (InputError, UnicodeDecodeError):  # edited by hand and broken: kept, but it is no version
+            except (InputError, UnicodeDecodeError):  # edited by hand and broken: kept, but not a version
                 write_atomically(self._history_folder(profile) / "unreadable.yaml", before)
             else:
                 reason_found = "was there, but not in the history"
@@ -256,7 +257,7 @@ class Store(Generic[K]):
         return number
 
     def _keep(self, profile: Path, content: bytes) -> int:
-        """The number of the version with this content, put into the history if it is not there."""
+        """Returns the number of the version with this content; adds it to the history if necessary."""
         number = self._number(profile, content)
         if number is None:
             number = max(self._history(profile), default=0) + 1
@@ -305,11 +306,10 @@ class Store(Generic[K]):
 
 
 def undone(activations: Sequence[Activation], active: int | None) -> int | None:
-    """The version that a roll-back returns to, from the log and the version that is active now.
+    """Returns the version that a roll-back returns to, given the log and the active version.
 
-    Roll-backs undo activations one by one, as an editor's undo does. The log may lack the last step, where a
-    kill came between it and the log: the active version tells. None for ``active`` means a model that is
-    not in the history.
+    Roll-backs undo activations one by one, like the undo of an editor. The log may lack the last step after a
+    kill; the active version then completes it. ``active`` is None for a model that is not in the history.
     """
     stack: list[int] = []
     for each in activations:
@@ -326,7 +326,7 @@ def undone(activations: Sequence[Activation], active: int | None) -> int | None:
 
 
 def _unwind(stack: list[int], version: int) -> None:
-    """Take from the stack what stands above a version in it."""
+    """Removes the entries above a version from the stack."""
     while stack[-1] != version:
         stack.pop()
 
@@ -347,9 +347,10 @@ def _iso(date: datetime) -> str:
 
 @contextmanager
 def measuring(axis_file: Path) -> Iterator[None]:
-    """One measurement at a time for a profile, also between processes: of two proposals one would be lost.
+    """Allows one measurement of a profile at a time, across processes, because of two proposals one would be
+    lost.
 
-    InputError, at once, where another process has it. The lock goes with its process, whatever ends it.
+    Raises `InputError` at once if another process holds the lock. The lock ends with its process.
     """
     try:
         file = os.open(axis_file, os.O_RDONLY | os.O_CLOEXEC)
@@ -370,7 +371,7 @@ def measuring(axis_file: Path) -> Iterator[None]:
 
 @contextmanager
 def _locked(profile: Path) -> Iterator[None]:
-    """One change at a time, also between processes; the lock goes with its process."""
+    """Allows one change at a time, across processes; the lock ends with its process."""
     try:
         folder = os.open(profile, os.O_RDONLY | os.O_DIRECTORY)
     except OSError as problem:

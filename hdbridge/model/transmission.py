@@ -1,4 +1,4 @@
-"""The transmission model: a gear ratio and a sum of effects, and the file that holds it."""
+"""Transmission model: a gear ratio and a sum of effects, and its file."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from hdbridge.model.response import Response
 class TransmissionModel:
     """theta_TE = theta_L - theta_M / N as a sum of effects, arcsec at the load.
 
-    The model says nothing of the gear's past: which state it starts from is told to `predict` and `tracker`
+    The model does not contain the gear's past. The initial state is passed to `predict` and `tracker`
     (`Start`), because it depends on the move before the record or the run, not on the gear.
     """
 
@@ -31,29 +31,29 @@ class TransmissionModel:
     """N: motor turns per load turn, positive."""
     effects: tuple[Effect, ...] = ()
     uncertainty: dict[str, dict[str, Any]] = field(default_factory=dict)
-    """Per effect name: parameter name -> 95 % half width, in the parameter's unit."""
+    """Effect name -> parameter name -> half width of the 95 % interval, in the parameter's unit."""
     provenance: dict[str, Any] = field(default_factory=dict)
-    """Where the numbers come from: recording, date, versions, drive identity (`Provenance`)."""
+    """Origin of the numbers: recording, date, versions, drive identity (`Provenance`)."""
     response: Response | None = None
     """Response of the axis to the correction in motion; None if it has not been measured."""
     path: Path | None = field(default=None, compare=False)
-    """The file that it was read from."""
+    """File that it was read from."""
 
     def predict(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
-        """Transmission error in arcsec for each sample of a motion, shape (n,)."""
+        """Returns the transmission error in arcsec for each sample of a motion, shape (n,)."""
         total = np.zeros(len(motion))
         for effect in self.effects:
             total += effect.predict(motion, start)
         return total
 
     def tracker(self, start: Start = Start.VIRGIN) -> ModelTracker:
-        """A fresh on-line tracker of the whole sum."""
+        """Returns a new on-line tracker of the whole sum."""
         return ModelTracker([effect.tracker(start) for effect in self.effects])
 
     def only(self, names: Iterable[str]) -> Self:
-        """The same model with no other effects than those named (unknown names are not an error).
+        """Returns the model with only the named effects (unknown names are not an error).
 
-        A law that stands in another's place goes by either name.
+        A law that replaces another is also found by the other's name.
         """
         wanted = set(names)
         kept = (each for each in self.effects if each.name in wanted or each.replaces in wanted)
@@ -61,12 +61,12 @@ class TransmissionModel:
 
     @classmethod
     def load(cls, path: Path | str) -> Self:
-        """Read a model file; InputError with file:line:column and the nearest right name."""
+        """Reads a model file; raises `InputError` with file:line:column and the nearest valid name."""
         return cls._from_document(read_yaml(path))
 
     @classmethod
     def from_text(cls, text: str, path: Path | str = "model.yaml") -> Self:
-        """A model file's text; ``path`` names it in complaints."""
+        """Reads the text of a model file; ``path`` names it in messages."""
         return cls._from_document(document_from_text(text, path))
 
     @classmethod
@@ -76,31 +76,31 @@ class TransmissionModel:
 
     @classmethod
     def from_document(cls, data: Mapping[str, Any], path: Path | None = None) -> Self:
-        """Reads `document`; KeyError or ValueError for anything else."""
+        """Reads the result of `document`; raises `KeyError` or `ValueError` for anything else."""
         return cls(*content_of_document(data), path=path)
 
     def document(self) -> dict[str, Any]:
-        """The content of the model file as plain data, ready for JSON."""
+        """Returns the content of the model file as plain data, ready for JSON."""
         return document_of(self.ratio, self.effects, self.uncertainty, self.provenance, self.response)
 
     def dump(self) -> str:
-        """The model file's text; what it says reads back exactly."""
+        """Returns the model file's text, which reads back exactly."""
         return text_of(self.document())
 
     def save(self, path: Path | str) -> None:
-        """Write the model file atomically."""
+        """Writes the model file atomically."""
         write_atomically(path, self.dump())
 
     def told(self, **provenance: Any) -> Self:
-        """The same model, with this in its provenance."""
+        """Returns the model with these entries added to its provenance."""
         return replace(self, provenance={**self.provenance, **provenance})
 
     def bound_to(self, axis: AxisConfig, identity: Identity | None = None) -> Self:
-        """The same model, bound to an axis and the drive that answered there (else the axis file's)."""
+        """Returns the model bound to an axis and the identity of its drive (by default the axis file's)."""
         return replace(self, provenance={**self.provenance, **binding(axis, identity)})
 
     def check_ratio(self, axis: AxisConfig) -> None:
-        """Refuse (InputError) a model of another gear ratio than the axis file's."""
+        """Raises `InputError` if the model's gear ratio differs from the axis file's."""
         if not math.isclose(self.ratio, axis.gear.ratio, rel_tol=1e-9):
             raise InputError(
                 f"{self._name()}: ratio: this model is of a gear with ratio {self.ratio:g}, but "
@@ -108,10 +108,11 @@ class TransmissionModel:
             )
 
     def check_bound_to(self, axis: AxisConfig, identity: Identity | None = None) -> None:
-        """Refuse (InputError) a model of another drive, axis or gear.
+        """Raises `InputError` if the model belongs to another drive, axis or gear.
 
-        ``identity`` is what the drive answered; without it the axis file's is taken. What the model or the
-        drive leaves open is not compared, and neither is the revision: new firmware does not change a gear.
+        ``identity`` is the one read from the drive, by default that of the axis file. Values that the model
+        or the drive leaves open are not compared, and neither is the revision, because new firmware does not
+        change a gear.
         """
         self.check_ratio(axis)
         check_binding(self.provenance, axis, identity, self._name(), "model", "calibrate it")
@@ -121,7 +122,7 @@ class TransmissionModel:
 
 
 class ModelTracker(Tracker):
-    """The sum of its effects' trackers."""
+    """Sum of the trackers of all effects."""
 
     __slots__ = ("_trackers",)
 
@@ -130,18 +131,18 @@ class ModelTracker(Tracker):
 
     @property
     def memory_deg(self) -> float:
-        """The longest of its effects'."""
+        """Longest memory of its effects."""
         return max((each.memory_deg for each in self._trackers), default=0.0)
 
     def peek(self, motor_deg: float, moment: Moment) -> float:
-        """Sum of the effects at ``motor_deg``, arcsec; changes nothing."""
+        """Returns the sum of the effects at ``motor_deg``, arcsec; changes nothing."""
         total = 0.0
         for tracker in self._trackers:
             total += tracker.peek(motor_deg, moment)
         return total
 
     def advance(self, motor_deg: float, moment: Moment) -> float:
-        """Move every effect on and return the sum, arcsec."""
+        """Advances every effect and returns the sum, arcsec."""
         total = 0.0
         for tracker in self._trackers:
             total += tracker.advance(motor_deg, moment)

@@ -1,12 +1,12 @@
-"""Synchronised moves of several axes: all begin together, arrive together, and go straight in between.
+"""Synchronised moves of several axes: common start, common arrival, straight path in between.
 
-The result is knots at the control period for each axis, which a stream (`SetPoint.stream`) follows to the
-bit. To be made outside of the loop: it takes milliseconds.
+The result is knots at the control period for each axis, which a stream (`SetPoint.stream`) follows exactly.
+Compute them outside the loop, because it takes milliseconds.
 
-Ruckig's free version plans no path through intermediate points (it would ask a server on the internet). So a
-path through way points rests at each at which its direction changes; points on a straight line are passed in
-motion. To round a corner without a rest, one has to leave the points: that is for the caller to decide, by
-other points.
+Ruckig's free version plans no path through intermediate points (it would call a server on the internet). A
+path through way points therefore rests at each point at which its direction changes; points on a straight
+line are passed in motion. Rounding a corner without a rest means leaving the points: the caller decides this
+by choosing other points.
 """
 
 from __future__ import annotations
@@ -28,21 +28,21 @@ from hdbridge.motion.stream import ACCELERATION_MARGIN
 from hdbridge.procedures.moves import MotionLimits
 
 _STRAIGHT = 1e-9
-"""Of the direction's unit vector, so far two may be apart and still be one."""
+"""Maximum difference of two unit direction vectors that count as equal."""
 MOST_S = 3600.0
-"""Longest plan; its knots are kept in memory."""
+"""Maximum duration of a plan, whose knots are kept in memory; s."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CoordinatedPlan:
-    """Knots of several axes for the same times."""
+    """Knots of several axes for common times."""
 
     duration_s: float
     knots: dict[str, FloatArray]
-    """Per axis, shape (n, 3): time in s (from 0, at each control period), load angle in degrees, velocity in
-    deg/s.
+    """Knots per axis, shape (n, 3): time in s (from 0, at each control period), load angle in degrees,
+    velocity in deg/s.
 
-    The first is where the axis stood, the last its target; both at rest.
+    The first is the initial position, the last the target; both at rest.
     """
 
 
@@ -53,11 +53,12 @@ def coordinated(
     period_s: float,
     share: float = 1.0,
 ) -> CoordinatedPlan:
-    """Move axes from rest, together, through points to rest at the last of them.
+    """Plans a synchronised move from rest, through points, to rest at the last of them.
 
-    ``starts_deg`` is where each axis stands. Each point gives load angles of some or all axes; the others
-    stay. ``share``, above 0 and up to 1, is taken of all limits of velocity and acceleration. InputError for
-    an axis that is not known, an angle outside its limits or not finite, and a plan longer than an hour.
+    ``starts_deg`` holds the position of each axis. Each point gives load angles of some or all axes; the
+    others stay. ``share``, above 0 and up to 1, scales all velocity and acceleration limits. Raises
+    `InputError` for an unknown axis, an angle outside its limits or not finite, and a plan longer than an
+    hour.
     """
     if not points_deg:
         raise InputError("a coordinated move without a point; expected at least one")
@@ -103,7 +104,7 @@ def _check_inside(name: str, angle_deg: float, limits: MotionLimits) -> None:
 
 
 class _Eased(NamedTuple):
-    """Limits within which the cubics between the knots keep to the axis's."""
+    """Limits that keep the cubics between the knots within the limits of the axis."""
 
     velocity_deg_s: float
     acceleration_deg_s2: float
@@ -111,8 +112,10 @@ class _Eased(NamedTuple):
 
 
 def _eased(limits: MotionLimits, period_s: float, share: float) -> _Eased:
-    """Where the jerk changes within a period T, the cubic passes the acceleration by up to 4/27 of jerk T,
-    and the velocity by up to 0.0162 of jerk T^2.
+    """Returns reduced limits for the knots.
+
+    If the jerk changes within a period T, the cubic exceeds the acceleration by up to 4/27 of jerk T, and the
+    velocity by up to 0.0162 of jerk T^2.
     """
     velocity, acceleration = share * limits.velocity_deg_s, share * limits.acceleration_deg_s2
     jerk = min(
@@ -124,7 +127,9 @@ def _eased(limits: MotionLimits, period_s: float, share: float) -> _Eased:
 
 
 def _straight(corners: Sequence[FloatArray]) -> list[tuple[FloatArray, FloatArray]]:
-    """From corner to corner, without points that are passed straight on; legs of no length left out."""
+    """Returns the legs from corner to corner, without points passed straight on and without legs of zero
+    length.
+    """
     legs: list[tuple[FloatArray, FloatArray]] = []
     for begin, end in pairwise(corners):
         way = end - begin
@@ -144,7 +149,7 @@ def _straight(corners: Sequence[FloatArray]) -> list[tuple[FloatArray, FloatArra
 def _leg(
     begin: FloatArray, end: FloatArray, limits: Sequence[_Eased], period_s: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Positions and velocities at each period from rest to rest, both of shape (n, axes)."""
+    """Returns positions and velocities at each period from rest to rest, both of shape (n, axes)."""
     count = len(begin)
     demand = InputParameter(count)
     demand.synchronization = Synchronization.Phase

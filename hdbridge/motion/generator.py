@@ -1,8 +1,8 @@
 """Jerk-limited plans of one axis from any present state, by ruckig on line.
 
-A plan is checked before it is given: it ends where it was asked to, in finite time, and stays within the
-bounds and the axis's velocity. Whatever ruckig cannot solve, or solves outside of the bounds, is None here,
-and the caller decides what is safe.
+A plan is checked before it is returned: it ends at its target, in finite time, and stays within the bounds
+and the axis's velocity. The result is None if ruckig finds no solution, or only one outside the bounds; the
+caller then decides what is safe.
 """
 
 from __future__ import annotations
@@ -17,14 +17,14 @@ from hdbridge.procedures.moves import MotionLimits
 
 SOLVED = frozenset({Result.Working, Result.Finished})
 SHARES = (1.0, 1.0 - 1e-6)
-"""Ruckig finds nothing where limits and distance meet in a point; a hair slower it does."""
+"""Ruckig fails if limits and distance coincide exactly; slightly slower it succeeds."""
 _MISS_DEG = 1e-6
-"""A plan whose end is farther from its target than this is none: ruckig was out of its depth."""
+"""Maximum distance of a plan's end from its target; beyond it ruckig has failed numerically."""
 _ROUNDING_DEG = 1e-9
 
 
 _NEAR_END = 0.999
-"""Share of a path's time at which it still comes from where it has been last."""
+"""Share of a path's duration at which it still moves in its final direction."""
 _HALVINGS = 30
 _At = Callable[[float], tuple[list[float], list[float], list[float]]]
 
@@ -38,7 +38,7 @@ class Kinematics(NamedTuple):
 
 
 class Bounds(NamedTuple):
-    """Between which positions a plan may lead."""
+    """Position range within which a plan must stay."""
 
     lower_deg: float
     upper_deg: float
@@ -51,10 +51,10 @@ class Plan(NamedTuple):
     end_deg: float
     duration_s: float
     at: _At
-    """Position (from ``begin_deg``), velocity and acceleration of one degree of freedom."""
+    """Position (relative to ``begin_deg``), velocity and acceleration of one degree of freedom."""
 
     def state(self, time_s: float) -> Kinematics:
-        """Where it is after so long; at rest, exactly at its end, when it is over."""
+        """Returns the state after this time; at rest, exactly at its end, after its duration."""
         if time_s >= self.duration_s:
             return Kinematics(self.end_deg, 0.0, 0.0)
         position, velocity, acceleration = self.at(time_s)
@@ -62,9 +62,9 @@ class Plan(NamedTuple):
 
 
 def _turn(velocity_deg_s: float, at: _At, duration_s: float) -> float:
-    """Where a path that begins at this velocity turns back, from its beginning; 0 where it does not.
+    """Returns where a path with this initial velocity turns back, relative to its start; 0 if it does not.
 
-    Ruckig's own extremes miss it where the acceleration at the beginning is beyond the plan's limit.
+    Ruckig's own extremes miss it if the initial acceleration exceeds the plan's limit.
     """
     later = _NEAR_END * duration_s
     if not velocity_deg_s or velocity_deg_s * at(later)[1][0] >= 0.0:
@@ -80,7 +80,7 @@ def _turn(velocity_deg_s: float, at: _At, duration_s: float) -> float:
 
 
 class Generator:
-    """Makes plans within the limits of one axis, or slower ones."""
+    """Computes plans within the limits of one axis, or slower ones."""
 
     def __init__(self, limits: MotionLimits) -> None:
         self._limits = limits
@@ -96,12 +96,12 @@ class Generator:
         velocity_deg_s: float = math.inf,
         acceleration_deg_s2: float = math.inf,
     ) -> Plan | None:
-        """The fastest way to rest at a position; no faster than the axis, whatever is asked for.
+        """Returns the fastest path to rest at a position; never faster than the axis, whatever is requested.
 
-        The present velocity and acceleration may be beyond what is asked for: they are brought down first.
+        The present velocity and acceleration may exceed the requested ones; they are then reduced first.
         """
         self._demand.control_interface = ControlInterface.Position
-        # From where it stands: what is planned does not depend on how far from zero that is.
+        # Relative to the present position, so that the plan does not depend on the distance from zero.
         self._demand.target_position = [target_deg - now.position_deg]
         plan = self._plan(now, velocity_deg_s, acceleration_deg_s2, bounds)
         if plan is None or abs(plan.end_deg - target_deg) > _MISS_DEG:
@@ -109,7 +109,7 @@ class Generator:
         return plan._replace(end_deg=target_deg)
 
     def to_rest(self, now: Kinematics, bounds: Bounds) -> Plan | None:
-        """The fastest way to rest, wherever that is."""
+        """Returns the fastest path to rest, wherever it ends."""
         self._demand.control_interface = ControlInterface.Velocity
         return self._plan(now, math.inf, math.inf, bounds)
 
@@ -118,7 +118,7 @@ class Generator:
     ) -> Plan | None:
         demand, limits = self._demand, self._limits
         begin_deg = now.position_deg
-        # The acceleration has to come down first, at the limit of jerk; the velocity goes on until it has.
+        # The acceleration must come down first, at the jerk limit; until then the velocity still changes.
         eased = now.acceleration_deg_s2 * abs(now.acceleration_deg_s2) / (2.0 * limits.jerk_deg_s3)
         if abs(now.velocity_deg_s + eased) > limits.velocity_deg_s * (1.0 + 1e-6):
             return None

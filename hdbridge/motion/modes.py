@@ -1,4 +1,4 @@
-"""What moves the set-point at present."""
+"""Modes of motion of a set-point."""
 
 from __future__ import annotations
 
@@ -6,15 +6,17 @@ from enum import IntEnum
 
 
 class MotionMode(IntEnum):
-    """The numbers are part of the daemon's shared memory: add, never renumber."""
+    """Source of the present motion. The numbers are part of the daemon's shared memory: add,
+    never renumber.
+    """
 
     HOLD = 0
     """At rest where the last motion ended."""
     GOTO = 1
-    """On the way to a target."""
+    """Moving to a target."""
     JOG = 2
-    """At a velocity for as long as somebody asks for it."""
+    """Moving at a velocity for as long as a client requests it."""
     STREAM = 3
-    """Along knots that somebody else has planned."""
+    """Following knots that a client has planned."""
     STOP = 4
     """Braking to rest within the limits."""

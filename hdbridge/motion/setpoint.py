@@ -1,11 +1,11 @@
-"""The set-point of one axis, period by period, for whatever is asked of it and whenever.
+"""Set-point of one axis, period by period, for commands at any time.
 
-Every motion goes on from the present position, velocity and acceleration: nothing has to be at rest to be
-given a new target. What cannot be done is refused (InputError) before anything has changed, and the motion
-under way goes on.
+Every motion continues from the present position, velocity and acceleration: a new target does not require
+rest. An impossible command is refused (`InputError`) before anything has changed, and the motion under way
+continues.
 
-It stays within the position limits at all times. A plan is taken only if its extremes are within them, and
-braking has a way out that always exists (`SetPoint._brake`). The last bit of rounding is cut off.
+The set-point always stays within the position limits. A plan is accepted only if its extremes are within
+them, and braking has a fallback that always exists (`SetPoint._brake`). Rounding errors are clipped.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ from hdbridge.motion.stream import Cubic, Stream
 from hdbridge.procedures.moves import MotionLimits
 
 MOST_TIMEOUT_S = 60.0
-"""Longer, a dead man's time-out is none."""
+"""Maximum time-out of a dead man's control; s."""
 
 
 class SetPoint:
-    """Where the load shall be, once per control period.
+    """Load target, once per control period.
 
     Pure: time is counted in calls of `step`. An axis that stands outside its position limits may hold there
     and move inwards.
@@ -35,9 +35,9 @@ class SetPoint:
     )  # fmt: skip
 
     def __init__(self, limits: MotionLimits, period_s: float) -> None:
-        """``period_s``: time from one `step` to the next. Stands at zero until `reset`.
+        """``period_s`` is the time between two calls of `step`. The set-point is at zero until `reset`.
 
-        InputError for limits that are not finite, or that leave no room.
+        Raises `InputError` for limits that are not finite or leave no range.
         """
         numbers = (limits.velocity_deg_s, limits.acceleration_deg_s2, limits.jerk_deg_s3, period_s)
         if not all(math.isfinite(each) and each > 0.0 for each in numbers):
@@ -53,12 +53,12 @@ class SetPoint:
         self._generator = Generator(limits)
         self._stream: Stream | None = None
         self._path: Plan | Cubic | None = None
-        """What is followed; None at rest and in a stream."""
+        """Path in progress; None at rest and in a stream."""
         self._steps = 0
-        """Periods since ``_path`` was made, which was ``_since_s`` ago then."""
+        """Periods since ``_path`` was set, at which time it had run for ``_since_s``."""
         self._since_s = 0.0
         self._left = self._stream_timeout = 0
-        """Periods that are left to a jog, or to a stream that rests."""
+        """Remaining periods of a jog, or of a stream at rest."""
         self._mode = MotionMode.HOLD
         self._underrun = False
         self._position_deg = self._velocity_deg_s = self._acceleration_deg_s2 = 0.0
@@ -66,43 +66,46 @@ class SetPoint:
 
     @property
     def position_deg(self) -> float:
-        """The load target of the last `step`."""
+        """Load target of the last `step`."""
         return self._position_deg
 
     @property
     def velocity_deg_s(self) -> float:
-        """Its velocity."""
+        """Velocity of the load target."""
         return self._velocity_deg_s
 
     @property
     def acceleration_deg_s2(self) -> float:
-        """Its acceleration."""
+        """Acceleration of the load target."""
         return self._acceleration_deg_s2
 
     @property
     def mode(self) -> MotionMode:
-        """What moves it."""
+        """Mode of the present motion."""
         return self._mode
 
     @property
     def at_rest(self) -> bool:
-        """Whether it stands, and would for good if nothing more came."""
+        """True if it stands still and would remain so without further input."""
         if self._stream is not None:
             return self._stream.waiting
         return self._path is None
 
     @property
     def underrun(self) -> bool:
-        """Whether the last stream ran out of knots in motion and had to be braked."""
+        """True if the last stream ran out of knots in motion and had to be braked."""
         return self._underrun
 
     @property
     def room(self) -> int:
-        """Knots that would be taken now; 0 outside of a stream."""
+        """Number of knots that would be accepted now; 0 outside a stream."""
         return 0 if self._stream is None else self._stream.room
 
     def reset(self, load_deg: float) -> None:
-        """Stand here: forget all motion. For an axis that is not being driven. InputError: not finite."""
+        """Sets a position at rest, discarding all motion, for an axis that is not being driven.
+
+        Raises `InputError` for a non-finite angle.
+        """
         _check_finite("load angle", load_deg)
         self._rest_at(load_deg)
         self._underrun = False
@@ -113,11 +116,11 @@ class SetPoint:
         velocity_deg_s: float | None = None,
         acceleration_deg_s2: float | None = None,
     ) -> None:
-        """Move to a load angle and rest there; from rest or from any motion.
+        """Moves to a load angle and rests there; from rest or from any motion.
 
-        Velocity and acceleration of this move, where given, are no more than the axis's in any case.
-        InputError for a target outside of the position limits or a number that is none; and, in motion, where
-        the axis would have to leave the position limits on its way (stop it first).
+        Velocity and acceleration limit this move; the axis's limits apply in any case. Raises `InputError`
+        for a target outside the position limits or an invalid number, and in motion if the axis would have to
+        leave the position limits on its way (stop it first).
         """
         limits = self._limits
         _check_finite("target", target_deg)
@@ -131,10 +134,10 @@ class SetPoint:
         self._take(self._planned(target_deg, speed, acceleration), MotionMode.GOTO)
 
     def jog(self, velocity_deg_s: float, timeout_s: float) -> None:
-        """Move at a velocity (no faster than the axis may) until the time-out; zero brakes.
+        """Moves at a velocity (no faster than the axis may) until the time-out; zero brakes.
 
-        To be called again before the time is out. It brakes before a position limit and waits there.
-        InputError for numbers that are none, and a time-out that is not above 0 and up to `MOST_TIMEOUT_S`.
+        Call it again before the time-out. It brakes before a position limit and waits there. Raises
+        `InputError` for invalid numbers, and for a time-out that is not above 0 and up to `MOST_TIMEOUT_S`.
         """
         _check_finite("velocity", velocity_deg_s)
         timeout = self._timeout(timeout_s)
@@ -143,8 +146,8 @@ class SetPoint:
         if not speed:
             self.stop()
             return
-        # Planned as a move, so that the position limit is kept by the plan: to the limit, or farther than
-        # it comes before its time is out.
+        # Planned as a move, so that the plan respects the position limit: to the limit, or farther than it
+        # can come before the time-out.
         easing_s = speed / limits.acceleration_deg_s2 + limits.acceleration_deg_s2 / limits.jerk_deg_s3
         reach = self._coasting_deg() + speed * (timeout_s + 2.0 * (easing_s + self._period_s))
         bounds = self._bounds_here()
@@ -156,17 +159,17 @@ class SetPoint:
         self._left = timeout
 
     def stop(self) -> None:
-        """Brake to rest within the limits. Never refused; at rest it ends a stream or a jog."""
+        """Brakes to rest within the limits. Never refused; at rest it ends a stream or a jog."""
         if self.at_rest:
             self._rest_at(self._position_deg)
         elif self._mode is not MotionMode.STOP:
             self._brake(0.0)
 
     def stream(self, timeout_s: float) -> None:
-        """Follow knots from here (`knot`), their time beginning with the first `step` after `begin_stream`.
+        """Follows knots from here (`knot`); their time starts with the first `step` after `begin_stream`.
 
-        It ends in a hold when it has rested without a knot for the time-out. InputError: in motion, or a
-        time-out that is not above 0 and up to `MOST_TIMEOUT_S`.
+        It becomes a hold after resting without a knot for the time-out. Raises `InputError` in motion, and
+        for a time-out that is not above 0 and up to `MOST_TIMEOUT_S`.
         """
         timeout = self._timeout(timeout_s)
         if not self.at_rest:
@@ -179,21 +182,21 @@ class SetPoint:
         self._mode = MotionMode.STREAM
 
     def begin_stream(self) -> None:
-        """Let the stream's time begin with the next `step`. InputError without a `stream`."""
+        """Starts the stream's time with the next `step`; raises `InputError` without a `stream`."""
         self._streaming().begin()
 
     def knot(self, time_s: float, position_deg: float, velocity_deg_s: float) -> None:
-        """One more knot of the stream: time from its beginning, and load angle and velocity then.
+        """Adds a knot to the stream: time from its start, and load angle and velocity at that time.
 
-        Between two knots it follows the cubic with their velocities. InputError, and the stream goes on as if
-        nothing had come, where the knot is no later than the last, or position, speed or (by more than 5 %)
-        acceleration would leave the limits, anywhere on the way to it or when braking from it; for a first
-        knot that is not at rest where the axis stands; and for one too many (`room`).
+        Between two knots the set-point follows the cubic with their velocities. Raises `InputError`, leaving
+        the stream unchanged, if the knot is not later than the last one; if position, speed or (by more than
+        5 %) acceleration would exceed the limits, anywhere on the way to it or when braking from it; if the
+        first knot is not at rest at the position of the axis; and if there is no space for it (`room`).
         """
         self._streaming().add(time_s, position_deg, velocity_deg_s)
 
     def step(self) -> float:
-        """One period on: the load target in degrees."""
+        """Advances one period; returns the load target in degrees."""
         if self._stream is not None:
             return self._step_stream(self._stream)
         if self._mode is MotionMode.JOG:
@@ -246,7 +249,7 @@ class SetPoint:
         self._bounds = self._bounds_here()
 
     def _bounds_here(self) -> Bounds:
-        """The position limits, and where it stands if that is outside of them."""
+        """Returns the position limits, extended to the present position if it is outside."""
         limits, here = self._limits, self._position_deg
         return Bounds(min(limits.position_min_deg, here), max(limits.position_max_deg, here))
 
@@ -258,7 +261,7 @@ class SetPoint:
         self._underrun = False
 
     def _planned(self, target_deg: float, velocity_deg_s: float, acceleration_deg_s2: float) -> Plan:
-        """The way to a target; InputError where there is none."""
+        """Returns the plan to a target; raises `InputError` if there is none."""
         now, bounds = self._state(), self._bounds_here()
         for acceleration in (acceleration_deg_s2, math.inf):
             # In motion a gentle move may have to brake as hard as the axis can, to stay within its limits.
@@ -274,12 +277,12 @@ class SetPoint:
         )
 
     def _brake(self, since_s: float) -> None:
-        """To rest, in the first of three ways that stays within the position limits.
+        """Brakes to rest in the first of three ways that stays within the position limits.
 
-        As fast as jerk allows; or, where that would swing beyond a limit, back to where it is now, which
-        brakes as hard and lets go later; or with constant acceleration, which needs no more room than any
-        path within the limits and is always possible. The last is needed only out of a stream whose knots
-        brake against a limit with more jerk than the axis may.
+        First, as fast as jerk permits. Second, if that would overshoot a limit, back to the present position,
+        which brakes as hard and releases later. Third, with constant acceleration, which needs no more travel
+        than any path within the limits and is always possible. The third is needed only out of a stream whose
+        knots brake against a limit with more jerk than the axis may have.
         """
         now, bounds = self._state(), self._bounds_here()
         path = (
@@ -290,7 +293,7 @@ class SetPoint:
         self._take(path, MotionMode.STOP, since_s)
 
     def _steady_stop(self, now: Kinematics, bounds: Bounds) -> Cubic:
-        """With constant deceleration at the limit, or what the room asks for."""
+        """Returns a stop with constant deceleration: the limit, or what the remaining travel requires."""
         place, speed = now.position_deg, abs(now.velocity_deg_s)
         left_deg = bounds.upper_deg - place if now.velocity_deg_s > 0.0 else place - bounds.lower_deg
         travel_deg = min(speed * speed / (2.0 * self._limits.acceleration_deg_s2), left_deg)
@@ -300,13 +303,13 @@ class SetPoint:
         return Cubic.between(0.0, place, now.velocity_deg_s, 2.0 * travel_deg / speed, end_deg, 0.0)
 
     def _coasting_deg(self) -> float:
-        """At most so far it comes before it has slowed down."""
+        """Returns an upper bound of the travel before the axis has slowed down."""
         limits, speed = self._limits, abs(self._velocity_deg_s)
         easing_s = (abs(self._acceleration_deg_s2) + limits.acceleration_deg_s2) / limits.jerk_deg_s3
         return limits.velocity_deg_s * (speed / limits.acceleration_deg_s2 + 2.0 * easing_s)
 
     def _timeout(self, timeout_s: float) -> int:
-        """In periods."""
+        """Converts a time-out to periods."""
         if not 0.0 < timeout_s <= MOST_TIMEOUT_S:
             raise InputError(
                 f"a time-out of {timeout_s!r} s; expected more than 0 and at most {MOST_TIMEOUT_S:g}"
@@ -325,7 +328,7 @@ def _check_finite(name: str, value: float) -> None:
 
 
 def _positive(name: str, value: float | None) -> float:
-    """A limit of a move; infinite where none is given."""
+    """Returns a limit of a move; infinite if none is given."""
     if value is None:
         return math.inf
     if not (math.isfinite(value) and value > 0.0):

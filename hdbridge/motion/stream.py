@@ -1,7 +1,8 @@
 """Knots of position and velocity over time, and the cubics between them.
 
-A knot is checked when it comes, with the whole way to it: position, speed and acceleration of a cubic have
-their extremes in closed form. So what has been taken can be followed to its end without another question.
+A knot is checked on arrival, together with the whole path to it: position, speed and acceleration of a cubic
+have their extremes in closed form. Accepted knots can therefore be followed to the end without further
+checks.
 """
 
 from __future__ import annotations
@@ -15,17 +16,19 @@ from hdbridge.motion.generator import Bounds, Kinematics
 from hdbridge.procedures.moves import MotionLimits
 
 MOST_KNOTS = 8192
-"""Knots that wait; a further one is refused."""
+"""Maximum number of waiting knots; a further one is refused."""
 ACCELERATION_MARGIN = 1.05
-"""Share of the acceleration limit that a cubic may reach: one through knots of a path at the limit does."""
+"""Ratio to the acceleration limit that a cubic may reach, as one through knots of a path at the
+limit does.
+"""
 BEGIN_DEG = 1e-6
-"""A stream begins so near to where the set-point stands."""
+"""Maximum distance of a stream's first knot from the set-point."""
 _ROUNDING = 1e-6
 _REST_DEG_S = 1e-9
 
 
 class Cubic(NamedTuple):
-    """Hermite's: from one knot to the next, over the share of the time between them."""
+    """Hermite cubic from one knot to the next, over the share of the time between them."""
 
     begin_s: float
     end_s: float
@@ -34,7 +37,7 @@ class Cubic(NamedTuple):
     a: float
     b: float
     c: float
-    """begin + s (a + s (b + s c)), degrees."""
+    """Coefficients of begin + s (a + s (b + s c)), degrees."""
 
     @classmethod
     def between(
@@ -46,7 +49,7 @@ class Cubic(NamedTuple):
         end_deg: float,
         to_deg_s: float,
     ) -> Cubic:
-        """The one with these ends."""
+        """Returns the cubic with these ends."""
         period_s = end_s - begin_s
         step = end_deg - begin_deg
         here, there = from_deg_s * period_s, to_deg_s * period_s
@@ -61,7 +64,7 @@ class Cubic(NamedTuple):
         return self.end_s - self.begin_s
 
     def state(self, time_s: float) -> Kinematics:
-        """Where it is at this time; before and after its ends it is at them."""
+        """Returns the state at this time; before and after its ends, the state at them."""
         period_s = self.end_s - self.begin_s
         s = 1.0 if time_s >= self.end_s else max(time_s - self.begin_s, 0.0) / period_s
         return Kinematics(
@@ -71,7 +74,7 @@ class Cubic(NamedTuple):
         )
 
     def fastest_deg_s(self) -> float:
-        """Largest speed."""
+        """Returns the largest speed."""
         speed = max(abs(self.a), abs(self.a + 2.0 * self.b + 3.0 * self.c))
         if self.c:
             vertex = -self.b / (3.0 * self.c)
@@ -80,15 +83,15 @@ class Cubic(NamedTuple):
         return speed / self.duration_s
 
     def hardest_deg_s2(self) -> float:
-        """Largest acceleration, which is at one of its ends."""
+        """Returns the largest acceleration, which is at one of the ends."""
         return max(abs(2.0 * self.b), abs(2.0 * self.b + 6.0 * self.c)) / (self.duration_s * self.duration_s)
 
     def extremes_deg(self) -> tuple[float, float]:
-        """Lowest and highest position."""
+        """Returns the lowest and the highest position."""
         places = [self.begin_deg, self.end_deg]
         root = self.b * self.b - 3.0 * self.a * self.c
         if root > 0.0:
-            # Without cancellation, and with c = 0: the two roots of a + 2 b s + 3 c s^2.
+            # Numerically stable roots of a + 2 b s + 3 c s^2, also for c = 0.
             q = -(self.b + math.copysign(math.sqrt(root), self.b))
             for over, under in ((q, 3.0 * self.c), (self.a, q)):
                 if under and 0.0 < (s := over / under) < 1.0:
@@ -99,45 +102,46 @@ class Cubic(NamedTuple):
 class Stream:
     """The knots of one stream, in its own time.
 
-    At a knot of no velocity it rests until there is another; meanwhile its time stands still, so that knots
-    that come late delay the path and do not make it jump. Out of knots in motion it says since when.
+    At a knot with zero velocity it rests until there is another. Its time stops meanwhile, so that late knots
+    delay the path instead of making it jump. If it runs out of knots in motion, ``overrun_s`` gives the time
+    since.
     """
 
     def __init__(self, begin_deg: float, limits: MotionLimits, bounds: Bounds, period_s: float) -> None:
         self._limits, self._bounds = limits, bounds
         self._period_s = period_s
         self._grid_s = 1e-7 * period_s
-        """Less than this apart two times are one."""
+        """Resolution of time: times closer than this are equal."""
         self._cubics: deque[Cubic] = deque()
         self._begin_deg = begin_deg
         self._last: tuple[float, float, float] | None = None
-        """The last knot that was taken."""
+        """Last accepted knot."""
         self._base_s = 0.0
-        """The stream's time when it rested last."""
+        """Stream time at the last rest."""
         self._steps = 0
-        """Periods since then."""
+        """Periods since the last rest."""
         self._released = self._begun = False
         self.overrun_s: float | None = None
-        """How long ago it was left without knots in motion; the state is that of the last knot."""
+        """Time since it ran out of knots in motion; the state is that of the last knot."""
         self._state = Kinematics(begin_deg, 0.0, 0.0)
 
     @property
     def room(self) -> int:
-        """How many knots would be taken."""
+        """Number of knots that would be accepted."""
         return MOST_KNOTS - len(self._cubics)
 
     @property
     def waiting(self) -> bool:
-        """Whether it rests for want of knots."""
+        """True if it rests because there are no knots."""
         return not self._cubics and self._state.velocity_deg_s == 0.0
 
     @property
     def state(self) -> Kinematics:
-        """Where it is now."""
+        """Present state."""
         return self._state
 
     def add(self, time_s: float, position_deg: float, velocity_deg_s: float) -> None:
-        """Take one more knot, or refuse it (InputError) and leave the stream as it is."""
+        """Adds a knot, or refuses it (`InputError`) and leaves the stream unchanged."""
         if not (math.isfinite(time_s) and math.isfinite(position_deg) and math.isfinite(velocity_deg_s)):
             raise InputError(
                 f"a knot of {position_deg!r} deg and {velocity_deg_s!r} deg/s at {time_s!r} s; expected "
@@ -178,7 +182,7 @@ class Stream:
         where = f"the way to the knot at {time_s:.6g} s"
         fastest, hardest = cubic.fastest_deg_s(), cubic.hardest_deg_s2()
         lowest, highest = cubic.extremes_deg()
-        # What differences of rounded positions cannot tell.
+        # Resolution of differences of rounded positions.
         grain = 4.0 * math.ulp(max(abs(cubic.begin_deg), abs(position_deg))) / cubic.duration_s
         if not fastest <= limits.velocity_deg_s * (1.0 + _ROUNDING) + grain:
             raise InputError(
@@ -204,11 +208,11 @@ class Stream:
             )
 
     def begin(self) -> None:
-        """Let time begin with the next step, or with the first one that has a knot."""
+        """Starts time with the next step, or with the first one that has a knot."""
         self._released = True
 
     def step(self) -> Kinematics:
-        """One period on."""
+        """Advances one period."""
         if not self._begun:
             self._begun = self._released and self._last is not None
         elif self._cubics:
@@ -228,7 +232,7 @@ class Stream:
         self._state = cubic.state(time_s)
 
     def _end(self, cubic: Cubic, time_s: float) -> None:
-        """The last knot is reached: at rest, in time for another, or lost."""
+        """Handles the last knot: at rest, on time for another, or overrun."""
         if self._last is not None and self._last[2] == 0.0:
             self._cubics.clear()
             self._state = Kinematics(cubic.end_deg, 0.0, 0.0)

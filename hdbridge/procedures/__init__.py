@@ -1,1 +1,1 @@
-"""What a bench does with an axis, as pure generators."""
+"""Measurement procedures of a bench, as pure generators."""

@@ -1,4 +1,4 @@
-"""Several procedures as one, and gently."""
+"""Sequence of procedures as one, optionally with limited acceleration."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ from hdbridge.procedures.moves import AxisView, Move, MoveTo, Procedure, Sample,
 
 @dataclass(frozen=True, slots=True)
 class Chain:
-    """One after the other; the outcome is the last one's.
+    """Procedures run one after the other; the outcome is the last one's.
 
-    With ``acceleration_deg_s2`` (at the load) no move accelerates faster: what accelerates winds the gear's
-    spring up, and a calibration wants to see the gear without it.
+    ``acceleration_deg_s2`` (at the load) limits every move. Acceleration winds the gear's spring up, and a
+    calibration measures the gear without that.
     """
 
     parts: tuple[Procedure[object], ...]
     acceleration_deg_s2: float | None = None
 
     def moves(self, axis: AxisView) -> Steps[object]:
-        """The moves of each."""
+        """Yields the moves of each procedure."""
         outcome: object = None
         for part in self.parts:
             steps = part.moves(axis)

@@ -1,4 +1,4 @@
-"""Runs at constant speed, both ways: ripple and response of the axis in motion."""
+"""Runs at constant speed in both directions: ripple and response of the axis in motion."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from hdbridge.procedures.moves import AxisView, MoveTo, Sample, Steps
 from hdbridge.units import DEG_PER_TURN
 
 SHARES = (0.95, 0.8, 0.64, 0.5, 0.38, 0.28, 0.18, 0.08)
-"""Speeds of the default test, as shares of the limit. At the limit a drive cuts the correction off."""
+"""Speeds of the default test, as shares of the limit. At the limit a drive would clip the correction."""
 WINDOW_S = 1.0
 TURNS = 3.0
-"""Motor turns that a run covers at least."""
+"""Minimum motor turns of a run."""
 TRANSIENT_S = 0.3
-"""Time at constant speed before the measurement begins."""
+"""Time at constant speed before the measurement starts."""
 KIND = "even speed"
 
 
@@ -24,7 +24,7 @@ class EvenRun:
     """One run: samples at constant speed."""
 
     speed_deg_s: float
-    """Speed of the load; negative backwards."""
+    """Load speed; negative backwards."""
     samples: tuple[Sample, ...]
 
 
@@ -37,9 +37,9 @@ class EvenSpeed:
 
     @classmethod
     def spread(cls, axis: AxisView) -> EvenSpeed:
-        """Speeds from a twelfth of the fastest run that fits the travel up to it.
+        """Spreads speeds over the shares `SHARES` of the fastest run that fits the travel.
 
-        InputError if the travel is too short for any run.
+        Raises `InputError` if the travel is too short for any run.
         """
         limits = axis.limits
         fastest = limits.velocity_deg_s
@@ -54,14 +54,14 @@ class EvenSpeed:
         return cls(tuple(round(share * fastest, 3) for share in SHARES))
 
     def travel_deg(self, axis: AxisView, speed_deg_s: float) -> float:
-        """Travel of one run with its ramps."""
+        """Returns the travel of one run including its ramps; load degrees."""
         limits = axis.limits
         ramp_s = speed_deg_s / limits.acceleration_deg_s2 + limits.acceleration_deg_s2 / limits.jerk_deg_s3
         even_deg = max(self.window_s * speed_deg_s, TURNS * DEG_PER_TURN / axis.ratio)
         return even_deg + speed_deg_s * (TRANSIENT_S + ramp_s)
 
     def moves(self, axis: AxisView) -> Steps[tuple[EvenRun, ...]]:
-        """Each speed forward and back."""
+        """Yields each speed forward and back."""
         runs: list[EvenRun] = []
         middle = 0.5 * (axis.limits.position_min_deg + axis.limits.position_max_deg)
         for speed in self.speeds_deg_s:
@@ -74,7 +74,7 @@ class EvenSpeed:
 
 
 def _even(samples: Sequence[Sample], speed_deg_s: float) -> tuple[Sample, ...]:
-    """The samples at constant speed, without the transient."""
+    """Returns the samples at constant speed, without the transient."""
     cycle_s = (samples[-1].time_s - samples[0].time_s) / (len(samples) - 1)
     step = speed_deg_s * cycle_s
     even = [

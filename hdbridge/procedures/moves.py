@@ -1,6 +1,6 @@
-"""The vocabulary of a bench: moves of the load target, each a path over time.
+"""Moves of the load target, each a path over time: the vocabulary of all procedures.
 
-A procedure is a generator that yields moves and receives the samples taken during each. It knows nothing of
+A procedure is a generator that yields moves and receives the samples taken during each. It does not depend on
 buses, drives or clocks, so the same generator runs on a simulated and on a real axis, and in a test without
 either.
 """
@@ -19,7 +19,7 @@ from hdbridge.errors import InputError
 
 @dataclass(frozen=True, slots=True)
 class MotionLimits:
-    """What the axis may do, at the load."""
+    """Motion limits of the axis, at the load."""
 
     position_min_deg: float
     position_max_deg: float
@@ -28,7 +28,7 @@ class MotionLimits:
     jerk_deg_s3: float
 
     def check(self, load_deg: float) -> None:
-        """InputError for a load angle outside the limits."""
+        """Raises `InputError` for a load angle outside the limits."""
         if not self.position_min_deg <= load_deg <= self.position_max_deg:
             raise InputError(
                 f"this would move the load to {load_deg:.6g} deg; the axis file allows "
@@ -39,14 +39,14 @@ class MotionLimits:
 
 @dataclass(frozen=True, slots=True)
 class AxisView:
-    """All that a procedure may know of its axis."""
+    """Properties of the axis that a procedure may use."""
 
     ratio: float
     limits: MotionLimits
 
 
 class Sample(NamedTuple):
-    """One control cycle as a procedure sees it; angles in degrees, multi-turn."""
+    """One control cycle as seen by a procedure; angles in degrees, multi-turn."""
 
     time_s: float
     load_target_deg: float
@@ -55,11 +55,11 @@ class Sample(NamedTuple):
     load_position_deg: float
     motor_torque_nm: float
     readings: tuple[float | None, ...] = ()
-    """Of each channel of the axis file the last reading that was believed; None where none is known."""
+    """Last good reading of each channel of the axis file; None if there is none."""
 
 
 class Path(NamedTuple):
-    """Where the load target is, over the time since the move began."""
+    """Load target over the time since the move began."""
 
     duration_s: float
     at: Callable[[float], float]
@@ -72,48 +72,48 @@ class Move(Protocol):
 
     @property
     def kind(self) -> str:
-        """What the leg is for, as the recording names it."""
+        """Purpose of the leg, as named in the recording."""
         ...
 
     def path(self, start_deg: float, limits: MotionLimits) -> Path:
-        """The path from where the load target stands."""
+        """Returns the path from the present load target."""
         ...
 
     def ended(self, samples: Sequence[Sample]) -> bool:
-        """Asked each cycle once the path's duration is over: True ends the leg."""
+        """Returns True to end the leg; called each cycle after the path's duration."""
         ...
 
 
 Outcome = TypeVar("Outcome", covariant=True)
 Steps = Generator[Move, Sequence[Sample], Outcome]
-"""What a procedure's ``moves`` returns."""
+"""Return type of a procedure's ``moves``."""
 
 
 class Procedure(Protocol[Outcome]):
-    """What a bench does with an axis."""
+    """A measurement that a bench runs on an axis."""
 
     def moves(self, axis: AxisView) -> Steps[Outcome]:
-        """The generator of moves; its return value is the procedure's outcome."""
+        """Returns the generator of moves; its return value is the procedure's outcome."""
         ...
 
 
 @dataclass(frozen=True, slots=True)
 class MoveTo:
-    """A jerk-limited move to a load angle, at the axis's limits or slower."""
+    """Jerk-limited move to a load angle, at the axis's limits or slower."""
 
     load_deg: float
     velocity_deg_s: float | None = None
     kind: str = "move"
     acceleration_deg_s2: float | None = None
-    """A gentler one winds the gear's spring up less."""
+    """A lower acceleration winds the gear's spring up less."""
 
     def path(self, start_deg: float, limits: MotionLimits) -> Path:
-        """Time-optimal within the limits (ruckig)."""
+        """Returns the time-optimal path within the limits (ruckig)."""
         limits.check(self.load_deg)
         if self.load_deg == start_deg:
             return Path(0.0, lambda _: start_deg, start_deg, start_deg)
-        # Ruckig finds nothing where limits and distance meet in a point, as 200 deg/s2, 4000 deg/s3 and
-        # 1 deg plus a rounding error do; a hair slower it does.
+        # Ruckig fails if limits and distance coincide exactly, as with 200 deg/s2, 4000 deg/s3 and 1 deg plus
+        # a rounding error; slightly slower it succeeds.
         for share in (1.0, 1.0 - 1e-6):
             trajectory, result = self._trajectory(start_deg, limits, share)
             if result in {Result.Working, Result.Finished}:
@@ -142,36 +142,36 @@ class MoveTo:
         trajectory = Trajectory(1)
         try:
             return trajectory, Ruckig(1).calculate(demand, trajectory)
-        except RuckigError:  # not finite, or a limit that is not positive
+        except RuckigError:  # a value that is not finite, or a limit that is not positive
             return trajectory, Result.ErrorInvalidInput
 
     def ended(self, samples: Sequence[Sample]) -> bool:
-        """The path's end is the leg's end."""
+        """Returns True, because the leg ends with its path."""
         return True
 
 
 @dataclass(frozen=True, slots=True)
 class Dwell:
-    """Stand still for a while."""
+    """Standstill for a given time."""
 
     duration_s: float
     kind: str = "standstill"
 
     def path(self, start_deg: float, limits: MotionLimits) -> Path:
-        """No motion."""
+        """Returns a path without motion."""
         return Path(self.duration_s, lambda _: start_deg, start_deg, start_deg)
 
     def ended(self, samples: Sequence[Sample]) -> bool:
-        """The path's end is the leg's end."""
+        """Returns True, because the leg ends with its path."""
         return True
 
 
 @dataclass(frozen=True, slots=True)
 class Settle:
-    """Stand still until the load encoder has come to rest, or the time is over.
+    """Standstill until the load encoder has settled, or until the time-out.
 
-    At rest means: over the last ``window_s`` the load encoder's two halves agree in their mean to
-    ``drift_arcsec``. Means, not extremes, so that encoder noise does not keep an axis from settling.
+    Settled means that over the last ``window_s`` the means of the two halves agree within ``drift_arcsec``.
+    Means are used instead of extremes, so that encoder noise does not prevent settling.
     """
 
     window_s: float = 0.06
@@ -181,11 +181,11 @@ class Settle:
     kind: str = "settle"
 
     def path(self, start_deg: float, limits: MotionLimits) -> Path:
-        """No motion."""
+        """Returns a path without motion."""
         return Path(max(self.minimum_s, self.window_s), lambda _: start_deg, start_deg, start_deg)
 
     def ended(self, samples: Sequence[Sample]) -> bool:
-        """Whether the last window is at rest."""
+        """Returns True if the last window is settled, or on time-out."""
         last = samples[-1].time_s
         if last - samples[0].time_s >= self.timeout_s:
             return True
@@ -199,16 +199,16 @@ class Settle:
         return drift * 3600.0 <= self.drift_arcsec
 
     def window(self, samples: Sequence[Sample]) -> Sequence[Sample]:
-        """The samples of the last window: what was measured at rest."""
+        """Returns the samples of the last window, measured at rest."""
         last = samples[-1].time_s
         return [each for each in samples if each.time_s > last - self.window_s]
 
 
 @dataclass(frozen=True, slots=True)
 class Sine:
-    """``amplitude cos(2 pi f t)`` about a centre; begins and ends at the upper extreme, at rest.
+    """``amplitude cos(2 pi f t)`` about a centre; starts and ends at the upper extreme, at rest.
 
-    Begun at the extreme, where the velocity is zero, so that nothing jumps.
+    It starts at the extreme because the velocity is zero there.
     """
 
     centre_deg: float
@@ -218,7 +218,7 @@ class Sine:
     kind: str = "sine"
 
     def path(self, start_deg: float, limits: MotionLimits) -> Path:
-        """The sine; refused where it would start with a jump or go too fast."""
+        """Returns the sine; raises `InputError` if it would start with a jump or be too fast."""
         omega = 2.0 * math.pi * self.frequency_hz
         begin = self.centre_deg + self.amplitude_deg
         if abs(start_deg - begin) > 1e-9:
@@ -239,5 +239,5 @@ class Sine:
         return Path(self.periods / self.frequency_hz, at, low, high)
 
     def ended(self, samples: Sequence[Sample]) -> bool:
-        """The path's end is the leg's end."""
+        """Returns True, because the leg ends with its path."""
         return True

@@ -1,11 +1,10 @@
-"""Plans: which procedures a calibration runs, as data.
+"""Plans: the procedures of a calibration, as data.
 
-A plan says what it wants in terms that suit every axis (load turns, motor degrees, motor turns per second);
-`Plan.tasks` makes it fit one axis: its ratio, its permitted travel and its speed. What had to be shortened
-is said in words.
+A plan uses units that suit every axis (load turns, motor degrees, motor turns per second). `Plan.tasks`
+adapts it to the ratio, permitted travel and speed of one axis, and reports what had to be shortened.
 
-Every task begins at the plan's reference pose, approached by a pre-conditioning move. So the elastic state is
-known wherever a recording is interrupted and taken up again, and the pose, which recurs, shows drift.
+Every task starts at the plan's reference pose, approached by a pre-conditioning move. The elastic state is
+thus known wherever a recording is interrupted and resumed, and the recurring pose shows drift.
 """
 
 from __future__ import annotations
@@ -34,24 +33,24 @@ from hdbridge.strictness import Strict
 from hdbridge.units import DEG_PER_TURN
 
 SPEED_SHARE = 0.95
-"""Share of the axis's highest speed that a plan uses at most."""
+"""Maximum share of the axis's velocity limit that a plan uses."""
 SMALLEST_TRAVEL_DEG = 90.0
-"""Motor degrees on either side of the middle without which no procedure makes sense."""
+"""Minimum travel on either side of the middle, motor degrees, below which no procedure is useful."""
 
 
 class StandstillEntry(Strict):
-    """Standing at the reference pose: the noise of the encoders."""
+    """Standstill at the reference pose: noise of the encoders."""
 
     procedure: Literal["standstill"] = Field(description="stand at the reference pose")
     duration_s: float = Field(5.0, ge=0.5, le=36_000, description="for so long")
 
     def fitted(self, room: Room, name: str) -> Iterator[Procedure[object]]:
-        """As it stands."""
+        """Yields the procedure unchanged."""
         yield Standstill(room.pose_deg, self.duration_s)
 
 
 class SweepEntry(Strict):
-    """Constant speed both ways: the synchronous part, load orders, the height of the loop."""
+    """Constant speed in both directions: the synchronous part, load orders, the height of the loop."""
 
     procedure: Literal["sweep"] = Field(description="both ways at constant speed, about the middle")
     load_turns: float | None = Field(
@@ -68,7 +67,7 @@ class SweepEntry(Strict):
         return self
 
     def fitted(self, room: Room, name: str) -> Iterator[Procedure[object]]:
-        """Shortened to the permitted travel, slowed to the permitted speed."""
+        """Yields the sweep, shortened to the permitted travel and slowed to the permitted speed."""
         turns = self.load_turns if self.load_turns is not None else (self.motor_turns or 0.0) / room.ratio
         half = room.half(name, "the sweep", 0.5 * turns * DEG_PER_TURN)
         speed = room.speed(name, self.motor_turns_per_s * DEG_PER_TURN)
@@ -76,7 +75,7 @@ class SweepEntry(Strict):
 
 
 class SinesEntry(Strict):
-    """Slow sines of several amplitudes, some smaller than the hysteresis is wide."""
+    """Slow sines of several amplitudes, some smaller than the width of the hysteresis."""
 
     procedure: Literal["sines"] = Field(description="slow sines about the reference pose")
     amplitudes_deg: tuple[Annotated[float, Field(gt=0, le=36_000)], ...] = Field(
@@ -86,7 +85,9 @@ class SinesEntry(Strict):
     periods: float = Field(2.0, ge=0.5, le=1000, description="periods of each")
 
     def fitted(self, room: Room, name: str) -> Iterator[Procedure[object]]:
-        """Amplitudes shortened to the travel, the frequency lowered to the permitted speed."""
+        """Yields the sines, with amplitudes shortened to the travel and the frequency lowered to the
+        permitted speed.
+        """
         amplitudes = tuple(
             dict.fromkeys(
                 round(room.half(name, f"the sine of {each:g} deg", each / room.ratio) * room.ratio, 6)
@@ -114,21 +115,21 @@ class ReversalsEntry(Strict):
     )
 
     def fitted(self, room: Room, name: str) -> Iterator[Procedure[object]]:
-        """Slowed to the permitted speed, the reach shortened to the travel."""
+        """Yields the reversals, slowed to the permitted speed, with the reach shortened to the travel."""
         reach = room.half(name, "the reach of the reversals", self.reach_deg / room.ratio) * room.ratio
         depths = tuple(each for each in self.depths_deg if each <= reach)
         yield Reversals(room.middle_deg, depths, reach, room.speed(name, self.motor_deg_per_s), self.beyond)
 
 
 class SteppingEntry(Strict):
-    """The stepping test, without compensation."""
+    """Stepping test without compensation."""
 
     procedure: Literal["stepping"] = Field(description="steps both ways, at rest after each")
     count: int = Field(30, ge=2, le=100_000, description="steps each way")
     step_deg: float = Field(43.56, gt=0, le=36_000, description="step at the motor")
 
     def fitted(self, room: Room, name: str) -> Iterator[Procedure[object]]:
-        """As many steps as the travel permits, about the middle."""
+        """Yields as many steps as the travel permits, about the middle."""
         yield room.stepping(name, self.count, self.step_deg)
 
 
@@ -136,13 +137,13 @@ PROCEDURES = ("standstill", "sweep", "sines", "reversals", "stepping")
 
 
 class _Context(dict[str, Any]):
-    """A dictionary that can be hashed, because whatever annotates a type has to be."""
+    """Hashable dictionary, because type annotations must be hashable."""
 
     __hash__ = object.__hash__  # type: ignore[assignment]
 
 
 def _named(entry: Any) -> str | None:
-    """The procedure that an entry names; None where there is none of that name."""
+    """Returns the procedure that an entry names; None if there is none of that name."""
     name = entry.get("procedure") if isinstance(entry, dict) else getattr(entry, "procedure", None)
     return name if name in PROCEDURES else None
 
@@ -163,7 +164,7 @@ Entry = Annotated[
 
 
 class ValidationEntry(Strict):
-    """The stepping test by which a new model is judged, with and without it."""
+    """Stepping test that judges a new model, with and without it."""
 
     count: int = Field(120, ge=2, le=100_000, description="steps each way")
     step_deg: float = Field(43.56, gt=0, le=36_000, description="step at the motor")
@@ -222,7 +223,7 @@ class Plan(Strict):
 
     @classmethod
     def load(cls, name: str) -> Self:
-        """A bundled plan by its name, else a plan file; InputError names the bundled ones."""
+        """Loads a bundled plan by its name, else a plan file; raises `InputError` with the bundled names."""
         bundled = bundled_folder("profiles") / "plans"
         known = sorted(each.stem for each in bundled.glob("*.yaml"))
         path = bundled / f"{name}.yaml" if name in known else Path(name)
@@ -235,11 +236,11 @@ class Plan(Strict):
         return read_yaml(path).validate(cls)
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain data that `validated` reads back."""
+        """Returns plain data that can be validated again."""
         return self.model_dump(by_alias=True, exclude_none=True, mode="json")
 
     def tasks(self, axis: AxisView) -> Tasks:
-        """What to run on one axis; InputError where its travel is too small for anything."""
+        """Returns the tasks for one axis; raises `InputError` if its travel is too small for anything."""
         room = Room(axis, self.precondition_deg)
         prelude = (
             Precondition(room.pose_deg, self.precondition_deg / axis.ratio),
@@ -254,12 +255,12 @@ class Plan(Strict):
         return Tasks(tuple(tasks), tuple(room.notes))
 
     def stepping(self, axis: AxisView) -> Stepping:
-        """The stepping test of the validation, on one axis."""
+        """Returns the stepping test of the validation for one axis."""
         room = Room(axis, self.precondition_deg)
         return room.stepping("validation", self.validation.count, self.validation.step_deg)
 
     def positioning(self, axis: AxisView) -> Positioning | None:
-        """The positioning test of the validation, on one axis; None where the plan has none."""
+        """Returns the positioning test of the validation for one axis; None if the plan has none."""
         if not self.validation.cycles:
             return None
         room = Room(axis, self.precondition_deg)
@@ -270,24 +271,24 @@ class Plan(Strict):
 
 @dataclass(frozen=True, slots=True)
 class Task:
-    """A procedure of a plan, made to fit an axis."""
+    """Procedure of a plan, adapted to an axis."""
 
     name: str
-    """Number and procedure, fit for a file's name."""
+    """Number and procedure, usable as a file name."""
     procedure: Procedure[object]
 
 
 @dataclass(frozen=True, slots=True)
 class Tasks:
-    """A plan made to fit an axis."""
+    """A plan adapted to an axis."""
 
     tasks: tuple[Task, ...]
     notes: tuple[str, ...]
-    """What had to be shortened or slowed, in words."""
+    """Descriptions of what had to be shortened or slowed."""
 
 
 class Room:
-    """The room that an axis leaves to a plan; notes what it had to take away."""
+    """Permitted travel and speed of an axis for a plan; records every reduction."""
 
     def __init__(self, axis: AxisView, precondition_deg: float) -> None:
         limits = axis.limits
@@ -296,7 +297,7 @@ class Room:
         self.notes: list[str] = []
         self._axis = axis
         self._back_deg = precondition_deg / axis.ratio
-        # On either side: what a pre-conditioning move needs beyond the travel itself.
+        # On either side: the extra travel of a pre-conditioning move.
         self._half_deg = 0.5 * (limits.position_max_deg - limits.position_min_deg) - 1.01 * self._back_deg
         if self._half_deg * axis.ratio < SMALLEST_TRAVEL_DEG:
             least = 2.0 * (SMALLEST_TRAVEL_DEG / axis.ratio + 1.01 * self._back_deg)
@@ -306,7 +307,7 @@ class Room:
             )
 
     def half(self, name: str, what: str, wanted_deg: float) -> float:
-        """Half the travel about the middle, load degrees."""
+        """Returns half the travel about the middle, load degrees, reduced to the permitted one."""
         if wanted_deg <= self._half_deg:
             return wanted_deg
         self.notes.append(
@@ -316,7 +317,7 @@ class Room:
         return self._half_deg
 
     def speed(self, name: str, motor_deg_s: float) -> float:
-        """A speed at the load, deg/s."""
+        """Returns a speed at the load, deg/s, reduced to the permitted one."""
         top = SPEED_SHARE * self._axis.limits.velocity_deg_s
         wanted = motor_deg_s / self.ratio
         if wanted > top:
@@ -324,7 +325,7 @@ class Room:
         return min(wanted, top)
 
     def stepping(self, name: str, count: int, step_deg: float) -> Stepping:
-        """Steps upwards from where the travel, centred, permits ``count`` of them, or fewer."""
+        """Returns centred upward steps: ``count`` of them, or as many as the travel permits."""
         step = step_deg / self.ratio
         possible = max(int(2.0 * self._half_deg / step), 2)
         if count > possible:

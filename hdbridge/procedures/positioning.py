@@ -1,4 +1,4 @@
-"""The positioning test of machine tools (ISO 230-2): targets approached from both sides, again and again."""
+"""Positioning test for machine tools (ISO 230-2): repeated approaches of targets from both sides."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ class Approach:
 
 @dataclass(frozen=True, slots=True)
 class Positioning:
-    """The standard test cycle: up through all targets, past the last, down through all, past the first."""
+    """Standard test cycle: up through all targets, past the last, down through all, past the first."""
 
     targets_deg: tuple[float, ...]
-    """Load angles, rising."""
+    """Load angles, ascending."""
     cycles: int = 5
     overrun_deg: float = 2.0
-    """Beyond the first and the last, at the load: more than any hysteresis is wide."""
+    """Travel beyond the first and the last target, at the load; larger than the width of any hysteresis."""
     settle: Settle = Settle()
 
     def moves(self, axis: AxisView) -> Steps[tuple[Approach, ...]]:
-        """Each approach a jerk-limited move and a settle."""
+        """Yields a jerk-limited move and a settle for each approach."""
         found: list[Approach] = []
         yield MoveTo(self.targets_deg[0] - self.overrun_deg, kind="precondition")
         for _ in range(self.cycles):
@@ -50,10 +50,10 @@ class Positioning:
 
 
 def targets(low_deg: float, high_deg: float, axis: AxisView) -> tuple[float, ...]:
-    """Targets over a travel, as many as ISO 230-2 asks of a rotary axis (at least 3, 5 or 8).
+    """Returns as many targets over a travel as ISO 230-2 requires of a rotary axis (at least 3, 5 or 8).
 
-    Within their spacing they are spread over the motor's turn by the golden ratio, so that an error that
-    repeats with the motor turn is not met at one phase only.
+    Within their spacing they are distributed over the motor turn by the golden ratio, so that an error that
+    repeats with the motor turn is sampled at different phases.
     """
     travel = high_deg - low_deg
     count = 3 if travel <= 90.0 else 5 if travel <= 180.0 else 8

@@ -1,4 +1,4 @@
-"""A procedure walked through on an ideal axis, before anything moves: how long, how far, how many legs."""
+"""Rehearsal of a procedure on an ideal axis before anything moves: duration, extent, number of legs."""
 
 from __future__ import annotations
 
@@ -10,19 +10,19 @@ from hdbridge.procedures.moves import AxisView, Move, Path, Procedure, Sample
 
 @dataclass(frozen=True, slots=True)
 class Rehearsal:
-    """What a procedure will ask of its axis."""
+    """Requirements of a procedure."""
 
     duration_s: float
-    """At an ideal axis; a real one takes longer to settle."""
+    """Duration on an ideal axis; a real one takes longer to settle."""
     lowest_deg: float
     highest_deg: float
     legs: int
 
 
 def rehearse(procedure: Procedure[object], axis: AxisView, start_deg: float = 0.0) -> Rehearsal:
-    """Walk through the procedure; InputError where it would leave the limits or break one.
+    """Rehearses the procedure; raises `InputError` if it would violate the limits.
 
-    Every leg's path is made as the bench will make it, so what is refused here never reaches the axis.
+    Every leg's path is computed as the bench will compute it, so a refused leg never reaches the axis.
     """
     duration, legs = 0.0, 0
     lowest = highest = start_deg
@@ -38,7 +38,7 @@ def rehearse(procedure: Procedure[object], axis: AxisView, start_deg: float = 0.
 def legs_of(
     procedure: Procedure[object], axis: AxisView, start_deg: float = 0.0
 ) -> Iterator[tuple[Move, Path]]:
-    """Each move of a procedure on an ideal axis, and the path that it takes."""
+    """Yields each move of a procedure on an ideal axis, with its path."""
     now, place = 0.0, start_deg
     steps = procedure.moves(axis)
     try:

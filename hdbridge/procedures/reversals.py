@@ -1,4 +1,4 @@
-"""Nested reversals: first-order reversal curves, which show whether a gear remembers return points."""
+"""Nested reversals: first-order reversal curves, which show if a gear has return-point memory."""
 
 from __future__ import annotations
 
@@ -9,20 +9,20 @@ from hdbridge.procedures.moves import AxisView, MoveTo, Steps
 
 @dataclass(frozen=True, slots=True)
 class Reversals:
-    """For each depth: back by it, forth by half of it, back again, then forth until all is forgotten.
+    """For each depth: back by it, forward by half of it, back again, then forward until all is forgotten.
 
-    Angles in ``depths_deg`` are motor degrees; ``reach_deg`` must be more than the hysteresis is wide.
+    ``depths_deg`` are motor degrees; ``reach_deg`` must exceed the width of the hysteresis.
     """
 
     centre_deg: float = 0.0
     depths_deg: tuple[float, ...] = (2.0, 4.0, 8.0, 12.0, 16.0, 24.0)
     reach_deg: float = 60.0
     velocity_deg_s: float = 0.2
-    """At the load."""
+    """Speed at the load."""
     beyond: bool = False
 
     def moves(self, axis: AxisView) -> Steps[None]:
-        """Starts each curve on the forward branch, at the centre."""
+        """Yields the curves, each starting on the forward branch at the centre."""
         depths = [each / axis.ratio for each in self.depths_deg]
         curves: list[tuple[float, ...]] = [(0.0, -each, -0.5 * each, -each, 0.0) for each in depths]
         if self.beyond:

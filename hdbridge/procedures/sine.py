@@ -17,7 +17,7 @@ class Sines:
     periods: float = 2.0
 
     def moves(self, axis: AxisView) -> Steps[None]:
-        """Each sine begins at its upper extreme."""
+        """Yields the sines, each starting at its upper extreme."""
         for amplitude_deg in self.amplitudes_deg:
             amplitude = amplitude_deg / axis.ratio
             yield MoveTo(self.centre_deg + amplitude)

@@ -1,4 +1,4 @@
-"""Standing still: what the encoders say when nothing moves is their noise."""
+"""Standstill: encoder readings without motion are noise."""
 
 from __future__ import annotations
 
@@ -9,29 +9,29 @@ from hdbridge.procedures.moves import AxisView, Dwell, MoveTo, Steps
 
 @dataclass(frozen=True, slots=True)
 class Precondition:
-    """Back and forth by more than any hysteresis is wide, ending in a forward move at ``load_deg``.
+    """Back and forth by more than the width of any hysteresis, ending in a forward move at ``load_deg``.
 
-    After it the gear's elastic state is known: saturated forward. Every plan begins with it.
+    The gear's elastic state is then known: saturated forward. Every plan starts with it.
     """
 
     load_deg: float = 0.0
     back_deg: float = 2.0
 
     def moves(self, axis: AxisView) -> Steps[None]:
-        """Two moves."""
+        """Yields the two moves."""
         yield MoveTo(self.load_deg - self.back_deg, kind="precondition")
         yield MoveTo(self.load_deg, kind="precondition")
 
 
 @dataclass(frozen=True, slots=True)
 class Standstill:
-    """Stand at ``load_deg`` for a while."""
+    """Standstill at ``load_deg`` for a given time."""
 
     load_deg: float = 0.0
     duration_s: float = 10.0
 
     def moves(self, axis: AxisView) -> Steps[None]:
-        """Go there and stand."""
+        """Yields the move and the standstill."""
         yield MoveTo(self.load_deg)
         yield Dwell(0.5, kind="move")
         yield Dwell(self.duration_s)
@@ -39,13 +39,13 @@ class Standstill:
 
 @dataclass(frozen=True, slots=True)
 class Reference:
-    """Stand at a pose that recurs, approached from the same side each time: what changes there is drift."""
+    """Standstill at a recurring pose, approached from the same side each time, so that changes are drift."""
 
     load_deg: float = 0.0
     duration_s: float = 1.5
 
     def moves(self, axis: AxisView) -> Steps[None]:
-        """Come to rest, then stand."""
+        """Yields the move, the settling and the standstill."""
         yield MoveTo(self.load_deg)
         yield Dwell(0.5, kind="move")
         yield Dwell(self.duration_s, kind="reference")

@@ -1,4 +1,4 @@
-"""The stepping test: how far the load is from where it was told to be, at rest, step after step."""
+"""Stepping test: deviation of the load from its target at rest, step by step."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ class Standing:
 
     @property
     def load_deg(self) -> float:
-        """Where the load encoder says that it stands, degrees."""
+        """Load position by the load encoder, degrees."""
         return self.target_deg + self.error_arcsec / ARCSEC_PER_DEG
 
 
 @dataclass(frozen=True, slots=True)
 class SteppingOutcome:
-    """Every step of both directions."""
+    """All steps of both directions."""
 
     cw: tuple[Standing, ...]
     """The first pass, towards positive angles."""
@@ -41,8 +41,8 @@ class SteppingOutcome:
 class Stepping:
     """``count`` steps of ``step_deg`` at the motor one way, then back.
 
-    It begins with a pre-conditioning move (back by ``precondition_deg`` and forth again), so that the gear's
-    elastic state is that of an axis that last moved forward.
+    It starts with a pre-conditioning move (back by ``precondition_deg`` and forward again), so that the
+    gear's elastic state is that of an axis that last moved forward.
     """
 
     count: int = 240
@@ -50,16 +50,16 @@ class Stepping:
     start_deg: float = 0.0
     """Load angle of the start."""
     precondition_deg: float = 2.0
-    """Load degrees; more than any hysteresis is wide."""
+    """Load degrees; larger than the width of any hysteresis."""
     settle: Settle = Settle()
 
     def __post_init__(self) -> None:
-        """InputError for steps of no size."""
+        """Raises `InputError` for steps of size zero."""
         if self.step_deg == 0.0:
             raise InputError("step_deg: found 0; expected the size of a step, negative for steps down first")
 
     def moves(self, axis: AxisView) -> Steps[SteppingOutcome]:
-        """Each step a jerk-limited move and a settle."""
+        """Yields a jerk-limited move and a settle for each step."""
         yield MoveTo(self.start_deg - self.precondition_deg, kind="precondition")
         yield MoveTo(self.start_deg, kind="precondition")
         passes: list[tuple[Standing, ...]] = []
@@ -75,7 +75,7 @@ class Stepping:
 
 
 def standing(target_deg: float, samples: Sequence[Sample], settle: Settle) -> Standing:
-    """What was measured at a target: the mean over the settled window."""
+    """Returns the result at a target: the mean over the settled window."""
     window = settle.window(samples)
     mean = sum(each.load_position_deg - target_deg for each in window) / len(window)
     return Standing(target_deg, mean * ARCSEC_PER_DEG, samples[-1].time_s - samples[0].time_s)

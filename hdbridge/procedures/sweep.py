@@ -1,4 +1,4 @@
-"""Slow sweeps both ways: the synchronous part, load orders, and the height of the loop."""
+"""Slow sweeps in both directions: the synchronous part, load orders, and the height of the loop."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ class Sweep:
     laps: int = 1
 
     def moves(self, axis: AxisView) -> Steps[None]:
-        """Each lap there and back; the elastic state is that of an axis coming from ``low_deg``."""
+        """Yields the laps; the elastic state is that of an axis coming from ``low_deg``."""
         yield MoveTo(self.low_deg)
         for _ in range(self.laps):
             yield MoveTo(self.high_deg, self.velocity_deg_s, kind="sweep")

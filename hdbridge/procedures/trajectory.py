@@ -1,4 +1,4 @@
-"""An own trajectory of the load: a function of time, or set-points at equal distances of time."""
+"""User-defined trajectory of the load: a function of time, or evenly spaced set-points."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from hdbridge.procedures.moves import AxisView, MotionLimits, MoveTo, Path, Samp
 from hdbridge.units import ARCSEC_PER_DEG
 
 GRID_S = 0.001
-"""A function is asked so often: no drive's cycle is much shorter."""
+"""Sampling period of a function; no drive's cycle is much shorter."""
 MOST_POINTS = 1_000_000
 UNITS = {"velocity_deg_s": "deg/s", "acceleration_deg_s2": "deg/s2", "jerk_deg_s3": "deg/s3"}
-"""The limits that a trajectory is held to, by the number of the derivative."""
+"""Limits that a trajectory must respect, in order of the derivative."""
 ROUNDING = 1e-6
-"""Share of a limit by which finite differences may pass it."""
+"""Share of a limit by which finite differences may exceed it."""
 
 
 @dataclass(frozen=True, slots=True)
 class Followed:
-    """How well the load kept to the trajectory, load encoder minus load target, arcsec."""
+    """Tracking error of the load, load encoder minus load target, arcsec."""
 
     rms_arcsec: float
     largest_arcsec: float
@@ -33,21 +33,23 @@ class Followed:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Trajectory:
-    """Load angles at equal distances of time, followed as one smooth path.
+    """Evenly spaced load angles, followed as one smooth path.
 
-    The axis first moves to the first of them, jerk-limited, and comes to rest at the last. Speed,
-    acceleration and jerk, rest before and after included, must be within the axis's limits: `rehearse`
-    refuses it (InputError) before anything moves. Between two set-points the path is a cubic, with the slope
-    of its neighbours.
+    The axis first moves to the first angle, jerk-limited, and comes to rest at the last. Speed, acceleration
+    and jerk, rest before and after included, must be within the axis's limits: `rehearse` refuses the
+    trajectory (`InputError`) before anything moves. Between two set-points the path is a cubic, with the
+    slope of its neighbours.
     """
 
     load_deg: FloatArray
     """Shape (n,), n at least 2."""
     period_s: float
-    """Time from one to the next."""
+    """Time between two angles."""
 
     def __post_init__(self) -> None:
-        """InputError for what is no path: too few points, a value that is not finite, no time between."""
+        """Raises `InputError` for an invalid path: too few points, a non-finite value, or a period that is
+        not positive.
+        """
         points = np.array(self.load_deg, dtype=np.float64)
         points.flags.writeable = False
         object.__setattr__(self, "load_deg", points)
@@ -67,7 +69,7 @@ class Trajectory:
 
     @classmethod
     def of(cls, load_deg: Callable[[float], float], duration_s: float) -> Self:
-        """A function of time: the load angle in degrees so many seconds after the beginning."""
+        """Samples a function of time that returns the load angle in degrees, in seconds after the start."""
         if not (math.isfinite(duration_s) and duration_s > 0.0):
             raise InputError(f"a trajectory of {duration_s!r} s; expected a duration above 0")
         count = min(math.ceil(duration_s / GRID_S), MOST_POINTS)
@@ -75,7 +77,7 @@ class Trajectory:
         return cls(np.array([load_deg(number * period_s) for number in range(count + 1)]), period_s)
 
     def moves(self, axis: AxisView) -> Steps[Followed]:
-        """To the beginning, along the path, and to rest."""
+        """Yields the move to the start, the path, and the settling."""
         follow = Follow(self.load_deg, self.period_s)
         yield MoveTo(float(self.load_deg[0]))
         samples = yield follow
@@ -85,16 +87,16 @@ class Trajectory:
 
 
 class Follow:
-    """The leg that follows set-points; all that takes time is prepared when it is made."""
+    """Leg that follows set-points; everything slow is prepared at construction."""
 
     kind = "trajectory"
 
     def __init__(self, load_deg: FloatArray, period_s: float) -> None:
         self._points, self._period_s = load_deg, period_s
         self._lowest, self._highest = float(load_deg.min()), float(load_deg.max())
-        # At rest before and after: a path that begins or ends in motion shows as an acceleration there.
+        # At rest before and after: a path that starts or ends in motion shows as an acceleration there.
         padded = np.concatenate([np.full(3, load_deg[0]), load_deg, np.full(3, load_deg[-1])])
-        # Each difference is a mean of the derivative, so it never passes the largest one.
+        # Each difference is a mean of the derivative, so it never exceeds the largest one.
         self._needs: dict[str, tuple[float, float]] = {}
         rounding_deg = np.spacing(max(abs(self._lowest), abs(self._highest), 1.0))
         for number, name in enumerate(UNITS, 1):
@@ -116,7 +118,7 @@ class Follow:
         )
 
     def path(self, start_deg: float, limits: MotionLimits) -> Path:
-        """The path; InputError where it does not begin where the axis stands, or needs more than it may."""
+        """Returns the path; raises `InputError` if it starts elsewhere than the axis or violates a limit."""
         if abs(start_deg - self._points[0]) > 1e-9:
             raise InputError(
                 f"a trajectory begins at {self._points[0]:g} deg, but the axis stands at {start_deg:g}: move "
@@ -144,5 +146,5 @@ class Follow:
         return Path(count * period_s, at, self._lowest, self._highest)
 
     def ended(self, samples: Sequence[Sample]) -> bool:
-        """The path's end is the leg's end."""
+        """Returns True, because the leg ends with its path."""
         return True

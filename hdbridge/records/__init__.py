@@ -1,1 +1,1 @@
-"""Measured time series of one axis: records, recordings with what moved how, records of other benches."""
+"""Measured time series of one axis: records, recordings with their segments, records of other benches."""

@@ -1,6 +1,6 @@
-"""Which column of a CSV file holds which channel of a record, in which unit, and where its counter wraps.
+"""Assignment of CSV columns to channels of a record, with units and wrapping counters.
 
-A record's own columns are in the units that their names say. A file of another program is read with a
+A record's own columns are in the units that their names state. A file of another program is read with
 `CsvColumns`: the options ``--columns``, ``--units`` and ``--unwrap`` of the command line.
 """
 
@@ -45,20 +45,20 @@ CHANNELS: Final[Mapping[str, str]] = MappingProxyType(
         **{without_unit(each.value).removesuffix("_c"): each.value for each in MEASURED},
     }
 )
-"""The column of a record for each channel that the options name."""
+"""Column of a record for each channel that the options name."""
 Said = str | Sequence[str] | Mapping[str, object] | None
 """``channel=value,channel=value``, several of them, or a mapping."""
 ROW: Final = "row"
-"""In place of a column: the number of the row, for a file without a time."""
+"""Placeholder for a column: the number of the row, for a file without a time."""
 
 
 class _Scale(NamedTuple):
-    """A value in the record's unit is ``at_zero + factor * value``."""
+    """Conversion: the value in the record's unit is ``at_zero + factor * value``."""
 
     factor: float
     at_zero: float = 0.0
     per: str = ""
-    """What has to be given after a colon: the factor is divided by it, or multiplied by it for a torque."""
+    """Quantity that must follow a colon: it divides the factor, or for a torque multiplies it."""
 
 
 _RAD: Final = math.degrees(1.0)
@@ -91,7 +91,7 @@ UNITS: Final[Mapping[str, Mapping[str, _Scale]]] = {
     },
     "c": {"degC": _Scale(1.0), "K": _Scale(1.0, -273.15), "degF": _Scale(5 / 9, -160 / 9)},
 }
-"""By the unit at the end of the record's column."""
+"""Known units by the unit at the end of the record's column."""
 _ALIASES: Final[Mapping[str, str]] = {
     alias: unit
     for unit, aliases in {
@@ -129,28 +129,28 @@ _HINTS: Final[Mapping[str, frozenset[str]]] = {
     "motor": frozenset({"motor", "mot", "input", "drive", "antrieb", "m"}),
     "load": frozenset({"load", "last", "output", "out", "link", "joint", "abtrieb", "l"}),
 }
-"""Words in the names of columns, to suggest one for a channel that is missing."""
+"""Words in column names that suggest a column for a missing channel."""
 _OTHERS: Final = frozenset(
     {"torque", "current", "speed", "velocity", "vel", "acceleration", "acc", "error", "temperature", "temp",
      "power", "target", "demand", "command", "cmd", "setpoint", "ref", "soll", "state", "status"}
 )  # fmt: skip
-"""Words in the names of columns that are no time and no measured angle."""
+"""Words in column names that indicate neither a time nor a measured angle."""
 
 
 @dataclass(frozen=True, slots=True)
 class Unit:
-    """The unit of a column; `str` gives it as the options write it: rad, -counts:65536, 0.1degC."""
+    """Unit of a column; `str` formats it as the options do: rad, -counts:65536, 0.1degC."""
 
     name: str
     scale: _Scale
     per: float | None = None
-    """Counts per turn, or the rated torque."""
+    """Counts per turn, or the rated torque in Nm."""
     times: float = 1.0
-    """One of the column's values is so many of the unit; negative if it counts the other way."""
+    """Number of units per value of the column; negative if it counts the other way."""
 
     @classmethod
     def parse(cls, text: str, channel: str, where: str = "--units") -> Self:
-        """From the text after ``channel=``; InputError says what is possible."""
+        """Parses the text after ``channel=``; raises `InputError` with the possible units."""
         known = _units_of(channel)
         found = _UNIT.match(text.strip())
         name = _canonical(found[3], known) if found else None
@@ -176,14 +176,14 @@ class Unit:
 
     @property
     def factor(self) -> float:
-        """What one of the column's values is in the record's unit; of a temperature, a difference of one."""
+        """Value of one column unit in the record's unit; for a temperature, of a difference of one."""
         factor = self.scale.factor * self.times
         if self.per is None:
             return factor
         return factor / self.per if self.scale.per == _PER_TURN else factor * self.per
 
     def convert(self, values: FloatArray) -> FloatArray:
-        """The values in the record's unit; the same array if that is the column's."""
+        """Returns the values in the record's unit; the same array if no conversion is needed."""
         factor, at_zero = self.factor, self.scale.at_zero
         if factor == 1.0 and not at_zero:
             return values
@@ -191,11 +191,11 @@ class Unit:
         return converted
 
     def named(self, name: str, channel: str) -> Self:
-        """The same with another unit."""
+        """Returns the same unit with another name."""
         return replace(self, name=name, scale=_units_of(channel)[name])
 
     def scaled(self, by: float) -> Self:
-        """The unit of a column whose values are ``by`` times as large as this one says."""
+        """Returns the unit of a column whose values are ``by`` times as large as this one states."""
         return replace(self, times=self.times * by)
 
     def __str__(self) -> str:
@@ -206,13 +206,13 @@ class Unit:
 
 @dataclass(frozen=True, slots=True)
 class CsvColumns:
-    """Where the channels of a record are in CSV files: what the user says, by the names of `CHANNELS`."""
+    """User's statement of where the channels are in CSV files, by the names of `CHANNELS`."""
 
     columns: Mapping[str, str] = field(default_factory=dict)
-    """The column's name, or its number (1 is the first), or `ROW`; of others the record's own column."""
+    """Column name, or its number (1 is the first), or `ROW`; other channels use the record's own column."""
     units: Mapping[str, Unit] = field(default_factory=dict)
     unwrap: Mapping[str, float] = field(default_factory=dict)
-    """The period of a counter that wraps, in the column's unit."""
+    """Period of each wrapping counter, in the column's unit."""
 
     @classmethod
     def of(
@@ -221,11 +221,10 @@ class CsvColumns:
         units: Said = None,
         unwrap: Said = None,
     ) -> Self:
-        """From ``motor=theta_m,time=t``, ``motor=counts:65536,time=ms`` and ``motor=65536``, or mappings.
+        """Parses ``motor=theta_m,time=t``, ``motor=counts:65536,time=ms`` and ``motor=65536``, or mappings.
 
-        Of several texts a later one prevails.
-
-        InputError for a channel, a unit or a period that cannot be.
+        Of several texts the later ones take precedence. Raises `InputError` for an impossible channel, unit
+        or period.
         """
         periods: dict[str, float] = {}
         for channel, text in _pairs(unwrap, "--unwrap", "PERIOD").items():
@@ -246,40 +245,40 @@ class CsvColumns:
         )
 
     def __bool__(self) -> bool:
-        """Whether anything is said."""
+        """True if anything was stated."""
         return bool(self.columns or self.units or self.unwrap)
 
     def column(self, channel: str) -> str:
-        """The column that is looked for."""
+        """Returns the name of the column for a channel."""
         return self.columns.get(channel, CHANNELS[channel])
 
 
 @dataclass(frozen=True, slots=True)
 class Origin:
-    """The CSV file that a record was read from, and how: for messages that name lines and options."""
+    """CSV file that a record was read from, and how, for messages that name lines and options."""
 
     file: CsvFile
     columns: Mapping[str, str]
-    """The column of the file for each channel that the record has."""
+    """Column of the file for each channel that the record has."""
     units: Mapping[str, Unit]
-    """The unit in which each of them was read."""
+    """Unit in which each of them was read."""
     stated: frozenset[str]
-    """The channels whose unit the user has stated."""
+    """Channels whose unit the user has stated."""
     unwrapped: frozenset[str]
     remarks: tuple[str, ...]
-    """What was assumed, in words."""
+    """Assumptions, as text."""
 
     @property
     def remark(self) -> str:
-        """One line that says what was assumed; empty if nothing was."""
+        """One line with the assumptions; empty if there were none."""
         return one_line(f"{self.file.path}: assumed {'; '.join(self.remarks)}") if self.remarks else ""
 
     def place(self, row: int) -> str:
-        """File and line of a row of the record."""
+        """Returns file and line of a row of the record."""
         return f"{self.file.path}:{self.file.line_of_row(row)}"
 
     def clock_cure(self, time_s: FloatArray) -> str:
-        """The option for a clock that wraps at a usual period; empty if it does not."""
+        """Returns the option for a clock that wraps at a common period; empty if it does not."""
         raw = time_s / self.units["time"].factor
         steps = np.diff(raw)
         ahead = float(np.median(steps[steps > 0.0])) if np.any(steps > 0.0) else 0.0
@@ -290,23 +289,23 @@ class Origin:
         return ""
 
     def exchanged(self) -> str:
-        """The option that exchanges motor and load."""
+        """Returns the option that exchanges motor and load."""
         return option("--columns", {"motor": self.columns["load"], "load": self.columns["motor"]})
 
     def scaled(self, channel: str, by: float) -> str:
-        """The option that makes the values of a channel ``by`` times as large."""
+        """Returns the option that makes the values of a channel ``by`` times as large."""
         return option("--units", {channel: str(self.units[channel].scaled(by))})
 
 
 def option(name: str, values: Mapping[str, str]) -> str:
-    """An option of the command line, quoted for a shell."""
+    """Returns an option of the command line, quoted for a shell."""
     return f"{name} {shlex.quote(','.join(f'{channel}={value}' for channel, value in values.items()))}"
 
 
 def read(file: CsvFile, said: CsvColumns) -> tuple[dict[str, Column], Origin]:
-    """The columns of a record from a CSV file, converted and unwrapped, and where they come from.
+    """Reads the columns of a record from a CSV file, converted and unwrapped, with their origin.
 
-    The record's own names come first, all others of the file are kept as they are.
+    The record's own names come first; all other columns of the file are kept as they are.
     """
     found = _located(file, said)
     units, remarks = _units(file, said, found)
@@ -320,7 +319,7 @@ def read(file: CsvFile, said: CsvColumns) -> tuple[dict[str, Column], Origin]:
         if channel in said.unwrap:
             values = _unwrapped(values, said.unwrap[channel], ordered=channel == "time")
         if name == time and abs(units[channel].factor) < 1e-3 and rows:
-            values = values - values[0]  # nanoseconds since 1970 have more digits than a float
+            values = values - values[0]  # nanoseconds since 1970 exceed the digits of a float
         converted[CHANNELS[channel]] = units[channel].convert(values)
     used = set(found.values())
     kept = {name: each for name, each in columns.items() if name not in used and name not in converted}
@@ -337,14 +336,14 @@ def read(file: CsvFile, said: CsvColumns) -> tuple[dict[str, Column], Origin]:
 
 
 def _located(file: CsvFile, said: CsvColumns) -> dict[str, str]:
-    """The column of the file for each channel; InputError names what is missing, with the options to pass."""
+    """Finds the column of each channel; raises `InputError` for missing ones, with the options to pass."""
     found: dict[str, str] = {}
     missing: list[str] = []
     for channel, own in CHANNELS.items():
         wanted = said.column(channel)
         name = ROW if wanted == ROW and ROW not in file.names else file.find(wanted)
         if channel not in said.columns and name != own:
-            name = None  # a record's own column has its name, not its number
+            name = None  # a record's own column is identified by its name, not its number
         if name is not None:
             found[channel] = name
         elif channel in said.columns or own in REQUIRED:
@@ -365,7 +364,7 @@ def _located(file: CsvFile, said: CsvColumns) -> dict[str, str]:
 
 
 def _missing(file: CsvFile, said: CsvColumns, missing: Sequence[str], found: Mapping[str, str]) -> InputError:
-    """Says which columns are missing, which there are, and what to pass."""
+    """Returns the error for missing columns: which exist, and which options to pass."""
     names = [f"'{said.column(each)}'" for each in missing]
     what = f"column{'s' * (len(names) > 1)} {', '.join(names)} {'are' if len(names) > 1 else 'is'} missing"
     if not file.header_line:
@@ -400,7 +399,7 @@ def _missing(file: CsvFile, said: CsvColumns, missing: Sequence[str], found: Map
 
 
 def _guess(channel: str, names: Sequence[str]) -> str | None:
-    """The column that may hold a channel."""
+    """Returns the column that may hold a channel, or None."""
     hints = _HINTS.get(channel, frozenset({channel}))
     words = {
         name: set(re.findall(r"[^\W\d_]+", re.sub(r"(?<=[a-z])(?=[A-Z])", " ", name).lower()))
@@ -413,7 +412,7 @@ def _guess(channel: str, names: Sequence[str]) -> str | None:
 
 
 def _units(file: CsvFile, said: CsvColumns, found: Mapping[str, str]) -> tuple[dict[str, Unit], list[str]]:
-    """The unit of each channel: as the user states it, else as the file says it, else the record's own."""
+    """Determines the unit of each channel: as stated by the user, else by the file, else the record's own."""
     units: dict[str, Unit] = {}
     remarks: list[str] = []
     for channel, name in found.items():
@@ -456,7 +455,7 @@ def _with_per(units: Mapping[str, str]) -> str:
 
 
 def _unwrapped(values: FloatArray, period: float, *, ordered: bool) -> FloatArray:
-    """Unwraps a counter; a clock (``ordered``) only ever goes forward."""
+    """Unwraps a counter; a clock (``ordered``) only runs forward."""
     if ordered:
         begins = np.diff(values, prepend=values[:1]) < 0.0
         clock: FloatArray = values + period * np.cumsum(begins)
@@ -465,7 +464,7 @@ def _unwrapped(values: FloatArray, period: float, *, ordered: bool) -> FloatArra
 
 
 def _units_of(channel: str) -> Mapping[str, _Scale]:
-    """The units that a channel can have."""
+    """Returns the units that a channel can have."""
     own = CHANNELS[channel].rpartition("_")[2]
     return UNITS.get(own, {own: _Scale(1.0)})
 
@@ -483,7 +482,7 @@ def _canonical(text: str, known: Mapping[str, _Scale]) -> str | None:
 
 
 def _unit_in_name(name: str, channel: str) -> str | None:
-    """The unit that a column's name ends with."""
+    """Returns the unit at the end of a column's name, or None."""
     found = _IN_NAME.search(name)
     return _canonical(found[1] or found[2], _units_of(channel)) if found else None
 
@@ -495,7 +494,7 @@ def _choices(known: Mapping[str, _Scale]) -> str:
 
 
 def _pairs(said: Said, where: str, what: str) -> dict[str, str]:
-    """``channel=value,channel=value`` as a mapping; a value may hold commas and equals signs."""
+    """Parses ``channel=value,channel=value``; a value may contain commas and equals signs."""
     if said is None:
         return {}
     if isinstance(said, str):

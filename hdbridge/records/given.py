@@ -1,4 +1,4 @@
-"""What `fit` and `diagnose` may be given as a measurement: one or several records or recordings."""
+"""Measurements accepted by `fit` and `diagnose`: one or several records or recordings."""
 
 from __future__ import annotations
 
@@ -10,11 +10,13 @@ from hdbridge.records.record import Record
 from hdbridge.records.recording import Recording
 
 Given = Record | Recording | Sequence[Record | Recording] | Mapping[Path, Recording]
-"""In the order of their time; a mapping says what messages call each."""
+"""In chronological order; the keys of a mapping name them in messages."""
 
 
 def by_name(given: Given) -> dict[Path, Recording]:
-    """Each recording by what messages call it: its file, or its number. InputError where there is none."""
+    """Returns the recordings by their name in messages: file or number. Raises `InputError` if
+    there is none.
+    """
     if isinstance(given, Mapping):
         named = dict(given)
     else:
@@ -37,9 +39,9 @@ def by_name(given: Given) -> dict[Path, Recording]:
 
 
 def agreed_ratio(recordings: Mapping[Path, Recording], said: Iterable[tuple[str, float | None]]) -> float:
-    """The gear's ratio, from what is ``said`` of it (where, and what) and the recordings, which must agree.
+    """Returns the gear ratio on which ``said`` (source and value) and the recordings agree.
 
-    InputError where they do not, or where nobody says it.
+    Raises `InputError` if they disagree, or if none states it.
     """
     said = [*said, *((f"{name}", each.ratio) for name, each in recordings.items())]
     known = [(where, value) for where, value in said if value is not None]

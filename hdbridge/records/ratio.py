@@ -1,4 +1,4 @@
-"""What is wrong with a record whose angles contradict the ratio of the gear, and the option that mends it."""
+"""Diagnosis of a record whose angles contradict the gear ratio, and the option that corrects it."""
 
 from __future__ import annotations
 
@@ -9,11 +9,13 @@ from hdbridge.records.columns import UNITS, Origin, option
 from hdbridge.units import DEG_PER_TURN
 
 UNIT_SHARE: Final = 0.006
-"""Maximum deviation of a slope from that of another unit, as a share: the nearest common ratio is as far."""
+"""Maximum deviation of a slope from that of another unit, as a share: the distance of the nearest common
+ratio.
+"""
 LEAST_COUNTS: Final = 1000.0
 """Minimum counts per turn of an encoder."""
 STANDSTILL: Final = 0.01
-"""Of a load that goes a smaller share of its way, the encoder is not read."""
+"""Share of the expected load travel below which the encoder counts as not being read."""
 _PLURALS: Final = {
     "deg": "degrees",
     "rad": "radians",
@@ -25,9 +27,10 @@ _PLURALS: Final = {
 
 
 def remedy(times: float, ratio: float, exact: float, origin: Origin | None) -> str:
-    """What to do about a load that goes ``times`` as far as the ratio and the motor say.
+    """Returns advice for a load that travels ``times`` as far as the ratio and the motor imply.
 
-    Names the option if the record is from a CSV file. ``exact`` is the share up to which a ratio is right.
+    Names the option if the record is from a CSV file. ``exact`` is the relative accuracy within which a ratio
+    counts as right.
     """
     if abs(times) < STANDSTILL:
         column = (
@@ -59,7 +62,9 @@ def remedy(times: float, ratio: float, exact: float, origin: Origin | None) -> s
 
 
 def _other_units(origin: Origin | None) -> list[tuple[float, str, str]]:
-    """For each other unit of an angle: what it makes of the load's share of the way, and what to do."""
+    """Returns for each other angle unit its effect on the load's relative travel, a
+    description, and advice.
+    """
     found = []
     for channel, sense in (("load", 1.0), ("motor", -1.0)):
         unit = origin.units[channel] if origin else None
@@ -88,7 +93,7 @@ def _other_places(ratio: float, origin: Origin | None) -> list[tuple[float, str,
 
 
 def _of_counts(times: float, exact: float, origin: Origin | None) -> str:
-    """Which counts per turn would agree, if the units are counts."""
+    """Returns the counts per turn that would agree, if the units are counts."""
     if origin is None:
         return ""
     agreeing = []
@@ -100,7 +105,7 @@ def _of_counts(times: float, exact: float, origin: Origin | None) -> str:
 
 
 def _round(counts: float, exact: float) -> int:
-    """The roundest number of counts within what the slope leaves open."""
+    """Returns the roundest number of counts within the uncertainty of the slope."""
     power: int = 2 ** round(math.log2(counts))
     if abs(counts / power - 1.0) < exact:
         return power

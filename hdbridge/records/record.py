@@ -1,6 +1,6 @@
-"""A record: what one axis did, sample by sample, as named columns with their units.
+"""A record: the motion of one axis, sample by sample, as named columns with units.
 
-A record comes from hdbridge's own bench or from somebody else's CSV file; both look alike. Sampling may be
+A record comes from hdbridge's own bench or from another program's CSV file; both look alike. Sampling may be
 uneven. Angles are multi-turn degrees.
 """
 
@@ -27,9 +27,11 @@ __all__ = ["MINIMUM_SAMPLES", "OPTIONAL", "REQUIRED", "Record", "concatenate", "
 MINIMUM_SAMPLES: Final = 2
 
 WRONG_RATIO: Final = 0.003
-"""A ratio this far off, relatively, is another gear's; the closest pair of common ones is 0.6 % apart."""
+"""Relative deviation of a ratio that indicates another gear; the closest pair of common ratios is 0.6 %
+apart.
+"""
 WRONG_RATIO_ARCSEC: Final = 900.0
-"""... if it also shows as more than this over the travel: several times what any gear's own error can be."""
+"""Minimum effect of such a deviation over the travel, several times the error of any gear; arcsec."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,11 +40,11 @@ class Record:
 
     columns: Mapping[str, Column]
     source: str = ""
-    """Where it comes from, for messages."""
+    """Source of the record, for messages."""
     starts: tuple[int, ...] = field(default=(0,))
-    """The rows where one of its records begins: between two of them nothing is known of the axis."""
+    """First row of each of its records; nothing is known of the axis between two of them."""
     origin: Origin | None = None
-    """The CSV file that it was read from, and how; None for any other record."""
+    """CSV file that it was read from, and how; None for any other record."""
 
     def __post_init__(self) -> None:
         missing = [name for name in REQUIRED if name not in self.columns]
@@ -55,7 +57,7 @@ class Record:
         object.__setattr__(self, "columns", MappingProxyType(columns))
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """For pickle, which knows no read-only mapping."""
+        """Supports pickle, which cannot handle the read-only mapping."""
         return type(self), (dict(self.columns), self.source, self.starts)
 
     @classmethod
@@ -68,20 +70,21 @@ class Record:
         units: Said = None,
         unwrap: Said = None,
     ) -> Self:
-        """Read a CSV file of any program, plain or gzip.
+        """Reads a CSV file of any program, plain or gzip.
 
-        ``columns`` says which column is which channel, ``units`` in which unit, ``unwrap`` by which period a
-        counter wraps, as the command line does: ``columns="motor=theta_m,time=t"`` or a mapping. What
-        was assumed is in ``.origin.remarks``.
+        ``columns`` assigns columns to channels, ``units`` their units, ``unwrap`` the period of a wrapping
+        counter, as on the command line: ``columns="motor=theta_m,time=t"`` or a mapping. The assumptions are
+        in ``.origin.remarks``.
 
-        InputError, with file and line: a required column is missing, a value of a known column is not a
-        finite number, a row is ragged, time runs backwards, there are too few samples, no known encoding.
+        Raises `InputError`, with file and line, if a required column is missing, a value of a known column is
+        not a finite number, a row is ragged, time runs backwards, there are too few samples, or the encoding
+        is unknown.
         """
         return cls.of_csv(Path(path), CsvColumns.of(columns, units, unwrap), minimum_samples)
 
     @classmethod
     def of_csv(cls, path: Path, said: CsvColumns, minimum_samples: int = MINIMUM_SAMPLES) -> Self:
-        """`read_csv`, with what is said of the file's columns taken apart already."""
+        """Does the same as `read_csv`, with parsed options."""
         file = CsvFile(path, [said.column(channel) for channel in CHANNELS])
         found, origin = read(file, said)
         record = cls(found, str(path), origin=origin)
@@ -100,9 +103,9 @@ class Record:
         return record
 
     def write_csv(self, path: Path | str) -> None:
-        """Write the record atomically, gzip where the name ends in ``.gz``.
+        """Writes the record atomically, gzip if the name ends in ``.gz``.
 
-        Every number reads back to the last bit, and the same record gives the same bytes.
+        Every number reads back exactly, and the same record gives the same bytes.
         """
         write_columns(Path(path), self.columns)
 
@@ -111,7 +114,7 @@ class Record:
         return len(self.time_s)
 
     def __eq__(self, other: object) -> bool:
-        """The same columns with the same values, to the last bit."""
+        """True for the same columns with exactly the same values."""
         if not isinstance(other, Record):
             return NotImplemented
         return self.columns.keys() == other.columns.keys() and all(
@@ -137,24 +140,26 @@ class Record:
 
     @property
     def motor_target_deg(self) -> FloatArray | None:
-        """Commanded motor angle in degrees, multi-turn."""
+        """Commanded motor angle in degrees, multi-turn, shape (n,); None if not recorded."""
         return self.columns.get("motor_target_deg")
 
     @property
     def measured(self) -> dict[Channel, FloatArray]:
-        """The measured channels that it has, each of shape (n,)."""
+        """Measured channels of the record, each of shape (n,)."""
         return {each: self.columns[each.value] for each in MEASURED if each.value in self.columns}
 
     def transmission_error_arcsec(self, ratio: float) -> FloatArray:
-        """theta_L - theta_M / N in arcsec at the load, shape (n,), from the measured angles.
+        """Returns theta_L - theta_M / N in arcsec at the load, shape (n,), from the measured angles.
 
-        Its mean holds the difference of the two encoders' zeros.
+        Its mean contains the difference of the two encoders' zeros.
         """
         error: FloatArray = (self.load_position_deg - self.motor_position_deg / ratio) * ARCSEC_PER_DEG
         return error
 
     def motion(self) -> Motion:
-        """What the axis did, for a model; by the commanded motor angle if there is one, else the measured."""
+        """Returns the motion of the axis for a model, with the commanded motor angle if there is one, else
+        the measured.
+        """
         target = self.motor_target_deg
         return Motion(
             motor_deg=self.motor_position_deg if target is None else target,
@@ -163,16 +168,18 @@ class Record:
         )
 
     def load_turns_per_motor_turn(self) -> float | None:
-        """The slope of the load angle over the motor angle, by least squares; None when the motor stood."""
+        """Returns the least-squares slope of the load angle over the motor angle; None if the motor stood
+        still.
+        """
         motor = self.motor_position_deg - np.mean(self.motor_position_deg)
         square = float(motor @ motor)
         return float(motor @ self.load_position_deg) / square if square else None
 
     def check_ratio(self, ratio: float) -> None:
-        """Refuse (InputError) a ratio that the record's own angles contradict.
+        """Raises `InputError` if the record's own angles contradict a ratio.
 
-        A small deviation is not refused but left to diagnosis, and so is any when the axis moved too little
-        to distinguish it from the gear's own error.
+        A small deviation is left to diagnosis, and so is any deviation if the axis moved too little to
+        distinguish it from the gear's own error.
         """
         slope = self.load_turns_per_motor_turn() if len(self) else None
         if slope is None:
@@ -192,28 +199,28 @@ class Record:
         raise InputError(f"{name}{found} ({over}); expected a ratio of {ratio:g}: {cure}")
 
     def rows(self, first: int, end: int) -> Self:
-        """The samples from row ``first`` up to, not including, ``end``."""
+        """Returns the samples from row ``first`` up to, not including, ``end``."""
         columns = {name: column[first:end] for name, column in self.columns.items()}
         inside = (start - first for start in self.starts if first < start < end)
         return type(self)(columns, self.source, (0, *inside), self.origin)
 
     def between(self, start_s: float, end_s: float) -> Self:
-        """The samples of a span of time, both ends included."""
+        """Returns the samples of a time span, both ends included."""
         first = int(np.searchsorted(self.time_s, start_s, side="left"))
         end = int(np.searchsorted(self.time_s, end_s, side="right"))
         return self.rows(first, end)
 
     def parts(self) -> tuple[Self, ...]:
-        """The records that it was put together from."""
+        """Returns the records that it was concatenated from."""
         ends = (*self.starts[1:], len(self))
         return tuple(self.rows(start, end) for start, end in zip(self.starts, ends, strict=True))
 
 
 def concatenate(records: Sequence[Record]) -> Record:
-    """Several records as one, in the order given, with one absolute zero.
+    """Concatenates records in the order given, with one absolute zero.
 
-    A record whose time starts again is moved in time to follow the one before. Columns that not every one has
-    are left out.
+    A record whose time starts again is shifted to follow the one before. Columns that some records lack are
+    left out.
     """
     if not records:
         raise ValueError("nothing to concatenate")
@@ -235,7 +242,7 @@ def concatenate(records: Sequence[Record]) -> Record:
 
 
 def time_shifts_s(records: Sequence[Record]) -> tuple[float, ...]:
-    """What to add to each record's time so that they follow each other; zero where they already do."""
+    """Returns the offsets that make the records' times follow each other, s; zero if they already do."""
     shifts: list[float] = []
     end_s = -np.inf
     for record in records:
@@ -250,7 +257,7 @@ def time_shifts_s(records: Sequence[Record]) -> tuple[float, ...]:
 
 
 def _frozen(column: Any) -> Column:
-    """A read-only view: of float64, or of text."""
+    """Returns a read-only view of float64 or of text."""
     array = np.asarray(column)
     if array.dtype.kind != "U":
         array = array.astype(np.float64, copy=False)
@@ -262,6 +269,6 @@ def _frozen(column: Any) -> Column:
 def _same(one: Column, other: Column) -> bool:
     if one.dtype != other.dtype or one.shape != other.shape:
         return False
-    if one.dtype.kind == "f":  # the bits of a NaN mean nothing and are not kept in a file
+    if one.dtype.kind == "f":  # the bits of a NaN have no meaning and are not kept in a file
         one, other = (np.where(np.isnan(each), np.nan, each) for each in (one, other))
     return one.tobytes() == other.tobytes()

@@ -1,8 +1,8 @@
-"""A recording: a record, what moved how in it, and where it comes from; one folder, or somebody's CSV files.
+"""A recording: a record, its segments and its provenance; one folder, or CSV files of another program.
 
-The folder holds ``record.csv.gz`` (several files where the record has several parts) and ``recording.yaml``.
-The latter is written last and names the former's checksum: a folder without it is not a recording, and raw
-data that were touched are noticed.
+The folder holds ``record.csv.gz`` (several files if the record has several parts) and ``recording.yaml``. The
+latter is written last and contains the former's checksum: a folder without it is not a recording, and
+modified raw data are detected.
 """
 
 from __future__ import annotations
@@ -27,17 +27,17 @@ from hdbridge.records.record import Record, concatenate, time_shifts_s
 from hdbridge.strictness import Strict
 
 GAP_CYCLES: Final = 5
-"""Within so few missing cycles the motor does not reverse and come back unnoticed."""
+"""Maximum number of missing cycles in which the motor cannot reverse and return unnoticed."""
 PART_SAMPLES: Final = 50
-"""A shorter part of a recording that is cut at its gaps is left out."""
+"""Minimum number of samples of a part when a recording is cut at its gaps; shorter parts are left out."""
 RECORD_NAME = "record.csv.gz"
 ABOUT_NAME = "recording.yaml"
 HEADER = "# What was recorded next to this file, by hdbridge. docs/files.md describes its keys.\n"
-"""How ``recording.yaml`` begins."""
+"""First line of ``recording.yaml``."""
 
 
 class Segment(Strict):
-    """One leg of what the axis did."""
+    """One leg of the motion."""
 
     kind: str = Field(
         min_length=1, description="what the leg was for: precondition, standstill, sweep, sine, step, ..."
@@ -81,7 +81,7 @@ class RecordingFile(Strict):
 
 @dataclass(frozen=True)
 class Recording:
-    """A record with what is known about it; of a bare CSV file that is only the record."""
+    """A record with what is known about it; for a bare CSV file, only the record."""
 
     record: Record
     segments: tuple[Segment, ...] = ()
@@ -94,11 +94,10 @@ class Recording:
 
     @classmethod
     def load(cls, *paths: Path | str, columns: Said = None, units: Said = None, unwrap: Said = None) -> Self:
-        """Recording folders and CSV files, as one recording in the order given.
+        """Loads recording folders and CSV files as one recording in the order given.
 
         ``columns``, ``units`` and ``unwrap`` are for CSV files of other programs, as for `Record.read_csv`.
-        InputError for whatever is wrong with one of them, and for files that have changed since they were
-        recorded.
+        Raises `InputError` for any error in them, and for files that have changed since they were recorded.
         """
         said = CsvColumns.of(columns, units, unwrap)
         return cls.joined([cls._load_one(Path(path), said) for path in paths])
@@ -142,7 +141,7 @@ class Recording:
 
     @classmethod
     def joined(cls, parts: Sequence[Self]) -> Self:
-        """One recording, in the order given; what its parts do not agree about is left open."""
+        """Joins recordings in the order given; attributes on which they differ are left open."""
         if len(parts) == 1:
             return parts[0]
         records = [each.record for each in parts]
@@ -160,9 +159,9 @@ class Recording:
         return cls(concatenate(records), tuple(segments), **common)
 
     def save(self, folder: Path | str) -> None:
-        """Write the folder, a file for each part of the record.
+        """Writes the folder, a file for each part of the record.
 
-        Refused (InputError) where there is a recording already: raw data stay.
+        Raises `InputError` if there already is a recording, because raw data are never replaced.
         """
         folder = Path(folder)
         if (folder / ABOUT_NAME).exists():
@@ -198,14 +197,14 @@ class Recording:
         return {name: value for name, value in about.items() if value not in (None, {}, [])}
 
     def pieces(self, *kinds: str) -> Iterator[tuple[Segment, Record]]:
-        """The segments of these kinds (of all, when none is given), each with its samples."""
+        """Yields the segments of these kinds (all if none is given), each with its samples."""
         for segment in self.segments:
             if not kinds or segment.kind in kinds:
                 yield segment, self.record.between(segment.start_s, segment.end_s)
 
 
 def versions_here() -> dict[str, str]:
-    """The software that makes a recording or a model in this process."""
+    """Returns the versions of the software that makes a recording or a model in this process."""
     return dict(_versions())
 
 
@@ -217,6 +216,6 @@ def _versions() -> tuple[tuple[str, str], ...]:
 
 
 def sha256_of(path: Path) -> str:
-    """Checksum of a file's bytes, as ``recording.yaml`` has it."""
+    """Returns the checksum of a file's bytes, as in ``recording.yaml``."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()

@@ -1,7 +1,7 @@
-"""Angles that jump by a constant: a counter that wraps, or an angle of one turn.
+"""Angles that jump by a constant: a wrapping counter, or an angle within one turn.
 
-The jump is seen in one angle and not in the other: a record that was put together from several jumps in both.
-Its size is constant: a misread sample is off by anything, and the next one is back.
+A wrap jumps in one angle and not in the other, whereas a concatenated record jumps in both. Its size is
+constant, whereas a misread sample is off by any amount and the next one is right again.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from hdbridge.records.columns import Unit
 from hdbridge.units import ARCSEC_PER_DEG, DEG_PER_TURN
 
 LEAST_JUMP_DEG: Final = 900.0 / ARCSEC_PER_DEG
-"""No gear's error jumps by as much."""
+"""Minimum jump, larger than any gear error; degrees."""
 CONSTANT_SHARE: Final = 0.05
 """Maximum deviation of the jumps of one counter from each other, as a share of their size."""
 NOMINAL_SHARE: Final = 0.02
@@ -27,33 +27,36 @@ NOMINAL_SHARE: Final = 0.02
 LEAST_TIMES: Final = 3.0
 """Minimum ratio of a jump to any other difference between the steps of the two angles."""
 SAME_SHARE: Final = 0.3
-"""The other angle has jumped as well if it leaves no more than this share of the jump unexplained."""
+"""Share of a jump up to which the other angle may leave it unexplained, for both to count as
+having jumped.
+"""
 THERE_AND_BACK: Final = 2
-"""Maximum number of samples that a misreading lasts."""
+"""Maximum duration of a misreading, in samples."""
 WINDOW: Final = 5
-"""Steps whose median is what a step is expected to be."""
+"""Number of steps whose median is the expected step."""
 _PERIODS: Final = (DEG_PER_TURN, math.tau, 1.0, 21_600.0, 1_296_000.0, *(2.0**bits for bits in range(8, 33)))
-"""A turn in each unit, and the values of binary counters."""
+"""One turn in each unit, and the ranges of binary counters."""
 
 
 class Wraps(NamedTuple):
     """Jumps of an angle that wraps."""
 
     rows: NDArray[np.intp]
-    """The first sample after each jump."""
+    """First sample after each jump."""
     period_deg: float
-    """Size of the jumps, one turn if they are whole turns."""
+    """Size of the jumps; one turn if they are whole turns."""
     jump_deg: float
-    """Size of the jumps as they are; a whole number of periods."""
+    """Measured size of the jumps, a whole number of periods."""
     tolerance_deg: float
-    """How far the sizes may be off."""
+    """Uncertainty of the sizes."""
 
 
 def find_wraps(angle_deg: FloatArray, other_deg: FloatArray, starts: Sequence[int] = (0,)) -> Wraps | None:
-    """The jumps of an angle by a constant that the other angle of the axis does not make, each of shape (n,).
+    """Finds the constant jumps of an angle that the other angle of the axis does not make; arrays of shape
+    (n,).
 
-    None if there are none. A single jump counts if it is a whole number of turns or a power of two of counts.
-    A step to the first sample of a record (`starts`) is not a step of the axis.
+    Returns None if there are none. A single jump counts if it is a whole number of turns or a power of two of
+    counts. A step to the first sample of a record (`starts`) is not a step of the axis.
     """
     if len(angle_deg) < 2 * WINDOW:
         return None
@@ -77,14 +80,16 @@ def find_wraps(angle_deg: FloatArray, other_deg: FloatArray, starts: Sequence[in
     calm = float(np.max(np.abs(np.delete(slip, large)), initial=0.0))
     if np.any(np.abs(sizes - period) > CONSTANT_SHARE * period) or LEAST_TIMES * calm > period:
         return None
-    # An angle wraps at the same place each time, where the gear's error is the same: no mean reduces it.
+    # An angle wraps at the same place each time, with the same gear error, so no mean reduces it.
     off = float(np.quantile(np.abs(np.delete(slip, large)), 0.99)) + float(np.std(sizes))
     wraps = Wraps(jumps + 1, period, jump, min(off, NOMINAL_SHARE * period))
     return wraps if len(jumps) > 1 or _nominal(wraps, 1.0, count_of(angle_deg)) else None
 
 
 def period_in(unit: Unit, wraps: Wraps, angle_deg: FloatArray) -> float:
-    """The period in the unit of the angle's column: the roundest that jumps and counts leave open."""
+    """Returns the period in the unit of the angle's column: the roundest one that the jumps and counts
+    permit.
+    """
     scale = abs(unit.factor)
     count = count_of(angle_deg / unit.factor)
     binary = 2.0 ** round(math.log2(wraps.jump_deg / scale))
@@ -103,12 +108,12 @@ def period_in(unit: Unit, wraps: Wraps, angle_deg: FloatArray) -> float:
 
 
 def unwrapped(angle_deg: FloatArray, period_deg: float) -> FloatArray:
-    """The continuous angle, shape (n,); right while no step exceeds half the period."""
+    """Returns the continuous angle, shape (n,); correct if no step exceeds half the period."""
     return np.asarray(np.unwrap(angle_deg, period=period_deg))
 
 
 def _nominal(wraps: Wraps, scale: float, count: float) -> float:
-    """The period if it is a turn of some unit or what a binary counter holds; else 0."""
+    """Returns the period if it is a turn in some unit or the range of a binary counter; else 0."""
     period, off = wraps.period_deg / scale, wraps.tolerance_deg / scale
     near = [each for each in _PERIODS if abs(each - period) <= max(off, 1e-6 * each)]
     if count and count != 1.0:
@@ -118,14 +123,14 @@ def _nominal(wraps: Wraps, scale: float, count: float) -> float:
 
 
 def _slope(step: FloatArray, other: FloatArray) -> float:
-    """How far the angle goes for a step of the other one, by the median of the larger steps."""
+    """Returns the travel of the angle per unit of the other one, from the median of the larger steps."""
     size = np.abs(other)
     large = size > 0.5 * float(np.quantile(size, 0.9))
     return float(np.median(step[large] / other[large])) if np.any(large) else 0.0
 
 
 def _lasting(jumps: NDArray[np.intp], excess: FloatArray) -> NDArray[np.intp]:
-    """The jumps that are not taken back at once."""
+    """Returns the jumps that are not reversed at once."""
     kept = np.ones(len(jumps), dtype=np.bool_)
     for place in range(len(jumps) - 1):
         out, back = jumps[place], jumps[place + 1]
@@ -136,7 +141,7 @@ def _lasting(jumps: NDArray[np.intp], excess: FloatArray) -> NDArray[np.intp]:
 
 
 def count_of(values: FloatArray) -> float:
-    """The largest decimal number that divides all steps; 0 if that is only the last digit."""
+    """Returns the largest decimal number that divides all steps; 0 if that is only the last digit."""
     for decimals in range(10):
         whole = np.round(values * 10.0**decimals)
         if np.all(np.abs(values * 10.0**decimals - whole) < 1e-4) and np.max(np.abs(whole)) < 2.0**53:

@@ -1,4 +1,4 @@
-"""Means over the bins of a coordinate, as a chart shows them."""
+"""Binned means of a coordinate, for charts."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from hdbridge.effects import BoolArray, FloatArray, IntArray
 from hdbridge.effects.coordinate import Coordinate
 
 LEAST_IN_BIN: Final = 3
-"""Points; the mean of fewer is not shown."""
+"""Minimum number of points per bin; emptier bins are not shown."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Bins:
-    """Means over bins, those with points enough; arrays of one length."""
+    """Means over sufficiently filled bins; arrays of one length."""
 
     place: FloatArray
     """Mean of the coordinate."""
@@ -29,9 +29,9 @@ class Bins:
 def binned(
     coordinate: Coordinate, y: FloatArray, rows: BoolArray | None = None, least: int = LEAST_IN_BIN
 ) -> Bins:
-    """Means of y over a coordinate; of the chosen ``rows`` only, where given.
+    """Returns the means of y over a coordinate, using only ``rows`` if given.
 
-    Bins of fewer than ``least`` points are left out.
+    Bins with fewer than ``least`` points are left out.
     """
     number, x = coordinate.numbers(), coordinate.values
     if rows is not None:

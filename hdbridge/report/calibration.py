@@ -1,4 +1,4 @@
-"""The page of a calibration: what was measured, what the model makes of it, and how far to trust it."""
+"""Report page of a calibration: measurements, fitted model, and its reliability."""
 
 from __future__ import annotations
 
@@ -41,14 +41,14 @@ TURN_LABEL: Final = "motor angle within its turn, deg"
 LOAD_LABEL: Final = "load angle, deg"
 R_LABEL: Final = "residual, arcsec"
 PAUSE_STEPS: Final = 20.0
-"""A gap in time of so many usual steps parts two runs."""
+"""Gap in time that separates two runs, in median steps."""
 HIGHEST_ORDER: Final = 16.0
-"""Of the spectrum that is drawn."""
+"""Highest order in the spectrum chart."""
 BINS_PER_TURN: Final = 128
 
 
 def calibration_page(result: Calibration) -> Page:
-    """The page of a calibration, or of a fit of somebody's records: result first, then the evidence."""
+    """Returns the page of a calibration, or of a fit of any records: result first, then the evidence."""
     traces = result.fit.traces
     sections = []
     if result.validation is not None:
@@ -120,7 +120,9 @@ def _verdict(result: Calibration) -> str:
 
 
 def _by_angle(traces: Traces, ratio: float) -> Iterator[Chart]:
-    """Over the motor angle with the model; over the load angle with means of whole motor turns."""
+    """Yields charts over the motor angle with the model, and over the load angle with means of whole motor
+    turns.
+    """
     sweeps = _of_kind(traces, "sweep")
     chosen = (sweeps if np.any(sweeps) else np.ones_like(sweeps)) & (traces.direction != 0.0)
     if not np.any(chosen):
@@ -142,7 +144,7 @@ def _by_angle(traces: Traces, ratio: float) -> Iterator[Chart]:
 def _over(
     x: FloatArray, y: FloatArray, width: float, middle: Callable[[FloatArray], Any]
 ) -> tuple[FloatArray, FloatArray]:
-    """The middle of y over stretches of x of a given width; a stretch without samples is a gap."""
+    """Returns the middle of y over intervals of x of a given width; an interval without samples is a gap."""
     first = float(np.min(x))
     place = ((x - first) / width).astype(np.intp)
     values: FloatArray = np.full(int(np.max(place)) + 1, np.nan)
@@ -155,13 +157,13 @@ def _over(
 
 
 def _both_ways(traces: Traces, x: FloatArray, y: FloatArray, chosen: BoolArray) -> list[Series]:
-    """The chosen samples of the forward and of the backward direction, those that there are."""
+    """Returns the chosen samples of each direction that occurs."""
     ways = (("forward", chosen & (traces.direction > 0.0)), ("backward", chosen & (traces.direction < 0.0)))
     return [Series(name, x[rows], y[rows], Mark.POINTS) for name, rows in ways if np.any(rows)]
 
 
 def _loops(traces: Traces) -> Iterator[Chart]:
-    """One chart for each sine or run of reversals, in the order measured."""
+    """Yields one chart for each sine or run of reversals, in the order measured."""
     for kind, words in (("sine", "Sine"), ("reversal", "Reversals")):
         runs = [rows for rows in _runs(_of_kind(traces, kind)) if _is_loop(traces.motor_deg[rows])]
         for number, rows in enumerate(runs, 1):
@@ -180,7 +182,7 @@ def _loops(traces: Traces) -> Iterator[Chart]:
 
 
 def _parted(y: FloatArray, time_s: FloatArray) -> FloatArray:
-    """With a gap at the first sample after a pause: what was not measured in between is not drawn."""
+    """Inserts a gap at the first sample after a pause, so that no line bridges it."""
     steps = np.diff(time_s, prepend=time_s[0])
     return np.where(steps > PAUSE_STEPS * float(np.median(steps)), np.nan, y)
 
@@ -212,9 +214,10 @@ def _spectrum(result: Calibration) -> Chart:
 
 
 def _alone(traces: Traces) -> tuple[FloatArray, FloatArray]:
-    """Orders and amplitudes of the error averaged in even bins of the motor angle, by FFT: for the eye.
+    """Returns orders and amplitudes of the error averaged in even bins of the motor angle, by FFT; for
+    display.
 
-    Empty bins count as zero; amplitudes are scaled by the share of bins that are filled.
+    Empty bins count as zero; amplitudes are scaled by the share of filled bins.
     """
     moving = traces.direction != 0.0
     shown = moving if np.mean(moving) > 0.5 else np.ones_like(moving)
@@ -223,7 +226,7 @@ def _alone(traces: Traces) -> tuple[FloatArray, FloatArray]:
     edges = np.min(motor) + DEG_PER_TURN / BINS_PER_TURN * np.arange(turns * BINS_PER_TURN + 1)
     filled, total = np.histogram(motor, edges)[0], np.histogram(motor, edges, weights=error)[0]
     binned = total / np.maximum(filled, 1)
-    # A bin's mean attenuates high orders; the sinc of half a bin puts them right.
+    # A bin's mean attenuates high orders; dividing by the sinc of half a bin corrects that.
     order = np.fft.rfftfreq(len(binned), 1.0 / BINS_PER_TURN)
     lines = np.abs(np.fft.rfft(binned)) / np.count_nonzero(filled) / np.sinc(order / BINS_PER_TURN)
     below = order <= HIGHEST_ORDER
@@ -313,7 +316,7 @@ def _parameters(result: Calibration) -> Iterator[Block]:
 
 
 def _parameter_words(effect: str, parameter: str) -> str:
-    """``orders[2].amplitude_arcsec`` of synchronous: "synchronous, order 2: amplitude"."""
+    """Returns ``orders[2].amplitude_arcsec`` of synchronous as "synchronous, order 2: amplitude"."""
     words = re.sub(r"^orders\[(\d+)\]\.", r"order \1: ", without_unit(parameter)).replace("_", " ")
     return f"{effect.replace('_', ' ')}, {words}" if ": " in words else f"{effect.replace('_', ' ')}: {words}"
 

@@ -1,4 +1,4 @@
-"""The page of a diagnosis: the verdict, what to do, each finding with its picture, all that was seen."""
+"""Report page of a diagnosis: verdict, advice, each finding with its chart, and all observations."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from hdbridge.units import without_unit
 SURE: Final = 0.9
 LIKELY: Final = 0.6
 TOLD: Final = 3
-"""Findings that the verdict speaks of."""
+"""Number of findings in the verdict."""
 UNEXPLAINED: Final = "unexplained"
 PLUS_MINUS: Final = "\N{PLUS-MINUS SIGN} 95 %"
 
@@ -36,12 +36,12 @@ def diagnosis_page(
     offer: Offer | None = None,
     command: str = "hdbridge diagnose RECORD... --model MODEL.yaml",
 ) -> Page:
-    """The page of a diagnosis.
+    """Returns the page of a diagnosis.
 
-    ``provenance`` says in names and values where records and model come from. ``stepping`` is the stepping
-    test under the old and the extended model, where there was one: it goes before everything else.
-    ``offer`` is what became of the extended model, where it was proposed for commit.
-    ``command`` is the diagnosis as it was asked for.
+    ``provenance`` holds names and values about the origin of records and model. ``stepping`` is the stepping
+    test with the old and the extended model, if there was one; it precedes everything else. ``offer`` is the
+    outcome for the extended model, if it was proposed for commit. ``command`` is the command line of the
+    diagnosis.
     """
     seen = diagnosis.views()
     verdict = _verdict(diagnosis, stepping)
@@ -119,7 +119,7 @@ def _verdict(diagnosis: Diagnosis, stepping: Validation | None) -> str:
 
 
 def _claim(finding: Finding) -> str:
-    """As sure as it is: "backlash behind the gear, up to 3.1 arcsec"."""
+    """Phrases a finding with its certainty: "backlash behind the gear, up to 3.1 arcsec"."""
     if finding.cause == UNEXPLAINED:
         size = f"up to {_two(finding.peak_arcsec)} arcsec"
         return f"something unexplained that depends on the {finding.lives_in or 'time'}, {size}"
@@ -325,7 +325,7 @@ def _name(cause: str) -> str:
 
 
 def _title(cause: str) -> str:
-    """The cause by its name, and by what it is where the name does not say it."""
+    """Returns the name of a cause, with its title unless the title contains the name."""
     name = _name(cause)
     if cause not in CATALOGUE:
         return name
@@ -340,5 +340,5 @@ def _listed(words: Sequence[str], last: str = "and") -> str:
 
 
 def _two(value: float) -> str:
-    """Two or three digits, without an exponent."""
+    """Formats two or three digits, without an exponent."""
     return f"{value:.1f}" if value >= 9.95 else f"{value:.2f}"

@@ -1,4 +1,4 @@
-"""The page of the test in motion: ripple over speed, and the measured response."""
+"""Report page of the motion test: ripple over speed, and the measured response."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from hdbridge.report.page import Chart, Grid, Mark, Page, Section, Series, Table
 
 
 def motion_page(axis_name: str, result: MotionTest) -> Page:
-    """The page of one test."""
+    """Returns the page of one test."""
     return Page(
         title=f"Motion test of axis '{axis_name}'",
         verdict=_verdict(result),
@@ -21,7 +21,7 @@ def motion_page(axis_name: str, result: MotionTest) -> Page:
 
 
 def motion_sections(result: MotionTest) -> list[Section]:
-    """Ripple over speed, and the response if there is one."""
+    """Returns the ripple over speed, and the response if there is one."""
     sections = [Section("Ripple over speed", blocks=[Grid([_ripple(result)]), _table(result)])]
     if result.response is not None:
         sections.append(

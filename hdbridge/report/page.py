@@ -1,7 +1,8 @@
-"""A page of results as plain data, and its rendering as one self-contained HTML file.
+"""Page of results as plain data, and its rendering as one self-contained HTML file.
 
-A page opens without a network: style, script and data are in it. Charts are drawn by uPlot (inlined; its
-licence and checksum lie in ``assets``). Pure: `render` gives the text, the caller writes it.
+A page opens without a network, because it contains style, script and data. Charts are drawn by uPlot
+(inlined; its licence and checksum are in ``assets``). Pure: `render` returns the text and the caller writes
+it.
 """
 
 from __future__ import annotations
@@ -24,44 +25,46 @@ from markupsafe import Markup
 from hdbridge.effects import FloatArray
 
 POINTS_MAXIMUM: Final = 4000
-"""Points of one series in a page; longer ones are thinned so that a page stays below a megabyte."""
+"""Maximum points of one series in a page; longer ones are thinned to keep a page below a megabyte."""
 _FIGURE: Final = re.compile(r"\(?[-+\N{MINUS SIGN}\N{PLUS-MINUS SIGN}]?\d[\d,.]*(e[-+]\d+)?\)?( ?%)?$")
 DIGITS: Final = 5
-"""Of a series' span: a hundredth of what a screen can show; more would only make the page larger."""
+"""Significant digits of a series' span: a hundredth of the screen resolution; more would only enlarge the
+page.
+"""
 
 
 class Mark(Enum):
-    """How a series is drawn."""
+    """Drawing style of a series."""
 
     LINE = "line"
-    """Joined in the order given: also loops, whose x goes back and forth."""
+    """Joined in the order given, also for loops, whose x goes back and forth."""
     DASHED = "dashed"
     POINTS = "points"
     FAINT = "faint"
-    """Small grey points, behind everything else: the raw data under what is made of them."""
+    """Small grey points behind everything else: raw data."""
     BARS = "bars"
-    """From zero (or, on a logarithmic axis, from its lower end) to y."""
+    """Bars from zero (or, on a logarithmic axis, from its lower end) to y."""
 
 
 @dataclass(frozen=True, eq=False)
 class Series:
-    """One set of points; x and y of one length, in the units that the chart's labels name. NaN is a gap."""
+    """One set of points; x and y of one length, in the units of the chart's labels. NaN is a gap."""
 
     label: str
     x: FloatArray | Sequence[float]
     y: FloatArray | Sequence[float]
     mark: Mark = Mark.LINE
     bar_width: float | None = None
-    """Of `Mark.BARS`, in units of x; else what looks right."""
+    """Width for `Mark.BARS`, in units of x; None for an automatic width."""
     spread: FloatArray | Sequence[float] | None = None
-    """Of `Mark.POINTS`: half the length of a vertical bar through each point, in units of y."""
+    """For `Mark.POINTS`: half the length of a vertical error bar at each point, in units of y."""
     colour: int | None = None
-    """Place in the palette, where series belong together; else each has its own."""
+    """Index in the palette for series that belong together; None for a colour of its own."""
 
 
 @dataclass(frozen=True, slots=True)
 class Level:
-    """A horizontal line at a value of y, for example a threshold."""
+    """Horizontal line at a value of y, for example a threshold."""
 
     label: str
     value: float
@@ -69,7 +72,7 @@ class Level:
 
 @dataclass(frozen=True, eq=False)
 class Chart:
-    """Series over common axes; the labels name the unit."""
+    """Series over common axes; the labels include the unit."""
 
     caption: str
     x_label: str
@@ -77,17 +80,17 @@ class Chart:
     series: Sequence[Series]
     height_px: int = 320
     y_range: tuple[float, float] | None = None
-    """Given where several charts are to be compared; else what the series need."""
+    """Fixed range for comparing several charts; None for the range of the series."""
     levels: Sequence[Level] = ()
     y_log: bool = False
-    """Logarithmic; values that are not positive are gaps."""
+    """Logarithmic y axis; non-positive values are gaps."""
     x_log: bool = False
-    """The same of x."""
+    """Logarithmic x axis; non-positive values are gaps."""
 
 
 @dataclass(frozen=True, slots=True)
 class Grid:
-    """Charts side by side where the window is wide enough."""
+    """Charts side by side if the window is wide enough."""
 
     charts: Sequence[Chart]
     columns: int = 2
@@ -95,7 +98,7 @@ class Grid:
 
 @dataclass(frozen=True, slots=True)
 class Heading:
-    """Of a column of figures: what it holds, and its unit, which stands below."""
+    """Header of a column of figures: quantity, and its unit on a second line."""
 
     name: str
     unit: str = "arcsec"
@@ -103,7 +106,7 @@ class Heading:
 
 @dataclass(frozen=True, slots=True)
 class Table:
-    """Rows of cells. Columns of figures are aligned to the right; numbers are shown with two decimals."""
+    """Rows of cells. Columns of figures are right-aligned; numbers are shown with two decimals."""
 
     header: Sequence[str | Heading]
     rows: Sequence[Sequence[str | float]]
@@ -122,7 +125,7 @@ Block = Chart | Grid | Table | Facts
 
 @dataclass(frozen=True, slots=True)
 class Section:
-    """A heading, a text (blank lines part its paragraphs) and what it speaks of."""
+    """Heading, text (blank lines separate paragraphs) and blocks."""
 
     title: str
     text: str = ""
@@ -130,12 +133,12 @@ class Section:
 
 
 class Status(Enum):
-    """What became of what the page reports: the first word of its verdict."""
+    """Outcome that the page reports: the first word of its verdict."""
 
     OFFERED = "offered"
-    """The model is better; whether it was committed since, the profile knows."""
+    """The model is better; the profile records if it has been committed since."""
     PENDING = "pending"
-    """The model is better and waits to be committed."""
+    """The model is better and awaits commit."""
     REFUSED = "refused"
     """The model is not offered; the active one stays."""
     FOUND = "found"
@@ -145,7 +148,7 @@ class Status(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Command:
-    """A command that comes next, and what it does."""
+    """A next command, and its purpose."""
 
     line: str
     purpose: str
@@ -153,7 +156,7 @@ class Command:
 
 @dataclass(frozen=True, slots=True)
 class Page:
-    """The whole page; ``verdict`` is what a reader in a hurry needs, after the one word of ``status``."""
+    """The whole page; ``verdict`` is the summary that follows the word of ``status``."""
 
     title: str
     verdict: str
@@ -164,7 +167,7 @@ class Page:
 
 
 def render(page: Page) -> str:
-    """The page as one HTML document; ValueError where a series' x and y are not of one length."""
+    """Returns the page as one HTML document; raises `ValueError` if a series' x and y differ in length."""
     charts = [chart for section in page.sections for block in section.blocks for chart in _charts_of(block)]
     return _template().render(
         page=page,
@@ -190,9 +193,9 @@ def histogram(
     bins: int | None = None,
     height_px: int = 320,
 ) -> Chart:
-    """How often values fall into bins of equal width, common to all groups; NaN and infinity are left out.
+    """Returns a histogram with bins of equal width common to all groups; ignores NaN and infinity.
 
-    ``bins``: how many; else by the square root of the number of values, between 5 and 60.
+    ``bins`` is their number, by default the square root of the number of values, between 5 and 60.
     """
     finite = {name: np.asarray(each, dtype=np.float64) for name, each in groups.items()}
     finite = {name: each[np.isfinite(each)] for name, each in finite.items()}
@@ -209,18 +212,18 @@ def histogram(
 
 
 def thinned(x: FloatArray, y: FloatArray, most: int = POINTS_MAXIMUM) -> tuple[FloatArray, FloatArray]:
-    """At most ``most`` points of a line in their order: of each run those of least and greatest y.
+    """Returns at most ``most`` points of a line in their order: those of least and greatest y of each run.
 
-    What would be seen at this size stays: peaks are kept, whatever falls between them is not drawn apart.
+    The visible shape is preserved: peaks are kept, points between them are dropped.
     """
     keep = _extremes(y, most)
     return (x, y) if keep is None else (x[keep], y[keep])
 
 
 def sampled(x: FloatArray, y: FloatArray, most: int = POINTS_MAXIMUM) -> tuple[FloatArray, FloatArray]:
-    """At most ``most`` points of a cloud in their order: three in four evenly spaced, the rest peaks.
+    """Returns at most ``most`` points of a cloud in their order: three in four evenly spaced, the rest peaks.
 
-    Peaks alone, as a line needs them, would make a cloud look wider than it is.
+    Peaks alone, as for a line, would make a cloud look wider than it is.
     """
     if len(x) <= most:
         return x, y
@@ -231,7 +234,9 @@ def sampled(x: FloatArray, y: FloatArray, most: int = POINTS_MAXIMUM) -> tuple[F
 
 
 def _extremes(y: FloatArray, most: int) -> list[int] | None:
-    """Where the least and greatest of each of ``most / 2`` runs are; None where nothing needs thinning."""
+    """Returns the indices of the least and greatest of each of ``most / 2`` runs; None if no thinning is
+    needed.
+    """
     if len(y) <= most:
         return None
     low, high = np.where(np.isnan(y), np.inf, y), np.where(np.isnan(y), -np.inf, y)
@@ -291,7 +296,7 @@ def _chart_data(chart: Chart) -> dict[str, Any]:
 
 
 def _rounded(values: FloatArray) -> list[float | None]:
-    """To a fixed number of decimals: `DIGITS` digits of the span."""
+    """Rounds to a fixed number of decimals: `DIGITS` digits of the span."""
     finite = values[np.isfinite(values)]
     span = float(np.ptp(finite)) or float(np.max(np.abs(finite))) if len(finite) else 1.0
     decimals = DIGITS - 1 - math.floor(math.log10(span)) if span > 0.0 else DIGITS
@@ -300,7 +305,7 @@ def _rounded(values: FloatArray) -> list[float | None]:
 
 
 def _significant(values: FloatArray) -> list[float | None]:
-    """For logarithmic axes: every value to the same relative precision."""
+    """Rounds every value to the same relative precision, for logarithmic axes."""
     return [float(f"{value:.{DIGITS - 1}g}") if math.isfinite(value) else None for value in values.tolist()]
 
 
@@ -312,7 +317,7 @@ def _text_of(cell: str | float) -> str:
 
 
 def _is_words(table: Table, column: int) -> bool:
-    """Whether a column holds words, which begin at the left, and no figures."""
+    """Returns True for a column of text, which is left-aligned, without figures."""
     cells = [row[column] for row in table.rows if column < len(row)]
     return column == 0 or not any(
         isinstance(cell, int | float) or _FIGURE.match(cell) is not None for cell in cells
@@ -320,7 +325,7 @@ def _is_words(table: Table, column: int) -> bool:
 
 
 def _script_safe(data: object) -> str:
-    """JSON that cannot end the script element it stands in."""
+    """Returns JSON that cannot end its surrounding script element."""
     return json.dumps(data, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
 
 

@@ -1,8 +1,8 @@
-"""The partial residual of a finding: the residual without it, over the coordinate that its cause depends on.
+"""Partial residual of a finding: the residual without it, over the coordinate that its cause depends on.
 
-Everything else that was found stays in the model, so what is seen is this finding alone, with the noise.
-A cause that scales what the model has (ripple that grows with torque, a loop that grows with speed) is seen
-as a scale over that coordinate, by least squares in each bin.
+All other findings stay in the model, so that only this one is visible, with the noise. A cause that scales a
+part of the model (ripple that grows with torque, a loop that grows with speed) is shown as a scale factor
+over that coordinate, by least squares in each bin.
 """
 
 from __future__ import annotations
@@ -19,22 +19,22 @@ from hdbridge.effects.coordinate import Coordinate, time
 from hdbridge.model import TransmissionModel
 
 LEAST_POINTS: Final = 200
-"""Points at which a finding shows by itself that it is looked at on; with fewer, all points."""
+"""Minimum number of points that show a finding alone; with fewer, all points are drawn."""
 SEEN_BINS: Final = 20
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Strength:
-    """How strongly a part of the model has to be scaled, bin by bin; arrays of one length."""
+    """Scale factor of a part of the model, bin by bin; arrays of one length."""
 
     of: str
-    """What is scaled, in words."""
+    """Name of the scaled part."""
     place: FloatArray
     measured_percent: FloatArray
     spread_percent: FloatArray
-    """Standard deviation of the measured, noise taken for white."""
+    """Standard deviation of the measured value, for white noise."""
     finding_percent: FloatArray
-    """The same by the finding."""
+    """The same according to the finding."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -43,18 +43,18 @@ class PartialResidual:
 
     coordinate: Coordinate
     residual_arcsec: FloatArray
-    """Measurement less the model with everything but this finding."""
+    """Measurement minus the model with everything except this finding."""
     own_arcsec: FloatArray | None
-    """What the finding does; None where it has no law."""
+    """Contribution of the finding; None if it has no law."""
     rows: BoolArray
-    """The points that show it."""
+    """Mask of the points that show it."""
     forward: BoolArray
-    """Direction, held at rest."""
+    """True for forward motion, held at rest."""
     strength: Strength | None = None
 
 
 def partial_residual(finding: Finding, diagnosis: Diagnosis) -> PartialResidual:
-    """Draw one finding of a diagnosis."""
+    """Computes the partial residual of one finding of a diagnosis."""
     traces = diagnosis.traces
     effect = _in_model(finding, diagnosis.model)
     own = None if effect is None else _does(effect, traces)
@@ -71,7 +71,7 @@ def partial_residual(finding: Finding, diagnosis: Diagnosis) -> PartialResidual:
 
 
 def _in_model(finding: Finding, model: TransmissionModel) -> Effect | None:
-    """The finding's effect as the extended model has it, so that picture and model are of one fit."""
+    """Returns the finding's effect as fitted in the extended model, so that chart and model agree."""
     effect = finding.effect
     if effect is None or (finding.within and effect.changes is not Part.LOOP):
         return effect
@@ -79,15 +79,15 @@ def _in_model(finding: Finding, model: TransmissionModel) -> Effect | None:
 
 
 def _does(effect: Effect, traces: Traces) -> FloatArray:
-    """What an effect does at the points of the traces, arcsec, shape (m,)."""
+    """Returns the contribution of an effect at the points of the traces, arcsec, shape (m,)."""
     does = traces.told(effect)
-    if effect.replaces in CATALOGUE:  # it stands in the place of another one
+    if effect.replaces in CATALOGUE:  # it replaces another effect
         does = does - traces.told(CATALOGUE[effect.replaces].model_validate(effect.parameters()))
     return does
 
 
 def _home(finding: Finding, traces: Traces, ratio: float) -> Coordinate:
-    """The coordinate that a finding is shown over: its effect's, or what it was seen to depend on."""
+    """Returns the coordinate of a finding: its effect's, or the one that it was found to depend on."""
     if finding.effect is not None:
         own = finding.effect.coordinate(traces.motion, ratio).at(traces.rows)
         return own if own.varies() else time(traces.motion).at(traces.rows)
@@ -110,7 +110,7 @@ def _strength(
     number = coarse.numbers()
     square = np.bincount(number, part**2)
     size = float(np.sqrt(np.mean(part**2)))
-    kept = square > 50.0 * (0.1 * size) ** 2  # bins in which the part is there at all
+    kept = square > 50.0 * (0.1 * size) ** 2  # bins in which the part is present at all
     noise = float(np.std(residual - own))
 
     def percent(y: FloatArray) -> FloatArray:

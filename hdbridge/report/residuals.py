@@ -1,4 +1,4 @@
-"""Charts of residuals: the partial residual of a finding, and what is seen over every coordinate."""
+"""Charts of residuals: the partial residual of a finding, and the residuals over every coordinate."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ from hdbridge.report.partial_residuals import PartialResidual, Strength
 R_LABEL: Final = "residual, arcsec"
 E_LABEL: Final = "error, arcsec"
 CLOUD: Final = 2500
-"""Raw points of a partial residual."""
+"""Maximum raw points in a partial residual chart."""
 SMALL_CLOUD: Final = 1200
-"""... of a small chart."""
+"""Maximum raw points in a small chart."""
 LINE_POINTS: Final = 2000
 FINER: Final = 3
-"""Bins of a finding's own curve to one of the means."""
+"""Bins of a finding's own curve per bin of the means."""
 CLOSER_POINTS: Final = 400
 MORE_TURNS_DEG: Final = 540.0
-"""Below this the position says little that the load angle does not."""
+"""Minimum span of the position; below it the chart adds little to that over the load angle."""
 PAUSE_STEPS: Final = 20.0
-"""A gap in time of so many usual steps parts two runs."""
+"""Gap in time that separates two runs, in median steps."""
 BLUE: Final = 0
 ORANGE: Final = 1
 GREEN: Final = 2
@@ -37,7 +37,7 @@ FORWARD, BACKWARD = "forward", "backward"
 
 
 def partial_residual_chart(partial_residual: PartialResidual) -> Chart:
-    """Raw points, means with their spread, and over them what the finding itself does."""
+    """Returns raw points, means with their spread, and the finding's own contribution."""
     if partial_residual.strength is not None:
         return _strength_chart(partial_residual.strength, partial_residual.coordinate)
     home, residual, own = (
@@ -86,7 +86,7 @@ def _strength_chart(strength: Strength, home: Coordinate) -> Chart:
 
 
 def residual_charts(seen: ResidualViews) -> Iterator[Chart]:
-    """Over each coordinate the model as it was given and the extended one, all to one scale."""
+    """Yields a chart over each coordinate with the given and the extended model, all to one scale."""
     reach = _reach(seen.given_arcsec)
     shares = seen.shares()
     forward = seen.direction > 0.0
@@ -127,7 +127,7 @@ def residual_charts(seen: ResidualViews) -> Iterator[Chart]:
 
 
 def beside_charts(traces: Traces) -> Iterator[Chart]:
-    """Model and measurement on the same trajectory: the whole, and where they are farthest apart."""
+    """Yields charts of model and measurement: the whole record, and where the extended model gains most."""
     whole = np.arange(len(traces.time_s))
     given = (traces.measured_arcsec - traces.model_arcsec) ** 2
     left = (traces.measured_arcsec - traces.extended_arcsec) ** 2
@@ -157,7 +157,7 @@ def beside_charts(traces: Traces) -> Iterator[Chart]:
 
 
 def _cloud(label: str, x: FloatArray, y: FloatArray, most: int) -> Series:
-    """So many points, drawn by lot (always the same ones): a cloud as dense and as wide as the whole."""
+    """Draws ``most`` points at random (always the same ones), a cloud as dense and as wide as the whole."""
     if len(x) > most:
         kept = np.sort(np.random.default_rng(0).choice(len(x), most, replace=False))
         label, x, y = f"{label} ({most:,} of {len(x):,})", x[kept], y[kept]
@@ -165,13 +165,13 @@ def _cloud(label: str, x: FloatArray, y: FloatArray, most: int) -> Series:
 
 
 def _ways(forward: BoolArray, rows: BoolArray) -> list[tuple[str, int, BoolArray]]:
-    """Name, colour and points of each direction that there is."""
+    """Returns name, colour and points of each direction that occurs."""
     both = ((FORWARD, BLUE, rows & forward), (BACKWARD, ORANGE, rows & ~forward))
     return [each for each in both if np.any(each[2])]
 
 
 def _reach(values: FloatArray) -> tuple[float, float]:
-    """Of an axis: all but the farthest few in a thousand, with a margin."""
+    """Returns an axis range that excludes the outermost 0.4 % of the values, with a margin."""
     low, high = np.quantile(values, [0.002, 0.998]).tolist()
     margin = 0.08 * (high - low) or 1.0
     return low - margin, high + margin

@@ -1,4 +1,4 @@
-"""The page of a stepping test under several compensation schemes."""
+"""Report page of a stepping test under several compensation schemes."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ ARTICLE_TABLE_3 = {
     "hysteresis": (55.7, -23.2),
     "both": (30.2, -29.15),
 }
-"""3 sigma and mean, arcsec, as the article's Table 3 prints them."""
+"""3 sigma and mean, arcsec, as printed in the article's Table 3."""
 
 
 def stepping_page(
@@ -50,7 +50,7 @@ def stepping_page(
     *,
     with_article: bool = False,
 ) -> Page:
-    """The page; ``with_article`` adds the article's Table 3 to the result."""
+    """Returns the page; ``with_article`` adds the article's Table 3 to the result."""
     best = _best(results)
     reach = 1.08 * max(
         abs(stand.error_arcsec)
@@ -134,7 +134,7 @@ def _by_way(result: SchemeResult) -> list[Series]:
 
 
 def _signed(value: float) -> str:
-    """Two decimals, a real minus sign, and no minus before a zero."""
+    """Formats two decimals with a typographic minus sign, and no minus before a zero."""
     text = f"{value:.2f}"
     return text.lstrip("-") if float(text) == 0.0 else text.replace("-", "\N{MINUS SIGN}")
 

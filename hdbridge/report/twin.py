@@ -1,4 +1,6 @@
-"""The page of a twin: measured and simulated side by side, what was wrong, what was learned, what is left."""
+"""Report page of a twin: measured and simulated signals, errors found, fitted values,
+unexplained residual.
+"""
 
 from __future__ import annotations
 
@@ -31,25 +33,25 @@ from hdbridge.twin.traces import Spectrum, Trace
 from hdbridge.twin.translation import Row as Translated
 
 WINDOW_S: Final = 1.0
-"""A picture of a detail shows so much of the record."""
+"""Duration of a detail chart; s."""
 MEASURED, SIMULATED, BEFORE, DIFFERENCE = "measured", "simulated", "before", "difference"
 
 
 @dataclass(frozen=True, slots=True)
 class Learned:
-    """A value of the plant before and after."""
+    """A plant value before and after the fit."""
 
     name: str
     unit: str
     before: float | None
     after: float
     interval: tuple[float, float] | None
-    """95 %; None where nothing shows the value, and it stands as it was assumed."""
+    """95 % interval; None if no data determine the value, which then keeps its assumption."""
 
 
 @dataclass(frozen=True, slots=True)
 class Named:
-    """What was wrong with the simulation, in words."""
+    """An error of the simulation, as text."""
 
     cause: str
     text: str
@@ -57,30 +59,30 @@ class Named:
 
 @dataclass(frozen=True, eq=False)
 class TwinReport:
-    """All that the page tells."""
+    """Content of the page."""
 
     axis: str
     before: Comparison
-    """The measured record against the simulation as it was."""
+    """Comparison of the measured record with the initial simulation."""
     after: Comparison | None = None
-    """... and as it is now; None where it was only compared."""
+    """Comparison with the fitted simulation; None if it was only compared."""
     learned: Sequence[Learned] = ()
     named: Sequence[Named] = ()
     translated: Sequence[Translated] = ()
     facts: Sequence[tuple[str, str]] = ()
     verdict: str = ""
-    """What became of the twin, in a sentence."""
+    """Outcome for the twin, in one sentence."""
     commands: Sequence[Command] = ()
     status: Status = Status.MEASURED
 
     @property
     def now(self) -> Comparison:
-        """The last of the two comparisons."""
+        """The later of the two comparisons."""
         return self.after or self.before
 
 
 def twin_page(report: TwinReport) -> Page:
-    """The page."""
+    """Returns the page."""
     sections = [
         Section(
             "How far simulation and axis are apart",
@@ -130,7 +132,7 @@ def twin_page(report: TwinReport) -> Page:
 
 
 def verdict(report: TwinReport) -> str:
-    """The signals in one sentence."""
+    """Returns one sentence about all signals."""
     parts = []
     for name in report.now.traces:
         now, before = report.now.row(name), report.before.row(name)
@@ -154,13 +156,13 @@ def _figure(value: float) -> str:
 
 
 def title_of(row: Row) -> str:
-    """A channel in words."""
+    """Returns the name of a channel, as text."""
     name, _, signal = row.channel.partition(":")
     return f"{TITLES[name]}, {TITLES[signal]}" if signal else TITLES[name]
 
 
 def _figures(report: TwinReport) -> Table:
-    """The whole record, channel by channel."""
+    """Returns the figures of the whole record, channel by channel."""
     return Table(_header(report), [_cells(report, row, title_of(row)) for row in _rows(report, ALL)])
 
 
@@ -210,7 +212,7 @@ def _learned(learned: Sequence[Learned]) -> Table:
 
 
 def _pictures(name: str, report: TwinReport) -> Section:
-    """One signal: the whole record, where the simulation was off most, the spectrum."""
+    """Returns the charts of one signal: whole record, largest deviation, difference, spectrum."""
     trace, before = report.now.traces[name], report.before.traces[name]
     label = f"{TITLES[name]}, {UNITS[name]}"
     worst = _worst(before)
@@ -268,7 +270,7 @@ def _spectrum(name: str, spectrum: Spectrum | None) -> list[Chart]:
 
 
 def _worst(trace: Trace) -> slice:
-    """The rows of the window in which the difference is largest."""
+    """Returns the rows of the window with the largest difference."""
     time_s = trace.time_s
     ends = np.searchsorted(time_s, time_s + WINDOW_S)
     power = np.concatenate([[0.0], np.cumsum(trace.difference**2)])

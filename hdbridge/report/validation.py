@@ -1,4 +1,4 @@
-"""The sections of a stepping test before and after: what a new model gained on the axis itself."""
+"""Sections of a stepping test before and after: the gain of a new model on the axis itself."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ ISO_FIGURES: Final = (
 
 
 def stepping_sections(checked: Validation) -> list[Section]:
-    """The stepping test, and the figures of ISO 230-2 where the plan had a positioning test."""
+    """Returns the stepping test, and the ISO 230-2 figures if the plan had a positioning test."""
     return [
         Section("Stepping test", _stepping_text(checked), [*_stepping(checked)]),
         *_iso_section(checked),

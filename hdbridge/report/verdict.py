@@ -1,4 +1,4 @@
-"""The first word of a page, and the command that comes next."""
+"""Status of a page, and the next commands."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from hdbridge.report.page import Command, Status
 
 
 def of_offer(offer: Offer) -> tuple[Status, tuple[Command, ...]]:
-    """What became of a model that was measured for commit."""
+    """Returns status and commands for a model that was measured for commit."""
     if not offer.made:
         return Status.REFUSED, ()
     if offer.pending is None:

@@ -1,4 +1,4 @@
-"""Numbers and sentences as pages write them."""
+"""Formatting of numbers and sentences for pages."""
 
 from __future__ import annotations
 
@@ -8,21 +8,21 @@ from hdbridge import units
 
 SIGMA: Final = "3\N{GREEK SMALL LETTER SIGMA}"
 SCATTER: Final = (f"pooled {SIGMA}", "mean", f"CW {SIGMA}", "mean", f"CCW {SIGMA}", "mean")
-"""Columns of a stepping test. Pooled is the result, so it comes first: a telephone shows two columns."""
+"""Columns of a stepping test. Pooled comes first as the result, because a telephone shows two columns."""
 
 
 def sentence(text: str) -> str:
-    """With a capital and one full stop."""
+    """Adds a capital letter and exactly one full stop."""
     return text[:1].upper() + text[1:].rstrip(".") + "."
 
 
 def figure(value: float, digits: int = 4) -> str:
-    """A number with so many digits and a real minus sign."""
+    """Formats a number with ``digits`` significant digits and a typographic minus sign."""
     return _typeset(units.figure(value, digits))
 
 
 def with_interval(value: float, half_width: float) -> tuple[str, str]:
-    """The half width with two digits, the value with as many decimals."""
+    """Formats the half width with two digits, and the value with as many decimals."""
     text, half = units.with_interval(value, half_width)
     return _typeset(text), _typeset(half)
 

@@ -1,8 +1,8 @@
-"""A simulated drive for other people's tests: on a bus, with faults by name and the true angles.
+"""Simulated drive for users' own tests: on a bus, with faults by name and the true angles.
 
-`hdbridge.pytest_plugin` makes one per test (the fixture `hdbridge_drive`); without pytest it is
-``with simulated_drive("article") as drive:``. docs/ci.md has a complete example. These names are public, as
-those of `hdbridge` itself.
+`hdbridge.pytest_plugin` creates one per test (the fixture `hdbridge_drive`); without pytest use ``with
+simulated_drive("article") as drive:``. docs/ci.md has a complete example. These names are public, like those
+of `hdbridge` itself.
 """
 
 from hdbridge.testing.history import Event, Frame, TrueState

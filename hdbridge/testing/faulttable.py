@@ -1,8 +1,8 @@
-"""The faults that a simulated drive makes by name: one row each.
+"""Faults of a simulated drive by name: one row each.
 
-They are those of the fault table in docs/timing-and-faults.md, seen from the other end of the bus: what the
-drive, its encoders, other nodes and the interface do. What a program does to itself (a target that is not a
-number, a full disk) it has to do itself.
+They are those of the fault table in docs/timing-and-faults.md, seen from the other end of the bus: actions of
+the drive, its encoders, other nodes and the interface. Faults of the program itself (a target that is not a
+number, a full disk) must be made by the program.
 """
 
 from __future__ import annotations
@@ -29,18 +29,18 @@ _BUS_OFF: Final = 0x40
 
 @dataclass(frozen=True)
 class Reach:
-    """What a fault may lay hands on."""
+    """Objects that a fault can act on."""
 
     drive: WatchedDrive
     another: Callable[[], AbstractContextManager[can.BusABC]]
-    """Opens the end of another node on the bus."""
+    """Opens another node's end of the bus."""
     port: Port | None
-    """The program's interface, where it is in this process."""
+    """The program's interface, if it is in this process."""
     bus: str
-    """What the bus is called in complaints."""
+    """Name of the bus, for messages."""
 
     def send(self, can_id: int, data: bytes = b"", times: int = 1, **kind: bool) -> End:
-        """Frames of another node."""
+        """Sends frames of another node."""
         kind = {"is_extended_id": False, **kind}
         with self.another() as bus:
             for _ in range(times):
@@ -48,14 +48,14 @@ class Reach:
         return _nothing
 
     def wish(self, name: str, value: object) -> End:
-        """Set a wish of the drive; its end is that it is as it was."""
+        """Sets an attribute of the drive's fault settings; its end restores the previous value."""
         wishes = self.drive.faults
         before = getattr(wishes, name)
         setattr(wishes, name, value)
         return lambda: setattr(wishes, name, before)
 
     def mute(self, can_id: int) -> End:
-        """Frames with an identifier are not sent any more."""
+        """Suppresses all frames with an identifier."""
         wishes = self.drive.faults
         wishes.muted_ids |= {can_id}
 
@@ -66,20 +66,20 @@ class Reach:
 
     @property
     def interface(self) -> Port:
-        """The program's interface; for rows that say that they need it."""
+        """The program's interface, for rows that require it."""
         assert self.port is not None
         return self.port
 
 
 def _nothing() -> None:
-    """The end of what is over as soon as it has begun."""
+    """End of a fault that is instantaneous."""
 
 
 Make = Callable[..., End]
 
 
 class Needs(Enum):
-    """What not every bus has."""
+    """Requirements that not every bus meets."""
 
     NOTHING = "nothing"
     INTERFACE = "the program's interface, in this process"
@@ -92,18 +92,18 @@ class Row:
 
     name: str
     what: str
-    """In a sentence; arguments by their names."""
+    """One sentence; arguments by their names."""
     make: Make
     arguments: Mapping[str, Value] = field(default_factory=dict)
-    """With their defaults."""
+    """Arguments with their defaults."""
     answers: str = ""
-    """The row of the fault table that it is for, as that begins."""
+    """Row of the fault table that it produces, by its first words."""
     needs: Needs = Needs.NOTHING
     touches: Callable[[Mapping[str, Any]], tuple[int, int]] | None = None
-    """The object that the drive must have for it, by the arguments."""
+    """Returns the object that the drive must have, given the arguments."""
 
     def check(self, reach: Reach, arguments: Mapping[str, Any]) -> None:
-        """InputError where this bus or this drive has nothing to make it with."""
+        """Raises `InputError` if the fault cannot be made on this bus or drive."""
         __tracebackhide__ = True  # pytest shows the test's line
         if self.needs is Needs.INTERFACE and reach.port is None:
             raise InputError(
@@ -120,14 +120,14 @@ class Row:
             raise InputError(f"fault '{self.name}': the drive has no object {place[0]:04X}h:{place[1]:02X}")
 
     def begin(self, reach: Reach, arguments: Mapping[str, Value]) -> End:
-        """Make it; BusError where the bus does not take its frames."""
+        """Starts the fault; raises `BusError` if the bus refuses its frames."""
         try:
             return self.make(reach, **arguments)
         except can.CanError as error:
             raise BusError(f"fault '{self.name}' cannot be made on {reach.bus}: {error}") from error
 
     def checked(self, given: Mapping[str, Any]) -> dict[str, Value]:
-        """The arguments, or an InputError that says which there are."""
+        """Returns the complete arguments; raises `InputError` with the existing ones."""
         __tracebackhide__ = True  # pytest shows the test's line
         signature = ", ".join(f"{name}={value!r}" for name, value in self.arguments.items()) or "none"
         for name, value in given.items():
@@ -161,7 +161,7 @@ def _once(act: Callable[[WatchedDrive], object]) -> Make:
 
 
 def _frame(can_id: int, data: bytes = b"", *, own: bool = False, **kind: bool) -> Make:
-    """A frame; where ``own``, the drive's node id is added to its identifier."""
+    """Returns a maker of a frame; with ``own`` the drive's node id is added to its identifier."""
     return lambda reach: reach.send(can_id + own * reach.drive.node_id, data, **kind)
 
 
@@ -361,14 +361,14 @@ _ROWS: Final = (
 )  # fmt: skip
 
 FAULTS: Final[Mapping[str, Row]] = MappingProxyType({row.name: row for row in _ROWS})
-"""All of them by name."""
+"""All faults by name."""
 
 OF_THE_PROGRAM: Final = ("target NaN", "it stays away for longer")
-"""Rows of the fault table without one of their own: the program's, and what comes of another by itself."""
+"""Rows of the fault table without a fault here: those of the program, and consequences of another row."""
 
 
 def find(name: str) -> Row:
-    """The fault of a name; InputError with the nearest right one."""
+    """Returns the fault with a name; raises `InputError` with the nearest one."""
     __tracebackhide__ = True  # pytest shows the test's line
     row = FAULTS.get(name)
     if row is None:
@@ -379,7 +379,7 @@ def find(name: str) -> Row:
 
 
 def sentences() -> Iterator[tuple[str, str, str]]:
-    """Name, arguments with their defaults, what it does: for pages."""
+    """Yields name, arguments with their defaults, and description of each fault, for documentation."""
     for row in _ROWS:
         arguments = ", ".join(f"{name}={shown(name, value)}" for name, value in row.arguments.items())
         yield row.name, arguments, row.what

@@ -1,4 +1,4 @@
-"""What a simulated drive has been through: events, frames, true angles, period by period."""
+"""History of a simulated drive: events, frames, and true angles period by period."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ from hdbridge.units import ARCSEC_PER_DEG
 EVENTS: Final = 10_000
 FRAMES: Final = 1_000
 PERIODS: Final = 250_000
-"""What is kept, the newest; periods for a thousand seconds at 4 ms."""
+"""Maximum number of kept entries, the newest; periods for a thousand seconds at 4 ms."""
 
 SHOWN_EVENTS: Final = 40
 SHOWN_FRAMES: Final = 12
-"""What a failed test's report shows of them."""
+"""Number of entries shown in the report of a failed test."""
 
 
 @dataclass(frozen=True)
 class Event:
-    """Something that happened: at ``time_s`` of the drive's time, of a ``kind``, in words.
+    """Event at ``time_s`` of the drive's time, with a ``kind`` and a text.
 
-    Kinds: ``state`` (power states of CiA 402), ``nmt``, ``emcy``, ``fault`` (one that was asked for, when
-    it begins and when it ends), ``bus`` (the program opens or closes its end), ``note`` (of the test).
+    Kinds: ``state`` (power states of CiA 402), ``nmt``, ``emcy``, ``fault`` (start and end of a requested
+    one), ``bus`` (the program opens or closes its end), ``note`` (from the test).
     """
 
     time_s: float
@@ -38,20 +38,20 @@ class Event:
 
 
 class TrueState(NamedTuple):
-    """What is true of the simulated axis at one moment, whatever its encoders and its frames say."""
+    """True state of the simulated axis at one moment, independent of encoders and frames."""
 
     time_s: float
-    """Of the drive's time, which begins with the test."""
+    """Drive time, which starts with the test."""
     motor_deg: float
-    """The motor's angle; the axis begins at 0."""
+    """Motor angle; the axis starts at 0."""
     load_deg: float
-    """The load's angle; it begins near 0, by the gear's error."""
+    """Load angle; it starts near 0, displaced by the gear's error."""
     ratio: float
-    """Motor turns per load turn, as the gear is sold."""
+    """Nominal motor turns per load turn."""
 
     @property
     def error_arcsec(self) -> float:
-        """How far the load is from where an ideal gear would have put it."""
+        """Deviation of the load from the angle that an ideal gear would give."""
         return (self.load_deg - self.motor_deg / self.ratio) * ARCSEC_PER_DEG
 
 
@@ -60,7 +60,7 @@ class Frame(NamedTuple):
 
     time_s: float
     sent: bool
-    """By the drive."""
+    """True if the drive sent it."""
     message: can.Message
 
     def __str__(self) -> str:
@@ -80,7 +80,7 @@ class Frame(NamedTuple):
 
 
 class History:
-    """The newest of all that; nothing grows without bound."""
+    """The newest events, frames and true states; bounded in size."""
 
     def __init__(self) -> None:
         self.events: deque[Event] = deque(maxlen=EVENTS)
@@ -88,7 +88,7 @@ class History:
         self.trace: deque[TrueState] = deque(maxlen=PERIODS)
 
     def report(self) -> str:
-        """For the report of a failed test: the last events, the last frames, the last true angles."""
+        """Returns the last events, frames and true angles, for the report of a failed test."""
         return "\n".join(self._lines())
 
     def _lines(self) -> Iterator[str]:

@@ -1,4 +1,4 @@
-"""The bus that simulated drives stand on: in lockstep or in real time, of this process or of the machine."""
+"""Bus of simulated drives: in lockstep or in real time, within this process or on the computer."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ from hdbridge.testing.settings import LOCKSTEP, BusChoice, Settings
 from hdbridge.testing.watched import WatchedDrive
 
 LONGEST_WAIT_S: Final = 0.005
-"""In real time: how long a drive may not notice that a fault is wanted."""
+"""Maximum delay of a requested fault in real time; s."""
 LONGEST_TURN_S: Final = 600.0
-"""How long a bus of the machine is waited for, that other tests use."""
+"""Maximum wait for a bus of the computer that other tests are using; s."""
 
 _IN_USE: Final[dict[str, int]] = {}
-"""Buses of the machine with a drive of this process, and the thread that made it."""
+"""Computer buses with a drive of this process, and the thread that created it."""
 
 
 @dataclass
@@ -39,25 +39,25 @@ class Line:
 
     choice: BusChoice
     interface: str
-    """What a program calls it, with the channel."""
+    """Interface name for the program, used with the channel."""
     channel: str
     clock: Clock
     opened: Callable[[], AbstractContextManager[can.BusABC]]
-    """Opens the end of a node."""
+    """Opens a node's end of the bus."""
     port: Port | None = None
-    """The program's interface, where it is in this process."""
+    """The program's interface, if it is in this process."""
     nodes: list[WatchedDrive] = field(default_factory=list)
 
     def note(self, kind: str, text: str) -> None:
-        """Put an event into every drive's history."""
+        """Adds an event to every drive's history."""
         for node in self.nodes:
             node.note(kind, text)
 
     @contextmanager
     def drive(self, settings: Settings) -> Iterator[tuple[WatchedDrive, list[HdbridgeError]]]:
-        """Switch a drive on, as long as the block lasts. What ends it before that is in the list.
+        """Switches a drive on for the duration of the block; yields it and the list of errors that ended it.
 
-        InputError where the bus has a drive of that node id.
+        Raises `InputError` if the bus already has a drive with that node id.
         """
         axis = settings.axis
         node_id = axis.drive.node_id
@@ -80,7 +80,7 @@ class Line:
 
     @contextmanager
     def _living(self, bus: can.BusABC, node: WatchedDrive) -> Iterator[list[HdbridgeError]]:
-        """On the virtual clock, or in a thread of its own."""
+        """Runs the drive on the virtual clock, or in a thread."""
         if isinstance(self.clock, StallingClock):
             nodes = self.clock.nodes
             nodes.append(node)
@@ -110,7 +110,9 @@ class Line:
 
 @contextmanager
 def open_line(choice: BusChoice) -> Iterator[Line]:
-    """A bus for drives; BusError where it cannot be opened. A bus of the machine is waited for."""
+    """Yields a bus for drives, waiting for a bus of the computer to become free; raises `BusError` if it
+    cannot be opened.
+    """
     if not choice.in_process:
         settings = BusConfig(interface=choice.interface, channel=choice.channel, bitrate_bps=None)
         with _turn(choice):
@@ -137,7 +139,9 @@ def open_line(choice: BusChoice) -> Iterator[Line]:
 
 @contextmanager
 def _turn(choice: BusChoice) -> Iterator[None]:
-    """Wait until no other test of this machine has a drive on the bus: workers of pytest-xdist share it."""
+    """Waits until no other test on this computer has a drive on the bus, because pytest-xdist workers share
+    it.
+    """
     name = str(choice)
     if _IN_USE.get(name) == threading.get_ident():
         raise InputError(

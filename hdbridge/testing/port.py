@@ -1,8 +1,7 @@
-"""The program's end of a simulated bus within this process: a python-can interface called ``hdbridge``.
+"""The program's end of a simulated bus in this process: a python-can interface called ``hdbridge``.
 
-A program opens it as any other, by interface and channel. Its failures are those of SocketCAN: an interface
-that goes down raises ENETDOWN once in ``recv`` and with each ``send``; one that was deleted needs to be
-opened again.
+A program opens it like any other, by interface and channel. Its failures are those of SocketCAN: an interface
+that goes down raises ENETDOWN once in ``recv`` and on each ``send``; a deleted one must be opened again.
 """
 
 from __future__ import annotations
@@ -22,13 +21,13 @@ from hdbridge.sim.lockstep import LockstepBus, VirtualClock
 
 INTERFACE: Final = "hdbridge"
 SLICE_S: Final = 0.01
-"""How long a waiting ``recv`` may not notice that the interface has gone."""
+"""Maximum delay before a waiting ``recv`` notices the loss of the interface; s."""
 
 _PORTS: Final[dict[str, Port]] = {}
 
 
 class Condition(Enum):
-    """Of an interface."""
+    """Condition of an interface."""
 
     UP = "up"
     DOWN = "down"
@@ -42,13 +41,13 @@ _ERRORS: Final = {
 
 
 class StallingClock(VirtualClock):
-    """A virtual clock on which the program may stand still, and wake up late."""
+    """Virtual clock on which the program can stall and wake up late."""
 
     stall_s = 0.0
-    """To be added to the next wait."""
+    """Delay to be added to the next wait; s."""
 
     def step(self, deadline_s: float) -> bool:
-        """See `VirtualClock`; where a stall is wanted, time passes by so much more."""
+        """Steps as `VirtualClock` does; a requested stall adds to the elapsed time."""
         going_on = super().step(deadline_s)
         if self.stall_s > 0.0:
             until_s, self.stall_s = self.now() + self.stall_s, 0.0
@@ -58,19 +57,19 @@ class StallingClock(VirtualClock):
 
 
 class Port:
-    """The interface of the program: where it leads, and what is wrong with it."""
+    """Interface of the program: its channel and its condition."""
 
     def __init__(self, channel: str, clock: StallingClock | None, note: Callable[[str, str], None]) -> None:
-        """``clock`` is that of a lockstep; None for real time. ``note`` is told of what the program does."""
+        """``clock`` is the lockstep clock, None for real time. ``note`` receives the program's actions."""
         self.channel = channel
         self.clock = clock
         self.note = note
         self.condition = Condition.UP
         self.losses = 0
-        """How often it went."""
+        """Number of times that it went away."""
         self.deletions = 0
         self.refused_sends = 0
-        """So many frames more find the transmit queue full."""
+        """Number of further frames that find the transmit queue full."""
         self.open_buses: list[ProgramBus] = []
 
     def __enter__(self) -> Port:
@@ -79,11 +78,11 @@ class Port:
 
     def __exit__(self, *_: object) -> None:
         del _PORTS[self.channel]
-        for each in list(self.open_buses):  # the program has left them open
+        for each in list(self.open_buses):  # buses that the program left open
             each.shutdown()
 
     def fail(self, condition: Condition) -> Callable[[], None]:
-        """Take the interface away; what is returned gives it back."""
+        """Takes the interface away; returns a function that restores it."""
 
         def comes_back() -> None:
             self.condition = Condition.UP
@@ -95,10 +94,10 @@ class Port:
 
 
 class ProgramBus(can.BusABC):
-    """One end that the program has opened. What it does not close is closed with the drive."""
+    """One end that the program has opened. An end left open is closed with the drive."""
 
     def __init__(self, channel: str, can_filters: Any = None, **_: Any) -> None:
-        """Further options, such as a bit rate, are those of hardware and change nothing."""
+        """Further options, such as a bit rate, concern hardware and are ignored."""
         port = _PORTS.get(channel)
         if port is None:
             raise can.CanInitializationError(
@@ -151,7 +150,7 @@ class ProgramBus(can.BusABC):
         super().shutdown()
 
     def _check_receive(self) -> bool:
-        """Whether frames can come; raises when that has ended since the last time."""
+        """Returns True if frames can arrive; raises if that has ended since the last call."""
         port = self._port
         if port.losses != self._losses:
             self._losses = port.losses
@@ -161,7 +160,7 @@ class ProgramBus(can.BusABC):
 
 
 class _LockstepEnd(LockstepBus):
-    """`LockstepBus` with an interface that may go; for one thread."""
+    """`LockstepBus` with an interface that can be lost; for one thread."""
 
     def __init__(self, channel: str, clock: VirtualClock, check: Callable[[], bool]) -> None:
         super().__init__(channel, clock)
@@ -183,7 +182,8 @@ class _LockstepEnd(LockstepBus):
         return message if ready else None
 
     def _check_thread(self) -> None:
-        # Told to every thread from then on: what a can.Notifier's thread raises is easily overlooked.
+        # Reported to every thread from then on, because an exception in a can.Notifier's thread is easily
+        # overlooked.
         self._shared |= threading.get_ident() != self._thread
         if self._shared:
             raise can.CanOperationError(
@@ -193,7 +193,7 @@ class _LockstepEnd(LockstepBus):
 
 
 class _RealTimeEnd(VirtualBus):
-    """python-can's virtual bus with an interface that may go."""
+    """python-can's virtual bus with an interface that can be lost."""
 
     def __init__(self, channel: str, check: Callable[[], bool]) -> None:
         super().__init__(channel)

@@ -1,4 +1,4 @@
-"""Which simulated drive a test gets: profile, truth, seed, bus. Everything is checked before it is made."""
+"""Settings of a test's simulated drive: profile, truth, seed, bus; checked before the drive is created."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from hdbridge.sim.truth import Truth
 
 VIRTUAL, LOCKSTEP = "virtual", "lockstep"
 EXAMPLES: Final = (VIRTUAL, LOCKSTEP, "socketcan:vcan0", "udp_multicast:239.74.163.2")
-"""Buses as they are written."""
+"""Examples of bus names."""
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ class BusChoice:
 
     @property
     def in_process(self) -> bool:
-        """Whether only this process can reach it."""
+        """True if only this process can reach it."""
         return self.interface in (VIRTUAL, LOCKSTEP)
 
     def __str__(self) -> str:
@@ -39,7 +39,9 @@ class BusChoice:
 
     @classmethod
     def parse(cls, text: str) -> BusChoice:
-        """From ``virtual``, ``lockstep`` or ``INTERFACE:CHANNEL``; InputError where it is neither."""
+        """Parses ``virtual``, ``lockstep`` or ``INTERFACE:CHANNEL``; raises `InputError` for
+        anything else.
+        """
         interface, colon, channel = text.partition(":")
         known = [each.partition(":")[0] for each in EXAMPLES]
         if interface in (VIRTUAL, LOCKSTEP) and not colon:
@@ -74,10 +76,11 @@ class Settings:
         folder: Path | None = None,
         firmware: Mapping[str, Any] = MappingProxyType({}),
     ) -> Settings:
-        """``folder`` is where relative paths start, by default the present one. InputError in one line.
+        """Loads and checks the settings; raises a one-line `InputError`.
 
-        Without ``truth``, the profile's ``twin.yaml`` is used if it has one, else its ``truth.yaml``.
-        ``firmware`` has keys of the truth file's section of that name.
+        ``folder`` is the base of relative paths, by default the present one. Without ``truth``, the profile's
+        ``twin.yaml`` is used if it has one, else its ``truth.yaml``. ``firmware`` has keys of the truth
+        file's section of that name.
         """
         folder = folder or Path()
         choice = BusChoice.parse(bus)

@@ -1,4 +1,4 @@
-"""The simulated drive as a test has it in hand."""
+"""Simulated drive as used in a test."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ POLL_S: Final = 0.005
 
 
 class DriveTime:
-    """The drive's time in the shape of the module ``time``; what is not here is that module's.
+    """Drive time with the interface of the module ``time``; missing names are that module's.
 
-    In real time it is the module's own time. In lockstep a ``sleep`` lets the drive run for so long and
-    returns at once. ``monkeypatch.setattr(program, "time", drive.time)`` lets a program live by it.
+    In real time it is the module's own time. In lockstep ``sleep`` runs the drive for that time and returns
+    at once. ``monkeypatch.setattr(program, "time", drive.time)`` makes a program use it.
     """
 
     def __init__(self, clock: Clock) -> None:
@@ -34,23 +34,23 @@ class DriveTime:
         self._offset_s = time.time() - clock.now()
 
     def monotonic(self) -> float:
-        """Seconds since some moment."""
+        """Returns seconds since an arbitrary moment."""
         return self._clock.now()
 
     perf_counter = monotonic
 
     def time(self) -> float:
-        """Seconds since 1970."""
+        """Returns seconds since 1970."""
         return self._clock.now() + self._offset_s
 
     def monotonic_ns(self) -> int:
-        """Nanoseconds since some moment."""
+        """Returns nanoseconds since an arbitrary moment."""
         return round(1e9 * self._clock.now())
 
     perf_counter_ns = monotonic_ns
 
     def sleep(self, seconds: float) -> None:
-        """Wait."""
+        """Waits."""
         self._clock.sleep_until(self._clock.now() + seconds)
 
     def __getattr__(self, name: str) -> Any:
@@ -58,9 +58,9 @@ class DriveTime:
 
 
 class SimulatedDrive:
-    """A CiA-402 drive with an axis on a bus. `simulated_drive` and the fixture ``hdbridge_drive`` make it.
+    """CiA-402 drive with an axis on a bus, created by `simulated_drive` and the fixture ``hdbridge_drive``.
 
-    A program reaches it by ``interface`` and ``channel``, which it hands to python-can, and ``node_id``.
+    A program reaches it by ``interface`` and ``channel``, which it passes to python-can, and ``node_id``.
     """
 
     def __init__(
@@ -73,24 +73,24 @@ class SimulatedDrive:
         self._reach = Reach(node, line.opened, line.port, str(line.choice))
         self._failures = failures
         self.interface: Final = line.interface
-        """For ``can.Bus``: what python-can calls it."""
+        """Interface name for ``can.Bus``."""
         self.channel: Final = line.channel
-        """For ``can.Bus``."""
+        """Channel for ``can.Bus``."""
         self.in_process: Final = settings.bus.in_process
-        """Whether only this process reaches the bus; else a program of its own can be the master."""
+        """True if only this process reaches the bus; else a separate program can be the master."""
         self.lockstep: Final = settings.bus.interface == LOCKSTEP
-        """Whether time passes only while the program waits."""
+        """True if time passes only while the program waits."""
         self.node_id: Final = node.node_id
         self.eds_path: Final = settings.axis.eds_path
-        """The EDS of the drive."""
+        """EDS of the drive."""
         self.truth_path: Final = settings.truth_path
-        """What the axis is like: the profile's twin.yaml or truth.yaml."""
+        """Description of the axis: the profile's twin.yaml or truth.yaml."""
         self.motor_counts_per_turn: Final = node.nameplate.motor_counts_per_turn
         self.load_counts_per_turn: Final = node.nameplate.load_counts_per_turn
         self.ratio: Final = node.ratio
         """Motor turns per load turn."""
         self.time: Final = DriveTime(line.clock)
-        """The drive's time, in the shape of the module ``time``."""
+        """Drive time, with the interface of the module ``time``."""
 
     def __repr__(self) -> str:
         name, bus = self._settings.truth.name, self._settings.bus
@@ -106,46 +106,46 @@ class SimulatedDrive:
 
     @property
     def trace(self) -> tuple[TrueState, ...]:
-        """The true angles after every period of the drive (60C2h) since it was made; the newest 250,000."""
+        """True angles after every period of the drive (60C2h) since its creation; the newest 250,000."""
         with self._node.lock:
             return tuple(self._node.history.trace)
 
     @property
     def state(self) -> str:
-        """The power state of CiA 402 in words, such as ``operation enabled`` or ``fault``."""
+        """Power state of CiA 402 as text, such as ``operation enabled`` or ``fault``."""
         return words(self._node.firmware.state.name)
 
     @property
     def nmt_state(self) -> str:
-        """The NMT state in words, such as ``operational``."""
+        """NMT state as text, such as ``operational``."""
         return words(self._node.nmt.name)
 
     # ---------------------------------------------------------------- what happened
 
     @property
     def log(self) -> tuple[Event, ...]:
-        """What happened, in the order of time: states, EMCY, faults asked for; the newest 10,000."""
+        """Events in chronological order: states, EMCY, requested faults; the newest 10,000."""
         with self._node.lock:
             return tuple(self._node.history.events)
 
     @property
     def emergencies(self) -> tuple[int, ...]:
-        """The codes of the EMCY messages that the drive has sent, without those that end an error."""
+        """Codes of the EMCY messages that the drive has sent, without those that end an error."""
         codes = (int(each.text[:4], 16) for each in self.log if each.kind == "emcy")
         return tuple(code for code in codes if code)
 
     @property
     def frames(self) -> tuple[Frame, ...]:
-        """The frames that the drive has sent and seen; the newest 1,000."""
+        """Frames that the drive has sent and seen; the newest 1,000."""
         with self._node.lock:
             return tuple(self._node.history.frames)
 
     def note(self, text: str) -> None:
-        """Put a line of the test's own into the log."""
+        """Adds a note of the test to the log."""
         self._node.note("note", text)
 
     def report(self) -> str:
-        """The end of the log, the last frames and the true angles, for people."""
+        """Returns the end of the log, the last frames and the true angles, as text."""
         with self._node.lock:
             return f"{self!r}\n{self._node.history.report()}"
 
@@ -153,7 +153,7 @@ class SimulatedDrive:
 
     @property
     def faults(self) -> Mapping[str, str]:
-        """What each fault does, by its name."""
+        """Description of each fault, by its name."""
         return MappingProxyType({row.name: row.what for row in FAULTS.values()})
 
     def fault(
@@ -165,11 +165,11 @@ class SimulatedDrive:
         for_s: float | None = None,
         **arguments: float,
     ) -> Fault:
-        """Make a fault: now, after a time (the drive's), or once the load passes an angle.
+        """Makes a fault: now, after a time (the drive's), or once the load passes an angle.
 
-        It ends ``for_s`` after it began, with the block where it is used as a context manager, or by
-        ``.end()``. InputError for a name or an argument that there is not, with the nearest right one, and
-        where this bus has nothing to make it with.
+        It ends ``for_s`` after it began, at the end of a ``with`` block, or by ``.end()``. Raises
+        `InputError` for an unknown name or argument, with the nearest one, and if the fault cannot be made on
+        this bus.
         """
         __tracebackhide__ = True  # pytest shows the test's line
         row = find(name)
@@ -194,16 +194,18 @@ class SimulatedDrive:
 
     @property
     def now(self) -> float:
-        """Seconds of the drive's time since it was made: that of ``log`` and ``trace``."""
+        """Drive time since its creation, s, as in ``log`` and ``trace``."""
         return self._node.time_s
 
     def sleep(self, seconds: float) -> None:
-        """Let the drive run for so long."""
+        """Lets the drive run for this time."""
         self.time.sleep(seconds)
         self._check()
 
     def wait_until(self, condition: Callable[[], object], timeout_s: float = 5.0, what: str = "it") -> None:
-        """Let the drive run until a condition is true; TimeoutError with the log after ``timeout_s``."""
+        """Runs the drive until a condition is true; raises `TimeoutError` with the log after
+        ``timeout_s``.
+        """
         __tracebackhide__ = True  # pytest shows the test's line
         end_s = self._clock.now() + timeout_s
         while not condition():
@@ -212,11 +214,11 @@ class SimulatedDrive:
             self.sleep(POLL_S)
 
     def open_bus(self, **options: Any) -> can.BusABC:
-        """Open the program's end of the bus: ``can.Bus`` with ``interface`` and ``channel``."""
+        """Opens the program's end of the bus: ``can.Bus`` with ``interface`` and ``channel``."""
         return can.Bus(interface=self.interface, channel=self.channel, ignore_config=True, **options)
 
     def _check(self) -> None:
-        """Raise what ended the drive."""
+        """Raises the error that ended the drive."""
         __tracebackhide__ = True  # pytest shows the test's line
         if self._failures:
             raise self._failures[0]
@@ -233,16 +235,17 @@ def simulated_drive(
     beside: SimulatedDrive | None = None,
     firmware: Mapping[str, Any] = MappingProxyType({}),
 ) -> Iterator[SimulatedDrive]:
-    """A simulated drive as long as the block lasts.
+    """Yields a simulated drive for the duration of the block.
 
     ``profile`` is a folder with an axis.yaml, or a bundled profile (``article``, ``demo``), relative to
     ``folder``. ``bus`` is ``virtual`` (this process, in real time), ``lockstep`` (this process, one thread,
     time passes only while the program waits) or ``INTERFACE:CHANNEL`` of python-can, for programs of any
     process. ``truth`` replaces the profile's twin.yaml or truth.yaml. The same truth and seed give the same
-    axis; in lockstep the same frames. With ``beside`` it stands on the bus of another drive, whose node id is
-    another. While another test has a drive on a bus of the machine, this one waits. ``firmware`` sets keys of
-    the truth file's section of that name, such as ``{"controlword": "level"}``. InputError, BusError in one
-    line.
+    axis, and in lockstep the same frames. ``beside`` is another drive whose bus it shares; their node ids
+    must differ. If another test has a drive on a bus of the computer, this one waits. ``firmware`` sets keys
+    of the truth file's section of that name, such as ``{"controlword": "level"}``.
+
+    Raises a one-line `InputError` or `BusError`.
     """
     settings = Settings.load(
         profile, bus if beside is None else str(beside._line.choice), seed, truth, folder, firmware

@@ -1,4 +1,4 @@
-"""A simulated drive that keeps its history, and whose faults come when they are wanted."""
+"""Simulated drive that keeps its history and makes faults on request."""
 
 from __future__ import annotations
 
@@ -31,19 +31,19 @@ _BOOT_UP: Final = (0x700, b"\0")
 
 @dataclass
 class Fault:
-    """A fault that a test asked for. As a context manager it ends with its block."""
+    """Fault requested by a test. As a context manager it ends with its block."""
 
     name: str
     arguments: Mapping[str, Any]
     begun_s: float | None = None
-    """When it began, in the drive's time; None while it waits for its moment."""
+    """Start in drive time, s; None while it is pending."""
     ended_s: float | None = None
-    """When it ended or was called off; None before."""
+    """End or cancellation in drive time, s; None before."""
     _finish: Callable[[Fault], None] = field(default=lambda _: None, repr=False)
     _undo: End | None = field(default=None, repr=False)
 
     def end(self) -> None:
-        """End it now; one that has not begun is called off. To end it again is no error."""
+        """Ends the fault now, or cancels it if it has not begun. Ending it again is not an error."""
         self._finish(self)
 
     def __enter__(self) -> Self:
@@ -58,16 +58,16 @@ class Fault:
 
 @dataclass(frozen=True)
 class When:
-    """The moment for which a fault waits; at once where neither is given."""
+    """Trigger of a fault; immediate if neither is given."""
 
     after_s: float = 0.0
     beyond_deg: float | None = None
-    """Once the load passes this angle, from either side."""
+    """Load angle to be passed, from either side."""
 
 
 @dataclass
 class _Plan:
-    """Something to do at a time, or once the load has passed an angle."""
+    """Action at a time, or once the load has passed an angle."""
 
     act: Callable[[], None]
     at_s: float = _NEVER
@@ -83,9 +83,9 @@ class _Plan:
 
 
 class WatchedDrive(DriveNode):
-    """`hdbridge.sim`'s drive of a truth, with a `History`, and faults that begin and end in its own time.
+    """The drive of `hdbridge.sim` with a `History`, and with faults that begin and end in its own time.
 
-    Any thread may call it.
+    Thread-safe.
     """
 
     def __init__(
@@ -104,7 +104,7 @@ class WatchedDrive(DriveNode):
         self.nameplate = nameplate_of(truth, load_object=load_object)
         self.ratio = self.nameplate.gear_motor_turns / self.nameplate.gear_load_turns
         self.last_tpdos: dict[int, bytes] = {}
-        """The data last sent, by identifier."""
+        """Data last sent, by identifier."""
         self._plans: list[_Plan] = []
         self._begin_s = clock.now()
         super().__init__(bus, self.machine, eds_path, node_id, clock, self.nameplate, truth.firmware)
@@ -112,22 +112,22 @@ class WatchedDrive(DriveNode):
 
     @property
     def time_s(self) -> float:
-        """Since it was made."""
+        """Time since its creation, s."""
         return self._clock.now() - self._begin_s
 
     def note(self, kind: str, text: str) -> None:
-        """Put an event into the history."""
+        """Adds an event to the history."""
         self.history.events.append(Event(self.time_s, kind, text))
 
     def true_state(self) -> TrueState:
-        """The axis now."""
+        """Returns the present true state of the axis."""
         machine = self.machine
         return TrueState(self.time_s, machine.true_motor_deg, machine.true_load_deg, self.ratio)
 
     # ---------------------------------------------------------------- faults
 
     def make(self, fault: Fault, begin: Callable[[], End], when: When, for_s: float | None) -> None:
-        """Begin a fault at its moment; it ends ``for_s`` later, or where somebody ends it."""
+        """Starts a fault at its trigger; it ends ``for_s`` later, or on request."""
 
         def begins() -> None:
             if fault.ended_s is not None:
@@ -157,13 +157,13 @@ class WatchedDrive(DriveNode):
             self.note("fault", f"{fault.name} {'ends' if fault._undo is not None else 'is called off'}")
 
     def tell_instead(self, index: int, subindex: int, value: int) -> End:
-        """Say another value of an object than it has, by SDO and in TPDOs."""
+        """Reports another value of an object than it has, by SDO and in TPDOs."""
         entry = self.dictionary[index, subindex]
         before = entry.bound
 
         def bind(read: Callable[[], int] | None) -> None:
             entry.bound = read
-            for pdo in self._tpdos:  # they have compiled what they read
+            for pdo in self._tpdos:  # they have compiled their sources
                 pdo.compile()
 
         bind(lambda: value)
@@ -172,7 +172,7 @@ class WatchedDrive(DriveNode):
     # ---------------------------------------------------------------- the drive, watched
 
     def next_event_s(self) -> float:
-        """See `hdbridge.device.node.DriveNode`; the moments of faults are events as well."""
+        """See `hdbridge.device.node.DriveNode`; the triggers of faults are events as well."""
         event_s = super().next_event_s()
         return min((event_s, *(plan.at_s for plan in self._plans))) if self._plans else event_s
 
@@ -215,7 +215,7 @@ class WatchedDrive(DriveNode):
         self._look()
 
     def _look(self) -> None:
-        """Note what has changed."""
+        """Records state changes."""
         if self.firmware.state is not self._last_state:
             self._last_state = self.firmware.state
             self.note("state", words(self._last_state.name))
@@ -225,10 +225,10 @@ class WatchedDrive(DriveNode):
 
 
 def shown(name: str, value: float) -> str:
-    """The argument of a fault as people write it: codes and objects in hexadecimal."""
+    """Formats an argument of a fault: codes and objects in hexadecimal."""
     return f"0x{value:04X}" if name in ("code", "index") and isinstance(value, int) else str(value)
 
 
 def words(name: str) -> str:
-    """The name of an enumeration's member as words."""
+    """Converts the name of an enumeration member to words."""
     return name.lower().replace("_", " ")

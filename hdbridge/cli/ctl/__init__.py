@@ -1,7 +1,7 @@
-"""``hdbridge ctl``: ask a daemon that runs: look, move, stop, compensate, run procedures.
+"""``hdbridge ctl``: control of a running daemon: look, move, stop, compensate, run procedures.
 
-common.py        where the daemon is; the right to move; Ctrl-C stops the axis
-look.py          what only looks
+common.py        address of the daemon; the lease; Ctrl-C stops the axis
+look.py          read-only commands
 motion.py        power and motion
 model.py         compensation, models, adaptation
 procedures.py    jobs, objects of the drive
@@ -16,13 +16,13 @@ import typer
 from hdbridge.cli.ctl import look, model, motion, procedures
 
 _SIGNED = {"ignore_unknown_options": True}
-"""For commands that take a number which may be negative, in place of an option that is none."""
+"""Settings of commands with a number that may be negative and would be taken for an option."""
 
 
 def register(app: typer.Typer) -> None:
-    """Add the commands."""
+    """Adds the commands."""
     group = typer.Typer(
-        help="Ask a daemon that runs: look, move, stop, compensate, run procedures.",
+        help="Control a running daemon: look, move, stop, compensate, run procedures.",
         no_args_is_help=True,
         rich_markup_mode="markdown",
     )

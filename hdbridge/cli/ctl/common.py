@@ -1,4 +1,4 @@
-"""What the commands share: where the daemon is, the right to move, what is printed of an axis."""
+"""Shared parts of the commands: address of the daemon, lease, printing of an axis."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from hdbridge.client.messages import AxisState
 
 STOP_S: Final = 3.0
-"""How long the answer to a stop is waited for."""
+"""Time-out of a stop command; s."""
 AtOption = Annotated[
     str | None,
     typer.Option(
@@ -50,7 +50,9 @@ TakeOption = Annotated[
 
 
 def connected(at: str | None, *, named: bool = True) -> Client:
-    """The daemon; use it as a context manager. ``named`` reports which one it is if no address was given."""
+    """Returns the daemon's client, a context manager. ``named`` reports its machine if no
+    address was given.
+    """
     from hdbridge.client import Client
 
     client = Client(at, name="hdbridge ctl")
@@ -60,7 +62,7 @@ def connected(at: str | None, *, named: bool = True) -> Client:
 
 
 def _name(at: str | None, client: Client) -> None:
-    """Reports the machine that a command acts on if it was not given with the command."""
+    """Reports the machine that a command acts on if the command did not name it."""
     if at is not None:
         return
     place = client.address.socket
@@ -72,7 +74,7 @@ def _name(at: str | None, client: Client) -> None:
 
 @contextmanager
 def stopping(at: str | None) -> Iterator[Client]:
-    """The daemon, to stop something. If it cannot do it, the error names the process that holds the bus."""
+    """Yields the daemon's client for a stop. If it fails, the error names the process that holds the bus."""
     from hdbridge.client import Client
 
     try:
@@ -86,7 +88,9 @@ def stopping(at: str | None) -> Iterator[Client]:
 
 
 def _who_holds(at: str | None) -> str:
-    """The processes that hold an interface, or listen at the daemon's socket, and what to do about them."""
+    """Describes the processes that hold an interface or listen at the daemon's socket, and how
+    to end them.
+    """
     from hdbridge.client.address import find
     from hdbridge.daemon.api.sockets import daemon_of
     from hdbridge.drive.interfacelock import holders, process_words
@@ -105,9 +109,9 @@ def _who_holds(at: str | None) -> str:
 
 @contextmanager
 def moving(at: str | None, name: str | None, *, force: bool = False) -> Iterator[Axis]:
-    """An axis, the right to move it, and Ctrl-C (and what else ends a command) that stops it.
+    """Yields an axis with the lease to move it; Ctrl-C or another end of the command stops it.
 
-    Without a name it is the only one; InputError where there are several.
+    Without a name it is the only axis; raises `InputError` if there are several.
     """
     with connected(at) as client:
         name = name or _only(client)
@@ -124,7 +128,7 @@ def _only(client: Client) -> str:
 
 @contextmanager
 def stopped_by_signals(client: Client, *names: str) -> Iterator[None]:
-    """Brake these axes to rest where the block is interrupted; the interruption goes on."""
+    """Brakes these axes to rest if the block is interrupted; the interruption propagates."""
 
     def interrupt(_number: int, _frame: FrameType | None) -> None:
         raise KeyboardInterrupt
@@ -138,7 +142,7 @@ def stopped_by_signals(client: Client, *names: str) -> Iterator[None]:
         yield
     except KeyboardInterrupt:
         for name in names:
-            with suppress(HdbridgeError):  # the daemon's own supervision is still there
+            with suppress(HdbridgeError):  # the daemon's own supervision remains
                 client.axis(name).stop()
                 notes.print(f"axis '{name}' is stopped; it stays enabled", markup=False, soft_wrap=True)
         raise
@@ -148,7 +152,7 @@ def stopped_by_signals(client: Client, *names: str) -> Iterator[None]:
 
 
 def tell(state: AxisState, json_file: Path | None) -> None:
-    """How an axis stands after a command."""
+    """Prints the state of an axis after a command."""
     write_json(json_file, document("ctl-axis", state))
     load = "" if state.load_position_deg is None else f", load encoder {state.load_position_deg:.4f} deg"
     error = "" if state.error_arcsec is None else f", error {state.error_arcsec:+.2f} arcsec"
@@ -159,7 +163,7 @@ def tell(state: AxisState, json_file: Path | None) -> None:
 
 
 def concerns(state: AxisState) -> Iterator[str]:
-    """What a person should know of an axis, a line each."""
+    """Yields the warnings about an axis, one line each."""
     if state.fault is not None:
         yield f"axis '{state.name}' stopped: {state.fault}"
     if state.adaptation.frozen is not None:
@@ -171,17 +175,17 @@ def concerns(state: AxisState) -> Iterator[str]:
 
 
 def document(kind: str, message: Any) -> dict[str, Any]:
-    """A message of the daemon as a result for machines."""
+    """Returns a message of the daemon as a JSON result."""
     return {"schema": f"hdbridge.{kind}/1", **message.model_dump(mode="json")}
 
 
 def figure(value: float | None, digits: int) -> str:
-    """A number in a table; a dash where there is none."""
+    """Formats a number in a table; a dash if there is none."""
     return "-" if value is None else f"{value:z.{digits}f}"
 
 
 def axes_table(axes: list[AxisState]) -> Table:
-    """One row per axis."""
+    """Returns a table with one row per axis."""
     table = Table("axis", "state")
     for name in ("target, deg", "load encoder, deg", "error, arcsec", "correction, arcsec"):
         table.add_column(name, justify="right")

@@ -1,4 +1,4 @@
-"""What looks at a machine, and moves nothing."""
+"""Commands that look at a machine and move nothing."""
 
 from __future__ import annotations
 
@@ -35,10 +35,10 @@ def status(at: AtOption = None, json_file: JsonOption = None) -> None:
 def watch(
     at: AtOption = None,
     every_s: Annotated[
-        float, typer.Option("--every", min=0.05, max=3600.0, help="Seconds between two looks.")
+        float, typer.Option("--every", min=0.05, max=3600.0, help="Seconds between two updates.")
     ] = 0.25,
     count: Annotated[
-        int | None, typer.Option("--count", min=1, help="Look so many times; else until Ctrl-C.")
+        int | None, typer.Option("--count", min=1, help="Number of updates; else until Ctrl-C.")
     ] = None,
     lines: Annotated[
         bool, typer.Option("--lines", help="A JSON object per line on standard output, in place of a table.")
@@ -82,7 +82,7 @@ def events(
 
 
 def lease(at: AtOption = None, force: TakeOption = False, json_file: JsonOption = None) -> None:
-    """Tell who has the right to move; with --force take it from whoever has it, and give it back."""
+    """Report who has the right to move; with --force take it from its holder, and release it."""
     with connected(at) as client:
         if force:
             with client.lease(force=True):
@@ -100,7 +100,7 @@ def mark(text: Annotated[str, typer.Argument(metavar="TEXT", help="One line.")],
 
 
 def _looks(count: int | None, every_s: float) -> Iterator[int]:
-    """So many, each after the time between two."""
+    """Yields ``count`` numbers, with a pause between two."""
     for number in itertools.count() if count is None else range(count):
         if number:
             time.sleep(every_s)

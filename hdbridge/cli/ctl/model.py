@@ -1,4 +1,4 @@
-"""Which model compensates the axes of a daemon, by which part, and how it follows the load encoder."""
+"""Commands for compensation, models and adaptation of a daemon's axes."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def compensate(
     force: TakeOption = False,
     json_file: JsonOption = None,
 ) -> None:
-    """Compensate by a part of the model from now on: none, synchronous, hysteresis, both or extended.
+    """Select the part of the model that compensates: none, synchronous, hysteresis, both or extended.
 
     The change is ramped, also in motion.
     """
@@ -75,6 +75,6 @@ def load_loop(
     force: TakeOption = False,
     json_file: JsonOption = None,
 ) -> None:
-    """Switch the slow integral of the error at the load on or off, where the machine file has one."""
+    """Switch the slow integral of the load error on or off, if the machine file has one."""
     with moving(at, axis, force=force) as moved:
         tell(moved.load_loop(on), json_file)

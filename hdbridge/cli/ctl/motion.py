@@ -1,4 +1,4 @@
-"""Power and motion of the axes of a daemon. What moves takes the right to move for as long as it runs."""
+"""Power and motion of a daemon's axes. A command that moves holds the lease while it runs."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ AccelerationOption = Annotated[
 def enable(
     axis: OneAxisArgument = None, at: AtOption = None, force: TakeOption = False, json_file: JsonOption = None
 ) -> None:
-    """Switch power on, standing still; the drive is booted and verified first where it is not."""
+    """Switch power on at standstill; boots and verifies the drive first if necessary."""
     with moving(at, axis, force=force) as moved:
         tell(moved.enable(), json_file)
 
@@ -41,7 +41,7 @@ def enable(
 def disable(
     axis: OneAxisArgument = None, at: AtOption = None, force: TakeOption = False, json_file: JsonOption = None
 ) -> None:
-    """Brake to rest, then switch power off. What hangs on the axis needs a brake."""
+    """Brake to rest, then switch power off. A suspended load needs a brake."""
     with moving(at, axis, force=force) as moved:
         tell(moved.disable(), json_file)
 
@@ -113,7 +113,7 @@ def move(
         list[float], typer.Argument(metavar="ANGLE...", help="Load angles in degrees, one after the other.")
     ],
     relative: Annotated[
-        bool, typer.Option("--relative", help="Each angle counts from the target before it.")
+        bool, typer.Option("--relative", help="Each angle is relative to the previous target.")
     ] = False,
     velocity_deg_s: VelocityOption = None,
     acceleration_deg_s2: AccelerationOption = None,
@@ -157,7 +157,7 @@ def jog(
     force: TakeOption = False,
     json_file: JsonOption = None,
 ) -> None:
-    """Turn an axis at a speed for a time, then brake to rest. It stops, too, when this command is killed."""
+    """Turn an axis at a speed for a time, then brake to rest. It also stops if this command is killed."""
     with moving(at, axis, force=force) as moved:
         note_clamped(moved.state().limits, velocity_deg_s=velocity_deg_s)
         moved.jog(velocity_deg_s, duration_s)

@@ -1,4 +1,4 @@
-"""Procedures that run through a daemon while it holds the bus, and objects of its drives."""
+"""Procedures that run in a daemon while it holds the bus, and objects of its drives."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def job(
         ),
     ] = None,
     wait: Annotated[
-        bool, typer.Option("--wait/--no-wait", help="Wait until it is done; else tell its name at once.")
+        bool, typer.Option("--wait/--no-wait", help="Wait until it is done; else print its name at once.")
     ] = True,
     at: AtOption = None,
     force: TakeOption = False,
@@ -121,7 +121,7 @@ def _followed(client: Client, begun: Job) -> Job:
 
 
 def _option(text: str) -> tuple[str, Any]:
-    """``count=60``: a number, true, false or a list as in JSON, else text."""
+    """Parses ``count=60``: a number, true, false or a list as in JSON, else text."""
     name, equals, value = text.partition("=")
     if not equals or not name:
         raise InputError(f"--set: found {text!r}; expected NAME=VALUE, count=60 for example")
@@ -146,7 +146,7 @@ def _print(found: list[Job]) -> None:
 
 
 def _figures(job: Job) -> Iterator[str]:
-    """What came out, in a line: the whole is in its recording, and in `--json`."""
+    """Yields the key figures, one line each; the full result is in the recording and in `--json`."""
     result = job.result or {}
     schemes = [
         f"{name} {told['pooled']['three_sigma_arcsec']:.2f}"
