@@ -30,21 +30,28 @@ HIGHEST = 0.36
 STOP = 0.46
 """Frequency from which nothing is corrected, as a share of the SYNC rate."""
 MIN_Z_SCORE = 4.0
-"""Amplitude over its standard deviation from which an order says something of the response."""
+"""Amplitude over its standard deviation from which an order shows the response."""
 MIN_DEVIATION = 0.01
 """Smallest deviation of a point, as a share: the response is not exactly linear."""
 MIN_APPLIED = 0.05
 """Gain of a filter below which its trial says nothing."""
-MAX_UNCERTAINTY = 0.35
-"""95 % half width, as a share of the gain, above which a frequency counts as unknown."""
-BIN_HZ = 1.5
+MAX_UNCERTAINTY = 0.5
+"""95 % half width, as a share of the gain, above which a frequency counts as unknown: the correction might
+leave more than half of the order."""
+BIN_HZ = 0.5
 """Points that are closer are merged, or closer than `BIN_SHARE` of their frequency."""
-BIN_SHARE = 0.03
+BIN_SHARE = 0.01
 MAX_GAP = 0.12
 """Largest gap between two points of a known range, as a share of the SYNC rate."""
 LEAD_CYCLES = 8
 LAG_CYCLES = 16
 """Reach of the filter into the past, in addition to the following lag."""
+POLES = 2
+"""Poles of the filter. A resonance of the axis, or a notch of its servo, rings longer than any short filter."""
+LONGEST_S = 0.4
+"""Longest time constant of a pole."""
+REFINEMENTS = 5
+"""Steps in which the poles are found (Sanathanan and Koerner, 1963)."""
 FADE = 0.12
 """Width over which the filter falls to zero beyond the last point, as a share of the SYNC rate."""
 UNKNOWN = 0.5
@@ -150,10 +157,15 @@ def following_lag_s(runs: Iterable[Harmonics]) -> float:
 
 class _Found(NamedTuple):
     frequency_hz: float
-    wanted: complex
-    """Filter that leaves nothing, without the following lag."""
+    response: complex
+    """Load per correction and transmission error, without the following lag."""
     deviation: float
-    """Standard deviation over size."""
+    """Standard deviation of the response."""
+
+    @property
+    def uncertainty(self) -> float:
+        """Half width of the 95 % interval, as a share of the gain."""
+        return 2.0 * self.deviation / abs(self.response)
 
 
 def response_of(
@@ -165,10 +177,12 @@ def response_of(
     limits: Limits,
     *,
     highest_hz: float = math.inf,
+    explore: bool = False,
 ) -> Response | None:
     """Response and filter from runs without and with correction; None if no frequency is known.
 
-    Nothing beyond ``highest_hz`` is corrected in full.
+    Nothing beyond ``highest_hz`` is corrected in full. With ``explore`` the filter continues beyond the known
+    range with its last gain: a run with it shows the response there.
     """
     lag_s = following_lag_s(none)
     points = _merged(_found(none, trials, orders, ratio, cycle_s, lag_s))
@@ -176,17 +190,17 @@ def response_of(
     kept = _known(points, highest_hz, MAX_GAP / cycle_s, limits)
     if not kept:
         return None
-    known_hz = kept[-1].frequency_hz
+    known_hz = min(kept[-1].frequency_hz, highest_hz)
     fastest = float(order_hz(max(orders), max(abs(each.speed_deg_s) for each in none), ratio))
     return Response(
         cycle_ms=1000.0 * cycle_s,
         following_lag_ms=round(1000.0 * lag_s, 3),
         known_to_hz=round(known_hz, 2),
         frequency_hz=tuple(round(each.frequency_hz, 3) for each in points),
-        gain=tuple(float(f"{1.0 / abs(each.wanted):.5g}") for each in points),
-        phase_deg=tuple(round(-math.degrees(np.angle(each.wanted)), 2) for each in points),
-        uncertainty=tuple(float(f"{2.0 * each.deviation:.3g}") for each in points),
-        filter=_filter(kept, lag_s, cycle_s, fastest, limits),
+        gain=tuple(float(f"{abs(each.response):.5g}") for each in points),
+        phase_deg=tuple(round(math.degrees(np.angle(each.response)), 2) for each in points),
+        uncertainty=tuple(float(f"{each.uncertainty:.3g}") for each in points),
+        filter=_filter(kept, highest_hz if explore else known_hz, lag_s, cycle_s, fastest, limits),
     )
 
 
@@ -198,7 +212,7 @@ def _found(
     cycle_s: float,
     lag_s: float,
 ) -> list[_Found]:
-    """The filter that is wanted, at each order and speed that shows it."""
+    """Response per order and speed, from every trial that shows it."""
     found: list[_Found] = []
     for trial in trials:
         for before, after in zip(none, trial.runs, strict=True):
@@ -207,14 +221,16 @@ def _found(
             error, effect = before.amplitudes, before.amplitudes - after.amplitudes
             if before.speed_deg_s < 0.0:  # the angle runs against the time
                 error, effect = error.conj(), effect.conj()
-            spread = np.hypot(before.deviations, after.deviations)
-            clear = abs(effect) > MIN_Z_SCORE * spread
-            clear &= abs(error) > MIN_Z_SCORE * before.deviations
+            clear = abs(error) > MIN_Z_SCORE * before.deviations
             clear &= (hertz < STOP / cycle_s) & (abs(applied) > MIN_APPLIED)
-            wanted = (applied * error / effect * np.exp(2j * math.pi * hertz * lag_s))[clear]
-            deviation = np.hypot(spread / abs(effect), before.deviations / abs(error))[clear]
-            rows = zip(hertz[clear].tolist(), wanted.tolist(), deviation.tolist(), strict=True)
-            found += [_Found(at, value, max(relative, MIN_DEVIATION)) for at, value, relative in rows]
+            with np.errstate(divide="ignore", invalid="ignore"):
+                answer = effect / (applied * error) * np.exp(-2j * math.pi * hertz * lag_s)
+                share = np.hypot(before.deviations, after.deviations) / abs(applied * error)
+                deviation = np.hypot(share, abs(answer) * before.deviations / abs(error))
+            rows = zip(
+                hertz[clear].tolist(), answer[clear].tolist(), deviation[clear].tolist(), strict=True
+            )
+            found += [_Found(at, value, max(each, MIN_DEVIATION * abs(value))) for at, value, each in rows]
     return sorted(found, key=lambda each: each.frequency_hz)
 
 
@@ -230,24 +246,24 @@ def _merged(found: Sequence[_Found]) -> list[_Found]:
 
 
 def _mean(group: Sequence[_Found]) -> _Found:
-    values = np.array([each.wanted for each in group])
+    values = np.array([each.response for each in group])
     hertz = np.array([each.frequency_hz for each in group])
-    weight = (np.array([each.deviation for each in group]) * abs(values)) ** -2.0
+    weight = np.array([each.deviation for each in group]) ** -2.0
     total = float(weight.sum())
     mean = complex(weight @ values) / total
     scatter = float(weight @ abs(values - mean) ** 2) / total / max(len(group) - 1, 1)
-    return _Found(float(weight @ hertz) / total, mean, math.sqrt(max(1.0 / total, scatter)) / abs(mean))
+    return _Found(float(weight @ hertz) / total, mean, math.sqrt(max(1.0 / total, scatter)))
 
 
 def _known(points: Sequence[_Found], highest_hz: float, max_gap_hz: float, limits: Limits) -> list[_Found]:
-    """The points from zero up to the first gap, doubt or limit."""
+    """The points from zero up to the first gap, doubt or limit; the last one may lie above ``highest_hz``."""
     kept: list[_Found] = []
     before_hz = 0.0
     for each in points:
-        hertz, size = each.frequency_hz, abs(each.wanted)
-        if hertz > highest_hz or hertz - before_hz > max_gap_hz:
+        hertz, size = each.frequency_hz, 1.0 / abs(each.response)
+        if before_hz > highest_hz or hertz - before_hz > max_gap_hz:
             break
-        if 2.0 * each.deviation > MAX_UNCERTAINTY:
+        if each.uncertainty > MAX_UNCERTAINTY:
             continue
         if size > limits.largest_gain or size * hertz > limits.largest_gain_hz:
             break
@@ -278,53 +294,87 @@ def _at(response: Response, hertz: FloatArray) -> tuple[ComplexArray, FloatArray
 
 def gain(lead: LeadFilter, frequency_hz: FloatArray, cycle_s: float) -> ComplexArray:
     """Complex gain of a filter, shape of ``frequency_hz``."""
+    hertz = np.asarray(frequency_hz, dtype=float)
     ahead_s = (lead.lead_cycles - np.arange(len(lead.weights)) / lead.per_cycle) * cycle_s
-    turned: ComplexArray = np.exp(2j * math.pi * np.multiply.outer(frequency_hz, ahead_s))
-    total: ComplexArray = turned @ np.array(lead.weights)
-    return total
+    total: ComplexArray = _turned(hertz, ahead_s) @ np.array(lead.weights)
+    return total / _denominator(hertz, np.array(lead.feedback), cycle_s)
+
+
+def _turned(hertz: FloatArray, ahead_s: FloatArray) -> ComplexArray:
+    turned: ComplexArray = np.exp(2j * math.pi * np.multiply.outer(hertz, ahead_s))
+    return turned
+
+
+def _denominator(hertz: FloatArray, feedback: FloatArray, cycle_s: float) -> ComplexArray:
+    late: ComplexArray = _turned(hertz, -cycle_s * np.arange(1, len(feedback) + 1)) @ feedback
+    return 1.0 + late
 
 
 def _filter(
-    kept: Sequence[_Found], lag_s: float, cycle_s: float, fastest_hz: float, limits: Limits
+    kept: Sequence[_Found], edge_hz: float, lag_s: float, cycle_s: float, fastest_hz: float, limits: Limits
 ) -> LeadFilter:
-    """Least squares on the relative error: what the wanted filter makes 1 up to the last point, 0 beyond."""
-    known = np.array([0.0, *(each.frequency_hz for each in kept)])
-    size = np.log([1.0, *(abs(each.wanted) for each in kept)])
-    phase = np.unwrap([0.0, *(float(np.angle(each.wanted)) for each in kept)])
-    trust = np.array([kept[0].deviation, *(each.deviation for each in kept)])
-    per_cycle = min(max(2, math.ceil((fastest_hz + known[-1]) * cycle_s)), 4)
+    """Least squares on the relative error: what the inverse response makes 1 up to ``edge_hz``, 0 beyond.
+
+    Between the points the inverse response without its poles is interpolated: it has no peak that is
+    narrower than their distance.
+    """
+    per_cycle = min(max(2, math.ceil((fastest_hz + edge_hz) * cycle_s)), 4)
     lag_cycles = math.ceil(max(0.0, lag_s) / cycle_s) + LAG_CYCLES
     count = (LEAD_CYCLES + lag_cycles) * per_cycle + 1
     ahead_s = (LEAD_CYCLES - np.arange(count) / per_cycle) * cycle_s
-    hertz = np.linspace(0.0, known[-1], 160)
-    wanted = np.exp(
-        np.interp(hertz, known, size) + 1j * (np.interp(hertz, known, phase) - 2.0 * math.pi * lag_s * hertz)
-    )
-    weight = 1.0 / (1.0 + 3.0 * np.interp(hertz, known, trust))
-    inside = weight[:, None] * np.exp(2j * math.pi * np.outer(hertz, ahead_s)) / wanted[:, None]
-    # Beyond the last point the axis is not known: the filter falls to zero, steeply and then for good.
-    edge, half = float(known[-1]), 0.5 * per_cycle / cycle_s
-    beyond = np.linspace(edge, half, 200)[1:]
-    fade = np.clip((beyond - edge) / (FADE / cycle_s), 0.0, 1.0)
-    last = float(abs(wanted[-1]))
-    dread = (0.05 + 0.95 * fade**2) * np.maximum(1.0 / last, np.minimum(fade, UNKNOWN))
-    outside = dread[:, None] * np.exp(2j * math.pi * np.outer(beyond, ahead_s))
-    rows = np.vstack(
-        [
-            inside.real,
-            inside.imag,
-            outside.real,
-            outside.imag,
-            REGULARISATION * np.eye(count),
-            1e3 * np.ones(count),
-        ]
-    )
-    goal = np.concatenate([weight, np.zeros(len(hertz) + 2 * len(beyond) + count), [SUM_WEIGHT]])
-    weights = np.linalg.lstsq(rows, goal, rcond=None)[0]
-    weights /= weights.sum()
+    points_hz = np.array([each.frequency_hz for each in kept])
+    inverse = 1.0 / np.array([each.response for each in kept])
+    trust = np.array([each.uncertainty / 2.0 for each in kept])
+    hertz, beyond = np.linspace(0.0, edge_hz, 160), np.linspace(edge_hz, 0.5 * per_cycle / cycle_s, 200)[1:]
+    weight = 1.0 / (1.0 + 3.0 * np.interp(hertz, points_hz, trust))
+    # Beyond the edge the axis is not known: the filter falls to zero, steeply and then for good.
+    fade = np.clip((beyond - edge_hz) / (FADE / cycle_s), 0.0, 1.0)
+    inside, outside = _turned(hertz, ahead_s), _turned(beyond, ahead_s)
+    late = _turned(hertz, -cycle_s * np.arange(1, POLES + 1))
+    feedback = np.zeros(POLES)
+    for refined in range(REFINEMENTS + 1):
+        flat = inverse * _denominator(points_hz, feedback, cycle_s)
+        known, rest = np.array([0.0, *points_hz]), 1.0 + float(feedback.sum())
+        size = np.log([rest, *abs(flat)])
+        phase = np.interp(hertz, known, np.unwrap([0.0, *np.angle(flat)])) - 2.0 * math.pi * lag_s * hertz
+        below = _denominator(hertz, feedback, cycle_s)
+        wanted = np.exp(np.interp(hertz, known, size) + 1j * phase) / below
+        dread = (0.05 + 0.95 * fade**2) * np.maximum(1.0 / abs(wanted[-1]), np.minimum(fade, UNKNOWN))
+        within = (weight / wanted / below)[:, None] * inside
+        without = (dread / _denominator(beyond, feedback, cycle_s))[:, None] * outside
+        if refined == REFINEMENTS:
+            break
+        goal = weight / below
+        within = np.hstack([within, -goal[:, None] * late])
+        without = np.hstack([without, np.zeros((len(beyond), POLES))])
+        feedback = _stable(_least_squares(within, without, goal)[count:], cycle_s)
+    constant = SUM_WEIGHT / rest * np.ones((1, count))
+    weights = _least_squares(np.vstack([within, constant]), without, np.append(weight, SUM_WEIGHT))
+    weights *= rest / weights.sum()
     return LeadFilter(
         lead_cycles=LEAD_CYCLES,
         per_cycle=per_cycle,
-        full_speed_deg_s=limits.full_speed_deg_s(float(np.exp(size).max())),
+        full_speed_deg_s=limits.full_speed_deg_s(max(1.0, float(abs(wanted).max()))),
         weights=tuple(float(f"{each:.9g}") for each in weights),
+        feedback=tuple(float(f"{each:.9g}") for each in feedback),
     )
+
+
+def _least_squares(within: ComplexArray, without: ComplexArray, goal: ComplexArray) -> FloatArray:
+    """Real coefficients with which ``within`` is ``goal`` and ``without`` is zero; both have a row per
+    frequency.
+    """
+    count = within.shape[1]
+    rows = np.vstack([within.real, within.imag, without.real, without.imag, REGULARISATION * np.eye(count)])
+    wanted = np.concatenate([goal.real, goal.imag, np.zeros(2 * len(without) + count)])
+    solution: FloatArray = np.linalg.lstsq(rows, wanted, rcond=None)[0]
+    return solution
+
+
+def _stable(feedback: FloatArray, cycle_s: float) -> FloatArray:
+    """The feedback with every pole inside the circle of `LONGEST_S`; poles outside are mirrored."""
+    poles = np.roots(np.array([1.0, *feedback]))
+    size = np.abs(poles)
+    inside = np.minimum(np.minimum(size, 1.0 / np.maximum(size, 1e-9)), math.exp(-cycle_s / LONGEST_S))
+    stable: FloatArray = np.real(np.poly(poles / np.maximum(size, 1e-9) * inside))[1:]
+    return stable

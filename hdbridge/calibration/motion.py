@@ -42,8 +42,10 @@ RETUNED = (
     "the servo does not answer as it did when the response was measured (following lag {:.1f} ms then, "
     "{:.1f} ms now): it was retuned, or the load changed; measure the response again"
 )
-TRIALS = 2
-"""Filters that are tried; the second one also learns from the first."""
+TRIALS = 3
+"""Filters that are tried. The first one explores: it corrects what is not known as well. Each one uses the
+runs of those before it.
+"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -200,15 +202,24 @@ def motion_test(
         return _tested(runner, model, none, static, limits)
     trials = [Trial(static)]
     highest, best = math.inf, MotionTest(_ripples(runner, none, static), None)
-    for _ in range(TRIALS):
+    for explore in (True, *[False] * (TRIALS - 1)):
         response = response_of(
-            none, trials, runner.orders, model.ratio, axis.drive.cycle_s, limits, highest_hz=highest
+            none,
+            trials,
+            runner.orders,
+            model.ratio,
+            axis.drive.cycle_s,
+            limits,
+            highest_hz=highest,
+            explore=explore,
         )
         if response is None:
             break
         filtered = runner.run("filtered correction", replace(model, response=response))
         found = MotionTest(_ripples(runner, none, static, filtered, response), response)
-        if found.harms_at:
+        if explore:
+            pass
+        elif found.harms_at:
             # The cause is not known, but it lies within the range of the filter.
             highest = 0.7 * response.known_to_hz
         elif best.response is None or found.remaining < best.remaining:

@@ -21,10 +21,15 @@ from hdbridge.model.response import LeadFilter
 class Prefilter:
     """Filters a correction; one call per cycle."""
 
-    __slots__ = ("_full_step", "_last", "_predicted", "_reaches", "_step", "_weights")
+    __slots__ = (
+        "_before", "_feedback", "_full_step", "_last", "_output", "_predicted", "_reaches", "_step", "_weights",
+    )  # fmt: skip
 
     def __init__(self, lead: LeadFilter, period_s: float) -> None:
         self._weights = lead.weights
+        self._feedback = (*lead.feedback, 0.0, 0.0)[:2]
+        self._output = self._before = 0.0
+        """Outputs of the last two cycles, arcsec."""
         self._predicted = deque(repeat(0.0, len(lead.weights)), len(lead.weights))
         """Predicted corrections, arcsec, the furthest ahead first."""
         first, per_cycle = lead.lead_cycles, lead.per_cycle
@@ -38,6 +43,7 @@ class Prefilter:
     def reset(self, correction_arcsec: float) -> None:
         """Start at rest with this correction."""
         self._predicted.extend(repeat(correction_arcsec, len(self._weights)))
+        self._output = self._before = correction_arcsec
         self._last = None
         self._step = 0.0
 
@@ -47,6 +53,7 @@ class Prefilter:
         if other is not None and (other._reaches, len(other._weights)) == (self._reaches, len(self._weights)):
             self._predicted = other._predicted.copy()
             self._last, self._step = other._last, other._step
+            self._output, self._before = other._output, other._before
 
     def follow(
         self,
@@ -66,6 +73,7 @@ class Prefilter:
         predicted = self._predicted
         if step == 0.0 and change == 0.0:
             predicted.extendleft(repeat(correction_arcsec, len(self._reaches)))
+            self._output, self._before = correction_arcsec, self._output
             return correction_arcsec
         then = moment
         grown = moment.motor_speed_deg_s * change / step if step else 0.0
@@ -76,5 +84,7 @@ class Prefilter:
                     motor_speed_deg_s=moment.motor_speed_deg_s + by_step * grown, load_deg=ahead_deg
                 )
             predicted.appendleft(predict(ahead_deg, then))
-        added: float = sum(map(mul, self._weights, predicted)) - correction_arcsec
-        return correction_arcsec + min((step / self._full_step) ** 2, 1.0) * added
+        first, second = self._feedback
+        output = sum(map(mul, self._weights, predicted)) - first * self._output - second * self._before
+        self._output, self._before = output, self._output
+        return correction_arcsec + min((step / self._full_step) ** 2, 1.0) * (output - correction_arcsec)

@@ -15,11 +15,12 @@ from hdbridge.strictness import Strict
 
 
 class LeadFilter(Strict):
-    """Weights of the correction along the path, from the near future to the past.
+    """Weights of the correction along the path, from the near future to the past, and of earlier outputs.
 
     Near standstill the filter fades out, because the rest of the move in it would make the motor turn back.
-    Weight j applies to the correction of the load target ``lead_cycles - j / per_cycle`` cycles ahead. The
-    weights sum to 1, so that nothing changes at rest.
+    Weight j applies to the correction of the load target ``lead_cycles - j / per_cycle`` cycles ahead. Feedback
+    i is subtracted times the filter's output of i cycles before. The weights sum to 1 plus the feedback, so
+    that nothing changes at rest.
     """
 
     lead_cycles: int = Field(ge=0, le=50, description="how far ahead the first weight lies, in cycles")
@@ -27,12 +28,21 @@ class LeadFilter(Strict):
     full_speed_deg_s: float = Field(
         gt=0, description="load speed from which the filter works in full; it fades out with its square"
     )
-    weights: tuple[float, ...] = Field(min_length=1, max_length=1000, description="the weights, sum 1")
+    weights: tuple[float, ...] = Field(
+        min_length=1, max_length=1000, description="the weights; their sum is 1 plus the sum of feedback"
+    )
+    feedback: tuple[float, ...] = Field(
+        default=(), max_length=2, description="weights of the outputs of the last cycles, subtracted"
+    )
 
     @model_validator(mode="after")
     def _check(self) -> LeadFilter:
-        if not math.isclose(math.fsum(self.weights), 1.0, abs_tol=1e-6):
-            raise ValueError(f"the weights sum to {math.fsum(self.weights):.6g}; expected 1")
+        first, second = (*self.feedback, 0.0, 0.0)[:2]
+        if not abs(first) < 1.0 + second < 2.0:
+            raise ValueError(f"feedback {list(self.feedback)} is not stable: measure the response again")
+        found, wanted = math.fsum(self.weights), 1.0 + math.fsum(self.feedback)
+        if not math.isclose(found, wanted, abs_tol=1e-6):
+            raise ValueError(f"the weights sum to {found:.6g}; expected {wanted:.6g}")
         if (len(self.weights) - 1) % self.per_cycle:
             raise ValueError(
                 f"{len(self.weights)} weights at {self.per_cycle} per cycle; "

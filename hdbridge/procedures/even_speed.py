@@ -14,7 +14,7 @@ SHARES = (0.95, 0.8, 0.64, 0.5, 0.38, 0.28, 0.18, 0.08)
 WINDOW_S = 1.0
 TURNS = 3.0
 """Minimum motor turns of a run."""
-TRANSIENT_S = 0.3
+TRANSIENT_S = 0.6
 """Time at constant speed before the measurement starts."""
 KIND = "even speed"
 
