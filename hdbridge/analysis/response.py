@@ -48,8 +48,6 @@ LAG_CYCLES = 16
 """Reach of the filter into the past, in addition to the following lag."""
 POLES = 2
 """Poles of the filter. A resonance of the axis, or a notch of its servo, rings longer than any short filter."""
-LONGEST_S = 0.4
-"""Longest time constant of a pole."""
 REFINEMENTS = 5
 """Steps in which the poles are found (Sanathanan and Koerner, 1963)."""
 FADE = 0.12
@@ -66,30 +64,30 @@ SUM_WEIGHT = 1e3
 
 
 class Limits(NamedTuple):
-    """Limits of the axis on a correction, and the largest order that is corrected."""
+    """Limits of the axis on a correction, and the orders that are corrected."""
 
-    amplitude_arcsec: float
+    orders: tuple[tuple[float, float], ...]
+    """Highest frequency, at the speed limit, and amplitude in arcsec of each order."""
     maximum_arcsec: float
     slew_arcsec_s: float
     acceleration_deg_s2: float
 
-    @property
-    def largest_gain(self) -> float:
-        """Gain at which the largest order takes half of the permitted size."""
-        return 0.5 * self.maximum_arcsec / self.amplitude_arcsec
+    def amplitude_arcsec(self, frequency_hz: float) -> float:
+        """Amplitude of the largest order that reaches this frequency."""
+        return max((each for top_hz, each in self.orders if top_hz >= frequency_hz), default=0.0)
 
-    @property
-    def largest_gain_hz(self) -> float:
-        """Gain times frequency at which the largest order takes half of the permitted slew."""
-        return 0.5 * self.slew_arcsec_s / (math.tau * self.amplitude_arcsec)
+    def excess(self, gain: float, frequency_hz: float) -> float:
+        """Factor by which the largest order takes more than half of the permitted size or slew; 1 if not."""
+        reach_arcsec = gain * self.amplitude_arcsec(frequency_hz)
+        slew_arcsec_s = math.tau * frequency_hz * reach_arcsec
+        return max(1.0, 2.0 * reach_arcsec / self.maximum_arcsec, 2.0 * slew_arcsec_s / self.slew_arcsec_s)
 
-    def full_speed_deg_s(self, gain: float) -> float:
-        """Speed from which a filter of this gain works in full.
+    def full_speed_deg_s(self, reach_arcsec: float) -> float:
+        """Speed from which a filter works in full that makes a correction this large.
 
         While it fades out in the slowest part of a stop, it takes `FADE_SHARE` of the load's speed at most.
         """
-        reach_deg = gain * self.amplitude_arcsec / ARCSEC_PER_DEG
-        return math.sqrt(2.0 * self.acceleration_deg_s2 * reach_deg / FADE_SHARE)
+        return math.sqrt(2.0 * self.acceleration_deg_s2 * reach_arcsec / ARCSEC_PER_DEG / FADE_SHARE)
 
 
 class Harmonics(NamedTuple):
@@ -256,18 +254,19 @@ def _mean(group: Sequence[_Found]) -> _Found:
 
 
 def _known(points: Sequence[_Found], highest_hz: float, max_gap_hz: float, limits: Limits) -> list[_Found]:
-    """The points from zero up to the first gap, doubt or limit; the last one may lie above ``highest_hz``."""
+    """The points from zero up to the first gap or doubt; the last one may lie above ``highest_hz``.
+
+    A response is raised if its inverse would exceed the limits: such an order is corrected in part.
+    """
     kept: list[_Found] = []
     before_hz = 0.0
     for each in points:
-        hertz, size = each.frequency_hz, 1.0 / abs(each.response)
+        hertz = each.frequency_hz
         if before_hz > highest_hz or hertz - before_hz > max_gap_hz:
             break
         if each.uncertainty > MAX_UNCERTAINTY:
             continue
-        if size > limits.largest_gain or size * hertz > limits.largest_gain_hz:
-            break
-        kept.append(each)
+        kept.append(each._replace(response=each.response * limits.excess(1.0 / abs(each.response), hertz)))
         before_hz = hertz
     return kept
 
@@ -300,7 +299,7 @@ def gain(lead: LeadFilter, frequency_hz: FloatArray, cycle_s: float) -> ComplexA
     return total / _denominator(hertz, np.array(lead.feedback), cycle_s)
 
 
-def _turned(hertz: FloatArray, ahead_s: FloatArray) -> ComplexArray:
+def _turned(hertz: FloatArray, ahead_s: NDArray[np.floating]) -> ComplexArray:
     turned: ComplexArray = np.exp(2j * math.pi * np.multiply.outer(hertz, ahead_s))
     return turned
 
@@ -327,18 +326,20 @@ def _filter(
     trust = np.array([each.uncertainty / 2.0 for each in kept])
     hertz, beyond = np.linspace(0.0, edge_hz, 160), np.linspace(edge_hz, 0.5 * per_cycle / cycle_s, 200)[1:]
     weight = 1.0 / (1.0 + 3.0 * np.interp(hertz, points_hz, trust))
+    known = np.array([0.0, *points_hz])
     # Beyond the edge the axis is not known: the filter falls to zero, steeply and then for good.
     fade = np.clip((beyond - edge_hz) / (FADE / cycle_s), 0.0, 1.0)
     inside, outside = _turned(hertz, ahead_s), _turned(beyond, ahead_s)
     late = _turned(hertz, -cycle_s * np.arange(1, POLES + 1))
     feedback = np.zeros(POLES)
     for refined in range(REFINEMENTS + 1):
-        flat = inverse * _denominator(points_hz, feedback, cycle_s)
-        known, rest = np.array([0.0, *points_hz]), 1.0 + float(feedback.sum())
-        size = np.log([rest, *abs(flat)])
+        # The poles are found in plain lines between the points; then they are taken out of the lines.
+        smooth = feedback if refined == REFINEMENTS else np.zeros(POLES)
+        flat, rest = inverse * _denominator(points_hz, smooth, cycle_s), 1.0 + float(smooth.sum())
+        size = np.interp(hertz, known, np.log([rest, *abs(flat)]))
         phase = np.interp(hertz, known, np.unwrap([0.0, *np.angle(flat)])) - 2.0 * math.pi * lag_s * hertz
+        wanted = np.exp(size + 1j * phase) / _denominator(hertz, smooth, cycle_s)
         below = _denominator(hertz, feedback, cycle_s)
-        wanted = np.exp(np.interp(hertz, known, size) + 1j * phase) / below
         dread = (0.05 + 0.95 * fade**2) * np.maximum(1.0 / abs(wanted[-1]), np.minimum(fade, UNKNOWN))
         within = (weight / wanted / below)[:, None] * inside
         without = (dread / _denominator(beyond, feedback, cycle_s))[:, None] * outside
@@ -347,14 +348,19 @@ def _filter(
         goal = weight / below
         within = np.hstack([within, -goal[:, None] * late])
         without = np.hstack([without, np.zeros((len(beyond), POLES))])
-        feedback = _stable(_least_squares(within, without, goal)[count:], cycle_s)
+        feedback = _stable(_least_squares(within, without, goal)[count:], points_hz, cycle_s)
     constant = SUM_WEIGHT / rest * np.ones((1, count))
     weights = _least_squares(np.vstack([within, constant]), without, np.append(weight, SUM_WEIGHT))
     weights *= rest / weights.sum()
     return LeadFilter(
         lead_cycles=LEAD_CYCLES,
         per_cycle=per_cycle,
-        full_speed_deg_s=limits.full_speed_deg_s(max(1.0, float(abs(wanted).max()))),
+        full_speed_deg_s=limits.full_speed_deg_s(
+            max(
+                each * limits.amplitude_arcsec(at)
+                for each, at in zip(abs(wanted).tolist(), hertz.tolist(), strict=True)
+            )
+        ),
         weights=tuple(float(f"{each:.9g}") for each in weights),
         feedback=tuple(float(f"{each:.9g}") for each in feedback),
     )
@@ -371,10 +377,15 @@ def _least_squares(within: ComplexArray, without: ComplexArray, goal: ComplexArr
     return solution
 
 
-def _stable(feedback: FloatArray, cycle_s: float) -> FloatArray:
-    """The feedback with every pole inside the circle of `LONGEST_S`; poles outside are mirrored."""
+def _stable(feedback: FloatArray, points_hz: FloatArray, cycle_s: float) -> FloatArray:
+    """The feedback with stable poles whose peaks are no narrower than the distance of the points there.
+
+    A pole outside of the unit circle is mirrored. There is none beyond the last point.
+    """
     poles = np.roots(np.array([1.0, *feedback]))
-    size = np.abs(poles)
-    inside = np.minimum(np.minimum(size, 1.0 / np.maximum(size, 1e-9)), math.exp(-cycle_s / LONGEST_S))
-    stable: FloatArray = np.real(np.poly(poles / np.maximum(size, 1e-9) * inside))[1:]
+    hertz = np.abs(np.angle(poles)) / (2.0 * math.pi * cycle_s)
+    gap_hz = np.diff([0.0, *points_hz, math.inf])[np.searchsorted(points_hz, hertz)]
+    size = np.maximum(np.abs(poles), 1e-9)
+    inside = np.minimum(np.minimum(size, 1.0 / size), np.exp(-math.pi * cycle_s * gap_hz))
+    stable: FloatArray = np.real(np.poly(poles / size * inside))[1:]
     return stable

@@ -192,8 +192,9 @@ def motion_test(
     none = runner.run("without correction", model.only(()))
     static_model = replace(model, response=None)
     static = runner.run("correction of rest", static_model)
+    speed = axis.limits.velocity_deg_s
     limits = Limits(
-        max(runner.amplitudes.values()),
+        tuple((float(order_hz(at, speed, model.ratio)), each) for at, each in runner.amplitudes.items()),
         axis.compensation.maximum_arcsec,
         axis.compensation.slew_arcsec_s,
         axis.limits.acceleration_deg_s2,

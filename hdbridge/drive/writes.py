@@ -19,6 +19,7 @@ from hdbridge.drive.image import position_limits_counts
 from hdbridge.drive.layout import PDOS_PER_KIND, Layout, Layouts
 from hdbridge.drive.objects import PDO_INVALID, Address, IntegerType
 from hdbridge.errors import InputError
+from hdbridge.units import ARCSEC_PER_DEG
 
 if TYPE_CHECKING:
     from canopen.objectdictionary import ObjectDictionary, ODVariable
@@ -337,7 +338,8 @@ def _limits(axis: AxisConfig) -> Iterator[PlannedWrite]:
             "motor count, and 0 in object 6065h means no supervision; raise it"
         )
     alone = "only hdbridge keeps to it"
-    rpm = math.ceil(limits.velocity_deg_s * axis.gear.ratio / 6.0)
+    slew = axis.compensation.slew_arcsec_s
+    rpm = math.ceil((limits.velocity_deg_s + slew / ARCSEC_PER_DEG) * axis.gear.ratio / 6.0)
     ramp = motor_rate(axis, limits.acceleration_deg_s2)
     late = "time after which a following error counts"
     yield _row(
@@ -349,7 +351,9 @@ def _limits(axis: AxisConfig) -> Iterator[PlannedWrite]:
         without=f"upper end of travel; {alone}",
     )  # fmt: skip
     yield _row(
-        axis, objects.MAX_MOTOR_SPEED, rpm, "speed limit in rpm of the motor", "limits.velocity_deg_s",
+        axis, objects.MAX_MOTOR_SPEED, rpm,
+        f"speed limit in rpm of the motor (higher by the compensation's {slew:g} arcsec/s)",
+        "limits.velocity_deg_s",
         without=f"speed limit; {alone}",
     )  # fmt: skip
     yield _row(

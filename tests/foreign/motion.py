@@ -1,22 +1,28 @@
-"""Figures of the compensation in motion: `PYTHONPATH=tests python -m foreign.motion [SEEDS [KIND]...]`.
+"""Figures of the compensation in motion.
 
-Each axis has the exact correction of rest as its model. Its response is measured over the bus as
-`hdbridge motion` does. Then the ripple of the load encoder is measured at fixed speeds. Axes: the foreign
-servo structures, and the simulated drive with a servo, load and spring drawn at random. Per speed: the share
-of the ripple that is removed, per cent, median (worst), static and filtered; the axes on which the filtered
-correction is worse than none; and the same for axes whose large orders (4 and below) are all slower than a
-third of the SYNC rate.
+    PYTHONPATH=tests python -m foreign.motion FILE [--kinds KIND...] [--seeds 0-4] [--exact]
+
+Each axis is calibrated by the plan `quick` with a motion test, and nothing is known beforehand; with
+``--exact`` its model is the exact correction of rest, and only the response is measured. Then the load
+encoder's error is measured at ten speeds up to the limit, both ways, without, with static and with filtered
+correction. Axes: the foreign servo structures, and the simulated drive with a servo, load and spring drawn at
+random. FILE keeps a line of JSON per axis; axes that it has are not measured again. Printed, per speed: the
+share removed, per cent, median (worst), of the orders that are slower than a third of the SYNC rate, static
+and filtered; and on how many axes the whole ripple is larger than without correction.
 """
 
 from __future__ import annotations
 
+import argparse
+import json
 import math
-import sys
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import yaml
@@ -25,17 +31,25 @@ from foreign.draw import draw
 from foreign.servos import STRUCTURES
 
 from hdbridge import Bench, Drive
-from hdbridge.analysis.response import harmonics
+from hdbridge.analysis.response import Harmonics, harmonics, order_hz
 from hdbridge.axis import AxisConfig
-from hdbridge.calibration.motion import motion_test, motor_orders
+from hdbridge.calibration import calibrate, start_journal
+from hdbridge.calibration.motion import motion_test
 from hdbridge.control.bench import compensation_for
 from hdbridge.effects import MotorOrder, Synchronous
 from hdbridge.errors import HdbridgeError
 from hdbridge.model import TransmissionModel
 from hdbridge.procedures.even_speed import EvenSpeed
+from hdbridge.procedures.plan import Plan
 from hdbridge.sim.lockstep import simulated_bench
 
-SPEEDS_DEG_S = (5.0, 38.0, 76.0, 100.0, 120.0)
+SHARES = (0.04, 0.1, 0.2, 0.32, 0.45, 0.58, 0.71, 0.84, 1.0)
+"""Speeds as shares of the limit, in addition to `SLOWEST_DEG_S`. The motion test measures at others."""
+SLOWEST_DEG_S = 1.0
+ORDERS = (1, 2, 3, 4, 6, 8)
+CHANCE = 1.02
+"""Factor by which a ripple must be larger to count as larger."""
+DATE = datetime(2026, 1, 1, tzinfo=UTC)
 PROFILE = Path(__file__).resolve().parents[2] / "profiles" / "article"
 RAISED = {
     "position_min_deg": -4000.0,
@@ -95,60 +109,109 @@ def foreign(seed: int, structure: str, folder: Path) -> Iterator[tuple[Drive, Tr
         yield drive, TransmissionModel(truth.mechanics.ratio, (Synchronous(orders=orders),))
 
 
-def figures(drive: Drive, model: TransmissionModel) -> np.ndarray:
-    """Ripple at each speed without, with static and with filtered correction; NaN if too fast, (n, 3)."""
+def calibrated(drive: Drive, folder: Path) -> TransmissionModel:
+    """The model of a calibration by the plan `quick`, with the response in motion."""
+    plan = Plan.load("quick")
+    validation = plan.validation.model_copy(update={"count": 20, "motion": True})
+    plan = plan.model_copy(update={"validation": validation})
+    journal = start_journal(folder / "recording", drive.axis, plan, DATE, drive.identity)
+    return calibrate(drive, journal, folder, DATE).model
+
+
+def figures(drive: Drive, model: TransmissionModel) -> dict[str, Any]:
+    """Whole ripple and slow orders, rms arcsec, per speed: without, with static, with filtered correction."""
     axis = drive.axis
-    response = motion_test(drive, model).response
-    speeds = tuple(each for each in SPEEDS_DEG_S if each <= 0.95 * axis.limits.velocity_deg_s)
-    orders = tuple(each.order for each in motor_orders(model))
-    table = np.full((len(SPEEDS_DEG_S), 3), np.nan)
-    for column, used in enumerate(
-        (model.only(()), replace(model, response=None), replace(model, response=response))
-    ):
+    limit = axis.limits.velocity_deg_s
+    speeds = (SLOWEST_DEG_S, *(round(share * limit, 3) for share in SHARES))
+    third_hz = 1.0 / (3.0 * axis.drive.cycle_s)
+    ripple: list[list[float]] = []
+    slow: list[list[float]] = []
+    for used in (model.only(()), replace(model, response=None), model):
         bench = Bench(drive, compensation_for(axis, used))
-        runs = [harmonics(each, orders, model.ratio) for each in bench.run(EvenSpeed(speeds, 2.0)).outcome]
-        table[: len(speeds), column] = np.sqrt(
-            np.mean(np.reshape([each.ripple_arcsec**2 for each in runs], (-1, 2)), axis=1)
-        )
-    return table
+        runs = [harmonics(each, ORDERS, model.ratio) for each in bench.run(EvenSpeed(speeds, 2.0)).outcome]
+        ripple.append(_both_ways([each.ripple_arcsec for each in runs]))
+        slow.append(_both_ways([_slow(each, third_hz, model.ratio) for each in runs]))
+    return {
+        "speed_deg_s": speeds,
+        "ripple_arcsec": list(zip(*ripple, strict=True)),
+        "slow_orders_arcsec": list(zip(*slow, strict=True)),
+        "known_to_hz": model.response.known_to_hz if model.response else None,
+        "cycle_ms": axis.drive.cycle_ms,
+    }
 
 
-def main(seeds: int, kinds: list[str]) -> None:
-    for kind in kinds or (*STRUCTURES, "simulated"):
-        tables, slow = [], []
-        for seed in range(seeds):
-            with tempfile.TemporaryDirectory() as name:
-                folder = Path(name)
-                place = simulated(seed, folder) if kind == "simulated" else foreign(seed, kind, folder)
-                try:
-                    with place as (drive, model):
-                        table = figures(drive, model)
-                        limit = 1.0 / (3.0 * drive.axis.drive.cycle_s)
-                except HdbridgeError as problem:
-                    print(f"  {kind} {seed}: {problem}")
-                    continue
-            hertz = 4.0 * np.array(SPEEDS_DEG_S) * model.ratio / 360.0
-            tables.append(table)
-            slow.append(hertz < limit)
-            removed = 100.0 * (1.0 - table[:, 1:] / table[:, :1])
-            line = "  ".join(f"{a:.0f}/{b:.0f}" for a, b in removed if not math.isnan(a))
-            print(f"  {kind} {seed}: static/filtered {line}", flush=True)
-        print(f"{kind}: {len(tables)} axes")
-        every, slower = np.array(tables), np.array(slow)
-        for at, speed in enumerate(SPEEDS_DEG_S):
-            print(f"  {speed:g} deg/s: {_line(every[:, at])}; slow orders: {_line(every[slower[:, at], at])}")
-        sys.stdout.flush()
+def _slow(run: Harmonics, third_hz: float, ratio: float) -> float:
+    """Rms of the orders below a third of the SYNC rate, arcsec."""
+    slow = order_hz(ORDERS, run.speed_deg_s, ratio) < third_hz
+    return math.sqrt(0.5 * float(np.sum(abs(run.amplitudes[slow]) ** 2)))
 
 
-def _line(table: np.ndarray) -> str:
-    table = table[~np.isnan(table[:, 0])]
-    if not len(table):
-        return "none"
-    removed = 100.0 * (1.0 - table[:, 1:] / table[:, :1])
-    cells = [f"{np.median(each):.0f} ({each.min():.0f})" for each in removed.T]
-    worse = int(np.sum(table[:, 2] > 1.02 * table[:, 0]))
-    return f"static {cells[0]}, filtered {cells[1]}, worse than none {worse} of {len(table)}"
+def _both_ways(values: list[float]) -> list[float]:
+    return [math.hypot(*pair) / math.sqrt(2.0) for pair in zip(values[::2], values[1::2], strict=True)]
+
+
+def measure(kind: str, seed: int, exact: bool) -> dict[str, Any]:
+    """The figures of one axis, or the error that it ends with."""
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        try:
+            with simulated(seed, folder) if kind == "simulated" else foreign(seed, kind, folder) as place:
+                drive, model = place
+                if exact:
+                    model = replace(model, response=motion_test(drive, model).response)
+                else:
+                    model = calibrated(drive, folder)
+                return figures(drive, model)
+        except HdbridgeError as problem:
+            return {"error": str(problem)}
+
+
+def main(file: Path, kinds: list[str], seeds: range, exact: bool) -> None:
+    done = [json.loads(line) for line in file.read_text().splitlines()] if file.exists() else []
+    for seed in seeds:
+        for kind in kinds:
+            key = {"kind": kind, "seed": seed, "exact": exact}
+            if not any(key.items() <= each.items() for each in done):
+                done.append(key | measure(kind, seed, exact))
+                with file.open("a") as out:
+                    out.write(json.dumps(done[-1]) + "\n")
+    for kind in kinds:
+        report(kind, [each for each in done if (each["kind"], each["exact"]) == (kind, exact)])
+
+
+def report(kind: str, axes: list[dict[str, Any]]) -> None:
+    """Prints the table of one kind."""
+    for each in axes:
+        if "error" in each:
+            print(f"{kind} {each['seed']}: {each['error']}")
+    axes = [each for each in axes if "error" not in each]
+    if not axes:
+        return
+    print(f"{kind}, {len(axes)} axes: removed of the slow orders, per cent, median (worst)")
+    slow = np.array([each["slow_orders_arcsec"] for each in axes])
+    ripple = np.array([each["ripple_arcsec"] for each in axes])
+    removed = 100.0 * (1.0 - slow[:, :, 1:] / slow[:, :, :1])
+    worse = ripple[:, :, 1:] > CHANCE * ripple[:, :, :1]
+    for at, speed in enumerate(("1 deg/s", *(f"{100.0 * share:g} %" for share in SHARES))):
+        cells = [
+            f"{name} {np.median(removed[:, at, i]):5.1f} ({removed[:, at, i].min():5.1f}), "
+            f"worse than none {worse[:, at, i].sum():2}"
+            for i, name in enumerate(("static", "filtered"))
+        ]
+        print(f"  {speed:>7}: {'; '.join(cells)}")
+    filtered = removed[:, :, 1]
+    print(
+        f"  all speeds: median {np.median(filtered):.1f}, below 88 % {np.mean(filtered < 88.0):.0%} of "
+        f"{filtered.size}, worst {filtered.min():.1f}"
+    )
 
 
 if __name__ == "__main__":
-    main(int(sys.argv[1]) if len(sys.argv) > 1 else 5, sys.argv[2:])
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("file", type=Path)
+    parser.add_argument("--kinds", nargs="+", default=[*STRUCTURES, "simulated"])
+    parser.add_argument("--seeds", default="0-4", help="first and last")
+    parser.add_argument("--exact", action="store_true", help="take the exact correction of rest as the model")
+    given = parser.parse_args()
+    first, last = map(int, given.seeds.split("-"))
+    main(given.file, given.kinds, range(first, last + 1), given.exact)
