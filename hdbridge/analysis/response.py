@@ -47,7 +47,7 @@ LEAD_CYCLES = 8
 LAG_CYCLES = 16
 """Reach of the filter into the past, in addition to the following lag."""
 POLES = 2
-"""Poles of the filter. A resonance of the axis, or a notch of its servo, rings longer than any short filter."""
+"""Poles of the filter. A resonance of the axis or a notch of its servo rings longer than the weights."""
 REFINEMENTS = 5
 """Steps in which the poles are found (Sanathanan and Koerner, 1963)."""
 FADE = 0.12
@@ -225,9 +225,7 @@ def _found(
                 answer = effect / (applied * error) * np.exp(-2j * math.pi * hertz * lag_s)
                 share = np.hypot(before.deviations, after.deviations) / abs(applied * error)
                 deviation = np.hypot(share, abs(answer) * before.deviations / abs(error))
-            rows = zip(
-                hertz[clear].tolist(), answer[clear].tolist(), deviation[clear].tolist(), strict=True
-            )
+            rows = zip(hertz[clear].tolist(), answer[clear].tolist(), deviation[clear].tolist(), strict=True)
             found += [_Found(at, value, max(each, MIN_DEVIATION * abs(value))) for at, value, each in rows]
     return sorted(found, key=lambda each: each.frequency_hz)
 

@@ -1,10 +1,10 @@
-"""The test in motion: ripple of the load over speed, and the response of the axis that is measured by it."""
+"""Motion test: ripple over speed by order, path errors, and the response of the axis measured by it."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -22,6 +22,7 @@ from hdbridge.analysis.response import (
 )
 from hdbridge.axis import AxisConfig
 from hdbridge.calibration.measure import Pace
+from hdbridge.calibration.path import PathError, path_errors
 from hdbridge.control.bench import axis_view, compensation_for
 from hdbridge.control.rig import Rig, bench_on
 from hdbridge.drive.drive import Drive
@@ -30,6 +31,7 @@ from hdbridge.errors import InputError
 from hdbridge.model import TransmissionModel
 from hdbridge.model.response import Response
 from hdbridge.procedures.even_speed import EvenSpeed
+from hdbridge.procedures.path_test import PathRun, PathTest
 from hdbridge.procedures.rehearsal import rehearse
 
 LEAST_ARCSEC = 0.2
@@ -49,6 +51,27 @@ runs of those before it.
 
 
 @dataclass(frozen=True, slots=True)
+class OrderRipple:
+    """Amplitude of one motor order of the load error at one speed, both directions together; arcsec."""
+
+    order: int
+    frequency_hz: float
+    none_arcsec: float
+    static_arcsec: float | None = None
+    filtered_arcsec: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class PathResult:
+    """Error on one path without correction, with that of rest, and with the filtered one."""
+
+    name: str
+    none: PathError
+    static: PathError
+    filtered: PathError | None = None
+
+
+@dataclass(frozen=True, slots=True)
 class Ripple:
     """Rms of the load error about a straight line at one speed, both directions together; arcsec."""
 
@@ -58,6 +81,7 @@ class Ripple:
     filtered_arcsec: float | None = None
     faded: tuple[int, ...] = ()
     """Motor orders that the filter does not correct at this speed, because they are too fast."""
+    orders: tuple[OrderRipple, ...] = ()
 
     @property
     def in_force_arcsec(self) -> float | None:
@@ -88,6 +112,7 @@ class MotionTest:
     response: Response | None
     """Response with the filter of the correction; None if no filter helps."""
     remarks: tuple[str, ...] = ()
+    paths: tuple[PathResult, ...] = ()
 
     @property
     def helps_to_deg_s(self) -> float | None:
@@ -118,6 +143,14 @@ class MotionTest:
         )
 
     @property
+    def harms_paths(self) -> bool:
+        """True if the error on all paths together is larger with the filtered correction than without."""
+        filtered = [each.filtered.path_arcsec for each in self.paths if each.filtered is not None]
+        return bool(filtered) and _rms(filtered) > CHANCE * _rms(
+            [each.none.path_arcsec for each in self.paths]
+        )
+
+    @property
     def remaining(self) -> float:
         """Mean share of the ripple that the filtered correction leaves; 1 without one."""
         shares = [
@@ -140,9 +173,11 @@ class MotionTest:
                     "removed_static_percent": each.removed_static_percent,
                     "removed_percent": each.removed_percent,
                     "faded_orders": list(each.faded),
+                    "orders": [asdict(order) for order in each.orders],
                 }
                 for each in self.ripples
             ],
+            "paths": [asdict(each) for each in self.paths],
             "response": self.response.model_dump(mode="json") if self.response else None,
             "remarks": list(self.remarks),
         }
@@ -157,20 +192,29 @@ class MotionTest:
                 each["static_arcsec"],
                 each["filtered_arcsec"],
                 tuple(each["faded_orders"]),
+                tuple(OrderRipple(**order) for order in each.get("orders", ())),
             )
             for each in data["speeds"]
         )
-        response = data["response"]
-        return cls(
-            ripples, Response.model_validate(response) if response else None, tuple(map(str, data["remarks"]))
+        paths = tuple(
+            PathResult(
+                each["name"],
+                PathError(**each["none"]),
+                PathError(**each["static"]),
+                PathError(**each["filtered"]) if each["filtered"] else None,
+            )
+            for each in data.get("paths", ())
         )
+        response = Response.model_validate(data["response"]) if data["response"] else None
+        return cls(ripples, response, tuple(map(str, data["remarks"])), paths)
 
 
 def motion_test_s(axis: AxisConfig, runs: int = 2 + TRIALS) -> float:
     """Longest duration of the test on an ideal axis."""
     view = axis_view(axis)
     middle = 0.5 * (axis.limits.position_min_deg + axis.limits.position_max_deg)
-    return runs * rehearse(EvenSpeed.spread(view), view, middle).duration_s
+    paths_s = 3.0 * rehearse(PathTest(), view, middle).duration_s
+    return paths_s + runs * rehearse(EvenSpeed.spread(view), view, middle).duration_s
 
 
 def motion_test(
@@ -181,14 +225,28 @@ def motion_test(
     progress: Callable[[str, float, float], None] = lambda *_: None,
     interrupted: Callable[[], bool] = lambda: False,
 ) -> MotionTest:
-    """Run a booted drive's axis at several speeds, without and with the model's correction.
+    """Run a booted drive's axis at several speeds and on paths, without and with the model's correction.
 
     With ``measure`` the response is measured, else the model's own is tested. A filter is kept only if it
-    leaves no more ripple than no correction at every speed. InputError if the model has
-    no order that could be measured, and if the travel is too short.
+    leaves no more ripple than no correction at every speed, and no larger path error. InputError if the model
+    has no order that could be measured, and if the travel is too short.
     """
-    axis = drive.axis
     runner = _Runner(drive, model, progress, interrupted)
+    found = _ripple_test(runner, model, measure)
+    used = [model.only(()), replace(model, response=None)]
+    if found.response is not None:
+        used.append(replace(model, response=found.response))
+    errors = path_errors([runner.run_paths(each) for each in used], model.ratio)
+    found = replace(found, paths=tuple(PathResult(each[0].name, *each) for each in zip(*errors, strict=True)))
+    if measure and found.harms_paths:
+        remark = "no filter is kept: with it the path error is larger than without correction"
+        return replace(found, response=None, remarks=(*found.remarks, remark))
+    return found
+
+
+def _ripple_test(runner: _Runner, model: TransmissionModel, measure: bool) -> MotionTest:
+    """The runs at constant speed."""
+    axis = runner.axis
     none = runner.run("without correction", model.only(()))
     static_model = replace(model, response=None)
     static = runner.run("correction of rest", static_model)
@@ -228,7 +286,7 @@ def motion_test(
         trials.append(Trial(filtered, response.filter))
     if best.response is not None:
         return best
-    if len(trials) == 1:
+    if len(trials) <= 2:
         return replace(best, remarks=("the response cannot be measured: the ripple is too small",))
     at = ", ".join(f"{speed:g}" for speed in found.harms_at)
     return replace(
@@ -284,6 +342,12 @@ class _Runner:
         bench = bench_on(self._drive, compensation_for(self.axis, model), interrupted=self._pace.interrupted)
         return tuple(harmonics(each, self.orders, self.ratio) for each in bench.run(self.procedure).outcome)
 
+    def run_paths(self, model: TransmissionModel) -> tuple[PathRun, ...]:
+        """The paths with this model."""
+        self._pace.begin("path error")
+        compensation = compensation_for(self.axis, model)
+        return bench_on(self._drive, compensation, interrupted=self._pace.interrupted).run(PathTest()).outcome
+
 
 def motor_orders(model: TransmissionModel) -> list[MotorOrder]:
     """The orders of the motor angle that the model corrects, by their number."""
@@ -303,16 +367,23 @@ def _ripples(
     filtered: tuple[Harmonics, ...] | None = None,
     response: Response | None = None,
 ) -> tuple[Ripple, ...]:
-    return tuple(
-        Ripple(
-            speed,
-            _both_ways(none, speed),
-            _both_ways(static, speed),
-            _both_ways(filtered, speed) if filtered else None,
-            tuple(faded_orders(response, runner.orders, speed, runner.ratio)) if response else (),
+    ripples: list[Ripple] = []
+    variants = [none, static, *([filtered] if filtered else [])]
+    for speed in sorted({abs(each.speed_deg_s) for each in none}):
+        both = [[run for run in each if abs(run.speed_deg_s) == speed] for each in variants]
+        whole = [_rms([run.ripple_arcsec for run in runs]) for runs in both]
+        orders = tuple(
+            OrderRipple(
+                order,
+                round(float(order_hz(order, speed, runner.ratio)), 2),
+                *(_rms([abs(run.amplitudes[place]) for run in runs]) for runs in both),
+            )
+            for place, order in enumerate(runner.orders)
         )
-        for speed in sorted({abs(each.speed_deg_s) for each in none})
-    )
+        faded = faded_orders(response, runner.orders, speed, runner.ratio) if response else ()
+        last = whole[2] if filtered else None
+        ripples.append(Ripple(speed, whole[0], whole[1], last, tuple(faded), orders))
+    return tuple(ripples)
 
 
 def faded_orders(
@@ -328,9 +399,8 @@ def faded_orders(
             yield order
 
 
-def _both_ways(runs: tuple[Harmonics, ...], speed_deg_s: float) -> float:
-    found = [each.ripple_arcsec for each in runs if abs(each.speed_deg_s) == speed_deg_s]
-    return math.sqrt(sum(each**2 for each in found) / len(found))
+def _rms(values: list[float]) -> float:
+    return math.sqrt(sum(each**2 for each in values) / len(values))
 
 
 def _removed(none_arcsec: float, arcsec: float | None) -> float | None:

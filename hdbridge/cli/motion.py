@@ -122,6 +122,16 @@ def print_motion(result: MotionTest) -> None:
             " ".join(map(str, each.faded)),
         )
     print_table(table)
+    fastest = result.ripples[-1]
+    table = Table(title=f"Motor orders at {fastest.speed_deg_s:g} deg/s, arcsec", title_justify="left")
+    for name in ("order", "Hz", "none", "static", "filtered"):
+        table.add_column(name, justify="right")
+    for order in fastest.orders:
+        figures = (order.none_arcsec, order.static_arcsec, order.filtered_arcsec)
+        table.add_row(str(order.order), f"{order.frequency_hz:.0f}", *map(_figure, figures))
+    print_table(table)
+    if result.paths:
+        print_table(_paths(result))
     if result.response is not None:
         console.print(
             f"response known up to {result.response.known_to_hz:.0f} Hz, "
@@ -132,6 +142,22 @@ def print_motion(result: MotionTest) -> None:
         console.print(f"the compensation removes half of the ripple or more up to {reached:g} deg/s")
     for line in result.remarks:
         console.print(f"note: {line}", markup=False, soft_wrap=True)
+
+
+def _paths(result: MotionTest) -> Table:
+    title = "Error on a path, rms arcsec, and time until the load has settled, ms"
+    table = Table(title=title, title_justify="left")
+    table.add_column("path")
+    for name in ("none", "static", "filtered", "settled", "static", "filtered"):
+        table.add_column(name, justify="right")
+    for each in result.paths:
+        variants = (each.none, each.static, each.filtered)
+        table.add_row(
+            each.name,
+            *(_figure(one.path_arcsec if one else None) for one in variants),
+            *(f"{1000.0 * one.settle_s:.0f}" if one else "" for one in variants),
+        )
+    return table
 
 
 def _figure(value: float | None) -> str:

@@ -22,7 +22,8 @@ class Prefilter:
     """Filters a correction; one call per cycle."""
 
     __slots__ = (
-        "_before", "_feedback", "_full_step", "_last", "_output", "_predicted", "_reaches", "_step", "_weights",
+        "_before", "_feedback", "_full_step", "_last", "_output", "_predicted", "_reaches", "_step",
+        "_weights",
     )  # fmt: skip
 
     def __init__(self, lead: LeadFilter, period_s: float) -> None:
@@ -85,6 +86,6 @@ class Prefilter:
                 )
             predicted.appendleft(predict(ahead_deg, then))
         first, second = self._feedback
-        output = sum(map(mul, self._weights, predicted)) - first * self._output - second * self._before
+        output: float = sum(map(mul, self._weights, predicted)) - first * self._output - second * self._before
         self._output, self._before = output, self._output
         return correction_arcsec + min((step / self._full_step) ** 2, 1.0) * (output - correction_arcsec)

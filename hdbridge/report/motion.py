@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from hdbridge import __version__
-from hdbridge.calibration.motion import MotionTest
+from hdbridge.calibration.motion import MotionTest, Ripple
 from hdbridge.model.response import Response
 from hdbridge.report.page import Chart, Grid, Mark, Page, Section, Series, Table
 
@@ -21,8 +21,24 @@ def motion_page(axis_name: str, result: MotionTest) -> Page:
 
 
 def motion_sections(result: MotionTest) -> list[Section]:
-    """Returns the ripple over speed, and the response if there is one."""
-    sections = [Section("Ripple over speed", blocks=[Grid([_ripple(result)]), _table(result)])]
+    """Returns the ripple over speed, the path errors, and the response if there is one."""
+    sections = [
+        Section("Ripple over speed", blocks=[Grid([_ripple(result)]), _table(result)]),
+        Section(
+            "Motor orders",
+            "Amplitude of each motor order of the load error.",
+            [Grid([_spectrum(each) for each in result.ripples if each.orders])],
+        ),
+    ]
+    if result.paths:
+        sections.append(
+            Section(
+                "Path error",
+                "Error of the load over a move at the limits and over a sine, without the lag of the servo "
+                "and the wind-up of the load. Settled: the load stays within 3 arcsec of its rest.",
+                [_paths(result)],
+            )
+        )
     if result.response is not None:
         sections.append(
             Section(
@@ -71,6 +87,29 @@ def _table(result: MotionTest) -> Table:
         for each in result.ripples
     ]
     return Table(["deg/s", "none", "static", "filtered", "removed", "orders faded out"], rows)
+
+
+def _spectrum(ripple: Ripple) -> Chart:
+    hertz = [each.frequency_hz for each in ripple.orders]
+    series = [Series("without correction", hertz, [each.none_arcsec for each in ripple.orders], Mark.POINTS)]
+    for name, values in (
+        ("correction of rest", [each.static_arcsec for each in ripple.orders]),
+        ("filtered correction", [each.filtered_arcsec for each in ripple.orders]),
+    ):
+        known = [math.nan if each is None else each for each in values]
+        if not all(map(math.isnan, known)):
+            series.append(Series(name, hertz, known, Mark.POINTS))
+    return Chart(f"{ripple.speed_deg_s:g} deg/s", "frequency, Hz", "amplitude, arcsec", series)
+
+
+def _paths(result: MotionTest) -> Table:
+    rows = [
+        [each.name, name, f"{one.path_arcsec:.2f}", f"{one.rest_arcsec:.2f}", f"{1000.0 * one.settle_s:.0f}"]
+        for each in result.paths
+        for name, one in (("none", each.none), ("static", each.static), ("filtered", each.filtered))
+        if one is not None
+    ]
+    return Table(["path", "correction", "path, rms arcsec", "at rest, arcsec", "settled after, ms"], rows)
 
 
 def _response(response: Response) -> list[Chart]:

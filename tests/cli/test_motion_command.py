@@ -42,6 +42,12 @@ def test_it_measures_the_response_proposes_it_and_the_committed_model_uses_it(hd
         assert each["removed_percent"] > 80.0
         assert each["removed_percent"] > each["removed_static_percent"] - 3.0
     assert result["speeds"][-1]["removed_static_percent"] < 50.0
+    assert [each["order"] for each in result["speeds"][0]["orders"]] == [1, 2, 3, 4, 6, 8]
+    for each in result["paths"]:
+        none, static, filtered = (each[name]["path_arcsec"] for name in ("none", "static", "filtered"))
+        assert filtered < 0.8 * static < 0.8 * none, each
+        assert abs(each["filtered"]["rest_arcsec"]) < 3.0
+    assert "Path error" in (tmp_path / "out.html").read_text()
     assert "Gain" in (tmp_path / "out.html").read_text()
     done = hdbridge("model", "commit", "fast")
     assert done.returncode == 0, done.stderr

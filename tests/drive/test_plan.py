@@ -28,7 +28,7 @@ def test_values_come_from_the_axis_file(axis: AxisConfig) -> None:
     assert written[1, 0x6065, 0] == round(5.0 * 8000 / 360)
     assert written[1, 0x6066, 0] == 20
     assert written[1, 0x6072, 0] == 1000
-    assert written[1, 0x6080, 0] == 214  # 20 deg/s and 20,000 arcsec/s at the load, x 50, in rpm
+    assert written[1, 0x6080, 0] == 213  # 20 deg/s and 20,000 arcsec/s at the load, x 50, in rpm
     assert written[1, 0x1017, 0] == 50
     assert written[1, 0x1016, 1] == 127 << 16 | 50
     assert written[1, 0x1400, 5] == 16

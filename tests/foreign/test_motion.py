@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 from foreign.bench import foreign_bench
 from foreign.servos import STRUCTURES
@@ -35,6 +36,14 @@ def test_the_measured_response_removes_the_ripple_at_speed(structure, tmp_path):
         assert each.filtered_arcsec < 1.05 * each.none_arcsec  # never worse than none
         if 4 * each.speed_deg_s * ratio / 360.0 < 0.8 * HIGHEST / cycle_s:
             assert each.removed_percent > 88.0, each
+    paths = np.array(
+        [[one.path_arcsec for one in (each.none, each.static, each.filtered)] for each in result.paths]
+    )
+    rms = np.sqrt(np.mean(paths**2, axis=0))
+    assert rms[2] < 1.02 * rms[1]
+    assert rms[2] < 0.5 * rms[0]
+    for each in result.paths:  # the last path ends without a ramp
+        assert each.filtered.settle_s <= each.none.settle_s + 0.02 or each.name == "sine", each
     fast = [each for each in result.ripples if 2 * each.speed_deg_s * ratio / 360.0 > 15.0]
     assert max(each.removed_percent - each.removed_static_percent for each in fast) > 15.0
     for one, other in zip(result.ripples, again.ripples, strict=True):
