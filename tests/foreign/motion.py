@@ -4,8 +4,8 @@
 
 Each axis is calibrated by `PLAN` with a motion test, and nothing is known beforehand. With ``--exact`` its
 model is the exact correction of rest, and only the response is measured. Then the error of the load is
-measured at ten speeds up to the limit, both ways, without, with static and with filtered correction. Axes: the
-foreign servo structures, and the simulated drive with a servo, load and spring drawn at random.
+measured at ten speeds up to the limit, both ways, without, with static and with filtered correction. Axes:
+the foreign servo structures, and the simulated drive with a servo, load and spring drawn at random.
 FILE keeps a line of JSON per axis; axes that it has are not measured again. Printed, per speed: the
 share removed, per cent, median (worst), of the orders that are slower than a third of the SYNC rate, static
 and filtered; and on how many axes the whole ripple is larger than without correction.
