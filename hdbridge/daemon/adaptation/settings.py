@@ -1,4 +1,4 @@
-"""What the adaptation of an axis may do, and how fast: the keys under ``adaptation`` of a machine file."""
+"""Keys under ``adaptation`` of a machine file: what the adaptation may change, and how fast."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ Parameter = Annotated[str, Field(pattern=r"^[a-z_]+\.[a-z_]+$")]
 
 
 class Standing(StrEnum):
-    """What the adaptation of an axis is doing."""
+    """State of an axis's adaptation."""
 
     OFF = "off"
     WAITING = "waiting"
-    """Nothing to learn from: at rest, too fast, no power, or too little motion yet."""
+    """Nothing to learn from: at rest, too fast, without power, or too little motion yet."""
     FOLLOWING = "following"
     FROZEN = "frozen"
-    """A fault; the reason is told. Ends by itself when what it depends on is well again, or by `resume`."""
+    """A doubt stops learning; the reason is reported. It ends when its cause does, or by `resume`."""
 
 
 class Excitation(Strict):
-    """What an axis must have done since the last update before the next one is made."""
+    """Motion required between two updates of the estimate."""
 
     turns: float = Field(
         2.0, ge=0.5, le=1000, description="motor turns (both directions) that show the orders of the motor"
@@ -39,7 +39,7 @@ class Excitation(Strict):
 
 
 class AdaptationSettings(Strict):
-    """Rates are per hour of the axis's own time, bounds are about the committed model."""
+    """Settings of the adaptation. Rates are per hour of axis time, bounds relative to the committed model."""
 
     mode: Mode = Field(
         "off", description="off, observe (only report what would change), or on (change the model in use)"
