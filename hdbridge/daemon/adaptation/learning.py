@@ -25,7 +25,8 @@ from hdbridge.effects import Channel, FloatArray
 from hdbridge.model import TransmissionModel
 
 PATIENCE = 4.0
-"""Multiple of the turns of `Excitation` after which a window without reversals updates the memoryless terms."""
+"""Multiple of the turns of `Excitation` after which a window without reversals updates the memoryless
+terms."""
 CLEAR_WINDOWS = 3
 """Consecutive plausible windows that end a passing doubt."""
 UNLEARNT = 3

@@ -1,6 +1,6 @@
-"""`/metrics` for Prometheus: the loop's timing, faults, the axes, and what the API is asked.
+"""`/metrics` for Prometheus: loop timing, faults, axes and API requests.
 
-A sink of the observer: `take` costs some microseconds for a batch. All else is read when it is scraped.
+A sink of the observer: `take` costs a few microseconds per batch. Everything else is read when scraped.
 """
 
 from __future__ import annotations
@@ -22,24 +22,24 @@ from hdbridge.daemon.service.interface import Bridge
 from hdbridge.drive.supervision import Fault
 
 BOUNDS_US: Final = (10, 20, 50, 100, 200, 500, 1000, 2000, 5000, 10_000, 50_000, 100_000)
-"""Upper bounds of the histograms, microseconds; the last bucket has no bound."""
+"""Upper bounds of the histogram buckets in microseconds; the last bucket is unbounded."""
 _FAULTS: Final = list(Fault)
 _PREFIX: Final = "hdbridge_"
 
 
 class Metrics:
-    """What accumulates between two scrapes."""
+    """Counts that accumulate between two scrapes."""
 
     def __init__(self) -> None:
         self.late = Histogram()
         self.busy = Histogram()
         self.faults: Counter[tuple[int, str]] = Counter()
-        """Events by index of the axis and name of the fault."""
+        """Number of events by axis index and name of the fault."""
         self.lost = 0
-        """Cycles that the observer itself was too slow for."""
+        """Cycles lost because the observer was too slow."""
 
     def take(self, samples: NDArray[np.void], events: Iterable[Any], lost: int) -> None:
-        """A batch of the observer: samples, and events of the loop as they lie in the shared memory."""
+        """Takes samples and events of the loop from the observer."""
         if len(samples):
             self.late.add(samples["late_us"])
             self.busy.add(samples["busy_us"])
@@ -50,7 +50,7 @@ class Metrics:
 
 
 class Histogram:
-    """Microseconds, counted in buckets."""
+    """Histogram of durations in microseconds."""
 
     def __init__(self) -> None:
         self._bounds = np.asarray(BOUNDS_US, dtype=float)
@@ -58,14 +58,14 @@ class Histogram:
         self._sum_us = 0.0
 
     def add(self, values_us: NDArray[np.floating[Any]]) -> None:
-        """Count values; one that is no number is left out."""
+        """Counts values; ignores NaN and infinity."""
         finite = values_us[np.isfinite(values_us)].astype(float)
         places = np.searchsorted(self._bounds, finite)
         self._counts += np.bincount(places, minlength=len(self._counts))
         self._sum_us += float(finite.sum())
 
     def family(self, name: str, about: str) -> Metric:
-        """In seconds, as Prometheus has it."""
+        """Returns the histogram in seconds, in Prometheus' format."""
         cumulative = np.cumsum(self._counts).tolist()
         bounds = [*(f"{each / 1e6:g}" for each in BOUNDS_US), "+Inf"]
         buckets = [(bound, float(count)) for bound, count in zip(bounds, cumulative, strict=True)]
@@ -73,20 +73,20 @@ class Histogram:
 
 
 def exposition(bridge: Bridge, metrics: Metrics, traffic: Traffic) -> bytes:
-    """The page in Prometheus' text format; the registry is its own, so nothing else gets into it."""
+    """Returns all metrics in Prometheus' text format, from a separate registry."""
     registry = CollectorRegistry()
     registry.register(_Scrape(bridge, metrics, traffic))
     return generate_latest(registry)
 
 
 class _Scrape(Collector):
-    """Everything, once."""
+    """Collector of one scrape."""
 
     def __init__(self, bridge: Bridge, metrics: Metrics, traffic: Traffic) -> None:
         self._bridge, self._metrics, self._traffic = bridge, metrics, traffic
 
     def collect(self) -> Iterator[Metric]:
-        """Loop, faults, axes, API."""
+        """Yields the metrics of loop, faults, axes and API."""
         state = self._bridge.state()
         metrics = self._metrics
         yield metrics.late.family("cycle_late_seconds", "How late cycles began.")
@@ -120,7 +120,7 @@ _AXIS: Final[Sequence[tuple[str, str, Any]]] = (
     ("queued_points", "Way points that wait.", lambda a: a.queued),
     ("model_age_seconds", "Since the model in use was made.", lambda a: a.model and a.model.age_s),
 )
-"""Name, words and value of each figure of an axis."""
+"""Name, description and value of each metric of an axis."""
 
 
 def _machine(state: MachineState) -> Iterator[Metric]:

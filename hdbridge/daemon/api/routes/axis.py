@@ -1,4 +1,4 @@
-"""One axis: look, power, move, stop, compensate, objects of the drive."""
+"""Routes of one axis: state, power, motion, stop, compensation, objects of the drive."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from hdbridge.evaluation.stepping import Scheme
 
 
 def axis_routes(bridge: Bridge) -> APIRouter:
-    """Every route below ``/axes/{axis}`` but stream and jobs."""
+    """Returns all routes below ``/axes/{axis}`` except stream and jobs."""
     routes = APIRouter(prefix="/axes/{axis}")
     _add_power(routes, bridge)
     _add_motion(routes, bridge)

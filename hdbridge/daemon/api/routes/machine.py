@@ -1,4 +1,4 @@
-"""The machine as a whole: state, events, lease, all axes at once, jobs, remarks."""
+"""Routes of the machine: state, events, lease, motion of all axes, jobs, remarks."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from hdbridge.drive.interfacelock import user_name
 
 
 def machine_routes(bridge: Bridge) -> APIRouter:
-    """Every route that is of no single axis, and the jobs."""
+    """Returns the routes that concern no single axis, and those of jobs."""
     routes = APIRouter()
     _add_looking(routes, bridge)
     _add_lease(routes, bridge)
@@ -143,7 +143,7 @@ def _add_jobs(routes: APIRouter, bridge: Bridge) -> None:
 
 
 def _who(request: Request, name: str) -> str:
-    """Name that a client gives, with its user and process, which the kernel reports on a Unix socket."""
+    """Returns the client's name with its user and process, which the kernel reports on a Unix socket."""
     peer, number = request.client or ("a client", 0)
     if not peer.startswith("uid="):
         return name or f"{peer}:{number}"
