@@ -1,4 +1,4 @@
-"""The keys under ``recorder`` of a machine file: where the flight recorder writes, how much, for how long."""
+"""Keys under ``recorder`` of a machine file: folder, size and age of flight recordings."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from hdbridge.strictness import Strict
 
 
 class RecorderSettings(Strict):
-    """The ring on disk, and what is kept aside of it."""
+    """Settings of the ring on disk and of the recordings kept aside."""
 
     folder: str | None = Field(
         None,
