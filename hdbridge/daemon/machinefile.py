@@ -1,7 +1,7 @@
-"""The machine file as it stands: which axes, on which bus, for whom, recorded where.
+"""Schema of the machine file: axes, bus, access, recorder.
 
-``machine.yaml`` is written by a person and never rewritten by the program. `hdbridge.daemon.machine` reads
-it together with the profiles that it names.
+A user writes ``machine.yaml``; the program never changes it. `hdbridge.daemon.machine` reads it together with
+the profiles that it names.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from hdbridge.evaluation.stepping import Scheme
 from hdbridge.strictness import Strict
 
 NAME = r"^[A-Za-z0-9][A-Za-z0-9._-]*$"
-"""What names a machine; its socket and its service are called so, too."""
+"""Pattern of a machine's name, which is also the name of its socket and service."""
 _TOKEN = re.compile(r"[A-Za-z0-9._~-]{16,200}")
 
 
@@ -124,7 +124,7 @@ class MachineFile(_Part):
 
 
 def token_complaint(path: Path) -> str | None:
-    """What is wrong with the file of the token; None where nothing is."""
+    """Returns what is wrong with a token file; None if it is valid."""
     try:
         content, mode = path.read_text(encoding="ascii").strip(), path.stat().st_mode
     except (OSError, UnicodeDecodeError) as problem:

@@ -168,12 +168,12 @@ class FlightFile:
         self._put(self._models, time_ns, {"axis": axis, "version": version, "text": text})
 
     def flush(self) -> None:
-        """Writes new messages and syncs them to the disk. After an OSError they wait for another flush."""
+        """Writes new messages and syncs them to the disk. After an OSError they wait for a retry."""
         self._writer.flush()  # type: ignore[no-untyped-call]
         self._stream.commit()
 
     def finish(self) -> None:
-        """Writes the index and gives the file its final name. After an OSError it stays a part to be mended."""
+        """Writes the index and renames the file. After an OSError it stays a part, to be mended."""
         self._writer.finish()  # type: ignore[no-untyped-call]
         try:
             self._stream.commit()
