@@ -1,4 +1,4 @@
-"""The right to move: one client at a time has it, for as long as it uses it."""
+"""The lease: the right to move, held by one client at a time."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Samples and events as they come, and what goes over the two WebSockets."""
+"""Live samples and events, and the messages of the two WebSockets."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from hdbridge.client.messages.requests import AXES_MAXIMUM, StreamPoint
 from hdbridge.client.messages.values import Name, Real, Report, Request
 
 POINTS_MAXIMUM: Final = 1000
-"""Stream points of one message."""
+"""Maximum number of stream points in a message."""
 _Column = list[float | None]
 
 
@@ -34,7 +34,7 @@ class EventKind(StrEnum):
     ENDING = "ending"
     LOAD_LOOP = "load-loop"
     NOTE = "note"
-    """From the service: a lease, a job, the recorder, the watch, the adaptation."""
+    """Note of the service: about a lease, a job, the recorder, the watch or the adaptation."""
 
 
 class Event(Report):

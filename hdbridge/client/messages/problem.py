@@ -1,4 +1,4 @@
-"""Errors over the wire (RFC 9457, ``application/problem+json``), and the way back to `hdbridge.errors`."""
+"""Errors as ``application/problem+json`` (RFC 9457), and their conversion to `hdbridge.errors`."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ STATUS: Final[dict[type[HdbridgeError], tuple[int, str]]] = {
     errors.OutputError: (507, "A result could not be written"),
     HdbridgeError: (500, "An error in hdbridge"),
 }
-"""Status and title of each error raised on purpose; the first row that fits counts."""
+"""Status and title of each hdbridge error; the first matching row applies."""
 
 
 class Problem(Report):
@@ -51,7 +51,7 @@ class Problem(Report):
 
     @classmethod
     def of(cls, error: HdbridgeError, axis: str | None = None) -> Problem:
-        """The problem that an error is over HTTP."""
+        """Returns the problem for an error."""
         kind, (status, title) = next(row for row in STATUS.items() if isinstance(error, row[0]))
         detail = str(error)
         said, _, hint = detail.rpartition("; ")
@@ -65,7 +65,7 @@ class Problem(Report):
         )
 
     def error(self) -> HdbridgeError:
-        """The error to raise where the request was made; one of a kind that is not known is a DaemonError."""
+        """Returns the error to raise in the client; DaemonError for an unknown kind."""
         name = self.type.removeprefix(TYPE_PREFIX)
         kind = next((each for each in STATUS if each.__name__ == name), errors.DaemonError)
         return kind("; ".join((self.detail, *self.errors)))

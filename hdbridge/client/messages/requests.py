@@ -1,4 +1,4 @@
-"""What a client may ask of an axis or the machine; each is bounded, and refused before anything moves."""
+"""Requests of a client to an axis or the machine; values are checked before anything moves."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from hdbridge.client.messages.values import (
 )
 
 QUEUE_MAXIMUM: Final = 1000
-"""Way points of one request."""
+"""Maximum number of way points in a request."""
 AXES_MAXIMUM: Final = 32
 
 

@@ -1,4 +1,4 @@
-"""What the daemon tells of the machine and its axes."""
+"""State of the machine and its axes."""
 
 from __future__ import annotations
 

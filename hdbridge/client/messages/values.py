@@ -1,4 +1,4 @@
-"""What several messages share: bounded numbers, names, closed sets, the two kinds of message."""
+"""Values that several messages share: bounded numbers, names, enumerations, and the two base classes."""
 
 from __future__ import annotations
 
@@ -8,12 +8,13 @@ from typing import Annotated, Final
 from pydantic import BaseModel, ConfigDict, Field, StringConstraints
 
 WORDS_MAXIMUM: Final = 400
-"""Characters of a text that a client gives."""
+"""Maximum length of a client's text."""
 
 _PRINTABLE: Final = r"^[^\x00-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069]*$"
-"""Nothing that moves a terminal's cursor, begins a line in a log or turns the direction of writing."""
+"""Text without characters that move a terminal's cursor, start a log line or reverse the writing
+direction."""
 Real = Annotated[float, Field(strict=True, allow_inf_nan=False)]
-"""A number, not the text of one; NaN and infinity are refused."""
+"""A number, not its text; NaN and infinity are refused."""
 Angle = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=-1e7, le=1e7)]
 """Degrees at the load, multi-turn; the axis's own limits are narrower."""
 Speed = Annotated[float, Field(strict=True, allow_inf_nan=False, gt=0, le=1e5)]
@@ -24,7 +25,7 @@ Acceleration = Annotated[float, Field(strict=True, allow_inf_nan=False, gt=0, le
 """Degrees per second squared at the load."""
 Seconds = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=0, le=86_400)]
 Name = Annotated[str, StringConstraints(strict=True, pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$")]
-"""Of an axis or a machine, as in its file."""
+"""Name of an axis or a machine, as in its file."""
 Words = Annotated[str, StringConstraints(strict=True, max_length=WORDS_MAXIMUM, pattern=_PRINTABLE)]
 """One line of text."""
 
