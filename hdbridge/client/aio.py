@@ -1,7 +1,7 @@
 """The asyncio client, with the same methods as `hdbridge.client.sync`.
 
-    async with AsyncClient() as client, client.lease():
-        await client.axis("joint-3").move(30)
+async with AsyncClient() as client, client.lease():
+    await client.axis("joint-3").move(30)
 """
 
 from __future__ import annotations

@@ -14,7 +14,7 @@ from hdbridge.errors import DaemonError
 
 
 def tls_context(address: Address) -> ssl.SSLContext | None:
-    """Returns the TLS context for HTTPS, with the system's or ``$SSL_CERT_FILE``'s certificates; else None."""
+    """Returns the TLS context for HTTPS, with the certificates of the system or ``$SSL_CERT_FILE``."""
     https = address.socket is None and address.url.startswith("https")
     return ssl.create_default_context() if https else None
 

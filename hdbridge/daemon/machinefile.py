@@ -29,7 +29,7 @@ class _Part(Strict):
 
 
 class LoadLoopSettings(_Part):
-    """A slow integral of the error that the load encoder measures, in addition to the model."""
+    """Load loop: a slow integral of the error at the load encoder, in addition to the model."""
 
     gain_1_s: float = Field(0.5, gt=0, le=5, description="share of the error that it takes away per second")
     maximum_arcsec: float = Field(30.0, gt=0, le=3600, description="most that it may add, at the load")
@@ -71,7 +71,7 @@ class TcpSettings(_Part):
 
 
 class ApiSettings(_Part):
-    """Where clients reach the daemon."""
+    """Access of clients to the daemon."""
 
     socket: str | None = Field(
         None,
@@ -87,7 +87,7 @@ class ApiSettings(_Part):
 
 
 class LimitSettings(_Part):
-    """How much the daemon takes before it gives up or refuses."""
+    """Limits of the daemon."""
 
     restarts_per_minute: int = Field(
         3, ge=0, le=60, description="how often a control process that died is started again before all ends"

@@ -21,7 +21,7 @@ OptionValue = Option | Annotated[list[Option], Field(max_length=100)]
 
 
 class JobKind(StrEnum):
-    """What may be run."""
+    """Kind of a job."""
 
     STEP = "step"
     CALIBRATE = "calibrate"
@@ -29,7 +29,7 @@ class JobKind(StrEnum):
 
 
 class JobState(StrEnum):
-    """How far a job is."""
+    """State of a job."""
 
     RUNNING = "running"
     DONE = "done"

@@ -10,7 +10,7 @@ from hdbridge.client.messages.values import Report, Request, Seconds, Words
 
 
 class LeaseRequest(Request):
-    """Ask for the right to move."""
+    """Request for the lease."""
 
     model_config = ConfigDict(json_schema_extra={"examples": [{"client": "cell controller", "force": False}]})
 
@@ -23,7 +23,7 @@ class LeaseRequest(Request):
 
 
 class LeaseGrant(Report):
-    """The right to move; the token goes into the header ``X-Lease`` of each request that moves."""
+    """The granted lease; its token goes into the header ``X-Lease`` of each request that moves an axis."""
 
     token: str = Field(description="secret; whoever has it may move", examples=["mZ3sWJx0b0lq"])
     client: str = Field(description="who holds it")
@@ -31,7 +31,7 @@ class LeaseGrant(Report):
 
 
 class LeaseState(Report):
-    """Who may move; the token is not told."""
+    """State of the lease, without its token."""
 
     held: bool = Field(description="whether anybody has the right to move")
     client: str | None = Field(None, description="who holds it", examples=["cell controller"])

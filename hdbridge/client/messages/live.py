@@ -18,7 +18,7 @@ _Column = list[float | None]
 
 
 class EventKind(StrEnum):
-    """What an event of the loop or the service tells."""
+    """Kind of an event of the loop or the service."""
 
     DONE = "done"
     REFUSED = "refused"
@@ -38,7 +38,7 @@ class EventKind(StrEnum):
 
 
 class Event(Report):
-    """Something that happened."""
+    """An event."""
 
     sequence: int = Field(ge=0, description="counts from the start of the service", examples=[17])
     kind: EventKind
@@ -50,7 +50,7 @@ class Event(Report):
 
 
 class Events(Report):
-    """Events since the one that was asked for."""
+    """Events after the requested number."""
 
     events: list[Event]
     lost: int = Field(0, ge=0, description="older ones that are kept no more")
@@ -58,7 +58,7 @@ class Events(Report):
 
 
 class AxisColumns(Report):
-    """What one axis did: a value per sample in each column, None where there is none."""
+    """Samples of one axis: one value per sample in each column, None if not available."""
 
     state: list[str]
     load_target_deg: _Column
@@ -91,7 +91,7 @@ class Samples(Report):
 
 
 class LiveOptions(Request):
-    """What a client of the live feed wants; its first message, and again whenever it wants something else."""
+    """Options of the live feed, sent as the first message and again to change them."""
 
     every: Annotated[int, Field(strict=True, ge=1, le=10_000)] = Field(
         1, description="one cycle in so many: those whose number it divides", examples=[10]

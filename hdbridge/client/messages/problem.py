@@ -32,7 +32,7 @@ STATUS: Final[dict[type[HdbridgeError], tuple[int, str]]] = {
 
 
 class Problem(Report):
-    """What went wrong with a request."""
+    """Problem document: the reason why a request failed."""
 
     type: str = Field(description="which kind of error, as a URN", examples=[f"{TYPE_PREFIX}LeaseError"])
     title: str = Field(description="the kind in words", examples=["The right to move is not yours"])

@@ -20,7 +20,7 @@ from hdbridge.client.messages.values import (
 
 
 class Fault(Report):
-    """What stopped an axis; latched until a reset."""
+    """Cause of a stop, latched until a reset."""
 
     name: str = Field(description="the row of the fault table", examples=["LOST_TPDO"])
     text: str = Field(description="what happened, in words", examples=["a TPDO is missing, twice in a row"])
@@ -36,7 +36,7 @@ class Fault(Report):
 
 
 class Limits(Report):
-    """What the axis may do, at the load."""
+    """Limits of an axis, at the load."""
 
     position_min_deg: float = Field(examples=[-180.0])
     position_max_deg: float = Field(examples=[180.0])
@@ -57,7 +57,7 @@ class ModelInUse(Report):
 
 
 class LoadLoopState(Report):
-    """The slow integral of the measured error."""
+    """State of the load loop, a slow integral of the measured error."""
 
     configured: bool = Field(description="whether the machine file has one for this axis")
     on: bool = False
@@ -70,7 +70,7 @@ class LoadLoopState(Report):
 
 
 class AdaptationState(Report):
-    """How the model's parameters follow the load encoder."""
+    """State of the adaptation of the model's parameters to the load encoder."""
 
     mode: AdaptationMode = AdaptationMode.OFF
     frozen: str | None = Field(None, description="why it does not change anything now; None when it does")
@@ -83,7 +83,7 @@ class AdaptationState(Report):
 
 
 class AxisState(Report):
-    """Everything about one axis at the newest cycle."""
+    """State of one axis in the newest cycle."""
 
     name: Name
     profile: str = Field(description="folder of its files on the daemon's machine")
@@ -164,7 +164,7 @@ class RecorderState(Report):
 
 
 class MachineState(Report):
-    """Everything about the machine at the newest cycle."""
+    """State of the machine in the newest cycle."""
 
     name: Name
     version: str = Field(description="of hdbridge")
