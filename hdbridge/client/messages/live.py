@@ -44,7 +44,7 @@ class Event(Report):
     kind: EventKind
     date: datetime = Field(description="by the machine's clock")
     cycle: int | None = Field(None, description="cycle of the loop")
-    axis: Name | None = Field(None, description="None: of the machine")
+    axis: Name | None = Field(None, description="None for the machine")
     text: str = Field("", description="in words", examples=["cycle 120: a TPDO is missing (282h): freeze"])
     hint: str | None = Field(None, description="what a person does about it")
 
@@ -53,8 +53,8 @@ class Events(Report):
     """Events after the requested number."""
 
     events: list[Event]
-    lost: int = Field(0, ge=0, description="older ones that are kept no more")
-    newest: int = Field(0, ge=0, description="ask for those since this one next time")
+    lost: int = Field(0, ge=0, description="older events that are no longer kept")
+    newest: int = Field(0, ge=0, description="number to pass in the next request")
 
 
 class AxisColumns(Report):
@@ -79,24 +79,28 @@ class Samples(Report):
     """A batch of cycles in columns, oldest first."""
 
     type: Literal["samples"] = "samples"
-    time_s: list[float] = Field(description="of SYNC, by the machine's monotonic clock")
+    time_s: list[float] = Field(description="time of SYNC, by the machine's monotonic clock")
     cycle: list[int]
     late_us: list[float]
     busy_us: list[float]
     bus_load: _Column = Field(description="share of the bus in use; None without a bit rate")
     skipped: list[int] = Field(description="periods left out since the loop began")
     axes: dict[Name, AxisColumns]
-    events: list[Event] = Field(default=[], description="what happened meanwhile")
-    lost: int = Field(0, ge=0, description="cycles that this client was too slow for, since the last batch")
+    events: list[Event] = Field(default=[], description="events since the last batch")
+    lost: int = Field(
+        0, ge=0, description="cycles lost since the last batch because this client was too slow"
+    )
 
 
 class LiveOptions(Request):
     """Options of the live feed, sent as the first message and again to change them."""
 
     every: Annotated[int, Field(strict=True, ge=1, le=10_000)] = Field(
-        1, description="one cycle in so many: those whose number it divides", examples=[10]
+        1, description="decimation: only cycles whose number it divides", examples=[10]
     )
-    axes: list[Name] | None = Field(None, max_length=AXES_MAXIMUM, description="only these; else all")
+    axes: list[Name] | None = Field(
+        None, max_length=AXES_MAXIMUM, description="selected axes; by default all"
+    )
 
 
 class StreamBegin(Request):
@@ -104,7 +108,7 @@ class StreamBegin(Request):
 
     lease: str = Field(max_length=200, description="the token of the lease")
     timeout_s: Annotated[Real, Field(gt=0, le=5)] = Field(
-        0.5, description="without a point for so long the axis stops within its limits"
+        0.5, description="time without a point after which the axis stops within its limits"
     )
 
 
@@ -118,5 +122,7 @@ class StreamPoints(Request):
 class StreamAnswer(Report):
     """The answer to each message of a stream."""
 
-    accepted: int = Field(ge=0, description="points taken of the message")
-    problem: Problem | None = Field(None, description="why no more; the axis then stops within its limits")
+    accepted: int = Field(ge=0, description="number of points accepted")
+    problem: Problem | None = Field(
+        None, description="reason for ending the stream; the axis then stops within its limits"
+    )

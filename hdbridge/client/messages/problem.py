@@ -34,18 +34,18 @@ STATUS: Final[dict[type[HdbridgeError], tuple[int, str]]] = {
 class Problem(Report):
     """Problem document: the reason why a request failed."""
 
-    type: str = Field(description="which kind of error, as a URN", examples=[f"{TYPE_PREFIX}LeaseError"])
+    type: str = Field(description="kind of error, as a URN", examples=[f"{TYPE_PREFIX}LeaseError"])
     title: str = Field(description="the kind in words", examples=["The right to move is not yours"])
     status: int = Field(ge=400, le=599, description="HTTP status", examples=[423])
     detail: str = Field(
-        description="what is wrong, what was expected and what to do, in one line",
+        description="error, expectation and remedy in one line",
         examples=["'cell controller' holds the lease for another 4.2 s; wait, or take it with force"],
     )
     axis: str | None = Field(None, description="the axis concerned", examples=["joint-3"])
     hint: str | None = Field(None, description="what a person does about it")
     errors: list[str] = Field(
         default=[],
-        description="of a request that is not valid: each complaint with the key it is about",
+        description="complaints about an invalid request, each with its key",
         examples=[["target_deg: expected a finite number"]],
     )
 

@@ -131,10 +131,10 @@ class Home(Request):
         None, description="speed towards the zero, deg/s at the load; else as the daemon finds right"
     )
     acceleration_deg_s2: Acceleration | None = Field(
-        None, description="deg/s2 at the load; else the axis's limit"
+        None, description="acceleration, deg/s2 at the load; else the axis's limit"
     )
-    offset_deg: Angle = Field(0.0, description="load angle that the home position gets (607Ch)")
-    timeout_s: Annotated[Real, Field(ge=0.1, le=3600)] = Field(60.0, description="that it may take, seconds")
+    offset_deg: Angle = Field(0.0, description="load angle of the home position (607Ch)")
+    timeout_s: Annotated[Real, Field(ge=0.1, le=3600)] = Field(60.0, description="time-out, seconds")
 
 
 class SdoWrite(Request):

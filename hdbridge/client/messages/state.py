@@ -48,7 +48,7 @@ class Limits(Report):
 class ModelInUse(Report):
     """The model that compensates an axis."""
 
-    version: int | None = Field(None, description="number in the history; None of one without", examples=[4])
+    version: int | None = Field(None, description="number in the history; None without one", examples=[4])
     file: str = Field(description="its file on the daemon's machine")
     date: datetime | None = Field(None, description="when it was made")
     age_s: float | None = Field(None, ge=0, description="since it was made, seconds")
@@ -61,7 +61,7 @@ class LoadLoopState(Report):
 
     configured: bool = Field(description="whether the machine file has one for this axis")
     on: bool = False
-    correction_arcsec: float = Field(0.0, description="what it adds now")
+    correction_arcsec: float = Field(0.0, description="present correction")
     doubt: str | None = Field(
         None,
         description="why it does not act: the load encoder is in doubt, or the error is beyond its bound",
@@ -73,7 +73,9 @@ class AdaptationState(Report):
     """State of the adaptation of the model's parameters to the load encoder."""
 
     mode: AdaptationMode = AdaptationMode.OFF
-    frozen: str | None = Field(None, description="why it does not change anything now; None when it does")
+    frozen: str | None = Field(
+        None, description="reason why the parameters do not change now; None while they do"
+    )
     updated: datetime | None = Field(None, description="when a parameter was changed last")
     parameters: dict[str, float] = Field(
         default={},
@@ -92,10 +94,10 @@ class AxisState(Report):
     state: ControlState
     power: PowerState
     mode: MotionMode
-    at_rest: bool = Field(description="the target stands and the axis is where it is")
+    at_rest: bool = Field(description="the set-point is at rest")
 
-    load_target_deg: float | None = Field(None, description="where the load shall be", examples=[30.0])
-    velocity_deg_s: float | None = Field(None, description="of the load target", examples=[0.0])
+    load_target_deg: float | None = Field(None, description="target of the load, degrees", examples=[30.0])
+    velocity_deg_s: float | None = Field(None, description="velocity of the load target", examples=[0.0])
     motor_target_deg: float | None = Field(None, description="the drive's demand (6062h), motor degrees")
     motor_position_deg: float | None = Field(None, description="motor encoder, motor degrees")
     load_position_deg: float | None = Field(None, description="load encoder, degrees", examples=[30.0001])
@@ -120,7 +122,7 @@ class AxisState(Report):
     underrun: bool = Field(False, description="the last stream ran out of points in motion")
 
     limits: Limits
-    fault: Fault | None = Field(None, description="what stopped it, until a reset")
+    fault: Fault | None = Field(None, description="cause of a stop, until a reset")
     model: ModelInUse | None = Field(None, description="None: not compensated")
     load_loop: LoadLoopState
     adaptation: AdaptationState

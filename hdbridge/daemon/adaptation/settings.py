@@ -47,7 +47,7 @@ class AdaptationSettings(Strict):
     )
     parameters: tuple[Parameter, ...] | None = Field(
         None,
-        description="adapted parameters, as EFFECT.PARAMETER; by default all that drift with wear and temperature",
+        description="adapted parameters, as EFFECT.PARAMETER; by default all that wear or temperature move",
     )
     rate_arcsec_per_hour: float = Field(
         30.0, gt=0, le=36_000, description="fastest change of any coefficient of the model"

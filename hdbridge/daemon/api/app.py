@@ -25,12 +25,15 @@ from hdbridge.daemon.service.interface import Bridge
 
 PREFIX: Final = "/api/v1"
 TAGS: Final = (
-    ("Look", "What the machine does. Everybody may, and nothing of it moves anything."),
-    ("Lease", "The right to move: one client at a time has it, for as long as it uses it."),
-    ("Stop", "Never refused to anybody who may ask at all; no lease is needed."),
-    ("Power", "Enable, disable, reset. These and all below need the lease, in the header `X-Lease`."),
-    ("Move", "Targets are load angles in degrees, held to the axis's limits."),
-    ("Compensate", "Which part of which model is used, and how it follows the load encoder."),
+    ("Look", "State of the machine. No lease is needed, and no request moves anything."),
+    ("Lease", "The right to move, held by one client at a time while it uses it."),
+    ("Stop", "Never refused to an authorised client; no lease is needed."),
+    (
+        "Power",
+        "Enable, disable, reset. These and all requests below need the lease, in the header `X-Lease`.",
+    ),
+    ("Move", "Targets are load angles in degrees, within the axis's limits."),
+    ("Compensate", "Model and the part of it that compensates; adaptation to the load encoder."),
     ("Jobs", "Procedures that run through the daemon while it holds the bus."),
     ("Drive", "Objects of the drive's dictionary, by SDO."),
 )
@@ -46,7 +49,7 @@ def create_app(bridge: Bridge, metrics: Metrics, traffic: Traffic) -> FastAPI:
     app = FastAPI(
         title="hdbridge",
         version=__version__,
-        summary="The daemon that holds the drives of one bus",
+        summary="The daemon that controls the drives of one bus",
         description=_ABOUT,
         openapi_url=None,
         docs_url=None,

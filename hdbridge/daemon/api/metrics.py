@@ -89,36 +89,38 @@ class _Scrape(Collector):
         """Yields the metrics of loop, faults, axes and API."""
         state = self._bridge.state()
         metrics = self._metrics
-        yield metrics.late.family("cycle_late_seconds", "How late cycles began.")
-        yield metrics.busy.family("cycle_busy_seconds", "How long cycles took.")
+        yield metrics.late.family("cycle_late_seconds", "Delay of the start of cycles.")
+        yield metrics.busy.family("cycle_busy_seconds", "Duration of cycles.")
         yield from _machine(state)
-        yield _counter("samples_lost", "Cycles that the service was too slow for.", [((), metrics.lost)])
+        yield _counter("samples_lost", "Cycles lost because the service was too slow.", [((), metrics.lost)])
         names = [each.name for each in state.axes]
         faults = [
             ((names[axis] if 0 <= axis < len(names) else "", fault), count)
             for (axis, fault), count in sorted(metrics.faults.items())
         ]
-        yield _counter("faults", "Faults seen, of the machine without an axis.", faults, ("axis", "fault"))
+        yield _counter(
+            "faults", "Faults by axis; without an axis those of the machine.", faults, ("axis", "fault")
+        )
         for name, about, of in _AXIS:
             rows = [((each.name,), value) for each in state.axes if (value := of(each)) is not None]
             yield _gauge(name, about, rows, ("axis",))
         states = [((each.name, one.value), each.state is one) for each in state.axes for one in ControlState]
-        yield _gauge("axis_state", "1 for the state that an axis is in.", states, ("axis", "state"))
+        yield _gauge("axis_state", "1 for the present state of an axis.", states, ("axis", "state"))
         latched = [((each.name,), each.fault is not None) for each in state.axes]
-        yield _gauge("axis_fault_latched", "Whether a fault stopped it.", latched, ("axis",))
+        yield _gauge("axis_fault_latched", "1 if a stop is latched.", latched, ("axis",))
         yield from _api(self._traffic)
 
 
 _AXIS: Final[Sequence[tuple[str, str, Any]]] = (
-    ("load_target_degrees", "Where the load shall be.", lambda a: a.load_target_deg),
+    ("load_target_degrees", "Load target.", lambda a: a.load_target_deg),
     ("load_position_degrees", "Load encoder.", lambda a: a.load_position_deg),
     ("motor_position_degrees", "Motor encoder.", lambda a: a.motor_position_deg),
-    ("load_error_arcsec", "Load encoder less load target.", lambda a: a.error_arcsec),
-    ("correction_arcsec", "What the compensation adds.", lambda a: a.correction_arcsec),
-    ("predicted_error_arcsec", "Transmission error by the model.", lambda a: a.predicted_arcsec),
+    ("load_error_arcsec", "Load encoder minus load target.", lambda a: a.error_arcsec),
+    ("correction_arcsec", "Correction by the compensation.", lambda a: a.correction_arcsec),
+    ("predicted_error_arcsec", "Transmission error predicted by the model.", lambda a: a.predicted_arcsec),
     ("motor_torque_newton_metres", "Torque of the motor.", lambda a: a.motor_torque_nm),
-    ("queued_points", "Way points that wait.", lambda a: a.queued),
-    ("model_age_seconds", "Since the model in use was made.", lambda a: a.model and a.model.age_s),
+    ("queued_points", "Waiting way points.", lambda a: a.queued),
+    ("model_age_seconds", "Age of the model in use.", lambda a: a.model and a.model.age_s),
 )
 """Name, description and value of each metric of an axis."""
 
@@ -127,18 +129,16 @@ def _machine(state: MachineState) -> Iterator[Metric]:
     info = GaugeMetricFamily(_PREFIX + "info", "1.", labels=("machine", "version"))
     info.add_metric((state.name, state.version), 1)
     yield info
-    yield _gauge("loop_alive", "Whether the control loop turned lately.", [((), state.cycle.alive)])
+    yield _gauge("loop_alive", "1 if the control loop turns.", [((), state.cycle.alive)])
     yield _gauge("cycle_period_seconds", "Period of the cycle.", [((), state.cycle.period_s)])
     yield _counter(
-        "cycles_skipped", "Periods left out because the loop was late.", [((), state.cycle.skipped)]
+        "cycles_skipped", "Periods skipped because the loop was late.", [((), state.cycle.skipped)]
     )
-    yield _gauge("bus_up", "Whether the CAN interface is there.", [((), state.bus.up)])
+    yield _gauge("bus_up", "1 if the CAN interface is up.", [((), state.bus.up)])
     if state.bus.load is not None:
-        yield _gauge("bus_load_ratio", "Share of the bus's time in use.", [((), state.bus.load)])
-    yield _counter(
-        "recorder_dropped", "Samples that the recorder did not write.", [((), state.recorder.dropped)]
-    )
-    yield _gauge("lease_held", "Whether a client has the right to move.", [((), state.lease.held)])
+        yield _gauge("bus_load_ratio", "Bus load.", [((), state.bus.load)])
+    yield _counter("recorder_dropped", "Samples that the recorder dropped.", [((), state.recorder.dropped)])
+    yield _gauge("lease_held", "1 if a client holds the lease.", [((), state.lease.held)])
 
 
 def _api(traffic: Traffic) -> Iterator[Metric]:

@@ -34,13 +34,13 @@ Holder = Annotated[
 AxisName = Annotated[str, Path(description="name of the axis, as in its file", examples=["joint-3"])]
 
 _WORDS: Final = {
-    400: "The body is no JSON, or nests too deep",
+    400: "The body is not JSON, or nests too deeply",
     404: "There is no such axis, job or object",
-    409: "Not in this state: not enabled, busy, or stopped by the supervision",
-    422: "A value is missing, not a number, out of its range or outside the axis's limits; nothing moved",
-    423: "The right to move is not yours; who has it is said",
-    502: "The drive refused, or does not answer",
-    503: "The bus is not there",
+    409: "Not possible in this state: not enabled, busy, or stopped by the supervision",
+    422: "A value is missing, not a number or outside its range or the axis's limits; nothing moved",
+    423: "Another client holds the lease, or nobody does; the answer names the holder",
+    502: "The drive refused the request or does not answer",
+    503: "The bus is not available",
 }
 LOOKING: Final = (404, 422)
 MOVING: Final = (400, 404, 409, 422, 423, 502, 503)
