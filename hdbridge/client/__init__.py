@@ -1,7 +1,7 @@
-"""What talks to the daemon from outside: the messages, and the clients that exchange them.
+"""Messages and clients of the daemon.
 
-Imports nothing of the daemon. `messages` needs pydantic only, the clients the extra ``hdbridge[daemon]``;
-they are loaded when they are used.
+Imports nothing of the daemon. `messages` needs only pydantic, the clients the extra ``hdbridge[daemon]``;
+they are imported on first use.
 """
 
 from __future__ import annotations

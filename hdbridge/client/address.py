@@ -1,4 +1,4 @@
-"""Where a daemon is, and how it is found by itself: one daemon on this machine needs no address."""
+"""Address of a daemon, and its discovery: a single daemon on this computer needs no address."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from pathlib import Path
 from hdbridge.errors import DaemonError, InputError
 
 SYSTEM_FOLDER = Path("/run/hdbridge")
-"""Where daemons that the service manager started have their sockets, each in a folder of its own."""
+"""Folder of the sockets of daemons started by the service manager, one subfolder each."""
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 
 
 @dataclass(frozen=True, slots=True)
 class Address:
-    """A Unix socket, or a URL and the token that it asks for."""
+    """A Unix socket, or a URL with its token."""
 
     socket: Path | None = None
     url: str = "http://hdbridge"
@@ -31,23 +31,23 @@ class Address:
 
     @property
     def websocket_url(self) -> str:
-        """The same for a WebSocket."""
+        """URL for WebSockets."""
         return "ws" + self.url.removeprefix("http")
 
     @property
     def headers(self) -> dict[str, str]:
-        """What every request shows."""
+        """Headers of every request."""
         return {} if self.token is None else {"Authorization": f"Bearer {self.token}"}
 
 
 def find(
     text: str | Path | None = None, token: str | None = None, environment: Mapping[str, str] = os.environ
 ) -> Address:
-    """The daemon at an address: a socket, a URL, a machine's name, or nothing for the one that there is.
+    """Returns the address of a daemon, given by socket, URL, machine's name, or nothing if only one runs.
 
-    Without ``text`` ``$HDBRIDGE_SOCKET`` counts, then ``$HDBRIDGE_URL`` (its token is ``$HDBRIDGE_TOKEN``),
-    then the sockets of this user's daemons and of the service manager's. DaemonError where there is none, or
-    more than one to choose from; InputError for what is no address.
+    Without ``text``, ``$HDBRIDGE_SOCKET`` is used, then ``$HDBRIDGE_URL`` (with the token
+    ``$HDBRIDGE_TOKEN``), then the sockets of this user's daemons and of the service manager's. Raises
+    DaemonError if there is none, or more than one to choose from, and InputError for an invalid address.
     """
     given = str(text or environment.get("HDBRIDGE_SOCKET") or environment.get("HDBRIDGE_URL") or "")
     token = token or environment.get("HDBRIDGE_TOKEN") or None
@@ -74,7 +74,7 @@ def find(
 
 
 def session_folder(environment: Mapping[str, str] = os.environ) -> Path:
-    """Where a daemon of this user has its socket, and where a client looks for it; it need not exist."""
+    """Returns the folder of this user's daemon sockets; it need not exist."""
     session = environment.get("XDG_RUNTIME_DIR")
     if session and Path(session).is_dir():
         return Path(session) / "hdbridge"
@@ -91,7 +91,7 @@ def _url(given: str, token: str | None) -> Address:
 
 
 def _sockets(environment: Mapping[str, str]) -> list[Path]:
-    """The sockets that somebody listens at, in folders that no stranger can write to."""
+    """Returns the sockets with a listener, in trusted folders."""
     found: list[Path] = []
     for folder in (session_folder(environment), SYSTEM_FOLDER):
         if _is_trusted(folder):
@@ -103,7 +103,7 @@ def _sockets(environment: Mapping[str, str]) -> list[Path]:
 
 
 def _is_trusted(folder: Path) -> bool:
-    """Whether what lies there is ours or the system's: below /tmp anybody can make a folder of any name."""
+    """Returns True if a folder is ours or the system's, because anyone can create folders below /tmp."""
     try:
         found = folder.lstat()
     except OSError:

@@ -1,4 +1,4 @@
-"""The client for asyncio: the same names as `hdbridge.client.sync`, to be awaited.
+"""The asyncio client, with the same methods as `hdbridge.client.sync`.
 
 async with AsyncClient() as client, client.lease():
     await client.axis("joint-3").move(30)
@@ -37,11 +37,11 @@ from hdbridge.errors import DaemonError, LeaseError
 
 
 class AsyncClient:
-    """A daemon, wherever it is. Close it, or use it as an asynchronous context manager.
+    """Client of a daemon. Close it, or use it as an asynchronous context manager.
 
-    ``address`` is a Unix socket, a URL or a machine's name; without it `hdbridge.client.address.find` looks
-    for the one that there is. ``token`` is what TCP asks for, ``name`` is shown to others while it
-    holds the lease. Several tasks may use it.
+    ``address`` is a Unix socket, a URL or a machine's name; `hdbridge.client.address.find` finds the daemon
+    without it. ``token`` is required over TCP; others see ``name`` while the client holds the lease. Several
+    tasks may use it.
     """
 
     def __init__(
@@ -69,57 +69,57 @@ class AsyncClient:
         await self.close()
 
     async def close(self) -> None:
-        """Close the connections."""
+        """Closes the connections."""
         await self._http.aclose()
 
     def axis(self, name: str) -> AsyncAxis:
-        """One axis; whether there is one of that name shows when it is asked for something."""
+        """Returns an axis. Its name is checked by the first request."""
         return AsyncAxis(self, name)
 
     async def axes(self) -> dict[str, AsyncAxis]:
-        """Every axis of the machine by its name."""
+        """Returns all axes of the machine by name."""
         return {each.name: AsyncAxis(self, each.name) for each in (await self.state()).axes}
 
     async def state(self) -> MachineState:
-        """Everything about the machine and its axes."""
+        """Returns the state of the machine and its axes."""
         return await self.do(MachineCalls.state())
 
     async def events(self, since: int = 0) -> Events:
-        """What happened since an event."""
+        """Returns the events after number ``since``."""
         return await self.do(MachineCalls.events(since))
 
     async def mark(self, text: str) -> list[Event]:
-        """A remark for the flight recorder."""
+        """Adds a remark to the event log and the flight recorder."""
         return (await self.do(MachineCalls.mark(text))).events
 
     async def stop(self) -> MachineState:
-        """Brake every axis to rest; needs no lease."""
+        """Brakes all axes to rest. Requires no lease."""
         return await self.do(MachineCalls.stop_all())
 
     async def quick_stop(self) -> MachineState:
-        """Stop every axis at once, latched until a reset; needs no lease."""
+        """Quick-stops all axes and latches the stops until a reset. Requires no lease."""
         return await self.do(MachineCalls.quick_stop_all())
 
     async def coordinated(
         self, targets_deg: Mapping[str, float], *, speed: float = 1.0, wait: bool = True
     ) -> MachineState:
-        """Move axes so that all begin and end together; ``speed`` is a share of their limits."""
+        """Moves axes so that all begin and end together; ``speed`` is a share of their limits."""
         return await self.do(MachineCalls.coordinated(targets_deg, speed, wait))
 
     async def jobs(self) -> list[Job]:
-        """The procedures that run or ran."""
+        """Returns the running and the last finished jobs."""
         return await self.do(MachineCalls.jobs())
 
     async def job(self, id_: str) -> Job:
-        """One of them."""
+        """Returns one job."""
         return await self.do(MachineCalls.job(id_))
 
     async def cancel_job(self, id_: str) -> Job:
-        """Stop its axis in order; what was measured is kept."""
+        """Cancels a job: its axis brakes to rest, its measurements are kept."""
         return await self.do(MachineCalls.cancel_job(id_))
 
     async def wait_for_job(self, id_: str) -> Job:
-        """The job when it is over; what it failed by is raised."""
+        """Waits for a job and returns it when it has ended; raises its error if it failed."""
         while (found := await self.job(id_)).state is JobState.RUNNING:
             await asyncio.sleep(POLL_S)
         if found.problem is not None:
@@ -127,14 +127,14 @@ class AsyncClient:
         return found
 
     async def lease_state(self) -> LeaseState:
-        """Who may move."""
+        """Returns the state of the lease."""
         return await self.do(MachineCalls.lease())
 
     @asynccontextmanager
     async def lease(self, *, force: bool = False) -> AsyncIterator[LeaseGrant]:
-        """Hold the right to move within the block; a task renews it while the event loop turns.
+        """Holds the lease within the block; a task renews it while the event loop runs.
 
-        Within a block that holds it already it is that one. LeaseError where another client has it.
+        A nested block reuses the lease. Raises LeaseError if another client holds it.
         """
         async with self._held(force) as grant:
             renewing = asyncio.ensure_future(self._renew(grant))
@@ -146,11 +146,11 @@ class AsyncClient:
 
     @property
     def holds_lease(self) -> bool:
-        """Whether this client has the right to move now."""
+        """True if this client holds the lease."""
         return self._grant is not None
 
     async def live(self, *, every: int = 1, axes: Sequence[str] | None = None) -> AsyncIterator[Samples]:
-        """Samples as they come, of one cycle in ``every``; a reader that is slow loses some and is told."""
+        """Yields batches of samples of one cycle in ``every``; each has the number lost by a slow reader."""
         wanted = LiveOptions(every=every, axes=None if axes is None else list(axes))
         async with self.connected("/live") as link:
             await link.send(wanted)
@@ -159,7 +159,7 @@ class AsyncClient:
 
     @asynccontextmanager
     async def connected(self, path: str) -> AsyncIterator[AsyncLink]:
-        """A WebSocket of the API."""
+        """Opens a WebSocket of the API."""
         url, options = sockets.url(self.address, path), sockets.options(self.address, self._tls)
         uds = transport.socket_of(self.address)
         async with AsyncExitStack() as stack:
@@ -172,7 +172,7 @@ class AsyncClient:
             yield AsyncLink(connection, self.address)
 
     async def do(self, call: Call[A]) -> A:
-        """Carry out a call, with the lease where it needs it."""
+        """Sends a request, with the lease if it requires one."""
         if not call.moving:
             return await self._send(call)
         async with self._held():
@@ -180,7 +180,7 @@ class AsyncClient:
 
     @asynccontextmanager
     async def _held(self, force: bool = False) -> AsyncIterator[LeaseGrant]:
-        """The lease, taken by the first that needs it and given back by the last."""
+        """Holds the lease, taken by the first user and released by the last."""
         async with self._lock:
             if self._grant is None:
                 self._grant = await self._send(MachineCalls.take_lease(self.name, force))
@@ -217,21 +217,21 @@ class AsyncClient:
 
 
 class AsyncLink:
-    """A WebSocket whose failures are errors of hdbridge."""
+    """A WebSocket that raises errors of hdbridge."""
 
     def __init__(self, connection: ClientConnection, address: Address) -> None:
         self._connection = connection
         self._address = address
 
     async def send(self, message: BaseModel) -> None:
-        """A message."""
+        """Sends a message."""
         try:
             await self._connection.send(message.model_dump_json())
         except sockets.FAILURES as problem:
             raise sockets.error_of(problem, self._address) from None
 
     async def receive(self, kind: type[M]) -> M:
-        """The next one."""
+        """Receives the next message."""
         try:
             text = await self._connection.recv()
         except sockets.FAILURES as problem:

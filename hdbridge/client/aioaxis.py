@@ -1,4 +1,4 @@
-"""One axis, for the client with asyncio."""
+"""An axis of the asyncio client."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 
 class AsyncAxis:
-    """One axis. What moves returns when the axis rests again, unless it is told not to wait."""
+    """An axis. Methods that move it return when it is at rest again, unless ``wait`` is False."""
 
     def __init__(self, client: AsyncClient, name: str) -> None:
         self.client = client
@@ -39,31 +39,31 @@ class AsyncAxis:
         self._calls = AxisCalls(name)
 
     async def state(self) -> AxisState:
-        """Everything about it."""
+        """Returns the state of the axis."""
         return await self.client.do(self._calls.state())
 
     async def enable(self) -> AxisState:
-        """Switch power on, standing still; the drive is booted and verified first where it is not."""
+        """Switches power on at rest; boots and verifies the drive first if that was not done."""
         return await self.client.do(self._calls.enable())
 
     async def disable(self) -> AxisState:
-        """Brake to rest, then switch power off."""
+        """Brakes to rest, then switches power off."""
         return await self.client.do(self._calls.disable())
 
     async def reset(self) -> AxisState:
-        """Release a latched stop; it stays disabled."""
+        """Releases a latched stop; the axis stays disabled."""
         return await self.client.do(self._calls.reset())
 
     async def stop(self) -> AxisState:
-        """Brake to rest and stay enabled; needs no lease."""
+        """Brakes to rest and stays enabled. Requires no lease."""
         return await self.client.do(self._calls.stop())
 
     async def quick_stop(self) -> AxisState:
-        """Stop at once, latched until a reset; needs no lease."""
+        """Quick-stops the axis and latches the stop until a reset. Requires no lease."""
         return await self.client.do(self._calls.quick_stop())
 
     async def home(self, method: int, **values: float | None) -> AxisState:
-        """Home by a method of the drive's own; ``values`` are those of `messages.Home`."""
+        """Homes by a method of the drive; ``values`` are the other fields of `messages.Home`."""
         return await self.client.do(self._calls.home(method, **values))
 
     async def move(
@@ -74,13 +74,13 @@ class AsyncAxis:
         acceleration_deg_s2: float | None = None,
         wait: bool = True,
     ) -> AxisState:
-        """Go to a load angle, degrees; an axis in motion is re-targeted without a stop."""
+        """Moves to a load angle in degrees; a present motion is redirected without a stop."""
         return await self.client.do(self._calls.move(target_deg, velocity_deg_s, acceleration_deg_s2, wait))
 
     async def jog(self, velocity_deg_s: float, duration_s: float | None = None) -> AxisState:
-        """Turn at a speed for a time, then brake; without a time it has to be called again within `JOG_S`.
+        """Turns at a speed for a time, then brakes; without a time, call it again within `JOG_S`.
 
-        LeaseError without a time where the lease is not held: it would end with this call.
+        Raises LeaseError without a time if the lease is not held, because it would end with this call.
         """
         call = self._calls.jog(velocity_deg_s, JOG_S)
         if duration_s is None:
@@ -94,7 +94,7 @@ class AsyncAxis:
             return await self.stop()
 
     async def queue(self, points: Sequence[QueueItem | float], *, wait: bool = True) -> AxisState:
-        """Append way points (load angles, or with their limits) and wait until the last is reached."""
+        """Appends way points (load angles, or with their own limits) and waits until the last is reached."""
         call = self._calls.queue(points)
         if not wait:
             self._need_lease("a queue that is not waited for")
@@ -104,11 +104,11 @@ class AsyncAxis:
             return await self.rest()
 
     async def clear_queue(self) -> AxisState:
-        """Forget the way points that have not begun."""
+        """Discards the waiting way points."""
         return await self.client.do(self._calls.clear_queue())
 
     async def rest(self) -> AxisState:
-        """Wait until it rests and nothing waits; SafetyStop where it was stopped."""
+        """Waits until the axis is at rest and no way points wait; raises SafetyStop if it was stopped."""
         while True:
             found = await self.state()
             if found.fault is not None:
@@ -119,10 +119,10 @@ class AsyncAxis:
 
     @asynccontextmanager
     async def stream(self, timeout_s: float = JOG_S) -> AsyncIterator[AsyncStream]:
-        """Follow set-points that are put within the block, and rest at the last one when it ends.
+        """Follows set-points that are put within the block; the axis rests at the last one when it ends.
 
-        The first one is where the axis stands. It brakes when no point is left for ``timeout_s``, and when an
-        error leaves the block.
+        The first set-point is the axis's position. The axis brakes if no point is left for ``timeout_s``, or
+        if an error leaves the block.
         """
         begin = given(StreamBegin, lease="", timeout_s=timeout_s)
         async with self.client.lease() as grant, self.client.connected(f"{self._calls.path}/stream") as link:
@@ -132,35 +132,35 @@ class AsyncAxis:
             await stream.end()
 
     async def compensate(self, scheme: Scheme | str) -> AxisState:
-        """Compensate by this part of the model; ``none`` switches it off."""
+        """Selects the part of the model that compensates; ``none`` switches compensation off."""
         return await self.client.do(self._calls.compensate(scheme))
 
     async def activate_model(self, version: int | str) -> AxisState:
-        """Use another model: its number in the history, ``pending`` or ``active``."""
+        """Activates a model: its number in the history, ``pending`` or ``active``."""
         return await self.client.do(self._calls.activate_model(version))
 
     async def load_loop(self, on: bool) -> AxisState:
-        """Switch the slow integral of the measured error on or off."""
+        """Switches the load loop (integral of the measured error) on or off."""
         return await self.client.do(self._calls.load_loop(on))
 
     async def adapt(self, mode: AdaptationMode | str) -> AxisState:
-        """``off``, ``observe`` or ``on``."""
+        """Sets the adaptation mode: ``off``, ``observe`` or ``on``."""
         return await self.client.do(self._calls.adapt(mode))
 
     async def adaptation_back(self) -> AxisState:
-        """Take back what the adaptation changed."""
+        """Discards the changes by the adaptation."""
         return await self.client.do(self._calls.adaptation_back())
 
     async def read(self, object_: str) -> SdoValue:
-        """An object of the drive: its number (6064h, 0x1018:4) or its name in the EDS."""
+        """Reads an object of the drive by its number (6064h, 0x1018:4) or EDS name."""
         return await self.client.do(self._calls.read(object_))
 
     async def write(self, object_: str, value: int | float | str) -> SdoValue:
-        """Write one; refused while the axis is enabled."""
+        """Writes an object of the drive; refused while the axis is enabled."""
         return await self.client.do(self._calls.write(object_, str(value)))
 
     async def job(self, kind: JobKind | str, *, wait: bool = True, **options: Any) -> Job:
-        """Run a procedure: ``step``, ``calibrate``, ``improve``, with the options of that command."""
+        """Runs a job: ``step``, ``calibrate`` or ``improve``, with the options of that command."""
         begun = await self.client.do(self._calls.job(kind, options))
         return await self.client.wait_for_job(begun.id) if wait else begun
 
@@ -170,29 +170,30 @@ class AsyncAxis:
 
 
 class AsyncStream:
-    """Set-points under way."""
+    """An open stream of set-points."""
 
     def __init__(self, link: AsyncLink) -> None:
         self._link = link
         self._ended = False
 
     async def put(self, points: Iterable[sockets.Point]) -> None:
-        """Hand over points: (time s, load angle deg) or (time, angle, speed deg/s), times since the begin.
+        """Sends points: (time s, load angle deg) or (time, angle, speed deg/s), time since the start.
 
-        Waits while the daemon has enough of them. InputError where one is refused: the axis brakes.
+        Waits while the daemon's buffer is full. Raises InputError if a point is refused; the axis then
+        brakes.
         """
         for each in sockets.parts(points, end=False):
             await self.exchange(each)
 
     async def end(self) -> None:
-        """No more points come; returns when the axis rests at the last one."""
+        """Ends the stream; returns when the axis is at rest at the last point."""
         if not self._ended:
             self._ended = True
             (last,) = sockets.parts((), end=True)
             await self.exchange(last)
 
     async def exchange(self, message: BaseModel) -> None:
-        """Send a message and take its answer."""
+        """Sends a message and receives its answer."""
         await self._link.send(message)
         answer = await self._link.receive(StreamAnswer)
         if answer.problem is not None:

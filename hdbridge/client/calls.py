@@ -1,7 +1,7 @@
-"""Every request that a client makes, as data: written once, carried out with and without asyncio.
+"""Requests of a client as data, shared by the synchronous and the asyncio client.
 
-A call that is ``moving`` needs the lease; one that ``waits`` is answered when a motion is over, and so has no
-time-out of its own: the daemon's own supervision bounds it.
+A ``moving`` call requires the lease. A call that ``waits`` is answered when a motion has ended, so it has no
+time-out: the daemon's supervision bounds it.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ PREFIX = "/api/v1"
 
 @dataclass(frozen=True)
 class Call(Generic[A]):
-    """One request and what its answer is."""
+    """A request and the type of its answer."""
 
     method: str
     path: str
@@ -36,11 +36,11 @@ class Call(Generic[A]):
 
     @property
     def content(self) -> bytes | None:
-        """The body as JSON."""
+        """Body as JSON."""
         return None if self.body is None else self.body.model_dump_json(exclude_none=True).encode()
 
     def read(self, status: int, kind: str, content: bytes) -> A:
-        """The answer; what the daemon refuses is raised as the error that it is."""
+        """Returns the parsed answer; raises the daemon's error if it refused the request."""
         if status >= 400:
             raise _refused(status, kind, content)
         try:
@@ -64,7 +64,7 @@ def _refused(status: int, kind: str, content: bytes) -> HdbridgeError:
 
 
 def given(request: type[M], /, **values: Any) -> M:
-    """A request; InputError, before anything is sent, where a value is none that it takes."""
+    """Builds a request; raises InputError for an invalid value before anything is sent."""
     try:
         return request.model_validate(values)
     except ValidationError as problem:
@@ -74,7 +74,7 @@ def given(request: type[M], /, **values: Any) -> M:
 
 
 class MachineCalls:
-    """The requests that are of no single axis."""
+    """Requests that concern no single axis."""
 
     @staticmethod
     def state() -> Call[messages.MachineState]:
@@ -134,7 +134,7 @@ class MachineCalls:
 
 
 class AxisCalls:
-    """The requests of one axis."""
+    """Requests of one axis."""
 
     def __init__(self, name: str) -> None:
         self.path = f"/axes/{quote(name, safe='')}"

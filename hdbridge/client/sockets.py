@@ -1,4 +1,4 @@
-"""What the WebSockets of both clients share: how they are opened, and what their errors are."""
+"""WebSockets of both clients: settings, messages, and the errors for their failures."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from hdbridge.client.messages import StreamPoint, StreamPoints
 from hdbridge.errors import DaemonError, HdbridgeError
 
 MESSAGE_MAXIMUM: Final = 32 << 20
-"""Bytes: a batch of the most samples that the daemon keeps, of many axes."""
+"""Maximum message size in bytes, enough for the largest batch of samples of many axes."""
 CLOSE_S: Final = 1.0
 FAILURES: Final = (OSError, EOFError, ConnectionClosed, InvalidHandshake)
-"""What a connection may raise."""
+"""Exceptions of a connection."""
 POINTS_AT_A_TIME: Final = 200
 Point = StreamPoint | tuple[float, float] | tuple[float, float, float]
-"""Time in seconds, load angle in degrees, and speed in deg/s where it is known."""
+"""Time in seconds, load angle in degrees, and optionally speed in deg/s."""
 
 
 def options(address: Address, tls: ssl.SSLContext | None) -> dict[str, Any]:
-    """What ``connect`` of either kind is given."""
+    """Returns the arguments of either ``connect``."""
     known: dict[str, Any] = {
         "additional_headers": address.headers,
         "max_size": MESSAGE_MAXIMUM,
@@ -36,12 +36,12 @@ def options(address: Address, tls: ssl.SSLContext | None) -> dict[str, Any]:
 
 
 def url(address: Address, path: str) -> str:
-    """Of a WebSocket of the API."""
+    """Returns the URL of a WebSocket of the API."""
     return f"{address.websocket_url}{PREFIX}{path}"
 
 
 def read(kind: type[M], text: str | bytes) -> M:
-    """A message of the daemon."""
+    """Parses a message of the daemon."""
     try:
         return kind.model_validate_json(text)
     except ValidationError:
@@ -51,7 +51,7 @@ def read(kind: type[M], text: str | bytes) -> M:
 
 
 def error_of(problem: Exception, address: Address) -> HdbridgeError:
-    """What a failure of the connection is here."""
+    """Returns the hdbridge error for a failure of the connection."""
     if isinstance(problem, HdbridgeError):
         return problem
     if isinstance(problem, InvalidStatus):
@@ -68,7 +68,7 @@ def error_of(problem: Exception, address: Address) -> HdbridgeError:
 
 
 def parts(points: Iterable[Point], end: bool) -> list[StreamPoints]:
-    """Points in messages of bounded size; InputError where one is none. The last one ends the stream."""
+    """Splits points into messages of bounded size; ``end`` adds the last. InputError for invalid points."""
     items = [
         each
         if isinstance(each, StreamPoint)

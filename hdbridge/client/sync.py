@@ -1,4 +1,4 @@
-"""The client without asyncio.
+"""The synchronous client.
 
     from hdbridge import Client
 
@@ -10,8 +10,8 @@
         for target_deg in (10, 20, 30):
             print(axis.move(target_deg).error_arcsec)
 
-What moves needs the lease. A method that moves takes it for as long as it runs, where it is not held by
-`Client.lease` already. Every error is one of `hdbridge.errors`.
+Motion requires the lease. A method that moves an axis takes it while it runs, unless `Client.lease` holds it
+already. Every error is one of `hdbridge.errors`.
 """
 
 from __future__ import annotations
@@ -46,15 +46,15 @@ from hdbridge.client.messages import (
 from hdbridge.errors import DaemonError, LeaseError
 
 RENEWALS: Final = 3
-"""How often a lease is renewed within its time-out."""
+"""Renewals of a lease per time-out."""
 
 
 class Client:
-    """A daemon, wherever it is. Close it, or use it as a context manager.
+    """Client of a daemon. Close it, or use it as a context manager.
 
-    ``address`` is a Unix socket, a URL or a machine's name; without it `hdbridge.client.address.find` looks
-    for the one that there is. ``token`` is what TCP asks for, ``name`` is shown to others while it
-    holds the lease. Several threads may use it.
+    ``address`` is a Unix socket, a URL or a machine's name; `hdbridge.client.address.find` finds the daemon
+    without it. ``token`` is required over TCP; others see ``name`` while the client holds the lease.
+    Thread-safe.
     """
 
     def __init__(
@@ -83,58 +83,58 @@ class Client:
         self.close()
 
     def close(self) -> None:
-        """Close the connections."""
+        """Closes the connections."""
         self._http.close()
 
     def axis(self, name: str) -> Axis:
-        """One axis; whether there is one of that name shows when it is asked for something."""
+        """Returns an axis. Its name is checked by the first request."""
         return Axis(self, name)
 
     @property
     def axes(self) -> dict[str, Axis]:
-        """Every axis of the machine by its name."""
+        """Returns all axes of the machine by name."""
         return {each.name: Axis(self, each.name) for each in self.state().axes}
 
     def state(self) -> MachineState:
-        """Everything about the machine and its axes."""
+        """Returns the state of the machine and its axes."""
         return self.do(MachineCalls.state())
 
     def events(self, since: int = 0) -> Events:
-        """What happened since an event."""
+        """Returns the events after number ``since``."""
         return self.do(MachineCalls.events(since))
 
     def mark(self, text: str) -> list[Event]:
-        """A remark for the flight recorder."""
+        """Adds a remark to the event log and the flight recorder."""
         return self.do(MachineCalls.mark(text)).events
 
     def stop(self) -> MachineState:
-        """Brake every axis to rest; needs no lease."""
+        """Brakes all axes to rest. Requires no lease."""
         return self.do(MachineCalls.stop_all())
 
     def quick_stop(self) -> MachineState:
-        """Stop every axis at once, latched until a reset; needs no lease."""
+        """Quick-stops all axes and latches the stops until a reset. Requires no lease."""
         return self.do(MachineCalls.quick_stop_all())
 
     def coordinated(
         self, targets_deg: Mapping[str, float], *, speed: float = 1.0, wait: bool = True
     ) -> MachineState:
-        """Move axes so that all begin and end together; ``speed`` is a share of their limits."""
+        """Moves axes so that all begin and end together; ``speed`` is a share of their limits."""
         return self.do(MachineCalls.coordinated(targets_deg, speed, wait))
 
     def jobs(self) -> list[Job]:
-        """The procedures that run or ran."""
+        """Returns the running and the last finished jobs."""
         return self.do(MachineCalls.jobs())
 
     def job(self, id_: str) -> Job:
-        """One of them."""
+        """Returns one job."""
         return self.do(MachineCalls.job(id_))
 
     def cancel_job(self, id_: str) -> Job:
-        """Stop its axis in order; what was measured is kept."""
+        """Cancels a job: its axis brakes to rest, its measurements are kept."""
         return self.do(MachineCalls.cancel_job(id_))
 
     def wait_for_job(self, id_: str) -> Job:
-        """The job when it is over; what it failed by is raised."""
+        """Waits for a job and returns it when it has ended; raises its error if it failed."""
         while (found := self.job(id_)).state is JobState.RUNNING:
             time.sleep(POLL_S)
         if found.problem is not None:
@@ -142,14 +142,14 @@ class Client:
         return found
 
     def lease_state(self) -> LeaseState:
-        """Who may move."""
+        """Returns the state of the lease."""
         return self.do(MachineCalls.lease())
 
     @contextmanager
     def lease(self, *, force: bool = False) -> Iterator[LeaseGrant]:
-        """Hold the right to move within the block; a thread renews it while this process runs.
+        """Holds the lease within the block; a thread renews it while this process runs.
 
-        Within a block that holds it already it is that one. LeaseError where another client has it.
+        A nested block reuses the lease. Raises LeaseError if another client holds it.
         """
         with self._held(force) as grant:
             ended = threading.Event()
@@ -163,11 +163,11 @@ class Client:
 
     @property
     def holds_lease(self) -> bool:
-        """Whether this client has the right to move now."""
+        """True if this client holds the lease."""
         return self._grant is not None
 
     def live(self, *, every: int = 1, axes: Sequence[str] | None = None) -> Iterator[Samples]:
-        """Samples as they come, of one cycle in ``every``; a reader that is slow loses some and is told."""
+        """Yields batches of samples of one cycle in ``every``; each has the number lost by a slow reader."""
         wanted = LiveOptions(every=every, axes=None if axes is None else list(axes))
         with self.connected("/live") as link:
             link.send(wanted)
@@ -176,7 +176,7 @@ class Client:
 
     @contextmanager
     def connected(self, path: str) -> Iterator[Link]:
-        """A WebSocket of the API."""
+        """Opens a WebSocket of the API."""
         url, options = sockets.url(self.address, path), sockets.options(self.address, self._tls)
         uds = transport.socket_of(self.address)
         with ExitStack() as stack:
@@ -189,7 +189,7 @@ class Client:
             yield Link(connection, self.address)
 
     def do(self, call: Call[A]) -> A:
-        """Carry out a call, with the lease where it needs it."""
+        """Sends a request, with the lease if it requires one."""
         if not call.moving:
             return self._send(call)
         with self._held():
@@ -197,7 +197,7 @@ class Client:
 
     @contextmanager
     def _held(self, force: bool = False) -> Iterator[LeaseGrant]:
-        """The lease, taken by the first that needs it and given back by the last."""
+        """Holds the lease, taken by the first user and released by the last."""
         with self._lock:
             if self._grant is None:
                 self._grant = self._send(MachineCalls.take_lease(self.name, force))
@@ -233,21 +233,21 @@ class Client:
 
 
 class Link:
-    """A WebSocket whose failures are errors of hdbridge."""
+    """A WebSocket that raises errors of hdbridge."""
 
     def __init__(self, connection: ClientConnection, address: Address) -> None:
         self._connection = connection
         self._address = address
 
     def send(self, message: BaseModel) -> None:
-        """A message."""
+        """Sends a message."""
         try:
             self._connection.send(message.model_dump_json())
         except sockets.FAILURES as problem:
             raise sockets.error_of(problem, self._address) from None
 
     def receive(self, kind: type[M]) -> M:
-        """The next one."""
+        """Receives the next message."""
         try:
             text = self._connection.recv()
         except sockets.FAILURES as problem:

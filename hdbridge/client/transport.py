@@ -1,4 +1,4 @@
-"""The HTTP under both clients: its settings, one request, and what its failures are."""
+"""HTTP transport of both clients: settings, requests, and the errors for its failures."""
 
 from __future__ import annotations
 
@@ -14,29 +14,29 @@ from hdbridge.errors import DaemonError
 
 
 def tls_context(address: Address) -> ssl.SSLContext | None:
-    """For HTTPS to a reverse proxy: trusts what the system, or ``$SSL_CERT_FILE``, does; None without TLS."""
+    """Returns the TLS context for HTTPS, with the certificates of the system or ``$SSL_CERT_FILE``."""
     https = address.socket is None and address.url.startswith("https")
     return ssl.create_default_context() if https else None
 
 
 def settings(address: Address) -> dict[str, Any]:
-    """What the client of httpx is made with; nothing of it comes from the environment."""
+    """Returns the settings of the httpx client, which ignores the environment."""
     return {"base_url": address.url + PREFIX, "headers": address.headers, "trust_env": False}
 
 
 def under(address: Address, tls: ssl.SSLContext | None) -> dict[str, Any]:
-    """What a transport of httpx is made with."""
+    """Returns the settings of the httpx transport."""
     uds = None if address.socket is None else str(address.socket)
     return {"uds": uds, "verify": False if tls is None else tls}  # without TLS it loads no certificates
 
 
 def socket_of(address: Address) -> str | None:
-    """The Unix socket, for a WebSocket."""
+    """Returns the path of the Unix socket for a WebSocket; None over TCP."""
     return None if address.socket is None else str(address.socket)
 
 
 def request(call: Call[A], grant: LeaseGrant | None, timeout_s: float) -> dict[str, Any]:
-    """What a call is to httpx."""
+    """Returns the arguments of an httpx request for a call."""
     headers = {"Content-Type": "application/json"} if call.body is not None else {}
     if grant is not None:
         headers["X-Lease"] = grant.token
@@ -51,18 +51,18 @@ def request(call: Call[A], grant: LeaseGrant | None, timeout_s: float) -> dict[s
 
 
 def answer(call: Call[A], response: httpx.Response) -> A:
-    """What came back, or the error that it is."""
+    """Returns the parsed answer, or raises the daemon's error."""
     return call.read(response.status_code, response.headers.get("content-type", ""), response.content)
 
 
 def check(address: Address) -> None:
-    """DaemonError where there is no socket: said in one way, whatever asks."""
+    """Raises DaemonError if the socket does not exist, with the same message for all requests."""
     if address.socket is not None and not address.socket.is_socket():
         raise DaemonError(f"{address}: there is no such socket; start the daemon with 'hdbridge run'")
 
 
 def unreachable(address: Address, problem: Exception) -> DaemonError:
-    """The daemon is not there, or went away in the middle."""
+    """Returns the error for a daemon that cannot be reached or has disconnected."""
     if isinstance(problem, httpx.ConnectError):
         return DaemonError(f"{address}: no daemon answers ({problem}); start it with 'hdbridge run'")
     what = "did not answer in time" if isinstance(problem, httpx.TimeoutException) else "went away"

@@ -1,1 +1,1 @@
-"""The daemon: holds the drives of one bus, day and night. See docs/architecture.md."""
+"""The daemon, which controls the drives of one bus permanently. See docs/architecture.md."""

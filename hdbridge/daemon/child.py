@@ -1,4 +1,4 @@
-"""A process that the keeper has started: a fresh interpreter that inherits what it is handed, and no more."""
+"""A child process of the keeper: a fresh interpreter that inherits only the given descriptors."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from contextlib import suppress
 
 
 class Child:
-    """One process, from its start to its end."""
+    """A child process, from its start to its end."""
 
     def __init__(self, program: Sequence[str], start_fd: int, handed: Sequence[int], now_s: float) -> None:
-        """Runs ``program`` in this interpreter with the number of ``start_fd`` as its argument.
+        """Runs ``program`` in this interpreter, with the number of ``start_fd`` as its argument.
 
-        ``handed`` are further descriptors that it inherits. It has a session of its own: what the terminal
-        sends is the keeper's to deal with.
+        It also inherits the descriptors in ``handed``. It has its own session, so that signals of the
+        terminal reach only the keeper.
         """
         self.started_s = now_s
         self._process = subprocess.Popen(
@@ -28,16 +28,16 @@ class Child:
         )
         self.pid = self._process.pid
         self.pidfd = os.pidfd_open(self.pid)
-        """Becomes readable when the process has ended."""
+        """Descriptor that becomes readable when the process has ended."""
 
     @property
     def ended(self) -> int | None:
-        """Its exit status, negative where a signal ended it; None while it runs."""
+        """Exit status, negative after a signal; None while it runs."""
         return self._process.poll()
 
     @property
     def how(self) -> str:
-        """How it ended, in words."""
+        """Exit status or signal in words."""
         status = self.ended
         if status is None:
             return "runs"
@@ -48,11 +48,11 @@ class Child:
         return f"ended by signal {-status}"
 
     def send(self, number: signal.Signals) -> None:
-        """Send a signal; nothing where it has ended: nobody else has its number before `ended` was asked."""
+        """Sends a signal, unless the process has ended; its id cannot be reused before `ended` is called."""
         self._process.send_signal(number)
 
     def close(self) -> None:
-        """End it at once where it still runs; the descriptor is closed."""
+        """Kills the process if it still runs, and closes the descriptor."""
         if self.ended is None:
             self._process.kill()
             self._process.wait()

@@ -1,4 +1,4 @@
-"""What outlives the processes of a daemon: log, lock, sockets, shared memory; and the keeper within."""
+"""Creation of a daemon: log, lock, sockets and shared memory, which outlive its processes, and the keeper."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ def hold(
     page: int | None = None,
     log: LogSettings | None = None,
 ) -> int:
-    """Run the daemon of a machine in this process until a signal ends it; the exit status.
+    """Runs the daemon of a machine in this process until a signal ends it; returns the exit status.
 
-    ``page`` is a port at which this machine alone reaches the live page, 0 takes any: the address is told on
-    standard error, with a token that is made for this run; a machine with an ``api.tcp`` has its page there.
-    ``force`` goes on where another process of this machine masters the interface, or another master is heard.
-    InputError, BusError and DaemonError where it cannot begin; then nothing was sent.
+    ``page`` is a loopback port for the live page (0: any free one). Its address is printed to standard error,
+    with a token for this run; a machine with ``api.tcp`` has its page there instead. ``force`` starts even if
+    another process controls the interface or another master is active on the bus. Raises InputError, BusError
+    or DaemonError if it cannot start; then nothing was sent.
     """
     log = log or LogSettings()
     begin_log(log)
@@ -62,6 +62,6 @@ def hold(
 
 
 def _tell_page(listener: socket.socket, token: str | None) -> None:
-    """For the person at the terminal; the token of a run does not belong in a log."""
+    """Prints the address of the page for the user; a token does not belong in a log."""
     host, port = listener.getsockname()
     print(f"page: http://{host}:{port}/{f'#token={token}' if token else ''}", file=sys.stderr, flush=True)

@@ -1,17 +1,17 @@
-"""The keeper: starts the daemon's two processes, looks after them, ends them in order, and does nothing else.
+"""The keeper: starts, monitors and ends the daemon's two processes, and does nothing else.
 
-It holds what has to outlive a child: the shared memory, the listening sockets, the lock of the CAN interface.
+It holds what must outlive a child: the shared memory, the listening sockets, the lock of the CAN interface.
 
     a child is        the keeper
     ----------------  ----------------------------------------------------------------------------------
-    control, dead     starts it again; its axes come up disabled. Too often in a minute: ends everything.
-                      So it does if somebody ended it by SIGTERM: only the keeper ends the daemon
-    control, hung     kills it after `Times.hung_s`: the bus is silent, the drives have stopped by themselves
-    service, dead     starts it again, later each time; the loop goes on
+    control, dead     restarts it; its axes come up disabled. If it dies too often in a minute, or by
+                      SIGTERM from somebody else, the keeper ends the daemon
+    control, hung     kills it after `Times.hung_s`; the bus is silent, so the drives have stopped already
+    service, dead     restarts it after increasing delays; the loop continues
     service, hung     kills it after `Times.service_hung_s`
 
-Where a child cannot even begin (a bus that cannot be opened, a folder that cannot be written), the daemon
-ends with that child's exit status.
+If a child cannot start (the bus cannot be opened, a folder cannot be written), the daemon ends with that
+child's exit status.
 """
 
 from __future__ import annotations
@@ -39,13 +39,14 @@ _log = logging.getLogger(__name__)
 TICK_S: Final = 0.25
 _SIGNALS: Final = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP, signal.SIGQUIT)
 _ERRORS: Final = range(2, 16)
-"""Exit statuses of an `HdbridgeError`: it has said what is wrong, and a second attempt would say it again."""
+"""Exit statuses of an `HdbridgeError`. The child has reported the error, and a restart would only repeat
+it."""
 _FIRST_ATTEMPTS: Final = 3
 
 
 @dataclass(frozen=True, slots=True)
 class Programs:
-    """What the children run; tests put others there."""
+    """Programs of the children; tests substitute others."""
 
     control: Sequence[str] = ("-m", "hdbridge.daemon.loop.process")
     service: Sequence[str] = ("-m", "hdbridge.daemon.service.process")
@@ -53,26 +54,26 @@ class Programs:
 
 @dataclass(frozen=True, slots=True)
 class Times:
-    """How long the keeper waits for what, seconds."""
+    """Time-outs of the keeper, seconds."""
 
     begin_s: float = 60.0
-    """For a child to begin."""
+    """Start of a child."""
     hung_s: float = 5.0
-    """For a turn of the control process; the drives have stopped by themselves long before."""
+    """A turn of the control process; the drives' own watchdogs act long before."""
     service_hung_s: float = 30.0
-    """For the service to show that it lives."""
+    """A sign of life of the service."""
     stop_s: float = 30.0
-    """For the control process to bring all axes to rest."""
+    """Braking of all axes by the control process."""
     service_stop_s: float = 10.0
-    """For the service to end after that."""
+    """End of the service after that."""
 
 
 SIMULATED: Final = Times(begin_s=600.0, stop_s=300.0, service_stop_s=120.0)
-"""With simulated drives a computer that is busy ends nothing."""
+"""Time-outs with simulated drives, long enough for a busy computer."""
 
 
 class Keeper:
-    """The two processes of one machine, from their start to their end."""
+    """Keeper of the two processes of one machine."""
 
     def __init__(
         self,
@@ -94,7 +95,7 @@ class Keeper:
         self._restarts = {"control": 0, "service": 0}
         self._ready = False
         self._status = 0
-        """With which all will end."""
+        """Exit status of the daemon."""
         self._signals = self._heeded = 0
         self._stopping_since_s: float | None = None
         self._service_told_s: float | None = None
@@ -102,7 +103,7 @@ class Keeper:
         self._selector = selectors.DefaultSelector()
 
     def run(self) -> int:
-        """Until a signal ends it, or it cannot go on; the exit status."""
+        """Runs until a signal ends it or it cannot continue; returns the exit status."""
         with ExitStack() as stack:
             stack.callback(self._selector.close)
             stack.enter_context(self._deferred_signals())
@@ -193,7 +194,7 @@ class Keeper:
             self._service_due_s = now_s + self._back_off.delay_s(lived_s)
 
     def _look_after(self, now_s: float) -> None:
-        """Say that all is well while it is; kill what hangs."""
+        """Kills hung children; reports readiness, sign of life and status to the service manager."""
         status = self._memory.status
         running = self._turns.look(status.loop_count)
         self._served.look(status.service_time_ns)
@@ -228,7 +229,7 @@ class Keeper:
     # ------------------------------------------------------------------ the end
 
     def _heed_signals(self, now_s: float) -> None:
-        """The first stops in order, the second at the quick-stop ramp, the third ends whatever still runs."""
+        """Handles signals: the first brakes to rest, the second quick-stops, the third ends everything."""
         while self._heeded < self._signals:
             self._heeded += 1
             if self._heeded == 1:
@@ -239,7 +240,7 @@ class Keeper:
                 self._end_all()
 
     def _stop(self, now_s: float, status: int, why: str) -> None:
-        """Bring the axes to rest and end; the service goes last, so that it sees and records the end."""
+        """Brakes the axes and ends; the service ends last, so that it records the stop."""
         if self._stopping_since_s is not None:
             return
         self._stopping_since_s, self._status = now_s, status
@@ -271,7 +272,7 @@ class Keeper:
 
     @contextmanager
     def _deferred_signals(self) -> Iterator[None]:
-        """Signals are counted, and wake the keeper up; what was ignored from the start (nohup) stays so."""
+        """Counts signals and wakes the keeper; signals ignored from the start (nohup) stay ignored."""
         reader, writer = socket.socketpair()
         with reader, writer:
             for each in (reader, writer):

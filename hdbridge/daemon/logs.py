@@ -1,7 +1,7 @@
-"""The daemon's log: an event per line, as JSON or, on a terminal, in words; the same event not too often.
+"""The daemon's log: one line per event, as JSON, or as text on a terminal, with a rate limit per event.
 
-Each process logs for itself to what it was given: standard error, which under systemd is the journal, and
-with ``--log`` a file. The control process logs how it begins, and nothing while it turns.
+Each process logs to standard error, which under systemd is the journal, and with ``--log`` to a file. The
+control process logs how it starts, and nothing while the loop turns.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from hdbridge.files.logformat import ForMachines, ForPeople, LogFile
 
 _ROOT = logging.getLogger("hdbridge")
 BURST: Final = 20
-"""So many of one event are logged within `WINDOW_S`; then it is said how many were left out."""
+"""Maximum number of records of one event per `WINDOW_S`; the number of omitted ones is reported."""
 WINDOW_S: Final = 10.0
 _LEVELS: Final = {
     logging.DEBUG: 7,
@@ -27,21 +27,21 @@ _LEVELS: Final = {
     logging.ERROR: 3,
     logging.CRITICAL: 2,
 }
-"""Priorities of syslog, which the journal takes from the beginning of a line."""
+"""Syslog priorities, which the journal reads from the start of a line."""
 
 
 @dataclass(frozen=True, slots=True)
 class LogSettings:
-    """Where the processes of the daemon log."""
+    """Log settings of the daemon's processes."""
 
     verbose: int = 0
-    """From 1 on every SDO transfer, too."""
+    """If 1 or more, SDO transfers are logged as well."""
     file: Path | None = None
-    """Appended to, everything, a JSON object per line."""
+    """File to which all records are appended, one JSON object per line."""
 
 
 class RateLimit(logging.Filter):
-    """Lets `BURST` records of an event through in each window, and tells of the others when it is over."""
+    """Passes `BURST` records of an event per window, and reports the number omitted after it."""
 
     def __init__(self, burst: int = BURST, window_s: float = WINDOW_S) -> None:
         super().__init__()
@@ -49,7 +49,7 @@ class RateLimit(logging.Filter):
         self._seen: dict[tuple[str, str], tuple[float, int]] = {}
 
     def filter(self, record: logging.LogRecord) -> bool:
-        """Whether it is logged; the first after a gap says how many were left out."""
+        """Returns True if the record is logged; the first after a gap includes the number omitted."""
         key = (record.name, str(record.msg))
         now_s = time.monotonic()
         since_s, count = self._seen.get(key, (now_s, 0))
@@ -67,14 +67,14 @@ class RateLimit(logging.Filter):
 
 
 class _Journal(ForMachines):
-    """JSON with the priority before it, where the journal reads along."""
+    """JSON preceded by the priority, for the journal."""
 
     def format(self, record: logging.LogRecord) -> str:
         return f"<{_LEVELS.get(record.levelno, 6)}>{super().format(record)}"
 
 
 def begin_log(settings: LogSettings) -> None:
-    """Log from now on, in this process."""
+    """Starts logging in this process."""
     _ROOT.propagate = False
     to_journal = "JOURNAL_STREAM" in os.environ
     stderr = logging.StreamHandler()
@@ -91,7 +91,7 @@ def begin_log(settings: LogSettings) -> None:
 
 
 def log_once(settings: LogSettings, where: str, event: str, facts: dict[str, object]) -> None:
-    """One event of a process that logs nothing afterwards, its library neither."""
+    """Logs one event in a process that logs nothing afterwards, not even from its libraries."""
     before = tuple(_ROOT.handlers)
     begin_log(settings)
     logging.getLogger(where).info(event, facts)

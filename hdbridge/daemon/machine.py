@@ -1,8 +1,7 @@
-"""The machine that a daemon holds: axes on one bus, checked together before anything is opened.
+"""Machine of a daemon: axes on one bus, validated together before anything is opened.
 
-`Machine` is what came of a machine file and the profiles that it names, or of one profile alone. It is read
-once, by the keeper, and handed to the other processes whole: who edits a file while the daemon runs changes
-nothing before the next start.
+`Machine` is made from a machine file and the profiles that it names, or from one profile. The keeper reads it
+once and passes it to the other processes, so edits of a file take effect at the next start.
 """
 
 from __future__ import annotations
@@ -35,7 +34,7 @@ from hdbridge.model import TransmissionModel
 
 
 def machine_file(text: str) -> Path | None:
-    """The machine file that a person means by its path, its folder or a bundled name; None: a profile."""
+    """Returns the machine file given by its path, its folder or a bundled name; None if it is a profile."""
     path = Path(text)
     if not path.exists() and path.name == text and text:
         path = bundled_folder("profiles") / text
@@ -46,32 +45,32 @@ def machine_file(text: str) -> Path | None:
     try:
         data = read_yaml(path).data
     except InputError:
-        return None  # whoever reads it as an axis file complains
+        return None  # reading it as an axis file reports the error
     schema = data.get("schema") if isinstance(data, dict) else None
     return path if str(schema).startswith("hdbridge.machine/") else None
 
 
 @dataclass(frozen=True)
 class Axis:
-    """One axis of the machine, with its files."""
+    """Axis of the machine, with its files."""
 
     config: AxisConfig
-    """The axis file, on the machine's bus."""
+    """Axis file, on the machine's bus."""
     profile: Profile
     compensation: Scheme = Scheme.EXTENDED
-    """Which part of the active model compensates from the start."""
+    """Part of the active model that compensates from the start."""
     adaptation: AdaptationSettings = AdaptationSettings()
     load_loop: LoadLoopSettings | None = None
 
     @property
     def name(self) -> str:
-        """As clients call it: the name in the axis file."""
+        """Name of the axis, from the axis file."""
         return self.config.name
 
     def model(self) -> TransmissionModel:
-        """The active model as it is on disk now; one without effects where the axis has none yet.
+        """Returns the active model on disk; one without effects if there is none yet.
 
-        InputError where it cannot be read, or is of another axis, drive or gear.
+        Raises InputError if it cannot be read, or belongs to another axis, drive or gear.
         """
         if not self.profile.model.exists():
             return TransmissionModel(self.config.gear.ratio)
@@ -82,11 +81,11 @@ class Axis:
 
 @dataclass(frozen=True)
 class Machine:
-    """Axes on one bus with one cycle, and all that the daemon needs to know of its machine."""
+    """Axes on one bus with one cycle, and the daemon's settings."""
 
     name: str
     path: Path
-    """The machine file, or the axis file where there is none."""
+    """Path of the machine file, or of the axis file if there is none."""
     axes: tuple[Axis, ...]
     bus: BusConfig
     realtime: RealtimeConfig
@@ -97,18 +96,19 @@ class Machine:
 
     @property
     def folder(self) -> Path:
-        """Where the file lies; relative paths in it start here."""
+        """Folder of the file, to which its relative paths refer."""
         return self.path.parent
 
     @property
     def cycle_s(self) -> float:
-        """The one cycle, seconds."""
+        """Cycle time, seconds."""
         return self.axes[0].config.drive.cycle_s
 
     def recorder_folder(self, environment: Mapping[str, str] = os.environ) -> Path:
-        """Where the flight recorder writes: as the machine file says, else in the state folder that the
-        service manager gives, else next to the file, and where that cannot be written in the user's state
-        folder.
+        """Returns the folder of the flight recorder.
+
+        It is the folder in the machine file, else in the service manager's state folder, else next to the
+        file, else, if that is not writable, in the user's state folder.
         """
         if self.recorder.folder is not None:
             return self.beside(self.recorder.folder)
@@ -117,15 +117,13 @@ class Machine:
         return (self.folder / "recordings" / "daemon").absolute()
 
     def axis_folder(self, axis: Axis, name: str, environment: Mapping[str, str] = os.environ) -> Path:
-        """A folder for what is kept of an axis: in its profile's, or where that cannot be written in the
-        state folder.
-        """
+        """Returns a folder for data of an axis: in its profile's if writable, else in the state folder."""
         if _writable(axis.profile.folder):
             return axis.profile.folder / name
         return self.state_folder(environment) / axis.name / name
 
     def state_folder(self, environment: Mapping[str, str] = os.environ) -> Path:
-        """That which the service manager gives, else one of the user's."""
+        """Returns the service manager's state folder, else the user's."""
         given = _given(environment)
         if given is not None:
             return given
@@ -133,18 +131,18 @@ class Machine:
         return Path(state) / "hdbridge" / self.name
 
     def beside(self, text: str) -> Path:
-        """A path as the machine file has it, relative to that file, made absolute."""
+        """Returns the absolute path for a path in the machine file."""
         return (self.folder / text).absolute()
 
     @classmethod
     def find(cls, text: str) -> Self:
-        """From a machine file, a folder with ``machine.yaml``, a profile, or the name of a bundled one."""
+        """Loads a machine file, a folder with ``machine.yaml``, a profile, or a bundled name."""
         path = machine_file(text)
         return cls.load(path) if path is not None else cls.of_profile(text)
 
     @classmethod
     def load(cls, path: Path | str) -> Self:
-        """Read a machine file, or the one in a folder; InputError with file:line:column."""
+        """Loads a machine file, or the one in a folder; InputError has file:line:column."""
         path = Path(path)
         document = read_yaml(path / "machine.yaml" if path.is_dir() else path)
         file = document.validate(MachineFile)
@@ -152,7 +150,7 @@ class Machine:
 
     @classmethod
     def of_profile(cls, name: str) -> Self:
-        """The machine of one axis by its profile, with the default of everything else."""
+        """Returns the machine of a single profile, with defaults for everything else."""
         profile = Profile.find(name)
         axis = AxisConfig.load(profile.axis)
         entry = AxisEntry(profile=str(profile.axis.absolute()))
@@ -178,12 +176,12 @@ class Machine:
         )  # fmt: skip
 
     def on_bus(self, **changes: str | int | None) -> Self:
-        """The same machine on another bus (keys of `BusConfig`)."""
+        """Returns the same machine on another bus (keys of `BusConfig`)."""
         axes = tuple(replace(axis, config=axis.config.on_bus(**changes)) for axis in self.axes)
         return replace(self, axes=axes, bus=axes[0].config.bus)
 
     def axis(self, name: str) -> Axis:
-        """An axis by its name; InputError says which there are."""
+        """Returns an axis by its name; InputError lists the names."""
         for axis in self.axes:
             if axis.name == name:
                 return axis
@@ -192,7 +190,7 @@ class Machine:
 
 
 def _axis(file: MachineFile, number: int, places: Places) -> Axis:
-    """Read one axis and everything that belongs to it, before any of it is needed."""
+    """Loads one axis and all its files, so that errors appear at the start."""
     entry = file.axes[number]
     try:
         profile = Profile.find(entry.profile, places.folder)
@@ -209,16 +207,16 @@ def _axis(file: MachineFile, number: int, places: Places) -> Axis:
 
 
 def _given(environment: Mapping[str, str]) -> Path | None:
-    """The state folder that the service manager has made."""
+    """Returns the state folder created by the service manager."""
     text = environment.get("STATE_DIRECTORY", "").split(":")[0]
     return Path(text) if text else None
 
 
 def _writable(folder: Path) -> bool:
-    """Whether something may be kept in a folder: not among what comes with hdbridge."""
+    """Returns True if data can be stored in a folder; the bundled profiles are read-only."""
     return os.access(folder, os.W_OK) and not folder.is_relative_to(bundled_folder("profiles"))
 
 
 def _absolute(profile: Profile) -> Profile:
-    """The processes of the daemon need not share a working folder with who started it."""
+    """Returns the profile with absolute paths, as the daemon's processes may have other working folders."""
     return Profile(profile.axis.absolute(), profile.model.absolute(), profile.truth.absolute())

@@ -1,4 +1,4 @@
-"""What has to agree between the axes of one machine, and who is told where it does not. Opens nothing."""
+"""Consistency checks between the axes of one machine, with the place of each error. Opens nothing."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ T = TypeVar("T")
 
 
 class Places:
-    """Complaints about a machine file; where there is none, about the axis file that stands for it."""
+    """Source of error messages about a machine file, or about the axis file that replaces it."""
 
     def __init__(self, path: Path, document: Document | None) -> None:
         self._path, self._document = path, document
@@ -31,12 +31,12 @@ class Places:
         return self._document.error(at, message)
 
     def where(self, at: Location) -> str:
-        """``line 5`` of the file, for another complaint to point at."""
+        """Returns ``line 5`` of the file, for reference in another message."""
         return f"line {self._document.position(at)[0]}" if self._document is not None else str(self._path)
 
 
 def agreed(axes: Sequence[Axis], ask: Callable[[AxisConfig], T], places: Places, key: str) -> T:
-    """What all axis files say; InputError where they differ, since the machine has one of it."""
+    """Returns the common value of all axis files; raises InputError if they differ."""
     first = ask(axes[0].config)
     for number, axis in enumerate(axes[1:], start=1):
         if ask(axis.config) != first:
@@ -49,9 +49,9 @@ def agreed(axes: Sequence[Axis], ask: Callable[[AxisConfig], T], places: Places,
 
 
 def check_together(axes: Sequence[Axis], places: Places) -> None:
-    """One SYNC and one master for all; names and node ids that nobody else has.
+    """Checks that all axes have the same SYNC and master, and unique names and node ids.
 
-    Identifiers of PDOs follow from the node ids, so they are distinct as well.
+    PDO identifiers follow from the node ids, so they are unique as well.
     """
     names: dict[str, int] = {}
     nodes: dict[int, str] = {}
@@ -87,7 +87,7 @@ def _nodes(config: AxisConfig) -> Iterator[tuple[int, str]]:
 
 
 def check_load(axes: Sequence[AxisConfig], bus: BusConfig, places: Places) -> None:
-    """The frames of a cycle fit into it."""
+    """Checks that the frames of a cycle fit into it."""
     try:
         check_bus_load(axes, bus.bitrate_bps)
     except InputError as problem:
@@ -95,7 +95,7 @@ def check_load(axes: Sequence[AxisConfig], bus: BusConfig, places: Places) -> No
 
 
 def check_tcp(file: MachineFile, places: Places) -> None:
-    """The token is there, and nobody else can read it."""
+    """Checks that the token file exists and only its owner can read it."""
     tcp = file.api.tcp
     if tcp is None:
         return

@@ -1,7 +1,7 @@
-"""The machine file as it stands: which axes, on which bus, for whom, recorded where.
+"""Schema of the machine file: axes, bus, access, recorder.
 
-``machine.yaml`` is written by a person and never rewritten by the program. `hdbridge.daemon.machine` reads
-it together with the profiles that it names.
+A user writes ``machine.yaml``; the program never changes it. `hdbridge.daemon.machine` reads it together with
+the profiles that it names.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from hdbridge.evaluation.stepping import Scheme
 from hdbridge.strictness import Strict
 
 NAME = r"^[A-Za-z0-9][A-Za-z0-9._-]*$"
-"""What names a machine; its socket and its service are called so, too."""
+"""Pattern of a machine's name, which is also the name of its socket and service."""
 _TOKEN = re.compile(r"[A-Za-z0-9._~-]{16,200}")
 
 
@@ -29,12 +29,12 @@ class _Part(Strict):
 
 
 class LoadLoopSettings(_Part):
-    """A slow integral of the error that the load encoder measures, in addition to the model."""
+    """Load loop: a slow integral of the error at the load encoder, in addition to the model."""
 
-    gain_1_s: float = Field(0.5, gt=0, le=5, description="share of the error that it takes away per second")
-    maximum_arcsec: float = Field(30.0, gt=0, le=3600, description="most that it may add, at the load")
+    gain_1_s: float = Field(0.5, gt=0, le=5, description="share of the error that is removed per second")
+    maximum_arcsec: float = Field(30.0, gt=0, le=3600, description="largest correction, at the load")
     slew_arcsec_s: float = Field(
-        20.0, gt=0, le=10_000, description="fastest change of what it adds, at the load"
+        20.0, gt=0, le=10_000, description="fastest change of the correction, at the load"
     )
 
 
@@ -47,13 +47,13 @@ class AxisEntry(_Part):
     )
     compensation: Scheme = Field(
         Scheme.EXTENDED,
-        description="which part of the active model compensates from the start: extended is the whole of it",
+        description="part of the active model that compensates from the start; extended is the whole model",
     )
     adapt: Mode | None = Field(
-        None, description="adaptation of this axis, where it is not the machine's (adaptation.mode)"
+        None, description="adaptation mode of this axis, if it differs from adaptation.mode"
     )
     load_loop: LoadLoopSettings | None = Field(
-        None, description="a slow loop on the load encoder; without the key there is none"
+        None, description="slow control loop on the load encoder; none without this key"
     )
 
 
@@ -62,35 +62,35 @@ class TcpSettings(_Part):
 
     port: int = Field(8402, ge=1, le=65_535, description="port of 127.0.0.1 to listen at")
     names: tuple[Annotated[str, Field(pattern=r"^[A-Za-z0-9.-]+$")], ...] = Field(
-        (), description="names by which a reverse proxy on this machine is reached"
+        (), description="host names of a reverse proxy on this machine"
     )
     token_file: str = Field(
         min_length=1,
-        description="file with the token that clients show, of mode 600, relative to this file",
+        description="file with the clients' token, of mode 600, relative to this file",
     )
 
 
 class ApiSettings(_Part):
-    """Where clients reach the daemon."""
+    """Access of clients to the daemon."""
 
     socket: str | None = Field(
         None,
         min_length=1,
-        description="Unix socket, relative to this file; without it NAME.sock in the runtime folder",
+        description="Unix socket, relative to this file; by default NAME.sock in the runtime folder",
     )
     group: str | None = Field(
-        None, min_length=1, description="group whose members may use the socket; else that of the daemon"
+        None, min_length=1, description="group whose members may use the socket; by default the daemon's"
     )
     tcp: TcpSettings | None = Field(
-        None, description="a TCP port for this machine as well; without the key none"
+        None, description="an additional TCP port for this machine; none without this key"
     )
 
 
 class LimitSettings(_Part):
-    """How much the daemon takes before it gives up or refuses."""
+    """Limits of the daemon."""
 
     restarts_per_minute: int = Field(
-        3, ge=0, le=60, description="how often a control process that died is started again before all ends"
+        3, ge=0, le=60, description="restarts of a dead control process before the daemon ends"
     )
 
 
@@ -105,26 +105,28 @@ class MachineFile(_Part):
         min_length=1, max_length=AXES_AT_MOST, description="the axes, all on one bus with one cycle"
     )
     bus: BusConfig | None = Field(
-        None, description="the CAN bus; without the key that of the axis files, which then agree"
+        None, description="the CAN bus; by default that of the axis files, which must agree"
     )
-    api: ApiSettings = Field(default_factory=ApiSettings, description="where clients reach the daemon")
+    api: ApiSettings = Field(default_factory=ApiSettings, description="access of clients to the daemon")
     lease_s: Annotated[float, Field(ge=0.5, le=3600)] = Field(
-        10.0, description="time after which the right to move lapses when its holder does not renew it"
+        10.0, description="time after which the lease expires unless its holder renews it"
     )
-    limits: LimitSettings = Field(default_factory=LimitSettings, description="how much the daemon takes")
+    limits: LimitSettings = Field(default_factory=LimitSettings, description="limits of the daemon")
     recorder: RecorderSettings = Field(
-        default_factory=RecorderSettings, description="the flight recorder: where, how much, for how long"
+        default_factory=RecorderSettings,
+        description="the flight recorder: folder, size and age of recordings",
     )
     adaptation: AdaptationSettings = Field(
-        default_factory=AdaptationSettings, description="what follows the load encoder, and how fast"
+        default_factory=AdaptationSettings, description="adaptation of model parameters to the load encoder"
     )
     realtime: RealtimeConfig | None = Field(
-        None, description="how the control process runs; without the key as the axis files say, which agree"
+        None,
+        description="scheduling of the control process; by default that of the axis files, which must agree",
     )
 
 
 def token_complaint(path: Path) -> str | None:
-    """What is wrong with the file of the token; None where nothing is."""
+    """Returns what is wrong with a token file; None if it is valid."""
     try:
         content, mode = path.read_text(encoding="ascii").strip(), path.stat().st_mode
     except (OSError, UnicodeDecodeError) as problem:

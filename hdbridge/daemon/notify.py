@@ -1,4 +1,4 @@
-"""What the service manager is told, by the protocol of sd_notify(3): lines in a datagram."""
+"""Notifications to the service manager by the protocol of sd_notify(3): lines in a datagram."""
 
 from __future__ import annotations
 
@@ -9,49 +9,47 @@ from contextlib import suppress
 from typing import Final, Self
 
 PATIENCE_S: Final = 1.0
-"""How long a manager is waited for that has ten messages to read yet, when it must not miss this one."""
+"""Maximum wait for a manager whose queue is full, for messages that it must not miss."""
 
 
 class Notifier:
-    """Tells the service manager; nobody, where there is none. It never fails."""
+    """Notifies the service manager, if there is one. It never fails."""
 
     def __init__(self, address: str | None = None, watchdog_s: float | None = None) -> None:
-        """``address`` is that of the manager's socket; one that begins with @ is an abstract one."""
+        """``address`` is the manager's socket; one that begins with @ is abstract."""
         self.watchdog_s = watchdog_s
-        """How long the manager waits for `alive`; None where it does not watch."""
+        """Watchdog time-out of the manager; None without a watchdog."""
         self._address = "\0" + address[1:] if address and address.startswith("@") else address
         self._status = ""
 
     @classmethod
     def of_environment(cls, environment: MutableMapping[str, str] = os.environ) -> Self:
-        """The one that the environment names, which is taken out of it: children are not to speak."""
+        """Returns the notifier of the environment, and removes it there so that children do not notify."""
         address = environment.pop("NOTIFY_SOCKET", None)
         period_us = environment.pop("WATCHDOG_USEC", "")
         meant = environment.pop("WATCHDOG_PID", str(os.getpid())) == str(os.getpid())
         return cls(address, int(period_us) / 1e6 if period_us.isdigit() and meant else None)
 
     def ready(self) -> None:
-        """All that was started works."""
+        """Reports that the daemon is ready."""
         self._tell("READY=1", PATIENCE_S)
 
     def alive(self) -> None:
-        """What is watched goes on."""
+        """Reports a sign of life to the watchdog."""
         if self.watchdog_s is not None:
             self._tell("WATCHDOG=1")
 
     def stopping(self) -> None:
-        """It ends."""
+        """Reports that the daemon is stopping."""
         self._tell("STOPPING=1", PATIENCE_S)
 
     def status(self, words: str) -> None:
-        """A line for ``systemctl status``; told when it changes."""
+        """Sets the line in ``systemctl status``, if it has changed."""
         if words != self._status and self._tell(f"STATUS={words}"):
             self._status = words
 
     def _tell(self, line: str, patience_s: float = 0.0) -> bool:
-        """Whether the manager has taken it. The axis is worth more than who watches it: who does not listen
-        is not waited for longer.
-        """
+        """Returns True if the manager took the message; waits at most ``patience_s`` for it."""
         if self._address is None:
             return True
         with suppress(OSError), socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as sender:

@@ -1,4 +1,4 @@
-"""How often, and how soon, something that died is started again. Pure: the time is passed in."""
+"""Limits and delays for restarting processes, and hang detection. Pure: the time is passed in."""
 
 from __future__ import annotations
 
@@ -6,14 +6,14 @@ from collections import deque
 
 
 class Budget:
-    """So many within a window of time, and no more."""
+    """Maximum number of events within a sliding time window."""
 
     def __init__(self, most: int, window_s: float) -> None:
         self._most, self._window_s = most, window_s
         self._times: deque[float] = deque()
 
     def spend(self, now_s: float) -> bool:
-        """Take one; False where the budget of the window is used up."""
+        """Counts an event; returns False if the window's budget is used up."""
         while self._times and now_s - self._times[0] >= self._window_s:
             self._times.popleft()
         if len(self._times) >= self._most:
@@ -23,14 +23,14 @@ class Budget:
 
 
 class BackOff:
-    """Delays that double from one failure to the next, up to a longest; a long life begins anew."""
+    """Delays that double with each failure up to a maximum; a long life resets them."""
 
     def __init__(self, first_s: float, longest_s: float, well_after_s: float) -> None:
         self._first_s, self._longest_s, self._well_after_s = first_s, longest_s, well_after_s
         self._next_s = first_s
 
     def delay_s(self, lived_s: float) -> float:
-        """How long to wait after something has died that had lived so long."""
+        """Returns the delay before the restart of a process that ran for ``lived_s``."""
         if lived_s >= self._well_after_s:
             self._next_s = self._first_s
         delay_s, self._next_s = self._next_s, min(2.0 * self._next_s, self._longest_s)
@@ -38,20 +38,20 @@ class BackOff:
 
 
 class Pulse:
-    """Whether a counter goes on, judged by how often one has looked.
+    """Hang detection by a counter, measured in looks without an advance.
 
-    Not by the time: who has stood still himself, with his process group for example, blames nobody else.
+    It does not use time, so a monitor that was itself suspended blames nobody else.
     """
 
     def __init__(self) -> None:
         self._last = 0
         self.misses = 0
-        """Looks in a row without an advance."""
+        """Consecutive looks without an advance."""
         self.begun = False
-        """Whether it has ever advanced, since it was started anew."""
+        """True if the counter has advanced since the restart."""
 
     def look(self, value: int) -> bool:
-        """Whether the counter has advanced since the last look."""
+        """Returns True if the counter has advanced since the last look."""
         advanced = value != self._last
         self._last = value
         self.misses = 0 if advanced else self.misses + 1
@@ -59,5 +59,5 @@ class Pulse:
         return advanced
 
     def restart(self, value: int) -> None:
-        """Whoever counts has been started anew, and the counter stands at this."""
+        """Starts again with a restarted process, whose counter has this value."""
         self._last, self.misses, self.begun = value, 0, False

@@ -1,4 +1,4 @@
-"""The runtime folder: where a daemon's socket lies while it runs."""
+"""The runtime folder, which contains a daemon's socket while it runs."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from hdbridge.errors import InputError
 
 
 def runtime_folder(environment: Mapping[str, str] = os.environ) -> Path:
-    """The folder, made where it is not there yet; InputError where it is not ours alone.
+    """Returns the runtime folder, created if necessary; raises InputError if others can access it.
 
-    That of the service manager, else that of the session (``$XDG_RUNTIME_DIR/hdbridge``), else one for this
-    user under ``/tmp``.
+    It is the service manager's, else the session's (``$XDG_RUNTIME_DIR/hdbridge``), else one of this user
+    under ``/tmp``.
     """
     given = environment.get("RUNTIME_DIRECTORY", "").split(":")[0]
     if given:
@@ -36,5 +36,5 @@ def runtime_folder(environment: Mapping[str, str] = os.environ) -> Path:
 
 
 def socket_path(name: str, folder: Path, given: Path | None = None) -> Path:
-    """The API's socket: the one that the machine file names, else NAME.sock in the runtime folder."""
+    """Returns the path of the API's socket: the machine file's, else NAME.sock in the runtime folder."""
     return given if given is not None else folder / f"{name}.sock"

@@ -1,4 +1,4 @@
-"""What compensates an axis, as the service sends it to the control process."""
+"""Compensation setting of an axis, as sent by the service to the control process."""
 
 from __future__ import annotations
 
@@ -19,34 +19,34 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class CompensationSetting:
-    """The model of an axis, the part of it that compensates, and the load loop."""
+    """Model of an axis, the part of it that compensates, and the state of the load loop."""
 
     model: TransmissionModel
     scheme: Scheme
     version: int | None = None
-    """Number of the model in the profile's history; None if it has none."""
+    """Number of the model in the profile's history; None without one."""
     file: Path | None = None
-    """File of the model; None of one that a job has made."""
+    """File of the model; None for a model made by a job."""
     load_loop: bool = False
-    """Whether the load loop is on."""
+    """True if the load loop is on."""
     adapted: TransmissionModel | None = None
-    """The model with the parameters that the adaptation has moved; None: as committed."""
+    """Model with adapted parameters; None without adaptation."""
 
     @property
     def compensating(self) -> TransmissionModel:
-        """The model as it compensates: the adapted parameters, the effects of the scheme."""
+        """Compensating model: the adapted parameters with the effects of the scheme."""
         return self.scheme.of(self.adapted or self.model)
 
     def compensation(self, axis: AxisConfig) -> Compensation:
-        """The inverse for the control loop; that of the whole model if the scheme is `NONE`.
+        """Returns the inverse for the control loop, or that of the whole model if the scheme is `NONE`.
 
-        InputError if the model does not fit the axis.
+        Raises InputError if the model does not fit the axis.
         """
         whole = self.adapted or self.model
         return compensation_for(axis, whole if self.scheme is Scheme.NONE else self.scheme.of(whole))
 
     def to_json(self) -> bytes:
-        """The setting as JSON; `from_json` reads it back exactly."""
+        """Returns the setting as JSON, which `from_json` restores exactly."""
         return json.dumps(
             {
                 "model": self.model.document(),
@@ -61,7 +61,7 @@ class CompensationSetting:
 
     @classmethod
     def from_json(cls, data: bytes) -> Self:
-        """Reads `to_json`; InputError for anything else."""
+        """Restores a setting from `to_json`; raises InputError for anything else."""
         try:
             given = json.loads(data)
             file = None if given["file"] is None else Path(given["file"])

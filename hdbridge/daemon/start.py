@@ -1,8 +1,8 @@
-"""What the keeper hands to the processes that it starts, and what each of them does first.
+"""Start data that the keeper passes to its children, and the first steps of each child.
 
-A child is a fresh interpreter, not a fork: it inherits descriptors and nothing else. One of them holds this,
-pickled, in memory that nobody else can open. So all processes have read the same machine file, the ones that
-are started later included.
+A child is a fresh interpreter, not a fork: it inherits only descriptors. One of them contains the pickled
+start data, in memory that no other process can open. So all processes, including restarted ones, use the same
+machine file.
 """
 
 from __future__ import annotations
@@ -29,41 +29,41 @@ _NAME_BYTES: Final = 15
 
 @dataclass(frozen=True, slots=True)
 class Simulation:
-    """Simulated axes in place of the bus."""
+    """Simulated axes that replace the bus."""
 
     truths: tuple[Path, ...]
-    """What each axis is like, one file per axis."""
+    """Files of the simulated axes' true parameters, one per axis."""
     seed: int = 0
     speed: float = 1.0
-    """Virtual seconds per second, at most."""
+    """Maximum virtual seconds per second."""
 
 
 @dataclass(frozen=True)
 class Start:
-    """All that a process of the daemon is told at its start."""
+    """Start data of a process of the daemon."""
 
     machine: Machine
     memory_fd: int
     """Descriptor of the shared memory."""
     keeper: int
-    """Process number of the keeper: who finds another parent has been left alone before it could ask."""
+    """Process id of the keeper; a child with another parent has lost it already."""
     simulation: Simulation | None = None
     force: bool = False
-    """Speak even where another master is heard. The lock of the interface is the keeper's either way."""
+    """If True, communicate even if another master is active. The keeper holds the interface's lock anyway."""
     socket: Path = Path()
     """Path of the Unix socket of the API."""
     socket_file: tuple[int, int] = (0, 0)
-    """Device and inode that the keeper has bound there."""
+    """Device and inode of the socket file."""
     api_fds: tuple[int, ...] = ()
-    """Listening sockets, the Unix one first; the service's."""
+    """Listening sockets for the service, the Unix one first."""
     page_token: str | None = None
-    """What the page on the last of them asks for; None: no page was asked for."""
+    """Token of the page on the last socket; None without a page."""
     restarts: int = 0
-    """How many processes of this kind there were before."""
+    """Number of earlier processes of this kind."""
     log: LogSettings = LogSettings()
 
     def hand_over(self, **changes: object) -> int:
-        """A descriptor from which a child reads it; to be closed when the child has been started."""
+        """Returns a descriptor with the data for a child; close it once the child runs."""
         told = replace(self, **changes)  # type: ignore[arg-type]
         fd = os.memfd_create("hdbridge-start", os.MFD_CLOEXEC)
         with os.fdopen(os.dup(fd), "wb") as file:
@@ -73,7 +73,7 @@ class Start:
 
     @classmethod
     def inherited(cls, arguments: list[str]) -> Self:
-        """What the keeper has told this process; closes the descriptor. InputError where it was no keeper."""
+        """Returns the keeper's data and closes the descriptor. Raises InputError without a keeper."""
         try:
             (number,) = arguments
             with os.fdopen(int(number), "rb") as file:
@@ -86,11 +86,11 @@ class Start:
 
 
 def begin_child(start: Start, name: str) -> None:
-    """The first act of a child: end with the keeper, leave Ctrl-C to it, have a name in ``top``."""
+    """Prepares a child: it ends with the keeper, ignores the terminal's signals and has a name in ``top``."""
     libc = ctypes.CDLL(None, use_errno=True)
     libc.prctl(_PR_SET_PDEATHSIG, signal.SIGTERM, 0, 0, 0)
     libc.prctl(_PR_SET_NAME, name.encode()[:_NAME_BYTES], 0, 0, 0)
-    for each in (signal.SIGINT, signal.SIGHUP, signal.SIGQUIT):  # of the terminal: the keeper sees to it
+    for each in (signal.SIGINT, signal.SIGHUP, signal.SIGQUIT):  # from the terminal; the keeper handles them
         signal.signal(each, signal.SIG_IGN)
-    if os.getppid() != start.keeper:  # it died before we could ask to be told
+    if os.getppid() != start.keeper:  # the keeper died before prctl took effect
         sys.exit(0)

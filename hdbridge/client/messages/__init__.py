@@ -1,12 +1,12 @@
-"""Every message between the daemon and its clients, typed; both ends import this and nothing of each other.
+"""Typed messages between the daemon and its clients. Both ends import this and nothing of each other.
 
-    values.py    numbers, names and closed sets that several messages share
-    state.py     what the daemon tells of the machine and its axes
-    requests.py  what a client may ask for
-    lease.py     the right to move
+    values.py    numbers, names and enumerations that several messages share
+    state.py     state of the machine and its axes
+    requests.py  requests of a client
+    lease.py     the lease
     jobs.py      procedures that run through the daemon
-    live.py      samples and events as they come
-    problem.py   errors (RFC 9457), and the way back to `hdbridge.errors`
+    live.py      live samples and events
+    problem.py   errors (RFC 9457) and their conversion to `hdbridge.errors`
 
 Angles are degrees at the load unless the name says ``motor``; errors and corrections are arcseconds at the
 load. A request refuses unknown keys, NaN and infinity; a report ignores keys that a newer daemon adds.

@@ -21,7 +21,7 @@ OptionValue = Option | Annotated[list[Option], Field(max_length=100)]
 
 
 class JobKind(StrEnum):
-    """What may be run."""
+    """Kind of a job."""
 
     STEP = "step"
     CALIBRATE = "calibrate"
@@ -29,7 +29,7 @@ class JobKind(StrEnum):
 
 
 class JobState(StrEnum):
-    """How far a job is."""
+    """State of a job."""
 
     RUNNING = "running"
     DONE = "done"
@@ -55,12 +55,16 @@ class Job(Report):
     id: str = Field(examples=["step-3"])
     kind: JobKind
     axis: Name
-    client: str = Field("", description="who began it", examples=["hdbridge ctl (anna, process 4242)"])
+    client: str = Field(
+        "", description="client that began it", examples=["hdbridge ctl (anna, process 4242)"]
+    )
     state: JobState
-    share: float = Field(0.0, ge=0, le=1, description="how much of it is done, 0 to 1", examples=[0.42])
-    text: str = Field("", description="what it is at", examples=["sweep 2 of 3"])
+    share: float = Field(0.0, ge=0, le=1, description="share that is done, 0 to 1", examples=[0.42])
+    text: str = Field("", description="present phase", examples=["sweep 2 of 3"])
     started: datetime
     ended: datetime | None = None
-    folder: str | None = Field(None, description="where its recording is, on the daemon's machine")
-    result: dict[str, Any] | None = Field(None, description="as the command of the same name writes it")
-    problem: Problem | None = Field(None, description="why it failed")
+    folder: str | None = Field(None, description="folder of its recording, on the daemon's machine")
+    result: dict[str, Any] | None = Field(
+        None, description="document, as written by the command of the same name"
+    )
+    problem: Problem | None = Field(None, description="reason for its failure")

@@ -1,4 +1,4 @@
-"""The right to move: one client at a time has it, for as long as it uses it."""
+"""The lease: the right to move, held by one client at a time."""
 
 from __future__ import annotations
 
@@ -10,31 +10,29 @@ from hdbridge.client.messages.values import Report, Request, Seconds, Words
 
 
 class LeaseRequest(Request):
-    """Ask for the right to move."""
+    """Request for the lease."""
 
     model_config = ConfigDict(json_schema_extra={"examples": [{"client": "cell controller", "force": False}]})
 
-    client: Words = Field(
-        "", description="who asks, in words that others are shown; else the user and process that asked"
-    )
-    force: bool = Field(
-        False, strict=True, description="take it from whoever holds it: its motion is stopped"
-    )
+    client: Words = Field("", description="name shown to other clients; by default user and process")
+    force: bool = Field(False, strict=True, description="take it from its holder, whose motion is stopped")
 
 
 class LeaseGrant(Report):
-    """The right to move; the token goes into the header ``X-Lease`` of each request that moves."""
+    """The granted lease; its token goes into the header ``X-Lease`` of each request that moves an axis."""
 
-    token: str = Field(description="secret; whoever has it may move", examples=["mZ3sWJx0b0lq"])
+    token: str = Field(description="secret that permits motion", examples=["mZ3sWJx0b0lq"])
     client: str = Field(description="who holds it")
     timeout_s: Seconds = Field(description="it ends when it was not used for so long", examples=[5.0])
 
 
 class LeaseState(Report):
-    """Who may move; the token is not told."""
+    """State of the lease, without its token."""
 
-    held: bool = Field(description="whether anybody has the right to move")
+    held: bool = Field(description="True if a client holds it")
     client: str | None = Field(None, description="who holds it", examples=["cell controller"])
-    since: datetime | None = Field(None, description="since when")
-    remaining_s: float | None = Field(None, description="until it ends unless it is used", examples=[4.2])
+    since: datetime | None = Field(None, description="time at which it was taken")
+    remaining_s: float | None = Field(
+        None, description="time until it expires unless it is used", examples=[4.2]
+    )
     timeout_s: float = Field(description="it ends when it was not used for so long", examples=[5.0])

@@ -1,4 +1,4 @@
-"""Samples and events as they come, and what goes over the two WebSockets."""
+"""Live samples and events, and the messages of the two WebSockets."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from hdbridge.client.messages.requests import AXES_MAXIMUM, StreamPoint
 from hdbridge.client.messages.values import Name, Real, Report, Request
 
 POINTS_MAXIMUM: Final = 1000
-"""Stream points of one message."""
+"""Maximum number of stream points in a message."""
 _Column = list[float | None]
 
 
 class EventKind(StrEnum):
-    """What an event of the loop or the service tells."""
+    """Kind of an event of the loop or the service."""
 
     DONE = "done"
     REFUSED = "refused"
@@ -34,31 +34,31 @@ class EventKind(StrEnum):
     ENDING = "ending"
     LOAD_LOOP = "load-loop"
     NOTE = "note"
-    """From the service: a lease, a job, the recorder, the watch, the adaptation."""
+    """Note of the service: about a lease, a job, the recorder, the watch or the adaptation."""
 
 
 class Event(Report):
-    """Something that happened."""
+    """An event."""
 
     sequence: int = Field(ge=0, description="counts from the start of the service", examples=[17])
     kind: EventKind
     date: datetime = Field(description="by the machine's clock")
     cycle: int | None = Field(None, description="cycle of the loop")
-    axis: Name | None = Field(None, description="None: of the machine")
+    axis: Name | None = Field(None, description="None for the machine")
     text: str = Field("", description="in words", examples=["cycle 120: a TPDO is missing (282h): freeze"])
     hint: str | None = Field(None, description="what a person does about it")
 
 
 class Events(Report):
-    """Events since the one that was asked for."""
+    """Events after the requested number."""
 
     events: list[Event]
-    lost: int = Field(0, ge=0, description="older ones that are kept no more")
-    newest: int = Field(0, ge=0, description="ask for those since this one next time")
+    lost: int = Field(0, ge=0, description="older events that are no longer kept")
+    newest: int = Field(0, ge=0, description="number to pass in the next request")
 
 
 class AxisColumns(Report):
-    """What one axis did: a value per sample in each column, None where there is none."""
+    """Samples of one axis: one value per sample in each column, None if not available."""
 
     state: list[str]
     load_target_deg: _Column
@@ -79,24 +79,28 @@ class Samples(Report):
     """A batch of cycles in columns, oldest first."""
 
     type: Literal["samples"] = "samples"
-    time_s: list[float] = Field(description="of SYNC, by the machine's monotonic clock")
+    time_s: list[float] = Field(description="time of SYNC, by the machine's monotonic clock")
     cycle: list[int]
     late_us: list[float]
     busy_us: list[float]
     bus_load: _Column = Field(description="share of the bus in use; None without a bit rate")
     skipped: list[int] = Field(description="periods left out since the loop began")
     axes: dict[Name, AxisColumns]
-    events: list[Event] = Field(default=[], description="what happened meanwhile")
-    lost: int = Field(0, ge=0, description="cycles that this client was too slow for, since the last batch")
+    events: list[Event] = Field(default=[], description="events since the last batch")
+    lost: int = Field(
+        0, ge=0, description="cycles lost since the last batch because this client was too slow"
+    )
 
 
 class LiveOptions(Request):
-    """What a client of the live feed wants; its first message, and again whenever it wants something else."""
+    """Options of the live feed, sent as the first message and again to change them."""
 
     every: Annotated[int, Field(strict=True, ge=1, le=10_000)] = Field(
-        1, description="one cycle in so many: those whose number it divides", examples=[10]
+        1, description="decimation: only cycles whose number it divides", examples=[10]
     )
-    axes: list[Name] | None = Field(None, max_length=AXES_MAXIMUM, description="only these; else all")
+    axes: list[Name] | None = Field(
+        None, max_length=AXES_MAXIMUM, description="selected axes; by default all"
+    )
 
 
 class StreamBegin(Request):
@@ -104,7 +108,7 @@ class StreamBegin(Request):
 
     lease: str = Field(max_length=200, description="the token of the lease")
     timeout_s: Annotated[Real, Field(gt=0, le=5)] = Field(
-        0.5, description="without a point for so long the axis stops within its limits"
+        0.5, description="time without a point after which the axis stops within its limits"
     )
 
 
@@ -118,5 +122,7 @@ class StreamPoints(Request):
 class StreamAnswer(Report):
     """The answer to each message of a stream."""
 
-    accepted: int = Field(ge=0, description="points taken of the message")
-    problem: Problem | None = Field(None, description="why no more; the axis then stops within its limits")
+    accepted: int = Field(ge=0, description="number of points accepted")
+    problem: Problem | None = Field(
+        None, description="reason for ending the stream; the axis then stops within its limits"
+    )

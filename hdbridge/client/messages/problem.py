@@ -1,4 +1,4 @@
-"""Errors over the wire (RFC 9457, ``application/problem+json``), and the way back to `hdbridge.errors`."""
+"""Errors as ``application/problem+json`` (RFC 9457), and their conversion to `hdbridge.errors`."""
 
 from __future__ import annotations
 
@@ -28,30 +28,30 @@ STATUS: Final[dict[type[HdbridgeError], tuple[int, str]]] = {
     errors.OutputError: (507, "A result could not be written"),
     HdbridgeError: (500, "An error in hdbridge"),
 }
-"""Status and title of each error raised on purpose; the first row that fits counts."""
+"""Status and title of each hdbridge error; the first matching row applies."""
 
 
 class Problem(Report):
-    """What went wrong with a request."""
+    """Problem document: the reason why a request failed."""
 
-    type: str = Field(description="which kind of error, as a URN", examples=[f"{TYPE_PREFIX}LeaseError"])
+    type: str = Field(description="kind of error, as a URN", examples=[f"{TYPE_PREFIX}LeaseError"])
     title: str = Field(description="the kind in words", examples=["The right to move is not yours"])
     status: int = Field(ge=400, le=599, description="HTTP status", examples=[423])
     detail: str = Field(
-        description="what is wrong, what was expected and what to do, in one line",
+        description="error, expectation and remedy in one line",
         examples=["'cell controller' holds the lease for another 4.2 s; wait, or take it with force"],
     )
     axis: str | None = Field(None, description="the axis concerned", examples=["joint-3"])
     hint: str | None = Field(None, description="what a person does about it")
     errors: list[str] = Field(
         default=[],
-        description="of a request that is not valid: each complaint with the key it is about",
+        description="complaints about an invalid request, each with its key",
         examples=[["target_deg: expected a finite number"]],
     )
 
     @classmethod
     def of(cls, error: HdbridgeError, axis: str | None = None) -> Problem:
-        """The problem that an error is over HTTP."""
+        """Returns the problem for an error."""
         kind, (status, title) = next(row for row in STATUS.items() if isinstance(error, row[0]))
         detail = str(error)
         said, _, hint = detail.rpartition("; ")
@@ -65,7 +65,7 @@ class Problem(Report):
         )
 
     def error(self) -> HdbridgeError:
-        """The error to raise where the request was made; one of a kind that is not known is a DaemonError."""
+        """Returns the error to raise in the client; DaemonError for an unknown kind."""
         name = self.type.removeprefix(TYPE_PREFIX)
         kind = next((each for each in STATUS if each.__name__ == name), errors.DaemonError)
         return kind("; ".join((self.detail, *self.errors)))

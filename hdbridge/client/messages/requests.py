@@ -1,4 +1,4 @@
-"""What a client may ask of an axis or the machine; each is bounded, and refused before anything moves."""
+"""Requests of a client to an axis or the machine; values are checked before anything moves."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ from hdbridge.client.messages.values import (
 )
 
 QUEUE_MAXIMUM: Final = 1000
-"""Way points of one request."""
+"""Maximum number of way points in a request."""
 AXES_MAXIMUM: Final = 32
 
 
 class Move(Request):
-    """Go to a load angle, jerk-limited; an axis in motion is re-targeted without a stop."""
+    """Move to a load angle, jerk-limited; a present motion is redirected without a stop."""
 
     target_deg: Angle = Field(description="load angle to go to, degrees", examples=[30.0])
     velocity_deg_s: Speed | None = Field(
@@ -40,7 +40,7 @@ class Move(Request):
 
 
 class Coordinated(Request):
-    """Several axes go to their targets, starting and ending together."""
+    """Move several axes to their targets, so that all begin and end together."""
 
     targets_deg: dict[Name, Angle] = Field(
         min_length=1,
@@ -55,7 +55,7 @@ class Coordinated(Request):
 
 
 class Jog(Request):
-    """Turn at a speed for as long as it is asked for again: a dead man's switch."""
+    """Turn at a speed while the request is repeated, as with a dead man's switch."""
 
     velocity_deg_s: Velocity = Field(description="speed with its sign, deg/s; 0 stops", examples=[-5.0])
     timeout_s: Annotated[Real, Field(gt=0, le=5)] = Field(
@@ -64,7 +64,7 @@ class Jog(Request):
 
 
 class QueueItem(Request):
-    """A way point: go there, rest, go on."""
+    """A way point: move there, rest, continue."""
 
     target_deg: Angle = Field(description="load angle, degrees", examples=[45.0])
     velocity_deg_s: Speed | None = Field(None, description="highest speed, deg/s; else the axis's limit")
@@ -75,7 +75,7 @@ class QueueItem(Request):
 
 
 class Queue(Request):
-    """Way points, appended to those that wait."""
+    """Way points to append to the queue."""
 
     model_config = ConfigDict(
         json_schema_extra={"examples": [{"points": [{"target_deg": 10.0}, {"target_deg": 20.0}]}]}
@@ -97,19 +97,19 @@ class StreamPoint(Request):
 
 
 class Compensate(Request):
-    """Which parts of the model compensate from now on; the change is ramped."""
+    """Select the parts of the model that compensate; the change is ramped."""
 
     scheme: Scheme = Field(description="`none` switches it off", examples=["both"])
 
 
 class SwitchLoadLoop(Request):
-    """Switch the slow integral of the measured error on or off, where the machine file has one."""
+    """Switch the load loop (integral of the measured error) on or off, if the machine file has one."""
 
     on: bool = Field(strict=True, description="on, or off", examples=[True])
 
 
 class ActivateModel(Request):
-    """Make a model of the axis's history the active one, in motion too; the change is ramped."""
+    """Activate a model of the axis's history, also during motion; the change is ramped."""
 
     version: Annotated[int, Field(strict=True, ge=1, le=10**9)] | Literal["pending", "active"] = Field(
         description="its number in `hdbridge model log`; `pending` commits the one that waits, `active` "
@@ -119,7 +119,7 @@ class ActivateModel(Request):
 
 
 class Home(Request):
-    """Home by a method of the drive's own (CiA 402, mode HM)."""
+    """Home by a method of the drive (CiA 402, mode HM)."""
 
     method: Annotated[int, Field(strict=True, ge=-128, le=127)] = Field(
         description="homing method, 6098h: see the drive's manual", examples=[37]
@@ -131,10 +131,10 @@ class Home(Request):
         None, description="speed towards the zero, deg/s at the load; else as the daemon finds right"
     )
     acceleration_deg_s2: Acceleration | None = Field(
-        None, description="deg/s2 at the load; else the axis's limit"
+        None, description="acceleration, deg/s2 at the load; else the axis's limit"
     )
-    offset_deg: Angle = Field(0.0, description="load angle that the home position gets (607Ch)")
-    timeout_s: Annotated[Real, Field(ge=0.1, le=3600)] = Field(60.0, description="that it may take, seconds")
+    offset_deg: Angle = Field(0.0, description="load angle of the home position (607Ch)")
+    timeout_s: Annotated[Real, Field(ge=0.1, le=3600)] = Field(60.0, description="time-out, seconds")
 
 
 class SdoWrite(Request):
@@ -164,6 +164,6 @@ class Mark(Request):
 
 
 class Adapt(Request):
-    """How parameters follow the load encoder from now on."""
+    """Mode in which the model's parameters follow the load encoder."""
 
     mode: AdaptationMode = Field(examples=["observe"])

@@ -1,4 +1,4 @@
-"""What the daemon tells of the machine and its axes."""
+"""State of the machine and its axes."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from hdbridge.client.messages.values import (
 
 
 class Fault(Report):
-    """What stopped an axis; latched until a reset."""
+    """Cause of a stop, latched until a reset."""
 
     name: str = Field(description="the row of the fault table", examples=["LOST_TPDO"])
     text: str = Field(description="what happened, in words", examples=["a TPDO is missing, twice in a row"])
@@ -36,7 +36,7 @@ class Fault(Report):
 
 
 class Limits(Report):
-    """What the axis may do, at the load."""
+    """Limits of an axis, at the load."""
 
     position_min_deg: float = Field(examples=[-180.0])
     position_max_deg: float = Field(examples=[180.0])
@@ -48,7 +48,7 @@ class Limits(Report):
 class ModelInUse(Report):
     """The model that compensates an axis."""
 
-    version: int | None = Field(None, description="number in the history; None of one without", examples=[4])
+    version: int | None = Field(None, description="number in the history; None without one", examples=[4])
     file: str = Field(description="its file on the daemon's machine")
     date: datetime | None = Field(None, description="when it was made")
     age_s: float | None = Field(None, ge=0, description="since it was made, seconds")
@@ -57,11 +57,11 @@ class ModelInUse(Report):
 
 
 class LoadLoopState(Report):
-    """The slow integral of the measured error."""
+    """State of the load loop, a slow integral of the measured error."""
 
     configured: bool = Field(description="whether the machine file has one for this axis")
     on: bool = False
-    correction_arcsec: float = Field(0.0, description="what it adds now")
+    correction_arcsec: float = Field(0.0, description="present correction")
     doubt: str | None = Field(
         None,
         description="why it does not act: the load encoder is in doubt, or the error is beyond its bound",
@@ -70,10 +70,12 @@ class LoadLoopState(Report):
 
 
 class AdaptationState(Report):
-    """How the model's parameters follow the load encoder."""
+    """State of the adaptation of the model's parameters to the load encoder."""
 
     mode: AdaptationMode = AdaptationMode.OFF
-    frozen: str | None = Field(None, description="why it does not change anything now; None when it does")
+    frozen: str | None = Field(
+        None, description="reason why the parameters do not change now; None while they do"
+    )
     updated: datetime | None = Field(None, description="when a parameter was changed last")
     parameters: dict[str, float] = Field(
         default={},
@@ -83,7 +85,7 @@ class AdaptationState(Report):
 
 
 class AxisState(Report):
-    """Everything about one axis at the newest cycle."""
+    """State of one axis in the newest cycle."""
 
     name: Name
     profile: str = Field(description="folder of its files on the daemon's machine")
@@ -92,10 +94,10 @@ class AxisState(Report):
     state: ControlState
     power: PowerState
     mode: MotionMode
-    at_rest: bool = Field(description="the target stands and the axis is where it is")
+    at_rest: bool = Field(description="the set-point is at rest")
 
-    load_target_deg: float | None = Field(None, description="where the load shall be", examples=[30.0])
-    velocity_deg_s: float | None = Field(None, description="of the load target", examples=[0.0])
+    load_target_deg: float | None = Field(None, description="target of the load, degrees", examples=[30.0])
+    velocity_deg_s: float | None = Field(None, description="velocity of the load target", examples=[0.0])
     motor_target_deg: float | None = Field(None, description="the drive's demand (6062h), motor degrees")
     motor_position_deg: float | None = Field(None, description="motor encoder, motor degrees")
     load_position_deg: float | None = Field(None, description="load encoder, degrees", examples=[30.0001])
@@ -120,7 +122,7 @@ class AxisState(Report):
     underrun: bool = Field(False, description="the last stream ran out of points in motion")
 
     limits: Limits
-    fault: Fault | None = Field(None, description="what stopped it, until a reset")
+    fault: Fault | None = Field(None, description="cause of a stop, until a reset")
     model: ModelInUse | None = Field(None, description="None: not compensated")
     load_loop: LoadLoopState
     adaptation: AdaptationState
@@ -164,7 +166,7 @@ class RecorderState(Report):
 
 
 class MachineState(Report):
-    """Everything about the machine at the newest cycle."""
+    """State of the machine in the newest cycle."""
 
     name: Name
     version: str = Field(description="of hdbridge")

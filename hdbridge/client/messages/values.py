@@ -1,4 +1,4 @@
-"""What several messages share: bounded numbers, names, closed sets, the two kinds of message."""
+"""Values that several messages share: bounded numbers, names, enumerations, and the two base classes."""
 
 from __future__ import annotations
 
@@ -8,12 +8,13 @@ from typing import Annotated, Final
 from pydantic import BaseModel, ConfigDict, Field, StringConstraints
 
 WORDS_MAXIMUM: Final = 400
-"""Characters of a text that a client gives."""
+"""Maximum length of a client's text."""
 
 _PRINTABLE: Final = r"^[^\x00-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069]*$"
-"""Nothing that moves a terminal's cursor, begins a line in a log or turns the direction of writing."""
+"""Text without characters that move a terminal's cursor, start a log line or reverse the writing
+direction."""
 Real = Annotated[float, Field(strict=True, allow_inf_nan=False)]
-"""A number, not the text of one; NaN and infinity are refused."""
+"""A number, not its text; NaN and infinity are refused."""
 Angle = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=-1e7, le=1e7)]
 """Degrees at the load, multi-turn; the axis's own limits are narrower."""
 Speed = Annotated[float, Field(strict=True, allow_inf_nan=False, gt=0, le=1e5)]
@@ -24,43 +25,43 @@ Acceleration = Annotated[float, Field(strict=True, allow_inf_nan=False, gt=0, le
 """Degrees per second squared at the load."""
 Seconds = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=0, le=86_400)]
 Name = Annotated[str, StringConstraints(strict=True, pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$")]
-"""Of an axis or a machine, as in its file."""
+"""Name of an axis or a machine, as in its file."""
 Words = Annotated[str, StringConstraints(strict=True, max_length=WORDS_MAXIMUM, pattern=_PRINTABLE)]
 """One line of text."""
 
 
 class Request(BaseModel):
-    """What a client sends: unknown keys are refused."""
+    """Message of a client; unknown keys are refused."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
 
 class Report(BaseModel):
-    """What the daemon sends: keys that a newer daemon adds are ignored."""
+    """Message of the daemon; keys that a newer daemon adds are ignored."""
 
     model_config = ConfigDict(frozen=True, extra="ignore", ser_json_inf_nan="null")
 
 
 class ControlState(StrEnum):
-    """Where the control loop has an axis, in the order of the loop's own numbers."""
+    """State of an axis in the control loop, in the order of the loop's numbers."""
 
     UNVERIFIED = "unverified"
-    """The drive was not checked against its axis file yet: nothing is sent to it."""
+    """The drive was not verified against its axis file; nothing is sent to it."""
     DISABLED = "disabled"
     ENABLING = "enabling"
     ENABLED = "enabled"
     STOPPING = "stopping"
-    """On its way to a stop in order, or to being disabled."""
+    """Braking to rest, then switching power off."""
     LENT = "lent"
-    """The service has the drive, for homing: the loop sends it no targets."""
+    """The service controls the drive, for homing; the loop sends it no targets."""
     QUICK_STOPPED = "quick-stopped"
-    """Latched: only a reset leads back."""
+    """Latched until a reset."""
     LATCHED = "latched"
-    """Latched until the drive was verified again."""
+    """Latched until the drive is verified again."""
 
 
 class MotionMode(StrEnum):
-    """What generates the targets of an axis, in the order of the loop's own numbers."""
+    """Source of an axis's targets, in the order of the loop's numbers."""
 
     HOLD = "hold"
     GOTO = "goto"
@@ -70,7 +71,7 @@ class MotionMode(StrEnum):
 
 
 class PowerState(StrEnum):
-    """The CiA-402 state that the drive's statusword tells."""
+    """CiA 402 state, from the drive's statusword."""
 
     NOT_READY_TO_SWITCH_ON = "not ready to switch on"
     SWITCH_ON_DISABLED = "switch on disabled"
@@ -84,20 +85,20 @@ class PowerState(StrEnum):
 
 
 class Scheme(StrEnum):
-    """Which parts of the model compensate."""
+    """Parts of the model that compensate."""
 
     NONE = "none"
     SYNCHRONOUS = "synchronous"
     HYSTERESIS = "hysteresis"
     BOTH = "both"
     EXTENDED = "extended"
-    """The whole model, with what a diagnosis added to it."""
+    """The whole model, with effects that a diagnosis added."""
 
 
 class AdaptationMode(StrEnum):
-    """Whether parameters follow the load encoder."""
+    """Mode in which the model's parameters follow the load encoder."""
 
     OFF = "off"
     OBSERVE = "observe"
-    """Estimates, reports what it would change, and changes nothing."""
+    """Estimates and reports changes without applying them."""
     ON = "on"

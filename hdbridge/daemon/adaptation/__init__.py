@@ -1,8 +1,9 @@
-"""Parameters that wear and temperature move, followed by the load encoder.
+"""Adaptation: model parameters that drift with wear and temperature follow the load encoder.
 
-`settings` is what a machine file may say; `adaptation` the whole of one axis, made of `measuring` (samples to
-observations), `regressors` (the linear problem), `prior` (the calibration's covariance), `estimator` and
-`plausibility`; `sink` ties the axes of a machine to the service, and `keeping` writes what survives it.
+`settings` defines the keys of a machine file. `adaptation` is the complete adaptation of one axis, built from
+`measuring` (samples to observations), `regressors` (the linear problem), `prior` (the calibration's
+covariance), `estimator` and `plausibility`. `sink` connects the axes of a machine to the service, and
+`keeping` stores the state.
 """
 
 from hdbridge.daemon.adaptation.settings import AdaptationSettings, Excitation, Mode, Standing

@@ -1,7 +1,7 @@
-"""One axis's adaptation: from samples to proposals of another model. Pure: time comes with the samples.
+"""Adaptation of one axis: turns samples into proposals of a changed model. Pure: samples contain the time.
 
-`Learning` says what the load encoder shows; the model in use follows it within its bounds and no faster than
-its rate.
+`Learning` estimates what the load encoder shows. The model in use follows the estimate within its bounds, at
+a limited rate.
 """
 
 from __future__ import annotations
@@ -26,17 +26,17 @@ from hdbridge.errors import InputError
 from hdbridge.model import TransmissionModel
 
 ZERO_LOST = (AxisState.UNVERIFIED, AxisState.LENT, AxisState.LATCHED)
-"""Afterwards the drive's zero may be another one."""
+"""States after which the drive's zero may have changed."""
 NEEDED = SampleFlag.FRESH | SampleFlag.MEMORY_KNOWN
 RATE_INTERVALS = 2.0
-"""A pause earns no more change than so many intervals."""
+"""Maximum number of intervals for which a pause permits change."""
 LEAST_SHARE = 0.99
-"""Of what the rate allows in an interval: so much is worth a change, however small."""
+"""Share of the change permitted per interval that is applied however small it is."""
 
 
 @dataclass(frozen=True, slots=True)
 class Memory:
-    """What survives a restart of the service."""
+    """State that survives a restart of the service."""
 
     estimate: tuple[float, ...]
     covariance: tuple[tuple[float, ...], ...]
@@ -46,21 +46,21 @@ class Memory:
 
 @dataclass(frozen=True, slots=True)
 class Report:
-    """What an axis's adaptation is doing, for people."""
+    """State of an axis's adaptation, for clients."""
 
     mode: Mode
     standing: Standing
     reason: str
-    """Why it is frozen or waits; empty while it follows."""
+    """Reason why it is frozen or waits; empty while it follows."""
     estimated: TransmissionModel
-    """What the load encoder shows now, before rates."""
+    """Model that the load encoder shows now, before rate limits."""
     zero_arcsec: float | None
-    """How far the zero has moved since it was taken; None before that. It is told, never applied."""
+    """Change of the zero since it was taken; None before. It is reported, never applied."""
     windows: int
 
 
 class Adaptation:
-    """One axis. `take` is to be called with its samples in order, from one thread."""
+    """Adaptation of one axis. Call `take` with its samples in order, from one thread."""
 
     def __init__(
         self,
@@ -70,29 +70,29 @@ class Adaptation:
         log: Log = lambda _: None,
         memory: Memory | None = None,
     ) -> None:
-        """``model`` is the committed one; ``memory`` what an earlier one of the same model had (`memory`).
+        """``model`` is the committed one; ``memory`` the state of an earlier adaptation of it (`memory`).
 
-        InputError where ``settings`` name a parameter that the model does not have.
+        Raises InputError if ``settings`` name a parameter that the model does not have.
         """
         self.settings = settings
         self.committed = model
-        """What it began with, and goes back to."""
+        """Committed model, to which `back` returns."""
         self.mode: Mode = settings.mode
         self._log = log
         self._now_s = 0.0
         self._learning = Learning(model, settings, reading, self._tell)
         self._proposed = self._used = np.zeros(self._learning.regressors.followed)
-        """Changes in the model proposed last, also where it was only reported; in the model in use."""
+        """Changes of the coefficients in the last proposed model, applied or not, and in the model in use."""
         self._in_use = model
         self._changed_s: float | None = None
-        """When a change was last made or considered."""
+        """Time at which a change was last made or considered."""
         if memory is not None:
             self._go_on(memory)
 
     def take(self, times_s: FloatArray, axis: NDArray[Any], disbelieved: str = "") -> Proposal | None:
-        """Samples of `AXIS_SAMPLE`, shape (n,), in order; another model where it is time for one.
+        """Takes samples of `AXIS_SAMPLE`, shape (n,), in order; returns a proposal when one is due.
 
-        ``disbelieved`` says why the load encoder is not to be believed just now; empty where it is.
+        ``disbelieved`` is the reason why the load encoder is not believed now; empty if it is.
         """
         if self.mode == "off" or not len(times_s):
             return None
@@ -113,19 +113,19 @@ class Adaptation:
         return self._proposal()
 
     def lost_path(self) -> None:
-        """Samples are missing: the state of the gear is not known until the axis has turned past its loop."""
+        """Handles missing samples: the hysteresis state is unknown until the axis has passed its loop."""
         self._learning.lose_path()
 
     def resume(self) -> None:
-        """Believe the load encoder again after a doubt, whatever it reads; learn anew from here on."""
+        """Ends a doubt about the load encoder, whatever it reads, and learns from now on."""
         self._learning.believe()
 
     def adapt(self, mode: Mode) -> None:
-        """Another mode from here on; ``on`` after a doubt is `resume`."""
+        """Changes the mode; ``on`` after a doubt also calls `resume`."""
         if mode == "on" and self._learning.doubt is not None:
             self.resume()
         if mode != self.mode:
-            # What was only observed is not applied at once: it begins from what is in use.
+            # Changes that were only observed are not applied at once: start from the model in use.
             self._proposed, self._changed_s = self._used, self._now_s
             if self.mode == "off":
                 self.lost_path()
@@ -133,7 +133,7 @@ class Adaptation:
             self.mode = mode
 
     def back(self) -> Proposal:
-        """Back to the committed model, and only observe from here on, until `adapt`."""
+        """Restores the committed model and only observes from now on, until `adapt`."""
         changes = changes_between(self.committed, self._in_use, self.committed)
         self._learning.begin_anew()
         self._proposed = self._used = np.zeros(self._learning.regressors.followed)
@@ -144,27 +144,27 @@ class Adaptation:
 
     @property
     def model(self) -> TransmissionModel:
-        """The model that is to be in use: what was proposed last to be applied, or kept over a restart."""
+        """Model that should be in use: the last one proposed to be applied, or restored after a restart."""
         return self._in_use
 
     @property
     def estimate_arcsec(self) -> FloatArray:
-        """Estimated changes of the followed coefficients, (f,)."""
+        """Estimated changes of the adapted coefficients, (f,)."""
         return self._learning.change_arcsec
 
     @property
     def covariance(self) -> FloatArray:
-        """Of the followed coefficients, (f, f)."""
+        """Covariance of the adapted coefficients, (f, f)."""
         followed = self._learning.regressors.followed
         return self._learning.covariance[:followed, :followed].copy()
 
     @property
     def used_arcsec(self) -> FloatArray:
-        """Changes of the followed coefficients in the model in use, (f,)."""
+        """Changes of the adapted coefficients in the model in use, (f,)."""
         return self._used.copy()
 
     def report(self) -> Report:
-        """What it is doing."""
+        """Returns its present state."""
         learning = self._learning
         standing, reason = Standing.FOLLOWING, ""
         if self.mode == "off":
@@ -179,7 +179,7 @@ class Adaptation:
         return Report(self.mode, standing, reason, estimated, learning.zero_moved_arcsec, learning.windows)
 
     def memory(self) -> Memory:
-        """What is to be kept over a restart."""
+        """Returns the state to keep over a restart."""
         learning = self._learning
         return Memory(
             tuple(learning.estimate.tolist()),
@@ -233,7 +233,7 @@ class Adaptation:
         return Proposal(model, changes, apply, self._now_s)
 
     def _model_at(self, change: FloatArray) -> TransmissionModel:
-        """The committed model changed by so much, with the intervals that are known now."""
+        """Returns the committed model with changed coefficients and their present intervals."""
         if not np.any(change):
             return self.committed
         regressors = self._learning.regressors

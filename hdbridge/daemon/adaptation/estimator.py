@@ -1,12 +1,12 @@
 """Recursive least squares with directional forgetting and held parameters. Pure: numpy alone.
 
-Each batch of observations ``y = H theta + noise`` is reduced to its information ``H' H / sigma^2``. The
-eigenvectors of that, in parameters scaled by how far each may stray, are the directions that the batch shows.
-Only along directions that are *excited* (which the batch by itself determines better than that scale) does
-the covariance grow before the update (Cao and Schwartz 2000, *A directional forgetting algorithm based on the
-decomposition of the information matrix*, Automatica 36; here for a batch at a time). So what is not shown is
-neither learned nor forgotten, and no direction's variance can wind up beyond its scale: growth happens only
-where the batch itself brings the variance back below it.
+Each batch of observations ``y = H theta + noise`` is reduced to its information ``H' H / sigma^2``, with
+each parameter scaled by its expected range. Its eigenvectors are the directions that the batch observes. A
+direction is *excited* if the batch alone determines it better than that range. Only along excited directions
+does the covariance grow before the update (Cao and Schwartz 2000, *A directional forgetting algorithm based
+on the decomposition of the information matrix*, Automatica 36; here for a batch at a time). So unobserved
+directions are neither learned nor forgotten, and there is no covariance wind-up: the variance grows only
+where the batch reduces it below its scale again.
 
 Parameters may be held: their uncertainty is accounted for, but neither they nor their variance change
 (Schmidt's consider filter).
@@ -22,9 +22,9 @@ from numpy.typing import NDArray
 from hdbridge.effects import FloatArray
 
 EXCITED = 1.0
-"""Information of a batch along a direction, in units of 1 / scale^2, from which on it is excited."""
+"""Information of a batch along a direction, in units of 1 / scale^2, above which the direction is excited."""
 NOTHING = 1e-12
-"""Share of the largest information below which there is none."""
+"""Share of the largest eigenvalue below which a direction has no information."""
 
 
 @dataclass(slots=True)
@@ -36,7 +36,7 @@ class Estimator:
     covariance: FloatArray
     """Shape (p, p), positive definite."""
     scale: FloatArray
-    """How far each parameter may stray (a standard deviation), shape (p,), positive."""
+    """Expected range (standard deviation) of each parameter, shape (p,), positive."""
 
     def update(
         self,
@@ -47,10 +47,10 @@ class Estimator:
         keep: float = 1.0,
         held: NDArray[np.bool_] | None = None,
     ) -> int:
-        """Take a batch in: rows (n, p), observed (n,), the noise of each; the number of excited directions.
+        """Updates the estimate with a batch: rows (n, p), observed (n,), noise standard deviation.
 
-        ``keep`` is the share of the old information that stays along excited directions (1: nothing is
-        forgotten). ``held`` (p,) are not changed.
+        Returns the number of excited directions. ``keep`` is the share of the old information that remains
+        along them (1: nothing is forgotten). Parameters in ``held`` (p,) do not change.
         """
         free = np.ones(len(self.estimate), dtype=bool) if held is None else ~held
         scale = self.scale[free]
@@ -72,7 +72,7 @@ class Estimator:
         return int(np.count_nonzero(excited))
 
     def variance_of(self, rows: FloatArray) -> FloatArray:
-        """Variance of ``rows @ estimate``, shape (n,)."""
+        """Returns the variance of ``rows @ estimate``, shape (n,)."""
         return np.asarray(np.einsum("ij,jk,ik->i", rows, self.covariance, rows))
 
     def _forget(self, directions: FloatArray, keep: float) -> None:

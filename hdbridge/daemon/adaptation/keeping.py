@@ -1,7 +1,7 @@
-"""What an adaptation leaves on disk: its state, which a restart goes on from, and its history.
+"""Files of an adaptation: its state, which survives a restart, and its history.
 
-``AXIS.json`` is replaced as a whole, ``AXIS.log.jsonl`` is only ever appended to. The state belongs to one
-committed model: with another one the adaptation begins anew.
+``AXIS.json`` is replaced as a whole, ``AXIS.log.jsonl`` is only appended to. The state belongs to one
+committed model; the adaptation of another model starts without it.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ SCHEMA = "hdbridge.adaptation/1"
 
 
 class StateFile(Strict):
-    """``AXIS.json``."""
+    """Content of ``AXIS.json``."""
 
     schema_: Literal["hdbridge.adaptation/1"] = Field(alias="schema")
     model: str
-    """Fingerprint of the committed model and of what is followed of it."""
+    """Fingerprint of the committed model and the adapted parameters."""
     saved: datetime
     estimate: tuple[float, ...]
     covariance: tuple[tuple[float, ...], ...]
@@ -41,20 +41,20 @@ class StateFile(Strict):
 
 
 class Keeping:
-    """The files of one axis. Raises OutputError where they cannot be written."""
+    """Files of one axis. Raises OutputError if they cannot be written."""
 
     def __init__(self, folder: Path, axis: str, now: Callable[[], datetime]) -> None:
-        """The folder is made where it is missing."""
+        """Creates the folder if it does not exist."""
         make_folder(folder)
         self._state = folder / f"{axis}.json"
         self._log = folder / f"{axis}.log.jsonl"
         self.now = now
-        """The time of day."""
+        """Returns the time of day."""
 
     def load(self, fingerprint: str) -> Memory | None:
-        """What was kept of this model; None where there is nothing, or it is another model's.
+        """Returns the stored state of this model; None if there is none or it belongs to another model.
 
-        What cannot be read is told in the history and begun anew.
+        If the file cannot be read, this is noted in the history and the result is None.
         """
         try:
             file = StateFile.model_validate_json(self._state.read_bytes())
@@ -70,12 +70,12 @@ class Keeping:
         return Memory(file.estimate, file.covariance, file.applied, file.windows)
 
     def save(self, fingerprint: str, memory: Memory) -> None:
-        """Keep this."""
+        """Stores the state."""
         file = StateFile(schema=SCHEMA, model=fingerprint, saved=self.now(), **asdict(memory))
         write_atomically(self._state, file.model_dump_json(by_alias=True))
 
     def log(self, entry: Entry) -> None:
-        """A line more of the history, with the time of day."""
+        """Appends a line with the time of day to the history."""
         line = json.dumps({"time": self.now().isoformat(), **entry}, allow_nan=False)
         try:
             with self._log.open("a", encoding="utf-8") as file:
@@ -87,6 +87,6 @@ class Keeping:
 
 
 def fingerprint_of(model: TransmissionModel, parameters: tuple[str, ...] | None) -> str:
-    """Of the committed model's numbers and of what is followed; where they come from does not matter."""
+    """Returns the fingerprint of a model's numbers, without provenance, and the adapted parameters."""
     text = replace(model, provenance={}).dump() + json.dumps(parameters)
     return hashlib.sha256(text.encode()).hexdigest()

@@ -1,8 +1,8 @@
-"""What an axis teaches: windows of observations, judged, and taken into the estimate.
+"""Learning: windows of observations are judged and update the estimate.
 
-A window is complete once the axis has moved enough (`Excitation`). It is refused as a whole where it cannot
-be wear or temperature (`plausibility`); then nothing is learnt until the doubt is over, and what the last
-windows before it taught is forgotten.
+A window is complete once the axis has moved enough (`Excitation`). It is rejected as a whole if neither wear
+nor temperature can cause it (`plausibility`). Then learning stops until the doubt ends, and the updates by
+the last windows before it are reverted.
 """
 
 from __future__ import annotations
@@ -25,31 +25,32 @@ from hdbridge.effects import Channel, FloatArray
 from hdbridge.model import TransmissionModel
 
 PATIENCE = 4.0
-"""Times the turns of `Excitation` after which a window without reversals is used for what needs none."""
+"""Multiple of the turns of `Excitation` after which a window without reversals updates the memoryless
+terms."""
 CLEAR_WINDOWS = 3
-"""Plausible windows in a row that end a doubt that does not last."""
+"""Consecutive plausible windows that end a passing doubt."""
 UNLEARNT = 3
-"""Windows before a fault was noticed that are forgotten."""
+"""Number of windows before a fault that are reverted."""
 
 
 @dataclass(frozen=True, slots=True)
 class Reading:
-    """How well an axis can be measured at all."""
+    """Measuring resolution of an axis."""
 
     motor_count_arcsec: float
-    """A count of the motor encoder, at the load."""
+    """One count of the motor encoder, at the load."""
     load_count_arcsec: float
     channels: tuple[Channel, ...] = ()
-    """Of the axis file, in the order of the samples' readings."""
+    """Channels of the axis file, in the order of the samples' readings."""
 
     @property
     def sigma_arcsec(self) -> float:
-        """Of an observation: the motor may stand anywhere within its count."""
+        """Standard deviation of an observation due to quantisation by the encoders' counts."""
         return math.hypot(self.motor_count_arcsec, self.load_count_arcsec) / math.sqrt(12.0)
 
 
 class Learning:
-    """The estimate of one axis, as changes of the committed coefficients."""
+    """Estimate of one axis, as changes of the committed coefficients."""
 
     def __init__(
         self,
@@ -58,63 +59,63 @@ class Learning:
         reading: Reading,
         tell: Callable[..., None],
     ) -> None:
-        """``tell(event, **facts)`` hears of doubts and of their ends."""
+        """``tell(event, **facts)`` is called when doubts begin and end."""
         self.regressors = Regressors(model, settings.parameters)
         self.bounds_arcsec = bounds_arcsec(self.regressors, settings)
-        """The most that each coefficient may change, (f,)."""
+        """Largest change of each coefficient, (f,)."""
         self.doubt: Doubt | None = None
-        """Why nothing is learnt just now."""
+        """Present doubt, which stops learning."""
         self.windows = 0
-        """That were learnt from."""
+        """Number of windows learned from."""
         self.begun_s: float | None = None
-        """Since when it has been learning without a doubt; None before the first window."""
+        """Time since which it has learned without a doubt; None before the first window."""
         self.learnt_s = 0.0
-        """End of the last window that was learnt from."""
+        """End of the last window learned from."""
         self._settings = settings
         self._sigma_arcsec = reading.sigma_arcsec
         self._tell = tell
         self._nuisances = self.regressors.remembers.copy()
         self._nuisances[self.regressors.zero :] = True
-        """The columns that a drift must not be taken for: the loop, the zero, the load encoder's disc."""
+        """Columns that may not be mistaken for a drift: the loop, the zero, the load encoder's disc."""
         self._measuring = Measuring(self.regressors, settings.slow_deg_s, reading.channels)
         self._plausibility = Plausibility(settings.zero_rate_arcsec_per_hour, reading.load_count_arcsec)
         self._estimator = estimator_of(self.regressors, settings)
         self._window: list[Observation] = []
         self._zero_arcsec: float | None = None
-        """Where the zero was when it was taken."""
+        """Zero when it was taken."""
         self._cleared = 0
         self._earlier: deque[tuple[FloatArray, FloatArray]] = deque(maxlen=UNLEARNT)
-        """Estimates and covariances before the last windows."""
+        """Estimates and covariances before each of the last windows."""
         self._seen_s: float | None = None
-        """End of the last window, learnt from or not."""
+        """End of the last window, used or not."""
 
     @property
     def known(self) -> bool:
-        """Whether the state of the hysteresis no longer depends on what is not known."""
+        """True if the hysteresis state no longer depends on the unknown past."""
         return self._measuring.known
 
     @property
     def change_arcsec(self) -> FloatArray:
-        """Estimated changes of the followed coefficients, within the bounds, (f,)."""
+        """Estimated changes of the adapted coefficients, within the bounds, (f,)."""
         return self._estimator.estimate[: self.regressors.followed].copy()
 
     @property
     def covariance(self) -> FloatArray:
-        """Of all columns, (count, count)."""
+        """Covariance of all columns, (count, count)."""
         return self._estimator.covariance
 
     @property
     def estimate(self) -> FloatArray:
-        """Of all columns, (count,)."""
+        """Estimate of all columns, (count,)."""
         return self._estimator.estimate
 
     @property
     def zero_moved_arcsec(self) -> float | None:
-        """How far the zero has moved since it was taken; None before that."""
+        """Change of the zero since it was taken; None before."""
         return None if self._zero_arcsec is None else self._zero() - self._zero_arcsec
 
     def take(self, times_s: FloatArray, axis: NDArray[Any], usable: NDArray[np.bool_]) -> None:
-        """Samples as `Measuring.take` has them."""
+        """Takes samples as `Measuring.take` does."""
         for each in self._measuring.take(times_s, axis, usable):
             self._window.append(each)
             if self._complete():
@@ -122,12 +123,12 @@ class Learning:
                 self._close(window)
 
     def lose_path(self) -> None:
-        """Samples are missing or the axis had no power: the state of the gear is not known any more."""
+        """Handles missing samples or lost power: the hysteresis state is unknown."""
         self._measuring.restart()
         self._window.clear()
 
     def lose_zero(self) -> None:
-        """The drive's zero may be another one: homed, or switched off. Ends a doubt about the zero."""
+        """Handles a possible change of the drive's zero (homed or off). Ends a doubt about the zero."""
         if self._zero_arcsec is None and self.doubt is None:
             return
         self._free_zero()
@@ -135,26 +136,26 @@ class Learning:
             self._believe("the zero was taken again")
 
     def begin_anew(self) -> None:
-        """Forget all but the calibration."""
+        """Forgets everything but the calibration."""
         self._estimator = estimator_of(self.regressors, self._settings)
         self._free_zero()
         self._believe("begun anew")
 
     def believe(self) -> None:
-        """End a doubt, whatever the load encoder reads: all may have changed since."""
+        """Ends a doubt, whatever the load encoder reads, and widens the covariance."""
         estimator = self._estimator
         estimator.covariance = estimator.covariance + np.diag(estimator.scale**2)
         self._free_zero()
         self._believe("by command")
 
     def go_on(self, estimate: FloatArray, covariance: FloatArray, windows: int) -> None:
-        """From what was known before; the zero has to be taken again."""
+        """Continues from an earlier estimate; the zero must be taken again."""
         self._estimator.estimate, self._estimator.covariance = estimate, covariance
         self.windows = windows
         self._free_zero()
 
     def question(self, doubt: Doubt) -> None:
-        """Learn nothing until this is over, and forget what the last windows taught."""
+        """Stops learning until this doubt ends, and reverts the last windows."""
         self._window.clear()
         self._cleared = 0
         before = self.doubt
@@ -177,7 +178,7 @@ class Learning:
         return _reversals(window) >= asked.reversals or turned >= PATIENCE * asked.turns
 
     def _close(self, window: list[Observation]) -> None:
-        """Judge a window, and learn from it."""
+        """Judges a window and learns from it if it is plausible."""
         rows = np.array([each.row for each in window])
         observed = np.array([each.error_arcsec for each in window])
         doubt = self._judged(window, rows, observed)
@@ -224,7 +225,7 @@ class Learning:
             self.begun_s = window[0].time_s
 
     def _earned_arcsec(self, window: list[Observation], rows: FloatArray) -> FloatArray:
-        """What may have changed, within the rates, in the time in which nothing was seen, (n,)."""
+        """Returns the change that the rates permit during the time without observations, (n,)."""
         if self._seen_s is None:
             return np.zeros(len(window))
         gap_h = max(window[0].time_s - self._seen_s, 0.0) / 3600.0
@@ -239,7 +240,7 @@ class Learning:
         return float(self.estimate[self.regressors.zero])
 
     def _take_zero(self, rows: FloatArray, observed: FloatArray) -> None:
-        """Begin from the median of a window: what scatters about it is judged, not the zero itself."""
+        """Takes the zero as the median of a window, so that only the scatter about it is judged."""
         at = self.regressors.zero
         estimate = self.estimate.copy()
         estimate[at] = 0.0
@@ -249,7 +250,7 @@ class Learning:
         self._zero_arcsec = float(estimate[at])
 
     def _free_zero(self) -> None:
-        """Nothing is known of the zero any more."""
+        """Resets the zero to unknown."""
         self._set_zero_sigma(ZERO_ARCSEC)
         self._zero_arcsec = None
         self._window.clear()

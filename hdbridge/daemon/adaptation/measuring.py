@@ -1,7 +1,7 @@
-"""From the samples of a cycle to observations: stands, and stretches of slow motion, each averaged.
+"""Observations from samples: standstills and stretches of slow motion, each averaged.
 
-Fast motion is not used: winding up, drag and a load encoder that is read later than the motor would pass for
-a change of the loop. Of a stand counts its later half, of slow motion every few degrees of the motor.
+Fast motion is not used, because wind-up, drag and the delay between the encoders would look like a change of
+the hysteresis loop. A standstill counts with its second half, slow motion once per few degrees of the motor.
 """
 
 from __future__ import annotations
@@ -18,32 +18,32 @@ from hdbridge.effects.kinematics import Observer
 from hdbridge.units import ARCSEC_PER_DEG, DEG_PER_TURN
 
 SETTLE_S = 0.05
-"""After a fast move the load is left this much time to come to rest, and after a turn of a slow one."""
+"""Settling time of the load after a fast move, and after a reversal in a slow one."""
 SHORTEST_S = 0.04
-"""Stands that are shorter, in addition to that, are not used."""
+"""Minimum duration of a standstill, in addition to the settling time."""
 LONGEST_S = 1.0
-"""A stand is an observation once it is over, or has lasted so long; then never again."""
+"""Maximum duration of a standstill; each gives at most one observation."""
 CELL_DEG = 3.0
 """Motor travel of an observation in slow motion."""
 REVERSAL_DEG = 0.3
-"""Travel by which the motor must come back for a reversal."""
+"""Motor travel back that counts as a reversal."""
 
 
 class Observation(NamedTuple):
-    """What a stand or a stretch of slow motion says."""
+    """Observation from one standstill or stretch of slow motion."""
 
     time_s: float
-    """At its end."""
+    """Time at its end."""
     error_arcsec: float
     """Observed transmission error less the committed model's, at the load."""
     row: FloatArray
-    """The columns of `Regressors`, shape (count,)."""
+    """Columns of `Regressors`, shape (count,)."""
     travel_deg: float
-    """Travel of the motor since the last observation, both directions."""
+    """Total travel of the motor since the last observation."""
     reversals: int
-    """Reversals of the motor since then."""
+    """Reversals of the motor since the last observation."""
     scatter_arcsec: float
-    """Standard deviation of its samples; NaN in motion, where it is not the encoder's."""
+    """Standard deviation of its samples; NaN in motion."""
 
 
 class _Sample(NamedTuple):
@@ -54,7 +54,7 @@ class _Sample(NamedTuple):
 
 
 class Measuring:
-    """One axis; `take` is given its samples in order, and is the only thing that knows their layout."""
+    """Measures one axis; `take` gets its samples in order. Only this class knows their layout."""
 
     def __init__(self, regressors: Regressors, slow_deg_s: float, channels: tuple[Channel, ...] = ()) -> None:
         """``channels`` are those of the axis file, in the order of the samples' readings."""
@@ -65,15 +65,15 @@ class Measuring:
         self.restart()
 
     def restart(self) -> None:
-        """The path is lost: power off, samples lost, another drive's state. The gear's past is unknown."""
+        """Restarts the path with an unknown hysteresis state, after power-off or lost samples."""
         self._regressors.restart()
         self._observer = Observer()
         self._last: float | None = None
         self._kept: list[_Sample] = []
         self._quiet_s = math.inf
-        """Since when the command stands, or is slow in one direction."""
+        """Time since which the command stands, or is slow in one direction."""
         self._done = True
-        """This stand has been used."""
+        """True once this standstill has been used."""
         self._standing = True
         self._turn_deg = 0.0
         self._sense = 0
@@ -83,13 +83,13 @@ class Measuring:
 
     @property
     def known(self) -> bool:
-        """Whether the state of the hysteresis no longer depends on what was before."""
+        """True if the hysteresis state no longer depends on the unknown past."""
         return self._regressors.known()
 
     def take(self, times_s: FloatArray, axis: NDArray[Any], usable: NDArray[np.bool_]) -> list[Observation]:
-        """The observations that samples of `AXIS_SAMPLE`, shape (n,), complete.
+        """Takes samples of `AXIS_SAMPLE`, shape (n,); returns the observations that they complete.
 
-        ``usable`` are those whose load encoder may be believed; the others lead the path on only.
+        ``usable`` marks samples whose load encoder is believed; the others only advance the path.
         """
         found: list[Observation] = []
         timeless = self._regressors.timeless
@@ -124,7 +124,7 @@ class Measuring:
     def _follow(
         self, time_s: float, motor_deg: float, moment: Moment, speed_deg_s: float
     ) -> Observation | None:
-        """Lead the path to the next command; what it completes."""
+        """Advances the path to the next command; returns the observation that this completes."""
         last = self._last
         self._last = motor_deg
         if last is None:
@@ -150,7 +150,7 @@ class Measuring:
         return ended
 
     def _count(self, motor_deg: float, step_deg: float) -> bool:
-        """Travel and reversals; whether this step begins another direction."""
+        """Counts travel and reversals; returns True if this step reverses the motion."""
         self._travel_deg += abs(step_deg)
         self._cell_deg += abs(step_deg)
         sense = 1 if step_deg > 0.0 else -1
@@ -165,7 +165,7 @@ class Measuring:
         return True
 
     def _end_of_stretch(self) -> Observation | None:
-        """What was kept as an observation, if it is enough for one."""
+        """Returns the collected samples as an observation, if there are enough."""
         kept, self._cell_deg = self._kept, 0.0
         enough = len(kept) > 2 and (
             kept[-1].time_s - kept[0].time_s >= SHORTEST_S
@@ -211,5 +211,5 @@ class Measuring:
 
 
 def turns(observations: list[Observation]) -> float:
-    """Motor turns that went by up to these observations."""
+    """Returns the motor turns during these observations."""
     return sum(each.travel_deg for each in observations) / DEG_PER_TURN

@@ -1,9 +1,9 @@
-"""Whether a window of observations can be wear or temperature.
+"""Plausibility: tests if wear or temperature can explain a window of observations.
 
-Both are slow. What is sudden, and what does not hold together, is neither. Whether the load encoder itself is
-well (frozen, noisy, jumping) is judged sample by sample in `hdbridge.daemon.watch.encoder_health`; here only
-what the estimate lets one ask. A shift that is common to all observations, or a zero that moves faster than
-it may, does not pass by itself: the zero has to be taken again (`Doubt.lasting`).
+Both are slow, so sudden or inconsistent changes have another cause. The health of the load encoder itself
+(frozen, noisy, jumping) is judged per sample in `hdbridge.daemon.watch.encoder_health`; the tests here need
+the estimate. A shift common to all observations, or a zero that moves too fast, does not end automatically:
+the zero must be taken again (`Doubt.lasting`).
 """
 
 from __future__ import annotations
@@ -20,42 +20,42 @@ from hdbridge.effects import FloatArray
 
 GATE_SIGMAS = 6.0
 NOISIER = 4.0
-"""Times by which the scatter of stands must have grown to be noise that was not there before."""
+"""Ratio of the scatter of standstills to its usual value above which it is noise."""
 SLOWLY = 0.02
-"""Share by which a window changes what is usual."""
+"""Weight of one window in the usual scatter."""
 TREND_FREE = 4
-"""Observations that a trend within a window needs beyond its unknowns."""
+"""Degrees of freedom required to fit a trend in a window."""
 ZEROS_KEPT = 256
 DRIFT_S = 120.0
-"""Time over which a drift of the zero is looked for ..."""
+"""Time span in which a drift of the zero is searched."""
 DRIFT_WINDOWS = 6
-"""... and windows that it takes."""
+"""Minimum number of windows to detect a drift."""
 SURE_SIGMAS = 3.0
 
 
 @dataclass(frozen=True, slots=True)
 class Doubt:
-    """Why nothing is learnt."""
+    """Reason why nothing is learned."""
 
     reason: str
-    """In words, with figures."""
+    """The reason in words, with figures."""
     lasting: bool
-    """True where it does not pass by itself: the zero has to be taken again."""
+    """True if it does not end automatically: the zero must be taken again."""
 
 
 class Plausibility:
-    """The judge of one axis."""
+    """Judges the windows of one axis."""
 
     def __init__(self, zero_rate_arcsec_per_hour: float, quiet_arcsec: float) -> None:
-        """The rate that no zero exceeds; the scatter that every stand may have (a count of the encoder)."""
+        """Takes the fastest drift of a zero, and the scatter that is always permitted (one count)."""
         self._zero_rate_arcsec_s = zero_rate_arcsec_per_hour / 3600.0
         self._quiet_arcsec = quiet_arcsec
         self._usual_arcsec: float | None = None
-        """Scatter of a stand, as it has been."""
+        """Usual scatter of a standstill."""
         self._zeros: deque[tuple[float, float]] = deque(maxlen=ZEROS_KEPT)
 
     def restart(self) -> None:
-        """The zero may be another one."""
+        """Forgets the zeros of earlier windows."""
         self._zeros.clear()
 
     def judge(
@@ -65,11 +65,11 @@ class Plausibility:
         sigma_arcsec: FloatArray,
         others: FloatArray,
     ) -> Doubt | None:
-        """None where a window is plausible.
+        """Returns a doubt, or None for a plausible window.
 
-        ``residual_arcsec`` is what the present estimate leaves of each observation, ``sigma_arcsec`` what it
-        may leave (one standard deviation), both of shape (n,); ``others`` (n, m) are the columns of what a
-        drift must not be taken for: the zero, the loop, the load encoder's disc.
+        ``residual_arcsec`` are the residuals by the present estimate, ``sigma_arcsec`` their permitted
+        standard deviations, both of shape (n,). ``others`` (n, m) are columns that may not be mistaken for a
+        drift: the zero, the loop, the load encoder's disc.
         """
         return (
             self._noise(window)
@@ -78,7 +78,7 @@ class Plausibility:
         )
 
     def follow(self, window: Sequence[Observation], zero_arcsec: float) -> Doubt | None:
-        """A window was plausible, and its own zero is this: what the last ones together say."""
+        """Takes the zero of a plausible window; returns a doubt if the last zeros together drift too fast."""
         scatter = _scatter_arcsec(window)
         if scatter is not None:
             usual = self._usual_arcsec
@@ -124,7 +124,7 @@ class Plausibility:
     def _trend(
         self, window: Sequence[Observation], residual_arcsec: FloatArray, others: FloatArray
     ) -> Doubt | None:
-        """A fast drift within one window; it is over when it is over."""
+        """Tests for a fast drift within one window, which passes with it."""
         if len(window) < others.shape[1] + 1 + TREND_FREE:
             return None
         time_s = np.array([each.time_s for each in window])
@@ -144,13 +144,13 @@ class Plausibility:
 
 
 def _scatter_arcsec(window: Sequence[Observation]) -> float | None:
-    """Median scatter of a window's stands."""
+    """Returns the median scatter of a window's standstills; None without any."""
     stands = [each.scatter_arcsec for each in window if not math.isnan(each.scatter_arcsec)]
     return float(np.median(stands)) if stands else None
 
 
 def _slope(time_s: FloatArray, values: FloatArray, others: FloatArray) -> tuple[float, float]:
-    """Slope of values (n,) by time with other columns (n, m) fitted in addition, and its standard error."""
+    """Returns the slope of values (n,), fitted with other columns (n, m), and its standard error."""
     columns = np.column_stack([time_s - np.mean(time_s), others])
     found, _, rank, _ = np.linalg.lstsq(columns, values, rcond=None)
     free = len(values) - rank

@@ -1,4 +1,4 @@
-"""What is known before the axis moves: the calibration's covariance, and how far each coefficient may go."""
+"""Prior of the adaptation: the calibration's covariance, and the bounds of each coefficient."""
 
 from __future__ import annotations
 
@@ -16,21 +16,22 @@ from hdbridge.daemon.adaptation.settings import AdaptationSettings
 from hdbridge.effects import Effect, FloatArray
 
 DISC_ARCSEC = 10.0
-"""Size that the load encoder's own errors per turn may have."""
+"""Expected size of the load encoder's own errors per turn."""
 ZERO_ARCSEC = 1000.0
-"""The zero is not known beforehand: its standard deviation."""
+"""Standard deviation of the zero, which is unknown at first."""
 LEAST_ARCSEC = 1e-3
-"""No calibration is surer than this."""
+"""Minimum standard deviation of a calibrated coefficient."""
 ZERO_SCALE_ARCSEC = 200.0
-"""What is common to all observations is put down to the zero, hardly to a disc that is met in one place."""
+"""Scale of the zero; it exceeds that of the disc, so that a common shift is attributed to the zero."""
 STEP_ARCSEC = 1e-4
 SIGMAS_AT_BOUND = 3.0
 
 
 def bounds_arcsec(regressors: Regressors, settings: AdaptationSettings) -> FloatArray:
-    """The most that each followed coefficient may differ from the committed one, (followed,).
+    """Returns the largest deviation of each adapted coefficient from the committed one, (followed,).
 
-    The share is that of the largest coefficient of the effect: a sine that happens to be zero may grow.
+    The share applies to the largest coefficient of the effect, so that a sine that happens to be zero may
+    grow.
     """
     bounds = np.empty(regressors.followed)
     for each in regressors.terms:
@@ -40,7 +41,7 @@ def bounds_arcsec(regressors: Regressors, settings: AdaptationSettings) -> Float
 
 
 def estimator_of(regressors: Regressors, settings: AdaptationSettings) -> Estimator:
-    """An estimator that knows what the committed model's ``uncertainty`` says, and nothing of the zero."""
+    """Returns an estimator with the committed model's ``uncertainty`` and an unknown zero."""
     scale = np.full(regressors.count, DISC_ARCSEC)
     scale[: regressors.followed] = bounds_arcsec(regressors, settings) / SIGMAS_AT_BOUND
     scale[regressors.zero] = ZERO_SCALE_ARCSEC
@@ -53,9 +54,9 @@ def estimator_of(regressors: Regressors, settings: AdaptationSettings) -> Estima
 
 
 def uncertainty_of(effect: Effect, covariance: FloatArray, before: Mapping[str, Any]) -> dict[str, Any]:
-    """95 % half widths of an effect's parameters by the covariance of its coefficients, for the model file.
+    """Returns 95 % half widths of an effect's parameters for the model file, from the covariance.
 
-    Parameters that are not followed keep what they had ``before``.
+    Parameters that are not adapted keep those of ``before``.
     """
     values = dict(leaves(effect.parameters()))
     halves = {
@@ -70,7 +71,7 @@ def uncertainty_of(effect: Effect, covariance: FloatArray, before: Mapping[str, 
 
 
 def _covariance(effect: Effect, uncertainty: Mapping[str, Any], scale: FloatArray) -> FloatArray:
-    """Of the coefficients, from half widths of the parameters; where there are none, the scale."""
+    """Returns the coefficients' covariance by the parameters' half widths, or the scale without them."""
     halves = dict(leaves(dict(uncertainty)))
     information = np.diag(1.0 / scale**2)
     for name, slope in _slopes(effect).items():
@@ -82,6 +83,6 @@ def _covariance(effect: Effect, uncertainty: Mapping[str, Any], scale: FloatArra
 
 
 def _slopes(effect: Effect) -> dict[str, FloatArray]:
-    """Derivatives of the parameters that the coefficients make, by the coefficients, (c,) each."""
+    """Returns the derivatives of each parameter with respect to the coefficients, (c,) each."""
     count = len(effect.coefficients())
     return slopes(effect, [Column(0, str(number)) for number in range(count)], np.full(count, STEP_ARCSEC))

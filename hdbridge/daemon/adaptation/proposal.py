@@ -1,4 +1,4 @@
-"""What the adaptation says: proposals of another model, and lines of its history."""
+"""Output of the adaptation: proposals of a changed model, and lines of its history."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ from hdbridge.analysis.intervals import leaves
 from hdbridge.model import TransmissionModel
 
 Entry = Mapping[str, Any]
-"""A line of the history: ``event``, ``axis_time_s``, and what belongs to it; plain data for JSON."""
+"""Line of the history: ``event``, ``axis_time_s`` and further data, all serialisable as JSON."""
 Log = Callable[[Entry], None]
 
 
 @dataclass(frozen=True, slots=True)
 class Change:
-    """One parameter."""
+    """Change of one parameter."""
 
     parameter: str
-    """``hysteresis.offset_arcsec``, ``synchronous.orders[2].phase_deg``."""
+    """Name, such as ``hysteresis.offset_arcsec`` or ``synchronous.orders[2].phase_deg``."""
     committed: float
     before: float
     after: float
@@ -27,12 +27,12 @@ class Change:
 
 @dataclass(frozen=True, slots=True)
 class Proposal:
-    """Another model for the compensation."""
+    """Proposed model for the compensation."""
 
     model: TransmissionModel
     changes: tuple[Change, ...]
     apply: bool
-    """False where it is only reported (``observe``)."""
+    """False if it is only reported (``observe``)."""
     time_s: float
     """Axis time."""
 
@@ -40,7 +40,7 @@ class Proposal:
 def changes_between(
     committed: TransmissionModel, before: TransmissionModel, after: TransmissionModel
 ) -> tuple[Change, ...]:
-    """The parameters that differ between ``before`` and ``after``."""
+    """Returns the parameters that differ between ``before`` and ``after``."""
     first, old, new = (_flat(each) for each in (committed, before, after))
     return tuple(
         Change(name, first.get(name, 0.0), old.get(name, 0.0), value)

@@ -1,10 +1,9 @@
-"""What is followed of a model, as a linear problem: the coefficients, and their columns on line.
+"""Linear problem of the adaptation: the adapted coefficients of a model and their columns.
 
-``observed - committed prediction = columns @ change + nuisances``. The equations are the effects' own: an
-effect without memory gives its columns for any angles; one with a memory is led along the command by trackers
-of unit coefficients, which by the effects' laws is the same. What must not pass for a change of the gear is
-fitted in addition, and never applied: the zero, and what an eccentric or oval disc of the load encoder adds,
-once and twice per turn of the load.
+``observed - committed prediction = columns @ change + nuisances``. The columns come from the effects
+themselves: an effect without memory gives them for any angles; for one with memory, trackers of unit
+coefficients follow the command, which by linearity is equivalent. Nuisance parameters are fitted as well and
+never applied: the zero, and the once and twice per turn error of an eccentric or oval load encoder disc.
 """
 
 from __future__ import annotations
@@ -22,42 +21,42 @@ from hdbridge.files.expectation import nearest
 from hdbridge.model import TransmissionModel
 
 LOAD_ORDERS = (1, 2)
-"""Per turn of the load: eccentricity and ovality of an encoder's disc."""
+"""Orders per turn of the load: eccentricity and ovality of the encoder's disc."""
 SAME_ARCSEC = 1e-6
-"""A state is known when it comes out alike whichever way the axis had moved before."""
+"""The state is known once trackers from either previous direction agree within this."""
 
 
 @dataclass(frozen=True, slots=True)
 class Term:
-    """An effect that is followed."""
+    """An adapted effect."""
 
     place: int
-    """In the model's effects."""
+    """Index in the model's effects."""
     effect: Effect
-    """As committed."""
+    """The committed effect."""
     columns: slice
-    """Its coefficients among all that are followed."""
+    """Its coefficients among all adapted ones."""
     memory: bool
-    """Whether only reversals show it."""
+    """True if it has memory, so that only reversals show it."""
 
 
 class Regressors:
-    """The columns of one model: first what is followed, then the zero, then the load encoder's disc."""
+    """Columns of one model: adapted coefficients, zero, load encoder disc."""
 
     def __init__(self, model: TransmissionModel, parameters: Sequence[str] | None = None) -> None:
-        """``parameters`` as in `AdaptationSettings`. InputError for one that the model does not have."""
+        """``parameters`` as in `AdaptationSettings`; InputError for one that the model does not have."""
         self.model = model
         self.terms = _terms(model, parameters)
         self.followed = sum(len(each.effect.coefficients()) for each in self.terms)
-        """How many coefficients are followed."""
+        """Number of adapted coefficients."""
         self.zero = self.followed
-        """The column of the zero."""
+        """Index of the zero's column."""
         self.count = self.followed + 1 + 2 * len(LOAD_ORDERS)
-        """How many columns there are."""
+        """Total number of columns."""
         self.committed = np.concatenate([np.zeros(0), *(each.effect.coefficients() for each in self.terms)])
-        """The committed coefficients, shape (followed,)."""
+        """Committed coefficients, shape (followed,)."""
         self.remembers = np.zeros(self.count, dtype=bool)
-        """The columns that only reversals show."""
+        """Mask of the columns with memory."""
         for each in self.terms:
             self.remembers[each.columns] = each.memory
         self._timeless = not any(each.needs() for each in model.effects)
@@ -65,11 +64,11 @@ class Regressors:
 
     @property
     def timeless(self) -> bool:
-        """True when no effect needs more than the motor angle: any `Moment` will do."""
+        """True if no effect needs more than the motor angle, so that any `Moment` will do."""
         return self._timeless
 
     def restart(self) -> None:
-        """Forget the path: nothing is known of the gear's past."""
+        """Restarts the path with an unknown hysteresis state."""
         followed = {each.place for each in self.terms}
         self._fixed = [
             _Both.of(effect) for place, effect in enumerate(self.model.effects) if place not in followed
@@ -82,20 +81,20 @@ class Regressors:
         }
 
     def advance(self, motor_deg: float, moment: Moment) -> None:
-        """The command has come to this angle."""
+        """Advances all trackers to this commanded angle."""
         for each in (*self._fixed, *self._units.values()):
             each.advance(motor_deg, moment)
 
     def known(self) -> bool:
-        """Whether the memories no longer depend on what was before `restart`."""
+        """Returns True if the trackers no longer depend on the state before `restart`."""
         return all(each.same for each in (*self._fixed, *self._units.values()))
 
     def state(self) -> tuple[float, ...]:
-        """What only this moment has: the sum of what is not followed, and the columns with a memory."""
+        """Returns the path-dependent values: the sum of effects not adapted, and columns with memory."""
         return (sum(each.value for each in self._fixed), *(each.value for each in self._units.values()))
 
     def rows(self, motor_deg: FloatArray, states: FloatArray) -> FloatArray:
-        """All columns at motor angles (n,), given what `state` was there, (n, s); shape (n, count)."""
+        """Returns all columns at motor angles (n,), given `state` there, (n, s); shape (n, count)."""
         rows = np.zeros((len(motor_deg), self.count))
         rows[:, list(self._units)] = states[:, 1:]
         motion = Motion(motor_deg)
@@ -108,7 +107,7 @@ class Regressors:
         return rows
 
     def changed(self, change: FloatArray) -> TransmissionModel:
-        """The committed model with its followed coefficients changed by so much, (followed,)."""
+        """Returns the committed model with its adapted coefficients changed, (followed,)."""
         effects = list(self.model.effects)
         for each in self.terms:
             effects[each.place] = each.effect.fitted(each.effect.coefficients() + change[each.columns])
@@ -116,7 +115,7 @@ class Regressors:
 
 
 class _Both:
-    """An effect on line, from either direction that the axis may have had before, until both agree."""
+    """Two trackers of an effect, started in either direction, until both agree."""
 
     __slots__ = ("_other", "_tracker", "same", "value")
 
@@ -128,7 +127,6 @@ class _Both:
 
     @classmethod
     def of(cls, effect: Effect) -> _Both:
-        """A fresh one."""
         tracker = effect.tracker(Start.FORWARD)
         return cls(tracker, None if isinstance(tracker, Memoryless) else effect.tracker(Start.BACKWARD))
 
@@ -159,7 +157,7 @@ def _terms(model: TransmissionModel, parameters: Sequence[str] | None) -> tuple[
 
 
 def _unit(effect: Effect, number: int) -> Effect:
-    """The effect with one coefficient of one and no other."""
+    """Returns the effect with one coefficient set to one and all others to zero."""
     unit = np.zeros_like(effect.coefficients())
     unit[number] = 1.0
     return effect.fitted(unit)

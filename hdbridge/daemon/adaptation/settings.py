@@ -1,4 +1,4 @@
-"""What the adaptation of an axis may do, and how fast: the keys under ``adaptation`` of a machine file."""
+"""Keys under ``adaptation`` of a machine file: what the adaptation may change, and how fast."""
 
 from __future__ import annotations
 
@@ -14,79 +14,87 @@ Parameter = Annotated[str, Field(pattern=r"^[a-z_]+\.[a-z_]+$")]
 
 
 class Standing(StrEnum):
-    """What the adaptation of an axis is doing."""
+    """State of an axis's adaptation."""
 
     OFF = "off"
     WAITING = "waiting"
-    """Nothing to learn from: at rest, too fast, no power, or too little motion yet."""
+    """Nothing to learn from: at rest, too fast, without power, or too little motion yet."""
     FOLLOWING = "following"
     FROZEN = "frozen"
-    """A fault; the reason is told. Ends by itself when what it depends on is well again, or by `resume`."""
+    """A doubt stops learning; the reason is reported. It ends when its cause does, or by `resume`."""
 
 
 class Excitation(Strict):
-    """What an axis must have done since the last update before the next one is made."""
+    """Motion required between two updates of the estimate."""
 
     turns: float = Field(
-        2.0, ge=0.5, le=1000, description="motor turns (both directions) that show the orders of the motor"
+        2.0,
+        ge=0.5,
+        le=1000,
+        description="motor turns, in both directions together, required for the motor orders",
     )
     reversals: int = Field(
-        2, ge=1, le=1000, description="reversals of the motor that show the loop and tell it from the zero"
+        2, ge=1, le=1000, description="reversals required to separate the hysteresis loop from the zero"
     )
-    samples: int = Field(
-        10, ge=2, le=10_000, description="stands and stretches of slow motion that were measured"
-    )
+    samples: int = Field(10, ge=2, le=10_000, description="standstills and stretches of slow motion required")
 
 
 class AdaptationSettings(Strict):
-    """Rates are per hour of the axis's own time, bounds are about the committed model."""
+    """Settings of the adaptation. Rates are per hour of axis time, bounds relative to the committed model."""
 
     mode: Mode = Field(
         "off", description="off, observe (only report what would change), or on (change the model in use)"
     )
     parameters: tuple[Parameter, ...] | None = Field(
         None,
-        description="what follows, as EFFECT.PARAMETER; without it all that wear and temperature move",
+        description="adapted parameters, as EFFECT.PARAMETER; by default all that wear or temperature move",
     )
     rate_arcsec_per_hour: float = Field(
-        30.0, gt=0, le=36_000, description="fastest change of any one coefficient of the model"
+        30.0, gt=0, le=36_000, description="fastest change of any coefficient of the model"
     )
     zero_rate_arcsec_per_hour: float = Field(
         60.0,
         gt=0,
         le=36_000,
-        description="fastest change of the zero (told, never applied); a faster one is a fault",
+        description="fastest change of the zero (reported, never applied); a faster one is a fault",
     )
     bound_share: float = Field(
-        0.5, gt=0, le=1, description="most that a coefficient may differ from the committed one, of its size"
+        0.5,
+        gt=0,
+        le=1,
+        description="largest deviation of a coefficient from the committed one, as a share of it",
     )
     least_bound_arcsec: float = Field(
-        5.0, ge=0, le=3600, description="most that it may differ where that share is less than this"
+        5.0, ge=0, le=3600, description="largest deviation, if that share is smaller"
     )
     zero_bound_arcsec: float = Field(
-        60.0, gt=0, le=3600, description="most that the zero may move since it was taken; more is a fault"
+        60.0,
+        gt=0,
+        le=3600,
+        description="largest change of the zero since it was taken; a larger one is a fault",
     )
     half_life_turns: float = Field(
         40.0,
         ge=1,
         le=1e6,
-        description="motor turns after which what was seen counts half, in the directions that they show",
+        description="motor turns after which older observations count half, in the observed directions",
     )
-    excitation: Excitation = Field(
-        default_factory=Excitation, description="what must be seen before an update"
-    )
+    excitation: Excitation = Field(default_factory=Excitation, description="motion required for an update")
     slow_deg_s: float = Field(
-        0.5, gt=0, le=100, description="load speed up to which motion is used; faster, only stands are"
+        0.5,
+        gt=0,
+        le=100,
+        description="highest load speed at which motion is used; of faster motion only standstills count",
     )
     interval_s: float = Field(
-        60.0, ge=1, le=86_400, description="least time between two changes of the model in use"
+        60.0, ge=1, le=86_400, description="minimum time between two changes of the model in use"
     )
     smallest_arcsec: float = Field(
-        0.1, ge=0, le=100, description="change of a coefficient below which the model in use stays as it is"
+        0.1, ge=0, le=100, description="smallest change of a coefficient that is applied"
     )
     folder: str | None = Field(
         None,
         min_length=1,
-        description="where state and history are kept (AXIS.json, AXIS.log.jsonl), relative to the machine "
-        "file; else the folder 'adaptation' beside the axis file",
+        description="folder of state and history (AXIS.json, AXIS.log.jsonl), relative to the machine "
+        "file; by default 'adaptation' next to the axis file",
     )

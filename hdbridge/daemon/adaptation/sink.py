@@ -1,4 +1,4 @@
-"""The adaptations of a machine, behind the service's observer: samples in, proposals out, files kept."""
+"""Adaptations of a machine: a sink of the observer that makes proposals and stores their state."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger(__name__)
 SAVE_S = 300.0
-"""The state is kept at least so often while it changes, in axis time."""
+"""Maximum interval in axis time between stores of a changing state."""
 BELIEVED = Judgement(True, "")
 
 
@@ -43,12 +43,12 @@ class Followed:
     keeping: Keeping
     fingerprint: str
     judgement: Callable[[], Judgement]
-    """Of `EncoderHealth`, as of the same samples."""
+    """Returns the judgement of `EncoderHealth` after the same samples."""
     updated: datetime | None = None
     saved_windows: int = 0
     saved_s: float = 0.0
     entries: list[Entry] = field(default_factory=list)
-    """Lines of history that have to be written yet."""
+    """Lines of the history that are not written yet."""
 
 
 def followed(
@@ -59,10 +59,10 @@ def followed(
     now: Callable[[], datetime],
     judgement: Callable[[], Judgement] = lambda: BELIEVED,
 ) -> Followed:
-    """An axis, going on from what is kept of its model in ``folder``.
+    """Returns an axis that continues from the state of its model in ``folder``.
 
-    ``model`` is the committed one, whole, whatever part of it compensates. InputError where the settings name
-    a parameter that it does not have; OutputError where the folder cannot be written.
+    ``model`` is the whole committed model, whatever the scheme. Raises InputError if the settings name a
+    parameter that it does not have, OutputError if the folder cannot be written.
     """
     keeping = Keeping(folder, axis.name, now)
     fingerprint = fingerprint_of(model, settings.parameters)
@@ -72,7 +72,7 @@ def followed(
 
 
 def reading_of(axis: AxisConfig) -> Reading:
-    """How finely an axis is measured, and which channels its samples have."""
+    """Returns the measuring resolution and the channels of an axis."""
     return Reading(
         axis.motor_encoder.resolution_arcsec / axis.gear.ratio,
         axis.load_encoder.resolution_arcsec,
@@ -81,7 +81,7 @@ def reading_of(axis: AxisConfig) -> Reading:
 
 
 class AdaptationSink:
-    """A sink of the observer. All its methods are to be called from one thread."""
+    """A sink of the observer. Call all methods from one thread."""
 
     def __init__(
         self,
@@ -90,22 +90,22 @@ class AdaptationSink:
         writer: Executor | None = None,
         first: int = 0,
     ) -> None:
-        """``propose`` is called with an axis's index and another model; it must not block. ``first`` is the
-        place of the first axis in a sample; the others come after it.
+        """``propose`` is called with an axis's index and a proposal; it must not block.
 
-        What `Proposal.apply` is not set for is only reported. Files are written in ``writer``, in which
-        one thread does them in order; without it at once.
+        ``first`` is the place of the first axis in a sample; the others follow it. Without `Proposal.apply`
+        a proposal is only reported. The single thread of ``writer`` writes files in order; without it they
+        are written at once.
         """
         self.axes = tuple(axes)
         self.problem = ""
-        """Why state or history could not be written last; empty when they could."""
+        """Last error of writing state or history; empty after success."""
         self._propose = propose
         self._writer = writer
         self._first = first
         self._time_s = 0.0
 
     def take(self, samples: SampleArray, events: Sequence[Event], lost: int) -> None:
-        """Samples of `sample_dtype`, in order; ``lost`` are those before them that were missed."""
+        """Takes samples of `sample_dtype`, in order; ``lost`` samples are missing before them."""
         if lost:
             for each in self.axes:
                 each.adaptation.lost_path()
@@ -122,19 +122,19 @@ class AdaptationSink:
             self._keep(each, self._time_s - each.saved_s >= SAVE_S)
 
     def back(self, place: int) -> Proposal:
-        """Back to the committed model, and observe only; the proposal is handed on, too."""
+        """Restores the committed model and only observes; also passes the proposal on."""
         proposal = self.axes[place].adaptation.back()
         self._tell(place, proposal)
         return proposal
 
     def adapt(self, place: int, mode: Mode) -> None:
-        """Another mode from here on. ``on`` believes the load encoder again where it was doubted."""
+        """Changes the mode. ``on`` ends a doubt about the load encoder."""
         each = self.axes[place]
         each.adaptation.adapt(mode)
         self._keep(each, True)
 
     def state(self, place: int) -> messages.AdaptationState:
-        """What clients are told."""
+        """Returns the state of the adaptation for clients."""
         each = self.axes[place]
         report = each.adaptation.report()
         return messages.AdaptationState(
@@ -145,7 +145,7 @@ class AdaptationSink:
         )
 
     def close(self) -> None:
-        """Keep what was learnt last."""
+        """Stores the state of all axes."""
         for each in self.axes:
             self._keep(each, True)
 

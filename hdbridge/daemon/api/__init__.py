@@ -1,9 +1,9 @@
-"""HTTP and WebSocket over a Unix socket, and over TCP where the machine file says so.
+"""HTTP and WebSocket API over a Unix socket, and over TCP if the machine file says so.
 
-sockets.py   the listening sockets, bound here
-policy.py    who may ask what on one listener
-guard.py     holds every request to it before a route sees it
+sockets.py   creates the listening sockets
+policy.py    rules for the requests to one listener
+guard.py     applies the policy before a request reaches a route
 app.py       the application, its description, metrics and health
-routes/      what may be asked
-server.py    uvicorn under it, bounded
+routes/      the requests of the API
+server.py    uvicorn with limits
 """

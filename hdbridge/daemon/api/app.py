@@ -1,4 +1,4 @@
-"""The application: every route over one `Bridge`, errors as problems, a description of itself."""
+"""The application: all routes over one `Bridge`, errors as problem documents, and its own description."""
 
 from __future__ import annotations
 
@@ -25,12 +25,15 @@ from hdbridge.daemon.service.interface import Bridge
 
 PREFIX: Final = "/api/v1"
 TAGS: Final = (
-    ("Look", "What the machine does. Everybody may, and nothing of it moves anything."),
-    ("Lease", "The right to move: one client at a time has it, for as long as it uses it."),
-    ("Stop", "Never refused to anybody who may ask at all; no lease is needed."),
-    ("Power", "Enable, disable, reset. These and all below need the lease, in the header `X-Lease`."),
-    ("Move", "Targets are load angles in degrees, held to the axis's limits."),
-    ("Compensate", "Which part of which model is used, and how it follows the load encoder."),
+    ("Look", "State of the machine. No lease is needed, and no request moves anything."),
+    ("Lease", "The right to move, held by one client at a time while it uses it."),
+    ("Stop", "Never refused to an authorised client; no lease is needed."),
+    (
+        "Power",
+        "Enable, disable, reset. These and all requests below need the lease, in the header `X-Lease`.",
+    ),
+    ("Move", "Targets are load angles in degrees, within the axis's limits."),
+    ("Compensate", "Model and the part of it that compensates; adaptation to the load encoder."),
     ("Jobs", "Procedures that run through the daemon while it holds the bus."),
     ("Drive", "Objects of the drive's dictionary, by SDO."),
 )
@@ -42,11 +45,11 @@ _ABOUT: Final = (
 
 
 def create_app(bridge: Bridge, metrics: Metrics, traffic: Traffic) -> FastAPI:
-    """The ASGI application; who may reach it is the listener's matter (`guard.py`)."""
+    """Returns the ASGI application; each listener's `guard.py` decides who may reach it."""
     app = FastAPI(
         title="hdbridge",
         version=__version__,
-        summary="The daemon that holds the drives of one bus",
+        summary="The daemon that controls the drives of one bus",
         description=_ABOUT,
         openapi_url=None,
         docs_url=None,
@@ -70,33 +73,33 @@ def _add_pages(app: FastAPI, bridge: Bridge, metrics: Metrics, traffic: Traffic)
 
     @app.get(f"{PREFIX}/openapi.json", include_in_schema=False)
     async def get_description() -> JSONResponse:
-        """The description of the API, OpenAPI 3.1."""
+        """Returns the description of the API, OpenAPI 3.1."""
         return JSONResponse(app.openapi())
 
     @app.get("/docs", include_in_schema=False)
     async def get_docs() -> HTMLResponse:
-        """The same for a person."""
+        """Returns the same as a page to read."""
         policy = "default-src 'none'; style-src 'unsafe-inline'; frame-ancestors 'none'"
         return HTMLResponse(described(), headers={"Content-Security-Policy": policy})
 
     @app.get("/", include_in_schema=False)
     async def get_page() -> Response:
-        """The live page."""
+        """Returns the live page."""
         return _static(PAGE)
 
     @app.get("/page/{name}", include_in_schema=False)
     async def get_page_file(name: str) -> Response:
-        """What belongs to it."""
+        """Returns a file of the live page."""
         return _static(name)
 
     @app.get("/metrics", include_in_schema=False)
     async def get_metrics() -> Response:
-        """Figures for Prometheus."""
+        """Returns metrics for Prometheus."""
         return Response(exposition(bridge, metrics, traffic), media_type=CONTENT_TYPE_LATEST)
 
     @app.get("/healthz", include_in_schema=False)
     async def get_health() -> Response:
-        """200 while the control loop turns, else 503."""
+        """Returns 200 while the control loop turns, else 503."""
         alive = bridge.state().cycle.alive
         status = HTTPStatus.OK if alive else HTTPStatus.SERVICE_UNAVAILABLE
         words = "ok\n" if alive else "the control loop does not turn\n"
@@ -116,7 +119,7 @@ def _operation(route: APIRoute) -> str:
 
 
 def _schema(app: FastAPI) -> dict[str, Any]:
-    """OpenAPI, with errors under the media type that they have, and how a client shows who it is."""
+    """Returns the OpenAPI description, with the media type of errors and the authentication scheme."""
     if app.openapi_schema is None:
         schema = get_openapi(
             title=app.title,

@@ -1,4 +1,4 @@
-"""Samples of the shared memory as the columns that clients get. Pure."""
+"""Conversion of samples to the columns that clients receive. Pure."""
 
 from __future__ import annotations
 
@@ -27,14 +27,13 @@ def columns(
     events: Sequence[Event] = (),
     lost: int = 0,
 ) -> Samples:
-    """A batch as columns: of the cycles whose number ``every`` divides, of the ``wanted`` axes.
+    """Returns a batch as columns: the cycles whose number ``every`` divides, of the ``wanted`` axes.
 
-    ``names`` are the axes in the order of the samples. A value that is not a number stays one here; JSON has
-    ``null`` for it.
+    ``names`` are the axes in the order of the samples. NaN stays NaN here and becomes ``null`` in JSON.
     """
     if every > 1:
         samples = samples[samples["cycle"] % every == 0]
-    # Not validated: these are the daemon's own figures, some thousands of them a second.
+    # Not validated, because these are the daemon's own values, thousands per second.
     return Samples.model_construct(
         time_s=(samples["time_ns"] / 1e9).tolist(),
         cycle=samples["cycle"].tolist(),

@@ -1,4 +1,4 @@
-"""The documented page of the API, made from its own OpenAPI description, without script or network."""
+"""HTML page of the API, generated from its own OpenAPI description, without script or network access."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _BOUNDS: Final = (
 
 
 def page(schema: Schema) -> str:
-    """One HTML page: every operation under its tag, its parameters, body, an example, its errors."""
+    """Returns one HTML page: each operation under its tag, with parameters, body, example and errors."""
     sections = [
         (tag, [each for each in _operations(schema) if each["tag"] == tag["name"]]) for tag in schema["tags"]
     ]
@@ -39,7 +39,7 @@ def page(schema: Schema) -> str:
 
 @cache
 def _template() -> Any:
-    # Everything is escaped: names and words of the description are text.
+    # Everything is escaped, because names and descriptions are plain text.
     environment = Environment(
         loader=PackageLoader("hdbridge.daemon.api"),
         autoescape=True,
@@ -52,7 +52,7 @@ def _template() -> Any:
 
 
 def _words(text: str) -> Markup:
-    """Text in which what stands between backticks is code."""
+    """Formats text between backticks as code."""
     parts = text.split("`")
     return Markup("").join(
         Markup("<code>{}</code>").format(part) if place % 2 else escape(part)
@@ -61,7 +61,7 @@ def _words(text: str) -> Markup:
 
 
 def _answered(schema: Schema) -> dict[str, Schema]:
-    """The types that answers are made of; those of requests stand with their request."""
+    """Returns the types of answers; types of requests are described with their request."""
     asked = {
         _type(each["requestBody"]["content"]["application/json"]["schema"])
         for methods in schema["paths"].values()
@@ -167,7 +167,7 @@ def _resolved(schema: Schema, given: Schema) -> Schema:
 
 
 def _example(model: Schema) -> Any:
-    """What the fields' own examples make together; those that may be left out are."""
+    """Builds an example from the examples of the required fields."""
     if "examples" in model:
         return model["examples"][0]
     required = model.get("required", ())

@@ -1,8 +1,8 @@
-"""What stands before the application on each listener: nothing that breaks its policy reaches a route.
+"""Guard of a listener: no request that breaks the listener's policy reaches a route.
 
-Host and origin, token, requests under way, size and depth of a body, time to send it. A stop is never refused
-to a client that may speak: it does not count among the requests under way, and its body is not waited for.
-A refusal closes the connection, so that the rest of a refused body is not read.
+It checks host and origin, token, requests under way, and the size, depth and duration of a body. A stop is
+never refused to an authorised client: it does not count among the requests under way, and its body is not
+waited for. A refusal closes the connection, so that the rest of a refused body is not read.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from hdbridge.daemon.api.problems import refusal
 from hdbridge.daemon.api.traffic import Traffic
 
 BODY_S: Final = 10.0
-"""Time in which a body has to be there."""
+"""Time-out for receiving a body."""
 REQUESTS_MAXIMUM: Final = 64
 WEBSOCKETS_MAXIMUM: Final = 32
 STOPS: Final = ("/stop", "/quick-stop")
@@ -40,7 +40,7 @@ _log = logging.getLogger(__name__)
 
 
 class Guard:
-    """An ASGI application around another one. ``now`` is a monotonic clock in seconds."""
+    """ASGI middleware that applies a policy. ``now`` is a monotonic clock in seconds."""
 
     def __init__(
         self, app: ASGIApp, policy: Policy, traffic: Traffic, now: Callable[[], float] = time.monotonic
@@ -51,7 +51,7 @@ class Guard:
         self._now = now
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """One request, one WebSocket, or the application's own start and end."""
+        """Handles a request, a WebSocket, or the application's start and end."""
         if scope["type"] == "http":
             await self._http(scope, receive, send)
         elif scope["type"] == "websocket":
@@ -71,7 +71,7 @@ class Guard:
                 present = {name.lower() for name, _ in message["headers"]}
                 more = [each for each in _HEADERS.items() if each[0] not in present]
                 if stops:
-                    more.append(_CLOSE)  # its body may still be under way
+                    more.append(_CLOSE)  # its body may still be arriving
                 message = {**message, "headers": [*message["headers"], *more]}
             await send(message)
 
@@ -95,7 +95,7 @@ class Guard:
         problem = self._refused(scope)
         if problem is None:
             _log.info("websocket", _about(scope))
-            # A client may go at any moment, also while it is told why its WebSocket is closed.
+            # A client may disconnect at any moment, even while it is told why its WebSocket is closed.
             with self._traffic.under_way("websocket"), suppress(WebSocketDisconnect):
                 await self._app(scope, receive, send)
             _log.info("websocket ended", _about(scope))
@@ -106,7 +106,7 @@ class Guard:
         await _answer(problem, send, "websocket.http.response")
 
     def _refused(self, scope: Scope) -> Problem | None:
-        """Why this is not let through."""
+        """Returns the reason for refusing a request or WebSocket; None if it is accepted."""
         policy, headers = self._policy, _headers(scope)
         host = headers.get("host", "")
         scheme = {"ws": "http", "wss": "https"}.get(scope["scheme"], str(scope["scheme"]))
@@ -134,7 +134,7 @@ class Guard:
 
 
 async def _read(scope: Scope, receive: Receive) -> tuple[bytes, Problem | None]:
-    """The whole body, or why it is not taken."""
+    """Reads the body; returns it, or the reason why it is refused."""
     length = _headers(scope).get("content-length", "0")
     too_large = refusal(413, f"the body is larger than {BODY_MAXIMUM >> 10} KiB; send less at a time")
     if not length.isascii() or not length.isdigit() or int(length[:20]) > BODY_MAXIMUM:
@@ -161,7 +161,7 @@ async def _read(scope: Scope, receive: Receive) -> tuple[bytes, Problem | None]:
 
 
 def _replayed(body: bytes, receive: Receive) -> Receive:
-    """A body that was read already, and then what comes after it."""
+    """Returns a `Receive` that first returns a body already read."""
     first: list[Message] = [{"type": "http.request", "body": body, "more_body": False}]
 
     async def replay() -> Message:
@@ -182,7 +182,7 @@ async def _answer(problem: Problem, send: Send, kind: str) -> None:
 
 
 def _headers(scope: Scope) -> dict[str, str]:
-    """Of a header that comes twice all values, joined: two hosts are no host."""
+    """Returns the headers; repeated ones are joined, so that two hosts match no host."""
     found: dict[str, str] = {}
     for name, value in scope["headers"]:
         key = name.decode("latin-1").lower()
@@ -192,7 +192,7 @@ def _headers(scope: Scope) -> dict[str, str]:
 
 
 def _about(scope: Scope) -> dict[str, Any]:
-    """Who and what, for the log: never a header, and nothing behind a question mark."""
+    """Returns peer, method and path for the log; never headers or the query."""
     client = scope.get("client") or ("unknown", 0)
     path = scope.get("raw_path") or scope["path"].encode()
     return {

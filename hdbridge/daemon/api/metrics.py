@@ -1,6 +1,6 @@
-"""`/metrics` for Prometheus: the loop's timing, faults, the axes, and what the API is asked.
+"""`/metrics` for Prometheus: loop timing, faults, axes and API requests.
 
-A sink of the observer: `take` costs some microseconds for a batch. All else is read when it is scraped.
+A sink of the observer: `take` costs a few microseconds per batch. Everything else is read when scraped.
 """
 
 from __future__ import annotations
@@ -22,24 +22,24 @@ from hdbridge.daemon.service.interface import Bridge
 from hdbridge.drive.supervision import Fault
 
 BOUNDS_US: Final = (10, 20, 50, 100, 200, 500, 1000, 2000, 5000, 10_000, 50_000, 100_000)
-"""Upper bounds of the histograms, microseconds; the last bucket has no bound."""
+"""Upper bounds of the histogram buckets in microseconds; the last bucket is unbounded."""
 _FAULTS: Final = list(Fault)
 _PREFIX: Final = "hdbridge_"
 
 
 class Metrics:
-    """What accumulates between two scrapes."""
+    """Counts that accumulate between two scrapes."""
 
     def __init__(self) -> None:
         self.late = Histogram()
         self.busy = Histogram()
         self.faults: Counter[tuple[int, str]] = Counter()
-        """Events by index of the axis and name of the fault."""
+        """Number of events by axis index and name of the fault."""
         self.lost = 0
-        """Cycles that the observer itself was too slow for."""
+        """Cycles lost because the observer was too slow."""
 
     def take(self, samples: NDArray[np.void], events: Iterable[Any], lost: int) -> None:
-        """A batch of the observer: samples, and events of the loop as they lie in the shared memory."""
+        """Takes samples and events of the loop from the observer."""
         if len(samples):
             self.late.add(samples["late_us"])
             self.busy.add(samples["busy_us"])
@@ -50,7 +50,7 @@ class Metrics:
 
 
 class Histogram:
-    """Microseconds, counted in buckets."""
+    """Histogram of durations in microseconds."""
 
     def __init__(self) -> None:
         self._bounds = np.asarray(BOUNDS_US, dtype=float)
@@ -58,14 +58,14 @@ class Histogram:
         self._sum_us = 0.0
 
     def add(self, values_us: NDArray[np.floating[Any]]) -> None:
-        """Count values; one that is no number is left out."""
+        """Counts values; ignores NaN and infinity."""
         finite = values_us[np.isfinite(values_us)].astype(float)
         places = np.searchsorted(self._bounds, finite)
         self._counts += np.bincount(places, minlength=len(self._counts))
         self._sum_us += float(finite.sum())
 
     def family(self, name: str, about: str) -> Metric:
-        """In seconds, as Prometheus has it."""
+        """Returns the histogram in seconds, in Prometheus' format."""
         cumulative = np.cumsum(self._counts).tolist()
         bounds = [*(f"{each / 1e6:g}" for each in BOUNDS_US), "+Inf"]
         buckets = [(bound, float(count)) for bound, count in zip(bounds, cumulative, strict=True)]
@@ -73,72 +73,72 @@ class Histogram:
 
 
 def exposition(bridge: Bridge, metrics: Metrics, traffic: Traffic) -> bytes:
-    """The page in Prometheus' text format; the registry is its own, so nothing else gets into it."""
+    """Returns all metrics in Prometheus' text format, from a separate registry."""
     registry = CollectorRegistry()
     registry.register(_Scrape(bridge, metrics, traffic))
     return generate_latest(registry)
 
 
 class _Scrape(Collector):
-    """Everything, once."""
+    """Collector of one scrape."""
 
     def __init__(self, bridge: Bridge, metrics: Metrics, traffic: Traffic) -> None:
         self._bridge, self._metrics, self._traffic = bridge, metrics, traffic
 
     def collect(self) -> Iterator[Metric]:
-        """Loop, faults, axes, API."""
+        """Yields the metrics of loop, faults, axes and API."""
         state = self._bridge.state()
         metrics = self._metrics
-        yield metrics.late.family("cycle_late_seconds", "How late cycles began.")
-        yield metrics.busy.family("cycle_busy_seconds", "How long cycles took.")
+        yield metrics.late.family("cycle_late_seconds", "Delay of the start of cycles.")
+        yield metrics.busy.family("cycle_busy_seconds", "Duration of cycles.")
         yield from _machine(state)
-        yield _counter("samples_lost", "Cycles that the service was too slow for.", [((), metrics.lost)])
+        yield _counter("samples_lost", "Cycles lost because the service was too slow.", [((), metrics.lost)])
         names = [each.name for each in state.axes]
         faults = [
             ((names[axis] if 0 <= axis < len(names) else "", fault), count)
             for (axis, fault), count in sorted(metrics.faults.items())
         ]
-        yield _counter("faults", "Faults seen, of the machine without an axis.", faults, ("axis", "fault"))
+        yield _counter(
+            "faults", "Faults by axis; without an axis those of the machine.", faults, ("axis", "fault")
+        )
         for name, about, of in _AXIS:
             rows = [((each.name,), value) for each in state.axes if (value := of(each)) is not None]
             yield _gauge(name, about, rows, ("axis",))
         states = [((each.name, one.value), each.state is one) for each in state.axes for one in ControlState]
-        yield _gauge("axis_state", "1 for the state that an axis is in.", states, ("axis", "state"))
+        yield _gauge("axis_state", "1 for the present state of an axis.", states, ("axis", "state"))
         latched = [((each.name,), each.fault is not None) for each in state.axes]
-        yield _gauge("axis_fault_latched", "Whether a fault stopped it.", latched, ("axis",))
+        yield _gauge("axis_fault_latched", "1 if a stop is latched.", latched, ("axis",))
         yield from _api(self._traffic)
 
 
 _AXIS: Final[Sequence[tuple[str, str, Any]]] = (
-    ("load_target_degrees", "Where the load shall be.", lambda a: a.load_target_deg),
+    ("load_target_degrees", "Load target.", lambda a: a.load_target_deg),
     ("load_position_degrees", "Load encoder.", lambda a: a.load_position_deg),
     ("motor_position_degrees", "Motor encoder.", lambda a: a.motor_position_deg),
-    ("load_error_arcsec", "Load encoder less load target.", lambda a: a.error_arcsec),
-    ("correction_arcsec", "What the compensation adds.", lambda a: a.correction_arcsec),
-    ("predicted_error_arcsec", "Transmission error by the model.", lambda a: a.predicted_arcsec),
+    ("load_error_arcsec", "Load encoder minus load target.", lambda a: a.error_arcsec),
+    ("correction_arcsec", "Correction by the compensation.", lambda a: a.correction_arcsec),
+    ("predicted_error_arcsec", "Transmission error predicted by the model.", lambda a: a.predicted_arcsec),
     ("motor_torque_newton_metres", "Torque of the motor.", lambda a: a.motor_torque_nm),
-    ("queued_points", "Way points that wait.", lambda a: a.queued),
-    ("model_age_seconds", "Since the model in use was made.", lambda a: a.model and a.model.age_s),
+    ("queued_points", "Waiting way points.", lambda a: a.queued),
+    ("model_age_seconds", "Age of the model in use.", lambda a: a.model and a.model.age_s),
 )
-"""Name, words and value of each figure of an axis."""
+"""Name, description and value of each metric of an axis."""
 
 
 def _machine(state: MachineState) -> Iterator[Metric]:
     info = GaugeMetricFamily(_PREFIX + "info", "1.", labels=("machine", "version"))
     info.add_metric((state.name, state.version), 1)
     yield info
-    yield _gauge("loop_alive", "Whether the control loop turned lately.", [((), state.cycle.alive)])
+    yield _gauge("loop_alive", "1 if the control loop turns.", [((), state.cycle.alive)])
     yield _gauge("cycle_period_seconds", "Period of the cycle.", [((), state.cycle.period_s)])
     yield _counter(
-        "cycles_skipped", "Periods left out because the loop was late.", [((), state.cycle.skipped)]
+        "cycles_skipped", "Periods skipped because the loop was late.", [((), state.cycle.skipped)]
     )
-    yield _gauge("bus_up", "Whether the CAN interface is there.", [((), state.bus.up)])
+    yield _gauge("bus_up", "1 if the CAN interface is up.", [((), state.bus.up)])
     if state.bus.load is not None:
-        yield _gauge("bus_load_ratio", "Share of the bus's time in use.", [((), state.bus.load)])
-    yield _counter(
-        "recorder_dropped", "Samples that the recorder did not write.", [((), state.recorder.dropped)]
-    )
-    yield _gauge("lease_held", "Whether a client has the right to move.", [((), state.lease.held)])
+        yield _gauge("bus_load_ratio", "Bus load.", [((), state.bus.load)])
+    yield _counter("recorder_dropped", "Samples that the recorder dropped.", [((), state.recorder.dropped)])
+    yield _gauge("lease_held", "1 if a client holds the lease.", [((), state.lease.held)])
 
 
 def _api(traffic: Traffic) -> Iterator[Metric]:

@@ -1,8 +1,8 @@
-"""Who may ask what on one listener. Pure: no socket, no clock.
+"""Policy of one listener: which requests it accepts. Pure: no socket, no clock.
 
-A page that the user opens elsewhere can send requests to a server on the user's own machine. So a request
-is refused whose ``Host`` is a name that this machine does not have (DNS rebinding) or whose ``Origin`` is not
-the very address that was asked (a foreign page). Neither is a matter of the token alone.
+A web page from elsewhere can send requests to a server on the user's own machine. So a request is refused if
+its ``Host`` is not a name of this machine (DNS rebinding), or its ``Origin`` is not the address of the
+request (a foreign page). A token alone does not prevent either.
 """
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ from typing import Final
 from hdbridge.errors import InputError
 
 BODY_MAXIMUM: Final = 256 << 10
-"""Bytes of a request's body, and of a WebSocket message."""
+"""Maximum size of a request's body and of a WebSocket message, bytes."""
 DEPTH_MAXIMUM: Final = 16
-"""Lists and objects within each other."""
+"""Maximum nesting of lists and objects."""
 TOKEN_MINIMUM: Final = 16
 SUBPROTOCOL: Final = "hdbridge.v1"
 TOKEN_SUBPROTOCOL: Final = "bearer."
-"""A browser cannot set a header on a WebSocket: it offers a subprotocol of this name with the token."""
+"""Prefix of the subprotocol that carries the token, because a browser cannot set headers on a WebSocket."""
 OWN_NAMES: Final = frozenset({"localhost", "hdbridge"})
 _HOST: Final = re.compile(r"(\[[0-9a-fA-F:.]+\]|[^:/@?#\s\[\]]+)(?::(\d{1,5}))?")
 _BRACKETS: Final = re.compile(rb'"(?:[^"\\]|\\.)*"?|[\[{]|[\]}]', re.DOTALL)
@@ -30,12 +30,12 @@ _BRACKETS: Final = re.compile(rb'"(?:[^"\\]|\\.)*"?|[\[{]|[\]}]', re.DOTALL)
 
 @dataclass(frozen=True, slots=True)
 class Policy:
-    """What a listener asks of each request."""
+    """Requirements of a listener."""
 
     token: str | None = None
-    """To be shown by every request for the API; None on a Unix socket, whose file mode decides."""
+    """Token required for the API; None on a Unix socket, where the file mode decides."""
     names: frozenset[str] = frozenset()
-    """Names by which a reverse proxy is reached, lower case."""
+    """Host names of a reverse proxy, lower case."""
 
     def __post_init__(self) -> None:
         token = self.token
@@ -46,7 +46,7 @@ class Policy:
             )
 
     def knows_host(self, host: str | None) -> bool:
-        """Whether a ``Host`` header is an address, or a name of this machine."""
+        """Returns True if a ``Host`` header is an address or a name of this machine."""
         match = _HOST.fullmatch(host or "")
         if match is None:
             return False
@@ -58,9 +58,9 @@ class Policy:
         return True
 
     def knows_origin(self, origin: str | None, host: str, scheme: str) -> bool:
-        """Whether a request comes from no web page, or from one that was loaded from here.
+        """Returns True if a request comes from no web page, or from one loaded from here.
 
-        A page that was loaded through a reverse proxy has one of the names, over HTTPS.
+        A page loaded through a reverse proxy has one of the names, over HTTPS.
         """
         if origin is None or origin.lower() == f"{scheme}://{host}".lower():
             return True
@@ -69,11 +69,11 @@ class Policy:
         return kind == "https" and match is not None and match[1] in self.names
 
     def needs_token(self, path: str) -> bool:
-        """Whether a path shows or does anything; pages without data do not."""
+        """Returns True if a path returns data or has an effect; static pages need no token."""
         return self.token is not None and (path == "/metrics" or path.startswith("/api/"))
 
     def admits(self, authorization: str | None, subprotocols: str | None) -> bool:
-        """Whether the token was shown, in constant time."""
+        """Returns True if the token was given; compares in constant time."""
         if self.token is None:
             return True
         kind, _, shown = (authorization or "").partition(" ")
@@ -87,7 +87,7 @@ class Policy:
 
 
 def too_deep(body: bytes) -> bool:
-    """Whether JSON nests deeper than any request does; a parser would recurse into it."""
+    """Returns True if JSON nests deeper than any valid request; a parser would recurse into it."""
     depth = 0
     for match in _BRACKETS.finditer(body):
         first = match[0][:1]

@@ -1,4 +1,4 @@
-"""Every error of the API as ``application/problem+json`` (RFC 9457), and never a stack trace."""
+"""Errors of the API as ``application/problem+json`` (RFC 9457), never with a stack trace."""
 
 from __future__ import annotations
 
@@ -17,24 +17,24 @@ _log = logging.getLogger(__name__)
 
 
 class UnknownError(InputError):
-    """What the path names is not there."""
+    """The object named by the path does not exist."""
 
 
 def refusal(status: int, detail: str, kind: str = "DaemonError", hint: str | None = None) -> Problem:
-    """A problem that is not an exception of the house."""
+    """Returns a problem for an error without an `HdbridgeError`."""
     title = HTTPStatus(status).phrase
     return Problem(type=f"{TYPE_PREFIX}{kind}", title=title, status=status, detail=detail, hint=hint)
 
 
 def answer(problem: Problem) -> Response:
-    """The response that a problem is."""
+    """Returns the response for a problem."""
     content = problem.model_dump_json(exclude_none=True)
     headers = {"WWW-Authenticate": "Bearer"} if problem.status == HTTPStatus.UNAUTHORIZED else None
     return Response(content, problem.status, headers, CONTENT_TYPE)
 
 
 def register(app: FastAPI) -> None:
-    """Have the application answer its errors so."""
+    """Registers the error handlers of the application."""
     app.add_exception_handler(HdbridgeError, _of_the_house)
     app.add_exception_handler(RequestValidationError, _not_valid)
     app.add_exception_handler(HTTPException, _of_http)
@@ -50,7 +50,7 @@ async def _of_the_house(request: Request, error: Exception) -> Response:
 
 
 async def _not_valid(request: Request, error: Exception) -> Response:
-    """What does not suit the schema: each complaint with its key; what was found is not repeated."""
+    """Answers a request that violates the schema: one complaint per key, without its value."""
     assert isinstance(error, RequestValidationError)
     complaints = []
     for each in error.errors()[:COMPLAINTS_MAXIMUM]:
@@ -72,7 +72,7 @@ async def _of_http(_request: Request, error: Exception) -> Response:
 
 
 async def _unexpected(request: Request, error: Exception) -> Response:
-    """An error in hdbridge: told in the log, not to the client."""
+    """Answers an unexpected error; its details go to the log only."""
     _log.error("failed", {"method": request.method, "path": request.url.path, "error": repr(error)})
     return answer(
         refusal(
@@ -83,5 +83,5 @@ async def _unexpected(request: Request, error: Exception) -> Response:
 
 
 def _printable(text: str) -> str:
-    """Half a character pair, which JSON may bring, is in no UTF-8."""
+    """Escapes unpaired surrogates, which JSON may contain but UTF-8 cannot."""
     return text.encode("utf-8", "backslashreplace").decode()[:400]

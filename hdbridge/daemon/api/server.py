@@ -1,8 +1,8 @@
-"""The server under the application: uvicorn on sockets that are open already, one guard for each.
+"""Server: uvicorn on open sockets, with one guard per socket.
 
-uvicorn's own part is bounded here: connections, time to send a request's head, size of a message, time that a
-WebSocket may be silent. A connection too many takes the place of the one that has been idle the longest, so
-that connections without a request keep nobody out.
+This module limits uvicorn's own part: number of connections, time to send a request's head, message size,
+silence of a WebSocket. A connection beyond the limit replaces the one that has been idle longest, so idle
+connections keep nobody out.
 """
 
 from __future__ import annotations
@@ -28,14 +28,16 @@ from hdbridge.daemon.api.traffic import Traffic
 from hdbridge.daemon.service.interface import Bridge
 
 CONNECTIONS_MAXIMUM: Final = 256
-"""For each listener. More than the requests and WebSockets that may be under way, which are not closed."""
+"""Maximum number of connections per listener. It exceeds the limits of requests and WebSockets under way,
+whose connections are never closed for others."""
 ACCEPTED_AT_ONCE: Final = 64
-"""Fewer than those: a request that came with its connection is read before the connection can be closed."""
+"""Connections accepted at once. Fewer than `CONNECTIONS_MAXIMUM`, so that a request that arrives with its
+connection is read before the connection can be closed in favour of others."""
 HEAD_S: Final = 10.0
-"""Time in which the head of a request has to be there."""
+"""Time-out for receiving the head of a request."""
 HEAD_BYTES: Final = 16 << 10
 IDLE_S: Final = 30
-"""A connection without a request is closed after so long."""
+"""Time after which an idle connection is closed."""
 PING_S: Final = 20.0
 ENDING_S: Final = 2
 _log = logging.getLogger(__name__)
@@ -43,7 +45,7 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class Listener:
-    """A listening socket and who may ask there."""
+    """A listening socket and its policy."""
 
     socket: socket.socket
     policy: Policy
@@ -60,12 +62,12 @@ class ApiServer:
 
     @property
     def started(self) -> bool:
-        """Whether every listener is served."""
+        """True if every listener is served."""
         return all(server.started for server, _ in self._servers)
 
     async def run(self) -> None:
-        """Serve until `stop`, or until the task is cancelled; open requests get a moment to end."""
-        # At DEBUG the server's libraries log headers: the token would be among them.
+        """Serves until `stop` or cancellation; open requests get a moment to complete."""
+        # At DEBUG the server's libraries log headers, including the token.
         for name in ("uvicorn", "uvicorn.error", "websockets"):
             logging.getLogger(name).setLevel(logging.WARNING)
         logging.getLogger("uvicorn.error").addFilter(_worth_telling)
@@ -74,7 +76,7 @@ class ApiServer:
                 group.create_task(server.serve(sockets=[listener.socket]))
 
     def add(self, listener: Listener) -> None:
-        """Serve one more listener while it runs."""
+        """Serves another listener while running."""
         server = self._server(listener)
         self._servers.append((server, listener))
         self._group.create_task(server.serve(sockets=[listener.socket]))
@@ -83,38 +85,38 @@ class ApiServer:
         return _Server(_config(self._app, listener, self.traffic))
 
     def stop(self) -> None:
-        """End soon; may be called from a signal handler or another thread."""
+        """Ends the server soon. May be called from a signal handler or another thread."""
         for server, _ in self._servers:
             server.should_exit = True
 
 
 class _Server(uvicorn.Server):
-    """Leaves the process's signals alone: those are the service's."""
+    """uvicorn server that leaves the process's signals to the service."""
 
     @contextmanager
     def capture_signals(self) -> Iterator[None]:
         yield
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
-        """Begin to serve; the kernel queues more connections than are accepted at once."""
+        """Starts to serve; the kernel queues more connections than are accepted at once."""
         await super().startup(sockets)
         for each in sockets or ():
             each.listen(BACKLOG)
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
-        """End; what clients have left open by then is cut."""
+        """Ends; aborts connections that clients have left open."""
         await super().shutdown(sockets)
         for each in tuple(self.server_state.connections):
             each.transport.abort()
 
 
 class _Connection(H11Protocol):
-    """Knows its peer by the kernel's word, and does not wait for ever for a request or for its reader."""
+    """HTTP connection that identifies its peer by the kernel and closes stalled connections."""
 
     _watch: asyncio.TimerHandle | None = None
     _idle_since_s = 0.0
     _unsent = 0
-    """Bytes that waited for the reader at the last check."""
+    """Unsent bytes at the last check."""
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         super().connection_made(transport)
@@ -132,7 +134,7 @@ class _Connection(H11Protocol):
 
     @property
     def idle(self) -> bool:
-        """Whether no request is being answered: none has come as a whole."""
+        """True if no complete request is being answered."""
         return self.cycle is None or self.cycle.response_complete or self.cycle.more_body
 
     def on_response_complete(self) -> None:
@@ -145,8 +147,8 @@ class _Connection(H11Protocol):
         super().connection_lost(exc)
 
     def _check(self) -> None:
-        """Close what has sent no whole head in all the time, or does not take what it was sent."""
-        if self.transport.get_protocol() is not self:  # a WebSocket by now: its pings decide
+        """Closes a connection without a complete head in time, or whose peer does not read."""
+        if self.transport.get_protocol() is not self:  # upgraded to a WebSocket, which has pings
             return
         unsent, self._unsent = self._unsent, self.transport.get_write_buffer_size()
         if self.transport.is_closing() or (unsent and unsent == self._unsent):
@@ -159,7 +161,7 @@ class _Connection(H11Protocol):
 
 
 class _WebSocket(WebSocketsSansIOProtocol):
-    """The same for a WebSocket, whose pings find out who is gone."""
+    """WebSocket connection that does the same; its pings detect dead peers."""
 
     _watch: asyncio.TimerHandle | None = None
 
@@ -174,7 +176,7 @@ class _WebSocket(WebSocketsSansIOProtocol):
         super().connection_lost(exc)
 
     def _check(self) -> None:
-        """What is closed and still does not take what it was sent never will."""
+        """Aborts a closing connection whose peer does not read."""
         if self.transport.is_closing():
             self.transport.abort()
         else:
@@ -182,7 +184,7 @@ class _WebSocket(WebSocketsSansIOProtocol):
 
 
 def _worth_telling(record: logging.LogRecord) -> bool:
-    """Drops what a client has done: a WebSocket that was refused, and a message that is not UTF-8."""
+    """Returns False for records of client errors: a refused WebSocket, a message that is not UTF-8."""
     words = record.getMessage()
     return "without completing handshake" not in words and "Invalid UTF-8" not in words
 

@@ -1,7 +1,7 @@
-"""The sockets that the API listens at, bound here and handed to the server as descriptors.
+"""Listening sockets of the API, bound here and passed to the server as descriptors.
 
-A server that binds a Unix socket by itself makes it writable for everybody (uvicorn: 0666). Here it is bound
-with its mode: it is never open to others, not even for a moment.
+A server that binds a Unix socket itself makes it writable for everybody (uvicorn: 0666). Here it is bound
+with its final mode, so it is never open to others, not even for a moment.
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ MODE: Final = 0o660
 LOOPBACK: Final = "127.0.0.1"
 BACKLOG: Final = 1024
 PATH_MAXIMUM: Final = 107
-"""Bytes that the kernel takes for the path of a Unix socket."""
+"""Maximum length of a Unix socket's path, bytes."""
 _CREDENTIALS: Final = struct.Struct("3i")
 
 
 class Peer(NamedTuple):
-    """The process at the other end of a Unix socket, as the kernel knows it."""
+    """Process at the other end of a Unix socket, as identified by the kernel."""
 
     pid: int
     uid: int
@@ -35,10 +35,10 @@ class Peer(NamedTuple):
 
 
 def unix_socket(path: Path, group: str | None = None) -> socket.socket:
-    """A listening Unix socket of mode 0660, owned by ``group`` where one is given.
+    """Returns a listening Unix socket of mode 0660, with ``group`` as its group if given.
 
-    A socket that nobody listens at is replaced. DaemonError where another process listens there; InputError
-    for a path that is something else, too long, or not writable, and for a group that does not exist.
+    Replaces a socket without a listener. Raises DaemonError if another process listens there, and InputError
+    for a path that is not a socket, too long or not writable, and for an unknown group.
     """
     if len(os.fsencode(path)) > PATH_MAXIMUM:
         raise InputError(f"{path}: longer than {PATH_MAXIMUM} bytes, which no Unix socket may be; shorten it")
@@ -51,7 +51,7 @@ def unix_socket(path: Path, group: str | None = None) -> socket.socket:
         listener.bind(os.fspath(path))
         if gid != -1:
             os.chown(path, -1, gid)
-        path.chmod(MODE)  # what the umask took from the group
+        path.chmod(MODE)  # restores group permissions that the umask removed
         listener.listen(BACKLOG)
     except OSError as problem:
         listener.close()
@@ -62,15 +62,15 @@ def unix_socket(path: Path, group: str | None = None) -> socket.socket:
 
 
 def file_of(path: Path) -> tuple[int, int]:
-    """Device and inode of a socket file: another file of that name is not the one that was bound."""
+    """Returns device and inode of a socket file, which identify the file that was bound."""
     found = path.lstat()
     return found.st_dev, found.st_ino
 
 
 def tcp_socket(port: int, option: str = "api.tcp.port") -> socket.socket:
-    """A listening TCP socket that only this machine reaches.
+    """Returns a listening TCP socket on the loopback address.
 
-    DaemonError if the port is taken, which ``option`` has given; InputError if it cannot be bound.
+    Raises DaemonError if the port (from ``option``) is in use, InputError if it cannot be bound.
     """
     listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
     try:
@@ -88,7 +88,7 @@ def tcp_socket(port: int, option: str = "api.tcp.port") -> socket.socket:
 
 
 def peer_of(connected: socket.socket) -> Peer | None:
-    """Who is at the other end; None of a socket that is not a Unix one."""
+    """Returns the peer of a Unix socket; None for other sockets."""
     if connected.family != socket.AF_UNIX:
         return None
     found = connected.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _CREDENTIALS.size)
@@ -96,7 +96,7 @@ def peer_of(connected: socket.socket) -> Peer | None:
 
 
 def daemon_of(connected: socket.socket) -> int:
-    """The process number of the daemon at the other end of a Unix socket: its keeper, which has begun it."""
+    """Returns the process id of the daemon at the other end of a Unix socket: that of its keeper."""
     peer = peer_of(connected)
     assert peer is not None
     if "hdbridge.daemon.service" not in command_line(peer.pid):
@@ -112,7 +112,7 @@ def _group(name: str) -> int:
 
 
 def _clear(path: Path) -> None:
-    """Remove what a daemon left there that is no more."""
+    """Removes the socket file of a daemon that no longer runs."""
     try:
         mode = path.lstat().st_mode
     except OSError:

@@ -1,4 +1,4 @@
-"""Counts of what goes over the API, for `/metrics`; one object for all listeners."""
+"""Counts of API requests for `/metrics`; one object for all listeners."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ from dataclasses import dataclass, field
 
 @dataclass(slots=True)
 class Traffic:
-    """Requests that were answered, and connections that are open."""
+    """Answered requests and open connections."""
 
     answered: Counter[tuple[str, int]] = field(default_factory=Counter)
-    """By method and status."""
+    """Number of answers by method and status."""
     open: Counter[str] = field(default_factory=Counter)
-    """Requests under way (``http``), and WebSockets (``websocket``)."""
+    """Number of requests under way (``http``) and of WebSockets (``websocket``)."""
 
     @contextmanager
     def under_way(self, kind: str) -> Iterator[None]:
-        """Counted as open within the block."""
+        """Counts a request or WebSocket as open within the block."""
         self.open[kind] += 1
         try:
             yield
@@ -27,6 +27,6 @@ class Traffic:
             self.open[kind] -= 1
 
     def count(self, method: str, status: int) -> None:
-        """One more answer. Methods that are not HTTP's own count as OTHER: the counts are bounded."""
+        """Counts an answer. Unknown methods count as OTHER, which bounds the number of counters."""
         known = method in {"GET", "HEAD", "POST", "PUT", "DELETE", "OPTIONS", "PATCH"}
         self.answered[method if known else "OTHER", status] += 1

@@ -1,4 +1,4 @@
-"""The memory that control process and service process share: rings, mailbox, relay. No locks."""
+"""Shared memory of control and service process: rings, mailbox, relay. Lock-free."""
 
 from hdbridge.daemon.memory.events import EventReader
 from hdbridge.daemon.memory.frames import IncomingReader, RelayedFrame

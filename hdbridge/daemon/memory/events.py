@@ -1,4 +1,4 @@
-"""What the loop tells the service, one slot each."""
+"""Ring of events from the loop to the service."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ _KINDS: Final = {int(kind): kind for kind in EventKind}
 
 
 class EventWriter:
-    """The loop's end."""
+    """The loop's end of the ring."""
 
     __slots__ = ("_append",)
 
@@ -29,19 +29,19 @@ class EventWriter:
         code: int = 0,
         text: str = "",
     ) -> None:
-        """Add an event; a long text is cut."""
+        """Adds an event; truncates a long text."""
         data = text.encode("utf-8", "replace")[:TEXT_BYTES]
         self._append(cycle, time_ns, axis, kind, id, code, len(data), data)
 
 
 class EventReader:
-    """Gives the events that came since it was made, or since its last `read`."""
+    """Reads the events since it was created or since its last `read`."""
 
     def __init__(self, region: Region, layout: Layout, *, checked: bool) -> None:
         self._ring = RingReader(region, layout.events, EVENT, checked=checked)
 
     def read(self) -> tuple[list[Event], int]:
-        """The new events, oldest first, and how many were lost."""
+        """Returns the new events, oldest first, and the number lost."""
         slots, lost = self._ring.read()
         return [_event(sequence, *values) for sequence, values in slots], lost
 

@@ -1,4 +1,4 @@
-"""CAN frames between the loop, which has the bus, and the service, which has SDO to do."""
+"""CAN frames between the loop, which has the bus, and the service, which needs it for SDO."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ class RelayedFrame(NamedTuple):
     """A data frame with an 11-bit identifier."""
 
     time_ns: int
-    """When it was received or queued, on the loop's clock."""
+    """Time of reception or queuing, on the loop's clock."""
     can_id: int
     data: bytes
 
 
 class IncomingWriter:
-    """The loop's end: what it received and does not use up itself."""
+    """The loop's end: received frames that the loop does not process itself."""
 
     __slots__ = ("_append",)
 
@@ -28,36 +28,36 @@ class IncomingWriter:
         self._append = Ring(region, layout.incoming, FRAME, checked=checked).append
 
     def put(self, time_ns: int, can_id: int, data: bytes) -> None:
-        """Pass a frame on."""
+        """Passes a frame to the service."""
         self._append(time_ns, can_id, len(data), data)
 
 
 class IncomingReader:
-    """Gives the frames that came since it was made, or since its last `read`."""
+    """Reads the frames since it was created or since its last `read`."""
 
     def __init__(self, region: Region, layout: Layout, *, checked: bool) -> None:
         self._ring = RingReader(region, layout.incoming, FRAME, checked=checked)
 
     def read(self) -> tuple[list[RelayedFrame], int]:
-        """The new frames, oldest first, and how many were lost."""
+        """Returns the new frames, oldest first, and the number lost."""
         slots, lost = self._ring.read()
         return [RelayedFrame(time, can_id, data[:n]) for _, (time, can_id, n, data) in slots], lost
 
 
 class Outgoing:
-    """Frames that the service wants sent; the loop sends at most one a cycle."""
+    """Frames for the bus from the service; the loop sends at most one per cycle."""
 
     def __init__(self, region: Region, layout: Layout, *, checked: bool) -> None:
         self._queue = Queue(region, layout.outgoing, FRAME, checked=checked)
-        self._producing = threading.Lock()  # of the service's own threads; the loop knows nothing of it
+        self._producing = threading.Lock()  # between threads of the service; the loop does not use it
 
     def put(self, time_ns: int, can_id: int, data: bytes) -> bool:
-        """Queue a frame; False, and it is not queued, where there is no room."""
+        """Queues a frame; returns False if the queue is full."""
         with self._producing:
             return self._queue.put(time_ns, can_id, len(data), data) > 0
 
     def take(self) -> RelayedFrame | None:
-        """The loop's end: the next frame."""
+        """Takes the next frame, at the loop's end; None if there is none."""
         slot = self._queue.take()
         if slot is None:
             return None
@@ -65,5 +65,5 @@ class Outgoing:
         return RelayedFrame(time_ns, can_id, data[:length])
 
     def clear(self) -> None:
-        """The loop's end: throw away what waits."""
+        """Discards waiting frames, at the loop's end."""
         self._queue.clear()

@@ -1,4 +1,4 @@
-"""The points of a streamed set-point, one queue per axis."""
+"""Queues of the knots of streamed set-points, one per axis."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ class KnotQueue:
 
     @property
     def free(self) -> int:
-        """How many more it takes."""
+        """Free places in the queue."""
         return self._queue.free
 
     def put(self, knots: Iterable[Knot]) -> int:
-        """Add knots in this order as long as there is room; how many were taken."""
+        """Adds knots in order while there is space; returns the number added."""
         taken = 0
         for knot in knots:
             if not self._queue.put(*knot):
@@ -30,16 +30,16 @@ class KnotQueue:
         return taken
 
     def peek(self) -> Knot | None:
-        """The loop's end: the next knot."""
+        """Returns the next knot, at the loop's end, without removing it; None if there is none."""
         slot = self._queue.peek()
         return None if slot is None else Knot(*slot[1])
 
     def drop(self) -> None:
-        """The loop's end: make an end of the knot that `peek` gave."""
+        """Removes the knot that `peek` returned."""
         self._queue.drop()
 
     def clear(self) -> None:
-        """The loop's end: throw away what waits."""
+        """Discards waiting knots, at the loop's end."""
         self._queue.clear()
 
     def __len__(self) -> int:

@@ -1,16 +1,16 @@
-"""What lies in the shared memory: the enumerations, the slots of each ring, and their places. Data only.
+"""Layout of the shared memory: enumerations, slots of each ring, and their offsets. Data only.
 
     header      magic, version, axes, period, sizes, and the status cells
     samples     one slot per cycle, newest `SAMPLES_KEPT`           control process -> service
     events      newest `EVENTS_KEPT`                                control process -> service
-    incoming    CAN frames that are not of the cycle, newest        control process -> service
-    outgoing    CAN frames that the service wants sent, bounded     service -> control process
+    incoming    newest CAN frames outside the cycle                 control process -> service
+    outgoing    CAN frames that the service sends, bounded          service -> control process
     commands    bounded                                             service -> control process
     knots       one bounded queue per axis                          service -> control process
-    settings    one slot per axis: what compensates it              service -> control process
+    settings    one compensation setting per axis                   service -> control process
 
-All numbers are in the machine's own byte order: both ends run on it. A slot begins and ends with its sequence
-number, counted from 1. A change of anything here is a new `VERSION`.
+All numbers are in native byte order, because both ends run on one computer. A slot begins and ends with its
+sequence number, counted from 1. Any change here requires a new `VERSION`.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ MAGIC: Final = b"hdbridge"
 VERSION: Final = 3
 PAGE: Final = 4096
 LINE: Final = 64
-"""A cache line: what two processes write lies in different ones."""
+"""Size of a cache line; data of different writers is in different lines."""
 AXES_AT_MOST: Final = 64
 
 SAMPLES_KEPT: Final = 16_384
@@ -36,115 +36,114 @@ COMMAND_SLOTS: Final = 256
 KNOT_SLOTS: Final = 8192
 SETTING_BYTES: Final = 1 << 18
 TEXT_BYTES: Final = 400
-"""Longest text of an event, bytes of UTF-8; more is cut."""
+"""Maximum length of an event's text, bytes of UTF-8; longer ones are truncated."""
 NO_FAULT: Final = 255
-"""``fault`` of a sample where none is latched."""
+"""Value of ``fault`` in a sample without a latched fault."""
 
 
 class SampleFlag(IntFlag):
-    """``flags`` of an axis in a sample."""
+    """Bits of ``flags`` of an axis in a sample."""
 
     FRESH = 1
-    """This cycle's feedback came and is believed; else the values are the last good ones."""
+    """Feedback of this cycle arrived and is plausible; else the values are the last good ones."""
     COMPENSATING = 2
     """The correction is engaged."""
     LIMITED = 4
-    """A cap or the slew limit of the compensation was at work in this cycle."""
+    """The amplitude or slew limit of the compensation acted in this cycle."""
     MEMORY_KNOWN = 8
     """The state of the hysteresis is known."""
     CHANGING = 16
-    """The correction is on the way from one model to another."""
+    """The correction is fading from one model to another."""
     AT_REST = 32
-    """The set-point stands."""
+    """The set-point is at rest."""
     UNDERRUN = 64
     """A stream ran out of knots in motion."""
     LOOP_DOUBTED = 128
-    """The load loop does not act; the last `EventKind.LOAD_LOOP` of the axis says why."""
+    """The load loop does not act; the axis's last `EventKind.LOAD_LOOP` gives the reason."""
     CHANNEL0_KNOWN = 256
     CHANNEL1_KNOWN = 512
 
 
 class CommandKind(IntEnum):
-    """What the service asks of the loop; what the fields of a command mean stands behind each."""
+    """Command from the service to the loop. The docstring of each describes its fields."""
 
     VERIFIED = 1
-    """i motor counts, j load counts, k statusword: the drive is booted; its RPDO may be sent."""
+    """i motor counts, j load counts, k statusword. The drive is verified; its RPDO may be sent."""
     RELEASE = 2
-    """Back to unverified: no RPDO."""
+    """Returns to unverified: no RPDO."""
     LEND = 3
-    """No RPDO until UNLEND: the service moves the drive by SDO."""
+    """Stops the RPDO until UNLEND, while the service controls the drive by SDO."""
     UNLEND = 4
-    """i, j, k as VERIFIED."""
+    """Ends LEND; i, j, k as VERIFIED."""
     ENABLE = 5
-    """i, j, k as VERIFIED."""
+    """Switches power on; i, j, k as VERIFIED."""
     DISABLE = 6
-    """Stop in order, then power off."""
+    """Brakes to rest, then switches power off."""
     QUICK_STOP = 7
-    """Axis -1: all."""
+    """Quick-stops an axis; axis -1 means all."""
     RESET = 8
-    """Release the latch, and switch power off. i is 1 when the drive was booted and verified again."""
+    """Releases the latch and switches power off. i is 1 if the drive was verified again."""
     MOVE = 9
     """a target deg, b velocity deg/s or NaN, c acceleration deg/s2 or NaN."""
     JOG = 10
     """a velocity deg/s, b time-out s."""
     STOP = 11
-    """Brake to rest within the limits; power stays on."""
+    """Brakes to rest within the limits; power stays on."""
     STREAM_BEGIN = 12
-    """a time-out s, i mask of the axes that begin in the same cycle, j number of the stream."""
+    """a time-out s, i mask of the axes that begin in the same cycle, j stream number."""
     STREAM_END = 13
-    """No more knots come: the axis goes to the last one and rests, or brakes."""
+    """Announces the end of the knots: the axis rests at the last one, or brakes."""
     CHANGE = 14
-    """Compensate by another setting; i is its number."""
+    """Changes the compensation; i is the number of the setting."""
     DRIVE_FAULT_RESET = 15
-    """Reset the drive's own fault, by its controlword."""
+    """Resets the drive's own fault by its controlword."""
 
 
 class EventKind(IntEnum):
-    """What the loop tells the service."""
+    """Event from the loop to the service."""
 
     DONE = 1
-    """The command ``id`` was carried out (or has begun: its end is another event)."""
+    """The command ``id`` was carried out, or has begun if another event reports its end."""
     REFUSED = 2
-    """The command ``id`` was refused and changed nothing; ``text`` says why. id 0: a frame of the relay."""
+    """The command ``id`` was refused and changed nothing; ``text`` is the reason. id 0: a relayed frame."""
     STATE = 3
     """``code`` is the new `AxisState`."""
     FAULT = 4
     """``code`` is the index in ``list(Fault)``, ``text`` the detail."""
     STOPPED = 5
-    """The supervision has latched; ``text`` explains it, ``code`` is the index of its cause (`NO_FAULT`: a
-    command), ``id`` is 1 if an emergency message of the drive explains it.
-    """
+    """The axis was stopped and latched; ``text`` explains it, ``code`` is the fault's index (`NO_FAULT`:
+    a command), ``id`` is 1 if an emergency message of the drive explains it."""
     MOTION_ENDED = 6
-    """The set-point has come to rest; ``code`` is the `MotionMode` that has ended, ``id`` its command."""
+    """The set-point has come to rest; ``code`` is the ended `MotionMode`, ``id`` its command."""
     UNDERRUN = 7
     BUS_DOWN = 8
     BUS_UP = 9
     CHANGED = 10
-    """The switch to another compensation is complete."""
+    """The change to another compensation is complete."""
     STREAM_REFUSED = 11
-    """A knot of the stream was refused and the axis brakes; ``text`` says why."""
+    """A knot of the stream was refused and the axis brakes; ``text`` is the reason."""
     ENDING = 12
     LOAD_LOOP = 13
-    """The load loop no longer acts (``code`` 1) and ``text`` says why, or acts again (``code`` 0)."""
+    """The load loop no longer acts (``code`` 1, ``text`` is the reason) or acts again (``code`` 0)."""
 
 
 class Event(NamedTuple):
-    """Something that happened in the loop."""
+    """Event of the loop."""
 
     sequence: int
     cycle: int
     time_ns: int
     axis: int
-    """Index of the axis; -1: the machine."""
+    """Index of the axis; -1 is the machine."""
     kind: EventKind
     id: int
-    """Of the command that it answers; 0: none."""
+    """Id of the command that it answers; 0 for none."""
     code: int
     text: str
 
 
 class Command(NamedTuple):
-    """What the service asks of one axis (-1: of all); see `CommandKind` for the fields."""
+    """Command of the service to one axis (-1: all); `CommandKind` describes the fields."""
 
     id: int
     kind: int
@@ -159,12 +158,12 @@ class Command(NamedTuple):
 
 
 class Knot(NamedTuple):
-    """A point that a streamed set-point goes through."""
+    """Point of a streamed path."""
 
     stream: int
-    """Number of the stream that it belongs to; those of an earlier one are thrown away."""
+    """Number of its stream; knots of earlier streams are discarded."""
     time_s: float
-    """Since the stream has begun."""
+    """Time since the stream began."""
     position_deg: float
     velocity_deg_s: float
 
@@ -185,16 +184,16 @@ class Axis(NamedTuple):
     load_position_deg: float
     motor_torque_nm: float
     velocity_deg_s: float
-    """Of the load target."""
+    """Velocity of the load target."""
     correction_arcsec: float
     predicted_arcsec: float
     loop_arcsec: float
-    """Of the slow integral at the load."""
+    """Correction by the load loop."""
     weight: float
     reading0: float
     reading1: float
     issued_deg: float
-    """The target that was sent in this cycle, 607Ah, degrees of the motor; NaN where none was."""
+    """Target sent in this cycle (607Ah) in motor degrees; NaN if none was sent."""
 
 
 _AXIS_FORMATS: Final = ("u1", "u1", "u1", "u1", "u2", "u2", *("f8",) * 13)
@@ -217,17 +216,17 @@ TAIL_BYTES: Final = 16
 
 
 def sample_struct(axes: int) -> struct.Struct:
-    """How the writer packs a sample of so many axes."""
+    """Returns the struct by which the writer packs a sample of ``axes`` axes."""
     return struct.Struct(f"@{_HEAD_CODE}{_AXIS_CODE * axes}{TAIL_CODE}")
 
 
 def slot_dtype(axes: int) -> np.dtype[Any]:
-    """A sample as it lies in the memory."""
+    """Returns the dtype of a sample's slot in the memory."""
     return np.dtype([*_HEAD, ("axes", AXIS_SAMPLE, (axes,)), *_TAIL])
 
 
 def sample_dtype(axes: int) -> np.dtype[Any]:
-    """A sample as readers see it: ``sequence, cycle, time_ns, late_us, busy_us, bus_load, skipped, axes``.
+    """Returns the dtype of samples: ``sequence, cycle, time_ns, late_us, busy_us, bus_load, skipped, axes``.
 
     ``time_ns`` is the monotonic clock at SYNC (virtual time on a virtual clock), ``bus_load`` a share,
     ``axes`` an array of `AXIS_SAMPLE`, shape (axes,).
@@ -252,13 +251,13 @@ COMMAND: Final = struct.Struct(f"@Qii4d3q{TAIL_CODE}")
 KNOT: Final = struct.Struct(f"@Qq3d{TAIL_CODE}")
 """sequence, stream, time, position, velocity."""
 HEADER: Final = struct.Struct("@8sIIQQQI4x")
-"""magic, version, axes, period in ns, bytes in all, crc of the layout's sizes, whether slots are checked."""
+"""magic, version, axes, period in ns, total bytes, crc of the layout's sizes, flag for checksums in slots."""
 STATUS_OFFSET: Final = 1024
-"""Where the status cells begin within the header's page."""
+"""Offset of the status cells in the header's page."""
 
 
 class Place(NamedTuple):
-    """A section of the memory: where its slots begin, how many, of which size."""
+    """Section of the memory: offset, number and size of its slots."""
 
     offset: int
     slots: int
@@ -266,7 +265,7 @@ class Place(NamedTuple):
 
 
 class Layout(NamedTuple):
-    """Where everything lies for a number of axes."""
+    """Offsets of all sections for a number of axes."""
 
     axes: int
     samples: Place
@@ -280,7 +279,7 @@ class Layout(NamedTuple):
 
     @classmethod
     def of(cls, axes: int) -> Layout:
-        """The layout for ``axes`` axes; each section begins with two cache lines for its counters."""
+        """Returns the layout for ``axes`` axes; each section is preceded by two cache lines of counters."""
         end = PAGE
 
         def place(slots: int, slot_bytes: int) -> Place:

@@ -1,4 +1,4 @@
-"""Commands from the service to the loop: bounded, so that a service that runs wild cannot fill the loop."""
+"""Commands from the service to the loop; bounded, so that a faulty service cannot flood the loop."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from hdbridge.errors import HdbridgeError
 
 
 class MailboxFullError(HdbridgeError):
-    """The loop has not taken the commands that wait; this one was not posted."""
+    """The command was not posted, because the loop has not taken the waiting ones."""
 
 
 class Mailbox:
-    """Both ends of the mailbox; each process uses one of them."""
+    """Mailbox with both ends; each process uses one of them."""
 
     def __init__(self, region: Region, layout: Layout, *, checked: bool) -> None:
         self._queue = Queue(region, layout.commands, COMMAND, checked=checked)
-        self._posting = threading.Lock()  # of the service's own threads; the loop knows nothing of it
+        self._posting = threading.Lock()  # between threads of the service; the loop does not use it
 
     def post(
         self,
@@ -33,7 +33,7 @@ class Mailbox:
         j: int = 0,
         k: int = 0,
     ) -> int:
-        """Post a command; its id, by which the loop's events name it. `MailboxFullError` where no room is."""
+        """Posts a command; returns its id, used in the loop's events. Raises `MailboxFullError` if full."""
         with self._posting:
             id_ = self._queue.put(kind, axis, a, b, c, d, i, j, k)
         if not id_:
@@ -44,12 +44,12 @@ class Mailbox:
         return id_
 
     def take(self) -> Command | None:
-        """The loop's end: the next command."""
+        """Takes the next command, at the loop's end; None if there is none."""
         slot = self._queue.take()
         return None if slot is None else Command(slot[0], *slot[1])
 
     def clear(self) -> None:
-        """The loop's end: throw away what waits: a loop that begins does, it was meant for another."""
+        """Discards waiting commands, at the loop's end; they were meant for an earlier loop."""
         self._queue.clear()
 
     def __len__(self) -> int:

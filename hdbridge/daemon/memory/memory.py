@@ -1,4 +1,4 @@
-"""The shared memory as both processes see it, each using its ends of what is in it."""
+"""The shared memory, as used by both processes."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ from hdbridge.errors import InputError
 
 
 class Memory:
-    """Shared memory for a number of axes on one bus.
+    """Shared memory for the axes of one bus.
 
-    The control process writes ``samples``, ``events`` and ``incoming`` and takes from ``commands``,
-    ``outgoing``, ``knots`` and ``settings``; the service does the opposite, with readers of its own
-    (`reader`, `event_reader`, `incoming_reader`: as many as it likes).
+    The control process writes ``samples``, ``events`` and ``incoming``, and takes from ``commands``,
+    ``outgoing``, ``knots`` and ``settings``. The service does the opposite; it may create any number of
+    readers (`reader`, `event_reader`, `incoming_reader`).
     """
 
     def __init__(self, region: Region, layout: Layout, period_ns: int, *, checked: bool) -> None:
-        """Use `create` or `attach`."""
+        """Use `create` or `attach` instead."""
         self._region = region
         self._layout = layout
         self._checked = checked
@@ -42,7 +42,7 @@ class Memory:
 
     @classmethod
     def create(cls, axes: int, period_s: float, *, checked: bool = not ORDERED) -> Self:
-        """New memory. ``checked`` puts a checksum into each slot: for a processor with weak ordering."""
+        """Creates memory. ``checked`` adds checksums to the slots, for weakly ordered processors."""
         period_ns = round(1e9 * period_s)
         if not 1 <= axes <= AXES_AT_MOST or period_ns < 1:
             raise InputError(
@@ -53,16 +53,16 @@ class Memory:
 
     @classmethod
     def attach(cls, fd: int) -> Self:
-        """Memory that another process has made, by its descriptor; InputError where it is none of ours.
+        """Attaches to another process's memory by its descriptor, which `close` closes.
 
-        The descriptor is then this object's: `close` closes it.
+        Raises InputError if it is not shared memory of this version of hdbridge.
         """
         region, layout, period_ns, checked = Region.attach(fd)
         return cls(region, layout, period_ns, checked=checked)
 
     @property
     def fd(self) -> int:
-        """Descriptor to hand down to another process."""
+        """Descriptor to pass to another process."""
         return self._region.fd
 
     @property
@@ -71,25 +71,25 @@ class Memory:
         return self.period_ns / 1e9
 
     def reader(self) -> SampleReader:
-        """Reads samples from now on."""
+        """Returns a reader of the samples from now on."""
         return SampleReader(self._region, self._layout, checked=self._checked)
 
     def event_reader(self) -> EventReader:
-        """Reads events from now on."""
+        """Returns a reader of the events from now on."""
         return EventReader(self._region, self._layout, checked=self._checked)
 
     def incoming_reader(self) -> IncomingReader:
-        """Reads relayed frames from now on."""
+        """Returns a reader of relayed frames from now on."""
         return IncomingReader(self._region, self._layout, checked=self._checked)
 
     def close(self) -> None:
-        """Leave the memory; it is gone when all have left."""
+        """Unmaps the memory, which is freed when all processes have done so."""
         self._region.close()
 
     def __enter__(self) -> Self:
-        """Itself."""
+        """Returns itself."""
         return self
 
     def __exit__(self, *_: object) -> None:
-        """`close`."""
+        """Calls `close`."""
         self.close()

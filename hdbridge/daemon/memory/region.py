@@ -1,7 +1,7 @@
-"""The memory itself: made by one process, handed down to others as a descriptor, mapped by each.
+"""Memory region: created by one process, passed to others as a descriptor, mapped by each.
 
-A memfd has no name in any file system: nobody else can open it, and it is gone with the last process that
-holds it, however that one died. It is sealed against shrinking, so that no access can fail later.
+A memfd has no name in any file system: no other process can open it, and it is freed with the last process
+that holds it, however that one dies. It is sealed against shrinking, so that no access can fail later.
 """
 
 from __future__ import annotations
@@ -18,22 +18,22 @@ from hdbridge.errors import InputError
 
 _STRONGLY_ORDERED: Final = frozenset({"x86_64", "amd64", "i386", "i586", "i686"})
 ORDERED: Final = platform.machine().lower() in _STRONGLY_ORDERED
-"""Whether this processor lets others see one's stores in the order in which they were made."""
+"""True if other processors see the stores of one in program order."""
 
 
 class Region:
-    """A mapped piece of shared memory with a header that says what it is."""
+    """A mapped region of shared memory with an identifying header."""
 
     def __init__(self, fd: int, size: int) -> None:
         self.fd = fd
-        """Descriptor to hand down."""
+        """Descriptor to pass to another process."""
         self._map = mmap.mmap(fd, size)
         self.view = memoryview(self._map)
         self._cells = self.view.cast("q")
 
     @classmethod
     def create(cls, layout: Layout, period_ns: int, *, checked: bool) -> Region:
-        """New memory, all zero but for its header. ``checked``: slots carry a checksum."""
+        """Creates memory, all zero but for its header. ``checked``: slots have checksums."""
         fd = os.memfd_create("hdbridge", os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
         try:
             os.ftruncate(fd, layout.total)
@@ -49,9 +49,9 @@ class Region:
 
     @classmethod
     def attach(cls, fd: int) -> tuple[Region, Layout, int, bool]:
-        """Memory that another process has made: it, its layout, the period in ns, whether slots are checked.
+        """Attaches to another process's memory; returns it, its layout, the period in ns and ``checked``.
 
-        `InputError` where the descriptor is none of hdbridge's memory, or of another version.
+        Raises `InputError` if the descriptor is not hdbridge's memory, or of another version.
         """
         try:
             size = os.fstat(fd).st_size
@@ -80,17 +80,17 @@ class Region:
         return cls(fd, size), layout, period_ns, bool(checked)
 
     def cells(self, offset: int, count: int) -> memoryview:
-        """So many aligned int64; to read or write one is whole."""
+        """Returns ``count`` aligned int64 cells, which are read and written atomically."""
         return self._cells[offset // 8 : offset // 8 + count]
 
     def close(self) -> None:
-        """Unmap, as far as no array of samples still looks at it, and close the descriptor."""
+        """Unmaps the memory, unless arrays of samples still refer to it, and closes the descriptor."""
         try:
             self._cells.release()
             self.view.release()
             self._map.close()
         except BufferError:
-            pass  # the last of those who look at it unmaps it
+            pass  # the last reference unmaps it
         if self.fd >= 0:
             os.close(self.fd)
             self.fd = -1

@@ -1,12 +1,12 @@
-"""Rings and queues for one producer and one consumer, without locks that a dying process could keep.
+"""Rings and queues for one producer and one consumer, without locks that a dying process could hold.
 
-A *ring* never waits: the newest slots overwrite the oldest, and a reader that was too slow is told how many
-it has lost. A *queue* is bounded: its producer is refused when it is full. In both a producer fills the slot
-and only then counts it, in one aligned store.
+A *ring* never waits: new slots overwrite the oldest, and a slow reader gets the number it lost. A *queue* is
+bounded: it refuses its producer when full. In both, a producer fills the slot and then advances the counter
+in one aligned store.
 
-No reader gets a torn slot. It copies, then looks whether the producer may have been there meanwhile. The
-sequence number stands first and last in a slot. Where the processor lets stores be seen in another order a
-checksum stands in it as well.
+No reader gets a torn slot. It copies the slot and then checks that the producer did not overwrite it
+meanwhile. A slot begins and ends with its sequence number. On processors that may reorder stores it also has
+a checksum.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ from hdbridge.daemon.memory.layout import LINE, TAIL_BYTES, Place
 from hdbridge.daemon.memory.region import Region
 
 RETRIES: Final = 3
-"""Copies of a slot that a reader makes before it gives a spoilt one up."""
+"""Attempts to copy a slot before a reader counts it as lost."""
 MISSES: Final = 100
-"""How often a consumer finds the next slot of a queue spoilt before it passes it over."""
+"""Times that a consumer finds the next slot of a queue incomplete before it skips it."""
 _CHECK: Final = struct.Struct("@I")
 
 
 class _Slots:
-    """The slots of one section and its two counters, each in a cache line of its own."""
+    """Slots of one section and its two counters, each in its own cache line."""
 
     __slots__ = ("_buffer", "_checked", "_head", "_offset", "_size", "_slots", "_struct", "_tail")
 
@@ -40,7 +40,7 @@ class _Slots:
         self._tail = region.cells(place.offset - LINE, 1)
 
     def _fill(self, sequence: int, values: tuple[Any, ...]) -> None:
-        """Write a slot, and its checksum where there is one."""
+        """Writes a slot, with its checksum if enabled."""
         at = self._offset + sequence % self._slots * self._size
         self._struct.pack_into(self._buffer, at, sequence, *values, 0, sequence)
         if self._checked:
@@ -48,7 +48,7 @@ class _Slots:
             _CHECK.pack_into(self._buffer, end, zlib.crc32(self._buffer[at:end]))
 
     def _copy(self, sequence: int) -> tuple[Any, ...] | None:
-        """The values of a slot; None where it does not hold that number, or not wholly."""
+        """Returns the values of a slot; None if its number differs or it is incomplete."""
         at = self._offset + sequence % self._slots * self._size
         data = bytes(self._buffer[at : at + self._size])
         values = self._struct.unpack(data)
@@ -60,7 +60,7 @@ class _Slots:
 
 
 class Ring(_Slots):
-    """The producer's end of a ring; `reader` makes a consumer's."""
+    """The producer's end of a ring; `RingReader` is a consumer's."""
 
     __slots__ = ("_sequence",)
 
@@ -69,7 +69,7 @@ class Ring(_Slots):
         self._sequence: int = self._head[0]
 
     def append(self, *values: Any) -> int:
-        """Add a slot; its sequence number."""
+        """Adds a slot; returns its sequence number."""
         sequence = self._sequence + 1
         self._fill(sequence, values)
         self._head[0] = self._sequence = sequence
@@ -77,7 +77,7 @@ class Ring(_Slots):
 
 
 class RingReader(_Slots):
-    """Reads what has been appended since it was made."""
+    """Reads the slots appended since it was created."""
 
     __slots__ = ("_next",)
 
@@ -86,12 +86,12 @@ class RingReader(_Slots):
         self._next = self._head[0] + 1
 
     def read(self, most: int = 1 << 62) -> tuple[list[tuple[int, tuple[Any, ...]]], int]:
-        """At most so many slots, oldest first, each with its sequence number; and how many were lost."""
+        """Returns at most ``most`` slots, oldest first, with their sequence numbers, and the number lost."""
         found: list[tuple[int, tuple[Any, ...]]] = []
         lost = 0
         end = self._head[0]
         while self._next <= end and len(found) < most:
-            # The one that is being written may lie where the oldest did.
+            # The slot being written may replace the oldest.
             oldest = self._head[0] + 2 - self._slots
             if self._next < oldest:
                 lost += oldest - self._next
@@ -109,7 +109,7 @@ class RingReader(_Slots):
 
 
 class Queue(_Slots):
-    """Both ends of a bounded queue; each process uses one of them."""
+    """Bounded queue with both ends; each process uses one of them."""
 
     __slots__ = ("_misses",)
 
@@ -122,11 +122,11 @@ class Queue(_Slots):
 
     @property
     def free(self) -> int:
-        """How many more it takes."""
+        """Free places in the queue."""
         return self._slots - len(self)
 
     def put(self, *values: Any) -> int:
-        """Add a slot at the producer's end; its sequence number, or 0 where the queue is full."""
+        """Adds a slot, at the producer's end; returns its sequence number, or 0 if the queue is full."""
         sequence: int = self._head[0] + 1
         if sequence - self._tail[0] > self._slots:
             return 0
@@ -135,13 +135,13 @@ class Queue(_Slots):
         return sequence
 
     def peek(self) -> tuple[int, tuple[Any, ...]] | None:
-        """The next slot at the consumer's end, with its sequence number; None where there is none (yet)."""
+        """Returns the next slot and its number, at the consumer's end; None if there is none (yet)."""
         sequence: int = self._tail[0] + 1
         if sequence > self._head[0]:
             return None
         values = self._copy(sequence)
         if values is None:
-            # Not visible as a whole yet. One that stays so must not hold up those behind it.
+            # Not completely visible yet. If it stays so, it must not block the slots behind it.
             self._misses += 1
             if self._misses >= MISSES:
                 self.drop()
@@ -149,17 +149,17 @@ class Queue(_Slots):
         return sequence, values
 
     def drop(self) -> None:
-        """Make an end of the slot that `peek` gave."""
+        """Removes the slot that `peek` returned."""
         self._misses = 0
         self._tail[0] += 1
 
     def take(self) -> tuple[int, tuple[Any, ...]] | None:
-        """The next slot as `peek` gives it, with an end made of it."""
+        """Removes and returns the next slot; None if there is none."""
         slot = self.peek()
         if slot is not None:
             self.drop()
         return slot
 
     def clear(self) -> None:
-        """Throw away what waits, at the consumer's end."""
+        """Discards waiting slots, at the consumer's end."""
         self._tail[0] = self._head[0]

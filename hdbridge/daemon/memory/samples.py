@@ -1,4 +1,4 @@
-"""The ring of cycle samples: one packed slot per cycle out of the loop, arrays of them for whoever reads."""
+"""Ring of samples: the loop writes one packed slot per cycle, readers get arrays of them."""
 
 from __future__ import annotations
 
@@ -23,18 +23,18 @@ from hdbridge.daemon.memory.region import Region
 from hdbridge.daemon.memory.rings import RETRIES
 
 SampleArray = npt.NDArray[np.void]
-"""Samples as `sample_dtype` has them, shape (n,)."""
+"""Samples with the dtype `sample_dtype`, shape (n,)."""
 _CHECK: Final = struct.Struct("@I")
 
 
 def joined_samples(batches: Sequence[SampleArray]) -> SampleArray:
-    """One after the other, as plain bytes: joining them field by field takes four times as long."""
+    """Returns the concatenated batches, joined as plain bytes, which is four times faster than by field."""
     plain = np.dtype((np.void, batches[0].dtype.itemsize))
     return np.concatenate([each.view(plain) for each in batches]).view(batches[0].dtype)
 
 
 class SampleWriter:
-    """The loop's end. Plain numbers in, no numpy: a third of the time."""
+    """The loop's end. It packs plain numbers without numpy, in a third of the time."""
 
     __slots__ = ("_buffer", "_checked", "_head", "_offset", "_pack_into", "_sequence", "_size")
 
@@ -58,7 +58,7 @@ class SampleWriter:
         skipped: int,
         axes: Sequence[float],
     ) -> None:
-        """One cycle's sample; ``axes`` has the fields of `layout.Axis` of one axis after the other."""
+        """Writes one cycle's sample; ``axes`` has the fields of `layout.Axis` of all axes in order."""
         sequence = self._sequence + 1
         at = self._offset + sequence % SAMPLES_KEPT * self._size
         self._pack_into(
@@ -82,7 +82,7 @@ class SampleWriter:
 
 
 class SampleReader:
-    """Gives the samples that came since it was made, or since its last `read`."""
+    """Reads the samples since it was created or since its last `read`."""
 
     def __init__(self, region: Region, layout: Layout, *, checked: bool) -> None:
         self._slots: npt.NDArray[Any] = np.frombuffer(
@@ -94,23 +94,23 @@ class SampleReader:
         self._next: int = self._head[0] + 1
 
     def read(self) -> tuple[SampleArray, int]:
-        """The new samples, oldest first, as an array of its own; and how many were lost before them.
+        """Returns a copy of the new samples, oldest first, and the number lost before them.
 
-        Lost are those that were overwritten before they were read.
+        Samples are lost if they are overwritten before they are read.
         """
         first = self._next
         end: int = self._head[0]
         self._next = end + 1
-        # The slot after the newest may be under way, and it lies where the oldest did.
+        # The slot after the newest may be in progress, and it replaces the oldest.
         kept = self._copy(max(first, end + 2 - SAMPLES_KEPT), end)
         return kept.view(self._dtype), end + 1 - first - len(kept)
 
     def _copy(self, first: int, end: int) -> npt.NDArray[Any]:
-        """The slots with these numbers, as far as they are whole."""
+        """Returns the complete slots with these numbers."""
         wanted = np.arange(first, end + 1)
         for _ in range(RETRIES):
             slots = self._slots[wanted % SAMPLES_KEPT]
-            # What was overwritten during the copy is lost, and what follows it is whole.
+            # Slots overwritten during the copy are lost; those after them are complete.
             overwritten = self._head[0] + 2 - SAMPLES_KEPT - first
             if overwritten > 0:
                 first += overwritten

@@ -11,9 +11,9 @@ from hdbridge.errors import InputError
 
 
 class SettingSlot:
-    """Both ends of one axis's slot. It holds the setting that was sent last, under its number.
+    """Slot of one axis with both ends. It contains the last setting sent, under its number.
 
-    It outlives both processes: a service that starts reads from it what the one before had sent.
+    It outlives both processes: a starting service reads the setting that an earlier one sent.
     """
 
     def __init__(self, region: Region, place: Place) -> None:
@@ -21,7 +21,7 @@ class SettingSlot:
         self._offset, _, self._capacity = place
         self._sent = region.cells(self._offset - 2 * LINE, 3)  # number, length, crc
         self._used = region.cells(self._offset - LINE, 1)
-        self._putting = threading.Lock()  # between threads of the service; the loop knows nothing of it
+        self._putting = threading.Lock()  # between threads of the service; the loop does not use it
 
     @property
     def number(self) -> int:
@@ -49,7 +49,7 @@ class SettingSlot:
         return number
 
     def get(self, number: int) -> bytes:
-        """The setting of that number. InputError if the slot does not hold it whole."""
+        """Returns the setting with this number. Raises InputError if the slot does not contain all of it."""
         length: int = self._sent[1]
         data = bytes(self._view[self._offset : self._offset + min(max(length, 0), self._capacity)])
         whole = len(data) == length and zlib.crc32(data) == self._sent[2]
@@ -58,5 +58,5 @@ class SettingSlot:
         return data
 
     def use(self, number: int) -> None:
-        """The loop's acknowledgement: it uses this setting from now on."""
+        """Acknowledges, at the loop's end, that this setting is in use from now on."""
         self._used[0] = number

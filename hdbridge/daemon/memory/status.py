@@ -1,4 +1,4 @@
-"""Single numbers that one process writes and the others look at: who is alive, and since when."""
+"""Status cells: numbers written by one process and monitored by the others."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ _STRIDE: Final = LINE // 8
 
 
 class Cell(IntEnum):
-    """The cells, each in a cache line of its own."""
+    """Status cells, each in its own cache line."""
 
     LOOP_COUNT = 0
     LOOP_TIME_NS = 1
@@ -28,7 +28,7 @@ _LOOP_TIME: Final = Cell.LOOP_TIME_NS * _STRIDE
 
 
 class Status:
-    """The cells by name. To read or write one is whole."""
+    """Access to the cells by name. Reads and writes are atomic."""
 
     __slots__ = ("_cells",)
 
@@ -37,45 +37,45 @@ class Status:
 
     @property
     def loop_count(self) -> int:
-        """Turns of the loop, of all control processes so far."""
+        """Turns of the loop, over all control processes so far."""
         return int(self._cells[Cell.LOOP_COUNT * _STRIDE])
 
     @property
     def loop_time_ns(self) -> int:
-        """When the loop's last turn was over, ``time.monotonic_ns``; 0 before the first."""
+        """End of the loop's last turn, ``time.monotonic_ns``; 0 before the first."""
         return int(self._cells[Cell.LOOP_TIME_NS * _STRIDE])
 
     @property
     def service_time_ns(self) -> int:
-        """When the service was last seen alive, ``time.monotonic_ns``."""
+        """Time at which the service was last alive, ``time.monotonic_ns``."""
         return int(self._cells[Cell.SERVICE_TIME_NS * _STRIDE])
 
     @property
     def keeper_time_ns(self) -> int:
-        """When the keeper was last seen alive, ``time.monotonic_ns``."""
+        """Time at which the keeper was last alive, ``time.monotonic_ns``."""
         return int(self._cells[Cell.KEEPER_TIME_NS * _STRIDE])
 
     @property
     def loop_pid(self) -> int:
-        """Process number of the control process; it changes when another takes its place."""
+        """Process id of the control process; it changes when the process is restarted."""
         return int(self._cells[Cell.LOOP_PID * _STRIDE])
 
     @property
     def service_pid(self) -> int:
-        """Process number of the service."""
+        """Process id of the service."""
         return int(self._cells[Cell.SERVICE_PID * _STRIDE])
 
     @property
     def stop_asked(self) -> int:
-        """Somebody wants the loop to end: 1 after it has stopped all axes in order, 2 after a quick stop."""
+        """Request to end the loop: 1 after braking all axes to rest, 2 after a quick stop."""
         return int(self._cells[Cell.STOP_ASKED * _STRIDE])
 
     def turned(self, count: int, time_ns: int) -> None:
-        """The loop's turn is over."""
+        """Records the end of a turn."""
         cells = self._cells
         cells[_LOOP_COUNT] = count
         cells[_LOOP_TIME] = time_ns
 
     def set(self, cell: Cell, value: int) -> None:
-        """Write a cell; each has one writer (``STOP_ASKED``: anybody, and never back)."""
+        """Writes a cell. Each has one writer, except ``STOP_ASKED``, which any process may raise."""
         self._cells[cell * _STRIDE] = value

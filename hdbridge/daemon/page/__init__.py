@@ -1,7 +1,7 @@
-"""The live page: what a browser shows of the daemon, and the buttons behind the lease.
+"""The live page: a browser's view of the daemon, with buttons that need the lease.
 
-Static files only; everything that moves comes over the API. Nothing is fetched from elsewhere: the charts are
-uPlot's, which the reports carry already, and `POLICY` forbids the browser to load anything from outside.
+It consists of static files; all data comes over the API. Nothing is loaded from elsewhere: the charts use
+uPlot, which the reports include already, and `POLICY` forbids the browser to load anything from outside.
 """
 
 from __future__ import annotations
@@ -11,12 +11,12 @@ from importlib.resources import files
 from typing import Final
 
 PAGE: Final = "index.html"
-"""The file at the root of the site."""
+"""File served at the root of the site."""
 POLICY: Final = (
     "default-src 'none'; script-src 'self'; style-src 'self' 'unsafe-inline'; img-src 'self' data:; "
     "connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
 )
-"""Content-Security-Policy of the page. Inline styles are uPlot's: it places its canvases by them."""
+"""Content-Security-Policy of the page. uPlot needs inline styles to place its canvases."""
 _TYPES: Final = {
     ".html": "text/html; charset=utf-8",
     ".js": "text/javascript; charset=utf-8",
@@ -28,7 +28,7 @@ _FROM_REPORTS: Final = {"uplot.js": "uPlot.iife.min.js", "uplot.css": "uPlot.min
 
 @cache
 def page_files() -> dict[str, tuple[bytes, str]]:
-    """Content and content type of each file of the page, by its name."""
+    """Returns content and content type of each file of the page, by name."""
     found = {each.name: each.read_bytes() for each in files(__name__).joinpath("assets").iterdir()}
     reports = files("hdbridge.report").joinpath("assets")
     found |= {name: reports.joinpath(source).read_bytes() for name, source in _FROM_REPORTS.items()}
@@ -36,5 +36,5 @@ def page_files() -> dict[str, tuple[bytes, str]]:
 
 
 def page_file(name: str) -> tuple[bytes, str] | None:
-    """Content and content type of one file; None where there is none of that name."""
+    """Returns content and content type of one file; None if there is no such file."""
     return page_files().get(name)

@@ -1,1 +1,1 @@
-"""The flight recorder: MCAP files in a ring on disk."""
+"""The flight recorder: a ring of MCAP files on disk."""

@@ -1,4 +1,4 @@
-"""What a recording says of its machine, in every one of its files: each is understood without the others."""
+"""Description of the machine in every file of a recording, so that each file is complete by itself."""
 
 from __future__ import annotations
 
@@ -14,33 +14,33 @@ from hdbridge.records.recording import versions_here
 
 FORMAT: Final = "hdbridge.flight/1"
 MACHINE_NAME: Final = "hdbridge"
-"""Name of the metadata record of the machine; that of an axis is ``axis/NAME``."""
+"""Name of the machine's metadata record; that of an axis is ``axis/NAME``."""
 
 
 @dataclass(frozen=True)
 class AxisAbout:
-    """What is known of an axis."""
+    """Description of an axis."""
 
     name: str
     ratio: float
     text: str = ""
-    """Its axis file."""
+    """Text of its axis file."""
     identity: Identity | None = None
-    """What the drive answered, else what the axis file expects."""
+    """Identity reported by the drive, else the one that the axis file expects."""
     channels: tuple[str, ...] = ()
-    """Columns of a record that ``reading0``, ``reading1`` are."""
+    """Record columns of ``reading0`` and ``reading1``."""
 
     @classmethod
     def of(cls, axis: AxisConfig, identity: Identity | None = None) -> Self:
-        """From the axis file and the drive that answered there."""
+        """Returns the description from an axis file and the drive's identity."""
         text = ""
-        with suppress(OSError):  # the axis file is there for people to read
+        with suppress(OSError):  # the axis file is included for people only
             text = axis.path.read_text(encoding="utf-8")
         channels = tuple(BY_KEY[key].value for key in axis.channels)
         return cls(axis.name, axis.gear.ratio, text, identity or axis.drive.identity, channels)
 
     def metadata(self, place: int) -> dict[str, str]:
-        """As MCAP has it: text only."""
+        """Returns the description as an MCAP metadata record, whose values are text."""
         identity = self.identity.model_dump(exclude_none=True) if self.identity else {}
         return {
             "place": str(place),
@@ -52,7 +52,7 @@ class AxisAbout:
 
     @classmethod
     def from_metadata(cls, name: str, data: Mapping[str, str]) -> Self:
-        """What `metadata` made."""
+        """Reads the result of `metadata`."""
         identity = {key[6:]: int(value, 16) for key, value in data.items() if key.startswith("drive_")}
         return cls(
             name,
@@ -65,7 +65,7 @@ class AxisAbout:
 
 @dataclass(frozen=True)
 class About:
-    """What is known of the machine."""
+    """Description of the machine."""
 
     machine: str
     period_s: float
@@ -76,11 +76,11 @@ class About:
 
     @classmethod
     def of(cls, machine: str, axes: tuple[AxisAbout, ...], period_s: float) -> Self:
-        """Of a machine that this process serves."""
+        """Returns the description of a machine served by this process."""
         return cls(machine, period_s, axes, versions_here())
 
     def metadata(self) -> dict[str, dict[str, str]]:
-        """By the name of each metadata record."""
+        """Returns the metadata records by name."""
         versions = {f"version_{name}": value for name, value in self.versions.items()}
         return {
             MACHINE_NAME: {
@@ -95,7 +95,7 @@ class About:
 
     @classmethod
     def from_metadata(cls, records: Mapping[str, Mapping[str, str]]) -> Self:
-        """What `metadata` made; InputError where it is none of hdbridge's recordings."""
+        """Reads the result of `metadata`; raises InputError if it is not an hdbridge recording."""
         machine = records.get(MACHINE_NAME, {})
         if machine.get("format") != FORMAT:
             raise InputError(

@@ -1,11 +1,11 @@
-"""From a flight recording to a record: what `fit` and `diagnose` read.
+"""Export of a flight recording to a record, the input of `fit` and `diagnose`.
 
-The columns are those of the bench: time is the number of the cycle times the period, the motor's target is
-the drive's demand. Cycles without fresh feedback are left out: what stands in them was not measured.
+The columns are those of the bench: time is the cycle number times the period, the motor's target is the
+drive's demand. Cycles without fresh feedback are omitted, because their values were not measured.
 
-Where the axis was not enabled it is left out unless asked for. Where more than `GAP_CYCLES` cycles are
-missing (lost, skipped, not fresh, or the axis was off) nothing is known of the path between, so a new part
-begins; within a part time goes on over the few that are missing.
+Cycles in which the axis was not enabled are omitted unless requested. A gap of more than `GAP_CYCLES` cycles
+(lost, skipped, not fresh or not enabled) begins a new part, because the path in it is unknown. Shorter gaps
+stay within a part, and time continues over them.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from hdbridge.records.recording import GAP_CYCLES, PART_SAMPLES, Recording
 
 ENABLED: Final = (AxisState.ENABLED, AxisState.STOPPING)
 UNSEATED: Final = (AxisState.UNVERIFIED, AxisState.LENT)
-"""Afterwards the encoders' zeros may be others: the drive was booted, or homed."""
+"""States after which the encoders' zeros may have changed: the drive was booted or homed."""
 MEASURED: Final = ("motor_target_deg", "motor_position_deg", "load_position_deg", "motor_torque_nm")
 SAME_RUN_S: Final = 0.5
 Columns = Mapping[str, NDArray[Any]]
@@ -37,7 +37,7 @@ _NS: Final = 1e9
 
 
 def axis_of(about: About, name: str | None, where: Path) -> tuple[int, AxisAbout]:
-    """The axis of that name, or the only one; InputError says which there are."""
+    """Returns index and description of the named or only axis; InputError lists the names otherwise."""
     names = [each.name for each in about.axes]
     if name is None and len(names) == 1:
         return 0, about.axes[0]
@@ -55,9 +55,9 @@ def exported(
     start_ns: int | None = None,
     end_ns: int | None = None,
 ) -> Recording:
-    """One axis of recordings in the order of their time; ``start_ns`` and ``end_ns`` are times of day.
+    """Exports one axis of recordings in chronological order; ``start_ns`` and ``end_ns`` are times of day.
 
-    InputError where the axis is not in them, they are of different gears, or nothing is left.
+    Raises InputError if the recordings lack the axis, have different gear ratios, or no sample is left.
     """
     if not flights:
         raise InputError("no flight recording; expected at least one")
@@ -96,7 +96,7 @@ def exported(
 
 
 def last_model(flights: Sequence[Flight], axis: str) -> ModelUsed | None:
-    """The model that the axis used at the end; None where none was written down."""
+    """Returns the last model that the axis used; None if none was recorded."""
     used = [each for flight in flights for each in flight.models if each.axis == axis]
     return used[-1] if used else None
 
@@ -121,10 +121,10 @@ def _joined(parts: Sequence[Columns]) -> Columns:
 
 
 def _cuts(rows: Columns, period_s: float) -> tuple[NDArray[np.intp], int]:
-    """Where a new part begins, and how many cycles are missing within the parts.
+    """Returns the first rows of new parts, and the number of cycles missing within parts.
 
-    The cycles count on from file to file, and begin anew with the control process; then the clock does not go
-    with them.
+    Cycle numbers continue from file to file and restart with the control process; the clock reveals a
+    restart.
     """
     steps = np.diff(rows["cycle"])
     apart_s = np.abs(np.diff(rows["clock_ns"]) / _NS - steps * period_s)
@@ -140,7 +140,7 @@ def _split(rows: Columns, cuts: NDArray[np.intp]) -> list[Columns]:
 def _record(rows: Columns, axis: AxisAbout, period_s: float) -> Record:
     columns = {"time_s": rows["cycle"] * period_s, **{name: rows[name] for name in MEASURED}}
     if np.isnan(columns["motor_torque_nm"]).any():
-        del columns["motor_torque_nm"]  # the drive does not send it
+        del columns["motor_torque_nm"]  # the drive does not report it
     for place, channel in enumerate(axis.channels):
         if np.all(rows["flags"] & (SampleFlag.CHANNEL0_KNOWN << place)):
             columns[channel] = rows[f"reading{place}"]
@@ -148,7 +148,7 @@ def _record(rows: Columns, axis: AxisAbout, period_s: float) -> Record:
 
 
 def _notes(flights: Sequence[Flight], axis: str, parts: int, missing: int, shorts: int) -> dict[str, Any]:
-    """What is to be known of how the record came about."""
+    """Returns the notes on the record's origin."""
     model = last_model(flights, axis)
     notes: dict[str, Any] = {
         "source": [each.path.name for each in flights],

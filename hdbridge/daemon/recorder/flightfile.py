@@ -1,7 +1,7 @@
-"""One file of the flight recorder while it is written: MCAP, whole up to its last flush, whatever happens.
+"""A file of the flight recorder being written: MCAP, complete up to its last flush in any event.
 
-A message goes into a chunk in memory; `flush` writes the chunk and has the disk confirm it. A file that was
-not finished has no index, but all its chunks: `mend` writes it again, finished. Until then its name ends in
+Messages collect in a chunk in memory; `flush` writes the chunk and syncs it to the disk. An unfinished file
+has all its chunks but no index: `mend` rewrites it as a finished one. Until it is finished its name ends in
 ``.part``, and its writer holds a lock on it.
 """
 
@@ -22,9 +22,9 @@ from hdbridge.daemon.recorder.wire import AXIS, MACHINE, Message, axis_messages,
 
 PART: Final = ".part"
 KEPT: Final = "kept"
-"""Folder, within the recorder's, of the recordings that a fault is in."""
+"""Subfolder for recordings that contain a fault."""
 CHUNK_BYTES: Final = 64 << 20
-"""Larger than any second: chunks end where they are flushed."""
+"""Maximum size of a chunk. It exceeds a second's data, so that chunks end at flushes."""
 EVENTS: Final = "/events"
 MODEL: Final = "/model"
 MACHINE_TOPIC: Final = "/machine"
@@ -60,14 +60,14 @@ _MODEL_SCHEMA: Final = {"type": "object", "properties": {"axis": _TEXT, "version
 
 
 def axis_topic(name: str) -> str:
-    """Where the samples of an axis are."""
+    """Returns the topic of an axis's samples."""
     return f"/axis/{name}/sample"
 
 
 class _Stream:
-    """What MCAP's writer writes to: bytes wait here until `commit` has them on the disk.
+    """Output stream of the MCAP writer; buffers bytes until `commit` syncs them to the disk.
 
-    A commit that fails leaves nothing half written, and may be tried again.
+    A failed commit leaves no partial data and can be repeated.
     """
 
     def __init__(self, path: Path) -> None:
@@ -83,7 +83,7 @@ class _Stream:
         return self._written + len(self._waiting)
 
     def flush(self) -> None:
-        """The writer flushes whenever it likes; what counts is `commit`."""
+        """Does nothing: the MCAP writer flushes at will, but only `commit` writes."""
 
     @property
     def waiting(self) -> int:
@@ -105,10 +105,10 @@ class _Stream:
 
 
 class FlightFile:
-    """Writes one file."""
+    """Writer of one file."""
 
     def __init__(self, path: Path, about: About) -> None:
-        """``path`` is the finished file's name. OSError where it cannot be made."""
+        """``path`` is the name of the finished file. Raises OSError if it cannot be created."""
         self.path = path
         self._part = path.with_name(path.name + PART)
         self._about = about
@@ -136,16 +136,16 @@ class FlightFile:
 
     @property
     def size(self) -> int:
-        """Bytes so far."""
+        """Size so far, bytes."""
         return self._stream.tell()
 
     @property
     def behind(self) -> int:
-        """Bytes that a flush could not write."""
+        """Bytes that the last flush could not write."""
         return self._stream.waiting
 
     def add_samples(self, samples: SampleArray) -> None:
-        """One message per cycle of the machine and of each axis."""
+        """Adds one message per cycle for the machine and for each axis."""
         times = (samples["time_ns"] + self._about.offset_ns).tolist()
         numbers = (samples["sequence"] & 0xFFFFFFFF).tolist()
         self._add(self._machine, times, numbers, machine_messages(samples))
@@ -153,27 +153,27 @@ class FlightFile:
             self._add(channel, times, numbers, axis_messages(samples, place))
 
     def add_event(self, event: Event) -> None:
-        """Something that the loop told."""
+        """Adds an event of the loop."""
         axes = self._about.axes
         name = axes[event.axis].name if 0 <= event.axis < len(axes) else self._about.machine
         kind = EventKind(event.kind)
         self._tell(event.time_ns, name, kind.name, event.text, _BAD.get(kind, "info"), event)
 
     def note(self, time_ns: int, kind: str, text: str, level: str = "info") -> None:
-        """Something that the recorder itself, or a client, has to say."""
+        """Adds a note of the recorder or a client."""
         self._tell(time_ns, self._about.machine, kind, text, level)
 
     def add_model(self, time_ns: int, axis: str, version: str, text: str) -> None:
-        """The model that an axis uses from now on."""
+        """Adds the model that an axis uses from now on."""
         self._put(self._models, time_ns, {"axis": axis, "version": version, "text": text})
 
     def flush(self) -> None:
-        """Write what came since; it is on the disk then. OSError: it waits for the next flush."""
+        """Writes new messages and syncs them to the disk. After an OSError they wait for a retry."""
         self._writer.flush()  # type: ignore[no-untyped-call]
         self._stream.commit()
 
     def finish(self) -> None:
-        """Write the index; the file has its own name then. OSError: it stays a part, to be mended."""
+        """Writes the index and renames the file. After an OSError it stays a part, to be mended."""
         self._writer.finish()  # type: ignore[no-untyped-call]
         try:
             self._stream.commit()
@@ -182,7 +182,7 @@ class FlightFile:
             self.abandon()
 
     def abandon(self) -> None:
-        """Close it as it is."""
+        """Closes the file as it is."""
         if self._stream.descriptor >= 0:
             os.close(self._stream.descriptor)
             self._stream.descriptor = -1

@@ -1,8 +1,9 @@
-"""What the flight recorder does with what it is told, without its thread: files, limits, what is kept.
+"""The flight recorder without its thread: files, limits and retention.
 
-Once a second what came is written as one chunk and confirmed by the disk, so a kill loses the last second at
-most. Free space is asked before: a full disk drops, counts, says so once, and says when there is room again.
-A fault, or a client's mark, moves the files of the time about it aside, where the ring does not remove them.
+Once a second, new data is written as one chunk and synced, so a kill loses at most the last second. Free
+space is checked first: while the disk is full, data is dropped and counted, and the begin and end of this
+are reported. A fault or a client's mark moves the files around its time aside, where the ring does not
+remove them.
 """
 
 from __future__ import annotations
@@ -23,16 +24,16 @@ from hdbridge.daemon.recorder.store import Store
 from hdbridge.errors import InputError
 
 MESSAGE_BYTES: Final = 256
-"""A message and its place in the index, before compression, at most."""
+"""Maximum size of a message with its index entry, before compression."""
 KEPT_FOR: Final = frozenset({EventKind.STOPPED, EventKind.BUS_DOWN})
-"""Events that are a fault: the axis was stopped."""
+"""Events that count as a fault."""
 MARK: Final = "MARK"
 _KEPT_NAMES: Final = frozenset({each.name for each in KEPT_FOR} | {MARK})
 _NS: Final = 1_000_000_000
 
 
 class Batch(NamedTuple):
-    """What the observer hands on at a time."""
+    """Data received from the observer at once."""
 
     samples: SampleArray | None
     events: tuple[Event, ...] = ()
@@ -40,7 +41,7 @@ class Batch(NamedTuple):
 
 
 class ModelUse(NamedTuple):
-    """An axis uses another model from now on."""
+    """Change of an axis's model."""
 
     axis: str
     version: str
@@ -48,7 +49,7 @@ class ModelUse(NamedTuple):
 
 
 class Note(NamedTuple):
-    """What somebody else than the loop has to say."""
+    """Note of another part of the daemon or a client."""
 
     kind: str
     text: str
@@ -59,27 +60,27 @@ Item = Batch | ModelUse | Note
 
 @dataclass(slots=True)
 class Counts:
-    """What the recorder has done since it began."""
+    """Counts since the recorder began."""
 
     recorded: int = 0
-    """Cycles on disk."""
+    """Cycles on the disk."""
     lost: int = 0
-    """Cycles that the observer was too slow for."""
+    """Cycles lost because the observer was too slow."""
     dropped: int = 0
-    """Cycles that the recorder was too slow for."""
+    """Cycles dropped because the recorder was too slow."""
     refused: int = 0
-    """Cycles that the disk had no room for."""
+    """Cycles not written because the disk was full."""
 
 
 class _Span(NamedTuple):
-    """A time about a fault, ns of the samples' clock."""
+    """Time span around a fault; ns of the samples' clock."""
 
     begin_ns: int
     end_ns: int
 
 
 class FlightLog:
-    """The recorder without its thread: who owns it calls `put` and, once a second, `flush`."""
+    """Recorder without a thread: its owner calls `put` and, once a second, `flush`."""
 
     def __init__(
         self,
@@ -89,7 +90,7 @@ class FlightLog:
         tell: Callable[[str], None] = lambda _: None,
         wall_ns: Callable[[], int] = time.time_ns,
     ) -> None:
-        """``tell`` says to a person what happened to the recording; ``wall_ns`` is the time of day."""
+        """``tell`` reports events of the recording to the user; ``wall_ns`` returns the time of day."""
         self._store = store
         self._about = about
         self._tell = tell
@@ -97,7 +98,7 @@ class FlightLog:
         self._file: FlightFile | None = None
         self._begun_ns = 0
         self._files: list[tuple[Path, int, int]] = []
-        """Finished ones of the ring that a fault may yet ask for, with their spans."""
+        """Finished files of the ring, with their time spans, that a fault may still require."""
         self._spans: list[_Span] = []
         self._models: dict[str, ModelUse] = {}
         self._waiting: list[Item] = []
@@ -105,17 +106,17 @@ class FlightLog:
         self._trouble = ""
         self._refused_now = 0
         self._behind = 0
-        """Cycles in a chunk that the disk did not take yet."""
+        """Cycles in a chunk that is not yet on the disk."""
         self.counts = Counts()
         store.folder.mkdir(parents=True, exist_ok=True)
 
     @property
     def folder(self) -> Path:
-        """Where the recordings are."""
+        """Folder of the recordings."""
         return self._store.folder
 
     def mend(self) -> None:
-        """Finish what a process that died has left; keep those of them that a fault is in."""
+        """Mends files of a process that died, and keeps those that contain a fault."""
         for path in mend_folder(self._store.folder, self._tell):
             self._tell(f"{path.name}: was not finished; it is whole up to its last second")
             with suppress(InputError, OSError):
@@ -124,15 +125,15 @@ class FlightLog:
         self._store.trim(self._wall_ns())
 
     def put(self, item: Item) -> None:
-        """Take something in; it is on the disk after the next `flush`."""
+        """Takes an item; it is on the disk after the next `flush`."""
         self._waiting.append(item)
         if isinstance(item, Batch) and item.samples is not None and len(item.samples):
             self._newest_ns = int(item.samples["time_ns"][-1])
 
     def flush(self) -> None:
-        """Write what came since the last time."""
+        """Writes the items since the last flush."""
         waiting, self._waiting = self._waiting, []
-        for item in waiting:  # a file that begins later needs the model, too
+        for item in waiting:  # a later file must contain the model as well
             if isinstance(item, ModelUse):
                 self._models[item.axis] = item
         if not waiting and (self._file is None or not self._file.behind):
@@ -164,7 +165,7 @@ class FlightLog:
         self._cut()
 
     def close(self) -> None:
-        """Write what there is, and finish the file."""
+        """Writes the remaining items and finishes the file."""
         self.flush()
         self._end()
 
@@ -200,7 +201,7 @@ class FlightLog:
                     file.add_event(event)
 
     def _refuse(self, cycles: int, problem: OSError) -> None:
-        """Nothing can be written now."""
+        """Counts cycles that cannot be written, and reports the first failure."""
         self.counts.refused += cycles
         self._refused_now += cycles
         words = problem.strerror or str(problem)
@@ -221,7 +222,7 @@ class FlightLog:
         self._trouble, self._refused_now = "", 0
 
     def _note_spans(self, items: Sequence[Item]) -> None:
-        """The times that are to be kept."""
+        """Notes the time spans to keep."""
         settings = self._store.settings
         for item in items:
             times = []
@@ -235,7 +236,7 @@ class FlightLog:
             ]
 
     def _cut(self) -> None:
-        """The next file, when this one is large or old enough, or a time to keep is over."""
+        """Begins another file once this one is large or old enough, or a span to keep is over."""
         file, settings = self._file, self._store.settings
         if file is None:
             return
@@ -260,12 +261,12 @@ class FlightLog:
         self._trim(0)
 
     def _keep(self) -> None:
-        """Move files aside that a fault asks for; forget those that none can ask for any more."""
+        """Moves files aside that a fault requires, and forgets those that none can require any more."""
         horizon_ns = self._newest_ns - int(self._store.settings.before_s * _NS)
         left = []
         for path, begin_ns, end_ns in self._files:
             if any(begin_ns <= each.end_ns and end_ns >= each.begin_ns for each in self._spans):
-                with suppress(FileNotFoundError):  # a person removed it
+                with suppress(FileNotFoundError):  # removed by a user
                     self._store.keep(path)
             elif end_ns >= horizon_ns:
                 left.append((path, begin_ns, end_ns))

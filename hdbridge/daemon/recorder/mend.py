@@ -1,4 +1,4 @@
-"""Writes files again that were not finished: whole up to their last chunk, with the index that they lack."""
+"""Mending of unfinished files: rewrites them up to their last complete chunk, with an index."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ CHUNK_BYTES: Final = 1 << 20
 
 
 def mend_folder(folder: Path, say: Callable[[str], None] = lambda _: None) -> list[Path]:
-    """Mend every unfinished file of a folder but those that are being written; the mended ones.
+    """Mends every unfinished file of a folder that is not being written; returns the mended files.
 
-    A file in which nothing is whole is removed. What cannot be mended now is said and left as it is.
+    Removes files without a complete chunk. Reports files that cannot be mended and leaves them unchanged.
     """
     mended = []
     for leftover in sorted(folder.glob(f".*{MENDING}")):
@@ -41,10 +41,10 @@ def mend_folder(folder: Path, say: Callable[[str], None] = lambda _: None) -> li
 
 
 def mend(path: Path) -> Path | None:
-    """Mend one file; its name afterwards, or None where nothing of it was whole and it was removed.
+    """Mends one file; returns its new name, or None if it had no complete chunk and was removed.
 
-    A finished one stays as it is. InputError if it is being written, `GoneError` if it does not exist any
-    more, OutputError if there is no space.
+    Leaves a finished file unchanged. Raises InputError if the file is being written, `GoneError` if it no
+    longer exists, OutputError if there is no space.
     """
     target = path.with_name(path.name.removesuffix(PART))
     aside = target.with_name(f".{target.name}{MENDING}")
@@ -83,7 +83,7 @@ def mend(path: Path) -> Path | None:
 
 
 def _copied(path: Path, file: BinaryIO, out: BinaryIO) -> tuple[int, bool]:
-    """Copy every whole record; how many messages there were, and whether the file had its end."""
+    """Copies every complete record; returns the number of messages and if the file was finished."""
     writer = Writer(out, chunk_size=CHUNK_BYTES)
     schemas: dict[int, int] = {0: 0}
     channels: dict[int, int] = {}

@@ -1,7 +1,7 @@
-"""Reads flight recordings, finished or not: everything up to the last whole chunk.
+"""Reading of flight recordings, finished or not, up to their last complete chunk.
 
-The recorder may be at work in the same folder: a file is renamed when it is finished and when it is kept, and
-removed when the folder is full. A recording is found under its present name as long as it exists.
+The recorder may be active in the same folder: it renames a file when it is finished or kept, and removes old
+files. A recording is found under its present name as long as it exists.
 """
 
 from __future__ import annotations
@@ -31,26 +31,26 @@ from hdbridge.files.regular import open_regular
 T = TypeVar("T")
 SUFFIX: Final = ".mcap"
 TORN: Final = (McapError, ZstdError, struct.error, ValueError, MemoryError)
-"""What reading the end of a file that was cut off may raise; ValueError: a checksum that is wrong."""
+"""Exceptions raised at the end of a truncated file; ValueError for a wrong checksum."""
 
 
 class GoneError(InputError):
-    """The recording does not exist any more: the recorder, or a person, has removed it."""
+    """The recording no longer exists: the recorder or a user removed it."""
 
 
 class Told(NamedTuple):
-    """An event of a recording."""
+    """Event of a recording."""
 
     time_ns: int
-    """Time of day."""
+    """Time of day, ns."""
     name: str
-    """Of the axis, or of the machine."""
+    """Name of the axis or the machine."""
     kind: str
     text: str
 
 
 class ModelUsed(NamedTuple):
-    """The model that an axis used from a time on."""
+    """Model that an axis used from a time on."""
 
     time_ns: int
     axis: str
@@ -60,26 +60,26 @@ class ModelUsed(NamedTuple):
 
 @dataclass(eq=False)
 class Flight:
-    """What one file holds."""
+    """Content of one file."""
 
     path: Path
     about: About
     finished: bool
-    """Whether it has its index; else it was cut off, or is being written."""
+    """True if it has its index; else it was cut off or is being written."""
     first_ns: int
-    """Time of day of the first message, and of the last."""
+    """Times of day of the first and the last message, ns."""
     last_ns: int
     axes: Mapping[str, Mapping[str, NDArray[Any]]] = field(default_factory=dict)
-    """By axis: a column for each field of a sample, as far as they were asked for."""
+    """Requested sample fields as columns, by axis."""
     machine: Mapping[str, NDArray[Any]] = field(default_factory=dict)
     events: tuple[Told, ...] = ()
     models: tuple[ModelUsed, ...] = ()
 
 
 def flight_files(paths: Sequence[Path]) -> list[Path]:
-    """Files as they are; for a folder its recordings, kept ones included, in the order of their dates.
+    """Returns the given files, and for each folder its recordings by date, kept ones included.
 
-    InputError if a folder has none.
+    Raises InputError if a folder has none.
     """
     found: list[Path] = []
     for path in paths:
@@ -97,9 +97,9 @@ def flight_files(paths: Sequence[Path]) -> list[Path]:
 
 
 def _inside(folder: Path) -> list[Path]:
-    """The recordings of a folder, each once, whatever is renamed meanwhile."""
+    """Returns the recordings of a folder, each once, even if files are renamed meanwhile."""
     found: dict[Path, Path] = {}
-    for _ in range(2):  # a file that is renamed during the first look may be missing from it
+    for _ in range(2):  # a file that is renamed during the first pass may be missed by it
         for place, _, names in os.walk(folder):
             for name in names:
                 if name.endswith((SUFFIX, SUFFIX + PART)):
@@ -109,16 +109,16 @@ def _inside(folder: Path) -> list[Path]:
 
 
 def _places(path: Path) -> tuple[Path, ...]:
-    """The names that a recording has one after the other, from ``path`` on."""
+    """Returns the successive names of a recording, from ``path`` on."""
     finished = path.with_name(path.name.removesuffix(PART))
     kept = finished if path.parent.name == KEPT else path.parent / KEPT / finished.name
     return (path, finished, kept)
 
 
 def each_flight(paths: Sequence[Path], look: Callable[[Path], T]) -> Iterator[T]:
-    """``look`` at each recording of files and folders.
+    """Calls ``look`` for each recording of files and folders; yields the results.
 
-    One that the recorder removes meanwhile is left out; `GoneError` if it was named itself.
+    Skips a recording that the recorder removes meanwhile; raises `GoneError` if it was named explicitly.
     """
     for path in flight_files(paths):
         try:
@@ -129,9 +129,9 @@ def each_flight(paths: Sequence[Path], look: Callable[[Path], T]) -> Iterator[T]
 
 
 def records_of(file: BinaryIO, where: Path) -> Iterator[McapRecord]:
-    """Every record up to the last whole chunk; the last one is a `Footer` only of a finished file.
+    """Yields every record up to the last complete chunk; the last is a `Footer` only if the file is finished.
 
-    InputError where it is no MCAP file at all.
+    Raises InputError if it is not an MCAP file.
     """
     try:
         yield from StreamReader(file, validate_crcs=True).records
@@ -144,7 +144,7 @@ def records_of(file: BinaryIO, where: Path) -> Iterator[McapRecord]:
 
 
 def read(path: Path, axes: tuple[str, ...] | None = None) -> Flight:
-    """All of a file; ``axes`` names those whose samples are wanted (None: all). InputError names the file."""
+    """Reads a file; ``axes`` selects the axes with samples (None: all). InputError names the file."""
     topics: dict[int, str] = {}
     messages: dict[str, list[bytes]] = defaultdict(list)
     metadata: dict[str, Mapping[str, str]] = {}
@@ -184,7 +184,7 @@ def read(path: Path, axes: tuple[str, ...] | None = None) -> Flight:
 
 
 class Overview(NamedTuple):
-    """What the index of a file says."""
+    """Summary of a file from its index."""
 
     path: Path
     about: About
@@ -197,7 +197,7 @@ class Overview(NamedTuple):
 
 
 def overview(path: Path) -> Overview:
-    """Of a finished file from its index, without reading its samples."""
+    """Returns the summary of a finished file without reading its samples; reads an unfinished one in full."""
     path, opened = _opened(path)
     with opened as file:
         size = os.fstat(file.fileno()).st_size
@@ -230,7 +230,7 @@ def overview(path: Path) -> Overview:
 
 
 def _opened(path: Path) -> tuple[Path, BinaryIO]:
-    """The recording under its present name, opened."""
+    """Opens a recording; returns its present name and the open file."""
     for place in _places(path):
         try:
             return place, open_regular(place)

@@ -1,7 +1,7 @@
-"""The flight recorder: everything that the loop tells, on disk within a second.
+"""The flight recorder: all samples and events of the loop, on disk within a second.
 
-`FlightRecorder` is a sink of the service's observer. It never blocks and never grows: what its thread is too
-slow for is dropped, counted and told. What the thread does is `flightlog`.
+`FlightRecorder` is a sink of the observer. It never blocks and uses bounded memory: data that its thread is
+too slow for is dropped, counted and reported. `flightlog` does the thread's work.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ from hdbridge.daemon.recorder.store import Store, free_bytes
 
 FLUSH_S: Final = 1.0
 QUEUE_BATCHES: Final = 500
-"""Ten seconds of the observer's batches."""
+"""Capacity of the queue: ten seconds of batches."""
 _log = logging.getLogger(__name__)
 
 
 class FlightRecorder:
-    """The sink: hands everything to a thread of its own; another mends what an earlier process has left."""
+    """Sink that passes everything to its thread; another thread mends files of earlier processes."""
 
     def __init__(
         self,
@@ -42,7 +42,7 @@ class FlightRecorder:
         wall_ns: Callable[[], int] = time.time_ns,
         free: Callable[[Path], int] = free_bytes,
     ) -> None:
-        """``tell`` is called in the recorder's thread. OSError where the folder cannot be made."""
+        """The recorder's thread calls ``tell``. Raises OSError if the folder cannot be created."""
         self._flight = FlightLog(
             Store(folder, settings or RecorderSettings(), free), about, tell=tell, wall_ns=wall_ns
         )
@@ -50,25 +50,25 @@ class FlightRecorder:
         self._tell = tell
         self._dropped = 0
         self._said: deque[Item] = deque(maxlen=1000)
-        """What others than the observer have to say; seldom."""
+        """Models and notes from other sources than the observer; they are rare."""
         self._thread = threading.Thread(target=self._run, name="recorder", daemon=True)
         self._thread.start()
-        # It may take as long as it likes: each file is mended whole or not at all.
+        # Its duration does not matter: each file is mended completely or not at all.
         self._mender = threading.Thread(target=self._mend, name="recorder-mend", daemon=True)
         self._mender.start()
 
     @property
     def folder(self) -> Path:
-        """Where the recordings are."""
+        """Folder of the recordings."""
         return self._flight.folder
 
     @property
     def counts(self) -> Counts:
-        """What became of the cycles so far."""
+        """Counts of cycles so far."""
         return replace(self._flight.counts, dropped=self._dropped)
 
     def take(self, samples: SampleArray, events: Sequence[Event], lost: int) -> None:
-        """From the observer; never waits."""
+        """Takes samples and events from the observer; never waits."""
         batch = Batch(samples if len(samples) else None, tuple(events), lost)
         try:
             self._queue.put_nowait(batch)
@@ -78,19 +78,19 @@ class FlightRecorder:
             self._dropped += len(samples)
 
     def use_model(self, axis: str, text: str, version: str = "") -> None:
-        """From now on the axis uses this model: the text of its file."""
+        """Records a change of model; ``text`` is the model file's content."""
         self._said.append(ModelUse(axis, version, text))
 
     def note(self, kind: str, text: str) -> None:
-        """Write down what another part of the daemon has to say."""
+        """Records a note of another part of the daemon."""
         self._said.append(Note(kind, text))
 
     def mark(self, text: str = "") -> None:
-        """Keep the time about now, as that about a fault."""
+        """Records a mark and keeps the time around it, as around a fault."""
         self._said.append(Note(MARK, text))
 
     def close(self) -> None:
-        """Finish the file; returns when it is on the disk."""
+        """Finishes the file; returns when it is on the disk."""
         self._queue.put(None)
         self._thread.join()
         self._mender.join()

@@ -1,4 +1,4 @@
-"""The keys under ``recorder`` of a machine file: where the flight recorder writes, how much, for how long."""
+"""Keys under ``recorder`` of a machine file: folder, size and age of flight recordings."""
 
 from __future__ import annotations
 
@@ -8,23 +8,28 @@ from hdbridge.strictness import Strict
 
 
 class RecorderSettings(Strict):
-    """The ring on disk, and what is kept aside of it."""
+    """Settings of the ring on disk and of the recordings kept aside."""
 
     folder: str | None = Field(
         None,
         min_length=1,
-        description="where the recordings go, relative to this file; without it recordings/daemon "
+        description="folder of the recordings, relative to this file; by default recordings/daemon "
         "next to it, or in the state folder of the service",
     )
-    size_mb: float = Field(2000.0, ge=1, le=1e7, description="size of the ring; the oldest file goes first")
-    age_days: float = Field(30.0, gt=0, le=36_500, description="age at which a file of the ring goes")
+    size_mb: float = Field(
+        2000.0, ge=1, le=1e7, description="size of the ring; the oldest file is removed first"
+    )
+    age_days: float = Field(30.0, gt=0, le=36_500, description="age at which a file of the ring is removed")
     file_mb: float = Field(64.0, ge=0.1, le=4000, description="size at which the next file begins")
     file_s: float = Field(300.0, ge=5, le=86_400, description="time after which the next file begins")
-    before_s: float = Field(60.0, ge=0, le=86_400, description="kept of the time before each fault")
-    after_s: float = Field(30.0, ge=0, le=86_400, description="kept of the time after each fault")
+    before_s: float = Field(60.0, ge=0, le=86_400, description="time before each fault that is kept")
+    after_s: float = Field(30.0, ge=0, le=86_400, description="time after each fault that is kept")
     kept_mb: float = Field(
-        1000.0, ge=1, le=1e7, description="size of what is kept of faults; the oldest goes first"
+        1000.0,
+        ge=1,
+        le=1e7,
+        description="size of the recordings kept for faults; the oldest is removed first",
     )
     free_mb: float = Field(
-        100.0, ge=0, le=1e7, description="left free on the disk: with less than this nothing is recorded"
+        100.0, ge=0, le=1e7, description="minimum free disk space; with less, nothing is recorded"
     )

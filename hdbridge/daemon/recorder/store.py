@@ -1,10 +1,10 @@
-"""The folder of a flight recorder: a ring of files by size and age, and those that are kept aside of it.
+"""Folder of a flight recorder: a ring of files limited by size and age, and the files kept aside.
 
     FOLDER/DATE-MACHINE.mcap.part    being written
-    FOLDER/DATE-MACHINE.mcap         the ring: the oldest goes first
-    FOLDER/kept/DATE-MACHINE.mcap    moved here because a fault is in it, or near
+    FOLDER/DATE-MACHINE.mcap         the ring; the oldest file is removed first
+    FOLDER/kept/DATE-MACHINE.mcap    kept because it contains, or is close to, a fault
 
-The names begin with the date in UTC, so that their order is that of time.
+Names begin with the date in UTC, so they sort by time.
 """
 
 from __future__ import annotations
@@ -28,20 +28,20 @@ _NS: Final = 1_000_000_000
 
 
 def free_bytes(folder: Path) -> int:
-    """What is free on its disk for whoever asks."""
+    """Returns the free bytes on the disk of ``folder``."""
     return shutil.disk_usage(folder).free
 
 
 @dataclass(frozen=True)
 class Store:
-    """The folder and its limits."""
+    """Folder of the recordings and its limits."""
 
     folder: Path
     settings: RecorderSettings
     free: Callable[[Path], int] = free_bytes
 
     def new_path(self, machine: str, now_ns: int) -> Path:
-        """Name of the next file; no other has it."""
+        """Returns an unused name for the next file."""
         date = datetime.fromtimestamp(now_ns / _NS, UTC).strftime("%Y%m%dT%H%M%SZ")
         number, name = 1, f"{date}-{machine}{SUFFIX}"
         while any(
@@ -54,11 +54,11 @@ class Store:
         return self.folder / name
 
     def room_for(self, size: int) -> bool:
-        """Whether so many bytes may be written, and what has to stay free stays so."""
+        """Returns True if ``size`` bytes can be written with the required space left free."""
         return self.free(self.folder) >= size + self.settings.free_mb * _MB
 
     def keep(self, path: Path) -> Path:
-        """Move a finished file aside; where it then is."""
+        """Moves a finished file aside; returns its new path."""
         kept = self.folder / KEPT
         kept.mkdir(exist_ok=True)
         target = kept / path.name
@@ -66,24 +66,24 @@ class Store:
         return target
 
     def trim(self, now_ns: int, writing: int = 0) -> list[Path]:
-        """Remove what is over the limits, oldest first; what is gone of the kept ones.
+        """Removes files over the limits, oldest first; returns the kept ones that were removed.
 
-        ``writing`` is the size of the file that is being written.
+        ``writing`` is the size of the file being written.
         """
         limits = self.settings
         _trim(self.folder, limits.size_mb * _MB - writing, now_ns / _NS - limits.age_days * _DAY_S)
         return _trim(self.folder / KEPT, limits.kept_mb * _MB, -1.0)
 
     def finished(self) -> list[Path]:
-        """The files of the ring, oldest first."""
+        """Returns the files of the ring, oldest first."""
         return sorted(self.folder.glob(f"*{SUFFIX}"))
 
 
 def _trim(folder: Path, most: float, oldest_s: float) -> list[Path]:
-    """Remove files until no more than ``most`` bytes are left and none is older; which."""
+    """Removes files beyond ``most`` bytes in all or older than ``oldest_s``; returns them."""
     files: list[tuple[Path, os.stat_result]] = []
     for path in sorted(folder.glob(f"*{SUFFIX}")):
-        with contextlib.suppress(FileNotFoundError):  # a person removed it
+        with contextlib.suppress(FileNotFoundError):  # removed by a user
             files.append((path, path.stat()))
     left = sum(status.st_size for _, status in files)
     gone = []

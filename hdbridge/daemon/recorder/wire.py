@@ -1,10 +1,10 @@
-"""Cycle samples as Protocol Buffers messages, a whole batch at a time.
+"""Encoding of samples as Protocol Buffers messages, one batch at a time.
 
-Foxglove, PlotJuggler and every MCAP tool read protobuf by the schema that the file itself carries. A message
-whose fields are all of fixed width, and all there, has one layout of bytes: tag, value, tag, value. So a
-batch is one numpy array of that layout, filled column by column, and no message is encoded by itself.
+Foxglove, PlotJuggler and all MCAP tools decode protobuf by the schema in the file. If all fields of a message
+are present and of fixed width, its bytes have one layout: tag, value, tag, value. So a batch is a numpy array
+of that layout, filled column by column, without encoding each message.
 
-One table of fields (`AXIS_FIELDS`, `MACHINE_FIELDS`) gives both the schema and the layout.
+One table of fields (`AXIS_FIELDS`, `MACHINE_FIELDS`) defines both schema and layout.
 """
 
 from __future__ import annotations
@@ -34,19 +34,19 @@ _FIXED: Final = {
     "u8": (FieldDescriptorProto.TYPE_FIXED64, 1),
     "u4": (FieldDescriptorProto.TYPE_FIXED32, 5),
 }
-"""numpy type: protobuf type and wire type."""
+"""Protobuf type and wire type of each numpy type."""
 _VARINT: Final = 0
 _MORE: Final = 0x80
 
 
 class Field(NamedTuple):
-    """A field of a message; its number is its place in the table, from 1."""
+    """Field of a message; its number is its place in the table, from 1."""
 
     name: str
     kind: str
-    """A numpy type, or ``enum``: a byte."""
+    """A numpy type, or ``enum`` for a byte."""
     values: Mapping[int, str] | None = None
-    """Of an enum."""
+    """Names of an enum's values."""
 
 
 def _names(values: Iterable[Enum]) -> dict[int, str]:
@@ -60,7 +60,7 @@ _ENUMS: Final[Mapping[str, Mapping[int, str]]] = {
     "fault": _names(Fault) | {NO_FAULT: "NONE"},
 }
 _WIDE: Final = {"u2": "u4"}
-"""What protobuf has no type of so few bytes for."""
+"""Wider types for those that protobuf lacks."""
 _AXIS_NAMES: Final = AXIS_SAMPLE.names or ()
 AXIS_FIELDS: Final = (
     Field("cycle", "i8"),
@@ -83,7 +83,7 @@ MACHINE_FIELDS: Final = (
 
 
 class Message:
-    """One kind of message: its schema, and batches of it to bytes and back."""
+    """Message type: its schema, encoding and decoding of batches."""
 
     def __init__(self, name: str, fields: tuple[Field, ...]) -> None:
         self.name = f"{PACKAGE}.{name}"
@@ -104,7 +104,7 @@ class Message:
 
     @cached_property
     def schema(self) -> bytes:
-        """A serialised FileDescriptorSet, as MCAP has it for protobuf."""
+        """Serialised FileDescriptorSet, as MCAP requires for protobuf."""
         files = FileDescriptorSet()
         file = files.file.add(name=f"{PACKAGE}/{self._short}.proto", package=PACKAGE, syntax="proto3")
         message: DescriptorProto = file.message_type.add(name=self._short)
@@ -123,7 +123,7 @@ class Message:
         return files.SerializeToString()
 
     def encode(self, columns: Mapping[str, Any], count: int) -> list[bytes]:
-        """So many messages; ``columns`` has an array for each field."""
+        """Returns ``count`` encoded messages; ``columns`` has an array for each field."""
         rows = np.full(count, self._template, self.layout)
         for each in self._fields:
             values = columns[each.name]
@@ -136,7 +136,7 @@ class Message:
         return [data[at : at + size] for at in range(0, count * size, size)]
 
     def decode(self, messages: list[bytes]) -> dict[str, NDArray[Any]]:
-        """A column for each field. InputError where a message is not of this layout."""
+        """Returns a column per field. Raises InputError if a message does not have this layout."""
         if any(len(each) != self.layout.itemsize for each in messages):
             raise InputError(f"its {self._short} messages are of another release of hdbridge")
         rows = np.frombuffer(b"".join(messages), self.layout)
@@ -164,7 +164,7 @@ MACHINE: Final = Message("MachineSample", MACHINE_FIELDS)
 
 
 def axis_messages(samples: SampleArray, place: int) -> list[bytes]:
-    """One message per sample, of the axis at ``place``."""
+    """Returns one message per sample for the axis at ``place``."""
     axis: Any = samples["axes"][:, place]
     return AXIS.encode(
         {"cycle": samples["cycle"], **{name: axis[name] for name in _AXIS_NAMES}}, len(samples)
@@ -172,5 +172,5 @@ def axis_messages(samples: SampleArray, place: int) -> list[bytes]:
 
 
 def machine_messages(samples: SampleArray) -> list[bytes]:
-    """One message per sample."""
+    """Returns one message per sample for the machine."""
     return MACHINE.encode({each.name: samples[each.name] for each in MACHINE_FIELDS}, len(samples))

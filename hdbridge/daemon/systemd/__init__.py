@@ -1,4 +1,4 @@
-"""The files with which systemd runs the daemon of a machine and sets its CAN interface up. Writes nothing."""
+"""systemd files that run a machine's daemon and configure its CAN interface. Writes nothing."""
 
 from __future__ import annotations
 
@@ -15,24 +15,24 @@ from hdbridge.daemon.machine import Machine
 from hdbridge.errors import InputError
 
 MARKER: Final = "# Written by 'hdbridge install-service'; 'hdbridge install-service --remove' removes it."
-"""The first line of each file: one without it is somebody else's."""
+"""First line of each file; a file without it is not ours."""
 _SYSTEM_UNITS: Final = Path("/etc/systemd/system")
 _NETWORKS: Final = Path("/etc/systemd/network")
 _HOMES: Final = (Path("/home"), Path("/root"), Path("/run/user"))
 _SERIAL: Final = frozenset({"slcan", "serial", "robotell", "seeedstudio"})
-"""Interfaces of python-can that are serial ports."""
+"""python-can interfaces that are serial ports."""
 
 
 @dataclass(frozen=True, slots=True)
 class ServiceFile:
-    """A file to be written."""
+    """A file to write."""
 
     path: Path
     text: str
 
     @property
     def ours(self) -> bool:
-        """Whether there is nothing at its place, or a file of this program."""
+        """True if the path is free or contains a file of this program."""
         try:
             with self.path.open(encoding="utf-8") as file:
                 return file.readline().rstrip("\n") == MARKER
@@ -43,11 +43,11 @@ class ServiceFile:
 
 
 def service_files(machine: Machine, *, user: bool = False, account: str | None = None) -> list[ServiceFile]:
-    """The unit of a machine's daemon, and for SocketCAN with a bit rate the file that sets the interface up.
+    """Returns the unit of a machine's daemon, and for SocketCAN with a bit rate the interface's network file.
 
-    ``user``: of the user's own service manager, which sets no interface up. ``account``: the user under which
-    the system's manager runs the daemon; without it who owns the machine file, and where that is root one
-    that exists only while the daemon runs.
+    ``user``: for the user's own service manager, which cannot configure interfaces. ``account``: user under
+    which the system's manager runs the daemon; the default is the machine file's owner, or a dynamic user if
+    that is root.
     """
     unit = f"hdbridge-{machine.name}.service"
     about = _about(machine)
@@ -90,13 +90,13 @@ def _render(template: str, about: dict[str, object]) -> str:
 
 
 def _quoted(word: Path | str) -> str:
-    """A word as systemd reads it in a list: specifiers and variables taken literally, quoted where needed."""
+    """Quotes a word for systemd, with specifiers and variables taken literally."""
     text = str(word).replace("\\", "\\\\").replace("%", "%%").replace("$", "$$").replace('"', '\\"')
     return f'"{text}"' if any(each.isspace() or each in "\"';\\" for each in text) else text
 
 
 def _folders(machine: Machine) -> list[Path]:
-    """Where models, recordings and adaptation are kept, and a socket that the machine file places."""
+    """Returns the folders that must be writable: of models, recordings, adaptation and the socket."""
     folders = {machine.folder, *(axis.profile.folder for axis in machine.axes)}
     if machine.api.socket is not None:
         folders.add(machine.beside(machine.api.socket).parent)
@@ -104,7 +104,7 @@ def _folders(machine: Machine) -> list[Path]:
 
 
 def _home(machine: Machine) -> str:
-    """How much of the home folders it must see: its files and its interpreter may lie there."""
+    """Returns the value of ProtectHome: files and interpreter may be in home folders."""
     needed = [*_folders(machine), Path(sys.executable), Path(sys.prefix), Path(__file__)]
     inside = any(home in each.parents for each in needed for home in _HOMES)
     return "read-only" if inside else "yes"

@@ -1,1 +1,1 @@
-"""The load-encoder watch: does the model still hold?"""
+"""Load-encoder watch: monitors the validity of the model and the health of the load encoder."""

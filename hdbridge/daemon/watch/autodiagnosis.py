@@ -1,12 +1,12 @@
-"""Diagnoses the last minutes of an axis by itself, when the watch has raised something.
+"""Automatic diagnosis of the last minutes of an axis after the watch has raised a verdict.
 
-Export and diagnosis are the commands that a person would type, in processes that get the processor only when
-nobody else wants it. What they give stands next to the recordings:
+Export and diagnosis run as the ordinary commands, in processes with the lowest scheduling priority. Their
+results are stored next to the recordings:
 
     FOLDER/diagnoses/DATE-AXIS/record/          the record (hdbridge record export)
     FOLDER/diagnoses/DATE-AXIS/model.yaml       the model that was in use
-    FOLDER/diagnoses/DATE-AXIS/diagnosis.json   what hdbridge diagnose found, and a page for a person
-    FOLDER/diagnoses/DATE-AXIS/log.txt          what the commands said
+    FOLDER/diagnoses/DATE-AXIS/diagnosis.json   result of hdbridge diagnose, with a page to read
+    FOLDER/diagnoses/DATE-AXIS/log.txt          output of the commands
 """
 
 from __future__ import annotations
@@ -31,15 +31,15 @@ DIAGNOSES: Final = "diagnoses"
 RECORD: Final = "record"
 RESULT: Final = "diagnosis.json"
 LONGEST_S: Final = 1800.0
-"""A diagnosis that takes longer is ended."""
+"""Time-out of a diagnosis."""
 APART_S: Final = 3600.0
-"""Of one axis no more than one in so long."""
+"""Minimum time between two diagnoses of one axis."""
 _NS: Final = 10**9
 _log = logging.getLogger(__name__)
 
 
 class AutoDiagnosis:
-    """One at a time, in a thread that waits for the process."""
+    """Runs one diagnosis at a time, in a thread that waits for its process."""
 
     def __init__(
         self,
@@ -49,7 +49,7 @@ class AutoDiagnosis:
         wall_ns: Callable[[], int] = time.time_ns,
         apart_s: float = APART_S,
     ) -> None:
-        """``folder`` is that of the flight recorder; ``tell`` gets axis and result, in another thread."""
+        """The flight recorder's ``folder``; another thread calls ``tell`` with axis and result."""
         self._folder = folder
         self._tell = tell
         self._wall_ns = wall_ns
@@ -61,7 +61,7 @@ class AutoDiagnosis:
         self._threads: list[threading.Thread] = []
 
     def ask(self, axis: str, model_text: str, minutes: float, reason: str) -> bool:
-        """Diagnose the last minutes; False where this axis was diagnosed a short while ago."""
+        """Starts a diagnosis of the last minutes; False if this axis was diagnosed within ``apart_s``."""
         now_ns = self._wall_ns()
         last_ns = self._last_ns.get(axis)
         if self._ended.is_set() or (last_ns is not None and now_ns - last_ns < self._apart_s * _NS):
@@ -75,7 +75,7 @@ class AutoDiagnosis:
         return True
 
     def close(self) -> None:
-        """End what runs."""
+        """Ends a running diagnosis."""
         self._ended.set()
         process = self._process
         if process is not None:
@@ -85,7 +85,7 @@ class AutoDiagnosis:
             each.join()
 
     def wait(self) -> None:
-        """Until nothing runs any more."""
+        """Waits until no diagnosis runs."""
         for each in self._threads:
             each.join()
 
@@ -120,7 +120,7 @@ class AutoDiagnosis:
         return f"{summary(found)}; {folder}"
 
     def _command(self, folder: Path, *arguments: object) -> None:
-        """Run one command of hdbridge to its end, with the lowest claim to the processor."""
+        """Runs one hdbridge command to its end, at the lowest priority."""
         line = [sys.executable, "-m", "hdbridge", *map(str, arguments)]
         with (folder / "log.txt").open("ab") as log:
             process = subprocess.Popen(
@@ -144,7 +144,7 @@ class AutoDiagnosis:
 
 
 def summary(found: dict[str, Any]) -> str:
-    """A diagnosis in one line."""
+    """Returns a diagnosis in one line."""
     findings: Sequence[dict[str, Any]] = found["findings"]
     baseline, floor = found["baseline"]["rms_arcsec"], found["noise_floor_arcsec"]
     named = ", ".join(
@@ -158,7 +158,7 @@ def summary(found: dict[str, Any]) -> str:
 
 
 def _yield_to_all(pid: int) -> None:
-    """Only what nobody else wants of the processor."""
+    """Gives a process only processor time that no other process needs."""
     with suppress(OSError):
         os.setpriority(os.PRIO_PROCESS, pid, 19)
     with suppress(OSError):

@@ -1,20 +1,20 @@
-"""Whether the load encoder is believed: its own faults, distinguished from wear of the gear.
+"""Health of the load encoder: detects its own faults and distinguishes them from wear of the gear.
 
-Four faults are looked for, each by what a gear cannot do (`signs`):
+Four faults are detected, each by a sign that a gear cannot produce (`signs`):
 
 * frozen: the reading does not change at all while the motor turns;
-* jumped: the residual steps while neither the motor, nor its speed, nor the model's prediction changes so;
-* noisy: a reading's own jitter is several times what it was, or readings jump there and back;
-* drifting: the zero runs away faster than a gear warms up, or farther than one ever does.
+* jumped: the residual steps although motor, speed and predicted error do not;
+* noisy: the jitter of a reading is several times its usual value, or readings jump there and back;
+* drifting: the zero moves faster or farther than warming up can move it.
 
-Jumps, drifts and noise in motion are looked for beside a model that predicts something: the gear's own error
-does all of that. An axis that is not calibrated yet is watched for what is left.
+Jumps, drifts and noise in motion are judged only with a calibrated model, because without its prediction the
+gear's own error looks the same. The other signs are judged on every axis.
 
-An encoder that drifts as slowly as a gear warms up, or reads eccentrically, looks like the gear: the load
-encoder alone cannot tell. A reading that freezes while the axis rests is seen when it next moves.
+An encoder that drifts as slowly as a gear warms up, or is eccentric, is not separable from the gear by the
+load encoder alone. A reading that freezes at rest is detected at the next motion.
 
-Frozen and noisy pass by themselves when the reading has been good for a while. After a jump, or a drift, the
-encoder's zero is not known: that stays until `reset`, or until the drive was verified or homed again.
+Frozen and noisy end automatically once the reading has been good for a while. After a jump or a drift the
+encoder's zero is unknown: that lasts until `reset`, or until the drive is verified or homed again.
 """
 
 from __future__ import annotations
@@ -46,32 +46,32 @@ from hdbridge.model import TransmissionModel
 from hdbridge.units import ARCSEC_PER_DEG
 
 UNSEATED = (AxisState.UNVERIFIED, AxisState.LENT)
-"""Afterwards the encoders' zeros may be others."""
+"""States after which the encoders' zeros may have changed."""
 TAIL = 64
-"""Samples that are looked at again with the next batch."""
+"""Samples evaluated again with the next batch."""
 LOOK_SAMPLES = 25
-"""So many new samples are looked at together: ten times a second, at 250 Hz."""
+"""New samples evaluated together: ten evaluations per second at 250 Hz."""
 BLOCK_S = 0.25
 BLOCK_SAMPLES = 20
-"""A block of fewer usable samples says nothing."""
+"""Minimum number of usable samples in a block."""
 LEARNED = 40
-"""Blocks from which a usual jitter is known."""
+"""Blocks after which the usual jitter is known."""
 REMEMBERED = 480
-"""Blocks from which it is taken; later ones could carry a slow fault into it."""
+"""Maximum number of blocks for the usual jitter; later ones might include a slow fault."""
 NOISY_BLOCKS = 3
-"""Noisy blocks in a row: less is a knock against the machine."""
+"""Consecutive noisy blocks that are a fault; fewer may be a knock against the machine."""
 TREND_BLOCKS = 120
-"""Blocks that a trend is taken from, at least; and, for a fast one, at most."""
+"""Minimum number of blocks for a slow trend; number of blocks for a fast one."""
 TREND_KEPT = 720
 TREND_EVERY = 20
 STEP_S = 180.0
-"""A step is looked for in the last of this time."""
+"""Time span, up to now, in which a step of the zero is searched."""
 UNMODELLED_ARCSEC = 3.0
-"""Residual of a model that does not say what it left on held-out data."""
+"""Assumed residual of a model without a held-out result."""
 
 
 class EncoderFault(Enum):
-    """What is wrong with the load encoder."""
+    """Fault of the load encoder."""
 
     FROZEN = "frozen"
     JUMPED = "jumped"
@@ -83,7 +83,7 @@ LATCHED = frozenset({EncoderFault.JUMPED, EncoderFault.DRIFTING})
 
 
 class Judgement(NamedTuple):
-    """Whether the load encoder is believed, and why (not), in words with figures."""
+    """Judgement of the load encoder, with the reason and figures."""
 
     believed: bool
     why: str
@@ -92,41 +92,42 @@ class Judgement(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class HealthLimits:
-    """From where on a load encoder is not believed."""
+    """Thresholds beyond which the load encoder is not believed."""
 
     sigmas: float = 8.0
-    """Standard deviations of a reading's noise that no reading is off by: one in 1e15."""
+    """Standard deviations of noise that no reading exceeds: probability 1e-15."""
     noise_ratio: float = 4.0
-    """Jitter of a second, by the usual one. Between 1, what it is, and 10, what a bad track makes."""
+    """Ratio of jitter to its usual value; normal is 1, a damaged track gives 10."""
     spikes: int = 3
-    """Readings that jump there and back within ten seconds: not chance any more."""
+    """Readings that jump there and back within ten seconds; so many are not chance."""
     frozen_arcsec: float = 120.0
-    """Travel of the motor, at the load, in which the reading must have changed: more than any backlash."""
+    """Load travel within which the reading must change; more than any backlash."""
     frozen_counts: float = 20.0
-    """... and at least so many of its counts."""
+    """Minimum of the same, in counts of the load encoder."""
     zero_rate_arcsec_min: float = 3.0
-    """A gear that warms up moves its zero by 5 to 60 arcsec in 10 to 60 minutes (`effects.zero_drift`): as a
-    rule by 1 a minute."""
+    """Drift rate of the zero. Warming up moves it by 5 to 60 arcsec in 10 to 60 minutes, typically by 1 per
+    minute (`effects.zero_drift`).
+    """
     zero_arcsec: float = 60.0
-    """... and by no more than this in all."""
+    """Total drift of the zero."""
     recovered_s: float = 10.0
-    """For so long must a reading be good to be believed again."""
+    """Time for which a reading must be good before it is believed again."""
 
 
 @dataclass(slots=True)
 class _Zero:
-    """What is known of the zero since the encoders were last verified."""
+    """Zero of the load encoder since it was last verified."""
 
     blocks: deque[tuple[float, float, float, float]] = field(default_factory=lambda: deque(maxlen=TREND_KEPT))
-    """Time, mean residual, direction, speed."""
+    """Time, mean residual, direction and speed of each block."""
     new: int = 0
-    """Blocks since the last look."""
+    """Blocks since the last evaluation."""
     reference_arcsec: float | None = None
     suspicions: int = 0
 
 
 class EncoderHealth:
-    """Follows the load encoder of one axis through the loop's samples."""
+    """Monitors the load encoder of one axis in the loop's samples."""
 
     def __init__(
         self,
@@ -144,10 +145,10 @@ class EncoderHealth:
         self._load_count_arcsec = axis.load_encoder.resolution_arcsec
         self._residual_arcsec = residual_of(model)
         self._predicted = bool(model.effects)
-        """Without a prediction the gear's own error may do what else only an encoder does."""
+        """False without a prediction: then the gear's own error may look like an encoder fault."""
         self._jitters: dict[bool, list[float]] = {True: [], False: []}
         self._learned: dict[bool, float] = {}
-        """What the jitter usually is, at rest and in motion."""
+        """Usual jitter at rest (True) and in motion (False)."""
         self._tail: SampleArray | None = None
         self._pending: list[Residuals] = []
         self._pending_samples = 0
@@ -163,32 +164,32 @@ class EncoderHealth:
 
     @property
     def judgement(self) -> Judgement:
-        """As of the last samples taken."""
+        """Judgement after the last samples taken."""
         if self._fault is None:
             return Judgement(True, "nothing speaks against the load encoder")
         return Judgement(False, self._why, self._fault)
 
     @property
     def noise_arcsec(self) -> float:
-        """Standard deviation of one reading: what was learned at rest, else what the model left."""
+        """Standard deviation of one reading: learned at rest, else the residual of the model."""
         return self._usual(standing=True)
 
     def reset(self) -> None:
-        """Believe it again, with a new zero: the encoder was looked after, or its zero was set."""
+        """Believes the encoder again, with a new zero, after maintenance or after its zero was set."""
         self._fault, self._why = None, ""
         self._zero = _Zero()
         self._spikes.clear()
         self._forget_place()
 
     def use(self, model: TransmissionModel) -> None:
-        """Another model predicts from now on; what its zero is has to be learned anew."""
+        """Uses another model from now on; the zero must be learned again."""
         self._residual_arcsec = residual_of(model)
         self._predicted = bool(model.effects)
         self._zero = _Zero()
         self._forget_place()
 
     def take(self, samples: SampleArray) -> Judgement:
-        """Judge the next samples of the loop, oldest first; some are looked at together."""
+        """Judges the next samples of the loop, oldest first; evaluates several batches together."""
         if len(samples):
             self._waiting.append(samples)
         if sum(map(len, self._waiting)) >= LOOK_SAMPLES:
@@ -201,7 +202,7 @@ class EncoderHealth:
             self.reset()
         tail = self._tail
         if tail is not None and samples["cycle"][0] <= tail["cycle"][-1]:
-            self._forget_place()  # the loop has begun anew
+            self._forget_place()  # the loop has restarted
             tail = None
         together = samples if tail is None else joined_samples([tail, samples])
         self._tail = together[-TAIL:].copy()
@@ -227,7 +228,7 @@ class EncoderHealth:
             return
         known.append(jitter_arcsec)
         if len(known) >= LEARNED:
-            # In motion the load shakes at some speeds more than at others: what is usual is the most of them.
+            # In motion the load vibrates more at some speeds, so a high quantile counts as usual.
             typical = np.median(known) if standing else np.quantile(known, 0.9)
             self._learned[standing] = max(float(typical), 0.3 * self._load_count_arcsec)
 
@@ -242,7 +243,7 @@ class EncoderHealth:
             self._fault, self._why = None, ""
 
     def _judge_frozen(self, found: Residuals) -> bool:
-        """Whether the reading does not follow the motor; also while it is not yet sure."""
+        """Blames a frozen reading; also returns True while the reading is suspiciously constant."""
         found = found.rows(found.fresh)
         if not len(found):
             return False
@@ -264,7 +265,7 @@ class EncoderHealth:
     def _judge_steps(self, found: Residuals) -> None:
         noise = max(self._usual(standing=bool(np.all(found.standing))), local_noise_arcsec(found))
         jump = find_jump(found, noise, self._count_arcsec, self.limits.sigmas)
-        if jump is not None and self._fault is not EncoderFault.FROZEN:  # which ends with one
+        if jump is not None and self._fault is not EncoderFault.FROZEN:  # a frozen reading ends with a jump
             moved = float(np.ptp(found.motor_deg[jump.row - SIDE : jump.row + SIDE])) / self._ratio
             self._blame(
                 EncoderFault.JUMPED,
@@ -272,7 +273,7 @@ class EncoderHealth:
                 f"by {moved * ARCSEC_PER_DEG:.1f} arcsec of the load (noise, counts and motion make at most "
                 f"{jump.allowed_arcsec:.1f})",
             )
-        # Not the samples that the next batch brings again.
+        # Excludes the samples that the next batch repeats.
         wild = misread(found.rows(slice(SIDE, None)), noise, self._count_arcsec, self.limits.sigmas)
         self._spikes.extend([self._now_s] * wild)
         while self._spikes and self._spikes[0] < self._now_s - 10.0:
@@ -283,7 +284,7 @@ class EncoderHealth:
             )
 
     def _gather(self, found: Residuals) -> None:
-        """Blocks of `BLOCK_S` or more; each is judged when it is full."""
+        """Collects samples into blocks of `BLOCK_S` or more and judges each complete block."""
         self._pending.append(found)
         self._pending_samples += len(found)
         if self._pending_samples < max(BLOCK_S / self._period_s, LOOK_SAMPLES):
@@ -299,11 +300,11 @@ class EncoderHealth:
             return
         moving = ~block.standing
         if np.any(moving) and not np.all(moving):
-            return  # what begins or ends to move swings
+            return  # the load oscillates after motion begins or ends
         standing = not np.any(moving)
         if not (standing or self._predicted):
-            return  # at speed the gear's own orders pass for jitter
-        # What the load itself does in motion is slow, or predicted: noise is in what is neither.
+            return  # at speed the gear's own orders look like jitter
+        # The load's own motion is slow or predicted; noise is in both differences.
         jitter = min(jitter_deg(block.load_deg) * ARCSEC_PER_DEG, jitter_deg(block.residual_arcsec))
         usual = self._usual(standing=standing)
         noisy = jitter > self.limits.noise_ratio * usual
@@ -346,7 +347,7 @@ class EncoderHealth:
             self._judge_trend(found[0], found[1], np.ptp(blocks[:, 0]))
 
     def _direction(self, speed_deg_s: float) -> float:
-        """Of the present or the last motion: at rest the loop stands where the last motion has left it."""
+        """Returns the direction of the present motion, or at rest that of the last one."""
         if abs(speed_deg_s) > 1e-9 or not self._zero.blocks:
             return float(np.sign(speed_deg_s))
         return self._zero.blocks[-1][2]
@@ -360,7 +361,7 @@ class EncoderHealth:
         runs = abs(found.rate_arcsec_min) > max(
             limits.zero_rate_arcsec_min, limits.sigmas * found.error_arcsec_min
         )
-        # One move that was bad may be in two evaluations; a drift is in the third as well.
+        # One bad move can affect two evaluations; only a drift affects a third.
         zero.suspicions = zero.suspicions + 1 if runs or abs(away) > limits.zero_arcsec else 0
         if zero.suspicions < 3:
             return
@@ -374,7 +375,7 @@ class EncoderHealth:
 
 
 def residual_of(model: TransmissionModel) -> float:
-    """What the model left on data that it had not seen, arcsec rms, as its file has it."""
+    """Returns the model's rms residual on held-out data in arcsec, from its file."""
     held_out = model.provenance.get("held_out")
     value = held_out.get("after_arcsec") if isinstance(held_out, dict) else None
     if isinstance(value, int | float) and math.isfinite(value) and value > 0.0:

@@ -1,20 +1,20 @@
-"""Does the model still hold? What was observed over a while, against what the model's intervals allow.
+"""Validity of the model: tests recent observations against the model's confidence intervals.
 
-The observed error less the model's is, if the model holds, noise plus what its parameters may be off by:
+If the model is valid, the observed error minus the predicted one is noise plus the errors of its parameters:
 
-    observed - predicted = columns @ change + zero + its trend + disc of the load encoder + noise
+    observed - predicted = columns @ change + zero + trend of the zero + load encoder disc + noise
 
-with ``change`` drawn from the model file's intervals (where it has none, from those of a usual calibration,
-as `diagnose.changes` has them), and noise of the size that the model left on data that it had not seen (or of
-the motor encoder's counts, where that is more). Three questions, by generalised least squares:
+``change`` has the covariance of the model file's intervals, or of a typical calibration if the file has none
+(as in `diagnose.changes`). The noise is the model's residual on held-out data, or the motor encoder's
+resolution if that is larger. Three tests use generalised least squares:
 
-* has a part of the model moved by more than its interval and the errors of this fit allow (chi square)?
-* has the zero moved since it was learned?
-* is more left, with every part free to move, than the noise allows (chi square)?
+* Has a part of the model changed by more than its interval and the errors of this fit allow (chi square)?
+* Has the zero moved since it was learned?
+* Is the residual, with every part free to change, larger than the noise allows (chi square)?
 
-What counts as a question's yes is set by how often it may be wrong: `Allowed.false_alarms_per_day` is divided
-by the number of questions asked in a day. Observations at one place in one direction are one observation:
-what the axis does not repeat is the noise, and what it repeats there is not known any better by waiting.
+The significance level follows from `Allowed.false_alarms_per_day`, divided by the number of tests per day.
+Observations at one place in one direction count as one: averaging more of them does not reduce the part of
+the error that repeats there.
 """
 
 from __future__ import annotations
@@ -38,89 +38,89 @@ from hdbridge.model import TransmissionModel
 
 DAY_S: Final = 86_400.0
 SPARE: Final = 20
-"""Places that must have been seen in addition to one for each column."""
+"""Places required in addition to one per column."""
 CLEARLY: Final = 0.8
 TREND_ARCSEC: Final = 60.0
-"""What the zero may go by from one end of the observations to their middle."""
+"""Scale of the zero's trend, from the middle of the observations to one end."""
 TOLD: Final = 0.02
-"""Relative change of a parameter from which on it is told."""
+"""Relative change of a parameter above which it is reported."""
 CELL: Final = 0.1
-"""Columns that differ by less are those of one place."""
+"""Rounding of the columns; rows that agree after it are one place."""
 
 
 @dataclass(frozen=True, slots=True)
 class Allowed:
-    """From where on a change is a change."""
+    """Thresholds of the tests."""
 
     false_alarms_per_day: float = 1.0 / 365.0
-    """Of one axis, while its model holds: once a year."""
+    """False alarms per axis with a valid model: one per year."""
     every_s: float = 10.0
-    """How often it is asked."""
+    """Interval between tests."""
     noise: float = 1.5
-    """Noise of a day at work, by that of a calibration."""
+    """Noise in operation relative to that of a calibration."""
     order_arcsec: float = 0.8
-    """Least change of the orders that is one, at the load."""
+    """Smallest change of the orders that counts, at the load."""
     loop_arcsec: float = 1.5
     loop_share: float = 3.0 * Scales().calibrated
-    """The same for a loop: the larger of a size and of this share of what the loop does."""
+    """Smallest change of a hysteresis loop: the larger of ``loop_arcsec`` and this share of the loop."""
     zero_arcsec: float = 5.0
-    """Least change of the zero: the least that a warm-up does (`effects.zero_drift`)."""
+    """Smallest change of the zero that counts: the smallest effect of warming up (`effects.zero_drift`)."""
     left_arcsec: float = 0.5
-    """Least of what no part of the model explains, root mean square, beyond the noise."""
+    """Smallest unexplained residual that counts, rms, in addition to the noise."""
 
 
 class Moved(NamedTuple):
-    """A part of the model that is no longer as it was."""
+    """A part of the model that has changed."""
 
     name: str
-    """Of the effect, or ``zero``."""
+    """Name of the effect, or ``zero``."""
     words: str
-    """What moved from where to where."""
+    """Description of the change."""
     size_arcsec: float
-    """Root mean square of what it does to the error."""
+    """Rms change of the error."""
     within_kind: bool
-    """Whether wear, warmth or age do such a thing; else it is something else that looks like it."""
+    """True if wear, temperature or ageing can cause such a change; else it has another cause."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Evidence:
-    """What a while at work says about the model."""
+    """Result of the tests over the recent operation of an axis."""
 
     places: int
-    """Different places at which the axis was observed."""
+    """Number of distinct places observed."""
     rms_arcsec: float
-    """Difference between measured and predicted error there, about its zero."""
+    """Rms difference of measured and predicted error about its zero."""
     allowed_arcsec: float
-    """The most of that which noise and the model's intervals make."""
+    """Upper limit of that by noise and the model's intervals."""
     left_arcsec: float
-    """What of it is left when every part of the model is free to move."""
+    """Rms residual with every part of the model free to change."""
     left_allowed_arcsec: float
     zero: FloatArray
-    """The zero, arcsec, and the coefficients of the load encoder's disc."""
+    """Zero in arcsec, and the coefficients of the load encoder's disc."""
     moved: tuple[Moved, ...]
 
     @property
     def holds(self) -> bool:
-        """Whether nothing has changed."""
+        """True if no test finds a change."""
         return not self.moved and not self.unexplained
 
     @property
     def clearly_holds(self) -> bool:
-        """Whether nothing is near its limit, either: for a verdict to be withdrawn."""
+        """True if also no value is near its limit, which withdraws a verdict."""
         return self.holds and self.left_arcsec < CLEARLY * self.left_allowed_arcsec
 
     @property
     def unexplained(self) -> bool:
-        """Whether more is left than any change of the model's parts explains."""
+        """True if the residual exceeds what changes of the model's parts explain."""
         return self.left_arcsec > self.left_allowed_arcsec
 
     @property
     def explained(self) -> bool:
-        """Whether a change within the kind of the model's parts is all there is."""
+        """True if the model's parts changed, all within what wear can cause, and nothing else did."""
         return bool(self.moved) and not self.unexplained and all(each.within_kind for each in self.moved)
 
     def words(self) -> str:
-        """With figures."""
+        """Returns the result in words with figures."""
         moved = "; ".join(each.words for each in self.moved) or "no part of the model moved"
         return (
             f"{moved}. Over {self.places} places the load is {self.rms_arcsec:.2f} arcsec rms off the model "
@@ -131,7 +131,7 @@ class Evidence:
 
 
 class Judge:
-    """Judges one model; ``noise_arcsec`` is the standard deviation of an observation."""
+    """Tests one model; ``noise_arcsec`` is the standard deviation of an observation."""
 
     def __init__(self, regressors: Regressors, noise_arcsec: float, allowed: Allowed | None = None) -> None:
         self._regressors = regressors
@@ -150,15 +150,18 @@ class Judge:
         self._bounds = bounds_arcsec(regressors, settings)
         questions = (len(regressors.terms) + 2) * DAY_S / allowed.every_s
         self.alpha = allowed.false_alarms_per_day / questions
-        """Probability of a wrong yes to one question."""
+        """Probability of a false positive in one test."""
 
     @property
     def least_places(self) -> int:
-        """So many places must have been seen."""
+        """Minimum number of places."""
         return self._regressors.count + 1 + SPARE
 
     def judge(self, observations: Sequence[Observation], zero: FloatArray | None) -> Evidence | None:
-        """None where too little was seen. ``zero`` is `Evidence.zero` of then; None: it is not known yet."""
+        """Tests the observations; returns None if they are too few.
+
+        ``zero`` is `Evidence.zero` from when it was learned; None if it is not known yet.
+        """
         if len(observations) < self.least_places:
             return None
         rows, observed = _places(observations)
@@ -188,8 +191,9 @@ class Judge:
     def _fit(
         self, rows: FloatArray, observed: FloatArray, columns: NDArray[np.intp] | slice = slice(None)
     ) -> tuple[FloatArray, FloatArray]:
-        """Change and covariance with every part free to move within what is possible at all; ``columns`` says
-        which of all columns the rows have.
+        """Fits all parts within their possible range; returns the change and its covariance.
+
+        ``columns`` selects the columns that the rows contain.
         """
         scale = np.append(self._scale, TREND_ARCSEC)[columns]
         information = rows.T @ rows / self._noise**2 + np.diag(1.0 / scale**2)
@@ -197,7 +201,7 @@ class Judge:
         return spread @ (rows.T @ observed) / self._noise**2, spread
 
     def _as_calibrated(self, rows: FloatArray, observed: FloatArray) -> tuple[float, float]:
-        """Root mean square about zero and disc, and the most of it that the model's intervals allow."""
+        """Returns the rms about zero and disc, and its upper limit by the model's intervals."""
         zero = self._regressors.zero
         nuisance, followed = rows[:, zero:], rows[:, :zero]
         basis, _ = np.linalg.qr(nuisance)
@@ -209,7 +213,7 @@ class Judge:
         return float(np.sqrt(about @ about / free)), float(np.sqrt(share * (self._noise**2 + allowed)))
 
     def _moved(self, term: Term, rows: FloatArray, change: FloatArray, spread: FloatArray) -> Moved | None:
-        """Whether an effect has moved by more than its interval and this fit's errors."""
+        """Returns the change of an effect, if it exceeds the effect's interval and this fit's errors."""
         at, allowed = term.columns, self._allowed
         own = change[at]
         variance = self._calibrated[at, at] + spread[at, at]
@@ -234,8 +238,9 @@ class Judge:
         return Moved(term.effect.name, _words(self._regressors.model, changed), size, within)
 
     def _zero_moved(self, rows: FloatArray, observed: FloatArray, before: FloatArray) -> Moved | None:
-        """Against the zero that was learned, with the disc of then: over a part of a turn the two are hardly
-        distinguished, but a disc does not change.
+        """Returns the change of the zero against the learned one, if significant.
+
+        The disc is fixed as learned, because over part of a turn it is hardly separable from the zero.
         """
         zero, disc = self._regressors.zero, slice(self._regressors.zero + 1, self._regressors.count)
         known = np.delete(np.arange(rows.shape[1]), np.arange(disc.start, disc.stop))
@@ -248,7 +253,7 @@ class Judge:
 
 
 def _words(before: TransmissionModel, after: TransmissionModel) -> str:
-    """The parameters that have moved most, by their own size."""
+    """Describes the four largest relative changes of parameters."""
     changes = changes_between(before, before, after)
     by = {each: abs(each.after - each.before) / max(abs(each.before), 1e-9) for each in changes}
     most = [each for each in sorted(changes, key=lambda each: -by[each]) if by[each] > TOLD]
@@ -256,7 +261,7 @@ def _words(before: TransmissionModel, after: TransmissionModel) -> str:
 
 
 def _places(observations: Sequence[Observation]) -> tuple[FloatArray, FloatArray]:
-    """Columns and error of each place, the mean of its observations; the last column is time, -1 to 1."""
+    """Returns columns and mean error of each place; the last column is time from -1 to 1."""
     rows = np.array([each.row for each in observations])
     time_s = np.array([each.time_s for each in observations])
     error = np.array([each.error_arcsec for each in observations])

@@ -1,8 +1,7 @@
-"""What the load encoder says beyond the model, of one axis in the loop's samples.
+"""Residual of the model in the loop's samples of one axis.
 
-The model's prediction in a sample is that at the motor angle that was *issued* in that cycle; the encoders
-were read at its SYNC, when the motor was still behind. So the prediction is taken from when the motor's
-present place was issued: earlier by the mean lag.
+The predicted error in a sample is that at the motor angle *issued* in that cycle. The encoders are read at
+its SYNC, when the motor still lags. So the prediction is taken from an earlier time, by the mean lag.
 """
 
 from __future__ import annotations
@@ -22,30 +21,30 @@ from hdbridge.units import ARCSEC_PER_DEG
 BoolArray = NDArray[np.bool_]
 
 DRIVEN: Final = (AxisState.ENABLED, AxisState.STOPPING)
-"""The motor follows the issued targets."""
+"""States in which the motor follows the issued targets."""
 LONGEST_LAG_S: Final = 0.05
-"""A motor that is later than this does not follow."""
+"""Largest lag of a motor that follows."""
 STANDING_DEG_S: Final = 1e-6
-"""Speed of the load target that is rest."""
+"""Speed of the load target below which it is at rest."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Residuals:
-    """Columns of one axis, all of shape (n,)."""
+    """Columns of one axis, each of shape (n,)."""
 
     cycle: NDArray[np.int64]
     time_s: FloatArray
-    """Cycles times the period."""
+    """Cycle number times the period."""
     motor_deg: FloatArray
     load_deg: FloatArray
     velocity_deg_s: FloatArray
-    """Of the load target."""
+    """Velocity of the load target."""
     predicted_arcsec: FloatArray
-    """Transmission error that the model predicts where the motor is."""
+    """Predicted transmission error at the motor's actual position."""
     residual_arcsec: FloatArray
-    """Measured transmission error minus predicted, with the difference of the encoders' zeros in it."""
+    """Measured minus predicted transmission error, including the difference of the encoders' zeros."""
     usable: BoolArray
-    """Fresh, driven, the state of the hysteresis known, no switch between models under way."""
+    """True for fresh samples of a driven axis with known hysteresis state and no model change under way."""
     fresh: BoolArray
 
     def __len__(self) -> int:
@@ -54,16 +53,16 @@ class Residuals:
 
     @property
     def standing(self) -> BoolArray:
-        """Where the load target rests."""
+        """True where the load target is at rest."""
         return np.abs(self.velocity_deg_s) < STANDING_DEG_S
 
     def rows(self, chosen: BoolArray | slice) -> Residuals:
-        """Some of the samples."""
+        """Returns the chosen samples."""
         return Residuals(*(getattr(self, name)[chosen] for name in self.__slots__))
 
 
 def any_of(states: NDArray[np.uint8], wanted: Sequence[AxisState]) -> BoolArray:
-    """Where an axis is in one of these states."""
+    """Returns a mask of the samples in one of these states."""
     found = states == wanted[0]
     for each in wanted[1:]:
         found |= states == each
@@ -71,13 +70,13 @@ def any_of(states: NDArray[np.uint8], wanted: Sequence[AxisState]) -> BoolArray:
 
 
 def joined(parts: Sequence[Residuals]) -> Residuals:
-    """One after the other."""
+    """Returns the concatenation of the parts."""
     names = Residuals.__slots__
     return Residuals(*(np.concatenate([getattr(each, name) for each in parts]) for name in names))
 
 
 def residuals(samples: SampleArray, place: int, ratio: float, period_s: float) -> Residuals:
-    """Of the axis at ``place`` in samples that follow each other; ``ratio`` is the gear's."""
+    """Returns the residuals of the axis at ``place`` in consecutive samples; ``ratio`` is the gear ratio."""
     axis: Any = samples["axes"][:, place]
     cycle = samples["cycle"].astype(np.int64)
     time_s = np.asarray(cycle * period_s, dtype=np.float64)
@@ -100,7 +99,7 @@ def residuals(samples: SampleArray, place: int, ratio: float, period_s: float) -
 
 
 def _lag_s(behind_deg: FloatArray, speed_deg_s: FloatArray, usable: BoolArray) -> float:
-    """How much later the motor is where it was told to be, by least squares over what moves."""
+    """Returns the lag of the motor behind the issued target in seconds, by least squares."""
     behind, speed = behind_deg[usable], speed_deg_s[usable]
     square = float(speed @ speed)
     if not square or not np.all(np.isfinite(behind)):

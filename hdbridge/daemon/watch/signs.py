@@ -1,7 +1,7 @@
-"""Signs by which a fault of the load encoder is told from a change of the gear. Pure functions of arrays.
+"""Signs that distinguish a load encoder fault from a change of the gear. Pure functions of arrays.
 
-A gear's error is tied to its motor: it does not jump while the motor hardly moves, does not stop while the
-motor turns, does not tremble more from one second to the next, and does not run away while the axis rests.
+A gear's error depends on its motor: it does not jump while the motor hardly moves, does not stay constant
+while the motor turns, does not become noisier within a second, and does not drift while the axis rests.
 """
 
 from __future__ import annotations
@@ -16,30 +16,31 @@ from hdbridge.effects import FloatArray
 from hdbridge.units import ARCSEC_PER_DEG
 
 SIDE = 5
-"""Samples on either side of a jump; their medians do not see two misread ones."""
+"""Samples on either side of a jump; their median ignores two misread ones."""
 _MEDIAN = 1.25
-"""Deviation of a median of few, by that of a mean."""
+"""Standard deviation of a median of few values, relative to that of their mean."""
 PREDICTED_SHARE = 0.5
-"""Of what the model says changes meanwhile, so much may be said too early or too late."""
+"""Share of the predicted change within a window that may appear too early or too late."""
 UNMODELLED_ARCSEC = 20.0
 UNMODELLED_DEG = 36.0
-"""So much the gear's error may change over so much travel of the motor, or more, in a way that no model says:
-ten times per turn by 10 arcsec to either side (`effects.motor_order` is 3 at most)."""
+"""Largest unmodelled change of the gear's error over this or a longer motor travel: an order of 10 per turn
+with an amplitude of 10 arcsec (`effects.motor_order` is at most 3).
+"""
 SHAKE_S = 0.002
-"""A change of speed may show in the error as so much time: wind-up, and the skew between two encoders."""
+"""Time by which a speed change may show in the error, through wind-up and skew between the encoders."""
 
 
 _DIFFERENCES = 1.0 / (0.6745 * np.sqrt(2.0))
 STEP_ARCSEC = 6.0
 STEP_SIGMAS = 8.0
 STEP_BLOCKS = 20
-"""Blocks on either side of a step of the zero."""
+"""Minimum number of blocks on either side of a step of the zero."""
 STEP_BETTER = 0.6
-"""Mean square that a step leaves, by that of a trend."""
+"""Largest ratio of the mean squares left by a step and by a trend."""
 
 
 class Jump(NamedTuple):
-    """Where the residual steps, and by how much."""
+    """A step of the residual."""
 
     row: int
     by_arcsec: float
@@ -47,10 +48,10 @@ class Jump(NamedTuple):
 
 
 def find_jump(found: Residuals, noise_arcsec: float, count_arcsec: float, sigmas: float) -> Jump | None:
-    """The first step of the residual that neither noise nor motor nor model can have made.
+    """Returns the first step of the residual that neither noise nor motion nor model can cause.
 
-    ``noise_arcsec`` is the standard deviation of one reading, ``count_arcsec`` one count of the motor encoder
-    at the load.
+    ``noise_arcsec`` is the standard deviation of one reading, ``count_arcsec`` a motor encoder count at the
+    load.
     """
     span = 2 * SIDE
     if len(found) < span:
@@ -70,14 +71,14 @@ def find_jump(found: Residuals, noise_arcsec: float, count_arcsec: float, sigmas
     rows = np.flatnonzero(together & (np.abs(step) > allowed))
     if not len(rows):
         return None
-    # Several windows see one step; the one in the middle of it sees most of it.
+    # Several windows contain the step; the one centred on it shows it best.
     near = rows[rows < rows[0] + span]
     row = int(near[np.argmax(np.abs(step[near]))])
     return Jump(row + SIDE, float(step[row]), float(allowed[row]))
 
 
 def misread(found: Residuals, noise_arcsec: float, count_arcsec: float, sigmas: float) -> int:
-    """How many samples are elsewhere, and back with the next one or two."""
+    """Returns the number of samples that jump away and return with the next one or two."""
     if len(found) < SIDE:
         return 0
     middle = slice(SIDE // 2, len(found) - SIDE // 2)
@@ -93,39 +94,39 @@ _Any = TypeVar("_Any", np.bool_, np.float64)
 
 
 def _windows(values: NDArray[_Any], width: int) -> NDArray[_Any]:
-    """Shape (..., width, windows). A copy: on batches of a few dozen samples, a view takes longer to make."""
+    """Returns a copy of all windows, shape (..., width, windows); faster than a view of short batches."""
     return values[..., np.arange(width)[:, None] + np.arange(values.shape[-1] - width + 1)]
 
 
 def _median(values: FloatArray) -> FloatArray:
-    """Of the `SIDE` samples from each one on."""
+    """Returns the median of each window of `SIDE` samples."""
     return np.asarray(np.sort(_windows(values, SIDE), axis=0)[SIDE // 2])
 
 
 def _spans(width: int, *columns: FloatArray) -> FloatArray:
-    """From the smallest to the largest of so many samples, one row for each column."""
+    """Returns the range of each column (row of the result) in each window."""
     windows = _windows(np.array(columns), width)
     return np.asarray(windows.max(axis=1) - windows.min(axis=1))
 
 
 def local_noise_arcsec(found: Residuals) -> float:
-    """Standard deviation of one reading, by the median change from one to the next: a jump is one of many."""
+    """Returns the standard deviation of one reading, by the median difference of neighbours."""
     steps = np.abs(found.residual_arcsec[1:] - found.residual_arcsec[:-1])
     return float(_DIFFERENCES * np.median(steps)) if len(steps) else 0.0
 
 
 class Trend(NamedTuple):
-    """How the zero of the residual goes on, with the direction of motion and the speed taken out."""
+    """Trend of the residual's zero, corrected for direction and speed of motion."""
 
     rate_arcsec_min: float
     error_arcsec_min: float
-    """Standard error, which allows for noise that is not white."""
+    """Standard error, allowing for coloured noise."""
     zero_arcsec: float
-    """In the middle of the time."""
+    """Zero in the middle of the time span."""
 
 
 class Step(NamedTuple):
-    """Where the zero of the residual is another from one block to the next."""
+    """Step of the residual's zero between two blocks."""
 
     time_s: float
     by_arcsec: float
@@ -135,7 +136,7 @@ class Step(NamedTuple):
 def trend(
     time_s: FloatArray, residual_arcsec: FloatArray, direction: FloatArray, velocity_deg_s: FloatArray
 ) -> Trend | None:
-    """Least squares of block means on time; None where there are too few to tell."""
+    """Fits a trend to block means by least squares; returns None for too few blocks."""
     minutes = (time_s - float(np.mean(time_s))) / 60.0
     design = np.column_stack([minutes, _plain(direction, velocity_deg_s)])
     fitted = _fit(design, residual_arcsec)
@@ -148,7 +149,7 @@ def trend(
 def find_step(
     time_s: FloatArray, residual_arcsec: FloatArray, direction: FloatArray, velocity_deg_s: FloatArray
 ) -> Step | None:
-    """The place where block means step, if a step explains them far better than a trend does."""
+    """Returns the step in the block means, if a step fits far better than a trend."""
     plain = _plain(direction, velocity_deg_s)
     basis, _ = np.linalg.qr(plain)
     rest = residual_arcsec - basis @ (basis.T @ residual_arcsec)
@@ -161,7 +162,7 @@ def find_step(
     if not len(likely):
         return None
     row = int(np.argmax(likely)) + STEP_BLOCKS + 1
-    # With a trend in both: a ramp that begins or ends is no step.
+    # Both fits include a trend, because a ramp that begins or ends is not a step.
     trended = np.column_stack([time_s - time_s[0], plain])
     stepped = _fit(np.column_stack([np.arange(count) >= row, trended]), residual_arcsec)
     sloping = _fit(trended, residual_arcsec)
@@ -175,7 +176,7 @@ def find_step(
 
 
 def _plain(direction: FloatArray, velocity_deg_s: FloatArray) -> FloatArray:
-    """What a zero is told beside: a constant, and what goes with the direction and the speed."""
+    """Returns the other columns of the fit: a constant, the direction and the speed."""
     columns = [np.ones(len(direction))]
     for each in (direction, velocity_deg_s):
         size = float(np.ptp(each))
@@ -185,7 +186,7 @@ def _plain(direction: FloatArray, velocity_deg_s: FloatArray) -> FloatArray:
 
 
 def _fit(design: FloatArray, values: FloatArray) -> tuple[FloatArray, float, float] | None:
-    """Solution, mean square left, and standard error of the first one; None where it cannot be told."""
+    """Returns solution, mean square left and standard error of the first coefficient; None if singular."""
     free = len(values) - design.shape[1]
     if free < 10:
         return None
@@ -202,8 +203,9 @@ def _fit(design: FloatArray, values: FloatArray) -> tuple[FloatArray, float, flo
 
 
 def stuck_arcsec(load_deg: FloatArray, motor_deg: FloatArray, ratio: float) -> tuple[int, float]:
-    """The last row at which the load's reading changed (0: not at all), and how far the motor has gone since,
-    arcsec at the load.
+    """Returns the last row at which the load reading changed (0 if none), and the motor travel since.
+
+    The travel is in arcsec at the load.
     """
     changed = np.flatnonzero(np.diff(load_deg) != 0.0)
     since = int(changed[-1]) + 1 if len(changed) else 0

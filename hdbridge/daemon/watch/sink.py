@@ -1,4 +1,4 @@
-"""The watches of a machine's axes behind the service's observer: a thread that takes samples and tells."""
+"""Watches of a machine's axes: a sink of the observer with a thread that evaluates samples."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ if TYPE_CHECKING:
     from hdbridge.daemon.recorder.recorder import FlightRecorder
 
 QUEUE_BATCHES: Final = 500
-"""Ten seconds of the observer's batches."""
+"""Capacity of the queue: ten seconds of batches."""
 BAD: Final = frozenset({Verdict.RECALIBRATE, Verdict.SOMETHING_CHANGED})
-"""What is diagnosed."""
+"""Verdicts that start a diagnosis."""
 _log = logging.getLogger(__name__)
 
 
@@ -36,7 +36,7 @@ class _Use(NamedTuple):
 
 
 class WatchSink:
-    """Takes what the observer hands on, and never blocks; what its thread is too slow for it does without."""
+    """Sink of the observer. It never blocks; samples are lost if its thread is too slow."""
 
     def __init__(
         self,
@@ -46,9 +46,9 @@ class WatchSink:
         diagnose: Callable[[Raised, TransmissionModel], object] = lambda *_: None,
         ending: Callable[[], None] = lambda: None,
     ) -> None:
-        """``watches`` in the order of the axes in a sample; ``ending`` is called by `close`.
+        """``watches`` are in the order of the axes in a sample; `close` calls ``ending``.
 
-        ``tell``, and ``diagnose`` when a verdict is `BAD`, are called in the watch's thread.
+        ``tell``, and ``diagnose`` for a verdict in `BAD`, are called in the watch's thread.
         """
         self._watches = tuple(watches)
         self._tell = tell
@@ -63,9 +63,9 @@ class WatchSink:
 
     @classmethod
     def of(cls, machine: Machine, tell: Callable[[str, int], None], recorder: FlightRecorder | None) -> Self:
-        """All axes of a machine; ``tell`` gets words and the index of the axis, in another thread.
+        """Creates the watches of a machine's axes; ``tell`` gets text and axis index, in another thread.
 
-        With a recorder every verdict is recorded, and a bad one diagnosed from its recordings.
+        With a recorder, every verdict is recorded and a bad one is diagnosed from its recordings.
         """
         places = {each.name: place for place, each in enumerate(machine.axes)}
         settings = WatchSettings()
@@ -96,7 +96,7 @@ class WatchSink:
         )
 
     def take(self, samples: SampleArray, events: Sequence[Event], lost: int) -> None:
-        """From the observer."""
+        """Takes samples from the observer."""
         try:
             self._queue.put_nowait(_Batch(samples, lost + self._missed))
             self._missed = 0
@@ -104,16 +104,16 @@ class WatchSink:
             self._missed += len(samples) + lost
 
     def use(self, place: int, model: TransmissionModel) -> None:
-        """Another model predicts on the axis at ``place`` from now on."""
+        """Uses another model for the axis at ``place`` from now on."""
         self._uses.append(_Use(place, model))
 
     def advice(self, axis: str) -> list[str]:
-        """What a person should know of an axis; empty while its model holds."""
+        """Returns the advice for an axis; empty while its model is valid."""
         words = self._words.get(axis)
         return [words] if words else []
 
     def close(self) -> None:
-        """End the thread when it has taken what waits, and what it has started."""
+        """Ends the thread after it has taken the waiting samples, and a running diagnosis."""
         self._queue.put(None)
         self._thread.join()
         self._ending()

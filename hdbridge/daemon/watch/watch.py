@@ -1,7 +1,8 @@
-"""The load-encoder watch of one axis: samples in, verdicts out. No thread, no file, no clock.
+"""Load-encoder watch of one axis: turns samples into verdicts. Uses no thread, file or clock.
 
-A verdict is raised when the evidence for it has lasted, and withdrawn when it has been gone for longer: one
-bad second, or one move, raises nothing. While the load encoder is not believed nothing is said of the gear.
+A verdict is raised when its evidence has persisted, and withdrawn when the evidence has been absent for
+longer, so one bad second or move raises nothing. There are no verdicts about the gear while the load encoder
+is not believed.
 """
 
 from __future__ import annotations
@@ -25,54 +26,54 @@ from hdbridge.effects import FloatArray
 from hdbridge.model import TransmissionModel
 
 OBSERVATIONS: Final = 600
-"""Stands and stretches that are looked at together, at most."""
+"""Maximum number of observations (standstills and stretches of slow motion) evaluated together."""
 UNIFORM: Final = 12.0**0.5
 
 
 class Verdict(Enum):
-    """What the watch has to say of an axis."""
+    """Verdict of the watch on an axis."""
 
     HOLDS = "the model holds"
     RECALIBRATE = "recalibrate"
-    """Parts of the model have moved as wear, warmth or age move them: a calibration mends it."""
+    """Parts of the model have changed as by wear, temperature or ageing; a calibration corrects this."""
     SOMETHING_CHANGED = "something changed"
-    """No such change explains what is measured: diagnose it."""
+    """No such change explains the measurements; a diagnosis is needed."""
     ENCODER = "the load encoder is not believed"
 
 
 class Raised(NamedTuple):
-    """A verdict that is new."""
+    """A new verdict."""
 
     time_s: float
-    """Of the loop: cycles times the period."""
+    """Loop time: cycle number times the period."""
     axis: str
     verdict: Verdict
     text: str
-    """The evidence in words, with figures."""
+    """Evidence in words with figures."""
 
     @property
     def words(self) -> str:
-        """Verdict and evidence."""
+        """Verdict and evidence in words."""
         return f"{self.verdict.value}: {self.text}" if self.text else self.verdict.value
 
 
 @dataclass(frozen=True, slots=True)
 class WatchSettings:
-    """How long evidence is gathered, and how long it must last."""
+    """Duration for which evidence is gathered and must persist."""
 
     window_s: float = 900.0
-    """What is older does not count."""
+    """Maximum age of an observation."""
     raise_s: float = 60.0
-    """For so long must the evidence stand."""
+    """Time for which evidence must persist before a verdict is raised."""
     withdraw_s: float = 300.0
-    """... and for so long be gone."""
+    """Time without evidence after which a verdict is withdrawn."""
     slow_deg_s: float = 0.5
-    """Load speed up to which motion is looked at; of faster moves only the stands are."""
+    """Highest load speed at which motion is evaluated; of faster moves only standstills count."""
     allowed: Allowed = Allowed()
 
 
 class _Steady:
-    """A verdict that changes only when another has lasted."""
+    """Debounced verdict, which changes only when another one has persisted."""
 
     def __init__(self, settings: WatchSettings) -> None:
         self._settings = settings
@@ -81,7 +82,7 @@ class _Steady:
         self._lasted_s = 0.0
 
     def take(self, verdict: Verdict, passed_s: float) -> bool:
-        """The evidence now, and the time since the last; whether the verdict has become this one."""
+        """Takes the present verdict and the time since the last; returns True when it is adopted."""
         if verdict is self.verdict:
             self._other, self._lasted_s = verdict, 0.0
             return False
@@ -96,7 +97,7 @@ class _Steady:
 
 
 class Watch:
-    """One axis."""
+    """Watch of one axis."""
 
     def __init__(
         self,
@@ -105,14 +106,14 @@ class Watch:
         place: int = 0,
         settings: WatchSettings | None = None,
     ) -> None:
-        """``place`` is the axis's index in a sample; ``model`` is the one that predicts."""
+        """``place`` is the axis's index in a sample; ``model`` predicts its error."""
         self._axis = axis
         self._place = place
         self._settings = settings or WatchSettings()
         self._period_s = axis.drive.cycle_s
         self.health = EncoderHealth(axis, model, place)
         self.evidence: Evidence | None = None
-        """The last; None until enough was seen."""
+        """Last evidence; None until enough observations exist."""
         self._steady = _Steady(self._settings)
         self._believed = True
         self._zero: FloatArray | None = None
@@ -120,31 +121,31 @@ class Watch:
 
     @property
     def axis(self) -> str:
-        """Its name."""
+        """Name of the axis."""
         return self._axis.name
 
     @property
     def model(self) -> TransmissionModel:
-        """Which is watched."""
+        """Model that is watched."""
         return self._model
 
     @property
     def verdict(self) -> Verdict:
-        """At present."""
+        """Present verdict."""
         return self._steady.verdict if self._believed else Verdict.ENCODER
 
     def use(self, model: TransmissionModel) -> None:
-        """Another model predicts from now on: what was seen under the old one says nothing of it."""
+        """Uses another model from now on; discards observations made with the old one."""
         self.health.use(model)
         self._steady = _Steady(self._settings)
         self._start(model)
 
     def lost(self) -> None:
-        """Cycles were lost: the path between is not known."""
+        """Restarts the path after lost cycles."""
         self._measuring.restart()
 
     def take(self, samples: SampleArray) -> list[Raised]:
-        """Judge the next samples, oldest first; the verdicts that are new."""
+        """Judges the next samples, oldest first; returns new verdicts."""
         if not len(samples):
             return []
         judgement = self.health.take(samples)
@@ -198,7 +199,7 @@ class Watch:
         self._judged_s = self._now_s
         while self._seen and not 0.0 <= self._now_s - self._seen[0].time_s <= self._settings.window_s:
             self._seen.popleft()
-        # An axis that rests says nothing new, and one that was never calibrated has not changed.
+        # An axis at rest gives no new evidence, and an uncalibrated one has no model to test.
         if not self._fresh or not self._believed or not self._model.effects:
             return []
         self._fresh = 0
@@ -213,7 +214,7 @@ class Watch:
         return []
 
     def _now(self, evidence: Evidence) -> Verdict:
-        """What the evidence says; near a limit what was said before."""
+        """Returns the verdict of the evidence; near a limit the present one."""
         if evidence.holds:
             return Verdict.HOLDS if evidence.clearly_holds else self._steady.verdict
         return Verdict.RECALIBRATE if evidence.explained else Verdict.SOMETHING_CHANGED

@@ -1,1 +1,1 @@
-"""What may be asked: one file per subject; each makes a router over the `Bridge` that it is given."""
+"""Routes of the API, one file per subject; each creates a router over a `Bridge`."""

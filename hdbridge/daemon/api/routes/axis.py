@@ -1,4 +1,4 @@
-"""One axis: look, power, move, stop, compensate, objects of the drive."""
+"""Routes of one axis: state, power, motion, stop, compensation, objects of the drive."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from hdbridge.evaluation.stepping import Scheme
 
 
 def axis_routes(bridge: Bridge) -> APIRouter:
-    """Every route below ``/axes/{axis}`` but stream and jobs."""
+    """Returns all routes below ``/axes/{axis}`` except stream and jobs."""
     routes = APIRouter(prefix="/axes/{axis}")
     _add_power(routes, bridge)
     _add_motion(routes, bridge)
@@ -33,26 +33,26 @@ def axis_routes(bridge: Bridge) -> APIRouter:
 def _add_power(routes: APIRouter, bridge: Bridge) -> None:
     @routes.get("", tags=["Look"], responses=refusals(LOOKING))
     async def get_axis(axis: AxisName) -> messages.AxisState:
-        """Tell everything about an axis at the newest cycle."""
+        """Report the state of an axis in the newest cycle."""
         return port(bridge, axis).state()
 
     @routes.post("/enable", tags=["Power"], responses=refusals(MOVING))
     async def enable(axis: AxisName, request: Request, holder: Holder = "") -> messages.AxisState:
-        """Switch power on, standing still; the drive is booted and verified first where it is not."""
+        """Switch power on at rest; the drive is booted and verified first if that was not done."""
         found = port(bridge, axis)
         await kept(bridge, holder, request, found.enable(holder))
         return found.state()
 
     @routes.post("/disable", tags=["Power"], responses=refusals(MOVING))
     async def disable(axis: AxisName, request: Request, holder: Holder = "") -> messages.AxisState:
-        """Brake to rest, then switch power off. What hangs on the axis needs a brake."""
+        """Brake to rest, then switch power off. A suspended load needs a brake."""
         found = port(bridge, axis)
         await kept(bridge, holder, request, found.disable(holder))
         return found.state()
 
     @routes.post("/reset", tags=["Power"], responses=refusals(MOVING))
     async def reset(axis: AxisName, request: Request, holder: Holder = "") -> messages.AxisState:
-        """Release a latched stop; the drive is verified again where that is due. It stays disabled."""
+        """Release a latched stop; the drive is verified again if necessary. It stays disabled."""
         found = port(bridge, axis)
         await kept(bridge, holder, request, found.reset(holder))
         return found.state()
@@ -67,7 +67,7 @@ def _add_power(routes: APIRouter, bridge: Bridge) -> None:
 
     @routes.post("/stop", tags=["Stop"], responses=refusals(STOPPING))
     async def stop(axis: AxisName) -> messages.AxisState:
-        """Brake to rest within the limits, stay enabled; ends jog, queue, stream, job. Needs no lease."""
+        """Brake to rest and stay enabled; ends jog, queue, stream and job. Needs no lease."""
         found = port(bridge, axis)
         await found.stop()
         return found.state()
@@ -78,7 +78,7 @@ def _add_motion(routes: APIRouter, bridge: Bridge) -> None:
     async def home(
         axis: AxisName, home: messages.Home, request: Request, holder: Holder = ""
     ) -> messages.AxisState:
-        """Home by a method of the drive's own, from disabled; it is disabled again afterwards."""
+        """Home by a method of the drive, disabled before and after."""
         found = port(bridge, axis)
         await kept(bridge, holder, request, found.home(holder, **home.model_dump()))
         return found.state()
@@ -87,7 +87,7 @@ def _add_motion(routes: APIRouter, bridge: Bridge) -> None:
     async def move(
         axis: AxisName, move: messages.Move, request: Request, holder: Holder = ""
     ) -> messages.AxisState:
-        """Go to a load angle, jerk-limited; an axis in motion is re-targeted without a stop."""
+        """Move to a load angle, jerk-limited; a present motion is redirected without a stop."""
         found = port(bridge, axis)
         await kept(bridge, holder, request, found.move(holder, **move.model_dump()))
         return found.state()
@@ -108,7 +108,7 @@ def _add_motion(routes: APIRouter, bridge: Bridge) -> None:
 
     @routes.delete("/queue", tags=["Move"], responses=refusals(MOVING))
     async def clear_queue(axis: AxisName, holder: Holder = "") -> messages.AxisState:
-        """Forget the way points that have not begun; the present motion goes to its end."""
+        """Discard the waiting way points; the present motion continues."""
         found = port(bridge, axis)
         await found.clear_queue(holder)
         return found.state()
@@ -119,7 +119,7 @@ def _add_compensation(routes: APIRouter, bridge: Bridge) -> None:
     async def compensate(
         axis: AxisName, compensate: messages.Compensate, holder: Holder = ""
     ) -> messages.AxisState:
-        """Compensate by this part of the model from now on; the change is ramped, also in motion."""
+        """Select the part of the model that compensates; the change is ramped, also during motion."""
         found = port(bridge, axis)
         await found.compensate(holder, Scheme(compensate.scheme.value))
         return found.state()
@@ -128,7 +128,7 @@ def _add_compensation(routes: APIRouter, bridge: Bridge) -> None:
     async def activate_model(
         axis: AxisName, model: messages.ActivateModel, holder: Holder = ""
     ) -> messages.AxisState:
-        """Make another model of the axis's history the active one; the change is ramped, also in motion."""
+        """Activate another model of the axis's history; the change is ramped, also during motion."""
         found = port(bridge, axis)
         await found.activate_model(holder, model.version)
         return found.state()
@@ -137,21 +137,21 @@ def _add_compensation(routes: APIRouter, bridge: Bridge) -> None:
     async def switch_load_loop(
         axis: AxisName, loop: messages.SwitchLoadLoop, holder: Holder = ""
     ) -> messages.AxisState:
-        """Switch the slow integral of the measured error on or off."""
+        """Switch the load loop, a slow integral of the measured error, on or off."""
         found = port(bridge, axis)
         await bridge.load_loop(holder, axis, loop.on)
         return found.state()
 
     @routes.post("/adaptation", tags=["Compensate"], responses=refusals(MOVING))
     async def adapt(axis: AxisName, adapt: messages.Adapt, holder: Holder = "") -> messages.AxisState:
-        """Let parameters follow the load encoder, only observe what would change, or neither."""
+        """Set the adaptation mode: apply changes of parameters, only report them, or neither."""
         found = port(bridge, axis)
         await bridge.adapt(holder, axis, adapt.mode)
         return found.state()
 
     @routes.delete("/adaptation", tags=["Compensate"], responses=refusals(MOVING))
     async def take_adaptation_back(axis: AxisName, holder: Holder = "") -> messages.AxisState:
-        """Take back what the adaptation changed since the model was activated."""
+        """Discard the changes by the adaptation since the model was activated."""
         found = port(bridge, axis)
         await bridge.adaptation_back(holder, axis)
         return found.state()
@@ -160,7 +160,7 @@ def _add_compensation(routes: APIRouter, bridge: Bridge) -> None:
 def _add_objects(routes: APIRouter, bridge: Bridge) -> None:
     @routes.get("/objects/{name:path}", tags=["Drive"], responses=refusals((*LOOKING, 409, 502, 503)))
     async def read_object(axis: AxisName, name: str) -> messages.SdoValue:
-        """Read an object of the drive by SDO: its number (6064h, 0x1018:4) or its name in the EDS."""
+        """Read an object of the drive by SDO, by its number (6064h, 0x1018:4) or its EDS name."""
         found, value = await port(bridge, axis).sdo_read(name)
         return messages.SdoValue(
             index=found.index, subindex=found.sub, name=found.name, type=found.type_name, value=value

@@ -1,4 +1,4 @@
-"""The machine as a whole: state, events, lease, all axes at once, jobs, remarks."""
+"""Routes of the machine: state, events, lease, motion of all axes, jobs, remarks."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from hdbridge.drive.interfacelock import user_name
 
 
 def machine_routes(bridge: Bridge) -> APIRouter:
-    """Every route that is of no single axis, and the jobs."""
+    """Returns the routes that concern no single axis, and those of jobs."""
     routes = APIRouter()
     _add_looking(routes, bridge)
     _add_lease(routes, bridge)
@@ -36,7 +36,7 @@ def machine_routes(bridge: Bridge) -> APIRouter:
 def _add_looking(routes: APIRouter, bridge: Bridge) -> None:
     @routes.get("/state", tags=["Look"])
     async def get_state() -> messages.MachineState:
-        """Tell everything about the machine and its axes at the newest cycle."""
+        """Report the state of the machine and its axes in the newest cycle."""
         return bridge.state()
 
     @routes.get("/events", tags=["Look"], responses=refusals((422,)))
@@ -45,12 +45,12 @@ def _add_looking(routes: APIRouter, bridge: Bridge) -> None:
             int, Query(ge=0, le=2**53, description="number of the newest event that is known already")
         ] = 0,
     ) -> messages.Events:
-        """Tell what happened since an event; 0 for all that is kept."""
+        """Report the events after a number; 0 for all that are kept."""
         return bridge.events(since)
 
     @routes.post("/mark", tags=["Look"], responses=refusals((400, 422)))
     async def mark(mark: messages.Mark) -> messages.Events:
-        """Write a remark into the flight recorder at the present cycle. Needs no lease."""
+        """Add a remark to the flight recorder at the present cycle. Needs no lease."""
         before = bridge.events(0).newest
         bridge.mark(mark.text)
         return bridge.events(before)
@@ -62,25 +62,25 @@ def _add_lease(routes: APIRouter, bridge: Bridge) -> None:
 
     @routes.get("/lease", tags=["Lease"])
     async def get_lease() -> messages.LeaseState:
-        """Tell who has the right to move."""
+        """Report the state of the lease."""
         return state()
 
     @routes.post("/lease", tags=["Lease"], status_code=201, responses=refusals((400, 422, 423)))
     async def take_lease(wanted: messages.LeaseRequest, request: Request) -> messages.LeaseGrant:
-        """Take the right to move. It lasts while it is used, or renewed; 423 says who has it."""
+        """Take the lease. It lasts while it is used or renewed; 423 names its present holder."""
         client = _who(request, wanted.client.strip())
         token = bridge.lease.take(client, force=wanted.force)
         return messages.LeaseGrant(token=token, client=client, timeout_s=bridge.lease.timeout_s)
 
     @routes.put("/lease", tags=["Lease"], responses=refusals((422, 423)))
     async def renew_lease(holder: Holder = "") -> messages.LeaseState:
-        """Keep the right to move although nothing is moved now."""
+        """Renew the lease without a motion."""
         bridge.lease.renew(holder)
         return state()
 
     @routes.delete("/lease", tags=["Lease"], responses=refusals((422, 423)))
     async def release_lease(holder: Holder = "") -> messages.LeaseState:
-        """Give the right to move back. Jog, stream and queue end in a stop; a move goes to its end."""
+        """Release the lease. Jog, stream and queue are stopped; a move is completed."""
         bridge.lease.release(holder)
         return state()
 
@@ -121,29 +121,29 @@ def _add_jobs(routes: APIRouter, bridge: Bridge) -> None:
 
     @routes.get("/jobs", tags=["Jobs"])
     async def get_jobs() -> list[messages.Job]:
-        """List the procedures that run or ran since the service began, newest last."""
+        """List the running jobs and the last finished ones, newest last."""
         return bridge.jobs()
 
     @routes.get("/jobs/{job_id}", tags=["Jobs"], responses=refusals(LOOKING))
     async def get_job(job_id: str) -> messages.Job:
-        """Tell how far a procedure is, and its result."""
+        """Report the progress and result of a job."""
         return job(job_id)
 
     @routes.delete("/jobs/{job_id}", tags=["Jobs"], responses=refusals(MOVING))
     async def cancel_job(job_id: str, holder: Holder = "") -> messages.Job:
-        """Stop a procedure's axis in order; what it has measured is kept."""
+        """Cancel a job: its axis brakes to rest, its measurements are kept."""
         job(job_id)
         await bridge.cancel_job(holder, job_id)
         return job(job_id)
 
     @routes.post("/axes/{axis}/jobs", tags=["Jobs"], status_code=201, responses=refusals(MOVING))
     async def start_job(axis: AxisName, wanted: messages.JobRequest, holder: Holder = "") -> messages.Job:
-        """Start a procedure on an axis: step, calibrate or improve. It answers at once."""
+        """Start a job on an axis: step, calibrate or improve. Answers at once."""
         return await port(bridge, axis).job(holder, wanted.kind, wanted.options)
 
 
 def _who(request: Request, name: str) -> str:
-    """Name that a client gives, with its user and process, which the kernel reports on a Unix socket."""
+    """Returns the client's name with its user and process, which the kernel reports on a Unix socket."""
     peer, number = request.client or ("a client", 0)
     if not peer.startswith("uid="):
         return name or f"{peer}:{number}"

@@ -1,4 +1,4 @@
-"""What several routes share: the lease's header, how errors are described, a request that is waited for."""
+"""Shared parts of the routes: the lease header, descriptions of errors, waiting for a motion."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from hdbridge.errors import LeaseError
 
 T = TypeVar("T")
 RENEWALS: Final = 3
-"""How often a lease is renewed within its time-out while a request of its holder is waited for."""
+"""Renewals per time-out of the lease while a request of its holder is waited for."""
 
 STOP_LOOKS: Final = 25
 STOP_LOOK_S: Final = 0.01
@@ -30,17 +30,17 @@ Holder = Annotated[
         examples=["mZ3sWJx0b0lq"],
     ),
 ]
-"""Missing it is empty, which is nobody's token."""
+"""Lease token; empty if missing, which is never valid."""
 AxisName = Annotated[str, Path(description="name of the axis, as in its file", examples=["joint-3"])]
 
 _WORDS: Final = {
-    400: "The body is no JSON, or nests too deep",
+    400: "The body is not JSON, or nests too deeply",
     404: "There is no such axis, job or object",
-    409: "Not in this state: not enabled, busy, or stopped by the supervision",
-    422: "A value is missing, not a number, out of its range or outside the axis's limits; nothing moved",
-    423: "The right to move is not yours; who has it is said",
-    502: "The drive refused, or does not answer",
-    503: "The bus is not there",
+    409: "Not possible in this state: not enabled, busy, or stopped by the supervision",
+    422: "A value is missing, not a number or outside its range or the axis's limits; nothing moved",
+    423: "Another client holds the lease, or nobody does; the answer names the holder",
+    502: "The drive refused the request or does not answer",
+    503: "The bus is not available",
 }
 LOOKING: Final = (404, 422)
 MOVING: Final = (400, 404, 409, 422, 423, 502, 503)
@@ -48,12 +48,12 @@ STOPPING: Final = (404, 409, 422, 502, 503)
 
 
 def refusals(statuses: tuple[int, ...]) -> dict[int | str, dict[str, Any]]:
-    """The errors that a route documents."""
+    """Returns the documentation of a route's errors."""
     return {each: {"model": Problem, "description": _WORDS[each]} for each in statuses}
 
 
 def port(bridge: Bridge, axis: str) -> AxisPort:
-    """The axis of that name; 404 where there is none."""
+    """Returns the axis of this name; raises UnknownError (404) if there is none."""
     found = bridge.axes.get(axis)
     if found is None:
         raise UnknownError(f"there is no axis {axis[:80]!a}; expected one of: {', '.join(bridge.axes)}")
@@ -61,7 +61,7 @@ def port(bridge: Bridge, axis: str) -> AxisPort:
 
 
 async def stopped(*axes: AxisPort) -> None:
-    """Wait for a quick stop to show in the axes' states, for a moment: their samples come in batches."""
+    """Waits briefly until a quick stop shows in the axes' states, because samples arrive in batches."""
     for _ in range(STOP_LOOKS):
         if all(each.state().state not in _ON for each in axes):
             return
@@ -69,9 +69,9 @@ async def stopped(*axes: AxisPort) -> None:
 
 
 async def kept(bridge: Bridge, holder: str, request: Request, motion: Awaitable[T]) -> T:
-    """Wait for a motion; its holder keeps the lease meanwhile, unless the client goes away.
+    """Waits for a motion and renews its holder's lease meanwhile, unless the client disconnects.
 
-    The motion itself goes to its end in any case.
+    The motion itself completes in any case.
     """
 
     async def renew() -> None:

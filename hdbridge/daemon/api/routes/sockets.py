@@ -1,7 +1,7 @@
-"""The two WebSockets: samples as they come, and streamed set-points.
+"""WebSockets for live samples and for streamed set-points.
 
-A client that is slow costs nothing: of samples it gets the newest and is told how many it lost; of set-points
-no more are taken than the buffer has room for.
+A slow client does not slow down the daemon: it gets the newest samples and the number lost, and its
+set-points are accepted only as the buffer empties.
 """
 
 from __future__ import annotations
@@ -22,32 +22,32 @@ from hdbridge.errors import HdbridgeError, InputError
 M = TypeVar("M", bound=BaseModel)
 BATCH_S: Final = 0.05
 SEND_S: Final = 30.0
-"""A client that has not read for so long is gone."""
+"""Time-out for sending to a client."""
 BEGIN_S: Final = 10.0
-"""Time in which a stream says what it wants."""
+"""Time-out for the first message of a stream."""
 _REASON_MAXIMUM: Final = 120
-"""Bytes of the reason that a WebSocket is closed with: 123 by RFC 6455."""
+"""Maximum length in bytes of a WebSocket's close reason; RFC 6455 permits 123."""
 _NOT_VALID: Final = 1008
 _NEWEST: Final = 2**62
-"""Later than any event."""
+"""Number later than any event."""
 _NORMAL: Final = 1000
 _GONE: Final = 1006
 
 
 def socket_routes(bridge: Bridge) -> APIRouter:
-    """``/live`` and ``/axes/{axis}/stream``."""
+    """Returns the routes ``/live`` and ``/axes/{axis}/stream``."""
     routes = APIRouter()
 
     @routes.websocket("/live")
     async def live(websocket: WebSocket) -> None:
-        """Samples in batches; the client may say which at any time (`LiveOptions`)."""
+        """Sends samples in batches; the client may change its `LiveOptions` at any time."""
         await _accept(websocket)
         feed = _Feed(bridge, websocket)
         sides = asyncio.ensure_future(feed.listen()), asyncio.ensure_future(feed.tell())
         await asyncio.wait(sides, return_when=asyncio.FIRST_COMPLETED)
         for each in sides:
             each.cancel()
-        # Closed only when nothing is being sent any more.
+        # Close only after both sides have ended.
         for ended in await asyncio.gather(*sides, return_exceptions=True):
             if isinstance(ended, InputError):
                 await _close(websocket, str(ended))
@@ -56,7 +56,7 @@ def socket_routes(bridge: Bridge) -> APIRouter:
 
     @routes.websocket("/axes/{axis}/stream")
     async def stream(websocket: WebSocket, axis: str) -> None:
-        """Set-points: `StreamBegin`, then `StreamPoints`; each is answered (`StreamAnswer`)."""
+        """Receives set-points: `StreamBegin`, then `StreamPoints`; each is answered by a `StreamAnswer`."""
         await _accept(websocket)
         try:
             await _stream(bridge, websocket, axis)
@@ -68,7 +68,7 @@ def socket_routes(bridge: Bridge) -> APIRouter:
 
 
 class _Feed:
-    """One client of the samples."""
+    """One client of the live samples."""
 
     def __init__(self, bridge: Bridge, websocket: WebSocket) -> None:
         self._bridge = bridge
@@ -76,7 +76,7 @@ class _Feed:
         self._options = LiveOptions()
 
     async def listen(self) -> None:
-        """Take what the client wants, until it goes; InputError where that cannot be had."""
+        """Receives the client's options until it disconnects; raises InputError for invalid ones."""
         while True:
             options = await _receive(self._websocket, LiveOptions)
             for each in options.axes or ():
@@ -84,7 +84,7 @@ class _Feed:
             self._options = options
 
     async def tell(self) -> None:
-        """Send batches; while one is on its way the subscription keeps only the newest samples."""
+        """Sends batches; while one is being sent, the subscription keeps only the newest samples."""
         names = list(self._bridge.axes)
         lost, known = 0, self._bridge.events(_NEWEST).newest
         async for batch in self._bridge.subscribe():
@@ -103,7 +103,7 @@ class _Feed:
             if told.time_s or told.events:
                 await _send(self._websocket, told)
                 lost = 0
-            await asyncio.sleep(BATCH_S)  # what comes meanwhile is one batch: fewer, larger messages
+            await asyncio.sleep(BATCH_S)  # collects samples, so that messages are fewer and larger
 
 
 async def _stream(bridge: Bridge, websocket: WebSocket, axis: str) -> None:
@@ -136,7 +136,7 @@ async def _accept(websocket: WebSocket) -> None:
 
 
 async def _receive(websocket: WebSocket, kind: type[M]) -> M:
-    """The next message; InputError where it is none of the kind."""
+    """Returns the next message; raises InputError if it is not of this kind."""
     try:
         text = await websocket.receive_text()
     except KeyError:
