@@ -116,7 +116,7 @@ def twin_page(report: TwinReport) -> Page:
             )
         )
     if report.facts:
-        sections.append(Section("Where it comes from", "", [Facts([*report.facts])]))
+        sections.append(Section("Provenance", "", [Facts([*report.facts])]))
     return Page(
         title=f"Twin of axis '{report.axis}'",
         verdict=" ".join(

@@ -287,7 +287,7 @@ def test_something_unexplained_has_no_name_and_no_curve():
     assert "No cause of the catalogue fits it" in said
     assert "Do not correct what has no name" in said
     assert "--extend" not in said
-    chart = charts(text)["What is left, over the load angle"]
+    chart = charts(text)["Unexplained residual, over the load angle"]
     assert [each["label"].split(" (")[0] for each in chart["series"]] == [
         "readings",
         "mean, forward",
