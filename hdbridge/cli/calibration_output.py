@@ -17,8 +17,8 @@ if TYPE_CHECKING:
     from hdbridge.calibration.result import Offer
 
 TAKEN_OFF = 0.95
-"""Share of the residual up to which the part fitted in addition to a model (a delay, load orders) is
-reported.
+"""Terms fitted in addition to the model (a delay, load orders) are reported if they reduce the residual to
+this share or less.
 """
 
 
