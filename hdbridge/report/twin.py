@@ -147,7 +147,7 @@ def _times(row: Row) -> str:
     return (
         f"{_figure(row.in_noise)} times the noise"
         if math.isfinite(row.in_noise)
-        else "where nothing is noise"
+        else "without measurable noise"
     )
 
 

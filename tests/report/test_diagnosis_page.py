@@ -296,7 +296,7 @@ def test_something_unexplained_has_no_name_and_no_curve():
 
 
 def test_what_lives_in_an_unknown_coordinate_is_drawn_over_time():
-    assert "What is left, over the time" in charts(page(unexplained("the moon's phase")))
+    assert "Unexplained residual, over the time" in charts(page(unexplained("the moon's phase")))
 
 
 def test_nothing_found_is_said_and_nothing_is_to_be_done():
