@@ -120,8 +120,8 @@ def print_stepping(checked: Validation) -> None:
         console.print(f"note: {escape(line)}", soft_wrap=True)
     floor = checked.floor
     console.print(
-        f"floor of this axis's counts and noise: {floor.three_sigma_arcsec:.2f} arcsec; the new model is at "
-        f"{checked.after.pooled.three_sigma_arcsec / floor.three_sigma_arcsec:.2f} of it",
+        f"best possible on this axis: {floor.three_sigma_arcsec:.2f} arcsec; new model: "
+        f"{checked.after.pooled.three_sigma_arcsec / floor.three_sigma_arcsec:.2f} times that",
         soft_wrap=True,
     )
 
