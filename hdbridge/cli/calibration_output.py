@@ -17,8 +17,8 @@ if TYPE_CHECKING:
     from hdbridge.calibration.result import Offer
 
 TAKEN_OFF = 0.95
-"""Share of the residual up to which the part fitted in addition to a model (a delay, load orders) is
-reported.
+"""Terms fitted in addition to the model (a delay, load orders) are reported if they reduce the residual to
+this share or less.
 """
 
 
@@ -120,8 +120,8 @@ def print_stepping(checked: Validation) -> None:
         console.print(f"note: {escape(line)}", soft_wrap=True)
     floor = checked.floor
     console.print(
-        f"floor of this axis's counts and noise: {floor.three_sigma_arcsec:.2f} arcsec; the new model is at "
-        f"{checked.after.pooled.three_sigma_arcsec / floor.three_sigma_arcsec:.2f} of it",
+        f"best possible on this axis: {floor.three_sigma_arcsec:.2f} arcsec; new model: "
+        f"{checked.after.pooled.three_sigma_arcsec / floor.three_sigma_arcsec:.2f} times that",
         soft_wrap=True,
     )
 

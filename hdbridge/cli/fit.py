@@ -106,5 +106,5 @@ def command(
     if refused:
         raise InputError(
             f"{out}: not written: the model is worse on held-out data; it {held_out.text}; record more, or "
-            "write it all the same with --force"
+            "write it anyway with --force"
         )

@@ -62,7 +62,7 @@ def move(
         typer.Option(
             "--hold",
             min=0.0,
-            help="Hold the last angle for so many seconds; else until Ctrl-C (a simulated axis: not at all).",
+            help="Seconds to hold the last angle; else until Ctrl-C (a simulated axis: not at all).",
         ),
     ] = None,
     model: ModelOption = None,

@@ -141,7 +141,7 @@ def mend(flights: FlightsArgument) -> None:
         if path.name.endswith(".mcap") and overview(path).finished:
             return
         done = mending.mend(path)
-        _say(f"{done}: finished" if done is not None else f"{path}: nothing in it was whole; removed")
+        _say(f"{done}: finished" if done is not None else f"{path}: it held no complete data; removed")
 
     for _ in each_flight(flights, mended):
         pass

@@ -57,7 +57,7 @@ def simulate(
     axis = load_axis(files, interface, channel)
     if axis.bus.interface == "virtual":
         raise InputError(
-            "the bus 'virtual' lives within one process, nobody could reach the simulated drive there; "
+            "the bus 'virtual' exists within one process only, so the simulated drive cannot be reached; "
             "give --interface udp_multicast --channel 239.0.0.1, or socketcan, "
             "or use 'hdbridge step --simulate'"
         )

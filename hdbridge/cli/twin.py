@@ -180,7 +180,7 @@ def _named(twin: Twin) -> list[Named]:
 
     named = [Named(each.cause, each.text.removeprefix(f"{each.cause}: ")) for each in twin.findings]
     named += [
-        Named("not told apart", f"{', '.join(each.names)}; {'; '.join(each.moves)} would tell")
+        Named("not separable", f"{', '.join(each.names)}; {'; '.join(each.moves)} would separate them")
         for each in twin.alike
     ]
     return [*named, *_left(twin)]
@@ -291,7 +291,10 @@ def _facts(
     rows.append(("axis", str(files.axis)))
     rows.append(("simulated by", "usual values" if afresh or not plant.is_file() else str(plant)))
     rows.append(
-        ("errs as", str(files.model) if files.model.is_file() else "that says: there is no active model")
+        (
+            "transmission error",
+            str(files.model) if files.model.is_file() else "of the plant, as there is no active model",
+        )
     )
     if recording.date:
         rows.append(("recorded", recording.date))

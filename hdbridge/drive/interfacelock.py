@@ -46,7 +46,7 @@ def interface_lock(interface: str, channel: object, folder: Path | None = None) 
             raise BusInUseError(
                 f"{interface}:{channel}: another hdbridge on this machine masters it "
                 f"({process_words(number) if number else 'it'} holds {path}); ask it with 'hdbridge ctl' if "
-                f"it is a daemon, or {end} (--force, in the library shared=True, opens the bus all the same)"
+                f"it is a daemon, or {end} (--force, in the library shared=True, opens the bus anyway)"
             ) from None
         yield
     finally:

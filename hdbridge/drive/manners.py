@@ -90,8 +90,8 @@ class Ear:
         """Raises `BusInUseError` if another master was heard."""
         if self._heard:
             raise BusInUseError(
-                f"{bus}: somebody else masters this bus: {self} in {duration_s:.2g} s, and nothing was sent; "
-                "stop that master first (--force, in the library force=True, speaks all the same)"
+                f"{bus}: another master is on this bus: {self} in {duration_s:.2g} s; nothing was sent; "
+                "stop that master first (--force, in the library force=True, sends anyway)"
             )
 
     def _name(self, can_id: int) -> str | None:

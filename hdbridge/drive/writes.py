@@ -129,7 +129,7 @@ _WATCHDOGS: Final = frozenset({(0x1016, 1), (0x1400, 5)})
 
 def _heartbeats(axis: AxisConfig) -> Iterator[PlannedWrite]:
     ms, master, field = axis.drive.heartbeat_ms, axis.drive.master_node_id, "drive.heartbeat_ms"
-    why = "the drive sends its heartbeat every so many ms"
+    why = "period of the drive's heartbeat, ms"
     without = "only missing TPDOs show that the drive is gone"
     yield _row(axis, objects.HEARTBEAT_PRODUCER, ms, why, field, without=without, exact=True)
     why = f"the drive stops by itself when node {master}, the master, is silent for {ms} ms"
@@ -141,7 +141,7 @@ def _heartbeats(axis: AxisConfig) -> Iterator[PlannedWrite]:
     source = axis.load_encoder.source
     if source.node is not None:
         address = objects.HEARTBEAT_PRODUCER
-        why = "the load encoder sends its heartbeat every so many ms"
+        why = "period of the load encoder's heartbeat, ms"
         yield PlannedWrite(source.node, address.index, address.sub, ms, why, field, address.type)
 
 

@@ -100,7 +100,7 @@ class Effect(Strict, ABC):
     channels: ClassVar[frozenset[Channel]] = frozenset()
     """Channels usually needed in addition to the motor angle; `needs` gives those of an instance."""
     compensable: ClassVar[Compensable]
-    """Statement whether the load really moves accordingly and predictably; see `is_compensable`."""
+    """Decision to compensate it or not, with the reason; see `is_compensable`."""
     replaces: ClassVar[str] = ""
     """Name of the effect that it replaces in a model, if it does not add to the others."""
     part: ClassVar[Part | None] = None

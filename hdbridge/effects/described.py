@@ -106,7 +106,7 @@ class Cause:
 
 @dataclass(frozen=True, slots=True)
 class Compensable:
-    """Decision whether the compensation should correct an effect, with the reason."""
+    """Decision to compensate an effect or not, with the reason."""
 
     possible: bool
     why: str

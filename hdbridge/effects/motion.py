@@ -53,9 +53,9 @@ class Channel(Enum):
 
     TIME = "time_s"
     SPEED = "motor_speed_deg_s"
-    """Of the command; derived from angle and time if not given."""
+    """Speed of the command; derived from angle and time if not given."""
     ACCELERATION = "motor_acceleration_deg_s2"
-    """Of the command; derived from angle and time if not given."""
+    """Acceleration of the command; derived from angle and time if not given."""
     DIRECTION = "direction"
     """Sign of the last motion of the command, held at rest; always derived."""
     LOAD_ANGLE = "load_deg"

@@ -59,8 +59,8 @@ def calibration_page(result: Calibration) -> Page:
         Section("Parameters", _parameters_text(result), [*_parameters(result)]),
         Section(
             "Transmission error",
-            "What the load encoder showed beyond the motor angle divided by the ratio, the zero taken off; "
-            "dots are means over short stretches.",
+            "Load encoder angle minus motor angle over the ratio, with the zero removed; dots are means over "
+            "short stretches.",
             [Grid([*_by_angle(traces, result.model.ratio)])],
         ),
     ]
@@ -80,11 +80,11 @@ def calibration_page(result: Calibration) -> Page:
             "alone, which shows the side lobes of its neighbours too.",
             [_spectrum(result)],
         ),
-        Section("What the model leaves", sentence(result.fit.held_out.text), [*_residual(result)]),
+        Section("Residual of the model", sentence(result.fit.held_out.text), [*_residual(result)]),
     ]
     if len(result.drift) > 1:
         sections.append(Section("Reference pose", _drift_text(result), [_drift(result)]))
-    sections.append(Section("Where it comes from", "", [_provenance(result)]))
+    sections.append(Section("Provenance", "", [_provenance(result)]))
     status, commands = _status(result)
     return Page(
         title=f"Calibration of axis '{result.axis}'"
@@ -115,7 +115,7 @@ def _verdict(result: Calibration) -> str:
         reason = sentence(offer.reason if offer is not None else result.fit.held_out.text)
         text = f"{text} {reason}".strip()
     if notes := len(result.fit.warnings):
-        text += f" Read the {'note' if notes == 1 else f'{notes} notes'} under 'What the model leaves'."
+        text += f" Read the {'note' if notes == 1 else f'{notes} notes'} under 'Residual of the model'."
     return text
 
 
@@ -250,11 +250,11 @@ def _residual(result: Calibration) -> Iterator[Block]:
             )
         ]
     )
-    yield histogram("How often which residual", R_LABEL, {"residual": left}, height_px=200)
+    yield histogram("Residual histogram", R_LABEL, {"residual": left}, height_px=200)
     noise = fit.noise
     yield Facts(
         [
-            ("left by the model, rms of a sample", f"{noise.residual_arcsec:.2f} arcsec"),
+            ("residual of the model, rms of a sample", f"{noise.residual_arcsec:.2f} arcsec"),
             ("... with what was fitted in addition to it", f"{noise.fitted_arcsec:.2f} arcsec"),
             (
                 "noise at rest",
@@ -265,14 +265,14 @@ def _residual(result: Calibration) -> Iterator[Block]:
                 f"{noise.laps_arcsec:.2f} arcsec" if noise.laps_arcsec is not None else "not measured",
             ),
             ("samples", f"{noise.samples:,}, worth {noise.effective_samples:,.0f} independent ones"),
-            ("given no weight", f"{fit.outliers.samples} samples that stand out alone"),
+            ("outliers", f"{fit.outliers.samples} samples, given no weight"),
         ]
     )
     rows = [
         [each.name.replace("_", " "), "passed" if each.passed else "look", each.text]
         for each in fit.residual_tests
     ]
-    yield Table(["test of the residual", "", "what it found"], rows)
+    yield Table(["test of the residual", "", "result"], rows)
     if fit.warnings:
         yield Facts([("note", each) for each in fit.warnings])
 
@@ -280,7 +280,7 @@ def _residual(result: Calibration) -> Iterator[Block]:
 def _parameters_text(result: Calibration) -> str:
     if all(each.identifiable for each in result.fit.intervals):
         return ""
-    return "In brackets: what these data cannot say."
+    return "In brackets: not determined by these data."
 
 
 def _parameters(result: Calibration) -> Iterator[Block]:
@@ -311,7 +311,7 @@ def _parameters(result: Calibration) -> Iterator[Block]:
         yield Table(
             ["in addition to the model", "value", "\N{PLUS-MINUS SIGN} 95 %", "unit"],
             fitted,
-            "Fitted too, so that it does not bend the parameters; not part of the model.",
+            "Fitted as well, so that it does not bias the parameters; not part of the model.",
         )
 
 
@@ -330,7 +330,7 @@ def _change(change: float, parameter: str) -> str:
 def _drift_text(result: Calibration) -> str:
     errors = [error for _, error in result.drift]
     return (
-        f"The axis came back to one pose {len(errors)} times, always from the same side: its zero moved by "
+        f"The axis returned to one pose {len(errors)} times, always from the same side: its zero moved by "
         f"{max(errors) - min(errors):.2f} arcsec."
     )
 

@@ -64,7 +64,7 @@ def diagnosis_page(
         _could(diagnosis),
     ]
     if facts := [*_remarks(diagnosis), *given]:
-        sections.append(Section("Where it comes from", "", [Facts(facts)]))
+        sections.append(Section("Provenance", "", [Facts(facts)]))
     if offer is not None:
         status, commands = of_offer(offer)
     else:
@@ -173,8 +173,8 @@ def _found(diagnosis: Diagnosis) -> Section:
     ]
     return Section(
         "What was found",
-        "Size: half the span of what it does in this record. Held out: residual (rms) on stretches of time "
-        "that the fit has not seen, everything else refitted. Gain: the share of the mean square that goes. "
+        "Size: half the span of its contribution to this record. Held out: residual (rms) on stretches of "
+        "time left out of the fit, everything else refitted. Gain: the share of the mean square removed. "
         "Offered: whether an improvement of the model may hold it, and if not, why.",
         [Table(header, rows)],
     )
@@ -197,7 +197,7 @@ def _finding(number: int, finding: Finding, diagnosis: Diagnosis) -> Section:
     else:
         text = (
             "Everything else that was found is in the model, so this is the finding alone, with the "
-            "noise. Dots are means, bars the spread of the readings in them, lines what the finding does."
+            "noise. Dots are means, bars the spread of their readings, lines the finding's contribution."
         )
     return Section(f"{number}. {sentence(title).rstrip('.')}", text, blocks)
 

@@ -60,7 +60,7 @@ def partial_residual_chart(partial_residual: PartialResidual) -> Chart:
             series.append(Series(name, curve.place, curve.mean, colour=colour if way else ORANGE))
     shown = residual[rows] if own is None else np.concatenate([residual[rows], own[rows]])
     return Chart(
-        f"{'What is left' if own is None else 'Residual without it'}, over the {home.name}",
+        f"{'Unexplained residual' if own is None else 'Residual without it'}, over the {home.name}",
         home.label,
         R_LABEL,
         series,
@@ -123,7 +123,7 @@ def residual_charts(seen: ResidualViews) -> Iterator[Chart]:
             x_log=home.spacing is Spacing.LOGARITHMIC,
         )
     groups = {way: seen.given_arcsec[rows] for way, _, rows in _ways(forward, everywhere)}
-    yield histogram("By direction: how often which, as given", R_LABEL, groups, bins=40, height_px=230)
+    yield histogram("Residual histogram by direction, as given", R_LABEL, groups, bins=40, height_px=230)
 
 
 def beside_charts(traces: Traces) -> Iterator[Chart]:

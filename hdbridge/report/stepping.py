@@ -122,7 +122,7 @@ def _remaining(result: SchemeResult, floor_arcsec: float) -> list[Chart]:
     ways = _by_way(result)
     return [
         Chart("Error of each step", X_LABEL, Y_LABEL, ways, height_px=280, levels=levels),
-        histogram("How often which error", Y_LABEL, {each.label: each.y for each in ways}, height_px=280),
+        histogram("Error histogram", Y_LABEL, {each.label: each.y for each in ways}, height_px=280),
     ]
 
 

@@ -116,7 +116,7 @@ def twin_page(report: TwinReport) -> Page:
             )
         )
     if report.facts:
-        sections.append(Section("Where it comes from", "", [Facts([*report.facts])]))
+        sections.append(Section("Provenance", "", [Facts([*report.facts])]))
     return Page(
         title=f"Twin of axis '{report.axis}'",
         verdict=" ".join(
@@ -147,7 +147,7 @@ def _times(row: Row) -> str:
     return (
         f"{_figure(row.in_noise)} times the noise"
         if math.isfinite(row.in_noise)
-        else "where nothing is noise"
+        else "without measurable noise"
     )
 
 

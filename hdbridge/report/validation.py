@@ -65,7 +65,7 @@ def _stepping(checked: Validation) -> Iterator[Block]:
         remains = {one.label: one.y for one in series}
     after = Chart("After, enlarged", X_LABEL, Y_LABEL, charts[-1].series, height_px=240)
     yield Table(["with", *(Heading(each) for each in SCATTER)], rows)
-    yield Grid([*charts, after, histogram("After: how often which error", Y_LABEL, remains, height_px=240)])
+    yield Grid([*charts, after, histogram("After: error histogram", Y_LABEL, remains, height_px=240)])
 
 
 def _iso_section(checked: Validation) -> list[Section]:

@@ -133,7 +133,7 @@ def test_another_master_and_silent_nodes_are_told() -> None:
 def test_nothing_is_asked_while_another_master_runs(can_id: int) -> None:
     with (
         bench((can_id, b"\x05\x00")) as (link, _, seen),
-        pytest.raises(BusInUseError, match=rf"somebody else masters this bus.*\({can_id:03X}h\)"),
+        pytest.raises(BusInUseError, match=rf"another master is on this bus.*\({can_id:03X}h\)"),
     ):
         scan_bus(link, listen_s=0.0)
     assert not [each for each in seen if 0x600 < each.arbitration_id < 0x680]

@@ -72,7 +72,7 @@ def identifiers(witness: can.BusABC) -> set[int]:
 )
 def test_a_drive_that_another_master_has_is_left_alone(frame: tuple[int, bytes], name: str) -> None:
     with bench(frame) as (bus, clock, witness), Drive(bus, AXIS, clock) as drive:
-        with pytest.raises(BusInUseError, match=f"somebody else masters this bus: .*{name}") as refused:
+        with pytest.raises(BusInUseError, match=f"another master is on this bus: .*{name}") as refused:
             drive.boot()
         assert "\n" not in str(refused.value)
         drive.close()

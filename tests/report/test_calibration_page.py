@@ -173,7 +173,7 @@ def test_what_cannot_be_known_stands_in_brackets(plain):
     row = re.search(r"hysteresis: width.*?</tr>", text).group(0)
     assert "(20)" in row
     assert "not known" in row
-    assert "In brackets: what these data cannot say." in text
+    assert "In brackets: not determined by these data." in text
 
 
 def test_notes_are_announced_at_the_top_and_stay_text(plain):

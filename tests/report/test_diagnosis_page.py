@@ -287,7 +287,7 @@ def test_something_unexplained_has_no_name_and_no_curve():
     assert "No cause of the catalogue fits it" in said
     assert "Do not correct what has no name" in said
     assert "--extend" not in said
-    chart = charts(text)["What is left, over the load angle"]
+    chart = charts(text)["Unexplained residual, over the load angle"]
     assert [each["label"].split(" (")[0] for each in chart["series"]] == [
         "readings",
         "mean, forward",
@@ -296,7 +296,7 @@ def test_something_unexplained_has_no_name_and_no_curve():
 
 
 def test_what_lives_in_an_unknown_coordinate_is_drawn_over_time():
-    assert "What is left, over the time" in charts(page(unexplained("the moon's phase")))
+    assert "Unexplained residual, over the time" in charts(page(unexplained("the moon's phase")))
 
 
 def test_nothing_found_is_said_and_nothing_is_to_be_done():
