@@ -22,6 +22,7 @@ from hdbridge.twin.parameters import LOAD
 from hdbridge.twin.replay import replay_directly
 from hdbridge.twin.replays import Replays
 from hdbridge.twin.result import HELD_OUT, Twin, Values
+from hdbridge.twin.structures import fit_structures, misfit
 from hdbridge.twin.thermal import with_warmth
 from hdbridge.twin.verdict import impossible, values_of, what_is_left
 
@@ -44,8 +45,13 @@ def fit_twin(
     whole = Recording.joined(list(recordings))
     data = coarse(prepare(whole, axis, start), FIT_S)
     with Replays(data, workers) as replays:
-        fitted = fit(replays, lambda share: progress(0.9 * share))
-        left = what_is_left(data, fitted.residuals, noise_in_motion(data))
+        noise = noise_in_motion(data)
+        found = fit(replays, lambda share: progress(0.7 * share))
+        if found is None or values_of(what_is_left(data, found.residuals, noise)) is Values.REPLAY:
+            other = fit_structures(replays, start, lambda share: progress(0.7 + 0.2 * share))
+            found = min([found or other, other], key=lambda each: misfit(data, each.residuals))
+        fitted = found
+        left = what_is_left(data, fitted.residuals, noise)
         values = values_of(left)
         findings: tuple[Finding, ...] = ()
         sets: dict[Alike, None] = {}

@@ -52,7 +52,7 @@ def what_is_left(
     ``residuals`` by channel over all rows of the data, ``noise`` by channel in its unit (`noise_in_motion`).
     """
     kinds = np.array(data.kinds)[data.leg.astype(np.intp)]
-    signals, found = _signals(data), []
+    signals, found = signals_of(data), []
     for name, counts in counted(data).items():
         held_out = (counts > 0.0) & (data.out > 0.0)
         inside = held_out if held_out.any() else counts > 0.0
@@ -66,7 +66,7 @@ def what_is_left(
     return tuple(found)
 
 
-def _signals(data: Data) -> dict[str, FloatArray]:
+def signals_of(data: Data) -> dict[str, FloatArray]:
     """By channel, in its unit: what was measured. Of the load angle, the error without its zero."""
     per_motor_deg = ARCSEC_PER_DEG / data.axis.gear.ratio
     found = {name: list[FloatArray]() for name in CHANNELS}
