@@ -70,8 +70,8 @@ def command(
 
     The recordings' commands are replayed on the simulated drive. It starts from the profile's twin or truth
     file, else from typical values, with the transmission error of the active model. Friction, inertia,
-    spring, loops and delays are fitted until it behaves as the axis did. `--simulate` uses the twin after
-    `hdbridge model commit PROFILE --twin`.
+    spring, loops and delays are fitted until it behaves as the axis did. The first line reports if the values
+    are the axis's. `--simulate` uses the twin after `hdbridge model commit PROFILE --twin`.
     """
     from hdbridge.axis import AxisConfig
 
@@ -135,13 +135,13 @@ def _learned(
     from hdbridge.report.twin import TwinReport
     from hdbridge.twin.kept import TWINS, KeptTwin
     from hdbridge.twin.making import fit_twin
-    from hdbridge.twin.verdict import better
+    from hdbridge.twin.verdict import judge
 
     with measuring(files.axis), progress_bar() as bar:
         task = bar.add_task("fit", total=1.0)
         twin = fit_twin([recording], axis, begun.truth, lambda share: bar.update(task, completed=share))
-        gain = better(twin.before, twin.after)
-        if gain.better:
+        verdict = judge(twin)
+        if verdict.kept:
             kept = KeptTwin(twin.truth).told(recordings=[str(each) for each in paths])
             reason = f"learned from {', '.join(each.name for each in paths)}"
             TWINS.propose(files.folder, kept, reason, datetime.now().astimezone(), recording.drive)
@@ -150,27 +150,32 @@ def _learned(
         axis.name,
         twin.before,
         twin.after,
-        learned=_values(begun.truth, twin.truth) if gain.better else (),
-        named=_named(twin) if gain.better else _left(twin),
+        learned=_values(begun.truth, twin.truth) if verdict.kept else (),
+        named=_named(twin) if verdict.kept else _left(twin),
         translated=begun.rows,
         facts=facts,
-        verdict=f"the twin is {'kept as pending' if gain.better else 'not kept'}: {gain.text}",
-        commands=(commit,) if gain.better else (),
-        status=Status.PENDING if gain.better else Status.REFUSED,
+        verdict=verdict.text,
+        values=str(twin.values),
+        left=twin.left,
+        commands=(commit,) if verdict.kept else (),
+        status=Status.PENDING if verdict.kept else Status.REFUSED,
     )
 
 
 def _values(before: Truth, after: Truth) -> list[Learned]:
-    """Returns the fitted values, before and after."""
+    """Returns the fitted values with their intervals, and the values before unless only assumed."""
     from hdbridge.report.twin import Learned
     from hdbridge.twin.parameters import PARAMETERS, value_in
+    from hdbridge.twin.result import Values
     from hdbridge.twin.thermal import THERMAL
 
+    fitted, assumed = after.provenance["fit"]["parameters"], Values.of(before) is Values.USUAL
     rows = []
     for each in {parameter.path: parameter for parameter in (*PARAMETERS, *THERMAL)}.values():
         now, interval = value_in(after, each), after.intervals.get(".".join(each.path))
-        if now is not None and interval is not None:
-            rows.append(Learned(each.name, each.unit, value_in(before, each), now, interval))
+        if now is not None and (interval is not None or each.name in fitted):
+            was = None if assumed else value_in(before, each)
+            rows.append(Learned(each.name, each.unit, was, now, interval))
     return rows
 
 
@@ -227,7 +232,8 @@ def _check(
             "twin": str(files.twin),
             "sentence": found.sentence,
             "changes": [{"cause": each.cause, "text": each.text} for each in found.changes],
-            "unexplained": found.unexplained,
+            "misfit_growth": dict(found.growth_before),
+            "unexplained": found.unexplained | found.grown,
             "unseen": list(found.unseen),
         },
     )
@@ -306,6 +312,18 @@ def as_dict(report: TwinReport) -> dict[str, Any]:
     return {
         "schema": "hdbridge.twin/1",
         "axis": report.axis,
+        "verdict": report.verdict,
+        "values": report.values,
+        "left": [
+            {
+                "channel": each.channel,
+                "share": each.share,
+                "times_noise": each.times_noise,
+                "kind": each.kind,
+                "explained": each.explained,
+            }
+            for each in report.left
+        ],
         "before": report.before.as_dict(),
         "after": report.after.as_dict() if report.after is not None else None,
         "parameters": [
@@ -327,13 +345,17 @@ def as_dict(report: TwinReport) -> dict[str, Any]:
 
 
 def print_report(report: TwinReport) -> None:
-    """Prints the verdict and the figures of the whole record."""
+    """Prints the verdict, the figures of the whole record, and the findings."""
     from hdbridge.report.twin import title_of, verdict
+    from hdbridge.report.words import sentence
     from hdbridge.twin.comparison import ALL
+    from hdbridge.twin.result import Values
 
     for effect in report.translated:
         if effect.counterpart is None:
             notes.print(f"{effect.effect} is not simulated: {effect.note}", markup=False, soft_wrap=True)
+    if report.verdict:
+        console.print(sentence(report.verdict), markup=False, soft_wrap=True, style="bold")
     console.print(escape(verdict(report)), soft_wrap=True)
     table = Table("")
     differences = ["difference before", "difference"] if report.after else ["difference"]
@@ -351,7 +373,8 @@ def print_report(report: TwinReport) -> None:
     print_table(table)
     for named in report.named:
         console.print(f"{named.cause}: {named.text}", markup=False, soft_wrap=True)
-    if report.verdict:
-        console.print(report.verdict, markup=False, soft_wrap=True, style="bold")
+    for estimate in report.learned if report.values == Values.AXIS else ():
+        if estimate.before is None:
+            console.print(estimate.text, markup=False, soft_wrap=True)
     for each in report.commands:
         console.print(f"  {each.line}   # {each.purpose}", markup=False, soft_wrap=True)

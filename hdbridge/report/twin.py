@@ -29,6 +29,7 @@ from hdbridge.report.page import (
 )
 from hdbridge.report.words import figure, sentence
 from hdbridge.twin.comparison import ALL, TITLES, UNITS, Comparison, Row
+from hdbridge.twin.result import Left, Values
 from hdbridge.twin.traces import Spectrum, Trace
 from hdbridge.twin.translation import Row as Translated
 
@@ -39,14 +40,21 @@ MEASURED, SIMULATED, BEFORE, DIFFERENCE = "measured", "simulated", "before", "di
 
 @dataclass(frozen=True, slots=True)
 class Learned:
-    """A plant value before and after the fit."""
+    """A fitted value of the plant."""
 
     name: str
     unit: str
     before: float | None
+    """None if it was only assumed."""
     after: float
     interval: tuple[float, float] | None
-    """95 % interval; None if no data determine the value, which then keeps its assumption."""
+    """95 %; None if the value is not the axis's."""
+
+    @property
+    def text(self) -> str:
+        """In words, as an estimate."""
+        between = f" ({_figure(self.interval[0])} to {_figure(self.interval[1])})" if self.interval else ""
+        return f"estimate: {self.name} {_figure(self.after)}{f' {self.unit}' if self.unit else ''}{between}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,7 +79,11 @@ class TwinReport:
     translated: Sequence[Translated] = ()
     facts: Sequence[tuple[str, str]] = ()
     verdict: str = ""
-    """Outcome for the twin, in one sentence."""
+    """What the values are worth, and the outcome for the twin, in one sentence."""
+    values: str = ""
+    """Where the values come from (`hdbridge.twin.result.Values`); empty if nothing was fitted."""
+    left: Sequence[Left] = ()
+    """What the twin leaves of each channel."""
     commands: Sequence[Command] = ()
     status: Status = Status.MEASURED
 
@@ -104,7 +116,13 @@ def twin_page(report: TwinReport) -> Page:
     )
     if report.learned:
         sections.append(
-            Section("What the plant is", "Intervals are of 95 %.", [_learned(report.learned)]),
+            Section(
+                "What the plant is" if report.values == Values.AXIS else "Values of the replay",
+                "Intervals are of 95 %."
+                if report.values == Values.AXIS
+                else "These values replay the recording. They are not the axis's, so they have no intervals.",
+                [_learned(report.learned)],
+            ),
         )
     if report.translated:
         rows = [[each.effect, each.counterpart or "none", each.note] for each in report.translated]
@@ -203,7 +221,7 @@ def _learned(learned: Sequence[Learned]) -> Table:
             each.name,
             _figure(each.before) if each.before is not None else "",
             _figure(each.after),
-            f"{_figure(each.interval[0])} to {_figure(each.interval[1])}" if each.interval else "not shown",
+            f"{_figure(each.interval[0])} to {_figure(each.interval[1])}" if each.interval else "none",
             each.unit,
         ]
         for each in learned

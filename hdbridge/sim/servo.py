@@ -1,4 +1,7 @@
-"""The drive's loops: a filter on the demand, then position and velocity cascade with feed-forward.
+"""The drive's loops: filters on the demand, position and velocity cascade with feed-forward, torque filters.
+
+The blocks in their order: moving average and two lags of the demand, position P, velocity PI on the filtered
+speed (whose integral may add up the position error instead: PIV), feed-forwards, notch, torque filter, limit.
 
 Like real drives of this class it closes its loops on an interpolated encoder: a motor that has settled
 stands on the middle of the commanded count, not anywhere within it.
@@ -8,13 +11,78 @@ from __future__ import annotations
 
 import math
 
+from hdbridge.sim.encoder import Late
 from hdbridge.sim.oscillator import Transition, transition
 from hdbridge.sim.state import state
 from hdbridge.sim.truth import Truth
+from hdbridge.sim.truth.motor import TrueNotch
 
 RAD_PER_DEG = math.pi / 180.0
 AT_REST_DEG_S = 0.05
 """Below this speed the demand rests: friction feed-forward keeps its direction, the integral may rest."""
+
+
+@state
+class MovingAverage:
+    """Mean of the demand over a time, by its integral now and then."""
+
+    _duration_s: float
+    _integral: float
+    _late_integral: Late
+    _start_deg: float
+
+    def __init__(self, duration_s: float, dt_s: float) -> None:
+        self._duration_s = max(duration_s, dt_s)
+        self._late_integral = Late(self._duration_s, dt_s, 0.0)
+        self.start_at(0.0)
+
+    def start_at(self, demand_deg: float) -> None:
+        """The demand has always been this one."""
+        self._start_deg, self._integral = demand_deg, 0.0
+        self._late_integral.begin(0.0)
+
+    def mean_deg(self) -> float:
+        """The mean up to now."""
+        return self._start_deg + (self._integral - self._late_integral.deg) / self._duration_s
+
+    def add_up(self, demand_deg: float, duration_s: float) -> None:
+        """Advance by a time in which the demand is this one on average."""
+        self._integral += (demand_deg - self._start_deg) * duration_s
+        self._late_integral.feed(self._integral)
+
+
+@state
+class Notch:
+    """Second-order notch, transposed direct form."""
+
+    _a1: float
+    _a2: float
+    _b0: float
+    _b2: float
+    _first: float
+    _second: float
+
+    def __init__(self, truth: TrueNotch | None, dt_s: float) -> None:
+        half = math.tan(math.pi * truth.frequency_hz * dt_s) if truth else 0.0
+        depth, width = (truth.depth, truth.width) if truth else (1.0, 1.0)
+        scale = 1.0 + width * half + half * half
+        self._b0 = (1.0 + depth * width * half + half * half) / scale
+        self._a1 = 2.0 * (half * half - 1.0) / scale
+        self._b2 = (1.0 - depth * width * half + half * half) / scale
+        self._a2 = (1.0 - width * half + half * half) / scale
+        self.rest_at(0.0)
+
+    def rest_at(self, torque_nm: float) -> None:
+        """This torque has always gone in and come out."""
+        self._first = (1.0 - self._b0) * torque_nm
+        self._second = (self._b2 - self._a2) * torque_nm
+
+    def notched_nm(self, torque_nm: float) -> float:
+        """One sample."""
+        notched = self._b0 * torque_nm + self._first
+        self._first = self._a1 * (torque_nm - notched) + self._second
+        self._second = self._b2 * torque_nm - self._a2 * notched
+        return notched
 
 
 @state
@@ -25,11 +93,14 @@ class Servo:
     """Highest torque in either direction."""
     measured_deg_s: float
     _acceleration_gain: float
+    _average: MovingAverage
     _dead_band: float
     _decay: float
     _direction: float
     _dt: float
     _filter: float
+    _filtered_nm: float
+    _filtered_speed: float
     _friction: float
     _hunting_band: float
     _integral: float
@@ -41,20 +112,34 @@ class Servo:
     _load_model: Transition
     _load_speed: float
     _measured: float
+    _notch: Notch
     _position_gain: float
     _reference: float
     _reference_speed: float
+    _speed_share: float
     _step_deg: float
     _steps_per_deg: float
+    _sums_position: bool
+    _torque_share: float
     _velocity_feedforward: float
     _velocity_gain: float
     _viscous: float
+    _with_average: bool
+    _with_filters: bool
 
     def __init__(self, truth: Truth) -> None:
         servo, encoder = truth.servo, truth.motor.encoder
         dt = truth.substep_s
         self._dt = dt
         self._filter = 1000.0 / servo.command_filter_ms
+        self._with_average = servo.moving_average_ms > 0.0
+        self._average = MovingAverage(servo.moving_average_ms / 1000.0, dt)
+        self._with_filters = bool(servo.notch or servo.speed_filter_ms or servo.torque_filter_ms)
+        self._speed_share = _share(servo.speed_filter_ms / 1000.0, dt)
+        self._torque_share = _share(servo.torque_filter_ms / 1000.0, dt)
+        self._notch = Notch(servo.notch, dt)
+        self._filtered_nm = 0.0
+        self._sums_position = servo.integral_of == "position"
         self._decay = math.exp(-self._filter * dt)
         self._position_gain = servo.position_gain_per_s
         self._velocity_gain = servo.velocity_gain_nm_s_per_rad * RAD_PER_DEG
@@ -83,11 +168,18 @@ class Servo:
         self._load_speed = motor_deg_s
         self._integral = 0.0
         self._direction = 0.0
+        self._average.start_at(self._measured)
+        self._filtered_speed = motor_deg_s
+        self._notch.rest_at(0.0)
+        self._filtered_nm = 0.0
         return self._measured
 
     def shift(self, torque_nm: float) -> None:
         """Let the integral be larger by so much."""
         self._integral += torque_nm
+        if self._with_filters:
+            self._filtered_nm += torque_nm
+            self._notch.rest_at(self._filtered_nm)
 
     def answer_nm(self, demand_deg: float, demand_deg_s: float, motor_deg: float) -> float:
         """The torque for one substep, in which the demand moves evenly from ``demand_deg`` on."""
@@ -96,6 +188,14 @@ class Servo:
         measured_speed = (measured - self._measured) / dt
         self._measured = measured
         self.measured_deg_s = measured_speed
+        if self._with_filters:
+            self._filtered_speed += self._speed_share * (measured_speed - self._filtered_speed)
+            measured_speed = self._filtered_speed
+        if self._with_average:
+            average = self._average
+            before_deg = average.mean_deg()
+            average.add_up(demand_deg + 0.5 * dt * demand_deg_s, dt)
+            demand_deg, demand_deg_s = before_deg, (average.mean_deg() - before_deg) / dt
 
         # The reference: the demand behind two equal lags, stepped exactly. It never overshoots a demand that
         # does not turn back, and it has a speed and an acceleration where a demand in whole counts has steps.
@@ -120,7 +220,9 @@ class Servo:
             integral = self._turn(1.0 if new_speed > 0.0 else -1.0)
         short = error * self._direction
         if not rests or short > self._dead_band or short < -self._hunting_band:
-            integral += self._integral_rate * speed_error
+            integral += self._integral_rate * (
+                self._position_gain * error if self._sums_position else speed_error
+            )
         torque = (
             self._velocity_gain * speed_error
             + integral
@@ -130,6 +232,9 @@ class Servo:
         )
         if self._load_known:
             torque += self._load_torque((self._reference - reference) / dt)
+        if self._with_filters:
+            self._filtered_nm += self._torque_share * (self._notch.notched_nm(torque) - self._filtered_nm)
+            torque = self._filtered_nm
         limit = self.limit_nm
         if torque > limit:
             # At the limit the integral may only go back.
@@ -159,3 +264,8 @@ class Servo:
 
     def _interpolated(self, motor_deg: float) -> float:
         return math.floor(motor_deg * self._steps_per_deg + 0.5) * self._step_deg
+
+
+def _share(time_s: float, step_s: float) -> float:
+    """Gain per step of a first-order lag; one without a time."""
+    return -math.expm1(-step_s / time_s) if time_s > 0.0 else 1.0

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -24,13 +24,13 @@ from hdbridge.effects import FloatArray
 from hdbridge.records.recording import Recording
 from hdbridge.sim.truth import Truth
 from hdbridge.twin.fitting import free_parameters
-from hdbridge.twin.known import Known, change_of
+from hdbridge.twin.known import Known, Misfit, change_of, growth, scales_by_kind
 from hdbridge.twin.least_squares import SOFT, Fitted, fitted_rows, legs_of_rows, solve, told
 from hdbridge.twin.misfit import CHANNELS, Data, coarse, prepare, rounding
-from hdbridge.twin.naming import Finding, finding
+from hdbridge.twin.naming import Finding, Moved, finding
 from hdbridge.twin.parameters import BY_NAME, Parameter, at_coordinates, coordinates
 from hdbridge.twin.replays import Replays
-from hdbridge.twin.rivals import FALSE_ALARM
+from hdbridge.twin.rivals import FALSE_ALARM, told_apart
 from hdbridge.twin.scales import Scales, least_deviation, noise_floor
 
 CHECK_S = 20.0
@@ -69,11 +69,20 @@ OWN = ("load friction", "temperature", "current limit", "velocity feed-forward")
 """Looked at in addition to what a fit changes."""
 KNOWN_WARMTH = "temperature"
 """... of which this one is no unknown where both twin and recording tell the temperature."""
+GROWN = 1.5
+"""Ratio of two misfits of one axis that is a change: without one they differ by their noise and by the legs
+that were recorded."""
+EXPLAINED = 0.25
+"""Share of the growth, in squares, that a named cause may leave: a misfit changes with the axis."""
+MOST_NAMED = 2
+"""Causes that are named by ratios, at most."""
+NOTICEABLE = 2.5
+"""Multiple of the least change that matters which a check has to be able to show."""
 
 
 @dataclass(frozen=True, slots=True)
 class Check:
-    """What has changed; nothing where there are no changes."""
+    """What has changed, and what of it the twin explains."""
 
     changes: tuple[Finding, ...]
     misfit_before: Mapping[str, float]
@@ -82,26 +91,45 @@ class Check:
     """The same with the changes."""
     unseen: tuple[str, ...] = ()
     """Causes of which even a large change would not have shown, in this motion or against this twin."""
+    growth_before: Mapping[str, float] = field(default_factory=dict)
+    """By channel, what the twin leaves of this recording over what it left of its own."""
+    growth_after: Mapping[str, float] = field(default_factory=dict)
+    """The same with the changes."""
+    blind: bool = False
+    """No change of any cause would have shown."""
 
     @property
     def sentence(self) -> str:
-        """One sentence for somebody at the bench; a second one of what would not have shown."""
+        """One sentence for somebody at the bench; others of what grew, and of what would not have shown."""
         found = ["Nothing has changed since the twin was made"]
         if self.changes:
             found = [f"Changed since the twin was made: {'. '.join(each.text for each in self.changes)}"]
-        elif self.unexplained:
+        elif self.unexplained or self.grown:
             found = ["Something has changed since the twin was made that no change of a cause explains"]
+        elif self.blind:
+            found = ["The twin explains too little of this axis to show a change"]
         found += [
             f"Unexplained: {name}, {times:.0f} times what the twin was off by when it was made"
             for name, times in self.unexplained.items()
         ]
-        found += [f"A change of {', '.join(self.unseen)} would not have shown"] if self.unseen else []
+        found += [
+            f"The twin leaves {times:.1f} times as much of the {name} as when it was made"
+            for name, times in self.grown.items()
+            if name not in self.unexplained
+        ]
+        if self.unseen and not self.blind:
+            found.append(f"A change of {', '.join(self.unseen)} would not have shown")
         return f"{'. '.join(found)}."
 
     @property
     def unexplained(self) -> dict[str, float]:
         """What is left with the changes of the channels that are beyond doubt off, as `misfit_after`."""
         return {name: times for name, times in self.misfit_after.items() if times > SOFT}
+
+    @property
+    def grown(self) -> dict[str, float]:
+        """The channels of which more is left, with the changes, than when the twin was made."""
+        return {name: times for name, times in self.growth_after.items() if times > GROWN}
 
 
 def check(
@@ -111,17 +139,23 @@ def check(
     progress: Callable[[float], None] = lambda _: None,
     workers: int | None = None,
 ) -> Check:
-    """What has changed between a twin and the axis that the recording shows.
+    """Reports what has changed between a twin and the axis that the recording shows.
 
-    InputError where the twin was not fitted, or the recording has no command.
+    The misfit of a twin is first compared with the one stored when it was made. A twin whose values are the
+    axis's names causes by the noise; any other names them by the ratio of both misfits.
+    InputError if the twin was not fitted, or the recording has no command.
     """
     known = Known.of(twin)
     data = coarse(prepare(recording, axis, twin), CHECK_S)
     floor = noise_floor(data)
     scale = {name: max(known.noise.get(name, 0.0), floor[name]) for name in CHANNELS}
+    parameters = free_parameters(twin, _own(data, twin))
     with Replays(data, workers) as replays:
-        search = _Search(replays, twin, known, scale, free_parameters(twin, _own(data, twin)))
         (before,) = replays([twin])
+        grown = growth(data, before, known.misfit, scale)
+        if not known.of_axis:
+            return _by_ratio(replays, twin, known.misfit, scale, parameters, grown, progress)
+        search = _Search(replays, twin, known, scale, parameters)
         best = search.found(progress)
         (after,) = replays([best.truth])
         if search.worsens(best):
@@ -130,7 +164,103 @@ def check(
     progress(1.0)
     gain = (_rms(before, scale), _rms(after, scale))
     changes = tuple(search.change(cause, best, gain) for cause in best.causes)
-    return Check(changes, was, now, search.unseen(best))
+    left = growth(data, after, known.misfit, scale)
+    return Check(changes, was, now, search.unseen(best), grown, left)
+
+
+def _by_ratio(
+    replays: Replays,
+    twin: Truth,
+    misfit: Misfit,
+    noise: Mapping[str, float],
+    parameters: Sequence[Parameter],
+    grown: dict[str, float],
+    progress: Callable[[float], None],
+) -> Check:
+    """What has changed against a twin that does not explain its axis, by the misfit that it was made with.
+
+    Each cause is fitted alone, in units of that misfit, then with the best one. A cause is named if it
+    explains most of the growth, and no other does as well within the scatter of the legs.
+    """
+    data = replays.data
+    groups: dict[str, tuple[Parameter, ...]] = {}
+    for each in parameters:
+        groups[each.cause] = (*groups.get(each.cause, ()), each)
+    unseen = tuple(cause for cause, own in groups.items() if not _shows(replays, twin, own, misfit, noise))
+    blind = len(unseen) == len(groups)
+    if max(grown.values(), default=0.0) <= GROWN:
+        return Check((), {}, {}, unseen, grown, grown, blind)
+    scale, legs = (
+        Scales(scales_by_kind(data, misfit, noise)),
+        legs_of_rows(data, fitted_rows(data, everything=True)),
+    )
+    named: list[str] = []
+    best: Fitted | None = None
+    left, now = _excess(grown), grown
+    for number in range(MOST_NAMED):
+        fits = {}
+        for cause in (each for each in groups if each not in named):
+            own = tuple(each for name in (*named, cause) for each in groups[name])
+            start, prior = best.truth if best else twin, np.array(coordinates(twin, own))
+            fits[cause] = solve(
+                replays, start, own, prior, STEPS, known=scale, everything=True, tempered=True
+            )
+            progress((number + len(fits) / len(groups)) / MOST_NAMED)
+        cause = min(fits, key=lambda each: fits[each].cost)
+        now_grown = growth(data, fits[cause].residuals, misfit, noise)
+        near = fits[cause].vector
+        rivals = [
+            each
+            for each, fit in fits.items()
+            if each != cause and not told_apart(near, fit.vector - near, legs)
+        ]
+        if rivals or _excess(now_grown) > EXPLAINED * left:
+            break
+        named, best, left, now = [*named, cause], fits[cause], _excess(now_grown), now_grown
+        if max(now.values()) <= GROWN:
+            break
+    progress(1.0)
+    changes = tuple(_ratio(groups[cause], twin, best.truth) for cause in named) if best else ()
+    return Check(changes, {}, {}, unseen, grown, now)
+
+
+def _excess(grown: Mapping[str, float]) -> float:
+    """By how much the squares of the channels exceed what the twin was made with, in units of that."""
+    return sum(max(each**2 - 1.0, 0.0) for each in grown.values())
+
+
+def _shows(
+    replays: Replays, twin: Truth, own: Sequence[Parameter], misfit: Misfit, noise: Mapping[str, float]
+) -> bool:
+    """Whether the misfit would grow if one of the parameters changed by a noticeable amount."""
+    moved = [
+        _shifted(twin, each, way * NOTICEABLE * each.least_change) for each in own for way in (-1.0, 1.0)
+    ]
+    here, *there = replays([twin, *moved])
+    data = replays.data
+    was = scales_by_kind(data, misfit, noise)
+    for found in there:
+        # What changes adds to what the twin leaves: by chance they have nothing in common.
+        change = {name: np.hypot(found[name] - here[name], was[name]) for name in CHANNELS}
+        if max(growth(data, change, misfit, noise).values(), default=0.0) > GROWN:
+            return True
+    return False
+
+
+def _ratio(own: Sequence[Parameter], before: Truth, after: Truth) -> Finding:
+    """A change by its ratio: neither value is the axis's."""
+    moved = []
+    for each in own:
+        (was,), (now,) = coordinates(before, [each]), coordinates(after, [each])
+        if each.linear:
+            moved.append((abs(now - was) / each.least_change, Moved(each.name, each.unit, 0.0, now - was)))
+        else:
+            times = Moved(each.name, "times what it was", 1.0, math.exp(now - was))
+            moved.append((abs(now - was) / each.least_change, times))
+    size = max(size for size, _ in moved)
+    shown = tuple(each for times, each in moved if times >= min(1.0, size))
+    channels = tuple(name for name in CHANNELS if any(name in each.shows_in for each in own))
+    return Finding(own[0].cause, shown, channels, size, (1.0, 1.0))
 
 
 def _own(data: Data, twin: Truth) -> list[str]:

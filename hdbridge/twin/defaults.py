@@ -76,6 +76,7 @@ def default_truth(axis: AxisConfig) -> Truth:
     data: dict[str, Any] = {
         "schema": "hdbridge.truth/1",
         "name": axis.name,
+        "provenance": {"values": "usual"},
         "substep_ms": SUBSTEP_MS,
         "motor": {
             "inertia_kg_m2": inertia,

@@ -73,7 +73,7 @@ def with_last(replays: Replays, best: Fitted, prior: FloatArray) -> tuple[Fitted
         new = len(best.parameters)
         off = abs(float(tried.place[new] - around[new]))
         sure = off > SURE * math.sqrt(float(tried.covariance[new, new]))
-        if sure and best.cost - tried.cost > EARNED * best.inflation:
+        if sure and best.cost - tried.cost > EARNED:
             best, prior = tried, around
     return best, prior
 
@@ -104,7 +104,7 @@ def with_loop(replays: Replays, best: Fitted, prior: FloatArray) -> Fitting | No
     if not led:
         return None
     nearest, around = min(led, key=lambda each: each[0].cost)
-    if best.cost - _cost(replays, nearest.truth, best) < EARNED * best.inflation:
+    if best.cost - _cost(replays, nearest.truth, best) < EARNED:
         return None
     rest = [number for number, each in enumerate(best.parameters) if each.cause != ELASTIC]
     parameters = (*(best.parameters[number] for number in rest), *nearest.parameters)
@@ -122,7 +122,7 @@ def with_limit(replays: Replays, best: Fitted, prior: FloatArray, usual: Truth) 
     if free_value(best.truth, LIMIT) >= highest or LIMIT in best.parameters:
         return unchanged
     without = with_values(best.truth, {LIMIT.name: highest})
-    if _cost(replays, without, best) - best.cost > EARNED * best.inflation:
+    if _cost(replays, without, best) - best.cost > EARNED:
         return Fitting(best.truth, (*best.parameters, LIMIT), np.append(prior, coordinates(usual, [LIMIT])))
     return unchanged._replace(truth=without)
 

@@ -59,7 +59,7 @@ APART = 0.1
 """In spreads of a parameter: fits that have come closer than this are on their way to the same place."""
 OPTIONAL = (
     "velocity feed-forward", "load friction", "temperature", "current limit", "motor encoder delay",
-    "encoder coupling", "friction growth", *LOOP,
+    "encoder coupling", "friction growth", "moving average", *LOOP,
 )  # fmt: skip
 """Not fitted unless asked for or earned: the ordinary motion does not show them, others can take their
 place, or a calibration has told them."""
@@ -76,8 +76,11 @@ def free_parameters(truth: Truth, more: Sequence[str] = ()) -> tuple[Parameter, 
     return tuple(free)
 
 
-def fit(replays: Replays, progress: Progress = lambda _: None, more: Sequence[str] = ()) -> Fitted:
-    """From the truth that the recordings were prepared with to the parameters that explain them best."""
+def fit(replays: Replays, progress: Progress = lambda _: None, more: Sequence[str] = ()) -> Fitted | None:
+    """From the truth that the recordings were prepared with to the parameters that explain them best.
+
+    None if its servo explains too little of them: see `hdbridge.twin.structures`.
+    """
     data, roughly = replays.data, replays.rough
     start = data.base
     begun = start_of(start, data)
@@ -99,9 +102,7 @@ def fit(replays: Replays, progress: Progress = lambda _: None, more: Sequence[st
             near = _led(replays, parameters, prior, each.truth, NEAR_STEPS, each, about)
             ends.append(_ended(replays, near, prior, most))
     if not ends:
-        # This axis has what no simulation has, in the channel that led the way. By the noise, however
-        # tempered, the others had no say; by what each of them is left with they have.
-        ends = [solve(replays, begun, parameters, prior, STEPS, most=most)]
+        return None
     progress(0.6)
     best = min(ends, key=lambda each: each.loss + (EARNED if each is not ends[0] else 0.0))
     laws = len(LAWS)  # so often at most another one is taken

@@ -8,7 +8,8 @@ with the twin's error as a nuisance).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Self
 
@@ -18,7 +19,58 @@ from hdbridge.effects import FloatArray
 from hdbridge.errors import InputError
 from hdbridge.sim.truth import Truth
 from hdbridge.twin.covariance import over_legs
+from hdbridge.twin.misfit import CHANNELS, Data, counted
 from hdbridge.twin.parameters import Parameter
+from hdbridge.twin.result import Values
+
+Misfit = Mapping[str, Mapping[str, float]]
+"""By channel, in its unit, and kind of leg: rms of what a replay leaves of the recording."""
+STRAY = 4.0
+"""A sample that leaves more than this times the rms of its kind counts as that: a motor that breaks away at a
+different time is no change of the axis."""
+
+
+def misfit_of(data: Data, residuals: Mapping[str, FloatArray]) -> dict[str, dict[str, float]]:
+    """What residuals leave of each recorded channel, by kind of leg."""
+    kinds = np.array(data.kinds)[data.leg.astype(np.intp)]
+    found: dict[str, dict[str, float]] = {}
+    for name, counts in counted(data).items():
+        for kind in dict.fromkeys(data.kinds):
+            inside = (counts > 0.0) & (kinds == kind)
+            if inside.any():
+                rms = math.sqrt(float(np.mean(np.square(residuals[name][inside]))))
+                found.setdefault(name, {})[kind] = float(f"{rms:.6g}")
+    return found
+
+
+def growth(
+    data: Data, residuals: Mapping[str, FloatArray], known: Misfit, noise: Mapping[str, float]
+) -> dict[str, float]:
+    """By channel: rms of what is left over what was left of the same kinds of leg when the twin was made.
+
+    A kind that the twin has not seen is held against the largest of the others; below the ``noise`` nothing
+    is left.
+    """
+    was, found = scales_by_kind(data, known, noise), {}
+    for name, counts in counted(data).items():
+        inside = counts > 0.0
+        if inside.any():
+            scale = was[name][inside]
+            now = np.minimum(np.abs(residuals[name][inside]), STRAY * scale)
+            found[name] = math.sqrt(float(np.sum(now**2)) / float(np.sum(scale**2)))
+    return found
+
+
+def scales_by_kind(data: Data, known: Misfit, noise: Mapping[str, float]) -> dict[str, Any]:
+    """By channel, for each row: the misfit of its kind of leg as it was, or the noise if that is more."""
+    kinds = np.array(data.kinds)[data.leg.astype(np.intp)]
+    found: dict[str, Any] = {}
+    for name in CHANNELS:
+        before = known.get(name, {})
+        otherwise = max(before.values(), default=0.0)
+        by_kind = {kind: max(before.get(kind, otherwise), noise[name]) for kind in dict.fromkeys(data.kinds)}
+        found[name] = np.array([by_kind[str(kind)] for kind in kinds])
+    return found
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,6 +83,10 @@ class Known:
     """Of their coordinates."""
     noise: dict[str, float]
     """Scale of each channel's residuals."""
+    misfit: Misfit
+    """What the twin left of its own recordings; empty in files of older versions."""
+    of_axis: bool
+    """Whether the twin's values are the axis's."""
 
     @classmethod
     def of(cls, twin: Truth) -> Self:
@@ -42,7 +98,9 @@ class Known:
                 "was fitted: make one with hdbridge twin"
             )
         names = tuple(about["parameters"])
-        return cls(names, np.array(about["covariance"], dtype=np.float64), dict(about["noise"]))
+        covariance = np.array(about["covariance"], dtype=np.float64)
+        of_axis = Values.of(twin) is not Values.REPLAY
+        return cls(names, covariance, dict(about["noise"]), about.get("misfit", {}), of_axis)
 
     def root(self, parameters: Sequence[Parameter]) -> FloatArray:
         """A root of the covariance of these parameters' coordinates, shape (p, fitted).

@@ -86,11 +86,6 @@ class Fitted:
         return 0.5 * float(self.vector @ self.vector)
 
     @property
-    def misfit(self) -> float:
-        """Mean size of the scaled residuals over the channels, in their units: comparable between fits."""
-        return float(np.prod([np.mean(np.abs(each)) + 1e-12 for each in self.residuals.values()]))
-
-    @property
     def inflation(self) -> float:
         """Mean square of the scaled residuals, 1 at least: what one of them is worth."""
         return max(1.0, float(self.vector @ self.vector) / max(len(self.vector), 1))

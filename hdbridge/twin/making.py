@@ -12,16 +12,19 @@ from hdbridge.twin.commands import legs_of
 from hdbridge.twin.comparison import Comparison, compare
 from hdbridge.twin.defaults import with_sections
 from hdbridge.twin.fitting import FIT_S, fit
+from hdbridge.twin.known import misfit_of
 from hdbridge.twin.least_squares import Fitted, fitted_rows, legs_of_rows
 from hdbridge.twin.loop_laws import by_law_of
-from hdbridge.twin.misfit import CHANNELS, coarse, held_out_legs, prepare
-from hdbridge.twin.naming import alike, name_causes, unexplained
+from hdbridge.twin.misfit import CHANNELS, Data, coarse, held_out_legs, prepare
+from hdbridge.twin.naming import Alike, Finding, alike, name_causes
 from hdbridge.twin.noise import noise_in_motion, with_load_noise
 from hdbridge.twin.parameters import LOAD
 from hdbridge.twin.replay import replay_directly
 from hdbridge.twin.replays import Replays
-from hdbridge.twin.result import HELD_OUT, Twin
+from hdbridge.twin.result import HELD_OUT, Twin, Values
+from hdbridge.twin.structures import fit_structures, misfit
 from hdbridge.twin.thermal import with_warmth
+from hdbridge.twin.verdict import impossible, values_of, what_is_left
 
 
 def fit_twin(
@@ -31,26 +34,50 @@ def fit_twin(
     progress: Callable[[float], None] = lambda _: None,
     workers: int | None = None,
 ) -> Twin:
-    """The twin of an axis, from recordings that have the commanded motor angle.
+    """Fits the twin of an axis to recordings that have the commanded motor angle.
 
     ``start`` is what is assumed of it: the translated axis file and model, or an older twin. Replays run in
-    ``workers`` processes. InputError where a recording has no command or is of another gear.
+    ``workers`` processes. InputError if a recording has no command or is of another gear.
+
+    Causes are named only if the values before and after are the axis's; intervals are given only if those
+    after are.
     """
     whole = Recording.joined(list(recordings))
     data = coarse(prepare(whole, axis, start), FIT_S)
     with Replays(data, workers) as replays:
-        fitted = fit(replays, lambda share: progress(0.9 * share))
-        like = by_law_of(with_sections(start, fitted.parameters), fitted.truth)
-        findings, rivals = name_causes(replays, like, fitted)
-        (left,) = replays([fitted.truth])
-        sets = dict.fromkeys((*rivals, *alike(fitted, legs_of_rows(data, fitted_rows(data)))))
-        rest = unexplained(data, left, noise_in_motion(data))
-    truth, warmth = with_warmth(whole, axis, fitted, with_knowledge(fitted))
-    if warmth is not None:
+        noise = noise_in_motion(data)
+        found = fit(replays, lambda share: progress(0.7 * share))
+        if found is None or values_of(what_is_left(data, found.residuals, noise)) is Values.REPLAY:
+            other = fit_structures(replays, start, lambda share: progress(0.7 + 0.2 * share))
+            found = min([found or other, other], key=lambda each: misfit(data, each.residuals))
+        fitted = found
+        left = what_is_left(data, fitted.residuals, noise)
+        values = values_of(left)
+        findings: tuple[Finding, ...] = ()
+        sets: dict[Alike, None] = {}
+        if values is Values.AXIS:
+            if Values.of(start) in {None, Values.AXIS}:
+                like = by_law_of(with_sections(start, fitted.parameters), fitted.truth)
+                findings, rivals = name_causes(replays, like, fitted)
+                sets = dict.fromkeys(rivals)
+            sets |= dict.fromkeys(alike(fitted, legs_of_rows(data, fitted_rows(data))))
+    truth, warmth = with_warmth(whole, axis, fitted, with_knowledge(fitted, data, values))
+    if values is Values.REPLAY:
+        truth = truth.model_copy(update={"intervals": {}})
+    elif warmth is not None and Values.of(start) in {None, Values.AXIS}:
         findings = (*findings, warmth)
     before, after = (_compared(whole, axis, each) for each in (start, truth))
+    cycle_s = data.pieces[0].commands.cycle_s
     progress(1.0)
-    return Twin(truth, findings, tuple(sets), rest, before, after)
+    return Twin(
+        truth,
+        findings,
+        tuple(sets),
+        left,
+        before,
+        after,
+        impossible(truth, axis, cycle_s) if values is Values.REPLAY else (),
+    )
 
 
 def _compared(whole: Recording, axis: AxisConfig, truth: Truth) -> Comparison:
@@ -60,18 +87,21 @@ def _compared(whole: Recording, axis: AxisConfig, truth: Truth) -> Comparison:
     return compare(whole.record, simulated, [*legs_of(whole), *held], axis.gear.ratio)
 
 
-def with_knowledge(fitted: Fitted) -> Truth:
+def with_knowledge(fitted: Fitted, data: Data, values: Values = Values.AXIS) -> Truth:
     """The fitted truth with its intervals and what a later check needs, as its file has it."""
     intervals = fitted.intervals()
     about: dict[str, Any] = {
         "parameters": [each.name for each in fitted.parameters],
         "covariance": [[float(f"{value:.6g}") for value in row] for row in fitted.covariance.tolist()],
         "noise": {name: float(f"{fitted.scales.noise[name]:.6g}") for name in CHANNELS},
+        "misfit": misfit_of(data, fitted.residuals),
     }
     truth = with_load_noise(fitted.truth, fitted.residuals[LOAD])
     return truth.model_copy(
         update={
             "intervals": {".".join(each.path): intervals[each.name] for each in fitted.parameters},
-            "provenance": {**truth.provenance, "versions": versions_here(), "fit": about},
+            "provenance": {
+                **truth.provenance, "values": str(values), "versions": versions_here(), "fit": about,
+            },
         }
-    )
+    )  # fmt: skip

@@ -16,7 +16,7 @@ from scipy.special import chdtrc
 from hdbridge.effects import FloatArray
 from hdbridge.sim.truth import Truth
 from hdbridge.twin.least_squares import Fitted
-from hdbridge.twin.misfit import CHANNELS, Data, counted
+from hdbridge.twin.misfit import CHANNELS
 from hdbridge.twin.parameters import Parameter, coordinates, free_value
 from hdbridge.twin.replays import Replays
 from hdbridge.twin.rivals import held_out, put_back, told_apart, without
@@ -34,18 +34,18 @@ class Moved:
     unit: str
     before: float
     after: float
-    lower: float
-    upper: float
-    """95 % interval of what it is after."""
+    lower: float = math.nan
+    upper: float = math.nan
+    """95 % interval of what it is after; NaN if it has none."""
 
     @property
     def sentence(self) -> str:
         """In words."""
         unit = f" {self.unit}" if self.unit else ""
-        before, after, lower, upper = (
-            figure(each, 3) for each in (self.before, self.after, self.lower, self.upper)
-        )
-        return f"{self.name} {before} -> {after}{unit} ({lower} to {upper})"
+        moved = f"{self.name} {figure(self.before, 3)} -> {figure(self.after, 3)}{unit}"
+        if math.isnan(self.lower):
+            return moved
+        return f"{moved} ({figure(self.lower, 3)} to {figure(self.upper, 3)})"
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,15 +79,6 @@ class Alike:
 
     names: tuple[str, ...]
     moves: tuple[str, ...]
-
-
-@dataclass(frozen=True, slots=True)
-class Unexplained:
-    """What a channel is left with beyond its noise, and the kind of leg where it is largest."""
-
-    channel: str
-    times_noise: float
-    kind: str
 
 
 def name_causes(
@@ -213,25 +204,6 @@ def alike(fitted: Fitted, legs: FloatArray) -> tuple[Alike, ...]:
 
 def _set(members: Sequence[Parameter]) -> Alike:
     return Alike(tuple(each.name for each in members), tuple(dict.fromkeys(each.move for each in members)))
-
-
-def unexplained(
-    data: Data, left: Mapping[str, FloatArray], noise: Mapping[str, float], least: float = 1.3
-) -> tuple[Unexplained, ...]:
-    """What residuals have beyond so many times the noise, by channel."""
-    counts = counted(data)
-    kinds = np.array(data.kinds)[data.leg.astype(np.intp)]
-    found = []
-    for name in CHANNELS:
-        inside = counts[name] > 0.0
-        if not inside.any():
-            continue
-        squares = np.square(left[name][inside])
-        times = math.sqrt(float(squares.mean())) / noise[name]
-        if times > least:
-            by_kind = {kind: float(squares[kinds[inside] == kind].mean()) for kind in set(kinds[inside])}
-            found.append(Unexplained(name, times, str(max(by_kind, key=lambda kind: by_kind[kind]))))
-    return tuple(found)
 
 
 def _moved(fitted: Fitted, start: Truth, own: Sequence[Parameter]) -> float:

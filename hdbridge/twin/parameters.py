@@ -124,6 +124,30 @@ PARAMETERS: Final[tuple[Parameter, ...]] = (
         (FOLLOWING,), _SINES, 0.30,
     ),
     Parameter(
+        "moving average", ("servo", "moving_average_ms"), "ms", 0.0, 7.0, 2.0, "command filter",
+        (FOLLOWING,), _SINES, 0.5, linear=True,
+    ),
+    Parameter(
+        "speed filter", ("servo", "speed_filter_ms"), "ms", 0.02, 20.0, 0.7, SERVO,
+        (FOLLOWING, TORQUE), _SINES, 0.4,
+    ),
+    Parameter(
+        "torque filter", ("servo", "torque_filter_ms"), "ms", 0.02, 20.0, 0.7, SERVO,
+        (FOLLOWING, TORQUE), _SINES, 0.4,
+    ),
+    Parameter(
+        "notch frequency", ("servo", "notch", "frequency_hz"), "Hz", 5.0, 800.0, 0.3, SERVO,
+        (TORQUE, FOLLOWING), _STEPS, 0.1,
+    ),
+    Parameter(
+        "notch depth", ("servo", "notch", "depth"), "", 0.0, 1.0, 0.3, SERVO,
+        (TORQUE, FOLLOWING), _STEPS, 0.2, linear=True,
+    ),
+    Parameter(
+        "notch width", ("servo", "notch", "width"), "", 0.05, 5.0, 0.7, SERVO,
+        (TORQUE, FOLLOWING), _STEPS, 0.4,
+    ),
+    Parameter(
         "velocity feed-forward", ("servo", "velocity_feedforward"), "", 0.0, 1.5, 0.1, FEEDFORWARD,
         (FOLLOWING,), _SPEEDS, 0.03, linear=True,
     ),

@@ -151,14 +151,15 @@ def _validated(data: dict[str, Any]) -> Truth:
 
 
 def _of_axis(axis: AxisConfig, base: Truth) -> Truth:
-    """The same plant with encoders and rated torque as the axis file has them, and nothing of its origin."""
+    """The same plant with encoders and rated torque of the axis file; of its origin ``values`` is left."""
     data = base.model_dump(by_alias=True)
     data["name"] = axis.name
     data["motor"]["rated_torque_nm"] = axis.drive.rated_torque_nm
     for section, encoder in (("motor", axis.motor_encoder), ("load", axis.load_encoder)):
         data[section]["encoder"]["counts_per_turn"] = max(4, encoder.counts_per_turn)
         data[section]["encoder"]["direction"] = encoder.direction
-    data["intervals"], data["provenance"] = {}, {}
+    values = base.provenance.get("values")
+    data["intervals"], data["provenance"] = {}, {} if values is None else {"values": values}
     return Truth.model_validate(data)
 
 

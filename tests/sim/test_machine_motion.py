@@ -11,7 +11,9 @@ import pytest
 import ruckig
 
 from hdbridge.sim.machine import Machine
+from hdbridge.sim.servo import Notch
 from hdbridge.sim.truth import Truth
+from hdbridge.sim.truth.motor import TrueNotch
 
 PROFILES = Path(__file__).parents[2] / "profiles"
 CYCLE_S = 0.004
@@ -361,3 +363,50 @@ def test_the_gear_has_the_hysteresis_law_of_the_truth_file(law: dict[str, Any] |
     assert axis.error_arcsec == pytest.approx(offset, abs=0.2)
     axis.move(-STEP_COUNTS)
     assert axis.error_arcsec == pytest.approx(-offset, abs=0.2)
+
+
+# ---------------------------------------------------------------- blocks of the servo
+
+
+def following_error_ms(**changes: Any) -> float:
+    """Following error at a constant speed over that speed, of an axis without friction."""
+    known = truth(
+        motor__coulomb_nm=0.0, motor__viscous_nm_s_per_rad=0.0, gear__motor_orders=(), gear__hysteresis=None,
+        load__coulomb_nm=0.0, load__viscous_nm_s_per_rad=0.0,
+        **changes,
+    )  # fmt: skip
+    machine, errors = Machine(known, 1), []
+    for cycle in range(500):
+        machine.follow(100.0 * cycle, 100.0 * (cycle + 1), round(CYCLE_S / machine.dt_s))
+        errors.append(100.0 * (cycle + 1) - machine.motor_reading)
+    return 1e3 * statistics.mean(errors[-100:]) / (100.0 / CYCLE_S)
+
+
+def test_a_moving_average_delays_the_demand_by_half_its_length() -> None:
+    without, averaged = following_error_ms(), following_error_ms(servo__moving_average_ms=3.3)
+    assert averaged - without == pytest.approx(1.65, abs=0.02)
+
+
+def test_filters_on_speed_and_torque_make_no_following_error_at_a_constant_speed() -> None:
+    notch = {"frequency_hz": 300.0, "depth": 0.3, "width": 0.5}
+    filtered = following_error_ms(servo__speed_filter_ms=0.3, servo__torque_filter_ms=0.2, servo__notch=notch)
+    assert filtered == pytest.approx(following_error_ms(), abs=0.02)
+
+
+def test_an_integral_of_the_position_error_needs_no_feed_forward_at_a_constant_speed() -> None:
+    """PI on the speed is left with the speed over the position gain."""
+    filtered_ms = following_error_ms()
+    gain = truth().servo.position_gain_per_s
+    forward = {"servo__velocity_feedforward": 0.0, "servo__integral_time_ms": 60.0}
+    of_speed = following_error_ms(**forward)
+    of_position = following_error_ms(**forward, servo__integral_of="position")
+    assert of_speed - filtered_ms == pytest.approx(1e3 / gain, rel=0.02)
+    assert of_position == pytest.approx(filtered_ms, abs=0.05)
+
+
+@pytest.mark.parametrize(("frequency_hz", "gain"), [(0.0, 1.0), (120.0, 0.25), (900.0, 1.0)])
+def test_a_notch_has_its_depth_at_its_frequency_and_nothing_far_off(frequency_hz: float, gain: float) -> None:
+    step_s = 0.0005
+    notch = Notch(TrueNotch(frequency_hz=120.0, depth=0.25, width=0.4), step_s)
+    shown = [notch.notched_nm(math.cos(math.tau * frequency_hz * number * step_s)) for number in range(4000)]
+    assert max(shown[2000:]) == pytest.approx(gain, rel=0.03)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -23,10 +24,13 @@ from hdbridge.twin.check import Check, check
 from hdbridge.twin.least_squares import solve
 from hdbridge.twin.making import with_knowledge
 from hdbridge.twin.misfit import CHANNELS, counted, prepare, residuals
+from hdbridge.twin.noise import noise_in_motion
 from hdbridge.twin.parameters import BY_NAME, coordinates, value_in, with_values
 from hdbridge.twin.regressions import read_off
 from hdbridge.twin.replays import Replays
+from hdbridge.twin.result import Values
 from hdbridge.twin.scales import noise_floor
+from hdbridge.twin.verdict import values_of, what_is_left
 
 DEMO = Path(__file__).parents[2] / "profiles" / "demo"
 AXIS = AxisConfig.load(DEMO)
@@ -58,7 +62,7 @@ def twin() -> Truth:
     parameters = tuple(BY_NAME[name] for name in NAMES)
     with Replays(prepare(recorded(), AXIS, TRUTH), 1) as replays:
         prior = np.array(coordinates(TRUTH, parameters))
-        return with_knowledge(solve(replays, TRUTH, parameters, prior, 2))
+        return with_knowledge(solve(replays, TRUTH, parameters, prior, 2), replays.data)
 
 
 def test_a_replay_of_the_true_axis_leaves_rounding_and_noise() -> None:
@@ -183,6 +187,58 @@ def test_a_load_that_rings_out_of_step_has_changed() -> None:
     (inertia,) = told.changes[0].parameters
     assert inertia.after == pytest.approx(1.5 * TRUTH.load_.inertia_kg_m2, rel=0.05)
     assert told.unexplained == {}
+
+
+@cache
+def replay_only() -> Truth:
+    """A twin with wrong loops: it leaves several times the noise, so its values are not the axis's."""
+    wrong = with_values(TRUTH, {"position gain": 120.0, "integral time": 40.0, "motor inertia": 6e-5})
+    parameters = tuple(BY_NAME[name] for name in NAMES)
+    with Replays(prepare(recorded(), AXIS, wrong), 1) as replays:
+        prior = np.array(coordinates(wrong, parameters))
+        fitted = solve(replays, wrong, parameters, prior, 6)
+        left = what_is_left(replays.data, fitted.residuals, noise_in_motion(replays.data))
+        assert values_of(left) is Values.REPLAY
+        return with_knowledge(fitted, replays.data, Values.REPLAY)
+
+
+def test_a_twin_with_values_of_its_own_is_checked_by_the_misfit_that_it_was_made_with() -> None:
+    told = check(recorded(seed=1), AXIS, replay_only(), workers=1)
+    assert told.changes == ()
+    assert told.sentence.startswith("Nothing has changed since the twin was made.")
+    assert max(told.growth_before.values()) < 1.1
+
+
+def test_such_a_twin_names_a_change_by_its_ratio() -> None:
+    doubled = recorded(seed=2, Coulomb_friction=2.0 * TRUTH.motor.coulomb_nm)
+    told = check(doubled, AXIS, replay_only(), workers=1)
+    assert [each.cause for each in told.changes] == ["friction"]
+    friction = next(each for each in told.changes[0].parameters if each.name == "Coulomb friction")
+    assert friction.after == pytest.approx(2.0, rel=0.2)
+    assert "times what it was" in told.sentence
+
+
+@pytest.mark.parametrize("twin_of", [twin, replay_only])
+def test_more_misfit_than_when_the_twin_was_made_is_never_nothing(twin_of: Callable[[], Truth]) -> None:
+    """A torque that hunts, which no parameter of the simulated drive brings about."""
+    torque = recorded(seed=1).record.columns["motor_torque_nm"]
+    hunts = torque + 0.05 * np.sin(np.arange(len(torque)) / 2.0) * (torque != 0.0)
+    record = replace(
+        recorded(seed=1).record, columns={**recorded(seed=1).record.columns, "motor_torque_nm": hunts}
+    )
+    told = check(replace(recorded(seed=1), record=record), AXIS, twin_of(), workers=1)
+    assert told.growth_before["motor torque"] > 1.5
+    assert "Nothing has changed" not in told.sentence
+    assert "motor torque" in told.sentence
+
+
+def test_a_twin_that_leaves_all_of_a_signal_shows_no_change() -> None:
+    known = replay_only()
+    about = known.provenance["fit"]
+    huge = {name: {kind: 1e6 * rms for kind, rms in by.items()} for name, by in about["misfit"].items()}
+    lost = known.model_copy(update={"provenance": {**known.provenance, "fit": {**about, "misfit": huge}}})
+    told = check(recorded(seed=1), AXIS, lost, workers=1)
+    assert told.sentence == "The twin explains too little of this axis to show a change."
 
 
 def test_what_no_cause_explains_is_no_nothing() -> None:

@@ -15,10 +15,10 @@ from hdbridge.records.recording import Recording
 from hdbridge.sim.exercise import Exercise
 from hdbridge.sim.truth import Truth
 from hdbridge.twin.misfit import CHANNELS, Data, demand_deg, prepare, traces_of
-from hdbridge.twin.naming import unexplained
 from hdbridge.twin.noise import noise_in_motion
 from hdbridge.twin.parameters import FOLLOWING, LOAD, TORQUE
 from hdbridge.twin.scales import noise_floor, scales
+from hdbridge.twin.verdict import what_is_left
 
 DEMO = Path(__file__).parents[2] / "profiles" / "demo"
 NOISE = {FOLLOWING: 0.5, TORQUE: 0.02, LOAD: 7.0}
@@ -96,5 +96,6 @@ def test_what_is_left_within_the_noise_of_the_motion_is_explained() -> None:
         )
         for name in CHANNELS
     }
-    assert unexplained(data, left, noise_in_motion(data)) == ()
-    assert {each.channel for each in unexplained(data, left, noise_floor(data))} == set(CHANNELS)
+    assert all(each.explained for each in what_is_left(data, left, noise_in_motion(data)))
+    some = what_is_left(data, left, noise_floor(data))
+    assert {each.channel for each in some if not each.explained} == set(CHANNELS)

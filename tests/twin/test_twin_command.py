@@ -22,9 +22,11 @@ from hdbridge.sim.exercise import Exercise
 from hdbridge.sim.truth import Truth
 from hdbridge.twin.comparison import compare
 from hdbridge.twin.kept import KeptTwin
-from hdbridge.twin.naming import Finding, Moved, Unexplained
+from hdbridge.twin.naming import Finding, Moved
+from hdbridge.twin.parameters import with_values
 from hdbridge.twin.replay import replay_directly
-from hdbridge.twin.result import Twin
+from hdbridge.twin.result import Left, Twin
+from hdbridge.twin.verdict import impossible
 
 DEMO = Path(__file__).parents[2] / "profiles" / "demo"
 
@@ -164,7 +166,7 @@ def test_a_recording_of_another_axis_or_without_commands_is_refused(profile: Pat
     assert "there is no active twin" in done.stderr
 
 
-def fitted(truth: Truth) -> Callable[..., Twin]:
+def fitted(truth: Truth, values: str = "axis", times_noise: float = 2.5) -> Callable[..., Twin]:
     """In place of a fit, which takes minutes: this is what it comes to."""
 
     def fit_twin(recordings: Any, axis: AxisConfig, start: Truth, progress: Any) -> Twin:
@@ -175,8 +177,13 @@ def fitted(truth: Truth) -> Callable[..., Twin]:
         )
         moved = Moved("Coulomb friction", "Nm", start.motor.coulomb_nm, truth.motor.coulomb_nm, 0.033, 0.035)
         finding = Finding("friction", (moved,), ("motor torque",), 99.0, (5.0, 1.0))
-        known = truth.model_copy(update={"intervals": {"motor.coulomb_nm": (0.033, 0.035)}})
-        return Twin(known, (finding,), (), (Unexplained("motor torque", 2.5, "step"),), before, after)
+        about = {"values": values, "fit": {"parameters": ["Coulomb friction"]}}
+        intervals = {"motor.coulomb_nm": (0.033, 0.035)} if values == "axis" else {}
+        known = truth.model_copy(update={"intervals": intervals, "provenance": about})
+        left = (Left("motor torque", 0.04, times_noise, "step"),)
+        findings = (finding,) if values == "axis" and "values" not in start.provenance else ()
+        wrong = impossible(truth, axis, 0.01) if values == "replay" else ()
+        return Twin(known, findings, (), left, before, after, wrong)
 
     return fit_twin
 
@@ -217,6 +224,64 @@ def test_a_twin_that_is_no_better_is_not_kept(
     assert told["parameters"] == []
     assert "What the plant is" not in (profile / "page.html").read_text()
     assert not (profile / "pending-twin.yaml").exists()
+
+
+def test_values_that_are_not_the_axis_s_are_offered_as_a_replay_only(
+    profile: Path, recording: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("hdbridge.twin.making.fit_twin", fitted(Truth.load(DEMO), "replay", 22.0))
+    done = run_here(profile, "twin", profile, recording, "--json", "told.json", "--html", "page.html")
+    assert done.returncode == 0, done.stderr
+    headline = (
+        "The twin replays this drive (motor torque to 4 %), but its values are not the axis's: motor torque "
+        "is left with 22 times its noise; the twin is kept as pending:"
+    )
+    assert done.stdout.startswith(headline)
+    assert "friction:" not in done.stdout, "no value is called a finding"
+    told = json.loads((profile / "told.json").read_text())
+    assert told["values"] == "replay"
+    assert told["verdict"].lower().startswith(headline.lower())
+    assert [(each["channel"], each["explained"]) for each in told["left"]] == [("motor torque", False)]
+    assert [each["cause"] for each in told["findings"]] == ["unexplained"]
+    assert [each["ci95"] for each in told["parameters"]] == [None]
+    page = (profile / "page.html").read_text()
+    assert headline.replace("'", "&#x27;") in page or headline.replace("'", "&#39;") in page
+    assert "They are not the axis" in page
+    pending = KeptTwin.load(profile / "pending-twin.yaml").truth
+    assert pending.provenance["values"] == "replay"
+    assert pending.intervals == {}
+
+
+def test_values_that_no_axis_has_are_refused(
+    profile: Path, recording: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    demo = Truth.load(DEMO)
+    for values, complaint in (
+        ({"friction feed-forward": 3.0}, "friction feed-forward 3 Nm; expected at most the friction"),
+        ({"motor inertia": 1e-3}, "motor inertia 0.001 kg m2; expected within a decade"),
+        ({"load inertia": 10.0}, "load inertia seen by the motor"),
+    ):
+        monkeypatch.setattr("hdbridge.twin.making.fit_twin", fitted(with_values(demo, values), "replay"))
+        done = run_here(profile, "twin", profile, recording)
+        assert done.returncode == 0, done.stderr
+        assert done.stdout.startswith("The twin is not kept: no axis has these values:")
+        assert complaint in done.stdout
+        assert not (profile / "pending-twin.yaml").exists()
+    late, axis = with_values(demo, {"servo dead time": 5.0}), AxisConfig.load(DEMO)
+    assert impossible(late, axis, 0.0025) == ()
+    assert impossible(late, axis, 0.002) == ("dead time 5 ms; expected at most two cycles, 4",)
+
+
+def test_from_usual_values_a_fit_gives_estimates_and_no_changes(
+    profile: Path, recording: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("hdbridge.twin.making.fit_twin", fitted(Truth.load(DEMO)))
+    done = run_here(profile, "twin", profile, recording, "--afresh", "--json", "told.json")
+    assert done.returncode == 0, done.stderr
+    assert "estimate: Coulomb friction 0.034 Nm (0.033 to 0.035)" in done.stdout
+    assert "->" not in done.stdout
+    (friction,) = json.loads((profile / "told.json").read_text())["parameters"]
+    assert friction["before"] is None
 
 
 @pytest.mark.slow

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 from pydantic import Field
 
 from hdbridge.sim.truth.encoder import TrueMotorEncoder
@@ -41,6 +43,14 @@ class TrueLoadFeedforward(Part):
     damping_ratio: float = Field(ge=0, le=2, description="damping ratio of the load, the motor held")
 
 
+class TrueNotch(Part):
+    """A notch on the torque, exact at its frequency (bilinear transform)."""
+
+    frequency_hz: float = Field(gt=0, le=900, description="centre; below half the rate of the substeps")
+    depth: float = Field(ge=0, le=1, description="gain at the centre")
+    width: float = Field(gt=0, le=10, description="bandwidth over the frequency")
+
+
 class TrueServo(Part):
     """The drive's loops: position and velocity cascade with feed-forward, limited in torque."""
 
@@ -49,6 +59,9 @@ class TrueServo(Part):
         gt=0, le=1_000, description="velocity loop: torque per speed error"
     )
     integral_time_ms: float = Field(gt=0, le=10_000, description="velocity loop: integral time")
+    integral_of: Literal["speed", "position"] = Field(
+        "speed", description="error that the integral adds up: PI on the speed, or PIV"
+    )
     integral_dead_band: float = Field(
         1.0,
         ge=0,
@@ -64,6 +77,12 @@ class TrueServo(Part):
     command_filter_ms: float = Field(
         gt=0, le=100, description="time constant of the second-order filter on the demand"
     )
+    moving_average_ms: float = Field(0.0, ge=0, le=100, description="moving average of the demand")
+    speed_filter_ms: float = Field(
+        0.0, ge=0, le=100, description="time constant of the lag on the measured speed"
+    )
+    torque_filter_ms: float = Field(0.0, ge=0, le=100, description="time constant of the lag on the torque")
+    notch: TrueNotch | None = Field(None, description="notch on the torque; without it: none")
     velocity_feedforward: float = Field(1.0, ge=0, le=1.5, description="part of the demanded speed")
     inertia_feedforward_kg_m2: float = Field(
         0.0, ge=0, le=100, description="torque per demanded acceleration, for the motor itself"

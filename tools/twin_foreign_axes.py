@@ -1,0 +1,133 @@
+"""Fits twins of the foreign axes in tests/foreign, whose servos the simulated drive does not have.
+
+    PYTHONPATH=tests .venv/bin/python tools/twin_foreign_axes.py --structures piv observed --first 20 --axes 2
+
+Each axis is recorded on the plan ``dynamics`` and on another motion. Its twin starts at usual values with the
+gear's true transmission error, as a calibration would give it. Printed for each axis: following error and
+torque of the twin on the other motion, per cent of the measured signal; how many intervals were given and how
+many of them hold the truth; what was said of the twin; and the CPU time of the fit.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # the matrices are small: threads only cost
+
+import yaml
+from foreign.bench import bench_of
+from foreign.draw import Truth as Foreign
+from foreign.draw import draw
+from foreign.mechanics import BoucWen
+from foreign.servos import STRUCTURES
+from twin_random_axes import ANOTHER, without_noise
+
+from hdbridge.axis import AxisConfig
+from hdbridge.control.bench import Bench
+from hdbridge.drive.drive import Drive
+from hdbridge.errors import HdbridgeError
+from hdbridge.procedures.plan import Plan
+from hdbridge.records.recording import Recording
+from hdbridge.sim.truth import Truth
+from hdbridge.twin.comparison import compare
+from hdbridge.twin.defaults import default_truth
+from hdbridge.twin.making import fit_twin
+from hdbridge.twin.replay import replay_directly
+from hdbridge.twin.verdict import judge
+
+
+def bench(foreign: Foreign, plan: Plan) -> Recording:
+    """A plan on the foreign axis, over frames, task by task."""
+    parts = []
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        bench_of(foreign, Path(folder)) as axis,
+        Drive(axis.bus, axis.axis, axis.clock) as drive,
+    ):
+        drive.boot()
+        place = Bench(drive)
+        for task in plan.tasks(place.view).tasks:
+            run = place.run(task.procedure)
+            parts.append(Recording(run.record, run.segments, run.axis, run.ratio))
+    return Recording.joined(parts)
+
+
+def axis_of(foreign: Foreign) -> AxisConfig:
+    """The axis file of a foreign axis."""
+    with tempfile.TemporaryDirectory() as folder, bench_of(foreign, Path(folder)) as axis:
+        return axis.axis
+
+
+def start(axis: AxisConfig, foreign: Foreign) -> Truth:
+    """Usual values, and the gear's own transmission error."""
+    law, truth = foreign.mechanics.hysteresis, default_truth(axis).model_dump(by_alias=True)
+    truth["gear"]["motor_orders"] = [each._asdict() for each in foreign.mechanics.motor_orders]
+    truth["gear"]["hysteresis"] = (
+        {"law": "bouc_wen", "offset_arcsec": law.offset_arcsec, "yield_deg": law.yield_deg}
+        if isinstance(law, BoucWen)
+        else {
+            "law": "maxwell_slip",
+            "elements": [{"limit_arcsec": limit, "yield_deg": travel} for limit, travel in law.elements],
+        }
+    )
+    return Truth.model_validate(truth)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--structures", nargs="+", default=list(STRUCTURES), choices=list(STRUCTURES))
+    parser.add_argument("--axes", type=int, default=2)
+    parser.add_argument("--first", type=int, default=1, help="seed of the first axis")
+    parser.add_argument("--workers", type=int, default=1)
+    options = parser.parse_args()
+    another = Plan.model_validate(yaml.safe_load(ANOTHER))
+    for seed in range(options.first, options.first + options.axes):
+        for structure in options.structures:
+            foreign = draw(seed, structure)
+            axis = axis_of(foreign)
+            try:
+                recording, other = bench(foreign, Plan.load("dynamics")), bench(foreign, another)
+            except HdbridgeError as stop:
+                print(f"{structure} {seed}: left out: {stop}", flush=True)
+                continue
+            began_s = time.process_time()
+            twin = fit_twin([recording], axis, start(axis, foreign), workers=options.workers)
+            took_s = time.process_time() - began_s
+            again = replay_directly(other, axis, without_noise(twin.truth), seed)
+            told = compare(other.record, again, other.segments, axis.gear.ratio)
+            shares = [
+                f"{name.split('_')[0]} {100.0 * row.share:.1f} %"
+                for name in ("following_error", "motor_torque")
+                if (row := told.row(name)) is not None
+            ]
+            true = foreign.by_place()
+            given = {place: pair for place, pair in twin.intervals.items() if place in true}
+            held = [place for place, (low, high) in given.items() if low <= true[place] <= high]
+            print(f"{structure} {seed}: {', '.join(shares)}; {len(held)} of {len(given)} intervals; ", end="")
+            print(f"{took_s:.0f} s\n    {judge(twin).text}")
+            for each in twin.unexplained:
+                print(f"    unexplained: {each}")
+            for place in true:
+                if place.startswith(("motor.", "load.", "gear.s", "gear.d", "servo.")):
+                    print(f"    {place}: {true[place]:.4g}, {_now(twin.truth, place)} {given.get(place, '')}")
+            sys.stdout.flush()
+
+
+def _now(truth: Truth, place: str) -> str:
+    at = truth
+    for key in place.split("."):
+        at = getattr(at, "load_" if key == "load" else key, None)
+        if at is None:
+            return "none"
+    return f"{at:.4g}"
+
+
+if __name__ == "__main__":
+    main()
