@@ -38,7 +38,7 @@ class JobState(StrEnum):
 
 
 class JobRequest(Request):
-    """Start a procedure on an axis that is enabled."""
+    """Start a job on an axis."""
 
     kind: JobKind = Field(examples=["step"])
     options: dict[OptionName, OptionValue] = Field(

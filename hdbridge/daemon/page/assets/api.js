@@ -1,10 +1,10 @@
-// Requests to the daemon: the token, the lease, and errors as the daemon words them.
+// Requests to the daemon, with token and lease; its errors are passed on verbatim.
 
 const ROOT = "/api/v1";
 const TOKEN_KEY = "hdbridge.token";
 let leaseToken = null;
 
-// An address that a person is given may end in #token=...: what follows the # never leaves the browser.
+// The page's address may end in #token=...; the part after # never leaves the browser.
 const given = /^#token=([A-Za-z0-9._~-]+)$/.exec(location.hash);
 if (given) {
   sessionStorage.setItem(TOKEN_KEY, given[1]);
@@ -40,7 +40,7 @@ export async function ask(method, path, body) {
   try {
     parsed = text ? JSON.parse(text) : {};
   } catch {
-    parsed = { detail: `the daemon answered with what is no JSON (status ${answer.status})` };
+    parsed = { detail: `the daemon's answer is not JSON (status ${answer.status})` };
   }
   if (!answer.ok) {
     if (answer.status === 423) leaseToken = null;

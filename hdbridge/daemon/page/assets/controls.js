@@ -1,4 +1,4 @@
-// The buttons: what they ask of the daemon, and the lease that they need.
+// The buttons, their requests to the daemon, and the lease.
 
 import { ask, axisPath, holdsLease, releaseLease, renewLease, takeLease } from "./api.js";
 
@@ -8,7 +8,7 @@ const JOG_TIMEOUT_S = 0.4; // the loop brakes by itself when the page, the netwo
 const at = (id) => document.getElementById(id);
 
 export class Controls {
-  /** chosen() gives the name of the axis that is shown; say(error) shows what went wrong; changed() after each answer. */
+  /** chosen() returns the name of the axis shown; say(error) shows an error; changed() is called after each answer. */
   constructor(chosen, say, changed) {
     this.chosen = chosen;
     this.say = say;

@@ -1,4 +1,4 @@
-// The live samples: a WebSocket that comes back by itself, and the last seconds of each axis in columns.
+// The live samples: a WebSocket that reconnects automatically, and the last seconds of each axis in columns.
 
 import { socket } from "./api.js";
 
@@ -6,7 +6,7 @@ export const KEPT_S = 20;
 const RATE_HZ = 250; // few enough for a slow line, and close enough that no motor angle is passed over
 const AGAIN_MS = [500, 1000, 2000, 5000];
 
-/** The last KEPT_S of one axis: arrays that are cut at the front now and then, not at each sample. */
+/** The last KEPT_S of one axis, in arrays that are trimmed occasionally rather than at each sample. */
 export class History {
   constructor() {
     this.columns = new Map();
@@ -14,7 +14,7 @@ export class History {
   }
 
   push(time, columns) {
-    // A clock that went back is another run of the loop: nothing before it belongs to it.
+    // If the clock goes back, the loop was restarted: discard earlier samples.
     if (this.time.length && time.length && time[0] <= this.time.at(-1)) this.clear();
     this.time.push(...time);
     for (const [name, values] of Object.entries(columns)) {

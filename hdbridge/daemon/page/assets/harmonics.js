@@ -1,4 +1,4 @@
-// What repeats with the angles: the mean transmission error over the motor's turn and over motor and load.
+// Periodic error: mean transmission error over the motor turn, and over motor and load angle.
 // Pure: numbers in, numbers out.
 
 export const MOTOR_BINS = 72;
@@ -9,7 +9,7 @@ const HALF_LIFE_S = 120; // so that the picture follows what changes
 
 const turn = (deg) => ((deg % 360) + 360) % 360;
 
-/** Means in bins of motor angle (from 0) and load angle (from -180 deg), older samples weighing less. */
+/** Means in bins of motor angle (from 0) and load angle (from -180 deg), with less weight on older samples. */
 export class Means {
   constructor() {
     this.clear();
@@ -36,7 +36,7 @@ export class Means {
     this.sum[load * MOTOR_BINS + motor] += value;
   }
 
-  /** Mean of each cell, NaN where there is nothing; the mean of all is taken out: a zero is arbitrary. */
+  /** Mean of each cell, NaN without samples, minus the mean of all, because the zero is arbitrary. */
   map() {
     const cells = Array.from(this.sum, (sum, n) => (this.weight[n] > 1e-3 ? sum / this.weight[n] : NaN));
     const known = cells.filter(Number.isFinite);
@@ -44,7 +44,7 @@ export class Means {
     return cells.map((each) => each - mean);
   }
 
-  /** Mean over the motor's turn, each load angle for itself first. */
+  /** Mean over the motor turn; each load angle has equal weight. */
   overMotor() {
     const cells = this.map();
     return Array.from({ length: MOTOR_BINS }, (_, motor) => {
@@ -62,7 +62,7 @@ export class Means {
   }
 }
 
-/** Amplitudes of the orders 1.. of a turn from means in even bins; null where too little was covered. */
+/** Amplitudes of the orders 1.. of a turn from means in equal bins; null if too few bins have samples. */
 export function orders(means, count = ORDERS) {
   const known = means.map((value, n) => [value, (2 * Math.PI * (n + 0.5)) / means.length]).filter(([value]) => Number.isFinite(value));
   if (known.length < NEEDED * means.length) return null;

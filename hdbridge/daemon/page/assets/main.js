@@ -1,4 +1,4 @@
-// Where the page begins: asks for the state, listens to the samples, and draws.
+// Entry point of the page: requests the state, receives samples, draws.
 
 import { ask, keepToken } from "./api.js";
 import { Controls } from "./controls.js";
@@ -11,7 +11,7 @@ const STATE_MS = 1000;
 const DRAW_MS = 150;
 const SLOW_MS = 1000;
 const ARCSEC = 3600;
-// Upper ends of the classes of lateness, microseconds; the last one is open.
+// Upper bounds of the delay classes, microseconds; the last one is open.
 const CLASSES_US = [10, 30, 100, 300, 1000, 3000, Infinity];
 
 const kept = new Map(); // of each axis: its history and what repeats with the angles
@@ -25,7 +25,7 @@ const charts = {
   error: timeChart("chart-error", "arcsec", [["load encoder less target", "--one"]], 1, 4),
   transmission: timeChart("chart-transmission", "arcsec", [["measured", "--one"], ["predicted", "--two", [5, 4]]], 1, 4),
   cycle: barChart("chart-cycle", "\u00b5s", "share of cycles, %", [["late by up to", "--one"]], (n) => (n < CLASSES_US.length - 1 ? String(CLASSES_US[n]) : "more")),
-  orders: barChart("chart-orders", "per motor turn", "amplitude, arcsec", [["measured", "--one"], ["what the model leaves", "--two"]], String),
+  orders: barChart("chart-orders", "per motor turn", "amplitude, arcsec", [["measured", "--one"], ["residual", "--two"]], String),
 };
 
 const of = (name) => {
@@ -59,7 +59,7 @@ async function refresh() {
 }
 
 async function begin() {
-  // Not before the events that were: the feed brings those that come.
+  // Connect after the past events are loaded; the feed delivers new ones.
   feed = "beginning";
   view.events((await ask("GET", "/events?since=0")).events);
   feed = new Feed(machine.cycle.period_s, take, (state) => view.connection(state, state === "live" ? `live, hdbridge ${machine.version}` : "connection lost; the axes are as the daemon has them"));
@@ -91,7 +91,7 @@ function take(batch) {
   view.events(batch.events);
 }
 
-/** The zero between the encoders is arbitrary: measured and predicted are laid upon each other. */
+/** Shifts the measured curve to the mean of the predicted one, because the encoders' relative zero is arbitrary. */
 function aligned(measured, predicted) {
   const both = measured.map((value, n) => (value === null || predicted[n] === null ? null : value - predicted[n])).filter((each) => each !== null);
   const offset = both.length ? both.reduce((a, b) => a + b, 0) / both.length : 0;
@@ -106,7 +106,7 @@ function draw() {
   const time = history.time.map((each) => each - now);
   const column = (name) => history.column(name);
   charts.position.draw([time, column("load_position_deg"), column("load_target_deg")]);
-  // In motion the drive lags behind its target: that would hide what the load is off by where it is to stand.
+  // In motion the drive lags behind its target, which would hide the positioning error at rest.
   const resting = document.getElementById("error-resting").checked;
   const speed = column("velocity_deg_s");
   charts.error.draw([time, column("error_arcsec").map((error, n) => (resting && speed[n] !== 0 ? null : error))]);

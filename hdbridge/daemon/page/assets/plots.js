@@ -1,4 +1,4 @@
-// The charts. Each is drawn anew a few times a second from what is kept; none keeps data of its own.
+// The charts, redrawn a few times a second from the stored samples; they hold no data.
 
 import { LOAD_BINS, MOTOR_BINS } from "./harmonics.js";
 
@@ -11,7 +11,7 @@ export function labels(plot, splits, axis, space, increment) {
   return splits.map((value) => (value === null ? "" : (value || 0).toFixed(digits).replace("-", "\u2212")));
 }
 
-/** The range of what is drawn with a margin; at least `least` wide, or noise at rest would fill the chart. */
+/** Range of the data with a margin; at least `least` wide, so that noise at rest does not fill the chart. */
 function spread(low, high, least) {
   if (low === null || high === null) return [-least / 2, least / 2];
   const half = Math.max(0.55 * (high - low), least / 2);

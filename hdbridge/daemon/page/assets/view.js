@@ -1,4 +1,4 @@
-// What stands on the page besides the charts: figures, fault, model, events.
+// Texts of the page: figures, fault, model, events.
 
 import { holdsLease } from "./api.js";
 
@@ -45,7 +45,7 @@ export function tabs(names, chosen, choose) {
   for (const button of box.children) button.setAttribute("aria-selected", String(button.textContent === chosen));
 }
 
-/** The newest sample of the axis that is shown. */
+/** Newest sample of the axis shown. */
 export function figures(axis) {
   at("load").textContent = number(axis.load_position_deg, 4);
   at("target").textContent = number(axis.load_target_deg, 4);
@@ -76,7 +76,7 @@ export function machine(state) {
   at("simulated").hidden = !state.simulated;
   const load = state.bus.load;
   at("bus-load").textContent = load === null || load === undefined ? "-" : (100 * load).toFixed(0);
-  at("cycle-figures").textContent = `${(1e3 * state.cycle.period_s).toFixed(1)} ms a cycle, ${state.cycle.skipped} left out`;
+  at("cycle-figures").textContent = `${(1e3 * state.cycle.period_s).toFixed(1)} ms per cycle, ${state.cycle.skipped} skipped`;
   const mine = holdsLease();
   at("holder").textContent = mine ? "you have control" : state.lease.held ? `${state.lease.client || "another client"} has control` : "nobody has control";
   at("lease").textContent = mine ? "Release control" : "Take control";
