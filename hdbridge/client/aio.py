@@ -1,12 +1,24 @@
-"""The asyncio client, with the same methods as `hdbridge.client.sync`.
+"""The asyncio client.
 
-async with AsyncClient() as client, client.lease():
-    await client.axis("joint-3").move(30)
+    from hdbridge import AsyncClient
+
+    async with AsyncClient() as client, client.lease():
+        axis = client.axis("joint-3")
+        await axis.enable()
+        for target_deg in (10, 20, 30):
+            print((await axis.move(target_deg)).error_arcsec)
+
+Motion requires the lease. A method that moves an axis takes it while it runs, unless `AsyncClient.lease`
+holds it already. Every error is one of `hdbridge.errors`.
 """
 
 from __future__ import annotations
 
-import asyncio
+import asyncio  # async only
+
+# sync: import threading
+# sync: import time
+# sync: import weakref
 from collections.abc import AsyncIterator, Mapping, Sequence
 from contextlib import AsyncExitStack, asynccontextmanager, suppress
 from pathlib import Path
@@ -19,8 +31,7 @@ from websockets.asyncio.client import ClientConnection, connect, unix_connect
 from hdbridge.client import sockets, transport
 from hdbridge.client.address import Address, find
 from hdbridge.client.aioaxis import AsyncAxis
-from hdbridge.client.axis import POLL_S
-from hdbridge.client.calls import A, Call, M, MachineCalls
+from hdbridge.client.calls import POLL_S, RENEWALS, A, Call, M, MachineCalls
 from hdbridge.client.messages import (
     Event,
     Events,
@@ -32,16 +43,15 @@ from hdbridge.client.messages import (
     MachineState,
     Samples,
 )
-from hdbridge.client.sync import RENEWALS
 from hdbridge.errors import DaemonError, LeaseError
 
 
 class AsyncClient:
-    """Client of a daemon. Close it, or use it as an asynchronous context manager.
+    """Client of a daemon. Close it, or use it as a context manager.
 
     ``address`` is a Unix socket, a URL or a machine's name; `hdbridge.client.address.find` finds the daemon
-    without it. ``token`` is required over TCP; others see ``name`` while the client holds the lease. Several
-    tasks may use it.
+    without it. ``token`` is required over TCP; others see ``name`` while the client holds the lease. Safe
+    for concurrent use.
     """
 
     def __init__(
@@ -61,6 +71,7 @@ class AsyncClient:
         self._grant: LeaseGrant | None = None
         under = httpx.AsyncHTTPTransport(**transport.under(self.address, self._tls))
         self._http = httpx.AsyncClient(transport=under, **transport.settings(self.address))
+        # sync: weakref.finalize(self, self._http.close)  # of a client that lives for one line only
 
     async def __aenter__(self) -> Self:
         return self
@@ -76,6 +87,7 @@ class AsyncClient:
         """Returns an axis. Its name is checked by the first request."""
         return AsyncAxis(self, name)
 
+    # sync: @property
     async def axes(self) -> dict[str, AsyncAxis]:
         """Returns all axes of the machine by name."""
         return {each.name: AsyncAxis(self, each.name) for each in (await self.state()).axes}
@@ -132,17 +144,21 @@ class AsyncClient:
 
     @asynccontextmanager
     async def lease(self, *, force: bool = False) -> AsyncIterator[LeaseGrant]:
-        """Holds the lease within the block; a task renews it while the event loop runs.
+        """Holds the lease within the block; it is renewed meanwhile.
 
         A nested block reuses the lease. Raises LeaseError if another client holds it.
         """
         async with self._held(force) as grant:
-            renewing = asyncio.ensure_future(self._renew(grant))
+            ended = asyncio.Event()
+            renewing = asyncio.ensure_future(self._renew(grant, ended))  # async only
+            # sync: renewing = threading.Thread(target=self._renew, args=(grant, ended), daemon=True)
+            # sync: renewing.start()
             try:
                 yield grant
             finally:
-                renewing.cancel()
-                await asyncio.wait([renewing])
+                ended.set()
+                await asyncio.wait([renewing])  # async only
+                # sync: renewing.join()
 
     @property
     def holds_lease(self) -> bool:
@@ -205,9 +221,8 @@ class AsyncClient:
             raise transport.unreachable(self.address, problem) from None
         return transport.answer(call, response)
 
-    async def _renew(self, grant: LeaseGrant) -> None:
-        while True:
-            await asyncio.sleep(grant.timeout_s / RENEWALS)
+    async def _renew(self, grant: LeaseGrant, ended: asyncio.Event) -> None:
+        while not await transport.waited(ended, grant.timeout_s / RENEWALS):
             try:
                 await self._send(MachineCalls.renew_lease())
             except LeaseError:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import asyncio
+import asyncio  # async only
 import time
 from collections.abc import AsyncIterator, Iterable, Sequence
 from contextlib import asynccontextmanager
@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING, Any
 from pydantic import BaseModel
 
 from hdbridge.client import sockets
-from hdbridge.client.axis import JOG_S, POLL_S
-from hdbridge.client.calls import AxisCalls, given
+from hdbridge.client.calls import JOG_S, POLL_S, AxisCalls, given
 from hdbridge.client.messages import (
     AdaptationMode,
     AxisState,

@@ -1,3 +1,4 @@
+# Made by tools/synchronous_client.py from aioaxis.py: edit that file.
 """An axis of the synchronous client."""
 
 from __future__ import annotations
@@ -5,12 +6,12 @@ from __future__ import annotations
 import time
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any
 
 from pydantic import BaseModel
 
 from hdbridge.client import sockets
-from hdbridge.client.calls import AxisCalls, given
+from hdbridge.client.calls import JOG_S, POLL_S, AxisCalls, given
 from hdbridge.client.messages import (
     AdaptationMode,
     AxisState,
@@ -26,10 +27,6 @@ from hdbridge.errors import LeaseError, SafetyStop
 
 if TYPE_CHECKING:
     from hdbridge.client.sync import Client, Link
-
-POLL_S: Final = 0.1
-JOG_S: Final = 0.5
-"""Time-out of a jog after the last request of its client."""
 
 
 class Axis:

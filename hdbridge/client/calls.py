@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Generic, TypeVar
+from typing import Any, Final, Generic, TypeVar
 from urllib.parse import quote
 
 from pydantic import BaseModel, TypeAdapter, ValidationError
@@ -20,6 +20,11 @@ from hdbridge.errors import DaemonError, HdbridgeError, InputError
 A = TypeVar("A")
 M = TypeVar("M", bound=BaseModel)
 PREFIX = "/api/v1"
+POLL_S: Final = 0.1
+JOG_S: Final = 0.5
+"""Time-out of a jog after the last request of its client."""
+RENEWALS: Final = 3
+"""Renewals of a lease per time-out."""
 
 
 @dataclass(frozen=True)

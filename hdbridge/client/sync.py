@@ -1,8 +1,7 @@
+# Made by tools/synchronous_client.py from aio.py: edit that file.
 """The synchronous client.
 
     from hdbridge import Client
-
-    Client().axis("joint-3").move(30)
 
     with Client() as client, client.lease():
         axis = client.axis("joint-3")
@@ -10,8 +9,8 @@
         for target_deg in (10, 20, 30):
             print(axis.move(target_deg).error_arcsec)
 
-Motion requires the lease. A method that moves an axis takes it while it runs, unless `Client.lease` holds it
-already. Every error is one of `hdbridge.errors`.
+Motion requires the lease. A method that moves an axis takes it while it runs, unless `Client.lease`
+holds it already. Every error is one of `hdbridge.errors`.
 """
 
 from __future__ import annotations
@@ -22,7 +21,7 @@ import weakref
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
-from typing import Any, Final, Self
+from typing import Any, Self
 
 import httpx
 from pydantic import BaseModel
@@ -30,8 +29,8 @@ from websockets.sync.client import ClientConnection, connect, unix_connect
 
 from hdbridge.client import sockets, transport
 from hdbridge.client.address import Address, find
-from hdbridge.client.axis import POLL_S, Axis
-from hdbridge.client.calls import A, Call, M, MachineCalls
+from hdbridge.client.axis import Axis
+from hdbridge.client.calls import POLL_S, RENEWALS, A, Call, M, MachineCalls
 from hdbridge.client.messages import (
     Event,
     Events,
@@ -45,16 +44,13 @@ from hdbridge.client.messages import (
 )
 from hdbridge.errors import DaemonError, LeaseError
 
-RENEWALS: Final = 3
-"""Renewals of a lease per time-out."""
-
 
 class Client:
     """Client of a daemon. Close it, or use it as a context manager.
 
     ``address`` is a Unix socket, a URL or a machine's name; `hdbridge.client.address.find` finds the daemon
-    without it. ``token`` is required over TCP; others see ``name`` while the client holds the lease.
-    Thread-safe.
+    without it. ``token`` is required over TCP; others see ``name`` while the client holds the lease. Safe
+    for concurrent use.
     """
 
     def __init__(
@@ -147,13 +143,13 @@ class Client:
 
     @contextmanager
     def lease(self, *, force: bool = False) -> Iterator[LeaseGrant]:
-        """Holds the lease within the block; a thread renews it while this process runs.
+        """Holds the lease within the block; it is renewed meanwhile.
 
         A nested block reuses the lease. Raises LeaseError if another client holds it.
         """
         with self._held(force) as grant:
             ended = threading.Event()
-            renewing = threading.Thread(target=self._renew, args=(grant, ended), name="lease", daemon=True)
+            renewing = threading.Thread(target=self._renew, args=(grant, ended), daemon=True)
             renewing.start()
             try:
                 yield grant

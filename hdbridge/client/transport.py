@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import ssl
 from typing import Any
 
@@ -70,3 +71,12 @@ def unreachable(address: Address, problem: Exception) -> DaemonError:
         f"{address}: the daemon {what} ({problem or type(problem).__name__}); whether it was done is not "
         "known: look at the state first"
     )
+
+
+async def waited(event: asyncio.Event, timeout_s: float) -> bool:
+    """Waits for an event as `threading.Event.wait` does: returns False at the time-out."""
+    try:
+        async with asyncio.timeout(timeout_s):
+            return await event.wait()
+    except TimeoutError:
+        return False
