@@ -66,6 +66,10 @@ class Response(Strict):
         description="half width of the 95 % interval at each, as a share of the gain"
     )
     filter: LeadFilter = Field(description="filter of the correction, computed from the points")
+    gain_objects: dict[str, int] = Field(
+        default={},
+        description="objects of the drive that hold servo gains, and their values at the measurement",
+    )
 
     @model_validator(mode="after")
     def _check(self) -> Response:
