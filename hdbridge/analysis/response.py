@@ -54,8 +54,10 @@ FADE = 0.12
 """Width over which the filter falls to zero beyond the last point, as a share of the SYNC rate."""
 UNKNOWN = 0.5
 """Response that is expected where none is known, per transmission error."""
-DIFFERENT = 0.15
-"""Smallest share by which two responses, or following lags, count as different."""
+DIFFERENT = 0.1
+"""Smallest rms share by which two responses count as different. The correction leaves that much more."""
+DIFFERENT_LAG = 0.15
+"""Smallest share by which two following lags count as different."""
 LAG_NOISE_MS = 0.5
 REGULARISATION = 1e-3
 FADE_SHARE = 0.3
@@ -269,15 +271,24 @@ def _known(points: Sequence[_Found], highest_hz: float, max_gap_hz: float, limit
     return kept
 
 
-def agree(one: Response, other: Response) -> bool:
-    """Returns False if the following lag, or most of the common frequencies, differ beyond their noise."""
-    lag_ms = max(abs(one.following_lag_ms), abs(other.following_lag_ms))
-    if abs(one.following_lag_ms - other.following_lag_ms) > max(DIFFERENT * lag_ms, LAG_NOISE_MS):
-        return False
+def difference(one: Response, other: Response) -> float:
+    """Rms relative difference of two responses over their known range, in excess of their noise."""
     hertz = np.array([each for each in other.frequency_hz if each <= min(one.known_to_hz, other.known_to_hz)])
-    values, noise = zip(*(_at(each, hertz) for each in (one, other)), strict=True)
-    apart = abs(values[0] / values[1] - 1.0) > np.maximum(DIFFERENT, 1.5 * (noise[0] + noise[1]))
-    return float(apart.mean()) < 0.5 if hertz.size else True
+    if not hertz.size:
+        return 0.0
+    (first, first_noise), (second, second_noise) = (_at(each, hertz) for each in (one, other))
+    square = abs(first / second - 1.0) ** 2
+    variance = 0.25 * (first_noise**2 + second_noise**2)
+    weight = 1.0 / (DIFFERENT**2 + variance)
+    return math.sqrt(max(0.0, float(weight @ (square - variance) / weight.sum())))
+
+
+def agree(one: Response, other: Response) -> bool:
+    """Returns False if the following lag or the response differs beyond its noise."""
+    lag_ms = max(abs(one.following_lag_ms), abs(other.following_lag_ms))
+    if abs(one.following_lag_ms - other.following_lag_ms) > max(DIFFERENT_LAG * lag_ms, LAG_NOISE_MS):
+        return False
+    return difference(one, other) < DIFFERENT
 
 
 def _at(response: Response, hertz: FloatArray) -> tuple[ComplexArray, FloatArray]:

@@ -16,6 +16,7 @@ from hdbridge.drive import objects
 from hdbridge.drive.bootplan import left_to_drive, plan
 from hdbridge.drive.bootup import await_sdo
 from hdbridge.drive.dictionary import load_eds
+from hdbridge.drive.gains import changed_gains, read_gains
 from hdbridge.drive.nameplate import (
     IDENTITY,
     device_type_complaints,
@@ -28,6 +29,7 @@ from hdbridge.drive.nameplate import (
 from hdbridge.drive.objects import Address, IntegerType
 from hdbridge.drive.sdo import ABSENT, SdoAbortError
 from hdbridge.errors import DriveError, SdoError
+from hdbridge.model import TransmissionModel
 
 REST_S: Final = 1.0
 
@@ -96,7 +98,18 @@ def identity(context: BringUpContext) -> Verdict:
     if sdo.has(objects.SUPPORTED_MODES.index, objects.SUPPORTED_MODES.sub):
         complaints += mode_complaints(axis, sdo.fetch(objects.SUPPORTED_MODES))
     text = ", ".join(f"{name.replace('_', ' ')} {value:#x}" for name, value in found.items())
-    return failed(text, *(each.text for each in complaints), **found) if complaints else passed(text, **found)
+    remedies = [each.text for each in complaints] + _retuned(context)
+    return failed(text, *remedies, **found) if remedies else passed(text, **found)
+
+
+def _retuned(context: BringUpContext) -> list[str]:
+    """Lines on servo gains that differ from those that the model's response in motion was measured with."""
+    path = context.axis.path.with_name("model.yaml")
+    response = TransmissionModel.load(path).response if path.exists() else None
+    if response is None or not response.gain_objects:
+        return []
+    changed = changed_gains(response.gain_objects, read_gains(context.drive.sdo))
+    return [f"{line}; restore it, or measure the response again: hdbridge motion" for line in changed]
 
 
 def eds(context: BringUpContext) -> Verdict:

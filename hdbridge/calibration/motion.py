@@ -15,6 +15,7 @@ from hdbridge.analysis.response import (
     Limits,
     Trial,
     agree,
+    difference,
     gain,
     harmonics,
     order_hz,
@@ -26,6 +27,7 @@ from hdbridge.calibration.path import PathError, path_errors
 from hdbridge.control.bench import axis_view, compensation_for
 from hdbridge.control.rig import Rig, bench_on
 from hdbridge.drive.drive import Drive
+from hdbridge.drive.gains import changed_gains, read_gains
 from hdbridge.effects.orders import MotorOrder, OrderSeries
 from hdbridge.errors import InputError
 from hdbridge.model import TransmissionModel
@@ -42,7 +44,8 @@ FADED = 0.5
 """Gain of the filter, as a share of the wanted one, below which an order counts as faded out."""
 RETUNED = (
     "the servo does not answer as it did when the response was measured (following lag {:.1f} ms then, "
-    "{:.1f} ms now): it was retuned, or the load changed; measure the response again"
+    "{:.1f} ms now; the response differs by {:.0f} %): it was retuned, or the load changed; measure the "
+    "response again"
 )
 TRIALS = 3
 """Filters that are tried. The first one explores: it corrects what is not known as well. Each one uses the
@@ -232,7 +235,13 @@ def motion_test(
     has no order that could be measured, and if the travel is too short.
     """
     runner = _Runner(drive, model, progress, interrupted)
+    gains = read_gains(drive.sdo) if isinstance(drive, Drive) else {}
     found = _ripple_test(runner, model, measure)
+    if found.response is not None and measure:
+        found = replace(found, response=found.response.model_copy(update={"gain_objects": gains}))
+    elif found.response is not None:
+        changed = changed_gains(found.response.gain_objects, gains)
+        found = replace(found, remarks=(*found.remarks, *changed))
     used = [model.only(()), replace(model, response=None)]
     if found.response is not None:
         used.append(replace(model, response=found.response))
@@ -309,7 +318,8 @@ def _tested(
     found = response_of(none, [Trial(static)], runner.orders, model.ratio, runner.cycle_s, limits)
     remarks: tuple[str, ...] = ()
     if found is not None and not agree(stored, found):
-        remarks = (RETUNED.format(stored.following_lag_ms, found.following_lag_ms),)
+        apart = 100.0 * difference(stored, found)
+        remarks = (RETUNED.format(stored.following_lag_ms, found.following_lag_ms, apart),)
     return MotionTest(_ripples(runner, none, static, filtered, stored), stored, remarks)
 
 

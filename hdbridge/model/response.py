@@ -18,9 +18,9 @@ class LeadFilter(Strict):
     """Weights of the correction along the path, from the near future to the past, and of earlier outputs.
 
     Near standstill the filter fades out, because the rest of the move in it would make the motor turn back.
-    Weight j applies to the correction of the load target ``lead_cycles - j / per_cycle`` cycles ahead.
-    Feedback i is subtracted times the filter's output of i cycles before. The weights sum to 1 plus the
-    feedback, so that nothing changes at rest.
+    Weight j applies to the correction of the load target ``lead_cycles - j / per_cycle`` cycles ahead. The
+    filter's output of i cycles before is subtracted with feedback i. The weights sum to 1 plus the feedback,
+    so that nothing changes at rest.
     """
 
     lead_cycles: int = Field(ge=0, le=50, description="how far ahead the first weight lies, in cycles")
@@ -66,6 +66,10 @@ class Response(Strict):
         description="half width of the 95 % interval at each, as a share of the gain"
     )
     filter: LeadFilter = Field(description="filter of the correction, computed from the points")
+    gain_objects: dict[str, int] = Field(
+        default={},
+        description="objects of the drive that hold servo gains, and their values at the measurement",
+    )
 
     @model_validator(mode="after")
     def _check(self) -> Response:

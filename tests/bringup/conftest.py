@@ -41,6 +41,8 @@ class Case:
     truth: dict[str, str] = field(default_factory=dict)
     eds: dict[str, str] = field(default_factory=dict)
     """Edits of the EDS that the axis file names; the drive has the original."""
+    drive_has_eds: bool = False
+    """Whether the drive has the edited EDS as well."""
     honest: bool = False
     """Whether the drive's own objects say what the plant really is, rather than what the axis file says."""
     node_id: int = 1
@@ -64,7 +66,7 @@ class Case:
         plain = (ARTICLE / "truth.yaml").read_text()
         truth = Truth.from_text(edited(plain, self.truth))
         nameplate = nameplate_of(truth if self.honest else Truth.from_text(plain))
-        eds = ARTICLE.parents[1] / "eds" / "hdbridge-402.eds"
+        eds = axis.eds_path if self.drive_has_eds else ARTICLE.parents[1] / "eds" / "hdbridge-402.eds"
         machine = Machine(truth, 0, may_compile=True)
         with lockstep_bench(machine, eds, self.node_id, nameplate=nameplate, behaviour=truth.firmware) as (
             bus,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -12,6 +13,8 @@ from hdbridge.bringup.checks import Outcome, Verdict
 from hdbridge.bringup.doctor import CHECKS
 from hdbridge.device.node import DriveNode
 from hdbridge.drive.states import State, decode
+from hdbridge.model import TransmissionModel
+from hdbridge.model.response import LeadFilter, Response
 
 PASS, FAIL, NOT_POSSIBLE = Outcome.PASS, Outcome.FAIL, Outcome.NOT_POSSIBLE
 
@@ -150,6 +153,55 @@ def test_what_is_wrong_is_named(
     assert failures(verdicts)[0] == check
     assert text in verdicts[check].remedies[0]
     assert all("\n" not in each for each in (verdicts[check].measured, *verdicts[check].remedies))
+
+
+GAIN_EDS = {
+    "[OptionalObjects]\nSupportedObjects=84\n": "[OptionalObjects]\nSupportedObjects=85\n85=0x60FB\n",
+    "[6085]": """[60FB]
+ParameterName=Position control parameter set
+ObjectType=0x9
+SubNumber=2
+
+[60FBsub0]
+ParameterName=Highest sub-index supported
+ObjectType=0x7
+DataType=0x0005
+AccessType=ro
+DefaultValue=1
+
+[60FBsub1]
+ParameterName=Position gain
+ObjectType=0x7
+DataType=0x0006
+AccessType=rw
+DefaultValue=200
+
+[6085]""",
+}
+
+
+def test_gains_that_were_changed_since_the_response_was_measured(
+    case: Callable[..., Any], tmp_path: Path
+) -> None:
+    examined = case(eds=GAIN_EDS, drive_has_eds=True)
+    response = Response(
+        cycle_ms=4.0,
+        following_lag_ms=5.0,
+        known_to_hz=80.0,
+        frequency_hz=(10.0,),
+        gain=(1.0,),
+        phase_deg=(0.0,),
+        uncertainty=(0.1,),
+        filter=LeadFilter(lead_cycles=0, per_cycle=1, full_speed_deg_s=1.0, weights=(1.0,)),
+        gain_objects={"60FBh:01": 200},
+    )
+    TransmissionModel(50.0, (), response=response).save(tmp_path / "model.yaml")
+    assert failures(examined.run(until="identity")) == []
+    examined.spoil = lambda node: setattr(node.dictionary[0x60FB, 1], "value", 110)
+    verdicts = examined.run(until="identity")
+    assert failures(verdicts) == ["identity"]
+    assert "60FBh:01 is 110, was 200" in verdicts["identity"].remedies[0]
+    assert "measure the response again" in verdicts["identity"].remedies[0]
 
 
 def test_a_load_encoder_that_is_not_there(case: Callable[..., Any]) -> None:

@@ -66,10 +66,12 @@ def test_it_measures_the_response_proposes_it_and_the_committed_model_uses_it(hd
     # Another servo is noticed.
     path = fast / "truth.yaml"
     text = path.read_text(encoding="utf-8")
-    path.write_text(text.replace("command_filter_ms: 1.0", "command_filter_ms: 4.0"), encoding="utf-8")
-    done = hdbridge("motion", "fast", "--simulate", "--no-measure")
-    assert done.returncode == 0, done.stderr
-    assert "measure the response again" in done.stdout
+    for tuned in ("command_filter_ms: 1.0", "command_filter_ms: 4.0"), ("gain_per_s: 200", "gain_per_s: 110"):
+        assert tuned[0] in text
+        path.write_text(text.replace(*tuned), encoding="utf-8")
+        done = hdbridge("motion", "fast", "--simulate", "--no-measure")
+        assert done.returncode == 0, done.stderr
+        assert "measure the response again" in done.stdout, tuned
 
 
 def test_a_model_without_orders_and_a_proposal_without_a_measurement_are_refused(hdbridge, tmp_path):

@@ -46,5 +46,6 @@ def test_the_measured_response_removes_the_ripple_at_speed(structure, tmp_path):
         assert each.filtered.settle_s <= each.none.settle_s + 0.02 or each.name == "sine", each
     fast = [each for each in result.ripples if 2 * each.speed_deg_s * ratio / 360.0 > 15.0]
     assert max(each.removed_percent - each.removed_static_percent for each in fast) > 15.0
+    assert again.remarks == ()  # it is the same servo
     for one, other in zip(result.ripples, again.ripples, strict=True):
         assert other.filtered_arcsec == pytest.approx(one.filtered_arcsec, rel=0.1, abs=0.2)
