@@ -74,6 +74,7 @@ def command(
     are the axis's. `--simulate` uses the twin after `hdbridge model commit PROFILE --twin`.
     """
     from hdbridge.axis import AxisConfig
+    from hdbridge.twin.commands import doubts
 
     files = Profile.find(profile)
     if check and (compare or afresh or truth is not None):
@@ -82,6 +83,8 @@ def command(
         )
     axis = AxisConfig.load(files.axis)
     recording = _joined(axis, load_recordings(recordings, columns, units, unwrap))
+    for doubt in doubts(recording, axis):
+        notes.print(f"look at the recording: {doubt}", markup=False, soft_wrap=True)
     if check:
         _check(files, axis, recording, json_file, html_file)
         return

@@ -10,7 +10,9 @@ Between parts that follow each other the drive is switched off, as the bench doe
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from ruckig import InputParameter, Result, Ruckig, Trajectory
@@ -28,7 +30,21 @@ STANDING_S = 0.3
 SETTLING_S = 1.5
 """... and so long where the recording begins on a drive that holds it: loops of 4/s have come to rest too."""
 UNEVEN = 0.25
-"""Share of a cycle by which a sample's time may be off the cycle's grid without being interpolated."""
+"""Share of a cycle by which a sample's time may be off the cycle's grid."""
+MOSTLY = 0.95
+"""Share of the samples that have to be so near: a master that stamps some rows late sent them in time."""
+REST_S = 0.1
+"""The command rests this long between two legs of a recording that names none: loops answer in some ms."""
+LEAST_LEG_S = 0.4
+"""Such a leg lasts at least this long: an acceleration and the ringing of a load at 15 Hz."""
+SIGN_SHARE = 0.2
+"""Share of the mean torque by which it has to oppose the motion, for its sign to be wrong."""
+TORQUE_MARGIN = 1.5
+"""Ratio of a torque to the axis's limit beyond which it is in a different unit."""
+AHEAD_CYCLES = 0.5
+"""Cycles by which a motor that leads its command shows that the command was logged late."""
+MOVING_DEG_S = 5.0
+"""Motor speed from which the direction of friction is beyond doubt."""
 OFF_AFTER, ON_BEFORE = 2, 1
 """The bench switches a drive off so many cycles after the last row of a procedure, once it has come to rest,
 and on again so many before the first row of the next."""
@@ -70,10 +86,7 @@ def commands_of(part: Record, axis: AxisConfig, truth: Truth) -> Commands:
         raise InputError(f"{name}{len(part)} rows; expected at least two in each part of a recording")
     time_s = part.time_s
     cycle_s = cycle_of(part, axis)
-    cycles = (time_s - time_s[0]) / cycle_s
-    nearest = np.round(cycles)
-    if np.max(np.abs(cycles - nearest)) <= UNEVEN and np.all(np.diff(nearest) >= 1.0):
-        cycles = nearest
+    cycles = counted_cycles(time_s, cycle_s)
     grid = np.arange(math.floor(cycles[-1]) + 1.0 + (cycles[-1] % 1.0 > 0.0))
     gaps = [first for first in part.starts[1:] if just_on(part, first)]
     nodes, values = cycles, target
@@ -160,11 +173,73 @@ def _approach(
     return [here] * standing + way + (rest * standing if not speed else [])
 
 
+def counted_cycles(time_s: FloatArray, cycle_s: float) -> FloatArray:
+    """Cycle number of each row, from zero; fractional if the rows do not follow the cycle.
+
+    Rows are counted: a stamp that is late does not make its command late. Gaps count as whole cycles.
+    """
+    cycles: FloatArray = (time_s - time_s[0]) / cycle_s
+    counted: FloatArray = np.concatenate([[0.0], np.cumsum(np.maximum(np.round(np.diff(cycles)), 1.0))])
+    off = np.abs(cycles - counted)
+    if np.mean(off <= UNEVEN) >= MOSTLY and np.max(off) < 1.0:
+        return counted
+    return cycles
+
+
 def legs_of(recording: Recording) -> tuple[Segment, ...]:
-    """The recording's legs; one for each of its parts where it says nothing of legs."""
+    """The recording's legs; if it names none, its motions from rest to rest or from turn to turn."""
     if recording.segments:
         return recording.segments
-    return tuple(
-        Segment(kind="motion", start_s=float(part.time_s[0]), end_s=float(part.time_s[-1]))
-        for part in recording.record.parts()
-    )
+    return tuple(leg for part in recording.record.parts() for leg in _legs_of_command(part))
+
+
+def _legs_of_command(part: Record) -> Iterator[Segment]:
+    """Legs of a part by its command; the part as a whole without one."""
+    time_s, target = part.time_s, part.motor_target_deg
+    cuts = [float(time_s[0])]
+    if target is not None and len(part) > 2:
+        way = np.sign(np.diff(target))
+        moving = np.flatnonzero(way)
+        for before, after in pairwise(moving.tolist()):
+            rests = time_s[after] - time_s[before + 1] >= REST_S
+            if (rests or way[before] != way[after]) and time_s[after] - cuts[-1] >= LEAST_LEG_S:
+                cuts.append(float(time_s[after]))
+    ends = [*cuts[1:], float(time_s[-1])]
+    for start_s, end_s in zip(cuts, ends, strict=True):
+        yield Segment(kind="motion", start_s=start_s, end_s=max(start_s, end_s))
+
+
+def doubts(recording: Recording, axis: AxisConfig) -> tuple[str, ...]:
+    """What looks wrong with torque and command of a recording, each in a sentence with what to do."""
+    lags, forward, backward = [], [], []
+    for part in recording.record.parts():
+        target, torque_nm = part.motor_target_deg, part.columns.get(Channel.MOTOR_TORQUE.value)
+        if target is None or len(part) < 3:
+            continue
+        speed = np.gradient(target, part.time_s)
+        moving = np.abs(speed) > MOVING_DEG_S
+        lags += [np.stack([target - part.motor_position_deg, speed])[:, moving]]
+        if torque_nm is not None:
+            forward.append(torque_nm[moving & (speed > 0.0)])
+            backward.append(torque_nm[moving & (speed < 0.0)])
+    found = []
+    if lags and (moved := np.concatenate(lags, axis=1)).size:
+        ahead_s = -float(moved[0] @ moved[1]) / float(moved[1] @ moved[1])
+        cycle_s = float(np.median(np.diff(recording.record.time_s)))
+        if ahead_s > AHEAD_CYCLES * cycle_s:
+            found.append(
+                f"the motor leads its command by {ahead_s / cycle_s:.1f} cycles; expected it behind: "
+                "the command was logged late, move motor_target_deg earlier by as many rows"
+            )
+    if forward and sum(map(len, forward)) and sum(map(len, backward)):
+        ahead, back = np.concatenate(forward), np.concatenate(backward)
+        torques = np.abs(np.concatenate([ahead, back]))
+        most_nm = 0.01 * axis.limits.torque_percent * axis.drive.rated_torque_nm
+        if float(np.mean(ahead) - np.mean(back)) < -2.0 * SIGN_SHARE * float(np.mean(torques)):
+            found.append("motor_torque_nm opposes the motion; expected it to drive it: change its sign")
+        if float(np.max(torques)) > TORQUE_MARGIN * most_nm:
+            found.append(
+                f"motor_torque_nm is up to {np.max(torques):.3g} Nm; expected at most {most_nm:.3g} "
+                "(limits.torque_percent of drive.rated_torque_nm): convert it to Nm if it is in per cent"
+            )
+    return tuple(found)
