@@ -49,6 +49,9 @@ class Abort(IntEnum):
 
     TOGGLE = 0x05030000
     COMMAND = 0x05040001
+    BLOCK_SIZE = 0x05040002
+    SEQUENCE = 0x05040003
+    CRC = 0x05040004
     WRITE_ONLY = 0x06010001
     READ_ONLY = 0x06010002
     NO_OBJECT = 0x06020000
@@ -61,6 +64,7 @@ class Abort(IntEnum):
     RANGE = 0x06090030
     TOO_HIGH = 0x06090031
     TOO_LOW = 0x06090032
+    NOT_STORED = 0x08000020
     STATE = 0x08000022
 
 
@@ -195,6 +199,16 @@ class Entry:
         self.value = value
         if self.follower is not None:
             self.follower(value)
+
+    def accepts(self, value: object) -> bool:
+        """Returns True for a number of its type within its limits; asks no guard."""
+        if self.codec is None or not isinstance(value, int | float):
+            return False
+        try:
+            self.codec.pack(value)
+        except struct.error:
+            return False
+        return (self.low is None or value >= self.low) and (self.high is None or value <= self.high)
 
     def writer(self) -> Callable[[int], None]:
         """What an RPDO calls with a received value; one out of range is refused by ``SdoAbortError``."""

@@ -25,6 +25,7 @@ class ErrorCode(IntEnum):
     PDO_TOO_LONG = 0x8220
     RPDO_TIMEOUT = 0x8250
     FOLLOWING_ERROR = 0x8611
+    SYNC_LOST = 0x8700
 
 
 class Emergency:

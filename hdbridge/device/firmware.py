@@ -20,7 +20,7 @@ from hdbridge.device.modes import (
     ProfilePosition,
 )
 from hdbridge.device.motion import Machine, Motion, wrap_int32
-from hdbridge.device.powerstate import POWERED, Control, State, Status, next_state
+from hdbridge.device.powerstate import POWERED, Control, PowerStage, State, Status, next_state
 from hdbridge.device.profile import Profile, stop
 
 SLOW_DOWN_RAMP: Final = (1, 5)
@@ -65,8 +65,10 @@ class Firmware:
         emergency: Emergency,
         faults: Faults | None = None,
         behaviour: Behaviour | None = None,
+        stage: PowerStage | None = None,
     ) -> None:
         self._faults = faults or Faults()
+        self._stage = stage or PowerStage()
         behaviour = behaviour or Behaviour()
         self._by_level = behaviour.controlword is Controlword.LEVEL
         self._status_delay_s = behaviour.status_delay_ms / 1000.0
@@ -93,6 +95,10 @@ class Firmware:
         self._halted = False
         self._word = 0
         self._waits_for_rest = False
+        self._awaits_power = False
+        self._resetting = False
+        self._stopped_itself = False
+        """In QUICK STOP ACTIVE without a command: a repeated controlword does not lead out of it."""
         self._beyond_window_s = 0.0
         self._following_error = False
         self._error_code = 0
@@ -104,7 +110,7 @@ class Firmware:
         self.motion.take_parameters()
         self.motion.take_actual_as_demand()
         self._limit_torque(self._dictionary.value(0x6072))
-        self._set_state(State.SWITCH_ON_DISABLED)
+        self._power_off(State.SWITCH_ON_DISABLED)
 
     # ---------------------------------------------------------------- objects
 
@@ -208,14 +214,20 @@ class Firmware:
             return
         if word != self._word:
             self._delay_status()
+        elif self._stopped_itself:
+            return
         rising = word & ~self._word
         self._word = word
-        self._waits_for_rest = False
+        self._waits_for_rest = self._stopped_itself = False
         if self.state is State.FAULT:
             if rising & _FAULT_RESET:
-                self._reset_fault()
+                self._resetting = True
+                self._stage.reset()
+                self._finish_reset()
             return
         wanted = next_state(self.state, word)
+        if self._awaits_power and wanted is not State.OPERATION_ENABLED:
+            self._power_off(self.state)
         if wanted is not self.state:
             self._transition(wanted)
         elif self.state is State.OPERATION_ENABLED and self._braking is not None and self._braking.then:
@@ -240,11 +252,19 @@ class Firmware:
         elif wanted is State.OPERATION_ENABLED:
             if leaving is State.QUICK_STOP_ACTIVE:
                 self._leave_quick_stop()
-            else:
-                self.motion.take_actual_as_demand()
-                self._operate()
+            elif not self._awaits_power:
+                self._set_state(State.SWITCHED_ON)
+                self._awaits_power = True
+                self._stage.switch(True)
+                self._finish_power_up()
         else:
             self._power_off(wanted)
+
+    def _finish_power_up(self) -> None:
+        if self._stage.is_on:
+            self._awaits_power = False
+            self.motion.take_actual_as_demand()
+            self._operate()
 
     def _operate(self) -> None:
         self._set_state(State.OPERATION_ENABLED)
@@ -254,8 +274,9 @@ class Firmware:
         self._enter_mode()
 
     def _power_off(self, state: State) -> None:
+        self._stage.switch(False)
         self._braking = None
-        self._halted = False
+        self._halted = self._awaits_power = self._stopped_itself = False
         self._set_state(state)
 
     def _leave_quick_stop(self) -> None:
@@ -343,6 +364,7 @@ class Firmware:
         elif option == 2 and self.state in POWERED:
             self._power_off(State.SWITCH_ON_DISABLED)
         elif option == 3 and self.state is State.OPERATION_ENABLED:
+            self._stopped_itself = True
             self._quick_stop()
 
     @property
@@ -350,7 +372,24 @@ class Firmware:
         """Whether set-points must keep coming: enabled in a cyclic mode."""
         return self.state is State.OPERATION_ENABLED and isinstance(self._mode, CyclicSynchronousPosition)
 
-    def _reset_fault(self) -> None:
+    def _judge_stage(self) -> None:
+        """Reacts to a failure of the power stage, without a ramp, or to the end of a pending request."""
+        stage = self._stage
+        if stage.error_code and self.state is not State.FAULT:
+            self._emergency.occur(stage.error_code, stage.error_details)
+            self._error_code = stage.error_code
+            self._power_off(State.FAULT)
+        elif self._resetting:
+            self._finish_reset()
+        elif self._awaits_power:
+            self._finish_power_up()
+
+    def _finish_reset(self) -> None:
+        if self._stage.is_resetting:
+            return
+        self._resetting = False
+        if self._stage.error_code:
+            return  # its cause is still there
         self._error_code = 0
         self._following_error = False
         self._emergency.clear_all()
@@ -362,6 +401,9 @@ class Firmware:
         """Run the axis for one period."""
         if self._old_status_s > 0.0:
             self._old_status_s -= period_s
+        stage = self._stage
+        if stage.error_code or self._resetting or self._awaits_power:
+            self._judge_stage()
         motion, braking = self.motion, self._braking
         if self.state not in POWERED:
             motion.coast(period_s)

@@ -26,8 +26,11 @@ from hdbridge.device.firmware import Firmware
 from hdbridge.device.motion import Machine
 from hdbridge.device.nameplate import Nameplate
 from hdbridge.device.nmt import Nmt, NmtCommand
+from hdbridge.device.parameters import StoredParameters
 from hdbridge.device.pdo import ReceivePdo, TransmitPdo
+from hdbridge.device.powerstate import POWERED, PowerStage
 from hdbridge.device.sdo_server import SdoServer
+from hdbridge.device.syncclock import SyncClock
 
 PDO_COUNT: Final = 512
 LONGEST_CATCH_UP_S: Final = 1.0
@@ -50,7 +53,8 @@ class DriveNode:
     """A CiA-402 drive on ``bus``, moving ``machine``.
 
     ``bus`` is any python-can bus, and is read only here; ``eds_path`` declares the objects; ``clock`` gives
-    the time of start; ``nameplate`` distinguishes drives, ``behaviour`` their firmware.
+    the time of start; ``nameplate`` distinguishes drives, ``behaviour`` their firmware. ``stage`` is a power
+    stage that takes time or fails, ``store`` the file of the stored parameters.
     ``poll`` must be called when frames may have come and at ``next_event_s``.
     """
 
@@ -63,24 +67,32 @@ class DriveNode:
         clock: Clock,
         nameplate: Nameplate | None = None,
         behaviour: Behaviour | None = None,
+        stage: PowerStage | None = None,
+        store: Path | None = None,
     ) -> None:
         self.bus = bus
         self.node_id = node_id
         self.behaviour = behaviour or Behaviour()
         self.faults = Faults()
         self.lost_frames = 0
-        self._sync_s = -_NEVER
+        self.period_begins_s = clock.now()
+        """Start of the present period of the axis, on the node's clock."""
         self.dictionary = Dictionary(Path(eds_path), node_id)
         self._clock = clock
         self._now_s = clock.now()
-        self._assemble(machine, nameplate or Nameplate())
+        self._assemble(machine, nameplate or Nameplate(), stage, store)
         self._begin()
 
-    def _assemble(self, machine: Machine, nameplate: Nameplate) -> None:
+    def _assemble(
+        self, machine: Machine, nameplate: Nameplate, stage: PowerStage | None, store: Path | None
+    ) -> None:
         nameplate.engrave(self.dictionary)
-        self.dictionary.restore()
+        self._parameters = StoredParameters(
+            self.dictionary, lambda: self.firmware.state not in POWERED, store
+        )
+        self._parameters.restore()
         self.emergency = Emergency(self.dictionary, self._send_unless_stopped)
-        self.firmware = Firmware(self.dictionary, machine, self.emergency, self.faults, self.behaviour)
+        self.firmware = Firmware(self.dictionary, machine, self.emergency, self.faults, self.behaviour, stage)
         if nameplate.load_object in self.dictionary:
             self.dictionary[nameplate.load_object].bind(self.firmware.motion.load_position)
         self._sdo = SdoServer(self.dictionary)
@@ -93,6 +105,8 @@ class DriveNode:
         entry[0x1016, 1].guard = _check_consumer
         entry[0x1016, 1].follower = lambda _: self._change_watch()
         entry[0x1017, 0].follower = lambda _: self._start_heartbeat()
+        for index in (0x100C, 0x100D):
+            entry[index, 0].follower = lambda _: self._stop_guarding()
         for sub in (1, 2):
             entry[0x60C2, sub].follower = lambda _: self._take_period()
 
@@ -112,6 +126,8 @@ class DriveNode:
         for pdo in (*self._tpdos, *self._rpdos):
             pdo.compile()
         self._watch_heartbeat()
+        self._guard_toggle = 0
+        self._stop_guarding()
         self._route()
         self._start_heartbeat()
         self._due_s = self._now_s
@@ -124,13 +140,21 @@ class DriveNode:
         value = self.dictionary.value
         mantissa = value(0x60C2, 1)
         self._period_s = (mantissa or 1) / 10.0 ** -value(0x60C2, 2)
-        self._measures_period = mantissa == 0 or (0x60C2, 1) not in self.dictionary
+        self._measures_period = (
+            mantissa == 0 or (0x60C2, 1) not in self.dictionary or self.behaviour.measures_period
+        )
+        self._sync = SyncClock(self._period_s)
+        self._sync_due_s = _NEVER
 
-    def _measure_period(self, now_s: float) -> None:
-        """A drive without object 60C2h, or with 0 in it, takes its period from SYNC."""
-        since_s, self._sync_s = now_s - self._sync_s, now_s
-        if 0.0 < since_s < LONGEST_CATCH_UP_S:
-            self._period_s = since_s
+    @property
+    def has_sync(self) -> bool:
+        """True while SYNC drives the node."""
+        return self._sync_due_s < _NEVER
+
+    @property
+    def period_s(self) -> float:
+        """The period of 60C2h, or of SYNC if the drive measures it."""
+        return self._period_s
 
     def _watch_heartbeat(self) -> None:
         """Object 1016h:01; supervision begins with the first heartbeat (CiA 301)."""
@@ -139,6 +163,22 @@ class DriveNode:
         self._watched_id = _HEARTBEAT + (word >> 16 & 0x7F) if self._watched_s and word >> 16 & 0x7F else None
         self._watch_due_s = _NEVER
         self._watch_ended = False
+
+    def _stop_guarding(self) -> None:
+        """Life guarding (100Ch, 100Dh) is off until the next request of the master (CiA 301)."""
+        self._life_s = self.dictionary.value(0x100C) * self.dictionary.value(0x100D) * 1e-3
+        self._life_due_s = _NEVER
+
+    def _on_guarding(self, now_s: float) -> None:
+        """Answers a remote frame by which the master asks for the state."""
+        if self.faults.silent or self.faults.deaf:
+            return
+        self._send(_HEARTBEAT + self.node_id, bytes([self.nmt | self._guard_toggle]))
+        self._guard_toggle ^= 0x80
+        if self._life_s:
+            self._life_due_s = now_s + self._life_s
+            self.emergency.clear(ErrorCode.HEARTBEAT)
+            self._due_s = self._next_due_s()
 
     def _change_watch(self) -> None:
         self._watch_heartbeat()
@@ -195,6 +235,8 @@ class DriveNode:
     def run_until(self, now_s: float) -> None:
         """Do what is due until ``now_s`` without looking at the bus; ``poll`` ends with it."""
         self._now_s = now_s
+        if self.nmt is _INITIALISING:
+            self._boot()
         if self.faults.concerns_poll:
             self.faults.concerns_poll = False
             self._make_faults()
@@ -211,6 +253,8 @@ class DriveNode:
         """Take in one frame that came at ``now_s``; what is not a plain 11-bit data frame is ignored."""
         self._now_s = now_s
         take = self._takers.get(message.arbitration_id)
+        if take is None and message.is_remote_frame and message.arbitration_id == _HEARTBEAT + self.node_id:
+            self._on_guarding(now_s)
         if take is None or self.faults.silent or self.faults.deaf:
             return
         if type(message) is DataFrame or not (
@@ -232,23 +276,32 @@ class DriveNode:
         if self.nmt in (Nmt.OPERATIONAL, Nmt.PRE_OPERATIONAL):
             self._send(can_id, data)
 
-    def _on_sync(self, _: bytearray, now_s: float) -> None:
+    def _on_sync(self, data: bytearray, now_s: float) -> None:
+        begins_s = now_s
         if self._measures_period:
-            self._measure_period(now_s)
+            # A drive without object 60C2h, or with 0 in it, takes its period from SYNC.
+            self._sync.take(now_s)
+            begins_s, self._period_s = self._sync.time_s, self._sync.period_s
         if self.behaviour.rpdo_before_tpdo:
             self._apply_rpdos()
         tpdos: list[Outgoing] = []
         for tpdo in self._sync_tpdos:
-            data = tpdo.on_sync()
-            if data is not None:
-                tpdos.append((tpdo.can_id, data))
+            if tpdo.sync_start and not tpdo.has_started(data):
+                continue
+            values = tpdo.on_sync()
+            if values is not None:
+                tpdos.append((tpdo.can_id, values))
         if self.faults.concerns_tpdos:
             tpdos = self.faults.spoil(tpdos)
-        for can_id, data in tpdos:
-            self._send(can_id, data)
+        for can_id, mapped in tpdos:
+            self._send(can_id, mapped)
         self._apply_rpdos()
+        self.period_begins_s = begins_s
         self._advance()
         self._run_due_s = now_s + 1.5 * self._period_s
+        if self.behaviour.sync_timeout_periods:
+            self._sync_due_s = now_s + (1.0 + self.behaviour.sync_timeout_periods) * self._period_s
+            self.emergency.clear(ErrorCode.SYNC_LOST)
         self._due_s = self._next_due_s()
 
     def _apply_rpdos(self) -> None:
@@ -283,7 +336,7 @@ class DriveNode:
     def _on_sdo_request(self, data: bytearray, now_s: float) -> None:
         if now_s < self._sdo_from_s:
             return
-        if answer := self._sdo.respond(bytes(data)):
+        for answer in self._sdo.respond(bytes(data)):
             self._send(0x580 + self.node_id, answer)
 
     def _on_nmt(self, data: bytearray, _: float) -> None:
@@ -300,7 +353,7 @@ class DriveNode:
             self._reset_node()
         elif command == NmtCommand.RESET_COMMUNICATION:
             self.firmware.connection_lost(ErrorCode.COMMUNICATION)
-            self.dictionary.restore(0x1000, 0x1FFF)
+            self._parameters.restore(0x1000, 0x1FFF)
             self._begin()
             self._boot()
 
@@ -320,7 +373,7 @@ class DriveNode:
         self._enter(state)
 
     def _reset_node(self) -> None:
-        self.dictionary.restore()
+        self._parameters.restore()
         self.emergency.reset()
         self.firmware.reset()
         self._begin()
@@ -358,7 +411,10 @@ class DriveNode:
         self.firmware.advance(self._period_s)
 
     def _next_due_s(self) -> float:
-        due_s = min(self._run_due_s, self._heartbeat_due_s, self._watch_due_s, self._rpdo_due_s)
+        due_s = min(
+            self._run_due_s, self._heartbeat_due_s, self._watch_due_s, self._life_due_s,
+            self._rpdo_due_s, self._sync_due_s,
+        )  # fmt: skip
         for tpdo in self._event_tpdos:
             due_s = min(due_s, tpdo.due_s(self._now_s))
         return due_s
@@ -366,9 +422,12 @@ class DriveNode:
     def _do_what_is_due(self, now_s: float) -> None:
         self._run_due_s = max(self._run_due_s, now_s - LONGEST_CATCH_UP_S)
         while self._run_due_s <= now_s:
+            self.period_begins_s = self._run_due_s
             self._run_due_s += self._period_s
             self._advance()
-        if self._watch_due_s <= now_s:
+        if self._sync_due_s <= now_s:
+            self._lose_sync()
+        if min(self._watch_due_s, self._life_due_s) <= now_s:
             self._lose_heartbeat()
         if self._rpdo_due_s <= now_s:
             self._miss_rpdo(now_s)
@@ -391,7 +450,7 @@ class DriveNode:
         self._due_s = self._next_due_s()
 
     def _lose_heartbeat(self) -> None:
-        self._watch_due_s = _NEVER
+        self._watch_due_s = self._life_due_s = _NEVER
         self._watch_ended = self.behaviour.heartbeat_consumer is HeartbeatConsumer.STOPS
         if self.faults.ignore_lost_heartbeat:
             return
@@ -402,6 +461,21 @@ class DriveNode:
         state = _AFTER_ERROR.get(self.dictionary.value(0x1029, 1))
         if state is not None and self.nmt is Nmt.OPERATIONAL and not self.faults.stay_operational:
             self._enter(state)
+
+    def _lose_sync(self) -> None:
+        """SYNC is overdue, so an axis that follows the bus has lost its set-points; pending ones are old."""
+        self._sync_due_s = _NEVER
+        for rpdo in self._sync_rpdos:
+            rpdo.pending = None
+        if self.firmware.follows_the_bus:
+            self.emergency.occur(ErrorCode.SYNC_LOST)
+            self.firmware.connection_lost(ErrorCode.SYNC_LOST)
+
+    def bus_failed(self) -> None:
+        """Reacts to an interface that is down or bus-off as to a lost master (6007h), in any mode."""
+        for rpdo in self._rpdos:
+            rpdo.pending = None
+        self.firmware.connection_lost(ErrorCode.COMMUNICATION)
 
     def _miss_rpdo(self, now_s: float) -> None:
         """An RPDO is overdue: that matters to an axis that follows the bus. The next one arms it again."""

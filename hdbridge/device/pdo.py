@@ -51,7 +51,13 @@ class Pdo:
         self.compile()
 
     def _install(self) -> None:
-        guards = {1: self._check_can_id, 2: _check_type, 3: self._check_inhibit, 5: None}
+        guards = {
+            1: self._check_can_id,
+            2: _check_type,
+            3: self._check_inhibit,
+            5: None,
+            6: self._check_inhibit,
+        }
         for sub, guard in guards.items():
             if (self._communication, sub) in self._dictionary:
                 entry = self._dictionary[self._communication, sub]
@@ -152,6 +158,8 @@ class TransmitPdo(Pdo):
         self.sent: bytes | None = None
         self.sent_s = -float("inf")
         self.syncs_to_go = 1
+        self.sync_start = 0
+        """Counter of the SYNC from which it counts; 0 once it has begun."""
         self.on_sync: Callable[[], bytes | None] = bytes
         """The data to send upon a SYNC, None when this one is not its turn."""
         super().__init__(dictionary, 0x1800 + number - 1, 0x1A00 + number - 1, changed)
@@ -170,6 +178,14 @@ class TransmitPdo(Pdo):
         self.sent = None
         self.sent_s = -float("inf")
         self.syncs_to_go = max(1, self.transmission_type)
+        self.sync_start = self._parameter(6)
+
+    def has_started(self, sync: bytearray) -> bool:
+        """Returns True from the SYNC with the start value on, or from any without a counter (CiA 301)."""
+        if sync and sync[0] != self.sync_start:
+            return False
+        self.sync_start, self.syncs_to_go = 0, 1
+        return True
 
     def _if_changed(self) -> bytes | None:
         data = self.pack()

@@ -59,6 +59,27 @@ class Status(IntEnum):
     REFERENCED = 1 << 14  # ours: homing has been done
 
 
+class PowerStage:
+    """The power stage as the firmware sees it. This one switches at once and never fails.
+
+    The firmware asks for power with ``switch`` and operates the axis only while ``is_on``. ``error_code`` is
+    the emergency error code of a failure (0: none) and stays until a ``reset`` has removed it. The firmware
+    remains in FAULT while ``is_resetting``.
+    """
+
+    is_on = True
+    is_resetting = False
+    error_code = 0
+    error_details = b""
+    """Up to five manufacturer-specific bytes of the emergency message."""
+
+    def switch(self, on: bool) -> None:
+        """Requests power, or switches it off."""
+
+    def reset(self) -> None:
+        """Requests the end of a failure."""
+
+
 POWERED: Final = frozenset({State.OPERATION_ENABLED, State.QUICK_STOP_ACTIVE, State.FAULT_REACTION_ACTIVE})
 """States in which the motor is under control."""
 

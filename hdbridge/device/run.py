@@ -1,14 +1,14 @@
-"""The simulated drive in real time, on any bus: one thread waits for a frame or the drive's next event."""
+"""Nodes in real time, on any bus: one thread waits for a frame or the next event of a node."""
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
-from typing import Final
+from typing import Final, Protocol
 
 import can
 
 from hdbridge.clock import Clock
-from hdbridge.device.node import DriveNode
 from hdbridge.errors import BusError
 
 LONGEST_WAIT_S: Final = 0.1
@@ -18,17 +18,27 @@ PATIENCE_S: Final = 5.0
 """How long reading the bus may fail without a break: an interface that is down may come up again."""
 
 
+class Served(Protocol):
+    """A `DriveNode`, or several behind one bus."""
+
+    def handle(self, message: can.Message, now_s: float) -> None: ...
+    def poll(self, now_s: float) -> None: ...
+    def run_until(self, now_s: float) -> None: ...
+    def next_event_s(self) -> float: ...
+    def bus_failed(self) -> None: ...
+
+
 def run(
     bus: can.BusABC,
-    node: DriveNode,
+    node: Served,
     clock: Clock,
     should_stop: Callable[[], bool],
     longest_wait_s: float = LONGEST_WAIT_S,
 ) -> None:
     """Serve ``node``, whose bus is ``bus``, until ``should_stop`` says so.
 
-    ``longest_wait_s`` is how long a new event of the node's may go unnoticed. While the interface fails the
-    drive goes on by its own clock, so that its watchdogs stop the axis. Raises BusError when reading has
+    ``longest_wait_s`` is how long a new event of the node's may go unnoticed. A failure of the interface
+    stops the axis as 6007h says, and the node goes on by its own clock. Raises BusError when reading has
     failed for ``PATIENCE_S``.
     """
     failing_since_s: float | None = None
@@ -37,15 +47,26 @@ def run(
             wait_s = min(node.next_event_s() - clock.now(), longest_wait_s)
             message = bus.recv(max(wait_s, 0.0))
             if message is not None:
-                node.handle(message, clock.now())
+                node.handle(message, clock.now() - _age_s(message))
             node.poll(clock.now())
             failing_since_s = None
         except can.CanError as error:
             now_s = clock.now()
-            failing_since_s = now_s if failing_since_s is None else failing_since_s
+            if failing_since_s is None:
+                failing_since_s = now_s
+                node.bus_failed()
             if now_s - failing_since_s > PATIENCE_S:
                 raise BusError(
                     f"{bus.channel_info}: cannot be read ({error}); bring the interface up and start again"
                 ) from error
             node.run_until(now_s)
             clock.sleep_until(now_s + LONGEST_WAIT_S)
+
+
+def _age_s(message: can.Message) -> float:
+    """Time for which a frame has waited for this process, by the stamp of SocketCAN; 0 for other interfaces.
+
+    The stamp is of the wall clock. Only the few milliseconds from it until now count, not the clock's steps.
+    """
+    age_s = time.time() - message.timestamp
+    return age_s if 0.0 < age_s < LONGEST_WAIT_S else 0.0

@@ -1,12 +1,13 @@
-"""The SDO server of the simulated drive (CiA 301): expedited and segmented transfers in both directions.
+"""The SDO server of a device (CiA 301): expedited, segmented and block transfers in both directions.
 
-Bytes in, bytes out: the node passes eight data bytes and sends what comes back. Block transfers are refused.
+Bytes in, bytes out: the node passes eight data bytes and sends what comes back.
 """
 
 from __future__ import annotations
 
 import struct
-from enum import IntEnum
+from binascii import crc_hqx
+from enum import Enum, IntEnum
 from typing import Final
 
 from hdbridge.device.dictionary import MAX_STRING, Abort, Dictionary, Entry, SdoAbortError
@@ -24,6 +25,22 @@ class _Client(IntEnum):
     UPLOAD = 2
     UPLOAD_SEGMENT = 3
     ABORT = 4
+    BLOCK_UPLOAD = 5
+    BLOCK_DOWNLOAD = 6
+
+
+class _Block(Enum):
+    """The step of a block transfer that is due."""
+
+    NONE = "none"
+    SEGMENTS_IN = "segments of a download"
+    END_IN = "end of a download"
+    START_OUT = "start of an upload"
+    ACKNOWLEDGE = "acknowledgement of a block of an upload"
+    END_OUT = "end of an upload"
+
+
+_MOST_SEGMENTS: Final = 127
 
 
 class SdoServer:
@@ -37,34 +54,51 @@ class SdoServer:
         self._expected_size: int | None = None
         self._toggle = 0
         self._object = [0, 0]
+        self._block = _Block.NONE
+        self._block_size = _MOST_SEGMENTS
+        self._sequence = 0
+        """Segments of the present block that have come in order."""
+        self._checks_crc = False
+        self._sent = 0
+        """Bytes of a block upload that are acknowledged."""
 
     def reset(self) -> None:
         """Forget a transfer that has begun."""
-        self._entry = None
+        self._entry, self._block = None, _Block.NONE
 
-    def respond(self, request: bytes) -> bytes | None:
-        """The answer to a request of eight bytes, or None where none is due."""
+    def respond(self, request: bytes) -> list[bytes]:
+        """The answers to a request of eight bytes."""
         if len(request) != 8:
-            return None
+            return []
         command = request[0]
         specifier = command >> 5
         try:
+            if command == 0x80:
+                self.reset()
+                return []
+            if self._block is _Block.SEGMENTS_IN:
+                return self._take_segment(command, request)
+            if specifier == _Client.BLOCK_DOWNLOAD:
+                return [self._block_download(command, request)]
+            if specifier == _Client.BLOCK_UPLOAD:
+                return self._block_upload(command, request)
+            self._block = _Block.NONE
             if specifier == _Client.UPLOAD:
-                return self._upload(self._open(request))
+                return [self._upload(self._open(request))]
             if specifier == _Client.DOWNLOAD:
-                return self._download(self._open(request), command, request[4:])
+                return [self._download(self._open(request), command, request[4:])]
             if specifier == _Client.UPLOAD_SEGMENT:
-                return self._upload_segment(command)
+                return [self._upload_segment(command)]
             if specifier == _Client.DOWNLOAD_SEGMENT:
-                return self._download_segment(command, request)
+                return [self._download_segment(command, request)]
             if specifier == _Client.ABORT:
                 self._entry = None
-                return None
+                return []
             _, *self._object = _HEAD.unpack_from(request)
             raise SdoAbortError(Abort.COMMAND)
         except SdoAbortError as abort:
-            self._entry = None
-            return _ABORT.pack(0x80, *self._object, abort.code)
+            self.reset()
+            return [_ABORT.pack(0x80, *self._object, abort.code)]
 
     def _open(self, request: bytes) -> Entry:
         """Begin a transfer; one that was under way is forgotten, as the client evidently has."""
@@ -117,6 +151,106 @@ class SdoServer:
         answer = bytes([0x20 | self._toggle]) + bytes(7)
         self._toggle ^= _TOGGLE
         return answer
+
+    # ---------------------------------------------------------------- block transfers
+
+    def _block_download(self, command: int, request: bytes) -> bytes:
+        if self._block is _Block.END_IN:
+            return self._end_download(command, request)
+        if command & 1:
+            raise SdoAbortError(Abort.COMMAND)
+        entry = self._open(request)
+        self._expected_size = struct.unpack_from("<I", request, 4)[0] if command & 2 else None
+        if self._expected_size is not None:
+            entry.check_length(self._expected_size)
+        elif not entry.writable:
+            raise SdoAbortError(Abort.READ_ONLY)
+        self._begin(entry, uploading=False)
+        self._checks_crc = bool(command & 4)
+        self._sequence, self._block = 0, _Block.SEGMENTS_IN
+        return _HEAD.pack(0xA4, *self._object) + bytes((_MOST_SEGMENTS, 0, 0, 0))
+
+    def _take_segment(self, command: int, request: bytes) -> list[bytes]:
+        number, is_last = command & 0x7F, bool(command & 0x80)
+        in_order = number == self._sequence + 1
+        if in_order:
+            self._sequence = number
+            self._buffer += request[1:]
+            most = MAX_STRING if self._expected_size is None else self._expected_size
+            if len(self._buffer) >= most + 7:
+                raise SdoAbortError(Abort.TOO_LONG)
+        if not is_last and number < _MOST_SEGMENTS:
+            return []
+        answer = bytes((0xA2, self._sequence, _MOST_SEGMENTS)) + bytes(5)
+        if is_last and in_order:
+            self._block = _Block.END_IN
+        self._sequence = 0
+        return [answer]
+
+    def _end_download(self, command: int, request: bytes) -> bytes:
+        entry = self._entry
+        if command & 0x03 != 1 or entry is None:
+            raise SdoAbortError(Abort.COMMAND)
+        data = self._buffer[: len(self._buffer) - (command >> 2 & 7)]
+        if self._expected_size not in (None, len(data)):
+            raise SdoAbortError(Abort.LENGTH)
+        if self._checks_crc and crc_hqx(data, 0) != struct.unpack_from("<H", request, 1)[0]:
+            raise SdoAbortError(Abort.CRC)
+        entry.write(data)
+        self.reset()
+        return bytes((0xA1,)) + bytes(7)
+
+    def _block_upload(self, command: int, request: bytes) -> list[bytes]:
+        step = command & 0x03
+        if step == 0:
+            return [self._begin_block_upload(self._open(request), request[4])]
+        if step == 3 and self._block is _Block.START_OUT:
+            self._block = _Block.ACKNOWLEDGE
+            return self._segments()
+        if step == 2 and self._block is _Block.ACKNOWLEDGE:
+            return self._acknowledged(request[1], request[2])
+        if step == 1 and self._block is _Block.END_OUT:
+            self.reset()
+            return []
+        raise SdoAbortError(Abort.COMMAND)
+
+    def _begin_block_upload(self, entry: Entry, block_size: int) -> bytes:
+        self._block_size = self._checked_size(block_size)
+        data = entry.read()
+        self._begin(entry, uploading=True)
+        self._buffer, self._sent = data, 0
+        self._block = _Block.START_OUT
+        return _HEAD.pack(0xC6, *self._object) + struct.pack("<I", len(data))
+
+    @staticmethod
+    def _checked_size(size: int) -> int:
+        if not 1 <= size <= _MOST_SEGMENTS:
+            raise SdoAbortError(Abort.BLOCK_SIZE)
+        return size
+
+    def _segments(self) -> list[bytes]:
+        """One block from ``_sent`` on."""
+        data, frames = self._buffer, []
+        for number in range(1, self._block_size + 1):
+            at = self._sent + 7 * (number - 1)
+            is_last = at + 7 >= len(data)
+            frames.append(bytes((number | 0x80 * is_last,)) + data[at : at + 7].ljust(7, b"\0"))
+            if is_last:
+                break
+        self._sequence = len(frames)
+        return frames
+
+    def _acknowledged(self, number: int, block_size: int) -> list[bytes]:
+        self._block_size = self._checked_size(block_size)
+        if number > self._sequence:
+            raise SdoAbortError(Abort.SEQUENCE)
+        self._sent += 7 * number
+        data = self._buffer
+        if self._sent < len(data) or (not data and number == 0):
+            return self._segments()
+        self._block = _Block.END_OUT
+        empty = self._sent - len(data)
+        return [struct.pack("<BH5x", 0xC1 | empty << 2, crc_hqx(data, 0))]
 
     def _begin(self, entry: Entry, *, uploading: bool) -> None:
         self._entry, self._uploading, self._buffer, self._toggle = entry, uploading, b"", 0

@@ -95,11 +95,14 @@ class RawMaster:
 
     def request(self, data: bytes) -> bytes:
         """One SDO request of eight bytes and its answer."""
+        (answer,) = self.requests(data)
+        return answer
+
+    def requests(self, data: bytes) -> list[bytes]:
+        """One SDO request of eight bytes and all its answers."""
         self.take()
         self.send(0x601, data)
-        answers = [data for can_id, data in self.take() if can_id == 0x581]
-        assert len(answers) == 1
-        return answers[0]
+        return [data for can_id, data in self.take() if can_id == 0x581]
 
     def write(self, index: int, sub: int, value: int, size: int) -> int:
         """Expedited download; the abort code, 0 for success."""

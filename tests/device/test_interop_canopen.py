@@ -76,6 +76,10 @@ def test_sdo_numbers_and_strings(remote):
     assert remote.sdo["Manufacturer device name"].raw == "hdbridge simulated CiA-402 servo drive"
     remote.sdo["Device label"].raw = "axis on the left, behind the pillar"
     assert remote.sdo["Device label"].raw == "axis on the left, behind the pillar"
+    with remote.sdo["Device label"].open("wb", size=30, block_transfer=True) as file:
+        file.write(b"thirty characters, as a block!")
+    with remote.sdo["Device label"].open("rb", block_transfer=True) as file:
+        assert file.read() == b"thirty characters, as a block!"
     remote.sdo[0x607D][1].raw = -123456
     assert remote.sdo[0x607D][1].raw == -123456
     assert remote.sdo[0x60E4][1].raw == 0

@@ -1,0 +1,56 @@
+"""Time and period of SYNC, freed of the jitter with which it is received."""
+
+from __future__ import annotations
+
+from typing import Final
+
+LONGEST_PERIOD_S: Final = 1.0
+SHORTEST_PERIOD_S: Final = 0.000_5
+_GAIN: Final = 0.05
+"""Final share of a deviation by which the time is corrected; that of the period is half its square."""
+_ASTRAY: Final = 0.5
+"""Deviation, in periods, from which on the series of SYNCs is taken to begin again."""
+_ANOTHER: Final = 0.1
+_AGREEING: Final = 3
+"""Successive intervals that agree within `_ANOTHER`, but not with the period, are another period."""
+
+
+class SyncClock:
+    """A second-order tracking filter, so a constant drift between two clocks leaves no error.
+
+    It begins with a least-squares line through all SYNCs and ends with fixed gains.
+    """
+
+    __slots__ = ("_agreeing", "_count", "_interval_s", "_received_s", "period_s", "time_s")
+
+    def __init__(self, period_s: float) -> None:
+        self.period_s = period_s
+        self.time_s = self._received_s = -float("inf")
+        self._interval_s = 0.0
+        self._count = self._agreeing = 0
+
+    def take(self, now_s: float) -> None:
+        """Takes a received SYNC; ``time_s`` is then its time without jitter."""
+        before_s, self._interval_s = self._interval_s, now_s - self._received_s
+        self._received_s = now_s
+        interval_s = self._interval_s
+        if not SHORTEST_PERIOD_S <= interval_s <= LONGEST_PERIOD_S:
+            self.time_s, self._agreeing = now_s, 0
+            self._count = min(self._count, 1) if interval_s > LONGEST_PERIOD_S else self._count
+            self._count = self._count or 1
+            return
+        strange = abs(interval_s - self.period_s) > _ANOTHER * self.period_s
+        agrees = abs(interval_s - before_s) <= _ANOTHER * interval_s
+        self._agreeing = self._agreeing + 1 if strange and (agrees or not self._agreeing) else 0
+        if self._count == 1 or self._agreeing >= _AGREEING:
+            self.time_s, self.period_s = now_s, interval_s
+            self._count, self._agreeing = 2, 0
+            return
+        error_s = now_s - self.time_s - self.period_s
+        if abs(error_s) > _ASTRAY * self.period_s:
+            self.time_s = now_s
+            return
+        self._count += 1
+        count = self._count
+        self.time_s = now_s - error_s * (1.0 - max(_GAIN, (4.0 * count - 2.0) / (count * (count + 1.0))))
+        self.period_s += error_s * max(0.5 * _GAIN * _GAIN, 6.0 / (count * (count + 1.0)))
