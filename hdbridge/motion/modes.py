@@ -20,3 +20,5 @@ class MotionMode(IntEnum):
     """Following knots that a client has planned."""
     STOP = 4
     """Braking to rest within the limits."""
+    FOLLOW = 5
+    """After a position that somebody else gives in each period."""

@@ -15,6 +15,7 @@ import math
 from hdbridge.errors import InputError
 from hdbridge.motion.generator import Bounds, Generator, Kinematics, Plan
 from hdbridge.motion.modes import MotionMode
+from hdbridge.motion.pursuit import Pursuit
 from hdbridge.motion.stream import Cubic, Stream
 from hdbridge.procedures.moves import MotionLimits
 
@@ -30,8 +31,9 @@ class SetPoint:
     """
 
     __slots__ = (
-        "_acceleration_deg_s2", "_bounds", "_generator", "_left", "_limits", "_mode", "_path", "_period_s",
-        "_position_deg", "_since_s", "_steps", "_stream", "_stream_timeout", "_underrun", "_velocity_deg_s",
+        "_acceleration_deg_s2", "_aim", "_bounds", "_generator", "_left", "_limits", "_mode", "_path",
+        "_period_s", "_position_deg", "_pursuit", "_since_s", "_steps", "_stream", "_stream_timeout",
+        "_underrun", "_velocity_deg_s",
     )  # fmt: skip
 
     def __init__(self, limits: MotionLimits, period_s: float) -> None:
@@ -52,6 +54,8 @@ class SetPoint:
         self._period_s = period_s
         self._generator = Generator(limits)
         self._stream: Stream | None = None
+        self._pursuit: Pursuit | None = None
+        self._aim = (0.0, 0.0)
         self._path: Plan | Cubic | None = None
         """Path in progress; None at rest and in a stream."""
         self._steps = 0
@@ -89,6 +93,8 @@ class SetPoint:
         """True if it stands still and would remain so without further input."""
         if self._stream is not None:
             return self._stream.waiting
+        if self._pursuit is not None:
+            return self._pursuit.at_rest
         return self._path is None
 
     @property
@@ -181,6 +187,23 @@ class SetPoint:
         self._underrun = False
         self._mode = MotionMode.STREAM
 
+    def follow(self) -> None:
+        """Pursue what `aim` gives, until another motion or `stop`. InputError: in motion."""
+        if not self.at_rest:
+            raise InputError("an axis begins to follow another master at rest: stop the axis first")
+        self._rest_at(self._position_deg)
+        self._pursuit = Pursuit(self._position_deg, self._limits, self._bounds, self._period_s)
+        self._aim = (self._position_deg, 0.0)
+        self._mode = MotionMode.FOLLOW
+
+    def aim(self, position_deg: float, spacing_s: float = 0.0) -> None:
+        """Pursue this position with the next `step`, as far as the limits allow. InputError: not finite.
+
+        ``spacing_s`` is the time between the set-points that it was interpolated from.
+        """
+        _check_finite("load angle", position_deg)
+        self._aim = (position_deg, spacing_s)
+
     def begin_stream(self) -> None:
         """Starts the stream's time with the next `step`; raises `InputError` without a `stream`."""
         self._streaming().begin()
@@ -199,6 +222,9 @@ class SetPoint:
         """Advances one period; returns the load target in degrees."""
         if self._stream is not None:
             return self._step_stream(self._stream)
+        if self._pursuit is not None:
+            self._set(self._pursuit.step(*self._aim))
+            return self._position_deg
         if self._mode is MotionMode.JOG:
             self._left -= 1
             if self._left < 0:
@@ -244,7 +270,7 @@ class SetPoint:
     def _rest_at(self, position_deg: float) -> None:
         self._position_deg = position_deg
         self._velocity_deg_s = self._acceleration_deg_s2 = 0.0
-        self._path = self._stream = None
+        self._path = self._stream = self._pursuit = None
         self._mode = MotionMode.HOLD
         self._bounds = self._bounds_here()
 
@@ -256,7 +282,7 @@ class SetPoint:
     def _take(self, path: Plan | Cubic, mode: MotionMode, since_s: float = 0.0) -> None:
         self._bounds = self._bounds_here()
         self._path, self._steps, self._since_s = path, 0, since_s
-        self._stream = None
+        self._stream = self._pursuit = None
         self._mode = mode
         self._underrun = False
 

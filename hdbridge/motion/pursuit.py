@@ -1,0 +1,67 @@
+"""Pursuit of a position that somebody else gives in each period, within the limits of the axis."""
+
+from __future__ import annotations
+
+import math
+
+from hdbridge.motion.generator import Bounds, Kinematics
+from hdbridge.procedures.moves import MotionLimits
+
+_ROUNDING = 1e-6
+
+
+class Pursuit:
+    """Reaches each goal exactly if the limits allow it; otherwise approaches it at the limit of acceleration.
+
+    Goals that lie on straight lines between set-points change their velocity in steps, also on a path within
+    the limits. Therefore a goal is reached exactly if its velocity changes by no more than the limit allows
+    from one set-point to the next. A goal outside the bounds is pursued to the bound. Jerk is not limited, as
+    for the knots of a stream.
+    """
+
+    __slots__ = ("_acceleration", "_fastest", "_goal_deg", "_lower", "_period_s", "_upper", "state")
+
+    def __init__(self, begin_deg: float, limits: MotionLimits, bounds: Bounds, period_s: float) -> None:
+        self._acceleration, self._period_s = limits.acceleration_deg_s2, period_s
+        self._fastest = limits.velocity_deg_s * (1.0 + _ROUNDING)
+        self._lower, self._upper = bounds
+        self._goal_deg = begin_deg
+        self.state = Kinematics(begin_deg, 0.0, 0.0)
+        """Position, velocity and acceleration at the end of the last period."""
+
+    @property
+    def at_rest(self) -> bool:
+        """True if it stands at its goal."""
+        return self.state.velocity_deg_s == 0.0 and self.state.position_deg == self._goal_deg
+
+    def step(self, goal_deg: float, spacing_s: float = 0.0) -> Kinematics:
+        """One period towards ``goal_deg`` (finite): the new state. ``spacing_s``: time between set-points."""
+        lower, upper, acceleration, period_s = self._lower, self._upper, self._acceleration, self._period_s
+        before_deg = self._goal_deg
+        self._goal_deg = goal_deg = lower if goal_deg < lower else upper if goal_deg > upper else goal_deg
+        position, velocity, _ = self.state
+        wanted = (goal_deg - position) / period_s
+        speed, room_deg = (wanted, upper - position) if wanted > 0.0 else (-wanted, position - lower)
+        if (
+            speed <= self._fastest
+            and abs(wanted - velocity) <= acceleration * (period_s + spacing_s)
+            and speed * (speed + acceleration * period_s) <= 2.0 * acceleration * room_deg  # as in `_speed`
+        ):
+            position = goal_deg
+        else:
+            away, change = goal_deg - position, acceleration * period_s
+            wanted = (goal_deg - before_deg) / period_s + math.copysign(self._speed(abs(away)), away)
+            # Whatever the goal does, the axis can still brake before its bounds.
+            least = max(-self._fastest, velocity - change, -self._speed(position - lower))
+            most = min(self._fastest, velocity + change, self._speed(upper - position))
+            wanted = min(max(wanted, least), most)
+            position = min(max(position + wanted * period_s, lower), upper)
+        self.state = state = Kinematics(position, wanted, (wanted - velocity) / period_s)
+        return state
+
+    def _speed(self, distance_deg: float) -> float:
+        """The highest speed of the next period from which it can still brake within a distance."""
+        if distance_deg <= 0.0:
+            return 0.0
+        change = self._acceleration * self._period_s
+        return change * (math.sqrt(0.25 + 2.0 * distance_deg / (change * self._period_s)) - 0.5)
