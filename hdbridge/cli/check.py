@@ -47,6 +47,8 @@ def check(profile: CheckedArgument, model: ModelOption = None, json_file: JsonOp
     else:
         machine = Machine.load(path)
         _check_bus(machine.bus, f"{path}: bus")
+        if machine.gateway is not None:
+            _check_bus(machine.gateway.bus, f"{path}: gateway.bus")
         reports = [_Report(axis.config, _existing(axis.profile.model)) for axis in machine.axes]
         facts = _of_machine(machine)
         document = {"schema": "hdbridge.check/1", **facts, "axes": [each.document() for each in reports]}
@@ -75,9 +77,16 @@ def _of_machine(machine: Machine) -> dict[str, str]:
 
     load = bus_load([axis.config for axis in machine.axes], machine.bus.bitrate_bps)
     names = ", ".join(axis.name for axis in machine.axes)
+    gateway = machine.gateway
+    outer: dict[str, str] = {}
+    if gateway is not None:
+        nodes = ", ".join(f"{name} as node {node}" for name, node in gateway.nodes.items())
+        outer["gateway"] = f"{nodes} on {gateway.bus.interface}:{gateway.bus.channel}"
+        outer["one outer count"] = f"{1_296_000 / gateway.counts_per_turn:.3g} arcsec at the load"
     return {
         "machine": machine.name,
         "axes of it": names,
+        **outer,
         "bus load": f"{100 * load:.0f} % at most" if load is not None else "not known: no bitrate_bps",
     }
 

@@ -94,6 +94,7 @@ class BusCycle:
         "clock",
         "count",
         "down",
+        "due_s",
         "faults",
         "histogram",
         "late_s",
@@ -135,8 +136,10 @@ class BusCycle:
         """Number of the last period; skipped periods are counted."""
         self.woke_s = clock.now()
         """When the last turn began, on the clock."""
+        self.due_s = self.woke_s
+        """When it was due."""
         self.late_s = 0.0
-        """How late that was."""
+        """How late it began."""
         self.busy_s = 0.0
         """From there to its end."""
         self.faults: list[tuple[Fault, str]] = []
@@ -255,7 +258,7 @@ class BusCycle:
         if self.faults:
             self.faults.clear()
         if deadline is None:
-            self.woke_s = now = clock.now()
+            self.woke_s = self.due_s = now = clock.now()
             self.late_s = 0.0
             self._deadline = now + period_s
             return now
@@ -270,7 +273,7 @@ class BusCycle:
             clock.sleep_until(deadline)
             now = clock.now()
         self._deadline = deadline + period_s
-        self.woke_s = now
+        self.due_s, self.woke_s = deadline, now
         return now
 
     def _overrun(self, late_s: float, missed: int) -> None:

@@ -1,4 +1,4 @@
-"""The keeper: starts, monitors and ends the daemon's two processes, and does nothing else.
+"""The keeper: starts, monitors and ends the daemon's processes, and does nothing else.
 
 It holds what must outlive a child: the shared memory, the listening sockets, the lock of the CAN interface.
 
@@ -9,6 +9,7 @@ It holds what must outlive a child: the shared memory, the listening sockets, th
     control, hung     kills it after `Times.hung_s`; the bus is silent, so the drives have stopped already
     service, dead     restarts it after increasing delays; the loop continues
     service, hung     kills it after `Times.service_hung_s`
+    gateway           as the service; its axes brake and lose power because their set-points end
 
 If a child cannot start (the bus cannot be opened, a folder cannot be written), the daemon ends with that
 child's exit status.
@@ -24,7 +25,7 @@ import socket
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from types import FrameType
 from typing import Final
 
@@ -50,6 +51,7 @@ class Programs:
 
     control: Sequence[str] = ("-m", "hdbridge.daemon.loop.process")
     service: Sequence[str] = ("-m", "hdbridge.daemon.service.process")
+    gateway: Sequence[str] = ("-m", "hdbridge.daemon.gateway.process")
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,18 +64,38 @@ class Times:
     """A turn of the control process; the drives' own watchdogs act long before."""
     service_hung_s: float = 30.0
     """A sign of life of the service."""
+    gateway_hung_s: float = 5.0
+    """A sign of life of the gateway."""
     stop_s: float = 30.0
     """Braking of all axes by the control process."""
     service_stop_s: float = 10.0
     """End of the service after that."""
 
 
-SIMULATED: Final = Times(begin_s=600.0, stop_s=300.0, service_stop_s=120.0)
+SIMULATED: Final = Times(begin_s=600.0, gateway_hung_s=120.0, stop_s=300.0, service_stop_s=120.0)
 """Time-outs with simulated drives, long enough for a busy computer."""
 
 
+@dataclass(slots=True)
+class _Helper:
+    """A process in addition to the control process; restarted after increasing delays, whatever ended it."""
+
+    name: str
+    program: Sequence[str]
+    listening: tuple[int, ...]
+    alive: Cell
+    """Cell with the time of its last sign of life."""
+    begun: Cell
+    """Cell with its process id."""
+    hung_s: float
+    child: Child | None = None
+    due_s: float | None = None
+    pulse: Pulse = field(default_factory=Pulse)
+    back_off: BackOff = field(default_factory=lambda: BackOff(0.5, 30.0, 60.0))
+
+
 class Keeper:
-    """Keeper of the two processes of one machine."""
+    """Keeper of the processes of one machine."""
 
     def __init__(
         self,
@@ -87,18 +109,32 @@ class Keeper:
         self._start, self._memory, self._listeners = start, memory, listeners
         self._notifier, self._programs, self._times = notifier, programs, times
         self._budget = Budget(start.machine.limits.restarts_per_minute, 60.0)
-        self._back_off = BackOff(0.5, 30.0, 60.0)
-        self._turns, self._served = Pulse(), Pulse()
+        self._turns = Pulse()
         self._control: Child | None = None
-        self._service: Child | None = None
-        self._service_due_s: float | None = None
-        self._restarts = {"control": 0, "service": 0}
+        api = tuple(each.fileno() for each in listeners)
+        self._helpers = [
+            _Helper(
+                "service", programs.service, api, Cell.SERVICE_TIME_NS, Cell.SERVICE_PID, times.service_hung_s
+            )
+        ]
+        if start.machine.gateway is not None:
+            self._helpers.append(
+                _Helper(
+                    "gateway",
+                    programs.gateway,
+                    (),
+                    Cell.GATEWAY_TIME_NS,
+                    Cell.GATEWAY_PID,
+                    times.gateway_hung_s,
+                )
+            )
+        self._restarts = {"control": 0, **{each.name: 0 for each in self._helpers}}
         self._ready = False
         self._status = 0
         """Exit status of the daemon."""
         self._signals = self._heeded = 0
         self._stopping_since_s: float | None = None
-        self._service_told_s: float | None = None
+        self._helpers_told_s: float | None = None
         self._fed_s = 0.0
         self._selector = selectors.DefaultSelector()
 
@@ -110,8 +146,11 @@ class Keeper:
             stack.callback(self._end_all)
             now_s = time.monotonic()
             self._start_control(now_s)
-            self._start_service(now_s)
-            while self._control is not None or self._service is not None or self._service_due_s is not None:
+            for helper in self._helpers:
+                self._start_helper(helper, now_s)
+            while self._control is not None or any(
+                each.child is not None or each.due_s is not None for each in self._helpers
+            ):
                 for key, _ in self._selector.select(TICK_S):
                     if key.data is not None:
                         key.data()
@@ -123,13 +162,15 @@ class Keeper:
         self._heed_signals(now_s)
         if self._control is not None and self._control.ended is not None:
             self._control_ended(self._control, now_s)
-        if self._service is not None and self._service.ended is not None:
-            self._service_ended(self._service, now_s)
+        for helper in self._helpers:
+            if helper.child is not None and helper.child.ended is not None:
+                self._helper_ended(helper, helper.child, now_s)
         if self._stopping_since_s is not None:
             self._go_on_stopping(now_s)
             return
-        if self._service_due_s is not None and now_s >= self._service_due_s:
-            self._start_service(now_s)
+        for helper in self._helpers:
+            if helper.due_s is not None and now_s >= helper.due_s:
+                self._start_helper(helper, now_s)
         self._look_after(now_s)
 
     # ------------------------------------------------------------------ children
@@ -138,12 +179,11 @@ class Keeper:
         self._control = self._started(self._programs.control, "control", (), now_s)
         self._turns.restart(self._memory.status.loop_count)
 
-    def _start_service(self, now_s: float) -> None:
-        self._service_due_s = None
-        listening = tuple(each.fileno() for each in self._listeners)
-        self._memory.status.set(Cell.SERVICE_TIME_NS, 0)
-        self._service = self._started(self._programs.service, "service", listening, now_s)
-        self._served.restart(0)
+    def _start_helper(self, helper: _Helper, now_s: float) -> None:
+        helper.due_s = None
+        self._memory.status.set(helper.alive, 0)
+        helper.child = self._started(helper.program, helper.name, helper.listening, now_s)
+        helper.pulse.restart(0)
 
     def _started(self, program: Sequence[str], name: str, listening: tuple[int, ...], now_s: float) -> Child:
         fd = self._start.hand_over(restarts=self._restarts[name], api_fds=listening)
@@ -177,30 +217,32 @@ class Keeper:
             self._restarts["control"] += 1
             self._start_control(now_s)
 
-    def _service_ended(self, child: Child, now_s: float) -> None:
-        status, how = child.ended, child.how
+    def _helper_ended(self, helper: _Helper, child: Child, now_s: float) -> None:
+        name, status, how = helper.name, child.ended, child.how
         assert status is not None
         self._forget(child)
-        self._service = None
+        helper.child = None
         if self._stopping_since_s is not None:
             return
         lived_s = now_s - child.started_s
-        _log.error("service process died", {"how": how, "lived_s": round(lived_s, 1)})
-        self._restarts["service"] += 1
-        if not self._ready and (status in _ERRORS or self._restarts["service"] >= _FIRST_ATTEMPTS):
+        _log.error(f"{name} process died", {"how": how, "lived_s": round(lived_s, 1)})
+        self._restarts[name] += 1
+        if not self._ready and (status in _ERRORS or self._restarts[name] >= _FIRST_ATTEMPTS):
             known = status if status in _ERRORS else HdbridgeError.exit_status
-            self._stop(now_s, known, f"the service cannot begin ({how})")
+            self._stop(now_s, known, f"the {name} cannot begin ({how})")
         else:
-            self._service_due_s = now_s + self._back_off.delay_s(lived_s)
+            helper.due_s = now_s + helper.back_off.delay_s(lived_s)
 
     def _look_after(self, now_s: float) -> None:
         """Kills hung children; reports readiness, sign of life and status to the service manager."""
         status = self._memory.status
         running = self._turns.look(status.loop_count)
-        self._served.look(status.service_time_ns)
         self._kill_hung(self._control, self._turns, self._times.hung_s)
-        self._kill_hung(self._service, self._served, self._times.service_hung_s)
-        serving = self._service is not None and status.service_pid == self._service.pid
+        serving = True
+        for helper in self._helpers:
+            helper.pulse.look(status.get(helper.alive))
+            self._kill_hung(helper.child, helper.pulse, helper.hung_s)
+            serving &= helper.child is not None and status.get(helper.begun) == helper.child.pid
         if not self._ready and self._turns.begun and serving:
             self._ready = True
             self._notifier.ready()
@@ -244,7 +286,8 @@ class Keeper:
         if self._stopping_since_s is not None:
             return
         self._stopping_since_s, self._status = now_s, status
-        self._service_due_s = None
+        for helper in self._helpers:
+            helper.due_s = None
         _log.info("stopping", {"why": why})
         self._notifier.stopping()
         self._memory.status.set(Cell.STOP_ASKED, 1)
@@ -256,19 +299,28 @@ class Keeper:
                 _log.error("the axes do not come to rest", {"after_s": self._times.stop_s})
                 self._status = self._status or HdbridgeError.exit_status
                 self._control.send(signal.SIGKILL)
-        elif self._service is not None:
-            if self._service_told_s is None:
-                self._service_told_s = now_s
-                self._service.send(signal.SIGTERM)
-            elif now_s - self._service_told_s > self._times.service_stop_s:
-                _log.error("the service does not end", {"after_s": self._times.service_stop_s})
-                self._service.send(signal.SIGKILL)
+            return
+        remaining = [each for each in self._helpers if each.child is not None]
+        number = signal.SIGTERM
+        if self._helpers_told_s is None:
+            self._helpers_told_s = now_s
+        elif now_s - self._helpers_told_s > self._times.service_stop_s:
+            number = signal.SIGKILL
+        else:
+            return
+        for helper in remaining:
+            assert helper.child is not None
+            if number is signal.SIGKILL:
+                _log.error(f"the {helper.name} does not end", {"after_s": self._times.service_stop_s})
+            helper.child.send(number)
 
     def _end_all(self) -> None:
-        for child in (self._control, self._service):
+        for child in (self._control, *(each.child for each in self._helpers)):
             if child is not None:
                 self._forget(child)
-        self._control = self._service = self._service_due_s = None
+        self._control = None
+        for helper in self._helpers:
+            helper.child = helper.due_s = None
 
     @contextmanager
     def _deferred_signals(self) -> Iterator[None]:

@@ -15,10 +15,18 @@ from typing import Self
 from hdbridge.axis import AxisConfig, BusConfig, RealtimeConfig
 from hdbridge.control.bench import compensation_for
 from hdbridge.daemon.adaptation.settings import AdaptationSettings
-from hdbridge.daemon.machinechecks import Places, agreed, check_load, check_tcp, check_together
+from hdbridge.daemon.machinechecks import (
+    Places,
+    agreed,
+    check_gateway,
+    check_load,
+    check_tcp,
+    check_together,
+)
 from hdbridge.daemon.machinefile import (
     ApiSettings,
     AxisEntry,
+    GatewaySettings,
     LimitSettings,
     LoadLoopSettings,
     MachineFile,
@@ -93,6 +101,7 @@ class Machine:
     lease_s: float
     limits: LimitSettings
     recorder: RecorderSettings
+    gateway: GatewaySettings | None = None
 
     @property
     def folder(self) -> Path:
@@ -170,9 +179,10 @@ class Machine:
         check_together(axes, places)
         check_load([axis.config for axis in axes], bus, places)
         check_tcp(file, places)
+        check_gateway(file, axes, bus, places)
         return cls(
             file.name, path.absolute(), tuple(axes), bus, realtime,
-            file.api, file.lease_s, file.limits, file.recorder,
+            file.api, file.lease_s, file.limits, file.recorder, file.gateway,
         )  # fmt: skip
 
     def on_bus(self, **changes: str | int | None) -> Self:

@@ -94,6 +94,36 @@ def check_load(axes: Sequence[AxisConfig], bus: BusConfig, places: Places) -> No
         raise places.error(("axes",), str(problem)) from None
 
 
+def check_gateway(file: MachineFile, axes: Sequence[Axis], bus: BusConfig, places: Places) -> None:
+    """Known axes, one node id each, a bus of its own, and positions that fit into an int32."""
+    gateway = file.gateway
+    if gateway is None:
+        return
+    outer = gateway.bus
+    if (outer.interface, str(outer.channel)) == (bus.interface, str(bus.channel)):
+        raise places.error(
+            ("gateway", "bus"),
+            f"{outer.interface}:{outer.channel} is the bus of the drives; expected another one, on which the "
+            "other master is",
+        )
+    known = {axis.name: axis.config for axis in axes}
+    nodes: dict[int, str] = {}
+    for name, node in gateway.nodes.items():
+        at = ("gateway", "nodes", name)
+        if name not in known:
+            raise places.error(at, f"no axis '{name}'; expected one of: {', '.join(known)}")
+        if (owner := nodes.setdefault(node, name)) != name:
+            raise places.error(at, f"node {node} is '{owner}' already; expected another node id")
+        limits = known[name].limits
+        farthest = max(abs(limits.position_min_deg), abs(limits.position_max_deg)) / 360.0
+        if farthest * gateway.counts_per_turn >= 1 << 31:
+            raise places.error(
+                ("gateway",),
+                f"{gateway.counts_per_turn} counts_per_turn: the limits of '{name}' do not fit into 32 bits; "
+                f"expected at most {int((1 << 31) / farthest) - 1}",
+            )
+
+
 def check_tcp(file: MachineFile, places: Places) -> None:
     """Checks that the token file exists and only its owner can read it."""
     tcp = file.api.tcp

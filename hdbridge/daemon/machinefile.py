@@ -86,6 +86,27 @@ class ApiSettings(_Part):
     )
 
 
+class GatewaySettings(_Part):
+    """The machine as CiA-402 drives on another bus, for a master there. Positions are those of the load."""
+
+    bus: BusConfig = Field(description="the bus of the other master")
+    nodes: dict[str, Annotated[int, Field(ge=1, le=127)]] = Field(
+        min_length=1, description="node id on that bus of each axis, by its name"
+    )
+    counts_per_turn: int = Field(
+        12_960_000,
+        ge=3600,
+        le=1 << 28,
+        description="increments per turn of the load; by default 0.1 arcsec each",
+    )
+    timeout_ms: float = Field(
+        100.0,
+        ge=10,
+        le=10_000,
+        description="an axis at rest that gets no set-point for so long loses its power",
+    )
+
+
 class LimitSettings(_Part):
     """Limits of the daemon."""
 
@@ -115,6 +136,9 @@ class MachineFile(_Part):
     recorder: RecorderSettings = Field(
         default_factory=RecorderSettings,
         description="the flight recorder: folder, size and age of recordings",
+    )
+    gateway: GatewaySettings | None = Field(
+        None, description="axes as drives of another master; without the key there is none"
     )
     adaptation: AdaptationSettings = Field(
         default_factory=AdaptationSettings, description="adaptation of model parameters to the load encoder"

@@ -127,6 +127,14 @@ def _concerns(state: MachineState) -> list[str]:
         for each in state.axes
         if each.job is not None
     ]
+    found += [
+        f"axis '{each.name}': node {outer.node_id} of another master, statusword {outer.statusword:04X}h, "
+        + ("no SYNC" if outer.period_s is None else f"SYNC every {1e3 * outer.period_s:.3f} ms")
+        if outer.alive
+        else f"axis '{each.name}': the gateway process does not run; it is started again by itself"
+        for each in state.axes
+        if (outer := each.outer) is not None
+    ]
     if state.recorder.note is not None:
         found.append(f"recorder: {state.recorder.note}")
     return [*found, *state.warnings]

@@ -52,6 +52,7 @@ from hdbridge.client.messages.state import (
     LoadLoopState,
     MachineState,
     ModelInUse,
+    OuterState,
     RecorderState,
 )
 from hdbridge.client.messages.values import (
@@ -95,6 +96,7 @@ __all__ = [
     "ModelInUse",
     "MotionMode",
     "Move",
+    "OuterState",
     "PowerState",
     "Problem",
     "Queue",

@@ -84,6 +84,16 @@ class AdaptationState(Report):
     )
 
 
+class OuterState(Report):
+    """The axis as a drive of another master, through the gateway."""
+
+    node_id: int = Field(ge=1, le=127, description="on the bus of that master")
+    alive: bool = Field(description="whether the gateway process runs")
+    nmt: int = Field(description="NMT state of the node as in a heartbeat", examples=[5])
+    statusword: int = Field(description="6041h as that master sees it", examples=[0x1237])
+    period_s: float | None = Field(None, description="period of that master's SYNC", examples=[0.004])
+
+
 class AxisState(Report):
     """State of one axis in the newest cycle."""
 
@@ -126,6 +136,7 @@ class AxisState(Report):
     model: ModelInUse | None = Field(None, description="None: not compensated")
     load_loop: LoadLoopState
     adaptation: AdaptationState
+    outer: OuterState | None = Field(None, description="None: the axis is not in a gateway")
     advice: list[str] = Field(
         default=[],
         description="what the load-encoder watch says",

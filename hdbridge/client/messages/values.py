@@ -68,6 +68,8 @@ class MotionMode(StrEnum):
     JOG = "jog"
     STREAM = "stream"
     STOP = "stop"
+    FOLLOW = "follow"
+    """After the set-points of another master, through the gateway."""
 
 
 class PowerState(StrEnum):

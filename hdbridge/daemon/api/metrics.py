@@ -101,7 +101,7 @@ class _Scrape(Collector):
         yield _counter(
             "faults", "Faults by axis; without an axis those of the machine.", faults, ("axis", "fault")
         )
-        for name, about, of in _AXIS:
+        for name, about, of in (*_AXIS, *_OUTER):
             rows = [((each.name,), value) for each in state.axes if (value := of(each)) is not None]
             yield _gauge(name, about, rows, ("axis",))
         states = [((each.name, one.value), each.state is one) for each in state.axes for one in ControlState]
@@ -111,6 +111,15 @@ class _Scrape(Collector):
         yield from _api(self._traffic)
 
 
+_OUTER: Final[Sequence[tuple[str, str, Any]]] = (
+    ("outer_statusword", "6041h as the other master sees it.", lambda a: a.outer and a.outer.statusword),
+    ("outer_nmt_state", "NMT state on the other master's bus.", lambda a: a.outer and a.outer.nmt),
+    (
+        "outer_sync_period_seconds",
+        "Period of the other master's SYNC.",
+        lambda a: a.outer and a.outer.period_s,
+    ),
+)
 _AXIS: Final[Sequence[tuple[str, str, Any]]] = (
     ("load_target_degrees", "Load target.", lambda a: a.load_target_deg),
     ("load_position_degrees", "Load encoder.", lambda a: a.load_position_deg),

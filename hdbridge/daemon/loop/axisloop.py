@@ -16,6 +16,7 @@ from hdbridge.daemon.loop.axissample import AxisSampler
 from hdbridge.daemon.loop.faultlog import FAULT_INDEX, FaultLog, Tell
 from hdbridge.daemon.loop.follower import AxisSetup, Follower
 from hdbridge.daemon.loop.knotfeed import KnotFeed
+from hdbridge.daemon.loop.outerfeed import OuterFeed
 from hdbridge.daemon.loop.states import AxisState, Cause, Happening, refusal, target_of
 from hdbridge.daemon.memory.knots import KnotQueue
 from hdbridge.daemon.memory.layout import NO_FAULT, Command, CommandKind, EventKind
@@ -36,7 +37,17 @@ _UNDER_COMMAND: Final = (AxisState.ENABLING, AxisState.ENABLED, AxisState.STOPPI
 class AxisLoop:
     """One axis. It sends nothing and is unverified until the service reports that its drive was verified."""
 
-    def __init__(self, index: int, setup: AxisSetup, knots: KnotQueue, slot: SettingSlot, tell: Tell) -> None:
+    def __init__(
+        self,
+        index: int,
+        setup: AxisSetup,
+        knots: KnotQueue,
+        slot: SettingSlot,
+        tell: Tell,
+        followed: KnotQueue,
+        due_s: Callable[[], float],
+    ) -> None:
+        """``followed`` has the gateway's set-points; ``due_s`` returns when the present turn was due."""
         config = setup.config
         self.index = index
         self.config = config
@@ -54,11 +65,12 @@ class AxisLoop:
         self._slot, self._tell = slot, tell
         slot.use(0)
         self._feed = KnotFeed(knots, self.set_point)
+        self._outer, self._due_s = OuterFeed(followed), due_s
         self._faults = FaultLog(index, self.supervision, tell, config.drive.cycle_s)
         self._period_s = config.drive.cycle_s
         self._follow = self.follower.follow
         self._sampler = AxisSampler(self.cycle, self.follower)
-        self._changing = self._underrun = False
+        self._changing = self._underrun = self._unfed = False
         self._doubt = ""
         """Last reported states of the compensation change, the stream underrun and the load loop."""
         self._enable_id = self._disable_id = self._motion_id = 0
@@ -86,6 +98,7 @@ class AxisLoop:
             CommandKind.STOP: self._stop,
             CommandKind.STREAM_END: lambda _: self._feed.end(),
             CommandKind.CHANGE: self._change,
+            CommandKind.FOLLOW: self._follow_outer,
             CommandKind.DRIVE_FAULT_RESET: lambda _: self.image.power.reset_fault(),
         }
 
@@ -271,6 +284,23 @@ class AxisLoop:
         self.set_point.jog(command.a, command.b)
         self._motion_id = command.id
 
+    def _follow_outer(self, command: Command) -> None:
+        self.set_point.follow()
+        self._outer.begin(command.j, command.a, self._due_s(), self.set_point.position_deg)
+        self._motion_id, self._mode = command.id, MotionMode.FOLLOW
+        self.cycle.command = self._pursue
+
+    def _pursue(self, feedback: Feedback) -> int | None:
+        """Follow the gateway's set-points of one period ago, because the newest may still be on their way."""
+        if self.set_point.mode is MotionMode.FOLLOW:
+            aim = self._outer.at(self._due_s() - self._period_s)
+            if aim is None:
+                self._unfed = True
+                self.set_point.stop()
+            else:
+                self.set_point.aim(aim, self._outer.spacing_s)
+        return self._follow(feedback)
+
     def _stop(self, _: Command) -> None:
         if self.state is AxisState.ENABLED:
             self.set_point.stop()
@@ -348,12 +378,19 @@ class AxisLoop:
         if mode is not self._mode:
             if mode is MotionMode.HOLD:
                 self._tell(self.index, EventKind.MOTION_ENDED, self._motion_id, self._mode)
+            if self._mode is MotionMode.FOLLOW:
+                self.cycle.command = self._follow
             if mode is not MotionMode.STREAM:
                 self._feed.leave()
                 if mode is not MotionMode.HOLD:
                     self._break_group()
                 self.group = frozenset()
             self._mode = mode
+        if self._unfed:
+            self._unfed = False
+            if not set_point.at_rest:
+                self._tell(self.index, EventKind.UNDERRUN, self._motion_id, 0)
+            self._happened(Happening.UNFED)
         if set_point.underrun is not self._underrun:
             self._underrun = set_point.underrun
             if self._underrun:

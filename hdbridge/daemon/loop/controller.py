@@ -55,7 +55,15 @@ class Controller:
         self.cycle = cycle
         self.memory = memory
         self.axes = tuple(
-            AxisLoop(index, setup, memory.knots[index], memory.settings[index], self._tell)
+            AxisLoop(
+                index,
+                setup,
+                memory.knots[index],
+                memory.settings[index],
+                self._tell,
+                memory.followed[index],
+                lambda: cycle.due_s,
+            )
             for index, setup in enumerate(setups)
         )
         for axis in self.axes:
@@ -83,7 +91,7 @@ class Controller:
         # Waiting commands, frames and knots were meant for an earlier loop with the axes in other states.
         memory.commands.clear()
         memory.outgoing.clear()
-        for knots in memory.knots:
+        for knots in (*memory.knots, *memory.followed):
             knots.clear()
 
     # ---------------------------------------------------------------- a turn

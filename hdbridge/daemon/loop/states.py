@@ -46,6 +46,7 @@ class Happening(Enum):
     OVERDUE = "the drive takes too long"
     STOP_LATCHED = "the supervision stops the axis"
     VERIFICATION_LOST = "a node restarted or the bus is down"
+    UNFED = "the gateway's set-points end"
 
 
 Cause = CommandKind | Happening
@@ -80,7 +81,11 @@ TRANSITIONS: Final[tuple[Transition, ...]] = (
     Transition(_S.ENABLING, _H.OVERDUE, _S.STOPPING),
     Transition(_S.ENABLING, _C.DISABLE, _S.STOPPING),
     Transition(_S.ENABLING, _C.QUICK_STOP, _S.QUICK_STOPPED),
-    *(Transition(_S.ENABLED, kind, _S.ENABLED) for kind in (_C.MOVE, _C.JOG, _C.STREAM_BEGIN, _C.STREAM_END)),
+    *(
+        Transition(_S.ENABLED, kind, _S.ENABLED)
+        for kind in (_C.MOVE, _C.JOG, _C.STREAM_BEGIN, _C.STREAM_END, _C.FOLLOW)
+    ),
+    Transition(_S.ENABLED, _H.UNFED, _S.STOPPING),
     Transition(_S.ENABLED, _C.DISABLE, _S.STOPPING),
     Transition(_S.ENABLED, _C.QUICK_STOP, _S.QUICK_STOPPED),
     Transition(_S.STOPPING, _C.DISABLE, _S.STOPPING),

@@ -11,13 +11,14 @@ from hdbridge.daemon.memory.layout import (
     Event,
     EventKind,
     Knot,
+    OuterCell,
     SampleFlag,
     sample_dtype,
 )
 from hdbridge.daemon.memory.mailbox import MailboxFullError
 from hdbridge.daemon.memory.memory import Memory
 from hdbridge.daemon.memory.samples import SampleArray, SampleReader, joined_samples
-from hdbridge.daemon.memory.status import Cell
+from hdbridge.daemon.memory.status import Cell, OuterCells
 
 __all__ = [
     "AXIS_SAMPLE",
@@ -33,6 +34,8 @@ __all__ = [
     "Knot",
     "MailboxFullError",
     "Memory",
+    "OuterCell",
+    "OuterCells",
     "RelayedFrame",
     "SampleArray",
     "SampleFlag",

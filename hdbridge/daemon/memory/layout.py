@@ -8,6 +8,8 @@
     commands    bounded                                             service -> control process
     knots       one bounded queue per axis                          service -> control process
     settings    one compensation setting per axis                   service -> control process
+    followed    one bounded queue per axis: set-points              gateway -> control process
+    outer       cells, one set per axis: power, resets, states      gateway <-> service
 
 All numbers are in native byte order, because both ends run on one computer. A slot begins and ends with its
 sequence number, counted from 1. Any change here requires a new `VERSION`.
@@ -22,7 +24,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 MAGIC: Final = b"hdbridge"
-VERSION: Final = 3
+VERSION: Final = 4
 PAGE: Final = 4096
 LINE: Final = 64
 """Size of a cache line; data of different writers is in different lines."""
@@ -34,6 +36,7 @@ INCOMING_KEPT: Final = 4096
 OUTGOING_SLOTS: Final = 256
 COMMAND_SLOTS: Final = 256
 KNOT_SLOTS: Final = 8192
+FOLLOWED_SLOTS: Final = 1024
 SETTING_BYTES: Final = 1 << 18
 TEXT_BYTES: Final = 400
 """Maximum length of an event's text, bytes of UTF-8; longer ones are truncated."""
@@ -97,6 +100,8 @@ class CommandKind(IntEnum):
     """Changes the compensation; i is the number of the setting."""
     DRIVE_FAULT_RESET = 15
     """Resets the drive's own fault by its controlword."""
+    FOLLOW = 16
+    """Follows the set-points of the gateway, from rest; a time-out s, j number of their series."""
 
 
 class EventKind(IntEnum):
@@ -166,6 +171,27 @@ class Knot(NamedTuple):
     """Time since the stream began."""
     position_deg: float
     velocity_deg_s: float
+
+
+class OuterCell(IntEnum):
+    """What gateway process and service write about one axis, each cell with one writer."""
+
+    WANTED = 0
+    """Gateway: number of the series of set-points for which power is wanted; 0: no power."""
+    GRANTED = 1
+    """Service: number of the series that the loop follows."""
+    REFUSED = 2
+    """Service: number of the last series that was refused."""
+    RESETS = 3
+    """Gateway: number of fault resets that were asked for."""
+    RESETS_DONE = 4
+    """Service: number of fault resets that are over, with or without success."""
+    STATUSWORD = 5
+    """Gateway: statusword that the outer master sees."""
+    NMT = 6
+    """Gateway: NMT state of the outer node."""
+    PERIOD_NS = 7
+    """Gateway: period of the outer SYNC; 0: none comes."""
 
 
 class Axis(NamedTuple):
@@ -275,6 +301,8 @@ class Layout(NamedTuple):
     commands: Place
     knots: tuple[Place, ...]
     settings: tuple[Place, ...]
+    followed: tuple[Place, ...]
+    outer: tuple[Place, ...]
     total: int
 
     @classmethod
@@ -295,5 +323,9 @@ class Layout(NamedTuple):
         commands = place(COMMAND_SLOTS, COMMAND.size)
         knots = tuple(place(KNOT_SLOTS, KNOT.size) for _ in range(axes))
         settings = tuple(place(1, SETTING_BYTES) for _ in range(axes))
+        followed = tuple(place(FOLLOWED_SLOTS, KNOT.size) for _ in range(axes))
+        outer = tuple(place(len(OuterCell), LINE) for _ in range(axes))
         total = -(-end // PAGE) * PAGE
-        return cls(axes, samples, events, incoming, outgoing, commands, knots, settings, total)
+        return cls(
+            axes, samples, events, incoming, outgoing, commands, knots, settings, followed, outer, total
+        )

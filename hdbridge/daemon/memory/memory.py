@@ -12,7 +12,7 @@ from hdbridge.daemon.memory.mailbox import Mailbox
 from hdbridge.daemon.memory.region import ORDERED, Region
 from hdbridge.daemon.memory.samples import SampleReader, SampleWriter
 from hdbridge.daemon.memory.setting import SettingSlot
-from hdbridge.daemon.memory.status import Status
+from hdbridge.daemon.memory.status import OuterCells, Status
 from hdbridge.errors import InputError
 
 
@@ -20,8 +20,9 @@ class Memory:
     """Shared memory for the axes of one bus.
 
     The control process writes ``samples``, ``events`` and ``incoming``, and takes from ``commands``,
-    ``outgoing``, ``knots`` and ``settings``. The service does the opposite; it may create any number of
-    readers (`reader`, `event_reader`, `incoming_reader`).
+    ``outgoing``, ``knots``, ``settings`` and ``followed``. The service does the opposite; it may create any
+    number of readers (`reader`, `event_reader`, `incoming_reader`). The gateway process fills ``followed``
+    and shares ``outer`` with the service.
     """
 
     def __init__(self, region: Region, layout: Layout, period_ns: int, *, checked: bool) -> None:
@@ -38,6 +39,8 @@ class Memory:
         self.commands = Mailbox(region, layout, checked=checked)
         self.knots = tuple(KnotQueue(region, place, checked=checked) for place in layout.knots)
         self.settings = tuple(SettingSlot(region, place) for place in layout.settings)
+        self.followed = tuple(KnotQueue(region, place, checked=checked) for place in layout.followed)
+        self.outer = tuple(OuterCells(region, place) for place in layout.outer)
         self.status = Status(region)
 
     @classmethod

@@ -5,7 +5,7 @@ from __future__ import annotations
 from enum import IntEnum
 from typing import Final
 
-from hdbridge.daemon.memory.layout import LINE, STATUS_OFFSET
+from hdbridge.daemon.memory.layout import LINE, STATUS_OFFSET, OuterCell, Place
 from hdbridge.daemon.memory.region import Region
 
 _STRIDE: Final = LINE // 8
@@ -21,6 +21,8 @@ class Cell(IntEnum):
     LOOP_PID = 4
     SERVICE_PID = 5
     STOP_ASKED = 6
+    GATEWAY_TIME_NS = 7
+    GATEWAY_PID = 8
 
 
 _LOOP_COUNT: Final = Cell.LOOP_COUNT * _STRIDE
@@ -46,29 +48,18 @@ class Status:
         return int(self._cells[Cell.LOOP_TIME_NS * _STRIDE])
 
     @property
-    def service_time_ns(self) -> int:
-        """Time at which the service was last alive, ``time.monotonic_ns``."""
-        return int(self._cells[Cell.SERVICE_TIME_NS * _STRIDE])
-
-    @property
-    def keeper_time_ns(self) -> int:
-        """Time at which the keeper was last alive, ``time.monotonic_ns``."""
-        return int(self._cells[Cell.KEEPER_TIME_NS * _STRIDE])
-
-    @property
     def loop_pid(self) -> int:
         """Process id of the control process; it changes when the process is restarted."""
         return int(self._cells[Cell.LOOP_PID * _STRIDE])
 
     @property
-    def service_pid(self) -> int:
-        """Process id of the service."""
-        return int(self._cells[Cell.SERVICE_PID * _STRIDE])
-
-    @property
     def stop_asked(self) -> int:
         """Request to end the loop: 1 after braking all axes to rest, 2 after a quick stop."""
         return int(self._cells[Cell.STOP_ASKED * _STRIDE])
+
+    def get(self, cell: Cell) -> int:
+        """Read a cell."""
+        return int(self._cells[cell * _STRIDE])
 
     def turned(self, count: int, time_ns: int) -> None:
         """Records the end of a turn."""
@@ -78,4 +69,19 @@ class Status:
 
     def set(self, cell: Cell, value: int) -> None:
         """Writes a cell. Each has one writer, except ``STOP_ASKED``, which any process may raise."""
+        self._cells[cell * _STRIDE] = value
+
+
+class OuterCells:
+    """The cells of one axis that gateway process and service share. To read or write one is whole."""
+
+    __slots__ = ("_cells",)
+
+    def __init__(self, region: Region, place: Place) -> None:
+        self._cells = region.cells(place.offset, len(OuterCell) * _STRIDE)
+
+    def __getitem__(self, cell: OuterCell) -> int:
+        return int(self._cells[cell * _STRIDE])
+
+    def __setitem__(self, cell: OuterCell, value: int) -> None:
         self._cells[cell * _STRIDE] = value

@@ -16,6 +16,7 @@ from hdbridge.errors import DaemonError, InputError, RefusedError, SafetyStop
 from hdbridge.motion import MotionMode
 
 if TYPE_CHECKING:
+    from hdbridge.axis import AxisConfig
     from hdbridge.daemon.service.core import Core
 
 _STOPPED: Final = frozenset({AxisState.QUICK_STOPPED, AxisState.LATCHED})
@@ -25,10 +26,11 @@ _POWER: Final = tuple(State)
 class AxisLink:
     """Connection to one axis; ``index`` is its place in the shared memory."""
 
-    def __init__(self, core: Core, index: int, name: str) -> None:
+    def __init__(self, core: Core, index: int, config: AxisConfig) -> None:
         self.core = core
         self.index = index
-        self.name = name
+        self.config = config
+        self.name = config.name
 
     # ---------------------------------------------------------------- the newest cycle
 
@@ -51,6 +53,15 @@ class AxisLink:
         """The drive's power state."""
         newest = self.core.observer.newest
         return _POWER[int(self.value("power"))] if newest is not None else State.UNKNOWN
+
+    def seeds(self) -> Arguments:
+        """Counts of both encoders and statusword, as ENABLE has them."""
+        motor, load = self.config.motor_encoder, self.config.load_encoder
+        return Arguments(
+            i=round(self.value("motor_position_deg") / motor.degrees(1)),
+            j=round(self.value("load_position_deg") / load.degrees(1)),
+            k=int(self.value("statusword")),
+        )
 
     # ---------------------------------------------------------------- commands
 

@@ -27,6 +27,7 @@ from hdbridge.daemon.service.dispatch import ANSWER_S
 from hdbridge.daemon.service.eventlog import Entry
 from hdbridge.daemon.service.jobs import JobBook, Runner, in_own_process
 from hdbridge.daemon.service.observer import PERIOD_S, Subscription
+from hdbridge.daemon.service.outermaster import OuterMaster
 from hdbridge.daemon.service.ports import ServiceAxis
 from hdbridge.daemon.service.power import UNKNOWN
 from hdbridge.daemon.service.reports import LATCHED
@@ -123,6 +124,10 @@ class ServiceBridge:
         self._start(self._watch())
         for axis in self.axes.values():
             self._start(self._take_over(axis))
+        if (gateway := self.machine.gateway) is not None:
+            master = OuterMaster(self.core, gateway)
+            for name in gateway.nodes:
+                self._start(master.serve(self.axes[name]))
         # Let each take-over start, so that no other request precedes it.
         await asyncio.sleep(0)
         timing = self.core.timing
@@ -273,7 +278,16 @@ class ServiceBridge:
             self.book.of_axis(name),
             adaptation.state() if adaptation is not None else messages.AdaptationState(),
             self.advice(name),
+            self._outer(name),
         )
+
+    def _outer(self, name: str) -> messages.OuterState | None:
+        gateway, memory = self.machine.gateway, self.core.memory
+        node_id = gateway.nodes.get(name) if gateway is not None else None
+        if node_id is None:
+            return None
+        alive_ns = memory.status.get(Cell.GATEWAY_TIME_NS)
+        return reports.outer_state(memory.outer[self._axis(name).link.index], node_id, alive_ns)
 
     def _warnings(self) -> list[str]:
         core = self.core

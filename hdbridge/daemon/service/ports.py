@@ -51,7 +51,7 @@ class ServiceAxis:
         self.axis = axis
         self.name = axis.name
         self.core = core
-        self.link = AxisLink(core, index, axis.name)
+        self.link = AxisLink(core, index, axis.config)
         self.commissioning = Commissioning(axis.config, core.memory, core.timing.clock)
         self.models = AxisModels(axis, core.memory.settings[index])
         self.power = AxisPower(self.link, self.commissioning, self.models.check_drive)
@@ -112,6 +112,13 @@ class ServiceAxis:
             self.motion.replace(None, "the axis was enabled anew")
             await self.settle()
             await self.power.enable()
+
+    async def prepare(self) -> None:
+        """Make the drive ready by SDO for the next `enable`."""
+        self.check_free()
+        async with self._drive:
+            if self.link.state is AxisState.DISABLED:
+                await self.power.prepare()
 
     async def disable(self, holder: str) -> None:
         """Brakes to rest, then switches power off."""

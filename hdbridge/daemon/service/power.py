@@ -40,6 +40,8 @@ class AxisPower:
         self._link = link
         self._drive = commissioning
         self._check_drive = check_drive
+        self.is_prepared = False
+        """Whether all is done by SDO that precedes power; nothing has been done by SDO since."""
         self._work = link.core.timing.work
 
     async def enable(self) -> None:
@@ -52,12 +54,22 @@ class AxisPower:
         self._check_drive(self._drive.identity)
         if link.state is not AxisState.DISABLED:
             await link.do(CommandKind.ENABLE)  # refused, with the reason
-        seeds = await self._work(self._drive.prepare)
+        if self.is_prepared:
+            self.is_prepared = False
+            seeds = link.seeds()
+        else:
+            seeds = (await self._work(self._drive.prepare)).arguments()
         try:
-            await link.do(CommandKind.ENABLE, POWER_S, **seeds.arguments())
+            await link.do(CommandKind.ENABLE, POWER_S, **seeds)
         except HdbridgeError:
             await self._rest()
             raise
+
+    async def prepare(self) -> None:
+        """Do what precedes power by SDO, so that the next `enable` needs none. Raises as `enable` does."""
+        self._check_drive(self._drive.identity)
+        await self._work(self._drive.prepare)
+        self.is_prepared = True
 
     async def disable(self) -> None:
         """Brakes to rest, then switches power off."""
@@ -66,6 +78,7 @@ class AxisPower:
 
     async def _rest(self) -> None:
         """Ends the drive's monitoring of the master if power is off."""
+        self.is_prepared = False
         if self._link.state is AxisState.DISABLED and self._link.power is not State.FAULT:
             with suppress(HdbridgeError):  # monitoring is set up again each time power is switched on
                 await self._work(self._drive.rest)
@@ -89,6 +102,7 @@ class AxisPower:
 
     async def verify(self, *, clear_fault: bool = False) -> None:
         """Boots and verifies the drive, then lets the control process communicate with it."""
+        self.is_prepared = False
         seeds = await self._work(self._drive.verify)
         if clear_fault:
             await self._work(self._drive.clear_fault)
@@ -110,6 +124,7 @@ class AxisPower:
     async def home(self, run: HomingRun) -> float:
         """Homes by the drive's own method, disabled before and after; returns the load angle afterwards."""
         link = self._link
+        self.is_prepared = False
         await link.do(CommandKind.LEND)
         try:
             positions, seeds = await self._work(self._drive.home, run)

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
+import time
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Final
 
 from hdbridge.axis.channels import BY_KEY
 from hdbridge.client import messages
 from hdbridge.daemon.loop.states import AxisState
-from hdbridge.daemon.memory import NO_FAULT, Event, EventKind, SampleFlag
+from hdbridge.daemon.memory import NO_FAULT, Event, EventKind, OuterCell, SampleFlag
 from hdbridge.daemon.service.eventlog import Entry
 from hdbridge.drive.states import State
 from hdbridge.drive.supervision import EXPLAINED_HINT, ROWS, Fault, Reaction
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from hdbridge.axis import AxisConfig
+    from hdbridge.daemon.memory import OuterCells
     from hdbridge.daemon.service.lease import Lease
     from hdbridge.daemon.service.ports import ServiceAxis
     from hdbridge.daemon.setting import CompensationSetting
@@ -28,6 +30,7 @@ FAULTS: Final = tuple(Fault)
 STATES: Final = tuple(messages.ControlState)
 MODES: Final = tuple(messages.MotionMode)
 LATCHED: Final = frozenset({AxisState.QUICK_STOPPED, AxisState.LATCHED})
+GATEWAY_GONE_NS: Final = 2_000_000_000
 _KINDS: Final = {kind: messages.EventKind[kind.name] for kind in EventKind}
 
 
@@ -142,6 +145,18 @@ def limits(config: AxisConfig) -> messages.Limits:
     )
 
 
+def outer_state(cells: OuterCells, node_id: int, alive_ns: int) -> messages.OuterState:
+    """An axis as the other master sees it; ``alive_ns``: when the gateway process was last seen alive."""
+    period_s = 1e-9 * cells[OuterCell.PERIOD_NS]
+    return messages.OuterState(
+        node_id=node_id,
+        alive=time.monotonic_ns() - alive_ns < GATEWAY_GONE_NS,
+        nmt=cells[OuterCell.NMT],
+        statusword=cells[OuterCell.STATUSWORD],
+        period_s=period_s or None,
+    )
+
+
 def axis_state(
     axis: ServiceAxis,
     stopped: Entry | None,
@@ -149,6 +164,7 @@ def axis_state(
     job: messages.Job | None,
     adaptation: messages.AdaptationState,
     advice: Sequence[str],
+    outer: messages.OuterState | None = None,
 ) -> messages.AxisState:
     """Returns the state of an axis.
 
@@ -202,6 +218,7 @@ def axis_state(
             doubt=loop_doubt if flags & SampleFlag.LOOP_DOUBTED else None,
         ),
         adaptation=adaptation,
+        outer=outer,
         advice=list(advice),
         queued=axis.motion.queued,
         job=job,

@@ -1,0 +1,160 @@
+"""The object dictionary of a gateway axis: the device's own, at the scale of the load."""
+
+from __future__ import annotations
+
+import io
+import math
+from collections.abc import Mapping
+from configparser import RawConfigParser
+from typing import TYPE_CHECKING, Final
+
+from hdbridge.device.dictionary import BUNDLED
+from hdbridge.device.nameplate import Nameplate
+
+if TYPE_CHECKING:
+    from hdbridge.axis import AxisConfig
+    from hdbridge.daemon.machinefile import GatewaySettings
+
+BRIDGE: Final = 0x2200
+"""Record of what only the bridge knows."""
+_INT32, _UNSIGNED8 = 0x0004, 0x0005
+BRIDGE_VALUES: Final = (
+    ("Error at the load, measured, 0.01 arcsec", _INT32),
+    ("Error predicted by the model, 0.01 arcsec", _INT32),
+    ("Correction of the compensation, 0.01 arcsec", _INT32),
+    ("Correction of the load loop, 0.01 arcsec", _INT32),
+    (
+        "Compensation: bit 0 engaged, 1 limited, 2 hysteresis known, 3 changing, 4 load loop doubted",
+        _UNSIGNED8,
+    ),
+    ("State of the axis in the control loop", _UNSIGNED8),
+)
+"""Name and type of its sub-indices, from 1."""
+_WITHOUT: Final = ("2100", "2101")
+"""Objects of the simulated drive's environment."""
+_PDOS: Final[Mapping[str, int | str]] = {
+    "1400sub2": 255,
+    "1600sub0": 1,
+    "1800sub2": 255,
+    "1800sub5": 50,
+    "1A00sub0": 1,
+    "1601sub0": 2,
+    "1601sub1": "0x60400010",
+    "1601sub2": "0x60600008",
+    "1801sub1": "$NODEID+0x80000280",
+    "1801sub2": 255,
+    "1A01sub0": 2,
+    "1A01sub1": "0x60410010",
+    "1A01sub2": "0x60610008",
+    "1402sub2": 1,
+    "1602sub0": 2,
+    "1602sub1": "0x60400010",
+    "1602sub2": "0x607A0020",
+    "1802sub2": 1,
+    "1A02sub0": 2,
+    "1A02sub1": "0x60410010",
+    "1A02sub2": "0x60640020",
+}
+"""The default mapping of CiA 402: the first pair event-driven, mode and position prepared but not valid.
+
+The statusword also comes every 50 ms, for masters that take it for periodic.
+"""
+_MOST: Final = 0xFFFF_FFFF
+_FOLLOWING_TIME_S: Final = 0.2
+"""Of the highest speed: default of 6065h."""
+
+
+def nameplate(axis: AxisConfig, settings: GatewaySettings) -> Nameplate:
+    """Scales: the load is the motor of this drive, without a gear; the real motor is the second encoder."""
+    return Nameplate(
+        motor_counts_per_turn=settings.counts_per_turn,
+        load_counts_per_turn=round(axis.motor_encoder.counts_per_turn),
+        gear_motor_turns=1,
+        gear_load_turns=1,
+        rated_torque_mnm=round(1000.0 * axis.drive.rated_torque_nm),
+    )
+
+
+def _defaults(axis: AxisConfig, settings: GatewaySettings) -> Mapping[str, int | str]:
+    limits, plate = axis.limits, nameplate(axis, settings)
+    counts = settings.counts_per_turn / 360.0
+
+    def unsigned(degrees: float) -> int:
+        return min(max(math.floor(degrees * counts), 1), _MOST)
+
+    velocity, acceleration = unsigned(limits.velocity_deg_s), unsigned(limits.acceleration_deg_s2)
+    return {
+        **_PDOS,
+        "1008": "hdbridge gateway",
+        "2000": axis.name,
+        "6065": unsigned(_FOLLOWING_TIME_S * limits.velocity_deg_s),
+        "6066": round(1000.0 * _FOLLOWING_TIME_S),
+        "6067": max(1, unsigned(axis.motor_encoder.degrees(2) / axis.gear.ratio)),
+        "6068": 10,
+        "6072": min(round(10.0 * limits.torque_percent), 0xFFFF),
+        "6076": plate.rated_torque_mnm,
+        "607Dsub1": math.ceil(limits.position_min_deg * counts),
+        "607Dsub2": math.floor(limits.position_max_deg * counts),
+        "607F": velocity,
+        "6080": math.ceil(limits.velocity_deg_s / 6.0),
+        "6081": velocity,
+        "6083": acceleration,
+        "6084": acceleration,
+        "6085": acceleration,
+        "608Fsub1": plate.motor_counts_per_turn,
+        "6092sub1": plate.motor_counts_per_turn,
+        "6091sub1": 1,
+        "6098": 37,
+        "6099sub1": velocity // 10,
+        "6099sub2": velocity // 50,
+        "609A": acceleration,
+        "60C2sub1": max(1, round(axis.drive.cycle_ms)),
+        "60C5": acceleration,
+        "60C6": acceleration,
+        "60E6sub1": plate.load_counts_per_turn,
+        "60E9sub1": plate.load_counts_per_turn,
+    }
+
+
+def eds(axis: AxisConfig, settings: GatewaySettings) -> str:
+    """The EDS of a gateway axis, as text."""
+    made = RawConfigParser(strict=False, delimiters="=")
+    made.optionxform = str  # type: ignore[assignment, method-assign]
+    made.read_string(BUNDLED.read_text(encoding="utf-8"))
+    made["FileInfo"]["FileName"] = f"{axis.name}-gateway.eds"
+    made["FileInfo"]["Description"] = f"hdbridge gateway of axis {axis.name}"
+    made["DeviceInfo"]["ProductName"] = "hdbridge gateway"
+    made["DeviceInfo"]["ProductNumber"] = "0x00000403"
+    made["DeviceInfo"]["OrderCode"] = "hdbridge-gateway"
+    made["1018sub2"]["DefaultValue"] = "0x00000403"
+    made["Comments"] = {
+        "Lines": "3",
+        "Line1": f"Positions are those of the load, {settings.counts_per_turn} increments per turn.",
+        "Line2": "Velocities are in increments/s, accelerations in increments/s2, torques in per mille.",
+        "Line3": "60E4h:01 is the motor encoder. 60F4h is the error at the load.",
+    }
+    for section, value in _defaults(axis, settings).items():
+        made[section]["DefaultValue"] = str(value)
+    made["6098"].update(LowLimit="35", HighLimit="37")
+    for section in _WITHOUT:
+        made.remove_section(section)
+    _add_bridge(made)
+    text = io.StringIO()
+    made.write(text, space_around_delimiters=False)
+    return text.getvalue().rstrip() + "\n"
+
+
+def _add_bridge(made: RawConfigParser) -> None:
+    index = f"{BRIDGE:04X}"
+    made["ManufacturerObjects"] = {"SupportedObjects": "2", "1": "0x2000", "2": f"0x{index}"}
+    made[index] = {"ParameterName": "Bridge", "ObjectType": "0x9", "SubNumber": str(len(BRIDGE_VALUES) + 1)}
+    rows = [("Highest sub-index supported", _UNSIGNED8), *BRIDGE_VALUES]
+    for sub, (name, data_type) in enumerate(rows):
+        made[f"{index}sub{sub:X}"] = {
+            "ParameterName": name,
+            "ObjectType": "0x7",
+            "DataType": f"0x{data_type:04X}",
+            "AccessType": "ro" if sub else "const",
+            "DefaultValue": "0" if sub else str(len(BRIDGE_VALUES)),
+            "PDOMapping": "1" if sub else "0",
+        }

@@ -1,0 +1,124 @@
+"""The gateway process: ``python -m hdbridge.daemon.gateway.process FD``, started by the keeper.
+
+It has the outer bus and its end of the shared memory. Nothing in the control process waits for it: without it
+the set-points of its axes end, so they brake and lose their power.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import time
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from types import FrameType
+from typing import TYPE_CHECKING, Final
+
+from hdbridge.clock import Clock, MonotonicClock
+from hdbridge.daemon.gateway.objects import eds
+from hdbridge.daemon.gateway.slave import Gateway
+from hdbridge.daemon.logs import begin_log
+from hdbridge.daemon.memory import Cell, Memory
+from hdbridge.daemon.start import Start, begin_child
+from hdbridge.device.run import run
+from hdbridge.drive.link import open_bus
+from hdbridge.errors import HdbridgeError
+from hdbridge.files.atomic import make_folder
+
+if TYPE_CHECKING:
+    from hdbridge.axis import AxisConfig
+
+ALIVE_S: Final = 0.1
+
+
+def main(arguments: list[str]) -> int:
+    """Serve until SIGTERM; the exit status."""
+    try:
+        start = Start.inherited(arguments)
+        begin_child(start, "hdbridge-outer")
+        begin_log(start.log)
+        serve(start)
+    except HdbridgeError as error:
+        print(f"hdbridge: {error}", file=sys.stderr)
+        return error.exit_status
+    return 0
+
+
+class SimulatedClock:
+    """The virtual clock of simulated drives: its time in the last turn of the loop, plus the time since."""
+
+    def __init__(self, memory: Memory, speed: float) -> None:
+        self._status, self._reader = memory.status, memory.reader()
+        self._period_s, self._speed = memory.period_s, speed
+        self._turn_s, self._turned_s = time.monotonic(), time.monotonic()
+        self._latest_s = 0.0
+
+    def now(self) -> float:
+        """Seconds on the clock of the control loop; they do not decrease."""
+        samples, _ = self._reader.read()
+        if len(samples):
+            self._turn_s = 1e-9 * int(samples[-1]["time_ns"])
+            self._turned_s = time.monotonic()
+        since_s = min((time.monotonic() - self._turned_s) * self._speed, self._period_s)
+        self._latest_s = max(self._latest_s, self._turn_s + since_s)
+        return self._latest_s
+
+    def sleep_until(self, deadline_s: float) -> None:
+        """Return at a time of this clock."""
+        while (left_s := deadline_s - self.now()) > 0.0:
+            time.sleep(min(left_s / self._speed, self._period_s))
+
+
+def serve(start: Start) -> None:
+    """Be the drives of the outer bus until SIGTERM. Raises `BusError` if the bus cannot be opened or read."""
+    machine, terminated = start.machine, False
+    settings = machine.gateway
+    assert settings is not None
+
+    def terminate(_: int, __: FrameType | None) -> None:
+        nonlocal terminated
+        terminated = True
+
+    signal.signal(signal.SIGTERM, terminate)
+    with (
+        Memory.attach(start.memory_fd) as memory,
+        open_bus(settings.bus, shared=True) as bus,
+        TemporaryDirectory(prefix="hdbridge-gateway-") as folder,
+    ):
+
+        def eds_of(axis: AxisConfig) -> Path:
+            path = Path(folder) / f"{axis.name}.eds"
+            path.write_text(eds(axis, settings), encoding="utf-8")
+            return path
+
+        def store_of(axis: AxisConfig) -> Path | None:
+            try:
+                return (
+                    make_folder(machine.axis_folder(machine.axis(axis.name), "gateway")) / "parameters.json"
+                )
+            except (HdbridgeError, OSError):
+                return None  # 1010h lasts until the process ends
+
+        simulation = start.simulation
+        clock: Clock = MonotonicClock() if simulation is None else SimulatedClock(memory, simulation.speed)
+        gateway = Gateway(
+            bus, [axis.config for axis in machine.axes], settings, memory, clock, eds_of, store_of
+        )
+        status = memory.status
+        status.set(Cell.GATEWAY_PID, os.getpid())
+        told_s = 0.0
+
+        def should_stop() -> bool:
+            nonlocal told_s
+            now_s = time.monotonic()
+            if now_s - told_s > ALIVE_S:
+                told_s = now_s
+                status.set(Cell.GATEWAY_TIME_NS, time.monotonic_ns())
+            return terminated
+
+        run(bus, gateway, clock, should_stop, longest_wait_s=machine.cycle_s)
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,331 @@
+"""The slaves of a gateway: CiA-402 drives on the outer bus in front of the axes of the control loop.
+
+A slave is the device of `hdbridge.device`. Its plant and power stage are an axis of the loop, seen through
+the shared memory. It writes set-points and asks for power, which the service grants; it has no other access.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+import can
+
+from hdbridge.clock import Clock
+from hdbridge.daemon.gateway.objects import BRIDGE, nameplate
+from hdbridge.daemon.loop.faultlog import FAULT_INDEX
+from hdbridge.daemon.loop.states import AxisState
+from hdbridge.daemon.memory import NO_FAULT, Knot, Memory, OuterCell, SampleArray, SampleFlag
+from hdbridge.device.behaviour import Behaviour, Controlword
+from hdbridge.device.node import FRAMES_PER_POLL, DriveNode
+from hdbridge.device.powerstate import PowerStage
+from hdbridge.drive.supervision import Fault
+from hdbridge.motion import MotionMode
+from hdbridge.units import ARCSEC_PER_DEG
+
+if TYPE_CHECKING:
+    from hdbridge.axis import AxisConfig
+    from hdbridge.daemon.machinefile import GatewaySettings
+
+BEHAVIOUR: Final = Behaviour.model_validate(
+    {"controlword": Controlword.LEVEL, "measures_period": True, "sync_timeout_periods": 3.0}
+)
+"""Reads controlwords as levels, runs with any period of SYNC, and stops if SYNC is lost."""
+DEAD_S: Final = 0.3
+"""A loop that has not turned for so long hangs or is gone."""
+POWER_S: Final = 5.0
+"""Longest time for the service and the inner drive to switch power on."""
+VELOCITY_S: Final = 0.02
+"""Time over which the actual velocity is measured."""
+
+TAKEN: Final = 0xFF01
+"""Another client of the daemon has the axis."""
+NOT_POWERED: Final = 0xFF02
+"""The inner drive did not get power, or lost it."""
+STOPPED: Final = 0xFF03
+"""A quick stop by command, or a stop without a code of its own."""
+INNER_BUS: Final = 0x7500
+"""CiA 402: communication, an additional module."""
+ERROR_CODES: Final[Mapping[Fault, int]] = {
+    Fault.HANG: 0x6010,
+    Fault.OVERRUN: 0x6010,
+    Fault.ENCODER_JUMP: 0x7305,
+    Fault.FOLLOWING_ERROR: 0x8611,
+    Fault.BAD_TARGET: 0x8612,
+    Fault.DRIVE_FAULT: 0xFF00,
+    Fault.DROPPED_OUT: 0x5440,
+    **dict.fromkeys(
+        (
+            Fault.LOST_TPDO,
+            Fault.WRONG_LENGTH,
+            Fault.FLOOD,
+            Fault.MASTER_LOST,
+            Fault.BOOT_UP,
+            Fault.NMT_CHANGE,
+            Fault.HEARTBEAT_LOST,
+            Fault.OWN_ID_ELSEWHERE,
+            Fault.FOREIGN_SYNC,
+            Fault.BUS_DOWN,
+            Fault.TRANSMIT_FULL,
+        ),
+        INNER_BUS,
+    ),
+}
+"""Error codes of CiA 402, or manufacturer-specific ones, for stops by the supervision of the loop."""
+_FAULTS: Final = {index: fault for fault, index in FAULT_INDEX.items()}
+_STOPPED_STATES: Final = frozenset({AxisState.QUICK_STOPPED, AxisState.LATCHED})
+
+
+class LoadAxis(PowerStage):
+    """One axis of the loop as plant (`hdbridge.device.motion.Machine`) and power stage of a slave."""
+
+    dt_s = 1e-6
+    temperature_c = load_torque_nm = 0.0
+
+    def __init__(
+        self, axis: AxisConfig, settings: GatewaySettings, memory: Memory, index: int, clock: Clock
+    ) -> None:
+        self.torque_limit_permille = 0.0
+        self._node: DriveNode | None = None
+        self._clock, self._index = clock, index
+        self._status, self._knots, self._cells = memory.status, memory.followed[index], memory.outer[index]
+        self._counts_per_deg = settings.counts_per_turn / 360.0
+        self._motor_deg, self._ratio = axis.motor_encoder.degrees(1), axis.gear.ratio
+        self._rated_nm = axis.drive.rated_torque_nm
+        self.motor_counts = self.load_counts = 0
+        self.velocity_counts_s = 0.0
+        self.torque_permille = 0
+        self.sample: SampleArray | None = None
+        """The axis in the newest cycle; None before the first."""
+        self._measured = (-math.inf, 0.0)
+        self._series = max(self._cells[OuterCell.WANTED], self._cells[OuterCell.GRANTED]) + 1
+        """Number of the next series of set-points; none is used twice, whatever process wrote it."""
+        self._wanted = 0
+        self._wanted_s = 0.0
+        self._begun = False
+        self._resets = self._cells[OuterCell.RESETS_DONE]
+        self._cells[OuterCell.WANTED] = 0
+        self._cells[OuterCell.RESETS] = self._resets
+
+    # ---------------------------------------------------------------- the newest cycle
+
+    def look(self, newest: SampleArray | None, now_s: float, alive: bool) -> None:
+        """Takes the newest cycle, shape (1,), and looks for errors; ``newest`` is None without a new one."""
+        if newest is not None:
+            self._take(newest)
+        sample = self.sample
+        if sample is None:
+            return
+        granted = self._wanted != 0 and self._cells[OuterCell.GRANTED] == self._wanted
+        follows = sample["state"] == AxisState.ENABLED and sample["mode"] == MotionMode.FOLLOW
+        was_on, self.is_on = self.is_on, granted and bool(follows)
+        if self.is_resetting and self._cells[OuterCell.RESETS_DONE] == self._resets:
+            self.is_resetting, self.error_code = False, 0
+        if self.error_code == 0:
+            self.error_code = self._judge(sample, was_on, now_s, alive)
+            self.error_details = bytes((int(sample["state"]), int(sample["fault"])))
+
+    def _take(self, newest: SampleArray) -> None:
+        self.sample = sample = newest[0]["axes"][self._index]
+        motor_deg, time_s = float(sample["motor_position_deg"]), 1e-9 * int(newest[0]["time_ns"])
+        self.motor_counts = round(float(sample["load_position_deg"]) * self._counts_per_deg)
+        self.load_counts = round(motor_deg / self._motor_deg)
+        self.torque_permille = round(1000.0 * float(sample["motor_torque_nm"]) / self._rated_nm)
+        since_s, before_deg = self._measured
+        if time_s - since_s >= VELOCITY_S:
+            moved = motor_deg - before_deg
+            if abs(moved) <= 1.5 * abs(self._motor_deg) or not math.isfinite(since_s):
+                moved = 0.0  # a count of chatter at rest
+            self.velocity_counts_s = moved / self._ratio / (time_s - since_s) * self._counts_per_deg
+            self._measured = (time_s, motor_deg)
+
+    def _judge(self, sample: SampleArray, was_on: bool, now_s: float, alive: bool) -> int:
+        """Error code of a condition that prevents operation, or 0."""
+        if not alive:
+            return ERROR_CODES[Fault.HANG] if self._wanted else 0
+        if sample["state"] in _STOPPED_STATES:
+            fault = int(sample["fault"])
+            return STOPPED if fault == NO_FAULT else ERROR_CODES.get(_FAULTS[fault], STOPPED)
+        if not self._wanted:
+            return 0
+        if self._cells[OuterCell.REFUSED] == self._wanted:
+            return TAKEN
+        if was_on and not self.is_on:
+            return TAKEN if sample["state"] == AxisState.ENABLED else NOT_POWERED
+        if not self.is_on and now_s - self._wanted_s > POWER_S:
+            return NOT_POWERED
+        return 0
+
+    # ---------------------------------------------------------------- the power stage
+
+    def switch(self, on: bool) -> None:
+        if not on and self._wanted:
+            self._knots.put([Knot(self._wanted, self._clock.now(), math.nan, 0.0)])
+        self.is_on = self._begun = False
+        self._wanted = self._series if on else 0
+        self._series += on
+        self._wanted_s = self._clock.now()
+        self._cells[OuterCell.WANTED] = self._wanted
+
+    def reset(self) -> None:
+        self._resets += 1
+        self.is_resetting = True
+        self._cells[OuterCell.RESETS] = self._resets
+
+    def publish(self, node: DriveNode) -> None:
+        """Shows the service the node as the outer master sees it."""
+        cells = self._cells
+        cells[OuterCell.STATUSWORD] = node.firmware.statusword()
+        cells[OuterCell.NMT] = int(node.nmt)
+        cells[OuterCell.PERIOD_NS] = round(1e9 * node.period_s) if node.has_sync else 0
+
+    # ---------------------------------------------------------------- the plant
+
+    def use_times_of(self, node: DriveNode) -> None:
+        """Time-stamps set-points by the periods of this node."""
+        self._node = node
+
+    def follow(self, start_counts: float, end_counts: float, substeps: int) -> None:
+        """A set-point: linear from start to end over this period."""
+        assert self._node is not None
+        begins_s = self._node.period_begins_s
+        if not self._begun:
+            self._begun = True
+            self._put(begins_s, start_counts)
+        self._put(begins_s + substeps * self.dt_s, end_counts)
+
+    def _put(self, time_s: float, counts: float) -> None:
+        self._knots.put([Knot(self._wanted, time_s, counts / self._counts_per_deg, 0.0)])
+
+    def coast(self, substeps: int, braked: bool) -> None:
+        """Without power there are no set-points."""
+
+    # ---------------------------------------------------------------- what only the bridge knows
+
+    def values(self) -> tuple[Callable[[], int], ...]:
+        """Readers of the sub-indices of `BRIDGE`, from 1."""
+
+        def arcsec(field: str) -> Callable[[], int]:
+            return lambda: 0 if self.sample is None else round(100.0 * float(self.sample[field]))
+
+        return (
+            self._error,
+            arcsec("predicted_arcsec"),
+            arcsec("correction_arcsec"),
+            arcsec("loop_arcsec"),
+            self._compensation,
+            lambda: 0 if self.sample is None else int(self.sample["state"]),
+        )
+
+    def _error(self) -> int:
+        sample = self.sample
+        if sample is None:
+            return 0
+        error_deg = float(sample["load_position_deg"]) - float(sample["load_target_deg"])
+        return round(100.0 * ARCSEC_PER_DEG * error_deg)
+
+    def _compensation(self) -> int:
+        flags = 0 if self.sample is None else int(self.sample["flags"])
+        bits = (
+            SampleFlag.COMPENSATING,
+            SampleFlag.LIMITED,
+            SampleFlag.MEMORY_KNOWN,
+            SampleFlag.CHANGING,
+            SampleFlag.LOOP_DOUBTED,
+        )
+        return sum(1 << place for place, flag in enumerate(bits) if flags & flag)
+
+
+class Gateway:
+    """All slaves of a machine on one outer bus; served as one node (`hdbridge.device.run.Served`)."""
+
+    def __init__(
+        self,
+        bus: can.BusABC,
+        axes: Sequence[AxisConfig],
+        settings: GatewaySettings,
+        memory: Memory,
+        clock: Clock,
+        eds_of: Callable[[AxisConfig], Path],
+        store_of: Callable[[AxisConfig], Path | None] = lambda _: None,
+    ) -> None:
+        """``eds_of`` returns the file with the EDS of an axis, ``store_of`` that of its stored parameters.
+
+        ``clock`` is the loop's.
+        """
+        self._bus, self._memory, self._clock = bus, memory, clock
+        self._reader = memory.reader()
+        self._turns, self._turned_s = -1, clock.now()
+        self._looked_s = -math.inf
+        self.axes: dict[str, LoadAxis] = {}
+        self.nodes: dict[str, DriveNode] = {}
+        for index, axis in enumerate(axes):
+            node_id = settings.nodes.get(axis.name)
+            if node_id is None:
+                continue
+            load = LoadAxis(axis, settings, memory, index, clock)
+            node = DriveNode(
+                bus,
+                load,
+                eds_of(axis),
+                node_id,
+                clock,
+                nameplate(axis, settings),
+                BEHAVIOUR,
+                load,
+                store_of(axis),
+            )
+            load.use_times_of(node)
+            for sub, read in enumerate(load.values(), start=1):
+                node.dictionary[BRIDGE, sub].bind(read)
+            self.axes[axis.name], self.nodes[axis.name] = load, node
+        self._served = tuple(self.nodes.values())
+
+    def handle(self, message: can.Message, now_s: float) -> None:
+        """Take in one frame."""
+        self._look(now_s)
+        for node in self._served:
+            node.handle(message, now_s)
+
+    def poll(self, now_s: float) -> None:
+        """Take in the frames that have come, and do what is due until ``now_s``."""
+        self.run_until(now_s)
+        for _ in range(FRAMES_PER_POLL):
+            message = self._bus.recv(0)
+            if message is None:
+                break
+            now_s = self._clock.now()
+            for node in self._served:
+                node.handle(message, now_s)
+        self.run_until(now_s)
+
+    def run_until(self, now_s: float) -> None:
+        """Do what is due until ``now_s`` without looking at the bus."""
+        self._look(now_s)
+        for name, node in self.nodes.items():
+            node.run_until(now_s)
+            self.axes[name].publish(node)
+
+    def next_event_s(self) -> float:
+        """When it must be polled at the latest."""
+        return min(node.next_event_s() for node in self._served)
+
+    def bus_failed(self) -> None:
+        """The outer interface is down: each axis stops by its 6007h."""
+        for node in self._served:
+            node.bus_failed()
+
+    def _look(self, now_s: float) -> None:
+        """Updates the axes, at most twice per period of the loop."""
+        if now_s - self._looked_s < 0.5 * self._memory.period_s:
+            return
+        self._looked_s = now_s
+        turns = self._memory.status.loop_count
+        if turns != self._turns:
+            self._turns, self._turned_s = turns, now_s
+        samples, _ = self._reader.read()
+        newest = samples[-1:] if len(samples) else None
+        for load in self.axes.values():
+            load.look(newest, now_s, now_s - self._turned_s < DEAD_S)

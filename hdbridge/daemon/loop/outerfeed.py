@@ -1,0 +1,68 @@
+"""The set-points of the gateway, from the shared memory to a position at any time."""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+from hdbridge.daemon.memory.knots import KnotQueue
+
+KNOTS_A_TURN: Final = 64
+LONGEST_SPACING_S: Final = 0.05
+FIRST_KNOT_S: Final = 2.0
+"""Longest time from the begin to the first set-point."""
+
+
+class OuterFeed:
+    """Of one axis. Between two set-points the position is linear, as in the interpolation of a CiA-402 drive.
+
+    A late set-point is bridged by going on for as long as the last two were apart. An axis at rest waits for
+    longer. Set-points of another series are dropped, so none from before an interruption takes effect.
+    """
+
+    __slots__ = ("_before", "_knots", "_last", "_patience_s", "_series")
+
+    def __init__(self, knots: KnotQueue) -> None:
+        self._knots = knots
+        self._series = 0
+        self._patience_s = 0.0
+        self._before = self._last = (0.0, 0.0)
+        """Time and position of the last two set-points."""
+
+    @property
+    def spacing_s(self) -> float:
+        """Time between the last two set-points."""
+        return min(self._last[0] - self._before[0], LONGEST_SPACING_S)
+
+    def begin(self, series: int, patience_s: float, time_s: float, position_deg: float) -> None:
+        """Begin at rest; ``patience_s``: longest time without a set-point at rest."""
+        self._series, self._patience_s = series, patience_s
+        self._before = self._last = (time_s + FIRST_KNOT_S, position_deg)
+
+    def at(self, time_s: float) -> float | None:
+        """The position at a time that never decreases; None once the set-points have ended."""
+        before, last = self._before, self._last
+        for _ in range(KNOTS_A_TURN):
+            if before is not last and last[0] >= time_s:
+                break
+            knot = self._knots.peek()
+            if knot is None:
+                break
+            self._knots.drop()
+            if knot.stream != self._series:
+                continue
+            if math.isnan(knot.position_deg):
+                return None
+            if before is last or knot.time_s > last[0]:
+                begun = (time_s, last[1]) if before is last else last
+                before, last = (
+                    begun,
+                    (max(knot.time_s, math.nextafter(begun[0], math.inf)), knot.position_deg),
+                )
+        self._before, self._last = before, last
+        if before is last:
+            return last[1] if time_s <= last[0] else None
+        length_s, step_deg = last[0] - before[0], last[1] - before[1]
+        if time_s > last[0] + (length_s if step_deg else self._patience_s):
+            return None
+        return before[1] + step_deg * max(time_s - before[0], 0.0) / length_s if step_deg else last[1]

@@ -1,0 +1,104 @@
+"""The outer master of a gateway as a client of the daemon, with the right to move until another takes it.
+
+The gateway process asks in cells of the shared memory; this grants. It prepares each drive as soon as the
+axis is disabled, so power follows a request without further SDO. When the service dies, a granted axis still
+follows its set-points, and the next service takes it as it is.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final
+
+from hdbridge.daemon.loop.states import AxisState
+from hdbridge.daemon.memory import CommandKind, OuterCell, OuterCells
+from hdbridge.daemon.service.timing import POLL_S
+from hdbridge.drive.states import State
+from hdbridge.errors import HdbridgeError, LeaseError
+from hdbridge.motion import MotionMode
+
+if TYPE_CHECKING:
+    from hdbridge.daemon.machinefile import GatewaySettings
+    from hdbridge.daemon.service.core import Core
+    from hdbridge.daemon.service.ports import ServiceAxis
+
+_OWN: Final = frozenset({AxisState.ENABLING, AxisState.ENABLED})
+_STOPPED: Final = frozenset({AxisState.UNVERIFIED, AxisState.QUICK_STOPPED, AxisState.LATCHED})
+PREPARE_AGAIN_S: Final = 2.0
+"""Pause after a drive could not be prepared."""
+
+
+class OuterMaster:
+    """Holds the lease for the gateway and serves its axes."""
+
+    def __init__(self, core: Core, settings: GatewaySettings) -> None:
+        self._core = core
+        self._patience_s = 1e-3 * settings.timeout_ms
+        self._name = f"the master on {settings.bus.interface}:{settings.bus.channel}"
+        self._token = ""
+
+    def holds(self) -> bool:
+        """Whether the lease is the outer master's; it is taken if nobody has it, and renewed."""
+        lease = self._core.lease
+        if lease.holder is None:
+            self._token = lease.take(self._name)
+        try:
+            lease.renew(self._token)
+        except LeaseError:
+            return False
+        return True
+
+    async def serve(self, axis: ServiceAxis) -> None:
+        """Do what the gateway asks for one axis, until cancelled."""
+        cells = self._core.memory.outer[axis.link.index]
+        timing = self._core.timing
+        prepare_s = timing.clock.now()
+        while True:
+            await timing.sleep(POLL_S)
+            holds = self.holds()
+            try:
+                if cells[OuterCell.RESETS] != cells[OuterCell.RESETS_DONE]:
+                    await self._reset(axis, cells, holds)
+                elif (series := cells[OuterCell.WANTED]) > max(
+                    cells[OuterCell.GRANTED], cells[OuterCell.REFUSED]
+                ):
+                    await self._enable(axis, cells, series)
+                elif holds and self._is_left(axis, cells):
+                    await axis.disable(self._token)
+                elif not holds and axis.link.value("mode") == MotionMode.FOLLOW:
+                    await axis.link.do(CommandKind.STOP)
+                elif (
+                    holds
+                    and timing.clock.now() >= prepare_s
+                    and axis.link.state is AxisState.DISABLED
+                    and axis.link.power is State.SWITCH_ON_DISABLED
+                    and not axis.power.is_prepared
+                ):
+                    prepare_s = timing.clock.now() + PREPARE_AGAIN_S
+                    await axis.prepare()
+            except HdbridgeError as error:
+                self._core.log.note(f"for {self._name}: {error}", axis.link.index)
+
+    def _is_left(self, axis: ServiceAxis, cells: OuterCells) -> bool:
+        """Whether the axis has power by a request that is over: of this gateway process or of one before."""
+        granted = cells[OuterCell.GRANTED]
+        return axis.link.state in _OWN and granted != 0 and cells[OuterCell.WANTED] != granted
+
+    async def _enable(self, axis: ServiceAxis, cells: OuterCells, series: int) -> None:
+        try:
+            await axis.enable(self._token)
+            await axis.link.do(CommandKind.FOLLOW, a=self._patience_s, j=series)
+        except HdbridgeError:
+            cells[OuterCell.REFUSED] = series
+            raise
+        cells[OuterCell.GRANTED] = series
+
+    async def _reset(self, axis: ServiceAxis, cells: OuterCells, holds: bool) -> None:
+        asked = cells[OuterCell.RESETS]
+        try:
+            if holds:
+                link = axis.link
+                await link.until(lambda: link.state is not AxisState.STOPPING, 2.0)
+                if link.state in _STOPPED or link.power is State.FAULT:
+                    await axis.reset(self._token)
+        finally:
+            cells[OuterCell.RESETS_DONE] = asked
