@@ -6,8 +6,9 @@ One run measures, in interleaved blocks, the CPU time of the thread (`time.threa
 
   bench     `Cycle.tick` with the compensation of the article's model, as `Bench` runs it
   loop N    `Controller.turn` for N enabled axes: set-point, compensation, states, sample into shared memory
+  follow 1  the same for one axis that follows the set-points of a gateway
 
-both on the same path, and prints medians, the ratio to the bench, and the cost per axis. The answering nodes
+all on the same path, and prints medians, the ratio to the bench, and the cost per axis. The answering nodes
 run in the same thread; what they cost is measured in the same blocks and subtracted. Nobody sleeps.
 ``--growth HOURS`` moves one simulated axis for so much axis time instead, and prints by how much the process
 and its Python objects have grown.
@@ -40,7 +41,7 @@ from hdbridge.control.sensed import Sensed
 from hdbridge.daemon.loop.controller import Controller
 from hdbridge.daemon.loop.follower import AxisSetup
 from hdbridge.daemon.loop.states import AxisState
-from hdbridge.daemon.memory import CommandKind, Memory
+from hdbridge.daemon.memory import CommandKind, Knot, Memory
 from hdbridge.drive.feedback import Feedback
 from hdbridge.drive.image import ProcessImage
 from hdbridge.drive.link import Link
@@ -149,8 +150,10 @@ def bench_cycle(
     return turn, cycle
 
 
-def controller_of(bus: can.BusABC, memory: Memory, model: TransmissionModel) -> Controller:
-    """A loop whose axes are enabled and on their way."""
+def controller_of(
+    bus: can.BusABC, memory: Memory, model: TransmissionModel, *, followed: int = 0
+) -> Controller:
+    """A loop whose axes are enabled and on their way; ``followed``: set-points of a gateway for the first."""
     configs = configs_of(memory.axes)
     cycle = BusCycle(Link(bus, NeverSleeping()), NeverSleeping(), memory.period_s, bitrate_bps=1_000_000)
     setups = [AxisSetup(each, compensation_for(each, model.bound_to(each))) for each in configs]
@@ -160,17 +163,30 @@ def controller_of(bus: can.BusABC, memory: Memory, model: TransmissionModel) -> 
         memory.commands.post(CommandKind.ENABLE, axis, k=STATUS_OFF)
         for _ in range(5):
             controller.turn()
+    if followed:
+        follow(controller, memory, followed)
+        return controller
     for axis in range(memory.axes):
         memory.commands.post(CommandKind.MOVE, axis, a=300.0, b=2.0, c=float("nan"))
         controller.turn()
     return controller
 
 
-def loop_block(count: int, model: TransmissionModel, cycles: int) -> float:
+def follow(controller: Controller, memory: Memory, turns: int) -> None:
+    """Have the axis follow a ramp of so many turns from the gateway's ring; another process would fill it."""
+    memory.commands.post(CommandKind.FOLLOW, 0, a=1.0, j=1)
+    begin_s, begin_deg = controller.cycle.due_s, controller.axes[0].set_point.position_deg
+    for turn in range(turns):
+        way_deg = 0.004 * min(turn * turn * 0.004, 2.0 * turn)  # 2 deg/s, within the limit of acceleration
+        memory.followed[0].put([Knot(1, begin_s + 0.004 * turn, begin_deg + way_deg, 0.0)])
+    controller.turn()
+
+
+def loop_block(count: int, model: TransmissionModel, cycles: int, *, followed: bool = False) -> float:
     """CPU time of a turn for so many axes, us; begun anew when a busy machine has stopped an axis in it."""
     for _ in range(20):
         with AnsweringNodes(count) as bus, Memory.create(count, 0.004) as memory:
-            controller = controller_of(bus, memory, model)
+            controller = controller_of(bus, memory, model, followed=cycles + 100 if followed else 0)
             block_us(controller.turn, 50)
             own = block_us(controller.turn, cycles)
             if all(axis.state is AxisState.ENABLED for axis in controller.axes):
@@ -197,6 +213,7 @@ def measure(counts: list[int], blocks: int, cycles: int) -> dict[str, float]:
         times.setdefault("bench", []).append(bench_block(model, cycles))
         for count in counts:
             times.setdefault(f"loop {count}", []).append(loop_block(count, model, cycles))
+        times.setdefault("follow 1", []).append(loop_block(1, model, cycles, followed=True))
     return {name: statistics.median(values) for name, values in times.items()}
 
 

@@ -80,7 +80,7 @@ def test_what_a_service_posted_before_it_was_killed_is_whole_and_a_new_one_goes_
     with Memory.create(1, 0.001) as memory:
         process = start(OTHER_END, memory)
         assert process.wait() == -signal.SIGKILL
-        assert memory.status.service_pid == process.pid
+        assert memory.status.get(Cell.SERVICE_PID) == process.pid
         taken = [memory.commands.take() for _ in range(101)]
         assert [each.a for each in taken[:100] if each] == list(map(float, range(100)))
         assert taken[100] is None
@@ -127,10 +127,10 @@ def test_status_cells_are_seen_by_the_other_side(memory: Memory) -> None:
         assert [
             status.loop_count,
             status.loop_time_ns,
-            status.service_time_ns,
-            status.keeper_time_ns,
+            status.get(Cell.SERVICE_TIME_NS),
+            status.get(Cell.KEEPER_TIME_NS),
             status.loop_pid,
-            status.service_pid,
+            status.get(Cell.SERVICE_PID),
         ] == [(1 << 40) + place for place in range(6)]
         assert status.stop_asked
 

@@ -1,4 +1,4 @@
-"""Stands in for a child of the keeper: ``control`` counts turns, ``service`` says that it lives.
+"""Stands in for a child of the keeper: ``control`` counts turns, the others say that they live.
 
 HDBRIDGE_TEST_CONTROL, HDBRIDGE_TEST_SERVICE in the environment are an exit status with which it ends at once.
 """
@@ -29,13 +29,15 @@ def main(kind: str, *arguments: str) -> int:
     with Memory.attach(start.memory_fd) as memory:
         status = memory.status
         time.sleep(0.05)
-        status.set(Cell.LOOP_PID if kind == "control" else Cell.SERVICE_PID, os.getpid())
+        own = {"control": Cell.LOOP_PID, "service": Cell.SERVICE_PID, "gateway": Cell.GATEWAY_PID}
+        status.set(own[kind], os.getpid())
         say(f"{kind} {os.getpid()} {start.restarts}")
         while not told and not (kind == "control" and status.stop_asked):
             if kind == "control":
                 status.set(Cell.LOOP_COUNT, status.loop_count + 1)
             else:
-                status.set(Cell.SERVICE_TIME_NS, time.monotonic_ns())
+                alive = Cell.SERVICE_TIME_NS if kind == "service" else Cell.GATEWAY_TIME_NS
+                status.set(alive, time.monotonic_ns())
             time.sleep(0.02)
         say(f"{kind} ends")
     return 0

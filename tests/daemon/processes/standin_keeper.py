@@ -20,12 +20,15 @@ if __name__ == "__main__":
     begin_log(LogSettings())
     # What the keeper asks of a machine: the whole one takes each of the processes a second to load.
     machine = SimpleNamespace(
-        name="article", axes=(SimpleNamespace(name="article"),), limits=SimpleNamespace(restarts_per_minute=3)
+        name="article",
+        axes=(SimpleNamespace(name="article"),),
+        limits=SimpleNamespace(restarts_per_minute=3),
+        gateway=True if "HDBRIDGE_TEST_WITH_GATEWAY" in os.environ else None,
     )
-    programs = Programs((STANDIN, "control"), (STANDIN, "service"))
+    programs = Programs((STANDIN, "control"), (STANDIN, "service"), (STANDIN, "gateway"))
     with Memory.create(1, CYCLE_S) as memory:
         keeper = Keeper(
             Start(machine, memory.fd, os.getpid()), memory, (), Notifier.of_environment(), programs,
-            Times(hung_s=3.0, service_hung_s=4.0),
+            Times(hung_s=3.0, service_hung_s=4.0, gateway_hung_s=4.0),
         )  # fmt: skip
         sys.exit(keeper.run())

@@ -141,6 +141,19 @@ def test_who_dies_or_hangs_is_replaced_and_the_other_goes_on(keeper: Callable[..
     kept.until(lambda: set(kept.said[-2:]) == {"control ends", "service ends"}, "they end in order")
 
 
+def test_a_gateway_that_dies_or_hangs_is_replaced_and_the_others_go_on(keeper: Callable[..., Kept]) -> None:
+    kept = keeper(HDBRIDGE_TEST_WITH_GATEWAY="1")
+    kept.until_told("READY=1")
+    for times, number in ((1, signal.SIGKILL), (2, signal.SIGSTOP)):
+        os.kill(kept.until_begun("gateway", times), number)
+    kept.until_begun("gateway", times=3)
+    assert len(kept.pids("control")) == len(kept.pids("service")) == 1
+    kept.process.send_signal(signal.SIGTERM)
+    assert kept.until_ended() == 0
+    assert kept.said[-3] == "control ends"
+    assert {*kept.said[-2:]} == {"service ends", "gateway ends"}
+
+
 @pytest.mark.parametrize(
     ("number", "how"), [(signal.SIGKILL, "ended by SIGKILL"), (signal.SIGTERM, "exit status 0")]
 )

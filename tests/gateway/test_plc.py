@@ -1,0 +1,406 @@
+"""A PLC-like master on the outer bus: it gets the load where it asks, and only when it asks."""
+
+from __future__ import annotations
+
+import math
+import struct
+
+import numpy as np
+import pytest
+from support.gateway import COUNTS_PER_DEG, NODE, GatewayBench, gateway_bench
+from support.service import play
+
+from hdbridge.daemon.memory import CommandKind
+
+STATE, ENABLED, FAULT, OFF = 0x6F, 0x27, 0x08, 0x40
+
+
+def scene(tmp_path, scenario, **options):
+    """Play a scenario with an axis that is verified and whose inner drive is prepared."""
+
+    async def main(bench: GatewayBench) -> None:
+        async with bench.service.ready() as bridge:
+            bench.bridge = bridge
+            await bench.configure()
+            await bench.wait(0.5)
+            await scenario(bench)
+
+    with gateway_bench(tmp_path, **options) as bench:
+        play(main(bench))
+
+
+async def swing(bench, amplitude_deg=2.0, period_s=2.0):
+    """Have the PLC swing the axis from where it stands."""
+    plc, begun, centre = bench.plc, bench.plc.cycle, bench.plc.target
+
+    def plan(cycle):
+        share = (cycle - begun) * plc.period_s / period_s
+        return centre + round(COUNTS_PER_DEG * amplitude_deg * 0.5 * (1.0 - math.cos(2.0 * math.pi * share)))
+
+    plc.plan = plan
+
+
+async def stands(bench, duration_s=0.3, within_deg=0.003):
+    """The load does not move by itself, whatever the PLC sends meanwhile."""
+    place = bench.load_deg
+    for _ in range(round(duration_s / 0.02)):
+        await bench.wait(0.02)
+        assert abs(bench.load_deg - place) < within_deg
+
+
+async def faulted(bench, *codes, within_s=1.0):
+    """The outer side is in FAULT with one of these codes; the drive has no power in the end."""
+    plc = bench.plc
+    await bench.until(lambda: plc.statusword & 0x4F == FAULT, within_s)
+    assert set(plc.emergencies) & set(codes), [hex(each) for each in plc.emergencies]
+    await bench.until(lambda: bench.daemon.nodes[0].firmware.state.name != "OPERATION_ENABLED", 2.0)
+
+
+async def reset(bench):
+    """Fault reset by an edge, then the way to operation enabled."""
+    plc = bench.plc
+    plc.plan = lambda cycle: None
+    plc.controlword = 0
+    await bench.wait(0.05)
+    plc.controlword = 0x80
+    await bench.until(lambda: plc.statusword & STATE | 0x20 == OFF | 0x20, 5.0)
+    await stands(bench, 0.1)
+    plc.emergencies.clear()
+    await bench.wait(1.0)  # the inner drive is prepared again
+    await bench.enable()
+    await swing(bench)
+    await bench.wait(0.5)
+    assert plc.statusword & STATE == ENABLED
+    assert plc.emergencies == []
+
+
+@pytest.mark.parametrize(
+    ("period_ms", "drift_ppm"),
+    [(1, 200), (2, -200), (4, 0), (4, 200), (4, -200), (5, 200), (10, 0), (20, -200)],
+)
+def test_the_set_point_is_that_of_a_drive_one_cycle_later(tmp_path, period_ms, drift_ppm):
+    """No set-point is lost, at any outer cycle and with 200 ppm of drift."""
+
+    async def scenario(bench):
+        answered_s = await bench.enable()
+        assert answered_s < 0.3  # python-canopen waits for 0.4 s
+        plc = bench.plc
+        await swing(bench)
+        await bench.wait(0.5)
+        reader = bench.daemon.memory.reader()
+        await bench.wait(4.0)
+        samples, lost = reader.read()
+        assert not lost
+        assert plc.emergencies == []
+        # CiA 402: each target is reached one outer period after its SYNC, linearly.
+        times = np.array([time_s for time_s, *_ in plc.seen]) + plc.period_s
+        targets = np.array([target for *_, target in plc.seen]) / COUNTS_PER_DEG
+        at = 1e-9 * samples["time_ns"]
+        expected = np.interp(at - bench.daemon.period_s, times, targets)
+        error = samples["axes"][:, 0]["load_target_deg"] - expected
+        inside = at < times[-1]
+        assert np.max(np.abs(error[inside])) < 0.5 / COUNTS_PER_DEG + 2e-6
+
+    scene(tmp_path, scenario, period_s=1e-3 * period_ms, drift_ppm=drift_ppm)
+
+
+def test_it_points_where_the_master_asks(tmp_path):
+    async def scenario(bench):
+        await bench.enable()
+        await stands(bench, within_deg=0.05)  # the correction is faded in
+        plc, begun, start = bench.plc, bench.plc.cycle, bench.plc.target
+        plc.plan = lambda cycle: start + round(COUNTS_PER_DEG * min(0.02 * (cycle - begun), 3.0))
+        await bench.wait(3.0)
+        assert plc.statusword & STATE == ENABLED
+        assert not plc.emergencies
+        wanted_deg = plc.target / COUNTS_PER_DEG
+        assert bench.load_deg == pytest.approx(wanted_deg, abs=10 / 3600)
+        assert plc.position / COUNTS_PER_DEG == pytest.approx(wanted_deg, abs=10 / 3600)
+        assert abs(await bench.read(0x2200, 1, signed=True)) < 1000
+        assert await bench.read(0x2200, 5) & 1
+        plc.controlword = 0
+        await bench.until(lambda: bench.daemon.states[0].name == "DISABLED")
+        assert plc.statusword & 0x4F == OFF
+
+    scene(tmp_path, scenario)
+
+
+def test_a_jump_of_the_target_stays_within_the_limits(tmp_path):
+    async def scenario(bench):
+        await bench.enable()
+        reader = bench.daemon.memory.reader()
+        bench.plc.target += round(3.0 * COUNTS_PER_DEG)
+        await bench.wait(1.0)
+        samples, _ = reader.read()
+        target = samples["axes"][:, 0]["load_target_deg"]
+        speed = np.diff(target) / bench.daemon.period_s
+        limits = bench.daemon.axes[0].config.limits
+        assert np.max(np.abs(speed)) <= limits.velocity_deg_s * 1.001
+        assert np.max(np.abs(np.diff(speed))) <= 2.001 * limits.acceleration_deg_s2 * bench.daemon.period_s
+        assert target[-1] == pytest.approx(bench.plc.target / COUNTS_PER_DEG, abs=1e-6)
+
+    scene(tmp_path, scenario)
+
+
+def test_a_lost_sync_stops_the_axis_and_its_return_moves_nothing(tmp_path):
+    async def scenario(bench):
+        plc = bench.plc
+        await bench.enable()
+        await swing(bench)
+        await bench.wait(0.6)
+        plc.cycling = False
+        await bench.wait(1.0)
+        plc.listen()
+        assert 0x8700 in plc.emergencies
+        assert bench.daemon.nodes[0].firmware.state.name != "OPERATION_ENABLED"
+        plc.begin()  # the same controlword as before, and targets far away
+        await stands(bench)
+        assert plc.statusword & 0x4F == FAULT
+        await reset(bench)
+
+    scene(tmp_path, scenario)
+
+
+def test_one_lost_sync_is_survived(tmp_path):
+    async def scenario(bench):
+        plc = bench.plc
+        await bench.enable()
+        await swing(bench)
+        await bench.wait(0.6)
+        plc._next_s += plc.period_s
+        await bench.wait(1.0)
+        assert plc.statusword & STATE == ENABLED
+        assert plc.emergencies == []
+
+    scene(tmp_path, scenario)
+
+
+def fault_of_the_drive(bench):
+    bench.daemon.nodes[0].faults.raise_error(0x4310)
+
+
+def reset_of_the_drive(bench):
+    bench.daemon.nodes[0].faults.boot_up()
+
+
+def silence_of_the_drive(bench):
+    bench.daemon.nodes[0].faults.drop_tpdos = 12
+
+
+def jump_of_the_load_encoder(bench):
+    bench.daemon.nodes[0].faults.load_jump_counts = 100_000
+
+
+def inner_bus_down(bench):
+    import errno
+
+    bench.daemon.bus.down = errno.ENETDOWN
+
+
+def quick_stop_by_a_client(bench):
+    bench.daemon.post(CommandKind.QUICK_STOP)
+
+
+def stalled_loop(bench):
+    bench.daemon.hang(0.6)
+
+
+@pytest.mark.parametrize(
+    ("happens", "codes"),
+    [
+        (fault_of_the_drive, (0xFF00,)),
+        (reset_of_the_drive, (0x7500,)),
+        (silence_of_the_drive, (0x7500,)),
+        (jump_of_the_load_encoder, (0x7305,)),
+        (inner_bus_down, (0x7500,)),
+        (quick_stop_by_a_client, (0xFF03,)),
+        (stalled_loop, (0x6010, 0x7500)),
+    ],
+)
+def test_what_fails_inside_is_a_fault_outside_until_it_is_reset(tmp_path, happens, codes):
+    async def scenario(bench):
+        plc = bench.plc
+        await bench.enable()
+        await swing(bench)
+        await bench.wait(0.6)
+        happens(bench)
+        await faulted(bench, *codes)
+        bench.daemon.bus.down = None
+        await bench.wait(1.0)
+        bench.daemon.nodes[0].faults.load_jump_counts = 0
+        await stands(bench)  # the PLC still sends 000Fh and its targets
+        assert await bench.read(0x603F) in codes
+        assert await bench.read(0x1001) & 1
+        plc.controlword = 0x8F
+        await bench.until(lambda: plc.statusword & 0x4F == OFF, 6.0)
+        await stands(bench)  # and holds the fault reset high
+        plc.controlword = 0x0F
+        await stands(bench)
+        assert plc.statusword & STATE != ENABLED
+        await reset_and_go(bench)
+
+    scene(tmp_path, scenario)
+
+
+async def reset_and_go(bench):
+    bench.plc.plan = lambda cycle: None
+    bench.plc.emergencies.clear()
+    await bench.wait(1.0)
+    await bench.enable()
+    await swing(bench)
+    await bench.wait(0.5)
+    assert bench.plc.statusword & STATE == ENABLED
+    assert bench.plc.emergencies == []
+
+
+@pytest.mark.parametrize(
+    "frame",
+    [
+        (0x000, bytes((2, NODE))),
+        (0x000, bytes((128, NODE))),
+        (0x000, bytes((129, NODE))),
+        (0x000, bytes((130, NODE))),
+    ],
+    ids=["stop", "pre-operational", "reset node", "reset communication"],
+)
+def test_an_nmt_command_stops_the_axis(tmp_path, frame):
+    async def scenario(bench):
+        plc = bench.plc
+        await bench.enable()
+        await swing(bench)
+        await bench.wait(0.6)
+        plc.send(*frame)
+        await bench.until(lambda: bench.daemon.nodes[0].firmware.state.name != "OPERATION_ENABLED", 2.0)
+        await bench.wait(0.5)
+        plc.send(0, bytes((1, NODE)))
+        await stands(bench)
+        assert not any(node.firmware.state.name == "OPERATION_ENABLED" for node in bench.daemon.nodes)
+
+    scene(tmp_path, scenario)
+
+
+def test_a_lost_heartbeat_of_the_master_stops_the_axis(tmp_path):
+    async def scenario(bench):
+        plc = bench.plc
+        await bench.write(0x1016, 1, 127 << 16 | 100, 4)
+        await bench.enable()
+        await swing(bench)
+        plc.send(0x77F, b"\x05")
+        await bench.until(lambda: bench.daemon.states[0].name == "DISABLED", 1.0)
+        assert 0x8130 in plc.emergencies
+        plc.send(0, bytes((1, NODE)))
+        await stands(bench)
+        assert plc.statusword & 0x4F == FAULT
+
+    scene(tmp_path, scenario)
+
+
+def test_a_dead_gateway_leaves_a_disabled_axis(tmp_path):
+    async def scenario(bench):
+        plc = bench.plc
+        await bench.enable()
+        await swing(bench)
+        await bench.wait(0.6)
+        bench.daemon.clock.nodes.remove(bench.gateway)
+        await bench.until(lambda: bench.daemon.states[0].name == "DISABLED", 1.0)
+        bench.daemon.clock.nodes.append(bench.gateway)
+        plc.heartbeats.clear()
+        bench.restart_gateway()
+        plc.send(0, bytes((1, NODE)))
+        await stands(bench, 0.5)  # the PLC sends 000Fh and targets all the time
+        assert bench.daemon.states[0].name == "DISABLED"
+        assert plc.heartbeats.count(0) == 1  # the boot-up message
+
+    scene(tmp_path, scenario)
+
+
+def test_a_dead_control_process_is_a_fault(tmp_path):
+    async def scenario(bench):
+        plc = bench.plc
+        await bench.enable()
+        await swing(bench)
+        await bench.wait(0.6)
+        bench.daemon.hang(0.2)
+        bench.daemon.begin_again()
+        await bench.until(lambda: plc.statusword & 0x4F == FAULT, 1.0)
+        await bench.until(lambda: bench.daemon.states[0].name == "DISABLED", 10.0)
+        await stands(bench)
+        await reset(bench)
+
+    scene(tmp_path, scenario)
+
+
+def test_a_client_takes_the_axis_by_force_and_gives_it_back(tmp_path):
+    async def scenario(bench):
+        plc, bridge = bench.plc, bench.bridge
+        await bench.enable()
+        await swing(bench)
+        await bench.wait(0.6)
+        token = bridge.lease.take("a person", force=True)
+        await faulted_by_a_client(bench)
+        await bridge.axes["axis1"].move(token, 1.0)
+        await stands(bench)
+        assert bench.load_deg == pytest.approx(1.0, abs=0.01)
+        plc.controlword = 0
+        await bench.wait(0.05)
+        plc.controlword = 0x80
+        await bench.wait(0.5)
+        plc.controlword = 0x06
+        await bench.wait(0.1)
+        plc.controlword = 0x0F
+        await stands(bench)
+        assert plc.statusword & STATE != ENABLED
+        await bridge.axes["axis1"].disable(token)
+        bridge.lease.release(token)
+        await reset(bench)
+
+    async def faulted_by_a_client(bench):
+        await bench.until(lambda: bench.plc.statusword & 0x4F == FAULT, 1.0)
+        assert 0xFF01 in bench.plc.emergencies
+
+    scene(tmp_path, scenario)
+
+
+def test_a_target_before_its_mode_and_a_mode_while_enabled_do_not_move_it(tmp_path):
+    async def scenario(bench):
+        plc = bench.plc
+        await bench.write(0x6060, 0, 1, 1)
+        await bench.enable()
+        await bench.wait(0.6)
+        plc.sends_targets = False
+        await bench.write(0x607A, 0, plc.target + 200_000, 4)
+        await stands(bench)  # profile position without a new set-point
+        await bench.write(0x6060, 0, 8, 1)
+        await stands(bench)
+        await bench.write(0x6060, 0, 6, 1)
+        await stands(bench)
+        await bench.write(0x607A, 0, plc.target - 200_000, 4)
+        await bench.write(0x6060, 0, 1, 1)
+        await stands(bench)
+        await bench.write(0x607A, 0, plc.target - 200_000, 4)
+        await stands(bench)
+        await bench.write(0x6040, 0, 0x1F, 2)
+        await bench.wait(0.02)
+        await bench.write(0x6040, 0, 0x1F, 2)  # no edge
+        await bench.wait(2.0)
+        assert bench.load_deg == pytest.approx((plc.target - 200_000) / COUNTS_PER_DEG, abs=0.01)
+        assert bench.gateway.nodes["axis1"].firmware.statusword() & 0x1400 == 0x1400
+
+    scene(tmp_path, scenario)
+
+
+def test_homing_makes_the_present_position_zero(tmp_path):
+    async def scenario(bench):
+        plc = bench.plc
+        await bench.write(0x6060, 0, 6, 1)
+        await bench.write(0x6098, 0, 37, 1)
+        await bench.enable()
+        await bench.wait(0.6)
+        await bench.write(0x607C, 0, 36_000, 4)
+        plc.controlword = 0x1F
+        await bench.until(lambda: plc.statusword & 0x1400 == 0x1400)
+        assert abs(await bench.read(0x6064, signed=True) - 36_000) < 500
+        answer = await bench.sdo(struct.pack("<BHBb3x", 0x2F, 0x6098, 0, 33))
+        assert answer[0] == 0x80  # there is no index pulse at the load
+
+    scene(tmp_path, scenario)

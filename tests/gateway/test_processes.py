@@ -1,0 +1,91 @@
+"""The whole daemon with a gateway, in processes of its own, and python-canopen as the foreign master."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from pathlib import Path
+
+import canopen
+import pytest
+from canopen.profiles.p402 import BaseNode402
+from support.running import Daemon, running
+
+from hdbridge.daemon.gateway.objects import eds
+from hdbridge.daemon.machine import Machine
+
+MACHINE = """
+schema: hdbridge.machine/1
+name: between
+axes:
+  - profile: article
+gateway:
+  bus: {{interface: udp_multicast, channel: 239.74.163.9, options: {{port: {port}}}}}
+  nodes: {{article: 5}}
+"""
+COUNTS_PER_DEG = 36_000
+
+
+class Patient(BaseNode402):
+    """A busy machine may be slow; the class is as it is."""
+
+    TIMEOUT_SWITCH_STATE_FINAL = 60.0
+    TIMEOUT_SWITCH_STATE_SINGLE = 30.0
+    TIMEOUT_CHECK_TPDO = 30.0
+    TIMEOUT_SWITCH_OP_MODE = 30.0
+
+
+def until(done, daemon: Daemon, timeout_s: float = 120.0):
+    """Waits for what a process does; `timeout_s` is only for what hangs."""
+    end_s = time.monotonic() + timeout_s
+    while not done():
+        assert time.monotonic() < end_s, daemon.events[-5:]
+        time.sleep(0.02)
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_a_foreign_master_moves_the_axis_and_a_dead_gateway_does_not(tmp_path: Path) -> None:
+    path = tmp_path / "machine.yaml"
+    path.write_text(MACHINE.format(port=20_000 + os.getpid() % 20_000), encoding="utf-8")
+    machine = Machine.load(path)
+    gateway = machine.gateway
+    assert gateway is not None
+    (tmp_path / "bridge.eds").write_text(eds(machine.axes[0].config, gateway), encoding="utf-8")
+    with running(tmp_path, path, "--simulate", name="between") as daemon:
+        daemon.until_told("READY=1")
+        daemon.until_axis("disabled")
+        network = canopen.Network()
+        options = {"port": gateway.bus.options["port"]}
+        network.connect(interface="udp_multicast", channel=gateway.bus.channel, **options)
+        try:
+            node = Patient(5, str(tmp_path / "bridge.eds"))
+            node.sdo.RESPONSE_TIMEOUT = 30.0
+            network.add_node(node)
+            node.nmt.state = "PRE-OPERATIONAL"
+            node.rpdo.read()
+            node.rpdo[1].enabled = False  # multicast returns a program's own frames
+            node.rpdo[1].save()
+            node.setup_402_state_machine()
+            node.op_mode = "PROFILED POSITION"
+            node.nmt.state = "OPERATIONAL"
+            for state in ("READY TO SWITCH ON", "SWITCHED ON", "OPERATION ENABLED"):
+                node.state = state
+            assert daemon.axis()["mode"] == "follow"
+            assert daemon.axis()["outer"]["node_id"] == 5
+            node.sdo[0x607A].raw = 3 * COUNTS_PER_DEG
+            node.sdo[0x6040].raw = 0x1F
+            until(lambda: node.sdo[0x6041].raw & 0x1400 == 0x1400, daemon)
+            assert node.sdo[0x6064].raw == pytest.approx(3 * COUNTS_PER_DEG, abs=100)
+            assert daemon.axis()["load_target_deg"] == pytest.approx(3.0, abs=1e-6)
+
+            (process,) = daemon.pids("gateway")
+            os.kill(process, signal.SIGKILL)
+            until(lambda: daemon.axis()["state"] == "disabled", daemon)
+            until(lambda: len(daemon.pids("gateway")) == 2, daemon)
+            until(lambda: daemon.axis()["outer"]["alive"], daemon)
+            until(lambda: node.nmt.state in ("PRE-OPERATIONAL", "INITIALISING"), daemon)
+            assert node.sdo[0x6041].raw & 0x4F == 0x40
+            assert daemon.axis()["state"] == "disabled"
+        finally:
+            network.disconnect()

@@ -1,0 +1,221 @@
+"""A gateway in simulated time: daemon, service, outer bus and a PLC-like master on it, in one thread."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+from uuid import uuid4
+
+import can
+from can.interfaces.virtual import VirtualBus
+
+from hdbridge.axis import BusConfig
+from hdbridge.daemon.gateway.objects import eds
+from hdbridge.daemon.gateway.slave import Gateway
+from hdbridge.daemon.machinefile import GatewaySettings
+from support.service import Service, stepped_service
+
+NODE = 5
+COUNTS_PER_DEG = 12_960_000 / 360.0
+
+
+class Plc:
+    """A master written from CiA 301 and CiA 402 alone; it runs on a clock of its own.
+
+    ``plan`` gives controlword and target for each of its cycles; both go out by one synchronous RPDO before
+    SYNC. What came by the TPDO of that SYNC is in ``seen``: time, statusword, position.
+    """
+
+    def __init__(self, channel: str, clock: Any, period_s: float = 0.004, drift_ppm: float = 0.0) -> None:
+        self.bus = VirtualBus(channel)
+        self._clock = clock
+        self.period_s = period_s * (1.0 + 1e-6 * drift_ppm)
+        self.controlword = 0
+        self.target = 0
+        self.plan: Callable[[int], int | None] = lambda cycle: None
+        self.cycle = 0
+        self.cycling = False
+        self.sends_targets = True
+        self.late_s: Callable[[int], float] = lambda cycle: 0.0
+        self._next_s = 0.0
+        self.statusword = self.position = 0
+        self.emergencies: list[int] = []
+        self.heartbeats: list[int] = []
+        self.seen: list[tuple[float, int, int, int]] = []
+        """Time of SYNC, statusword, position, target that was sent before it."""
+        self._answers: list[bytes] = []
+
+    # ---------------------------------------------------------------- a node of the virtual clock
+
+    def next_event_s(self) -> float:
+        return self._next_s + self.late_s(self.cycle) if self.cycling else float("inf")
+
+    def poll(self, now_s: float) -> None:
+        self.listen()
+        if self.cycling and now_s >= self.next_event_s():
+            self._next_s += self.period_s
+            self._turn(now_s)
+
+    def listen(self) -> None:
+        while (message := self.bus.recv(0)) is not None:
+            data = bytes(message.data)
+            if message.arbitration_id == 0x180 + NODE and len(data) >= 6:
+                self.statusword, self.position = struct.unpack("<Hi", data[:6])
+            elif message.arbitration_id == 0x080 + NODE:
+                self.emergencies.append(struct.unpack_from("<H", data)[0])
+            elif message.arbitration_id == 0x580 + NODE:
+                self._answers.append(data)
+            elif message.arbitration_id == 0x700 + NODE:
+                self.heartbeats.append(data[0])
+
+    def _turn(self, now_s: float) -> None:
+        planned = self.plan(self.cycle)
+        if planned is not None:
+            self.target = planned
+        if self.sends_targets:
+            self.send(0x200 + NODE, struct.pack("<Hi", self.controlword, self.target))
+        self.send(0x080)
+        self.seen.append((now_s, self.statusword, self.position, self.target))
+        self.cycle += 1
+
+    # ---------------------------------------------------------------- by hand
+
+    def send(self, can_id: int, data: bytes = b"", **kind: Any) -> None:
+        self.bus.send(can.Message(arbitration_id=can_id, data=data, **{"is_extended_id": False, **kind}))
+
+    def begin(self) -> None:
+        self._next_s = self._clock.now() + self.period_s
+        self.cycling = True
+
+    def take_answer(self) -> bytes | None:
+        return self._answers.pop(0) if self._answers else None
+
+
+class GatewayBench:
+    """Everything between the outer master and the simulated drive."""
+
+    def __init__(self, service: Service, channel: str, gateway: Callable[[], Gateway], plc: Plc) -> None:
+        self.service, self.daemon, self.plc = service, service.daemon, plc
+        self.channel = channel
+        self._made = gateway
+        self.gateway = gateway()
+        self.daemon.clock.nodes += [plc, self.gateway]  # in this order: a frame arrives when it is sent
+
+    def restart_gateway(self) -> None:
+        """The process was killed, and another takes its place."""
+        nodes = self.daemon.clock.nodes
+        nodes.remove(self.gateway)
+        self.gateway = self._made()
+        nodes.append(self.gateway)
+
+    async def wait(self, duration_s: float) -> None:
+        await self.service.timing.sleep(duration_s)
+
+    async def until(self, done: Callable[[], bool], timeout_s: float = 5.0) -> float:
+        """Let time pass until ``done``; how long that took."""
+        begun_s = self.now_s
+        while not done():
+            assert self.now_s < begun_s + timeout_s, (
+                f"not within {timeout_s} s: {self.plc.statusword:04X}h, {self.daemon.states}, "
+                f"{[hex(each) for each in self.plc.emergencies]}, {list(self.daemon.events)[-4:]}"
+            )
+            await self.wait(0.001)
+        return self.now_s - begun_s
+
+    @property
+    def now_s(self) -> float:
+        return self.daemon.clock.now()
+
+    async def sdo(self, request: bytes) -> bytes:
+        self.plc.listen()
+        self.plc._answers.clear()
+        self.plc.send(0x600 + NODE, request)
+        found: list[bytes] = []
+
+        def answered() -> bool:
+            self.plc.listen()
+            if (answer := self.plc.take_answer()) is not None:
+                found.append(answer)
+            return bool(found)
+
+        await self.until(answered, 1.0)
+        return found[0]
+
+    async def write(self, index: int, sub: int, value: int, size: int) -> None:
+        data = value.to_bytes(size, "little", signed=value < 0)
+        head = bytes((0x23 | (4 - size) << 2,)) + struct.pack("<HB", index, sub)
+        answer = await self.sdo(head + data.ljust(4, b"\0"))
+        assert answer[0] == 0x60, answer.hex()
+
+    async def read(self, index: int, sub: int = 0, *, signed: bool = False) -> int:
+        answer = await self.sdo(struct.pack("<BHB4x", 0x40, index, sub))
+        assert answer[0] & 0xE0 == 0x40, answer.hex()
+        return int.from_bytes(answer[4 : 8 - (answer[0] >> 2 & 3)], "little", signed=signed)
+
+    async def configure(self, mode: int = 8) -> None:
+        """What a PLC does before it cycles: PDOs mapped by the master, mode, NMT start."""
+        plc = self.plc
+        for first, cob, words in (
+            (0x1400, 0x200, (0x60400010, 0x607A0020)),
+            (0x1800, 0x180, (0x60410010, 0x60640020)),
+        ):
+            await self.write(first, 1, 0x8000_0000 | cob + NODE, 4)
+            await self.write(first + 0x200, 0, 0, 1)
+            for sub, word in enumerate(words, start=1):
+                await self.write(first + 0x200, sub, word, 4)
+            await self.write(first + 0x200, 0, len(words), 1)
+            await self.write(first, 2, 1, 1)
+            await self.write(first, 1, cob + NODE, 4)
+        await self.write(0x6060, 0, mode, 1)
+        plc.send(0, bytes((1, NODE)))
+        plc.target = await self.read(0x6064, signed=True)
+
+    async def enable(self) -> float:
+        """Walk the states by the levels of the controlword; time from 'enable operation' to its answer."""
+        plc = self.plc
+        if not plc.cycling:
+            plc.begin()
+        for word, bits in ((0x06, 0x21), (0x07, 0x23)):
+            plc.controlword = word
+            await self.until(lambda bits=bits: plc.statusword & 0x6F == bits)
+        plc.target = plc.position
+        plc.controlword = 0x0F
+        return await self.until(lambda: plc.statusword & 0x6F == 0x27)
+
+    @property
+    def load_deg(self) -> float:
+        """Where the load truly is."""
+        return float(self.daemon.nodes[0].firmware.motion.machine.load_reading) / 2_880_000 * 360.0
+
+
+@contextmanager
+def gateway_bench(
+    folder: Path, period_s: float = 0.004, drift_ppm: float = 0.0, **options: Any
+) -> Iterator[GatewayBench]:
+    """A stepped service with a gateway, nothing verified yet, and a PLC-like master that is silent."""
+    channel = f"outer-{uuid4()}"
+    with ExitStack() as stack:
+        service = stack.enter_context(stepped_service(folder, **options))
+        clock = service.daemon.clock
+        bus = BusConfig(interface="virtual", channel=channel)
+        settings = GatewaySettings(bus=bus, nodes={service.machine.axes[0].name: NODE})
+        service.machine = replace(service.machine, gateway=settings)
+        configs = [axis.config for axis in service.machine.axes]
+
+        def eds_of(axis: Any) -> Path:
+            path = folder / f"{axis.name}.eds"
+            path.write_text(eds(axis, settings))
+            return path
+
+        outer = stack.enter_context(VirtualBus(channel))
+
+        def gateway() -> Gateway:
+            return Gateway(outer, configs, settings, service.daemon.memory, clock, eds_of)
+
+        plc = Plc(channel, clock, period_s, drift_ppm)
+        stack.callback(plc.bus.shutdown)
+        yield GatewayBench(service, channel, gateway, plc)
