@@ -404,3 +404,20 @@ def test_homing_makes_the_present_position_zero(tmp_path):
         assert answer[0] == 0x80  # there is no index pulse at the load
 
     scene(tmp_path, scenario)
+
+
+def test_power_that_the_inner_drive_refuses_is_a_fault_until_it_is_reset(tmp_path):
+    async def scenario(bench):
+        plc = bench.plc
+        bench.daemon.nodes[0].faults.raise_error(0x4310)  # without power, so the loop does not stop anything
+        await bench.wait(0.5)
+        plc.begin()
+        for word in (0x06, 0x07, 0x0F):
+            plc.controlword = word
+            await bench.wait(0.05)
+        await bench.until(lambda: plc.statusword & 0x4F == FAULT, 6.0)
+        assert set(plc.emergencies) <= {0xFF02, 0xFF00}
+        assert plc.emergencies
+        await reset(bench)
+
+    scene(tmp_path, scenario)

@@ -43,7 +43,7 @@ VELOCITY_S: Final = 0.02
 TAKEN: Final = 0xFF01
 """Another client of the daemon has the axis."""
 NOT_POWERED: Final = 0xFF02
-"""The inner drive did not get power, or lost it."""
+"""The inner drive did not get power, or lost it; the log of the daemon has the reason."""
 STOPPED: Final = 0xFF03
 """A quick stop by command, or a stop without a code of its own."""
 INNER_BUS: Final = 0x7500
@@ -151,7 +151,7 @@ class LoadAxis(PowerStage):
         if not self._wanted:
             return 0
         if self._cells[OuterCell.REFUSED] == self._wanted:
-            return TAKEN
+            return NOT_POWERED if self._cells[OuterCell.HELD] else TAKEN
         if was_on and not self.is_on:
             return TAKEN if sample["state"] == AxisState.ENABLED else NOT_POWERED
         if not self.is_on and now_s - self._wanted_s > POWER_S:

@@ -192,6 +192,8 @@ class OuterCell(IntEnum):
     """Gateway: NMT state of the outer node."""
     PERIOD_NS = 7
     """Gateway: period of the outer SYNC; 0: none comes."""
+    HELD = 8
+    """Service: 1 while the outer master holds the lease."""
 
 
 class Axis(NamedTuple):

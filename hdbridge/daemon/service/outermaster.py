@@ -55,6 +55,7 @@ class OuterMaster:
         while True:
             await timing.sleep(POLL_S)
             holds = self.holds()
+            cells[OuterCell.HELD] = int(holds)
             try:
                 if cells[OuterCell.RESETS] != cells[OuterCell.RESETS_DONE]:
                     await self._reset(axis, cells, holds)

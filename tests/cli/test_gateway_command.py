@@ -1,0 +1,104 @@
+"""``hdbridge gateway`` and the key ``gateway`` of a machine file."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import can
+import canopen
+import pytest
+from support.command import run_here
+
+from hdbridge.canframe import DataFrame
+
+PROFILE = Path(__file__).parents[2] / "profiles" / "article"
+MACHINE = """
+schema: hdbridge.machine/1
+name: between
+axes:
+  - profile: article
+gateway:
+  bus: {interface: udp_multicast, channel: 239.74.163.11, options: {port: 43210}}
+  nodes: {article: 5}
+"""
+
+
+def machine(tmp_path, text=MACHINE):
+    path = tmp_path / "machine.yaml"
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def test_the_eds_has_the_scale_and_the_limits_of_the_load(tmp_path):
+    done = run_here(tmp_path, "gateway", "eds", machine(tmp_path))
+    assert done.returncode == 0, done.stderr
+    (tmp_path / "bridge.eds").write_text(done.stdout, encoding="utf-8")
+    od = canopen.import_od(str(tmp_path / "bridge.eds"), 5)
+    per_turn = od[0x608F][1].default
+    assert per_turn == 12_960_000
+    assert od[0x6092][1].default * od[0x6091][2].default == per_turn * od[0x6091][1].default
+    assert [od[0x607D][sub].default for sub in (1, 2)] == [-400 * 36_000, 400 * 36_000]
+    assert od[0x607F].default == 20 * 36_000
+    assert od[0x6502].default & 0xA1 == 0xA1
+    assert od[0x1400][1].default == 0x205
+    assert od[0x1402][1].default == 0x80000405
+    assert len(od[0x2200]) == 7
+
+
+def test_the_ideal_drive_answers_on_the_bus_of_the_gateway(tmp_path):
+    path = machine(tmp_path)
+    with can.Bus(interface="udp_multicast", channel="239.74.163.11", port=43210) as bus:
+        done = run_here(tmp_path, "gateway", "simulate", path, "--duration", "0.5")
+        assert done.returncode == 0, done.stderr
+        assert "ideal drive: node 5" in done.stderr
+        seen = []
+        while (message := bus.recv(0.1)) is not None:
+            seen.append((message.arbitration_id, bytes(message.data)))
+        assert (0x705, b"\0") in seen
+        bus.send(DataFrame(0x000, b"\x01\x05"))
+
+
+@pytest.mark.parametrize(
+    ("replaced", "by", "words"),
+    [
+        (
+            "{article: 5}",
+            "{arm: 5}",
+            "machine.yaml:8:16: gateway.nodes.arm: no axis 'arm'; expected one of: article",
+        ),
+        ("{article: 5}", "{article: 0}", "gateway.nodes.article: found 0; expected an integer from 1 to 127"),
+        (
+            "{interface: udp_multicast, channel: 239.74.163.11, options: {port: 43210}}",
+            "{interface: virtual, channel: hdbridge}",
+            "virtual:hdbridge is the bus of the drives; expected another one",
+        ),
+    ],
+)
+def test_a_gateway_that_cannot_work_is_refused_at_the_desk(tmp_path, replaced, by, words):
+    done = run_here(tmp_path, "check", machine(tmp_path, MACHINE.replace(replaced, by)))
+    assert done.returncode == 2
+    assert words in done.stderr
+
+
+def test_positions_have_to_fit_into_32_bits(tmp_path):
+    shutil.copytree(PROFILE, tmp_path / "own")
+    text = (tmp_path / "own" / "axis.yaml").read_text(encoding="utf-8")
+    text = text.replace("position_max_deg: 400", "position_max_deg: 3600")
+    (tmp_path / "own" / "axis.yaml").write_text(text, encoding="utf-8")
+    text = MACHINE.replace("profile: article", "profile: own")
+    text = text.replace("nodes:", "counts_per_turn: 268435456\n  nodes:")
+    done = run_here(tmp_path, "check", machine(tmp_path, text))
+    assert done.returncode == 2
+    assert "the limits of 'article' do not fit into 32 bits; expected at most 214748363" in done.stderr
+    done = run_here(tmp_path, "check", machine(tmp_path, text.replace("268435456", "214748363")))
+    assert done.returncode == 0, done.stderr
+
+
+def test_a_machine_without_a_gateway_says_which_key_is_missing(tmp_path):
+    done = run_here(tmp_path, "gateway", "eds", "article")
+    assert done.returncode == 2
+    assert "has no gateway; expected a key 'gateway'" in done.stderr
+    done = run_here(tmp_path, "gateway", "eds", machine(tmp_path), "--axis", "arm")
+    assert done.returncode == 2
+    assert "--axis arm: is not in the gateway; expected one of: article" in done.stderr
