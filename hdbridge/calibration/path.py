@@ -1,18 +1,19 @@
 """Path errors: how far the load is off its path during a move and after it.
 
-The servo lags behind its target, and the load winds the gear's spring up. Both would be the same on a gear
-without error: they are fitted to the runs and taken out.
+The motor lags behind its target, and the load winds the gear's spring up. Both would be the same on a gear
+without error. They are fitted to the runs as responses to the target, and taken out. The error of the gear
+depends on the angle, so that no response to a smooth target reproduces it.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hdbridge.procedures.moves import Sample
 from hdbridge.procedures.path_test import PathRun
 from hdbridge.units import ARCSEC_PER_DEG
 
@@ -22,6 +23,12 @@ SETTLED_ARCSEC = 3.0
 """The load has settled once it stays this close to where it comes to rest."""
 AT_REST_S = 0.2
 """End of the rest after a path over which the rest error is taken."""
+
+
+LAGS = (0, 1, 2, 4, 8, 16, 32, 64)
+"""Cycles between which the speed is averaged, for the response of the motor."""
+WIND_UP_LAGS = LAGS[:6]
+"""The same of the acceleration, for the wind-up; longer ones would take the hysteresis for it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,20 +47,27 @@ class PathError:
 def path_errors(variants: Sequence[Sequence[PathRun]], ratio: float) -> list[list[PathError]]:
     """Errors of the same paths run in several ways, the first one without correction.
 
-    The servo's lag comes from the motor encoder of the first one: it does not contain the gear's hysteresis,
-    which has the sign of the speed as well.
+    The motor's response comes from the motor encoder of the first one, the wind-up from the others: in the
+    first one the hysteresis hides it.
     """
-    derivatives = [[_derivatives(run.samples) for run in variant] for variant in variants]
-    lag = _fit(derivatives[0], [_off(run, "motor_position_deg", ratio) for run in variants[0]])
+    servo = _fit(
+        [_servo_columns(run) for run in variants[0]],
+        [_off(run, "motor_position_deg", ratio) for run in variants[0]],
+    )
     errors = [
-        [_off(run, "load_position_deg", 1.0) - each @ lag for run, each in zip(*pair, strict=True)]
-        for pair in zip(variants, derivatives, strict=True)
+        [_off(run, "load_position_deg", 1.0) - _servo_columns(run) @ servo for run in variant]
+        for variant in variants
     ]
-    wound = [each[:, 1:] for variant in derivatives for each in variant]
-    spring = _fit(wound, [each for variant in errors for each in variant])
+    compensated = [run for variant in variants[1:] for run in variant]
+    spring = _fit(
+        [_wind_up_columns(run) for run in compensated], [each for variant in errors[1:] for each in variant]
+    )
     return [
-        [_judged(run, error - each[:, 1:] @ spring) for run, error, each in zip(*triple, strict=True)]
-        for triple in zip(variants, errors, derivatives, strict=True)
+        [
+            _judged(run, error - _wind_up_columns(run) @ spring)
+            for run, error in zip(variant, found, strict=True)
+        ]
+        for variant, found in zip(variants, errors, strict=True)
     ]
 
 
@@ -63,21 +77,42 @@ def _judged(run: PathRun, error_arcsec: FloatArray) -> PathError:
     mean = float(error[time > time[-1] - AT_REST_S].mean())
     moving = np.flatnonzero(abs(error - mean) > SETTLED_ARCSEC)
     settle_s = float(time[moving[-1]] - run.samples[-1].time_s) if moving.size else 0.0
-    return PathError(run.name, float(np.sqrt(np.mean(error_arcsec**2))), mean, max(settle_s, 0.0))
+    return PathError(
+        run.name, float(np.sqrt(np.mean(error_arcsec[run.skipped :] ** 2))), mean, max(settle_s, 0.0)
+    )
+
+
+def _servo_columns(run: PathRun) -> FloatArray:
+    """Speed of the load target over past cycles, and its sign for the friction, shape (n, columns)."""
+    speed = _speed(run)
+    return np.column_stack([*_averages(speed, LAGS), np.sign(speed)])
+
+
+def _wind_up_columns(run: PathRun) -> FloatArray:
+    """Acceleration of the load target over past cycles, shape (n, columns)."""
+    return np.column_stack(_averages(np.gradient(_speed(run)), WIND_UP_LAGS))
+
+
+def _averages(values: FloatArray, lags: Sequence[int]) -> list[FloatArray]:
+    """Mean of the values between two lags, for each pair of neighbours; it starts at rest."""
+    total = np.concatenate([np.zeros(lags[-1] + 1), np.cumsum(values)])
+    end = len(total)
+    count = len(values)
+    return [
+        (total[end - count - near : end - near] - total[end - count - far : end - far]) / (far - near)
+        for near, far in pairwise(lags)
+    ]
+
+
+def _speed(run: PathRun) -> FloatArray:
+    """Speed of the load target, degrees per cycle."""
+    target = np.array([each.load_target_deg for each in run.samples])
+    return np.diff(target, prepend=target[0])
 
 
 def _fit(columns: Sequence[FloatArray], values: Sequence[FloatArray]) -> FloatArray:
     solution: FloatArray = np.linalg.lstsq(np.vstack(columns), np.concatenate(values), rcond=None)[0]
     return solution
-
-
-def _derivatives(samples: Sequence[Sample]) -> FloatArray:
-    """Speed, acceleration and jerk of the load target, shape (n, 3)."""
-    target = np.array([each.load_target_deg for each in samples])
-    cycle_s = (samples[-1].time_s - samples[0].time_s) / (len(samples) - 1)
-    speed = np.gradient(target, cycle_s)
-    acceleration = np.gradient(speed, cycle_s)
-    return np.column_stack([speed, acceleration, np.gradient(acceleration, cycle_s)])
 
 
 def _off(run: PathRun, encoder: str, turns: float) -> FloatArray:

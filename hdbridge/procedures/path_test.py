@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 from hdbridge.procedures.moves import AxisView, Dwell, MoveTo, Sample, Sine, Steps
@@ -32,6 +31,8 @@ class PathRun:
     name: str
     samples: tuple[Sample, ...]
     rest: tuple[Sample, ...]
+    skipped: int = 0
+    """Samples at the beginning that are not judged."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,11 +68,6 @@ class PathTest:
         yield Dwell(REST_S, kind="precondition")
         samples = yield Sine(middle, amplitude_deg, SINE_HZ, SINE_PERIODS, kind=KIND)
         rest = yield Dwell(REST_S, kind=KIND)
-        runs.append(PathRun("sine", _later_periods(samples), (*rest,)))
+        # A sine begins with a step of the acceleration.
+        runs.append(PathRun("sine", (*samples,), (*rest,), len(samples) // SINE_PERIODS))
         return tuple(runs)
-
-
-def _later_periods(samples: Sequence[Sample]) -> tuple[Sample, ...]:
-    """The sine without its first period: it begins with a step of the acceleration."""
-    begin_s = samples[0].time_s + 1.0 / SINE_HZ
-    return tuple(each for each in samples if each.time_s >= begin_s)
