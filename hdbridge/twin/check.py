@@ -96,9 +96,9 @@ class Known:
     """Of their coordinates."""
     noise: dict[str, float]
     """Scale of each channel's residuals."""
-    misfit: Misfit
+    misfit: Misfit = field(default_factory=dict)
     """What the twin left of its own recordings; empty in files of older versions."""
-    of_axis: bool
+    of_axis: bool = True
     """Whether the twin's values are the axis's."""
 
     @classmethod
