@@ -140,9 +140,9 @@ def _rows(before: Any, after: Any) -> list[Difference]:
     """Returns the differences of two models or of two twins; ``before`` may be None."""
     if isinstance(after, TransmissionModel):
         return diff(before or after.only(()), after)
-    from hdbridge.twin import difference
+    from hdbridge.twin.kept import diff as diff_of_twins
 
-    return difference.diff(before.truth if before else None, after.truth)
+    return diff_of_twins(before.truth if before else None, after.truth)
 
 
 def _folder(profile: str) -> Path:

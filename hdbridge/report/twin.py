@@ -28,9 +28,8 @@ from hdbridge.report.page import (
     Table,
 )
 from hdbridge.report.words import figure, sentence
-from hdbridge.twin.comparison import ALL, TITLES, UNITS, Comparison, Row
+from hdbridge.twin.comparison import ALL, TITLES, UNITS, Comparison, Row, Spectrum, Trace
 from hdbridge.twin.result import Left, Values
-from hdbridge.twin.traces import Spectrum, Trace
 from hdbridge.twin.translation import Row as Translated
 
 WINDOW_S: Final = 1.0

@@ -18,6 +18,8 @@ from hdbridge.sim.truth import Truth
 from hdbridge.sim.truth.motor import TrueNotch
 
 RAD_PER_DEG = math.pi / 180.0
+HIGHEST_NOTCH = 0.45
+"""Frequency of a notch over the rate of the substeps: at half of it the bilinear transform ends."""
 AT_REST_DEG_S = 0.05
 """Below this speed the demand rests: friction feed-forward keeps its direction, the integral may rest."""
 
@@ -63,7 +65,7 @@ class Notch:
     _second: float
 
     def __init__(self, truth: TrueNotch | None, dt_s: float) -> None:
-        half = math.tan(math.pi * truth.frequency_hz * dt_s) if truth else 0.0
+        half = math.tan(math.pi * min(truth.frequency_hz * dt_s, HIGHEST_NOTCH)) if truth else 0.0
         depth, width = (truth.depth, truth.width) if truth else (1.0, 1.0)
         scale = 1.0 + width * half + half * half
         self._b0 = (1.0 + depth * width * half + half * half) / scale

@@ -35,6 +35,8 @@ MOSTLY = 0.95
 """Share of the samples that have to be so near: a master that stamps some rows late sent them in time."""
 REST_S = 0.1
 """The command rests this long between two legs of a recording that names none: loops answer in some ms."""
+RINGS_S = 1.0
+"""A leg ends this long after its command has come to rest; a longer standstill belongs to none."""
 LEAST_LEG_S = 0.4
 """Such a leg lasts at least this long: an acceleration and the ringing of a load at 15 Hz."""
 SIGN_SHARE = 0.2
@@ -196,7 +198,7 @@ def legs_of(recording: Recording) -> tuple[Segment, ...]:
 def _legs_of_command(part: Record) -> Iterator[Segment]:
     """Legs of a part by its command; the part as a whole without one."""
     time_s, target = part.time_s, part.motor_target_deg
-    cuts = [float(time_s[0])]
+    cuts, moved_s = [float(time_s[0])], [float(time_s[-1])]
     if target is not None and len(part) > 2:
         way = np.sign(np.diff(target))
         moving = np.flatnonzero(way)
@@ -204,9 +206,12 @@ def _legs_of_command(part: Record) -> Iterator[Segment]:
             rests = time_s[after] - time_s[before + 1] >= REST_S
             if (rests or way[before] != way[after]) and time_s[after] - cuts[-1] >= LEAST_LEG_S:
                 cuts.append(float(time_s[after]))
+                moved_s.insert(-1, float(time_s[before + 1]))
+        if len(moving):
+            moved_s[-1] = float(time_s[moving[-1] + 1])
     ends = [*cuts[1:], float(time_s[-1])]
-    for start_s, end_s in zip(cuts, ends, strict=True):
-        yield Segment(kind="motion", start_s=start_s, end_s=max(start_s, end_s))
+    for start_s, end_s, last_s in zip(cuts, ends, moved_s, strict=True):
+        yield Segment(kind="motion", start_s=start_s, end_s=max(start_s, min(end_s, last_s + RINGS_S)))
 
 
 def doubts(recording: Recording, axis: AxisConfig) -> tuple[str, ...]:

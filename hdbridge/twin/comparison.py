@@ -18,10 +18,126 @@ from hdbridge.effects import Channel, FloatArray
 from hdbridge.errors import InputError
 from hdbridge.records.record import Record
 from hdbridge.records.recording import Segment
-from hdbridge.twin.rests import STANDS_COUNTS, stands, unknown_rows
-from hdbridge.twin.settling import band_arcsec, overshoot_arcsec, scatter_s, settling_s
-from hdbridge.twin.traces import Spectrum, Trace, spectrum_of
+from hdbridge.twin.stretches import STANDS_COUNTS, stands, unknown_rows
 from hdbridge.units import ARCSEC_PER_DEG
+
+# ----------------------------------------------------------------
+# Two records of a signal over time, and their spectra. Pure.
+
+SPECTRUM_SAMPLES: Final = 1024
+SHORTEST: Final = 32
+"""Samples of the shortest part that has a spectrum."""
+
+
+@dataclass(frozen=True, eq=False)
+class Trace:
+    """A signal of both records over time, for a picture."""
+
+    time_s: FloatArray
+    measured: FloatArray
+    simulated: FloatArray
+
+    @property
+    def difference(self) -> FloatArray:
+        """Measured less simulated."""
+        return self.measured - self.simulated
+
+
+@dataclass(frozen=True, eq=False)
+class Spectrum:
+    """Amplitude density by frequency, in the signal's unit per root hertz."""
+
+    frequency_hz: FloatArray
+    measured: FloatArray
+    simulated: FloatArray
+    difference: FloatArray
+
+
+def spectrum_of(trace: Trace, parts: Sequence[slice]) -> Spectrum | None:
+    """Welch's estimate over the parts, on an even grid; None where all are too short."""
+    steps = np.concatenate([np.diff(trace.time_s[part]) for part in parts])
+    period_s = float(np.median(steps)) if len(steps) else 0.0
+    if period_s <= 0.0:
+        return None
+    longest = max(parts, key=lambda part: part.stop - part.start)
+    length = min(SPECTRUM_SAMPLES, longest.stop - longest.start)
+    if length < SHORTEST:
+        return None
+    from scipy.signal import welch  # noqa: PLC0415 - takes a second to load
+
+    powers: list[FloatArray] = []
+    weights: list[int] = []
+    frequency = np.empty(0)
+    for part in parts:
+        time_s = trace.time_s[part]
+        if len(time_s) < length:
+            continue
+        grid = np.arange(time_s[0], time_s[-1], period_s)
+        if len(grid) < length:
+            continue
+        values = (trace.measured[part], trace.simulated[part], trace.difference[part])
+        even = np.stack([np.interp(grid, time_s, each) for each in values])
+        frequency, power = welch(even, 1.0 / period_s, nperseg=length, detrend="linear")
+        powers.append(power)
+        weights.append(len(grid))
+    if not powers:
+        return None
+    mean = np.average(np.stack(powers), axis=0, weights=weights)
+    return Spectrum(frequency, *np.sqrt(mean))
+
+
+# ----------------------------------------------------------------
+# When a load has settled after a stop, and by how much noise moves that. Pure.
+
+SETTLED_ARCSEC: Final = 10.0
+"""A load that swings by less than this about where it comes to rest has settled: three motor counts of 8000
+at a ratio of 50."""
+SETTLED_NOISE: Final = 5.0
+"""... or by less than so many times the noise of the load's reading, where that is more."""
+OVER_S: Final = 0.04
+"""How far it swings is root two times its rms over so long: half a period of the slowest ringing, 15 Hz."""
+SHORTEST_SWING: Final = 4
+DRAWS: Final = 24
+
+
+def band_arcsec(noise_arcsec: float) -> float:
+    """Within what a load of this noise has settled."""
+    return max(SETTLED_ARCSEC, SETTLED_NOISE * noise_arcsec)
+
+
+def settling_s(time_s: FloatArray, load_arcsec: FloatArray, noise_arcsec: float, band: float) -> float:
+    """Time from the first sample, where the command rests, until the load stays settled."""
+    length = min(max(SHORTEST_SWING, round(OVER_S / float(np.median(np.diff(time_s))))), len(time_s))
+    squares = np.square(load_arcsec - _rest_arcsec(load_arcsec))
+    swing = 2.0 * (np.convolve(squares, np.full(length, 1.0 / length), mode="valid") - noise_arcsec**2)
+    outside = np.flatnonzero(swing > band**2)
+    return float(time_s[outside[-1] + 1] - time_s[0]) if len(outside) else 0.0
+
+
+def scatter_s(
+    time_s: FloatArray, load_arcsec: FloatArray, noise_arcsec: float, band: float, noises: Sequence[float]
+) -> float:
+    """By how much two settling times of a load that moves so are apart, rms, for readings of these noises."""
+    rng = np.random.default_rng(0)
+    own = settling_s(time_s, load_arcsec, noise_arcsec, band)
+    squares = 0.0
+    for each in noises:
+        for _ in range(DRAWS):
+            noisy = load_arcsec + each * rng.standard_normal(len(load_arcsec))
+            squares += (settling_s(time_s, noisy, float(np.hypot(noise_arcsec, each)), band) - own) ** 2
+    return float(np.sqrt(squares / DRAWS))
+
+
+def overshoot_arcsec(load_arcsec: FloatArray, way: float) -> float:
+    """How far it goes beyond where it comes to rest; ``way`` is the sign of the motion before."""
+    return max(0.0, float(np.max(way * (load_arcsec - _rest_arcsec(load_arcsec)))))
+
+
+def _rest_arcsec(load_arcsec: FloatArray) -> float:
+    return float(np.mean(load_arcsec[-max(SHORTEST_SWING, len(load_arcsec) // 4) :]))
+
+
+# ----------------------------------------------------------------
 
 Rows = NDArray[np.bool_]
 ALL: Final = "all"

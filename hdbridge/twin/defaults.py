@@ -14,6 +14,7 @@ from typing import Any, Final
 from hdbridge.axis import AxisConfig
 from hdbridge.sim.truth import Truth
 from hdbridge.sim.truth.encoder import TrueCoupling
+from hdbridge.sim.truth.motor import TrueNotch
 from hdbridge.twin.parameters import Parameter, with_load_encoder, with_values
 
 
@@ -50,6 +51,8 @@ COUPLING_HZ: Final = Usual(
 COUPLING_DAMPING: Final = Usual(
     0.1, "", "metal bellows couplings: 0.05 to 0.2 with the bearings of the encoder"
 )
+NOTCH_HZ: Final = Usual(100.0, "Hz", "a notch on the resonance of motor and load: 40 to 200 Hz")
+SHORTEST_FILTER_MS: Final = Usual(0.02, "ms", "a filter that is as good as none: a tenth of a short substep")
 BRAKE_SHARE: Final = Usual(
     3.0, "of the rated torque", "holding brakes are built for more than the motor gives"
 )
@@ -125,7 +128,13 @@ def with_sections(truth: Truth, parameters: Iterable[Parameter]) -> Truth:
     if truth.load_.encoder.coupling is None and "coupling" in wanted:
         rigid = TrueCoupling(frequency_hz=COUPLING_HZ.value, damping_ratio=COUPLING_DAMPING.value)
         truth = with_load_encoder(truth, coupling=rigid)
-    return truth
+    servo: dict[str, Any] = {}
+    if truth.servo.notch is None and "notch" in wanted:
+        servo["notch"] = TrueNotch(frequency_hz=NOTCH_HZ.value, depth=1.0, width=1.0)
+    for name in ("speed_filter_ms", "torque_filter_ms"):
+        if name in wanted and not getattr(truth.servo, name):
+            servo[name] = SHORTEST_FILTER_MS.value
+    return truth.model_copy(update={"servo": truth.servo.model_copy(update=servo)}) if servo else truth
 
 
 def _encoder(encoder: Any) -> dict[str, Any]:

@@ -8,11 +8,11 @@ from typing import Any
 from hdbridge.axis import AxisConfig
 from hdbridge.records.recording import Recording, versions_here
 from hdbridge.sim.truth import Truth
+from hdbridge.twin.check import misfit_of
 from hdbridge.twin.commands import legs_of
 from hdbridge.twin.comparison import Comparison, compare
 from hdbridge.twin.defaults import with_sections
 from hdbridge.twin.fitting import FIT_S, fit
-from hdbridge.twin.known import misfit_of
 from hdbridge.twin.least_squares import Fitted, fitted_rows, legs_of_rows
 from hdbridge.twin.loop_laws import by_law_of
 from hdbridge.twin.misfit import CHANNELS, Data, coarse, held_out_legs, prepare

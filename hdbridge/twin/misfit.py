@@ -22,8 +22,17 @@ from hdbridge.sim.truth import Truth
 from hdbridge.twin.commands import Commands, commands_of, legs_of
 from hdbridge.twin.parameters import FOLLOWING, LOAD, TORQUE, with_load_encoder
 from hdbridge.twin.replay import run
-from hdbridge.twin.rests import RINGING_S, STANDS_COUNTS, begins_in_motion, held_rows, stands, unknown_rows
-from hdbridge.twin.stretches import RUN_IN_S, continuous, stretches
+from hdbridge.twin.stretches import (
+    RINGING_S,
+    RUN_IN_S,
+    STANDS_COUNTS,
+    begins_in_motion,
+    continuous,
+    held_rows,
+    stands,
+    stretches,
+    unknown_rows,
+)
 from hdbridge.units import ARCSEC_PER_DEG
 
 FINEST_STEPS_PER_TURN = 2**40

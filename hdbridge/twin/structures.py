@@ -38,6 +38,8 @@ INTEGRAL: Final = 3.0
 """Integral time times that bandwidth (symmetric optimum: 2 to 4)."""
 FILTER_MS: Final = 0.5
 """Speed and torque filter at the start: half to twice the period of common velocity loops."""
+SHORT_MS: Final = 0.1
+"""Command filter that is as good as none: a fifth of a substep."""
 VELOCITY_FEEDFORWARD: Final = 0.9
 """At the start, between none that is seldom and the whole speed."""
 STEP: Final = 0.02
@@ -89,7 +91,8 @@ def fit_structures(
     Each of the starts has the mechanics of ``begun``, as far as regressions give none.
     """
     few = replays.rough
-    tried = [least_squares_fit(few, each, FEW) for each in starts(start_of(begun, replays.data))]
+    cycle_ms = 1e3 * replays.data.pieces[0].commands.cycle_s
+    tried = [least_squares_fit(few, each, FEW) for each in starts(start_of(begun, replays.data), cycle_ms)]
     progress(0.3)
     tried.sort(key=lambda each: each.misfit)
     again = [least_squares_fit(few, Structure(each.truth, each.parameters), MORE) for each in tried[:BEST]]
@@ -112,12 +115,23 @@ def fit_structures(
     return solve(replays, end.truth, end.parameters, place, 0)
 
 
-def starts(truth: Truth) -> Iterator[Structure]:
-    """The list of servos that a fit starts at."""
+def starts(truth: Truth, cycle_ms: float) -> Iterator[Structure]:
+    """The list of servos that a fit starts at.
+
+    A feed-forward of the acceleration acts on the demand behind its filter, or on differences over whole SYNC
+    cycles: that is a moving average of one cycle.
+    """
+    lag_ms = truth.servo.dead_time_ms + 2.0 * truth.servo.command_filter_ms
+    averaged_ms = min(cycle_ms, BY_NAME["moving average"].most)
+    averaged = {
+        "moving_average_ms": averaged_ms,
+        "command_filter_ms": SHORT_MS,
+        "dead_time_ms": max(lag_ms - 0.5 * averaged_ms, 0.0),
+    }
     whole = truth.motor.inertia_kg_m2 + truth.load_.whole_inertia_kg_m2 / truth.gear.ratio**2
     fastest = VELOCITY_BANDWIDTH_RAD_S.value * truth.motor.inertia_kg_m2
     for gain, rate in BANDWIDTHS:
-        for forward, integral in product((0.0, 0.9 * whole), INTEGRALS):
+        for (forward, command), integral in product(((0.0, {}), (whole, {}), (whole, averaged)), INTEGRALS):
             servo = truth.servo.model_copy(
                 update={
                     "position_gain_per_s": gain,
@@ -131,9 +145,11 @@ def starts(truth: Truth) -> Iterator[Structure]:
                     "load_feedforward": None,
                     "viscous_feedforward_nm_s_per_rad": 0.0,
                     "friction_feedforward_nm": 0.0,
+                    **command,
                 }
             )
-            names = (*MECHANICS, *LOOPS, *(("inertia feed-forward",) if forward else ()))
+            more = (("inertia feed-forward",) if forward else ()) + (("moving average",) if command else ())
+            names = (*MECHANICS, *LOOPS, *more)
             parameters = tuple(BY_NAME[each] for each in names)
             yield Structure(with_sections(truth.model_copy(update={"servo": servo}), parameters), parameters)
 
@@ -152,7 +168,7 @@ def more_blocks(best: Reached) -> Iterator[tuple[str, Structure]]:
             yield f"notch {place}", Structure(truth.model_copy(update={"servo": notched}), parameters)
     if servo.moving_average_ms == 0.0:
         lag_ms = min(max(2.0 * servo.command_filter_ms, 0.5), 3.0)
-        averaged = servo.model_copy(update={"moving_average_ms": 2.0 * lag_ms, "command_filter_ms": 0.1})
+        averaged = servo.model_copy(update={"moving_average_ms": 2.0 * lag_ms, "command_filter_ms": SHORT_MS})
         parameters = (*best.parameters, BY_NAME["moving average"])
         yield "average", Structure(truth.model_copy(update={"servo": averaged}), parameters)
     if servo.friction_feedforward_nm == 0.0:

@@ -23,13 +23,11 @@ from hdbridge.axis import AxisConfig
 from hdbridge.effects import Channel, FloatArray
 from hdbridge.records.recording import Recording
 from hdbridge.sim.truth import Truth
-from hdbridge.twin.covariance import sandwich
-from hdbridge.twin.least_squares import Fitted
+from hdbridge.twin.least_squares import Fitted, sandwich
 from hdbridge.twin.misfit import held_out_legs
-from hdbridge.twin.naming import Finding, finding
+from hdbridge.twin.naming import FALSE_ALARM, Finding, finding
 from hdbridge.twin.parameters import BY_NAME, Parameter, coordinates
 from hdbridge.twin.replay import replay_directly
-from hdbridge.twin.rivals import FALSE_ALARM
 from hdbridge.twin.stretches import continuous
 
 TEMPERATURE: Final = "temperature"

@@ -410,3 +410,11 @@ def test_a_notch_has_its_depth_at_its_frequency_and_nothing_far_off(frequency_hz
     notch = Notch(TrueNotch(frequency_hz=120.0, depth=0.25, width=0.4), step_s)
     shown = [notch.notched_nm(math.cos(math.tau * frequency_hz * number * step_s)) for number in range(4000)]
     assert max(shown[2000:]) == pytest.approx(gain, rel=0.03)
+
+
+@pytest.mark.parametrize("frequency_hz", [30.0, 480.0, 900.0])
+def test_a_notch_is_stable_at_any_frequency(frequency_hz: float) -> None:
+    """At a substep of 1 ms the last one is beyond half the rate."""
+    notch = Notch(TrueNotch(frequency_hz=frequency_hz, depth=0.0, width=5.0), 0.001)
+    assert max(abs(notch.notched_nm(1.0 if number % 2 else -1.0)) for number in range(2000)) < 3.0
+    assert [notch.notched_nm(1.0) for _ in range(2000)][-1] == pytest.approx(1.0)

@@ -71,6 +71,16 @@ def test_legs_of_a_bare_record_are_cut_where_its_command_sets_out(bare: Record) 
         assert target[row] == target[row - 1] != target[row + 1]
 
 
+def test_a_long_standstill_belongs_to_no_leg() -> None:
+    """What is held out is motion, not the hour in which a gear cools down."""
+    time_s = np.arange(0.0, 20.0, 0.01)
+    angle = np.interp(time_s, [0.0, 1.0, 15.0, 16.0], [0.0, 90.0, 90.0, 0.0])
+    record = Record({"time_s": time_s, "motor_target_deg": angle, "motor_position_deg": angle,
+                     "load_position_deg": angle / 50.0})  # fmt: skip
+    spans = [(leg.start_s, leg.end_s) for leg in legs_of(Recording(record, ratio=50.0))]
+    assert spans == [pytest.approx((0.0, 2.0), abs=0.02), pytest.approx((15.0, 17.0), abs=0.02)]
+
+
 def test_an_oscillation_without_rest_is_cut_at_its_turns() -> None:
     time_s = np.arange(0.0, 6.0, 0.004)
     angle = 20.0 * np.sin(2.0 * np.pi * 0.5 * time_s)

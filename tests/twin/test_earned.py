@@ -19,8 +19,7 @@ from hdbridge.records.recording import Recording
 from hdbridge.sim.lockstep import simulated_bench
 from hdbridge.sim.truth import Truth
 from hdbridge.sim.truth.encoder import TrueCoupling
-from hdbridge.twin.earned import with_last, with_limit, with_loop
-from hdbridge.twin.fitting import free_parameters
+from hdbridge.twin.fitting import free_parameters, with_last, with_limit, with_loop
 from hdbridge.twin.least_squares import Fitted, solve
 from hdbridge.twin.loop_laws import LAWS, LOOP, by_each_law, by_law_of, loop_parameters
 from hdbridge.twin.misfit import prepare

@@ -24,12 +24,11 @@ from hdbridge.twin.check import Check, check
 from hdbridge.twin.least_squares import solve
 from hdbridge.twin.making import with_knowledge
 from hdbridge.twin.misfit import CHANNELS, counted, prepare, residuals
-from hdbridge.twin.noise import noise_in_motion
+from hdbridge.twin.noise import noise_floor, noise_in_motion
 from hdbridge.twin.parameters import BY_NAME, coordinates, value_in, with_values
 from hdbridge.twin.regressions import read_off
 from hdbridge.twin.replays import Replays
 from hdbridge.twin.result import Values
-from hdbridge.twin.scales import noise_floor
 from hdbridge.twin.verdict import values_of, what_is_left
 
 DEMO = Path(__file__).parents[2] / "profiles" / "demo"

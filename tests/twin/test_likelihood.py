@@ -14,9 +14,8 @@ from hdbridge.records.recording import Recording
 from hdbridge.sim.exercise import Exercise
 from hdbridge.sim.truth import Truth
 from hdbridge.twin.least_squares import solve
-from hdbridge.twin.likelihood import deviation, rooted
 from hdbridge.twin.misfit import prepare
-from hdbridge.twin.noise import expected
+from hdbridge.twin.noise import deviation, expected, rooted
 from hdbridge.twin.parameters import BY_NAME, coordinates, with_values
 from hdbridge.twin.replays import Replays
 

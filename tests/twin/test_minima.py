@@ -14,9 +14,18 @@ from hdbridge.axis import AxisConfig
 from hdbridge.records.recording import Recording, Segment
 from hdbridge.sim.exercise import Exercise
 from hdbridge.sim.truth import Truth
-from hdbridge.twin.fitting import better_places
+from hdbridge.twin.fitting import (
+    as_late,
+    better_places,
+    delays,
+    exchanged,
+    feedforwards,
+    inertias,
+    lags,
+    neighbours,
+    springs,
+)
 from hdbridge.twin.least_squares import solve
-from hdbridge.twin.minima import as_late, delays, exchanged, feedforwards, inertias, lags, neighbours, springs
 from hdbridge.twin.misfit import Data, prepare
 from hdbridge.twin.parameters import BY_NAME, FOLLOWING, coordinates, free_value, with_values
 from hdbridge.twin.replays import Replays

@@ -19,10 +19,10 @@ from hdbridge.sim.truth import Truth
 from hdbridge.twin.comparison import FOLLOWING_ERROR, LOAD_ERROR, compare
 from hdbridge.twin.least_squares import solve
 from hdbridge.twin.misfit import prepare, remembers, residuals
+from hdbridge.twin.noise import scales
 from hdbridge.twin.parameters import BY_NAME, FOLLOWING, LOAD, TORQUE, coordinates, with_values
 from hdbridge.twin.replay import replay_directly
 from hdbridge.twin.replays import Replays
-from hdbridge.twin.scales import scales
 
 DEMO = Path(__file__).parents[2] / "profiles" / "demo"
 AXIS = AxisConfig.load(DEMO)

@@ -13,8 +13,8 @@ from hdbridge.effects import FloatArray
 from hdbridge.sim.truth import Truth
 from hdbridge.twin.least_squares import fitted_rows, legs_of_rows, solve
 from hdbridge.twin.naming import Alike, Finding, alike, name_causes
+from hdbridge.twin.noise import Scales
 from hdbridge.twin.parameters import BY_NAME, FOLLOWING, LOAD, TORQUE, coordinates, with_values
-from hdbridge.twin.scales import Scales
 
 TRUTH = Truth.load(Path(__file__).parents[2] / "profiles" / "demo")
 NAMES = ("Coulomb friction", "servo dead time", "command filter")

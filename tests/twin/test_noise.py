@@ -15,9 +15,8 @@ from hdbridge.records.recording import Recording
 from hdbridge.sim.exercise import Exercise
 from hdbridge.sim.truth import Truth
 from hdbridge.twin.misfit import CHANNELS, Data, demand_deg, prepare, traces_of
-from hdbridge.twin.noise import noise_in_motion
+from hdbridge.twin.noise import noise_floor, noise_in_motion, scales
 from hdbridge.twin.parameters import FOLLOWING, LOAD, TORQUE
-from hdbridge.twin.scales import noise_floor, scales
 from hdbridge.twin.verdict import what_is_left
 
 DEMO = Path(__file__).parents[2] / "profiles" / "demo"

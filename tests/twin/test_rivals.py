@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from hdbridge.sim.truth import Truth
+from hdbridge.twin.naming import put_back, told_apart
 from hdbridge.twin.parameters import BY_NAME, with_values
-from hdbridge.twin.rivals import put_back, told_apart
 
 DEMO = Truth.load(Path(__file__).parents[2] / "profiles" / "demo")
 

@@ -46,7 +46,7 @@ class TrueLoadFeedforward(Part):
 class TrueNotch(Part):
     """A notch on the torque, exact at its frequency (bilinear transform)."""
 
-    frequency_hz: float = Field(gt=0, le=900, description="centre; below half the rate of the substeps")
+    frequency_hz: float = Field(gt=0, le=900, description="centre, at most 0.45 of the rate of the substeps")
     depth: float = Field(ge=0, le=1, description="gain at the centre")
     width: float = Field(gt=0, le=10, description="bandwidth over the frequency")
 
