@@ -1,7 +1,7 @@
-"""Path errors: how far the load is off its path during a move and after it.
+"""Path errors: deviation of the load from its path during a move and after it.
 
-The servo lags behind its target, and the load winds the gear's spring up. Both would be the same on a gear
-without error: they are fitted to the runs and taken out.
+The servo's lag and the wind-up of the gear's spring would be the same on a gear without error, so both are
+fitted to the runs and removed.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ FloatArray = NDArray[np.float64]
 SETTLED_ARCSEC = 3.0
 """The load has settled once it stays this close to where it comes to rest."""
 AT_REST_S = 0.2
-"""End of the rest after a path over which the rest error is taken."""
+"""Length of the final part of the rest over which the rest error is taken."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,10 +38,10 @@ class PathError:
 
 
 def path_errors(variants: Sequence[Sequence[PathRun]], ratio: float) -> list[list[PathError]]:
-    """Errors of the same paths run in several ways, the first one without correction.
+    """Returns the errors of the same paths run with several corrections, the first without one.
 
-    The servo's lag comes from the motor encoder of the first one: it does not contain the gear's hysteresis,
-    which has the sign of the speed as well.
+    The servo's lag is fitted to the motor encoder of the first, which does not contain the gear's hysteresis;
+    hysteresis has the sign of the speed as well.
     """
     derivatives = [[_derivatives(run.samples) for run in variant] for variant in variants]
     lag = _fit(derivatives[0], [_off(run, "motor_position_deg", ratio) for run in variants[0]])
@@ -72,7 +72,7 @@ def _fit(columns: Sequence[FloatArray], values: Sequence[FloatArray]) -> FloatAr
 
 
 def _derivatives(samples: Sequence[Sample]) -> FloatArray:
-    """Speed, acceleration and jerk of the load target, shape (n, 3)."""
+    """Returns speed, acceleration and jerk of the load target, shape (n, 3)."""
     target = np.array([each.load_target_deg for each in samples])
     cycle_s = (samples[-1].time_s - samples[0].time_s) / (len(samples) - 1)
     speed = np.gradient(target, cycle_s)
@@ -81,6 +81,6 @@ def _derivatives(samples: Sequence[Sample]) -> FloatArray:
 
 
 def _off(run: PathRun, encoder: str, turns: float) -> FloatArray:
-    """Encoder over ``turns``, minus the load target, arcsec."""
+    """Returns the encoder angle over ``turns``, minus the load target; arcsec, shape (n,)."""
     off = [getattr(each, encoder) / turns - each.load_target_deg for each in run.samples]
     return ARCSEC_PER_DEG * np.array(off)
