@@ -422,7 +422,6 @@ def _interpolation_period(cycle_ms: float) -> tuple[int, int] | None:
 
 def _teeth_for(ratio: float, difference: int, teeth: Teeth) -> str:
     """Returns the tooth counts that a ratio needs, for the stated output and the same difference of teeth."""
-    held = round(ratio * difference)
     for more in (difference, 2, 1):
         held = round(ratio * more)
         if math.isclose(held, ratio * more, rel_tol=1e-9):

@@ -1,11 +1,11 @@
-"""Calibration: from a bare axis to a model that can be trusted, reviewed and undone.
+"""Calibration: measures an axis, fits a model, tests it, and offers it for commit.
 
-    measure      a plan is run on a bench, without compensation, into a folder that grows (`Journal`)
-    identify     the recording, or anybody's, becomes a `FitResult`
-    validate     the stepping test with the model before and with the new one
-    propose      the model becomes the profile's pending one, if it is better on data that it has not seen
+    measure      runs a plan on a bench, without compensation, into a growing recording folder (`Journal`)
+    identify     fits a model to this or any other recording (`FitResult`)
+    validate     runs the stepping test with the old model and with the new one
+    propose      makes the model the profile's pending one if it is better on unseen data
 
-`calibrate` does all four. Bench and drive come in; nothing here knows whether they are simulated.
+`calibrate` does all four. Bench and drive are passed in, real or simulated.
 """
 
 from hdbridge.calibration.fit import fit

@@ -1,4 +1,4 @@
-"""A model from recordings alone: hdbridge's own, or anybody's."""
+"""Fits a model to recordings alone, made by hdbridge or by others."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ def fit(
     active: TransmissionModel | None = None,
     independent_zeros: bool = False,
 ) -> Calibration:
-    """Fit a model to one or several recordings; ``.model`` is the model, ``.as_dict()`` the document.
+    """Fits a model to one or several recordings; ``.model`` is the model, ``.as_dict()`` the document.
 
-    ``ratio`` (motor turns per load turn) is needed where neither the recordings nor ``axis`` say it; with
+    ``ratio`` (motor turns per load turn) is needed if neither the recordings nor ``axis`` state it; with
     ``axis`` the model is bound to it. ``active`` is the model to compare with and to fall back on.
-    ``independent_zeros`` says that the encoders' zeros were lost between the recordings.
+    ``independent_zeros`` means that the encoders lost their zeros between the recordings.
 
-    InputError where a recording cannot be used, is of another gear, or was made by no axis; what the data
-    leave open stands in ``.fit.warnings``.
+    InputError if a recording cannot be used, belongs to another gear, or does not come from an axis.
+    Quantities that the data do not determine are listed in ``.fit.warnings``.
     """
     recordings = by_name(recording)
     said = [("ratio", ratio), (str(axis.path), axis.gear.ratio) if axis else ("axis", None)]

@@ -31,7 +31,7 @@ def identify(
     *,
     independent_zeros: bool = False,
 ) -> FitResult:
-    """Fit a model. InputError where the recordings cannot be used; what they cannot say: ``warnings``."""
+    """Fits a model; InputError if the recordings are unusable. ``warnings`` lists undetermined quantities."""
     prepared = [observed(each.record, ratio) for each in recordings]
     whole = [replace(each, record=seen.record) for each, seen in zip(recordings, prepared, strict=True)]
     measured = measured_of(whole, independent_zeros=independent_zeros)
@@ -41,9 +41,10 @@ def identify(
 
 
 def measured_of(recordings: Sequence[Recording], *, independent_zeros: bool = False) -> Measured:
-    """Several recordings, one after the other: their legs, or the whole of what has none.
+    """Joins recordings in order; uses their legs, or the whole record if there are none.
 
-    ``independent_zeros`` says that the encoders' zeros were lost between the recordings.
+    ``independent_zeros`` means that the encoders lost their zeros between the recordings.
+    InputError if nothing usable is left.
     """
     pieces: list[_Piece] = []
     for recording in recordings:
@@ -56,7 +57,7 @@ def measured_of(recordings: Sequence[Recording], *, independent_zeros: bool = Fa
     kinds = tuple(dict.fromkeys(each.kind for each in pieces))
     zero = np.concatenate([each.zero for each in pieces])
     edges = np.cumsum([0, *(len(each.record) for each in pieces)]).tolist()
-    # From one leg the axis moved straight to the next, but for jumps and where the zeros were lost.
+    # Motion is continuous from one leg to the next, except at jumps and where the zeros were lost.
     begins = {0, *(np.flatnonzero(np.diff(zero)) + 1).tolist()}
     begins |= {row + 1 for row in jumps(whole.motor_position_deg, whole.time_s).tolist() if row + 1 in edges}
     begins |= {
@@ -73,7 +74,7 @@ def measured_of(recordings: Sequence[Recording], *, independent_zeros: bool = Fa
 
 
 def standings(recording: Recording, ratio: float) -> list[tuple[float, float]]:
-    """Time (s) and error (arcsec) at each visit to the reference pose; the first is zero."""
+    """Returns time (s) and error (arcsec, relative to the first) of each visit to the reference pose."""
     found = [
         (
             float(np.mean(piece.time_s)),
@@ -86,7 +87,7 @@ def standings(recording: Recording, ratio: float) -> list[tuple[float, float]]:
 
 
 def resting(recording: Recording, window_s: float) -> FloatArray:
-    """Means over windows of ``window_s`` while the axis stood, about the mean of each stand; arcsec, (n,)."""
+    """Returns means over windows at standstill, relative to each standstill's mean; arcsec, shape (n,)."""
     means: list[FloatArray] = []
     for _, piece in recording.pieces(*STANDING):
         if len(piece) < 2:
@@ -104,9 +105,9 @@ def provenance(
     recordings: Sequence[Recording],
     held_out: Mapping[str, Any] | str,
 ) -> dict[str, Any]:
-    """What a model file says of where its numbers come from.
+    """Returns the provenance that a model file records.
 
-    ``held_out`` is its gain on unseen data, or in words why there is none.
+    ``held_out`` is the gain on unseen data, or the reason why there is none, in words.
     """
     dates = sorted({each.date for each in recordings if each.date})
     data: dict[str, Any] = {
@@ -120,12 +121,12 @@ def provenance(
 
 
 def with_provenance(model: TransmissionModel, data: dict[str, Any]) -> TransmissionModel:
-    """The same model, saying where it comes from."""
+    """Returns the model with ``data`` added to its provenance."""
     return replace(model, provenance={**model.provenance, **data})
 
 
 def _sessions(recording: Recording) -> bool:
-    """Whether the zeros within it are numbered by its sessions."""
+    """Returns True if the recording has several sessions, each with its own encoder zeros."""
     return len({each.session for each in tasks_of(recording)}) > 1
 
 
@@ -149,7 +150,7 @@ def _pieces(recording: Recording, zero: int, independent: bool) -> Iterator[_Pie
         if tasks and leg.start_s >= tasks[0].start_s:
             session, known = tasks.pop(0).session, False
         if not known and leg.kind == "precondition":
-            continue  # the state before it is not known, after it it is
+            continue  # the gear's state is known only after this leg
         if len(piece):
             yield _Piece(
                 piece, leg.kind, np.full(len(piece), zero + session - 1), None if known else Start.FORWARD

@@ -1,8 +1,8 @@
-"""A recording folder that grows: one file per task of a plan, and always a valid recording of what is there.
+"""Growing recording folder: one file per task of a plan; a valid recording at any time.
 
-After each task its samples are written, then ``recording.yaml`` is replaced atomically. Whatever ends the
-measurement (Ctrl-C, a fault, a kill, a power cut), the folder holds all tasks before it; of an interrupted
-task also what had been measured, where there was time to write it. `Journal.open` goes on with it.
+After each task its samples are written, then ``recording.yaml`` is replaced atomically. However the
+measurement ends (Ctrl-C, a fault, a kill, a power cut), the folder holds all tasks completed before, and the
+samples of an interrupted task if there was time to write them. `Journal.open` resumes it.
 """
 
 from __future__ import annotations
@@ -31,11 +31,11 @@ from hdbridge.records.recording import (
 )
 
 PAUSE_S = 1.0
-"""Between two tasks in the recording's time; the drive is disabled there."""
+"""Gap between two tasks on the recording's time axis, during which the drive is disabled."""
 
 
 class TaskEntry(BaseModel):
-    """A task of the plan as it was run, in the recording's notes."""
+    """One run of a task of the plan, as the recording's notes list it."""
 
     model_config = ConfigDict(defer_build=True, frozen=True, extra="forbid")
 
@@ -47,11 +47,11 @@ class TaskEntry(BaseModel):
     end_s: float = Field(description="time of its last sample")
     lost: tuple[str, ...] = Field(
         (),
-        description="channels of the axis file that were lost during the test: the samples do without them",
+        description="channels of the axis file that failed during the test; the samples do not contain them",
     )
     survived: tuple[Survived, ...] = Field(
         (),
-        description="faults that it went on in spite of, and the one that ended it",
+        description="faults that the run tolerated, and the one that ended it",
     )
 
 
@@ -63,7 +63,7 @@ class _Notes(BaseModel):
 
 
 class Journal:
-    """The folder; `add` writes a task into it."""
+    """Recording folder of a calibration; `add` writes a task into it."""
 
     def __init__(self, folder: Path, about: RecordingFile, plan: Plan) -> None:
         self.folder = folder
@@ -82,10 +82,10 @@ class Journal:
         identity: Identity,
         notes: dict[str, Any],
     ) -> Self:
-        """A new one; InputError where there is a recording already. The first task writes the first file."""
+        """Creates a journal, written with its first task. InputError if the folder has a recording."""
         if (folder / ABOUT_NAME).exists():
             raise InputError(
-                f"{folder}: there is a recording already; expected a new folder, or go on with it: --resume"
+                f"{folder}: there is a recording already; expected a new folder, or --resume to continue it"
             )
         about = RecordingFile.model_construct(
             schema_="hdbridge.recording/1",
@@ -102,7 +102,7 @@ class Journal:
 
     @classmethod
     def open(cls, folder: Path) -> Self:
-        """One that was begun; InputError where the folder is no recording of a calibration."""
+        """Opens a journal to resume it; InputError if the folder is not the recording of a calibration."""
         if not (folder / ABOUT_NAME).exists():
             raise InputError(f"{folder}: no {ABOUT_NAME} in this folder; expected a calibration's recording")
         document = read_yaml(folder / ABOUT_NAME)
@@ -112,11 +112,11 @@ class Journal:
                 ("notes",), "has no plan; expected the recording of a calibration ('hdbridge calibrate')"
             )
         plan = document.validate(Plan, ("notes", "plan"))
-        Recording.load(folder)  # files that changed since are noticed before anything moves
+        Recording.load(folder)  # detects changed files before anything moves
         return cls(folder, about, plan)
 
     def check_is_of(self, axis: AxisConfig, identity: Identity | None = None) -> None:
-        """Refuse (InputError) to go on with a recording of another axis, gear or drive."""
+        """Refuses a recording of another axis, gear or drive with InputError."""
         for what, theirs, ours in (
             ("axis", self._about.axis, axis.name),
             ("gear ratio", self._about.ratio, axis.gear.ratio),
@@ -128,31 +128,31 @@ class Journal:
             if theirs is not None and ours is not None and theirs != ours:
                 raise InputError(
                     f"{self.folder / ABOUT_NAME}: this recording is of {what} {theirs}, but here is {ours} "
-                    f"({axis.path}); go on with it on that one, or begin a new one"
+                    f"({axis.path}); resume it there, or begin a new one"
                 )
 
     @property
     def done(self) -> frozenset[str]:
-        """Names of the tasks that were run to their end."""
+        """Names of the completed tasks."""
         return frozenset(each.task for each in self._tasks if each.complete)
 
     @property
     def date(self) -> str:
-        """When it was begun, ISO 8601."""
+        """Date and time of its start, ISO 8601."""
         return self._about.date or ""
 
     @property
     def identity(self) -> Identity | None:
-        """The drive that it was measured with."""
+        """Identity of the drive that it was measured with."""
         return self._about.drive
 
     @property
     def notes(self) -> dict[str, Any]:
-        """What else is known of it."""
+        """Notes of the recording."""
         return dict(self._about.notes)
 
     def begin_session(self) -> None:
-        """Nothing is known of what happened since the last task: the encoders may have lost their zeros."""
+        """Starts a session, because the encoders may have lost their zeros since the last task."""
         self._session += 1
 
     def add(
@@ -165,11 +165,11 @@ class Journal:
         lost: tuple[str, ...] = (),
         survived: tuple[Survived, ...] = (),
     ) -> None:
-        """Keep what a task has measured; nothing where it has measured nothing."""
+        """Writes a task's samples and legs; does nothing if there are no samples."""
         if not len(record):
             return
         end_s = max((each.end_s for each in self._tasks), default=-PAUSE_S)
-        # Each run on the bench begins at its own zero of time.
+        # Each run on the bench has its own zero of time.
         shift_s = end_s + PAUSE_S - float(record.time_s[0])
         if shift_s:
             record = Record({**record.columns, "time_s": record.time_s + shift_s})
@@ -196,7 +196,7 @@ class Journal:
         self._write(file, segments)
 
     def recording(self) -> Recording:
-        """All that was measured."""
+        """Loads everything measured so far."""
         return Recording.load(self.folder)
 
     def _write(self, file: dict[str, Any], segments: list[dict[str, Any]]) -> None:
@@ -219,7 +219,7 @@ class Journal:
 
 
 def survived_in(folders: Iterable[Path]) -> tuple[str, ...]:
-    """A line for each file of these recordings that was measured in spite of something."""
+    """Returns one line for each file whose run tolerated faults."""
     found = []
     for folder in folders:
         if (folder / ABOUT_NAME).exists():
@@ -230,5 +230,5 @@ def survived_in(folders: Iterable[Path]) -> tuple[str, ...]:
 
 
 def tasks_of(recording: Recording) -> tuple[TaskEntry, ...]:
-    """The tasks of a calibration's recording; none for any other."""
+    """Returns the tasks of a calibration's recording; none for any other recording."""
     return _Notes.model_validate({"plan": {}, **recording.notes}).tasks if "plan" in recording.notes else ()

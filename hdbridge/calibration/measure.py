@@ -1,4 +1,4 @@
-"""A plan run on a bench, without compensation, into a journal."""
+"""Runs a plan on a bench, without compensation, into a journal."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ TELL_CYCLES = 50
 
 
 class Pace:
-    """How far a measurement is, counted in control cycles: one ask of `interrupted` each."""
+    """Progress of a measurement, counted in control cycles: a bench calls `interrupted` once per cycle."""
 
     def __init__(
         self,
@@ -33,7 +33,7 @@ class Pace:
         tell: Callable[[str, float, float], None],
         interrupted: Callable[[], bool],
     ) -> None:
-        """``tell`` receives what is going on, seconds done and seconds in all."""
+        """``tell`` receives the task's name, the seconds done and the seconds in all."""
         self.name = ""
         self.total_s = total_s
         self._done_s = 0.0
@@ -43,12 +43,12 @@ class Pace:
         self._cycles = 0
 
     def begin(self, name: str) -> None:
-        """Another task begins."""
+        """Starts a task."""
         self.name = name
         self._say()
 
     def interrupted(self) -> bool:
-        """What a bench asks in each cycle."""
+        """Counts a cycle and reports progress; returns the caller's ``interrupted()``."""
         self._cycles += 1
         if self._cycles >= TELL_CYCLES:
             self._say()
@@ -62,16 +62,16 @@ class Pace:
 
 @dataclass(frozen=True, slots=True)
 class Outlook:
-    """What is still to be run."""
+    """Remaining tasks of a plan."""
 
     tasks: tuple[Task, ...]
     duration_s: float
-    """Of the tasks, at an ideal axis."""
+    """Duration of the tasks on an ideal axis."""
     notes: tuple[str, ...]
 
 
 def outlook(plan: Plan, axis: AxisConfig, done: Sequence[str] | frozenset[str] = ()) -> Outlook:
-    """What a plan still asks of an axis; InputError where it would leave the limits."""
+    """Returns the remaining tasks of a plan on an axis; InputError if they would leave its limits."""
     view = axis_view(axis)
     fitted = plan.tasks(view)
     left = tuple(each for each in fitted.tasks if each.name not in set(done))
@@ -89,7 +89,7 @@ def start_journal(
     identity: Identity,
     notes: dict[str, Any] | None = None,
 ) -> Journal:
-    """A new journal, with what the plan had to give up on this axis in its notes."""
+    """Creates a journal; its notes list how the plan was shortened for this axis."""
     shortened = outlook(plan, axis).notes
     return Journal.create(
         folder,
@@ -108,16 +108,17 @@ def measure(
     progress: Callable[[str, float, float], None] = lambda *_: None,
     interrupted: Callable[[], bool] = lambda: False,
 ) -> None:
-    """Run what is left of the journal's plan on a booted drive.
+    """Runs the remaining tasks of the journal's plan on a booted drive.
 
-    ``progress`` receives the task's name, the seconds done and those in all. What a task had measured when it
-    was stopped (KeyboardInterrupt, `SafetyStop`, `DriveError`, `BusError`) is kept before that is passed on.
+    ``progress`` receives the task's name, the seconds done and those in all. If a task is stopped
+    (KeyboardInterrupt, `SafetyStop`, `DriveError`, `BusError`), its samples are kept before the error is
+    raised.
     """
     journal.check_is_of(drive.axis, drive.identity)
     left = outlook(journal.plan, drive.axis, journal.done)
     if not left.tasks:
         return
-    make_folder(journal.folder)  # a disk that cannot be written is noticed before the axis moves
+    make_folder(journal.folder)  # fails on an unwritable disk before the axis moves
     pace = Pace(left.duration_s, drive.axis.drive.cycle_s, progress, interrupted)
     bench = bench_on(drive, interrupted=pace.interrupted)
     journal.begin_session()

@@ -37,20 +37,19 @@ from hdbridge.procedures.path_test import PathRun, PathTest
 from hdbridge.procedures.rehearsal import rehearse
 
 LEAST_ARCSEC = 0.2
-"""Amplitude of an order from which it is looked at."""
+"""Minimum amplitude of the orders that are evaluated."""
 CHANCE = 1.05
 """Factor by which a ripple must be larger to count as larger."""
 FADED = 0.5
-"""Gain of the filter, as a share of the wanted one, below which an order counts as faded out."""
+"""Share of the wanted gain below which the filter no longer corrects an order."""
 RETUNED = (
     "the servo does not answer as it did when the response was measured (following lag {:.1f} ms then, "
     "{:.1f} ms now; the response differs by {:.0f} %): it was retuned, or the load changed; measure the "
     "response again"
 )
 TRIALS = 3
-"""Filters that are tried. The first one explores: it corrects what is not known as well. Each one uses the
-runs of those before it.
-"""
+"""Maximum number of filters tried, each based on the runs of those before it. The first one explores: it
+also corrects orders beyond the known frequency range."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,7 +65,7 @@ class OrderRipple:
 
 @dataclass(frozen=True, slots=True)
 class PathResult:
-    """Error on one path without correction, with that of rest, and with the filtered one."""
+    """Error on one path without correction, with the static one, and with the filtered one."""
 
     name: str
     none: PathError
@@ -88,7 +87,7 @@ class Ripple:
 
     @property
     def in_force_arcsec(self) -> float | None:
-        """Ripple with the filtered correction, or with that of rest if there is no filter."""
+        """Ripple with the filtered correction, or with the static one if there is no filter."""
         return self.static_arcsec if self.filtered_arcsec is None else self.filtered_arcsec
 
     @property
@@ -103,13 +102,13 @@ class Ripple:
 
     @property
     def removed_static_percent(self) -> float | None:
-        """Share of the ripple that the correction at rest removes."""
+        """Share of the ripple that the static correction removes."""
         return _removed(self.none_arcsec, self.static_arcsec)
 
 
 @dataclass(frozen=True, slots=True)
 class MotionTest:
-    """Ripple over speed, without correction, with that of rest, and with the filtered one."""
+    """Ripple over speed without correction, with the static one, and with the filtered one."""
 
     ripples: tuple[Ripple, ...]
     response: Response | None
@@ -119,7 +118,7 @@ class MotionTest:
 
     @property
     def helps_to_deg_s(self) -> float | None:
-        """Highest speed up to which the correction in force removes half of the ripple at least."""
+        """Highest speed up to which the correction in force removes at least half of the ripple."""
         reached = None
         for each in sorted(self.ripples, key=lambda one: one.speed_deg_s):
             removed = each.removed_in_force_percent
@@ -163,7 +162,7 @@ class MotionTest:
         return sum(shares) / len(shares)
 
     def as_dict(self) -> dict[str, Any]:
-        """The contract of ``hdbridge motion --json``: schema ``hdbridge.motion/1``."""
+        """Returns the document of ``hdbridge motion --json``, schema ``hdbridge.motion/1``."""
         return {
             "schema": "hdbridge.motion/1",
             "helps_to_deg_s": self.helps_to_deg_s,
@@ -187,7 +186,7 @@ class MotionTest:
 
     @classmethod
     def from_dict(cls, data: dict[str, Any]) -> MotionTest:
-        """Reads `as_dict`."""
+        """Restores a test from `as_dict`."""
         ripples = tuple(
             Ripple(
                 each["speed_deg_s"],
@@ -213,7 +212,7 @@ class MotionTest:
 
 
 def motion_test_s(axis: AxisConfig, runs: int = 2 + TRIALS) -> float:
-    """Longest duration of the test on an ideal axis."""
+    """Returns the longest duration of the test on an ideal axis."""
     view = axis_view(axis)
     middle = 0.5 * (axis.limits.position_min_deg + axis.limits.position_max_deg)
     paths_s = 3.0 * rehearse(PathTest(), view, middle).duration_s
@@ -228,11 +227,11 @@ def motion_test(
     progress: Callable[[str, float, float], None] = lambda *_: None,
     interrupted: Callable[[], bool] = lambda: False,
 ) -> MotionTest:
-    """Run a booted drive's axis at several speeds and on paths, without and with the model's correction.
+    """Runs a booted drive's axis at several speeds and on paths, without and with the model's correction.
 
-    With ``measure`` the response is measured, else the model's own is tested. A filter is kept only if it
-    leaves no more ripple than no correction at every speed, and no larger path error. InputError if the model
-    has no order that could be measured, and if the travel is too short.
+    With ``measure`` the response is measured, otherwise the model's own is tested. A filter is kept only if
+    at every speed it leaves no more ripple than no correction, and no larger path error. InputError if no
+    motor order of the model is large enough to measure, or if the travel is too short.
     """
     runner = _Runner(drive, model, progress, interrupted)
     gains = read_gains(drive.sdo) if isinstance(drive, Drive) else {}
@@ -254,7 +253,7 @@ def motion_test(
 
 
 def _ripple_test(runner: _Runner, model: TransmissionModel, measure: bool) -> MotionTest:
-    """The runs at constant speed."""
+    """Runs the constant-speed part of the test."""
     axis = runner.axis
     none = runner.run("without correction", model.only(()))
     static_model = replace(model, response=None)
@@ -310,7 +309,7 @@ def _tested(
     static: tuple[Harmonics, ...],
     limits: Limits,
 ) -> MotionTest:
-    """The test of the model's own response, which says if the servo does not answer so any more."""
+    """Tests the model's own response; remarks on it if the servo has changed since it was measured."""
     stored = model.response
     if stored is None:
         return MotionTest(_ripples(runner, none, static), None)
@@ -324,7 +323,7 @@ def _tested(
 
 
 class _Runner:
-    """Runs the speeds with one correction after the other."""
+    """Runs the procedures with a given correction."""
 
     def __init__(
         self,
@@ -347,20 +346,20 @@ class _Runner:
         self._pace = Pace(motion_test_s(axis), self.cycle_s, progress, interrupted)
 
     def run(self, name: str, model: TransmissionModel) -> tuple[Harmonics, ...]:
-        """The orders of each run with this model."""
+        """Runs all speeds with this model; returns the orders of each run."""
         self._pace.begin(name)
         bench = bench_on(self._drive, compensation_for(self.axis, model), interrupted=self._pace.interrupted)
         return tuple(harmonics(each, self.orders, self.ratio) for each in bench.run(self.procedure).outcome)
 
     def run_paths(self, model: TransmissionModel) -> tuple[PathRun, ...]:
-        """The paths with this model."""
+        """Runs the paths with this model."""
         self._pace.begin("path error")
         compensation = compensation_for(self.axis, model)
         return bench_on(self._drive, compensation, interrupted=self._pace.interrupted).run(PathTest()).outcome
 
 
 def motor_orders(model: TransmissionModel) -> list[MotorOrder]:
-    """The orders of the motor angle that the model corrects, by their number."""
+    """Returns the motor orders that the model corrects, by number, from `LEAST_ARCSEC` up."""
     series = [
         each
         for each in model.effects
@@ -399,7 +398,7 @@ def _ripples(
 def faded_orders(
     response: Response, orders: tuple[int, ...], speed_deg_s: float, ratio: float
 ) -> Iterator[int]:
-    """Motor orders that the filter does not correct at a speed."""
+    """Yields the motor orders that the filter does not correct at a speed."""
     cycle_s = response.cycle_ms / 1000.0
     for order in orders:
         hertz = float(order_hz(order, speed_deg_s, ratio))

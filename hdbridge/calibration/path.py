@@ -1,4 +1,4 @@
-"""Path errors: how far the load is off its path during a move and after it.
+"""Path errors: deviation of the load from its path during a move and after it.
 
 The motor lags behind its target, and the load winds the gear's spring up. Both would be the same on a gear
 without error. They are fitted to the runs as responses to the target, and taken out. The error of the gear
@@ -22,7 +22,7 @@ FloatArray = NDArray[np.float64]
 SETTLED_ARCSEC = 3.0
 """The load has settled once it stays this close to where it comes to rest."""
 AT_REST_S = 0.2
-"""End of the rest after a path over which the rest error is taken."""
+"""Length of the final part of the rest over which the rest error is taken."""
 
 
 LAGS = (0, 1, 2, 4, 8, 16, 32, 64)
@@ -45,7 +45,7 @@ class PathError:
 
 
 def path_errors(variants: Sequence[Sequence[PathRun]], ratio: float) -> list[list[PathError]]:
-    """Errors of the same paths run in several ways, the first one without correction.
+    """Returns the errors of the same paths run with several corrections, the first without one.
 
     The motor's response comes from the motor encoder of the first one, the wind-up from the others: in the
     first one the hysteresis hides it.
@@ -116,6 +116,6 @@ def _fit(columns: Sequence[FloatArray], values: Sequence[FloatArray]) -> FloatAr
 
 
 def _off(run: PathRun, encoder: str, turns: float) -> FloatArray:
-    """Encoder over ``turns``, minus the load target, arcsec."""
+    """Returns the encoder angle over ``turns``, minus the load target; arcsec, shape (n,)."""
     off = [getattr(each, encoder) / turns - each.load_target_deg for each in run.samples]
     return ARCSEC_PER_DEG * np.array(off)

@@ -1,4 +1,4 @@
-"""The whole calibration, from a booted drive to a pending model; and the same again from its folder."""
+"""Whole calibration, from a booted drive to a pending model, and its result read again from its folder."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ ACTIVE_NAME = "active.yaml"
 Progress = Callable[[str, float, float], None]
 
 
-@left_realtime()  # a fit takes its time; a bench goes back for each motion
+@left_realtime()  # fitting takes long; a bench resumes real-time priority for each motion
 def calibrate(
     drive: Drive | Rig,
     journal: Journal,
@@ -43,11 +43,11 @@ def calibrate(
     interrupted: Callable[[], bool] = lambda: False,
     tell: Callable[[str], None] = lambda _: None,
 ) -> Calibration:
-    """Measure what is missing, fit, validate, and propose the model to the profile.
+    """Measures the remaining tasks, fits, validates, and proposes the model to the profile.
 
     ``profile`` is the folder of axis.yaml; ``tell`` receives a line for each step. A model that does not
-    improve on data that it has not seen, or with which the axis points worse, is kept in the recording's
-    folder but not proposed.
+    improve on unseen data, or that makes the axis point worse, is saved in the recording's folder but not
+    proposed.
     """
     axis = drive.axis
     measure(drive, journal, progress=progress, interrupted=interrupted)
@@ -101,7 +101,7 @@ def calibrate(
 def proposed(
     profile: Path, model: TransmissionModel, reason: str, date: datetime, drive: Drive | Rig
 ) -> Offer:
-    """The model as pending; where it cannot be written, the figures are told nonetheless."""
+    """Makes the model pending; if it cannot be written, the offer's reason still states the figures."""
     try:
         return Offer(True, reason, propose(profile, model, reason, date, drive.identity))
     except OutputError as problem:
@@ -117,7 +117,7 @@ def conclude(
     axis: AxisConfig | None = None,
     independent_zeros: bool = False,
 ) -> Calibration:
-    """Fit recordings, by where they come from and in their order; no drive is needed.
+    """Fits recordings in the order given, keyed by their paths; needs no drive.
 
     With ``axis`` the model is bound to it.
     """
@@ -143,7 +143,7 @@ def conclude(
 
 
 def _lost(recordings: Mapping[Path, Recording]) -> Iterator[str]:
-    """A line for each channel that was lost while it was measured."""
+    """Yields one line for each channel that failed during a task."""
     tasks = [(task, path) for path, each in recordings.items() for task in tasks_of(each)]
     for key in dict.fromkeys(key for task, _ in tasks for key in task.lost):
         places = ", ".join(f"{path.name}/{task.file}" for task, path in tasks if key in task.lost)
@@ -151,7 +151,10 @@ def _lost(recordings: Mapping[Path, Recording]) -> Iterator[str]:
 
 
 def concluded(folder: Path) -> Calibration:
-    """The result of a calibration again, from its folder: refitted, with the validation as it was."""
+    """Restores the result of a calibration from its folder: refits it and reads the stored tests and offer.
+
+    InputError if the recording has no gear ratio, or if the stored result is damaged.
+    """
     recording = Recording.load(folder)
     if recording.ratio is None:
         raise InputError(f"{folder}: the recording names no gear ratio; fit it with 'hdbridge fit --ratio'")
@@ -168,7 +171,7 @@ def concluded(folder: Path) -> Calibration:
         offer = Offer(bool(data["offered"]), str(data["reason"]))
     except (ValueError, KeyError, TypeError, OSError):
         raise InputError(
-            f"{path}: is not what a calibration has written; restore it, or remove it and report without it"
+            f"{path}: not the result of a calibration; restore it, or remove it and report without it"
         ) from None
     return replace(result, validation=validation, motion=motion, offer=offer)
 
@@ -176,7 +179,7 @@ def concluded(folder: Path) -> Calibration:
 def active_model(
     profile: Path, axis: AxisConfig, drive: Drive | Rig, tell: Callable[[str], None] = lambda _: None
 ) -> TransmissionModel | None:
-    """The profile's active model, where it is this axis's and this drive's."""
+    """Returns the profile's active model if it belongs to this axis and drive, else None."""
     path = profile / "model.yaml"
     if not path.exists():
         return None
@@ -190,7 +193,7 @@ def active_model(
 
 
 def _kept(folder: Path, result: Calibration) -> Calibration:
-    """Result, model and what it was compared with, next to the recording that they come from."""
+    """Saves the result, the new model and the active one next to the recording."""
     with writing():
         result.model.save(folder / MODEL_NAME)
         if result.active:

@@ -1,4 +1,4 @@
-"""What a calibration says: the fit, the validation, and whether the model is offered for commit."""
+"""Result of a calibration: the fit, the validation, and the offer for commit."""
 
 from __future__ import annotations
 
@@ -19,39 +19,39 @@ __all__ = ["Calibration", "Offer", "Stepped"]
 
 @dataclass(frozen=True, slots=True)
 class Offer:
-    """Whether a model is offered for commit, and why."""
+    """Decision to offer a model for commit, with its reason."""
 
     made: bool
     reason: str
     pending: Path | None = None
-    """The file that waits to be committed."""
+    """File of the pending model."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Calibration:
-    """A calibration, or a fit of somebody's records (then without axis, validation and offer)."""
+    """Result of a calibration, or of a fit to recordings alone (then without validation and offer)."""
 
     recordings: tuple[str, ...]
     fit: FitResult
     model: TransmissionModel
-    """With its provenance."""
+    """Model, with its provenance."""
     active: TransmissionModel | None
-    """What it is compared with."""
+    """Model that it is compared with."""
     axis: str | None = None
     date: str | None = None
-    """When it was recorded, ISO 8601."""
+    """Date and time of the recording, ISO 8601."""
     plan: str | None = None
     shortened: tuple[str, ...] = ()
-    """What the plan had to give up on this axis."""
+    """How the plan was shortened for this axis, in words."""
     validation: Validation | None = None
     motion: MotionTest | None = None
-    """The test in motion, by which the response was measured; None if the plan has none."""
+    """Motion test, which measures the response; None if the plan has none."""
     drift: tuple[tuple[float, float], ...] = ()
-    """Time (s) and error (arcsec, the first is zero) at the reference pose each time."""
+    """Time (s) and error (arcsec, relative to the first) of each visit to the reference pose."""
     offer: Offer | None = None
 
     def as_dict(self) -> dict[str, Any]:
-        """The contract of ``--json``: schema ``hdbridge.calibration/1``."""
+        """Returns the document of ``--json``, schema ``hdbridge.calibration/1``."""
         fit, held_out = self.fit, self.fit.held_out
         return {
             "schema": "hdbridge.calibration/1",
@@ -138,5 +138,5 @@ class Calibration:
 
 
 def _number(value: float) -> float | None:
-    """JSON knows no infinity."""
+    """Returns the number; None if it is not finite, because JSON has no infinity."""
     return float(value) if math.isfinite(value) else None

@@ -1,4 +1,4 @@
-"""Does the axis point better with the new model? The stepping test with and without it."""
+"""Validation of a model: the stepping test with the model before and with the new one."""
 
 from __future__ import annotations
 
@@ -29,27 +29,27 @@ from hdbridge.records.recording import Recording
 from hdbridge.units import figure
 
 WINDOW_S = 0.06
-"""Over which the stepping test takes its mean at rest."""
+"""Averaging time of the stepping test at rest."""
 CHANCE = 2.0
-"""Standard errors by which a stepping test must be worse to count as worse."""
+"""Number of standard errors by which a stepping test must be worse to count as worse."""
 
 
 @dataclass(frozen=True, slots=True)
 class Stepped:
-    """A stepping test under one model."""
+    """Result of a stepping test with one model."""
 
     model: str
-    """Which, in words."""
+    """Description of the model."""
     cw: Scatter
     ccw: Scatter
     pooled: Scatter
     errors_arcsec: tuple[tuple[float, ...], tuple[float, ...]]
-    """Of each step, way there and way back."""
+    """Error of each step, outward and back."""
     targets_deg: tuple[tuple[float, ...], tuple[float, ...]]
 
     @classmethod
     def of(cls, model: str, outcome: SteppingOutcome) -> Stepped:
-        """From what the procedure gave."""
+        """Creates it from the procedure's outcome."""
         result = SchemeResult.of(outcome)
         return cls(
             model,
@@ -64,7 +64,7 @@ class Stepped:
         )
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain data, which `from_dict` reads back."""
+        """Returns plain data, which `from_dict` reads."""
         return {
             "model": self.model,
             **{
@@ -77,7 +77,7 @@ class Stepped:
 
     @classmethod
     def from_dict(cls, data: dict[str, Any]) -> Stepped:
-        """Read back."""
+        """Restores it from `as_dict`."""
         errors, targets = (
             (tuple(map(float, data[name][0])), tuple(map(float, data[name][1])))
             for name in ("errors_arcsec", "targets_deg")
@@ -90,9 +90,9 @@ class Stepped:
 
 
 def worse_ways(before: Stepped, after: Stepped) -> tuple[str, ...]:
-    """The directions in which a test scatters more after than before, by more than chance, in words.
+    """Describes each direction in which steps scatter significantly more after than before.
 
-    Both together may scatter less all the same.
+    The pooled scatter may be smaller nevertheless.
     """
     found = []
     for name, one, other, errors in (
@@ -107,40 +107,40 @@ def worse_ways(before: Stepped, after: Stepped) -> tuple[str, ...]:
 
 
 def _chance(steps: int) -> float:
-    """Factor by which a standard deviation of so many steps must be larger to count as larger.
+    """Returns the ratio above which a standard deviation from this number of steps is significantly larger.
 
-    Of n steps it is known to 1 / sqrt(2 n) of itself; two are compared.
+    The relative standard error of one is 1 / sqrt(2 n), that of the ratio of two 1 / sqrt(n).
     """
     return 1.0 + CHANCE / math.sqrt(max(steps, 1))
 
 
 @dataclass(frozen=True, slots=True)
 class Validation:
-    """The stepping test before and after, and what the axis could do at best."""
+    """Stepping test before and after, with the best possible result on the axis."""
 
     before: Stepped
     after: Stepped
     floor: Floor
     accuracy_before: AxisAccuracy | None = None
     accuracy_after: AxisAccuracy | None = None
-    """By the positioning test, where the plan has one."""
+    """Accuracy by the positioning test, if the plan has one."""
     survived: tuple[str, ...] = ()
-    """A line for each run that went on in spite of something."""
+    """One line for each run that tolerated faults."""
 
     @property
     def improves(self) -> bool:
-        """Whether the axis points no worse with the new model, by more than chance."""
+        """True if the axis does not point significantly worse with the new model."""
         worse = _chance(sum(map(len, self.after.errors_arcsec)))
         return self.after.pooled.three_sigma_arcsec <= worse * self.before.pooled.three_sigma_arcsec
 
     @property
     def worse(self) -> tuple[str, ...]:
-        """What got worse in one direction, in words."""
+        """Directions that became worse, in words."""
         return worse_ways(self.before, self.after)
 
     @property
     def summary(self) -> str:
-        """The result in one sentence: 3 sigma before and after, their ratio, and the floor."""
+        """Result in one sentence: 3 sigma before and after, their ratio, and the best possible."""
         before, after = (each.pooled.three_sigma_arcsec for each in (self.before, self.after))
         ratio = before / after if after <= before else after / before
         return (
@@ -149,7 +149,7 @@ class Validation:
         )
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain data, which `from_dict` reads back."""
+        """Returns plain data, which `from_dict` reads."""
         return {
             "before": self.before.as_dict(),
             "after": self.after.as_dict(),
@@ -167,7 +167,7 @@ class Validation:
 
     @classmethod
     def from_dict(cls, data: dict[str, Any]) -> Validation:
-        """Read back; the first calibrations measured no accuracy."""
+        """Restores it from `as_dict`; the oldest files have no accuracy."""
         floor = Floor(data["quantisation_floor_arcsec"], data["noise_floor_arcsec"])
         measured = data.get("accuracy", {})
         before, after = (_accuracy(measured.get(name)) for name in ("before", "after"))
@@ -183,21 +183,21 @@ class Validation:
 
 @dataclass(frozen=True, slots=True)
 class Floor:
-    """Three sigma of a stepping test on an axis whose gear is perfectly known, arcsec."""
+    """Best possible three sigma of a stepping test, with the gear perfectly known; arcsec."""
 
     quantisation_arcsec: float
-    """A motor target is a whole count."""
+    """Share of the motor encoder, because a motor target is a whole number of counts."""
     noise_arcsec: float
-    """How the load encoder at rest differs from one settled window to the next, and its count."""
+    """Share of the load encoder: its noise between settled windows, and its resolution."""
 
     @property
     def three_sigma_arcsec(self) -> float:
-        """Both together."""
+        """Root sum square of both."""
         return math.hypot(self.quantisation_arcsec, self.noise_arcsec)
 
 
 def floor_of(axis: AxisConfig, recording: Recording) -> Floor:
-    """The floor, from the axis's counts and its noise at rest as it was recorded."""
+    """Returns the best possible result, from the encoders' resolutions and the recorded noise at rest."""
     means = resting(recording, WINDOW_S)
     count = axis.load_encoder.resolution_arcsec / math.sqrt(12.0)
     noise = float(np.std(means)) if len(means) else 0.0
@@ -206,7 +206,7 @@ def floor_of(axis: AxisConfig, recording: Recording) -> Floor:
 
 
 def validation_s(plan: Plan, axis: AxisConfig) -> float:
-    """How long a plan's validation takes at an ideal axis."""
+    """Returns the duration of a plan's validation on an ideal axis."""
     view = axis_view(axis)
     stepping, positioning = plan.stepping(view), plan.positioning(view)
     each_s = rehearse(stepping, view, stepping.start_deg).duration_s
@@ -226,9 +226,9 @@ def validate(
     progress: Callable[[str, float, float], None] = lambda *_: None,
     interrupted: Callable[[], bool] = lambda: False,
 ) -> Validation:
-    """Step and position a booted drive's axis with the model before (None: none) and with the new one.
+    """Runs the stepping and positioning tests with the model before (None: none) and with the new one.
 
-    Each run's samples go to ``folder``, also when it is stopped.
+    ``drive`` is booted. The samples of each run go to ``folder``, even if it is stopped.
     """
     axis = drive.axis
     stepping = plan.stepping(axis_view(axis))
@@ -267,7 +267,7 @@ def validate(
 
 @contextmanager
 def record_kept(bench: ProcedureBench, path: Path) -> Iterator[None]:
-    """Write what the bench measures within, also when it is stopped."""
+    """Writes the bench's record to ``path`` on exit, even if the run is stopped."""
     try:
         yield
     finally:
@@ -279,7 +279,7 @@ def record_kept(bench: ProcedureBench, path: Path) -> Iterator[None]:
 
 
 def _accuracy(data: dict[str, Any] | None) -> AxisAccuracy | None:
-    """Read back what `AxisAccuracy.as_dict` gave."""
+    """Restores what `AxisAccuracy.as_dict` returned."""
     return (
         AxisAccuracy(**{name.removesuffix("_arcsec"): value for name, value in data.items()})
         if data

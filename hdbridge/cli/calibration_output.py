@@ -30,7 +30,7 @@ def print_calibration(result: Calibration) -> None:
     fit = result.fit
     before = (
         {(each.effect, each.parameter): each.before for each in diff(result.active, result.model)}
-        if (result.active)
+        if result.active
         else {}
     )
     table = Table(title=_title(result), title_justify="left")

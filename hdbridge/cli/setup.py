@@ -61,7 +61,7 @@ def setup(
     eds: Annotated[Path | None, typer.Option("--eds", metavar="FILE", help="The drive's EDS file.")] = None,
     plan: Annotated[
         str, typer.Option("--plan", metavar="quick|full|FILE", help="Plan of the calibration.")
-    ] = ("quick"),
+    ] = "quick",
     simulate: Annotated[
         bool, typer.Option("--simulate", help="Set up a simulated axis, a copy of the profile demo.")
     ] = False,

@@ -1,1 +1,1 @@
-"""The timed loop: one cycle, its clock and priority, the compensation, and the bench that runs procedures."""
+"""Timed control loop: bus cycle, clock and priority, compensation, and the bench for procedures."""

@@ -1,13 +1,13 @@
-"""One axis's share of the control cycle: what it measured, what is wrong with it, what it is told.
+"""One axis's part of the control cycle: feedback, fault judgement, and the RPDOs that answer it.
 
-`BusCycle` runs the period and brings the frames; here they are judged by the fault table, and the RPDO that
-follows is made. Nothing here waits or sends. An axis is
+`BusCycle` runs the period and delivers the frames; this module judges them by the fault table and makes the
+next RPDOs. Nothing here waits or sends. An axis is
 
-* *silent*: it gets no RPDO. Its TPDOs are taken when they come, and nothing about it is a fault. So it is
-  until `AxisCycle.begin`, after `AxisCycle.silence`, and from a reaction of `Reaction.LATCH` on.
+* *silent*: it gets no RPDO. TPDOs are accepted when they arrive, and nothing is judged as a fault. This is
+  the state before `AxisCycle.begin`, after `AxisCycle.silence`, and after a reaction of `Reaction.LATCH`.
 * *speaking*: it gets an RPDO in every period, its TPDOs are awaited, and everything is judged.
-* *stopped*: speaking, with a quick stop latched. The quick stop is sent until the motor stands, while the
-  other axes go on. When that is over, well or not, nobody waits for its TPDOs any more.
+* *stopped*: speaking, with a quick stop latched. The quick stop is sent until the motor stands still, while
+  the other axes continue. After that, or after its time-out, its TPDOs are no longer awaited.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ from hdbridge.drive.writes import drives_patience_s
 from hdbridge.errors import InputError, SafetyStop
 
 Target = int | None
-"""Motor counts for 607Ah; None for the last one once more."""
+"""Motor counts for 607Ah; None repeats the last one."""
 Command = Target | Callable[[Feedback], Target]
 
 STILL_CYCLES: Final = 3
-"""After a quick stop the motor has to keep its place for this many cycles to count as standing."""
+"""Cycles without motion after which the motor counts as standing still after a quick stop."""
 _ENABLED: Final = State.OPERATION_ENABLED
 _POWERED: Final = (State.OPERATION_ENABLED, State.QUICK_STOP_ACTIVE, State.FAULT_REACTION_ACTIVE)
 _STILL_DRIVEN: Final = (State.OPERATION_ENABLED, State.FAULT_REACTION_ACTIVE, State.UNKNOWN)
@@ -42,9 +42,9 @@ class AxisCycle:
     """One axis on a `BusCycle`; silent until `begin`.
 
     ``image`` gives the controlword (``image.power.go``) and the scaling; ``supervision`` holds the latch and
-    the list of faults; ``monitor`` may be shared with the boot-up. ``plausibility`` is by default what the
-    axis file allows. ``refused`` are the errors of a command that stop the axis as a bad target does; others
-    pass through the whole cycle, to the cost of the other axes.
+    the list of faults; ``monitor`` may be shared with the boot-up. ``plausibility`` defaults to the limits
+    of the axis file. Errors of a command that are in ``refused`` stop this axis, as a bad target does; any
+    others pass through the whole cycle and so affect the other axes.
     """
 
     __slots__ = (
@@ -71,32 +71,32 @@ class AxisCycle:
         self.name = name or axis.name
         self.monitor = monitor if monitor is not None else NetworkMonitor()
         self.command: Command = None
-        """The target in motor counts, None to hold the last one, or a function of the cycle's feedback that
-        gives either. It is used while the drive is enabled; before that the target is the actual position, so
-        that enabling moves nothing. It stays until another is set."""
+        """Target in motor counts, None to repeat the last one, or a function of the cycle's feedback
+        that returns either. It is used while the drive is enabled; before that the target is the
+        actual position, so that enabling causes no motion. It stays until another is set."""
         self.silent = True
-        """It gets no RPDO."""
+        """True while it gets no RPDO."""
         self.feedback = Feedback(
             -1, 0.0, image.statusword or 0, image.motor_counts, image.load_counts, image.demand_counts,
             image.torque_permille, False, image.readings,
         )  # fmt: skip
-        """Of the last turn; not fresh where it has none of its own."""
+        """Feedback of the last turn; stale if that turn had none."""
         self.patience_s = drives_patience_s(axis)
-        """For how long the drive waits for a silent master before it stops by itself."""
+        """Time without a frame of the master after which the drive stops on its own."""
         self.spoke_s = 0.0
-        """Begin of the last turn that gave it an RPDO, on the clock."""
+        """Clock time at the start of the last turn that sent it an RPDO."""
 
         # Between the bus and its axes:
         self.pending: list[tuple[Fault, str]] = []
-        """Faults of this turn that are not judged yet."""
+        """Faults of this turn that are not yet judged."""
         self.needed = 0
-        """Bits of the TPDOs that make a turn's feedback fresh."""
+        """Bits of the TPDOs without which a turn's feedback is stale."""
         self.awaited = False
-        """The turn waits for its TPDOs."""
+        """True if the turn waits for its TPDOs."""
         self.rested = True
-        """It begins with the next turn: what waited is not of it."""
+        """True until its first turn; frames that were queued before that do not count."""
         self.changed: Callable[[], None] = _nobody
-        """Called when it is to be treated otherwise from the next turn on."""
+        """Callback for a change of its identifiers or state that takes effect with the next turn."""
 
         self._traffic = Traffic(image, self.monitor, 0.0)
         self._plausibility = plausibility if plausibility is not None else Plausibility.of(axis)
@@ -112,7 +112,7 @@ class AxisCycle:
         self._stop_cycles = max(int(stop_timeout_s / axis.drive.cycle_s), STILL_CYCLES + 1)
 
     def begin(self) -> None:
-        """Speak from the next turn on; what came before, and how far the encoders moved, is not judged.
+        """Starts to speak with the next turn; earlier frames and encoder motion are not judged.
 
         After a `Reaction.LATCH` it stays silent unless the latch has been released.
         """
@@ -125,19 +125,19 @@ class AxisCycle:
         self.changed()
 
     def silence(self) -> None:
-        """Send nothing more to it from the next turn on, and judge nothing about it."""
+        """Stops sending to it and judging it, from the next turn on."""
         self.silent = True
         self.pending.clear()
         self._commanded = False
         self.changed()
 
     def reset(self, *, verified: bool = False) -> None:
-        """Release the latch (`Supervision.reset`); after a `Reaction.LATCH` it speaks again with `begin`."""
+        """Releases the latch (`Supervision.reset`); after a `Reaction.LATCH` also call `begin`."""
         self.supervision.reset(verified=verified)
 
     @property
     def riding(self) -> bool:
-        """A quick stop is being driven: the drive has not confirmed it, and the time for that is not over."""
+        """True while a quick stop is under way: neither confirmed by the drive nor timed out."""
         stop = self.supervision.stop
         if stop is None or self.supervision.reaction is Reaction.LATCH:
             return False
@@ -145,13 +145,13 @@ class AxisCycle:
 
     @property
     def confirmed(self) -> bool:
-        """After a quick stop: the drive has left 'operation enabled', and the motor stood."""
+        """True if, after a quick stop, the drive has left 'operation enabled' and the motor stood still."""
         stop = self.supervision.stop
         return stop is not None and stop is self._ridden and self._still >= STILL_CYCLES
 
     @property
     def stopped(self) -> SafetyStop | None:
-        """The latched stop in its own words; complete once `riding` is over. None while the axis may run."""
+        """Latched stop as an error, complete once `riding` is over; None while the axis may run."""
         supervision = self.supervision
         if supervision.stop is None:
             return None
@@ -170,30 +170,31 @@ class AxisCycle:
         return self._traffic.identifiers | self._channel_ids
 
     def route(self) -> tuple[tuple[int, ...], tuple[int, ...]]:
-        """Identifiers of the TPDOs that each turn needs, and of those of the channels that come with it.
+        """Returns the identifiers of the TPDOs that each turn needs, and of its channel TPDOs.
 
-        Settles whether the turns to come wait for them.
+        Also decides if the following turns wait for them.
         """
         self.awaited = not self.silent and (self.supervision.stop is None or self.riding)
         self._awaited_channels = self.image.awaited_channels()
         return self.image.tpdo_ids, tuple(self._awaited_channels)
 
     def start(self, now: float, count: int) -> None:
-        """Its first turn after `begin` starts."""
+        """Starts the first turn after `begin`; ``now`` is the clock time, ``count`` the cycle number."""
         self._traffic.heard_s = self.spoke_s = now
         self._good_cycle = count
 
     @property
     def powered(self) -> bool:
-        """The drive has power, or is on the way to it."""
+        """True if the drive has power or is being switched on."""
         power = self.image.power
         return power.aim is _ENABLED or power.state in _POWERED
 
     def stop_before_sync(self) -> Frames | None:
-        """RPDOs with a quick stop, if a fault that came before SYNC stops the axis; else None.
+        """Returns RPDOs with a quick stop if a fault noticed before SYNC stops the axis, else None.
 
-        A drive keeps the last RPDO until SYNC. If it has stopped on its own in between, the set-point in
-        there would set it in motion again. After a fault that latches the axis, no RPDO is sent at all.
+        A drive holds the last RPDO until SYNC. If it has stopped on its own in the meantime, the set-point
+        in that RPDO would set it in motion again. After a fault that latches the axis, no RPDO is sent at
+        all.
         """
         if max(ROWS[fault].first for fault, _ in self.pending) is not Reaction.QUICK_STOP:
             return None
@@ -201,7 +202,7 @@ class AxisCycle:
         return self.image.pack_rpdo_stop()
 
     def glance(self, frame: Frame) -> None:
-        """Look at a TPDO that is too early or too late to be used: has the drive dropped out?"""
+        """Checks the statusword of a TPDO that is too early or too late to be used."""
         word = self.image.statusword_in(frame.can_id, frame.data)
         if self._commanded and word is not None:
             self.image.power.observe(word)
@@ -210,7 +211,7 @@ class AxisCycle:
                 self._commanded = False
 
     def hear(self, frame: Frame) -> None:
-        """A frame of the axis that is not waited for: what it means."""
+        """Interprets a frame of the axis that is not awaited, and notes its faults."""
         can_id, data, _ = frame
         if can_id not in self._channel_ids:
             faults = list(self._traffic.faults(frame, commanded=self._commanded))
@@ -224,7 +225,7 @@ class AxisCycle:
             self.pending += faults
 
     def turn(self, now: float, count: int, time_s: float, complete: bool) -> Frames | None:
-        """One period is received, ``complete`` with every TPDO: judge it; the RPDOs, where they are to go."""
+        """Judges one period, ``complete`` if every TPDO arrived; returns the RPDOs to send, or None."""
         image, supervision = self.image, self.supervision
         self.spoke_s = now
         stop = supervision.stop
@@ -270,7 +271,7 @@ class AxisCycle:
         return data
 
     def listen(self, count: int, time_s: float, complete: bool) -> None:
-        """One period is over for an axis that is silent."""
+        """Ends one period of a silent axis."""
         image = self.image
         if self._channels:
             image.step_channels()
@@ -284,12 +285,12 @@ class AxisCycle:
             self.stale(count, time_s)
 
     def also(self, count: int, fault: Fault, detail: str) -> None:
-        """A fault that came of answering the turn, or after it."""
+        """Judges a fault that occurred while the turn was answered, or after it."""
         if self.supervision.also(count, fault, detail) is Reaction.LATCH:
             self._latch()
 
     def bus_down(self, count: int, time_s: float, detail: str) -> None:
-        """The interface failed somewhere in the turn."""
+        """Judges a failure of the interface during the turn."""
         if self.pending:
             self._judge(count)
         self.also(count, Fault.BUS_DOWN, detail)
@@ -297,7 +298,7 @@ class AxisCycle:
             self.stale(count, time_s)
 
     def stale(self, count: int, time_s: float) -> Feedback:
-        """Feedback of a cycle that has none of its own: the last good values."""
+        """Returns stale feedback with the last good values, for a cycle without its own."""
         image = self.image
         if self._last is not None:
             self.feedback = self._last._replace(cycle=count, time_s=time_s, fresh=False)
@@ -311,7 +312,7 @@ class AxisCycle:
     # ---------------------------------------------------------------- the parts of a turn
 
     def _react(self, count: int, data: Frames | None, before: Feedback) -> Frames | None:
-        """The rest of a turn in which something is wrong, or was in the last one."""
+        """Finishes a turn with a fault in this turn or the last."""
         power, stop = self.image.power, self.supervision.stop
         reaction = self._judge(count)
         if reaction is Reaction.QUICK_STOP:
@@ -332,13 +333,13 @@ class AxisCycle:
         return reaction
 
     def _latch(self) -> None:
-        """Set-points stop. Whatever comes next, it begins with a drive that nobody wants enabled."""
+        """Stops the set-points; the axis will start again with a drive that is not to be enabled."""
         self.image.power.quick_stop()
         if not self.silent:
             self.silence()
 
     def _step_channels(self) -> None:
-        """Hold what did not come, give up what stays away, and wait again for what is back."""
+        """Holds missing readings, gives up lost channels, and awaits those that are back."""
         image = self.image
         faults = image.step_channels()
         if faults or len(self._awaited_channels) < len(self._channel_ids):
@@ -347,7 +348,7 @@ class AxisCycle:
                 self.changed()
 
     def _believable(self, last: Feedback, count: int) -> bool:
-        """Whether the positions can follow from the last good ones; notes a following error as well."""
+        """Returns False if the positions contradict the last good ones; also notes a following error."""
         image, plausibility = self.image, self._plausibility
         motor = image.motor_counts
         cycles = count - self._good_cycle
@@ -368,21 +369,21 @@ class AxisCycle:
         self.pending.append((Fault.DRIVE_FAULT if fault else Fault.DROPPED_OUT, detail))
 
     def _idle(self) -> Frames:
-        """The RPDOs with the actual position as target."""
+        """Returns the RPDOs with the actual position as target."""
         try:
             return self.image.pack_rpdo_idle()
         except InputError:
-            # It does not fit the target object. The drive is not enabled or is told to stop: it ignores it.
+            # It does not fit the target object. The drive ignores it: it is not enabled, or is being stopped.
             return self.image.pack_rpdo_held()
 
     # ---------------------------------------------------------------- a quick stop, turn by turn
 
     def _over(self) -> bool:
-        """Whether the latched quick stop has been driven to its end."""
+        """Returns True if the latched quick stop is confirmed or timed out."""
         return self._still >= STILL_CYCLES or self._left == 0
 
     def _note(self, stop: Event | None) -> None:
-        """A stop has been latched since the last turn, or released."""
+        """Notes that a stop was latched or released since the last turn."""
         self._ridden = stop
         self._still, self._left = 0, self._stop_cycles
         if stop is not None:
@@ -390,7 +391,7 @@ class AxisCycle:
         self.changed()
 
     def _ride(self, before: Feedback) -> None:
-        """One turn of the quick stop is over."""
+        """Counts one turn of the quick stop."""
         if self._over():
             return
         feedback = self.feedback
@@ -403,4 +404,4 @@ class AxisCycle:
 
 
 def _nobody() -> None:
-    """It is on no bus yet."""
+    """Does nothing: the axis is on no bus yet."""

@@ -1,7 +1,6 @@
-"""The bench: runs procedures on a drive, real or simulated, and keeps what was measured.
+"""Bench: runs procedures on a drive, real or simulated, and records the measurements.
 
-The same code and the same procedures run on both. What differs is the bus and the clock, which come in with
-the drive.
+The same code and procedures run on both; only the bus and the clock of the drive differ.
 """
 
 from __future__ import annotations
@@ -43,7 +42,7 @@ _AT_REST = Moment()
 
 
 class _Leg(NamedTuple):
-    """One move of a procedure as it was run; a `Segment` is made of it when there is time."""
+    """One move of a procedure as it was run; converted to a `Segment` after the run."""
 
     kind: str
     start_s: float
@@ -52,15 +51,15 @@ class _Leg(NamedTuple):
 
 @dataclass(frozen=True)
 class Run(Recording, Generic[Outcome]):
-    """The recording of a procedure that has run, and what the procedure gave."""
+    """Recording of a procedure that has run, with its outcome."""
 
     outcome: Outcome = field(kw_only=True)
     survived: tuple[Survived, ...] = field(default=(), kw_only=True)
-    """Faults that the supervision let pass."""
+    """Faults that the supervision tolerated."""
 
 
 def known_on_line(axis: AxisConfig) -> frozenset[Channel]:
-    """The channels that `Bench` passes to the effects in each cycle."""
+    """Returns the channels that `Bench` passes to the effects in each cycle."""
     known = {each for each in Channel if each.axis_key in {"", *axis.channels}}
     return frozenset(known - ({Channel.MOTOR_TORQUE} if TORQUE_ACTUAL in layouts(axis).absent else set()))
 
@@ -73,9 +72,9 @@ def walk(
     place_deg: Callable[[], float],
     leg: Callable[[Move, Path], Sequence[Sample]],
 ) -> Outcome:
-    """The procedure's legs, one after the other; between two there is no time to lose.
+    """Runs the legs of a procedure in sequence, without a pause between two; returns its outcome.
 
-    ``place_deg`` tells where the load target stands; ``leg`` runs a move on its path for its samples.
+    ``place_deg`` returns the present load target; ``leg`` runs a move along its path and returns its samples.
     """
     done_s = 0.0
     steps = procedure.moves(view)
@@ -93,7 +92,7 @@ def walk(
 
 
 def record_of(samples: Sequence[Sample], axis: AxisConfig) -> Record:
-    """The record of a bench's samples, without a channel that was lost on the way."""
+    """Returns the record of a bench's samples, without the channels that failed during the run."""
     names = Sample._fields[:-1]
     table = np.array([row[:-1] for row in samples], dtype=np.float64).reshape(-1, len(names))
     columns = dict(zip(names, table.T, strict=True))
@@ -108,12 +107,12 @@ def record_of(samples: Sequence[Sample], axis: AxisConfig) -> Record:
 
 
 def lost_channels(axis: AxisConfig, record: Record) -> tuple[str, ...]:
-    """The axis file's keys of the channels that a record of `Bench` does without."""
+    """Returns the axis file's keys of the channels that a record of `Bench` lacks."""
     return tuple(key for key in axis.channels if BY_KEY[key].value not in record.columns)
 
 
 def axis_view(axis: AxisConfig) -> AxisView:
-    """What a procedure may know of its axis."""
+    """Returns the properties of the axis that procedures may use."""
     limits = axis.limits
     return AxisView(
         axis.gear.ratio,
@@ -128,10 +127,10 @@ def axis_view(axis: AxisConfig) -> AxisView:
 
 
 def compensation_for(axis: AxisConfig, model: TransmissionModel) -> Compensation:
-    """The model's inverse with the caps of the axis file, at the axis's cycle.
+    """Returns the model's inverse with the caps of the axis file, at the axis's cycle.
 
-    InputError for a model of another gear, axis or drive than the axis file's, and where an effect needs what
-    the control loop does not know.
+    InputError if the model is bound to another gear, axis or drive, or if an effect needs a channel that the
+    control loop does not have.
     """
     model.check_bound_to(axis)
     for name, channels in unmet(compensable(model.effects), known_on_line(axis)).items():
@@ -148,11 +147,11 @@ def compensation_for(axis: AxisConfig, model: TransmissionModel) -> Compensation
 
 
 class Bench:
-    """A drive in cyclic position mode, with or without compensation.
+    """Drive in cyclic position mode, with or without compensation.
 
-    Power is on only while a procedure runs: `run` enables the drive where it stands, and on every way out
-    brings it to rest and disables it, so that there is time for files between two procedures. The
-    compensation is ramped in from the start of each.
+    Power is on only while a procedure runs: `run` enables the drive at standstill, and always brings it to
+    rest and disables it at the end, so that files can be written between two procedures. The compensation is
+    ramped in at the start of each.
     """
 
     def __init__(
@@ -162,9 +161,9 @@ class Bench:
         *,
         interrupted: Callable[[], bool] = lambda: False,
     ) -> None:
-        """A model compensates as `compensation_for` makes it, and is refused (InputError) where that refuses.
+        """Prepares the bench; a model is converted by `compensation_for`, with its InputErrors.
 
-        ``interrupted`` is asked in each cycle; a yes stops the axis (KeyboardInterrupt).
+        ``interrupted`` is called in each cycle; True stops the axis (KeyboardInterrupt).
         """
         axis = drive.axis
         if compensation is None:
@@ -190,7 +189,7 @@ class Bench:
         self._sensed = Sensed(axis)
         self._place = 0.0
         self._most = math.inf
-        """Samples of a leg; where there are more, the first half goes."""
+        """Maximum number of samples of a leg; beyond it the first half is dropped."""
         self._measured: list[list[Sample]] = []
         self._legs: list[_Leg] = []
         self._watch = Watch(self.supervision, 0)
@@ -202,17 +201,16 @@ class Bench:
         *,
         keep_s: float = math.inf,
     ) -> Run[Outcome]:
-        """Run one procedure to its end; ``progress`` receives the share done after each leg.
+        """Runs one procedure to its end; ``progress`` receives the share done after each leg.
 
-        Of a leg that lasts longer than ``keep_s`` at least the last so many seconds are kept, at most twice
-        as many: for one that holds the axis for hours.
+        ``keep_s`` limits the samples of a leg that holds the axis for hours: at least its last ``keep_s``
+        seconds are kept, at most twice as many.
 
-        Refused with InputError, before anything moves, where the procedure would leave the axis's limits, and
-        where the compensation's model is of another gear, axis or drive.
-        Raises SafetyStop when the supervision stops the axis, KeyboardInterrupt when it was interrupted; the
-        record up to then is `record`.
+        InputError, before anything moves, if the procedure would leave the axis's limits or if the
+        compensation's model is bound to another gear, axis or drive. SafetyStop if the supervision stops the
+        axis, KeyboardInterrupt if interrupted; `record` then returns the samples up to the stop.
         """
-        # Every motion with a model begins here. What the drive answered counts, not only its axis file.
+        # Every motion with a model begins here: check it against the connected drive, not only the axis file.
         self._compensation.model.check_bound_to(self._drive.axis, self._drive.identity)
         standing_deg = self._drive.read_positions().motor_deg / self.view.ratio
         rehearsal = rehearse(procedure, self.view, standing_deg)
@@ -242,12 +240,12 @@ class Bench:
     def _powered(
         self, procedure: Procedure[Outcome], rehearsal: Rehearsal, progress: Callable[[float], None]
     ) -> Outcome:
-        """The procedure, from power on to power off."""
+        """Runs the procedure, from power on to power off."""
         self._enable()
         try:
             outcome = walk(procedure, self.view, rehearsal, progress, lambda: self._place, self._leg)
         except SafetyStop:
-            raise  # the drive stands, or stops by itself; the latch stays
+            raise  # the drive stands still, or stops on its own; the latch stays
         except BaseException:
             with suppress(HdbridgeError):
                 self._image.power.quick_stop()
@@ -258,7 +256,7 @@ class Bench:
         return outcome
 
     def _tell_end(self) -> None:
-        """What happened within the cycle is told when the axis rests: the cycle itself tells nothing."""
+        """Logs the events of the run, once the axis is at rest: the cycle itself does not log."""
         nodes = self._drive.monitor.nodes.values()
         facts = {
             "samples": sum(len(each) for each in self._measured),
@@ -269,25 +267,25 @@ class Bench:
         _log.info("run ended", {name: value for name, value in facts.items() if value})
 
     def record(self) -> Record:
-        """What the present procedure has measured so far.
+        """Returns the samples of the present procedure so far.
 
-        A channel that was lost on the way is left out: what was held would pass for measured.
+        A channel that failed during the run is left out, because held values would look like measurements.
         """
-        # Made into arrays only here: between two legs there is no time for it on a real bus.
+        # Converted to arrays only here: on a real bus there is no time for it between two legs.
         return record_of([sample for samples in self._measured for sample in samples], self._image.axis)
 
     @property
     def legs(self) -> tuple[Segment, ...]:
-        """The moves that the present procedure has run so far."""
+        """Moves that the present procedure has run so far."""
         return tuple(Segment(kind=each.kind, start_s=each.start_s, end_s=each.end_s) for each in self._legs)
 
     @property
     def survived(self) -> tuple[Survived, ...]:
-        """What the present procedure has gone on in spite of so far; the fault that stopped it included."""
+        """Faults tolerated by the present procedure so far, and the one that stopped it."""
         return self._watch.survived(self.cycle.skipped)
 
     def _enable(self) -> None:
-        """Enable the drive by PDO, standing still, and begin from where it stands."""
+        """Enables the drive by PDO at standstill, and starts from its position."""
         self._drive.enable()
         self.cycle.restart()
         feedback = until_enabled(self.cycle.tick, self._image.power, self.cycle.period_s)
@@ -309,7 +307,7 @@ class Bench:
         self._compensation.engage()
 
     def _await_channels(self, feedback: Feedback) -> Feedback:
-        """Stand until every channel of the axis file has told something."""
+        """Waits at standstill until every channel of the axis file has a reading; else DriveError."""
         image, period_s = self._image, self.cycle.period_s
         rarest = max((each.every_cycles for each in image.axis.channels.values()), default=0)
         for _ in range(math.ceil(ENABLE_TIMEOUT_S / period_s) + 2 * rarest):
@@ -327,7 +325,7 @@ class Bench:
         )
 
     def _leg(self, move: Move, path: Path) -> Sequence[Sample]:
-        """One move, cycle by cycle, from where the load target stands."""
+        """Runs one move, cycle by cycle, from the present load target; returns its samples."""
         samples: list[Sample] = []
         tick, image, interrupted = self.cycle.tick, self._image, self._interrupted
         command, hold, counts_for = (
@@ -342,7 +340,7 @@ class Bench:
         compensation, sensed = self._compensation, self._sensed
         needs, has_channels = bool(compensation.needs), bool(image.channels)
         target_deg, most = self._place, self._most
-        # Counted in cycles that were run, not in clock time: a period that was skipped must not make the
+        # Counted in completed cycles, not in clock time: a skipped period must not make the
         # target jump ahead.
         elapsed_s = 0.0
 
@@ -392,7 +390,7 @@ class Bench:
                 self._legs.append(_Leg(move.kind, samples[0].time_s, samples[-1].time_s))
 
     def _rest(self) -> None:
-        """Wait for the drive to stand with power off or in quick stop, then disable it."""
+        """Waits until the drive stands still with power off or in quick stop, then disables it."""
         power = self._image.power
         for _ in range(math.ceil(STOP_TIMEOUT_S / self.cycle.period_s)):
             before = self._image.motor_counts

@@ -1,25 +1,24 @@
-"""The control cycle of one bus: one thread, absolute deadlines, the same order in every period.
+"""Control cycle of one bus: one thread, absolute deadlines, the same order in every period.
 
-    wait - drain - stop what must not run on - SYNC - receive - check - RPDOs - heartbeat
+    wait - drain - stop before SYNC - SYNC - receive - check - RPDOs - heartbeat
 
-* *drain*: what waited since the last cycle is not of this one. Heartbeats and emergencies are noted, TPDOs
-  are stale and thrown away, after a look at their statusword.
-* *stop*: a drive puts its last RPDO into force with SYNC, whatever happened in between. So before the first
-  SYNC, after a stall of this process that a drive does not wait out, and after a fault that stops an axis,
-  that RPDO is replaced by one with a quick stop. Drives of silent axes are put into PRE-OPERATIONAL instead.
-* *receive*: until every TPDO of every axis is there, or the window closes. The newest of each identifier
-  wins. Those of the optional channels are waited for when they come with every SYNC and are not lost, else
-  taken when they come.
+* *drain*: frames queued since the last cycle do not belong to this one. Heartbeats and emergencies are noted;
+  TPDOs are stale and are discarded after a check of their statusword.
+* *stop*: a drive puts its last RPDO into force with SYNC, whatever happened in between. That RPDO is
+  therefore replaced by a quick stop before the first SYNC, after a stall of this process beyond the drive's
+  time-out, and after a fault that stops an axis. Drives of silent axes are put into PRE-OPERATIONAL instead.
+* *receive*: until every TPDO of every axis has arrived, or the window closes. The newest of each identifier
+  wins. Those of the optional channels are awaited if they come with every SYNC and are not lost; otherwise
+  they are accepted whenever they arrive.
 * *check*: axis by axis, by the fault table of `hdbridge.drive.supervision`.
-* *RPDOs*: with this cycle's feedback already in them; each is sent before the next axis is looked at.
-* *heartbeat*: the master's own comes from this loop and nowhere else, so that a loop that hangs is noticed
-  by the drives.
+* *RPDOs*: made from this cycle's feedback; each is sent before the next axis is checked.
+* *heartbeat*: the master's heartbeat is sent only by this loop, so that the drives notice a loop that hangs.
 
-A fault of one axis stops that axis and no other (`hdbridge.control.axiscycle`); a fault of the bus concerns
-all. A period that begins more than half a period late is given up, with those behind it: the next SYNC comes
-on the next whole period. SYNCs are never sent closer than half a period.
+A fault of one axis stops only that axis (`hdbridge.control.axiscycle`); a fault of the bus affects all. If a
+period begins more than half a period late, it is skipped with those after it that are past, and the next
+SYNC comes at the next whole period. SYNCs are never closer together than half a period.
 
-This is the one place where speed comes before looks: no logging, no SDO, no allocation that can be avoided.
+This is the one module in which speed comes before looks: no logging, no SDO, no avoidable allocation.
 """
 
 from __future__ import annotations
@@ -42,26 +41,27 @@ from hdbridge.drive.traffic import bus_faults
 from hdbridge.errors import BusError
 
 WINDOW: Final = 0.8
-"""Share of the period after SYNC in which the TPDOs must arrive; the rest is for the RPDOs to get through."""
+"""Share of the period after SYNC in which the TPDOs must arrive; the rest is for sending the RPDOs."""
 LATE: Final = 0.5
-"""Share of the period by which a cycle may begin late before it is given up."""
+"""Share of the period by which a cycle may begin late before it is skipped."""
 SPARE: Final = 0.1
-"""Share of the period before the next SYNC in which nothing is sent for others."""
+"""Share of the period, before the next SYNC, in which no frames of ``outgoing`` are sent."""
 DRAIN_MAXIMUM: Final = 256
-"""Frames read before SYNC; at 1 Mbit/s a full bus brings at most 220 in 10 ms."""
+"""Maximum number of frames read before SYNC; a full bus at 1 Mbit/s delivers at most 220 in 10 ms."""
 FLUSH_MAXIMUM: Final = 10_000
-"""Frames thrown away when the cycle begins."""
+"""Maximum number of queued frames discarded when the cycle begins."""
 _CLOCK_STEP_S: Final = 1e-6
-"""Rounding of times, which are sums of periods."""
+"""Tolerance for the rounding of times that are sums of periods."""
 _HEARTBEAT_DATA: Final = bytes([NmtState.OPERATIONAL])
 
 
 class BusCycle:
     """Runs the axes of one bus over a link, one `exchange` per period.
 
-    ``on_frame`` is given every frame that is no PDO of the cycle: SDO answers, heartbeats, emergencies.
-    ``outgoing`` is asked once per turn, when everything of the cycle is sent, for one more frame to send.
-    Both may be set at any time. They run within the cycle, so they must be quick, and raise nothing.
+    ``on_frame`` receives every frame that is not a PDO of the cycle: SDO answers, heartbeats, emergencies.
+    ``outgoing`` is called once per turn, after all frames of the cycle are sent, and returns one more frame
+    to send, or None. Both may be set at any time. They run within the cycle, so they must be quick and must
+    not raise.
     """
 
     __slots__ = (
@@ -122,30 +122,30 @@ class BusCycle:
         self.on_frame = on_frame
         self.outgoing = outgoing
         self.axes: tuple[AxisCycle, ...] = ()
-        """In the order in which they are answered."""
+        """Axes in the order in which they are answered."""
         self.histogram = Histogram()
-        """How late each period began."""
+        """Lateness of the start of each period."""
         self.overruns = 0
-        """Cycles that were given up for lateness."""
+        """Number of cycles that were skipped because they began too late."""
         self.skipped = 0
-        """Whole periods without a SYNC."""
+        """Number of whole periods without a SYNC."""
         self.refused = 0
-        """Frames of ``outgoing`` for which there was no room; they are dropped."""
+        """Number of frames of ``outgoing`` that were dropped because the transmit buffer was full."""
 
         self.count = -1
         """Number of the last period; skipped periods are counted."""
         self.woke_s = clock.now()
-        """When the last turn began, on the clock."""
+        """Clock time at which the last turn began."""
         self.due_s = self.woke_s
-        """When it was due."""
+        """Clock time at which it was due."""
         self.late_s = 0.0
-        """How late it began."""
+        """Lateness of the last turn."""
         self.busy_s = 0.0
-        """From there to its end."""
+        """Duration of the last turn."""
         self.faults: list[tuple[Fault, str]] = []
-        """What was wrong with the bus itself in the last turn; each speaking axis has judged it as well."""
+        """Faults of the bus itself in the last turn; each speaking axis has judged them as well."""
         self.down: str | None = None
-        """How the interface failed in the last turn, or None."""
+        """Failure of the interface in the last turn, in words; None if there was none."""
 
         self._window_s = WINDOW * period_s
         self._late_s = LATE * period_s
@@ -167,29 +167,29 @@ class BusCycle:
 
     @property
     def bus_load(self) -> float:
-        """Share of the period that the last turn's frames took at worst; NaN where no bit rate was given.
+        """Worst-case share of the period that the last turn's frames took; NaN if the bit rate is not known.
 
-        A frame that was awaited counts even if it did not come.
+        An awaited frame counts even if it did not arrive.
         """
         return self._bits_of_turn * self._per_bit
 
     def join(self, axis: AxisCycle) -> None:
-        """Take an axis on the bus; it is silent until its ``begin``. Not within a turn.
+        """Adds an axis, which stays silent until its ``begin``. Must not be called within a turn.
 
-        InputError where an identifier of it is another axis's, or where it needs another cycle or master.
+        InputError if another axis uses one of its identifiers, or if it needs another cycle or master.
         """
         check_members((*self.axes, axis), self.period_s)
         self._take_axes((*self.axes, axis))
 
     def leave(self, axis: AxisCycle) -> None:
-        """Forget an axis: its frames are those of a stranger from now on. Not within a turn."""
+        """Removes an axis; its frames are then treated as foreign. Must not be called within a turn."""
         self._take_axes(tuple(each for each in self.axes if each is not axis))
 
     def restart(self) -> None:
-        """Begin anew at the next `exchange`, at once; the numbers of the cycles go on.
+        """Restarts at once with the next `exchange`, after a pause; the cycle numbers continue.
 
-        For when the cycle has rested: what arrived meanwhile, and how far the encoders moved, is not judged.
-        The latches and the histogram stay, and who is silent.
+        Frames and encoder motion during the pause are not judged. Latches, the histogram and the silent axes
+        stay.
         """
         self._deadline: float | None = None
         self._rested = self._interrupted = True
@@ -198,18 +198,18 @@ class BusCycle:
                 axis.begin()
 
     def relink(self, link: Link) -> None:
-        """Go on with another link, on a bus that was opened anew after the last one failed.
+        """Continues on another link, after the bus failed and was reopened.
 
-        The axes stay latched: each has to be verified, released (`AxisCycle.reset`) and begun.
+        The axes stay latched: each must be verified, released (`AxisCycle.reset`) and begun.
         """
         fast = fast_link(link)
         self._send, self._recv, self._dropped = fast.send, fast.recv, fast.dropped
         self.restart()
 
     def exchange(self) -> None:
-        """Run one period for all axes; what came of it is in each axis and here.
+        """Runs one period for all axes; results are in each axis and in this object.
 
-        It raises nothing of the bus or the axes: a failure is latched in the axes that it concerns.
+        Errors of the bus or the axes are not raised but latched in the axes that they affect.
         """
         now = self._wait()
         count = self.count
@@ -237,7 +237,7 @@ class BusCycle:
                     try:
                         self._send(*frame)
                     except TransmitBufferFull as error:
-                        # Stale set-points are worse than none: it is not sent again, and the axes stop.
+                        # A stale set-point is worse than none: it is not resent, and the axes stop.
                         self._no_room(f"RPDO: {error}")
             for axis in self._listening:
                 axis.listen(count, time_s, got & axis.needed == axis.needed)
@@ -252,7 +252,7 @@ class BusCycle:
     # ---------------------------------------------------------------- the parts of a turn
 
     def _wait(self) -> float:
-        """Sleep to the next deadline, skipping whole periods when it is long past; the time then."""
+        """Sleeps until the next deadline, skipping periods that are past; returns the clock time."""
         clock, deadline, period_s = self.clock, self._deadline, self.period_s
         self.count += 1
         if self.faults:
@@ -283,7 +283,7 @@ class BusCycle:
         self._everybody(Fault.OVERRUN, f"by {1e3 * late_s:.1f} ms, periods skipped: {missed}")
 
     def _stop_before_sync(self) -> None:
-        """Replace the set-points that SYNC must not put into force any more."""
+        """Replaces set-points that must not come into force with the next SYNC."""
         send, now = self._send, self.clock.now()
         for axis in self._speaking:
             if now - axis.spoke_s >= axis.patience_s - _CLOCK_STEP_S and axis.powered:
@@ -303,19 +303,19 @@ class BusCycle:
                         send(*frame)
 
     def _note_hang(self, axis: AxisCycle, silence_s: float) -> None:
-        """This process was silent for longer than a drive under power waits."""
+        """Notes that this process was silent for longer than the time-out of a powered drive."""
         hang = (Fault.HANG, f"{1e3 * silence_s:.0f} ms; the drive waits {1e3 * axis.patience_s:.0f} ms")
         axis.pending.insert(0, hang)
         if all(fault is not Fault.HANG for fault, _ in self.faults):
             self.faults.append(hang)
 
     def _drain(self, now: float) -> bool:
-        """Read what waited; whether that was all of it."""
+        """Reads the queued frames; returns False if there are too many."""
         recv, slots = self._recv, self._slots
         self._early = 0
         most = DRAIN_MAXIMUM
         if self._rested:
-            # Whatever waited is old news.
+            # After a pause all queued frames are stale.
             most = FLUSH_MAXIMUM
             self._heartbeat_s = now
         for _ in range(most):
@@ -341,7 +341,7 @@ class BusCycle:
         return True
 
     def _before_sync(self, frame: Frame, slot: Slot) -> None:
-        """A TPDO out of its window: stale, unless nobody waits for it."""
+        """Handles a TPDO before SYNC: stale if it is awaited, else accepted."""
         bit, accept, axis = slot
         if axis.awaited:
             if not axis.rested:
@@ -356,7 +356,7 @@ class BusCycle:
         self._early |= bit
 
     def _receive(self, window_end_s: float) -> int:
-        """Take this cycle's TPDOs until all are there or the window closes; the bits of those that came."""
+        """Reads this cycle's TPDOs until all have arrived or the window closes; returns their bits."""
         recv, slots, awaited = self._recv, self._slots, self._awaited
         got = self._early
         spoilt: dict[int, int] | None = None
@@ -391,11 +391,11 @@ class BusCycle:
         return got
 
     def _note_missing(self, got: int, spoilt: dict[int, int]) -> None:
-        """What did not come, or came with the wrong length, is a fault of the axis that waits for it."""
+        """Notes missing TPDOs and those of the wrong length as faults of the axis that awaits them."""
         for can_id, length in spoilt.items():
             bit, _, axis = self._slots[can_id]
             if axis.awaited:
-                # A fault of the axis only where no good one of that identifier came and it is needed.
+                # The axis has a fault only if it needs that TPDO and no valid one arrived.
                 fault = Fault.WRONG_LENGTH if bit & axis.needed & ~got else Fault.DISCARDED_FRAME
                 expected = axis.image.length_of(can_id)
                 axis.pending.append((fault, f"{can_id:03X}h with {length} bytes, expected {expected}"))
@@ -411,7 +411,7 @@ class BusCycle:
                     axis.pending.append((Fault.LOST_TPDO, ", ".join(lost)))
 
     def _other(self, frame: Frame) -> None:
-        """A frame that is not waited for: what it means, and to whom."""
+        """Passes a frame that is not awaited to its axis and to ``on_frame``, and notes bus faults."""
         self._bits_of_turn += FRAME_BITS[len(frame.data)]
         axis = self._listeners.get(frame.can_id)
         if axis is not None:
@@ -424,7 +424,7 @@ class BusCycle:
             self.on_frame(frame)
 
     def _heartbeat(self, now: float) -> None:
-        """The master's heartbeat, when it is due; one that was missed is not made up for."""
+        """Sends the master's heartbeat when it is due; a missed one is not made up for."""
         self._heartbeat_s += self._heartbeat_period_s
         if self._heartbeat_s <= now:
             self._heartbeat_s = now + self._heartbeat_period_s
@@ -435,7 +435,7 @@ class BusCycle:
             self._no_room(f"heartbeat: {error}")
 
     def _send_for_others(self, outgoing: Callable[[], tuple[int, bytes] | None]) -> None:
-        """One frame that is not of the cycle, while there is time for it before the next SYNC."""
+        """Sends one frame of ``outgoing`` if there is time before the next SYNC."""
         if self.clock.now() > self.woke_s + (1.0 - SPARE) * self.period_s:
             return
         frame = outgoing()
@@ -450,14 +450,14 @@ class BusCycle:
     # ---------------------------------------------------------------- faults of the bus
 
     def _everybody(self, fault: Fault, detail: str) -> None:
-        """A fault of the bus that is noticed before the axes are answered."""
+        """Notes a bus fault, for all axes, before they are answered."""
         self.faults.append((fault, detail))
         for axis in self._speaking:
             if not axis.rested:
                 axis.pending.append((fault, detail))
 
     def _no_room(self, detail: str) -> None:
-        """A frame of the cycle did not get out: those that are answered stop with the next turn."""
+        """Notes an unsent frame of the cycle; axes that were already answered stop with the next turn."""
         self.faults.append((Fault.TRANSMIT_FULL, detail))
         for axis in self._speaking:
             if axis.feedback.cycle == self.count:
@@ -488,11 +488,11 @@ class BusCycle:
         self._changed = True
 
     def _change(self) -> None:
-        """Some axis is to be treated otherwise from the next turn on."""
+        """Requests `_rebuild` at the next turn."""
         self._changed = True
 
     def _rebuild(self, now: float) -> None:
-        """Sort the axes and their identifiers anew, and start those that begin."""
+        """Sorts the axes and their identifiers again, and starts those that begin."""
         self._changed = False
         self._speaking, self._listening, self._slots, self._listeners, self._awaited, self._bits = routes(
             self.axes
@@ -504,4 +504,4 @@ class BusCycle:
 
 
 def _nobody() -> None:
-    """The axis is on no bus."""
+    """Does nothing: the axis is on no bus."""

@@ -1,8 +1,8 @@
-"""Records from bus logs: what `fit` and `diagnose` read, out of frames that any CAN tool has logged.
+"""Records from bus logs, for `fit` and `diagnose`: CAN frames logged by any tool.
 
 Reads the formats of python-can. The PDO mapping comes from the SDO traffic in the log, else from the axis
-file. Any master may have driven the axis. A sample is what the drive has sent for one SYNC, at the time of
-that SYNC. Without SYNC it is a frame that carries both encoders. Nothing is interpolated.
+file. The master may be any. A sample consists of the data sent for one SYNC, at the time of that SYNC;
+without SYNC it is one frame that carries both encoders. Nothing is interpolated.
 """
 
 from __future__ import annotations
@@ -42,22 +42,22 @@ READERS: Final[dict[str, Any]] = {
     ".trc": can.TRCReader,
     ".mf4": can.MF4Reader,
 }
-"""Readers by the end of the file's name; .gz may follow it."""
+"""Readers by file name suffix; .gz may follow it."""
 _BINARY: Final = {".blf", ".mf4"}
 FOLLOWED_SHARE: Final = 0.5
-"""Share of the samples with motion in which a target moves if it is the command of each cycle."""
+"""Minimum share of moving samples in which the target changes, if it is the command of each cycle."""
 _SINCE_1970_S: Final = 1e9
-"""Time stamps below it are relative."""
+"""Smallest time stamp that is absolute; smaller ones are relative."""
 _RESETS: Final = (NmtCommand.RESET_NODE, NmtCommand.RESET_COMMUNICATION)
 
 
 def import_log(
     path: Path, axis: AxisConfig, *, channel: str | None = None, all_states: bool = False
 ) -> Recording:
-    """The recording of one axis from a bus log; ``channel`` is the bus, if the axis is on several in the log.
+    """Returns the recording of one axis from a bus log; ``channel`` is needed if it is on several buses.
 
-    Samples in which the drive was not enabled are left out unless ``all_states``. Parts begin at a gap and
-    when the drive boots. The notes say where the mapping came from.
+    Samples with the drive not enabled are left out unless ``all_states``. A new part begins at a gap and when
+    the drive boots. The notes state the origin of the mapping.
 
     InputError if the log cannot be read, has no sample of the axis, or contradicts the gear's ratio.
     """
@@ -88,7 +88,7 @@ def import_log(
 
 
 def _messages(path: Path, cut_off: list[str]) -> Iterator[can.Message]:
-    """The data frames with 11-bit identifiers; ``cut_off`` says why a damaged log has no more."""
+    """Yields the data frames with 11-bit identifiers; ``cut_off`` receives the damage that ends it early."""
     packed = path.suffix.lower() == ".gz"
     suffix = (path.with_suffix("") if packed else path).suffix.lower()
     if suffix not in READERS:
@@ -127,7 +127,7 @@ def _messages(path: Path, cut_off: list[str]) -> Iterator[can.Message]:
 
 
 def _silence(axis: AxisConfig, heard: Counter[int], channel: str | None) -> str:
-    """Message for a log without a PDO of the axis."""
+    """Returns the message for a log without a PDO of the axis."""
     where = f" on channel {channel}" if channel is not None else ""
     most = ", ".join(f"{can_id:03X}h" for can_id, _ in heard.most_common(8))
     return (
@@ -138,7 +138,7 @@ def _silence(axis: AxisConfig, heard: Counter[int], channel: str | None) -> str:
 
 
 class _Bus:
-    """The axis as one channel of the log shows it."""
+    """One axis in one channel of the log."""
 
     def __init__(self, axis: AxisConfig, *, all_states: bool) -> None:
         self._axis, self._od, self._all_states = axis, dictionary_of(axis), all_states
@@ -150,14 +150,14 @@ class _Bus:
         self._boots = {objects.COB_HEARTBEAT + each for each in self._nodes}
         self._asked: dict[int, tuple[int, int, int]] = {}
         self._held: dict[tuple[int, int, int], int] = {}
-        """Values of objects from the SDO traffic, by node, index and sub-index."""
+        """Object values from the SDO traffic, by node, index and sub-index."""
         self._image: ProcessImage | None = None
         self._needed: frozenset[int] = frozenset()
         """Identifiers of the PDOs that carry the encoders."""
         self._missing: list[str] = []
         """Encoders that no PDO carries."""
         self._is_free = False
-        """An encoder's PDO does not come with SYNC."""
+        """True if an encoder's PDO does not come with SYNC."""
         self._targets: dict[int, tuple[PdoCodec, int]] = {}
         self._fresh: set[int] = set()
         self._sync_s: float | None = None
@@ -168,7 +168,7 @@ class _Bus:
         self._disabled = 0
         self._wrong: dict[int, int] = {}
         self.has_heard = False
-        """A PDO of the axis was heard."""
+        """True if the log has a PDO of the axis."""
         self.source = ""
         """Origin of the mapping, in words."""
 
@@ -178,7 +178,7 @@ class _Bus:
         return sum(map(len, self._parts))
 
     def take(self, can_id: int, data: bytes, time_s: float) -> None:
-        """The next frame of the log."""
+        """Takes the next frame of the log."""
         if can_id in self._requests or can_id in self._answers:
             if len(data) == 8:
                 self._take_sdo(can_id, data)
@@ -194,13 +194,13 @@ class _Bus:
             self._take_pdo(can_id, data, time_s)
 
     def end(self) -> None:
-        """The log is over."""
+        """Ends the log."""
         self._end_window()
 
     # -- SDO ----------------------------------------------------------------------------------------------
 
     def _take_sdo(self, can_id: int, data: bytes) -> None:
-        """An SDO frame: expedited transfers, of up to 4 bytes. A write counts once it is confirmed."""
+        """Takes an SDO frame of an expedited transfer (up to 4 bytes). A write counts once confirmed."""
         command, index, sub = data[0], int.from_bytes(data[1:3], "little"), data[3]
         size = 4 - (command >> 2 & 3) if command & 1 else 4
         value = int.from_bytes(data[4 : 4 + size], "little")
@@ -235,7 +235,7 @@ class _Bus:
             self._begin(unseated=True)
 
     def _layouts(self) -> Layouts:
-        """The PDOs of each node: as the log maps them, else as the axis file does."""
+        """Returns the PDOs of each node as mapped in the log, else as in the axis file."""
         drive, load = self._nodes[0], self._nodes[-1]
         tpdo = objects.TPDO_COMMUNICATION, objects.TPDO_MAPPING, objects.COB_TPDO1
         sent = {node: list(self._logged(node, *tpdo)) for node in dict.fromkeys((drive, load))}
@@ -271,7 +271,7 @@ class _Bus:
     # -- PDO ----------------------------------------------------------------------------------------------
 
     def _mapped_image(self) -> ProcessImage:
-        """The image of the present mapping."""
+        """Returns the process image for the present mapping."""
         if self._image is None:
             pdos = self._layouts()
             self._image = ProcessImage(self._axis, self._od, pdos)
@@ -321,7 +321,7 @@ class _Bus:
             self._sample(image, time_s)
 
     def _end_window(self) -> None:
-        """The SYNC period is over: what has come in it is a sample, if both encoders have."""
+        """Ends a SYNC period; it becomes a sample if both encoders were received."""
         image = self._image
         if image is None or self._sync_s is None or self._is_free:
             return
@@ -355,7 +355,7 @@ class _Bus:
             image.follow_target(self._target)
 
     def _begin(self, *, unseated: bool = False) -> None:
-        """A new part begins: nothing is known of the path to it."""
+        """Begins a new part: the path of the axis up to it is not known."""
         self._reseated |= unseated and self._seated
         self._target, self._targets_heard = None, 0
         self._fresh.clear()
@@ -365,7 +365,7 @@ class _Bus:
     # -- the result ---------------------------------------------------------------------------------------
 
     def why_empty(self) -> str:
-        """Message for a channel that has PDOs of the axis, but no sample."""
+        """Returns the message for a channel that has PDOs of the axis, but no sample."""
         image = self._mapped_image()
         pdos = "; ".join(map(str, image.tpdos))
         boot = (
@@ -392,7 +392,7 @@ class _Bus:
         return f"no SYNC period has both encoders ({needed}){boot}"
 
     def recording(self, path: Path, channel: str) -> Recording:
-        """Everything as one recording."""
+        """Returns all parts as one recording."""
         pieces = [piece for part in self._parts for piece in _unbroken(part)]
         long = [each for each in pieces if len(each) >= PART_SAMPLES]
         long = [_from_first_target(each) for each in long]
@@ -411,7 +411,7 @@ class _Bus:
             record.check_ratio(self._axis.gear.ratio)
         except InputError as problem:
             assumed = self.source == "the axis file"
-            more = "; the mapping is that of the axis file: is it the one of this log?" if assumed else ""
+            more = "; the mapping is that of the axis file, the log may use another" if assumed else ""
             raise InputError(one_line(f"{path}: {problem}{more}")) from None
         pdos = "; ".join(map(str, self._mapped_image().tpdos))
         notes: dict[str, Any] = {
@@ -434,7 +434,7 @@ class _Bus:
         )
 
     def _identity(self) -> Identity | None:
-        """The identity that the drive answered in the log."""
+        """Returns the identity that the drive reported in the log."""
         numbers = [self._held.get((self._axis.drive.node_id, 0x1018, sub)) for sub in range(1, 5)]
         if numbers[0] is None or numbers[1] is None:
             return None
@@ -442,7 +442,7 @@ class _Bus:
 
 
 def _unbroken(samples: list[Sample]) -> list[list[Sample]]:
-    """The pieces without a gap, and without a clock that runs backwards."""
+    """Splits samples at gaps and at time stamps that run backwards."""
     steps = np.diff([each.time_s for each in samples])
     if not len(steps):
         return [samples] if samples else []
@@ -452,13 +452,13 @@ def _unbroken(samples: list[Sample]) -> list[list[Sample]]:
 
 
 def _from_first_target(samples: list[Sample]) -> list[Sample]:
-    """Without the samples before the first target was heard, if one was."""
+    """Drops the samples before the first target, if there is one."""
     first = next((row for row, each in enumerate(samples) if not math.isnan(each.motor_target_deg)), 0)
     return samples[first:]
 
 
 def _is_followed(record: Record) -> bool:
-    """The target is the command of each cycle, not the end of a move that the drive plans."""
+    """Returns True if the target is the command of each cycle, not the end of a move that the drive plans."""
     target, motor = np.diff(record.columns["motor_target_deg"]), np.diff(record.motor_position_deg)
     fast = np.abs(motor) > 0.1 * np.max(np.abs(motor), initial=0.0)
     return bool(np.mean(target[fast] != 0.0) > FOLLOWED_SHARE) if np.any(fast) else True

@@ -1,7 +1,7 @@
-"""Which axes can share a bus, and which identifier is whose. Pure.
+"""Routing of identifiers to the axes of a bus, and the check that axes can share a bus. Pure.
 
-One cycle, one master, and no identifier twice. What a turn of the bus has to know of its axes is sorted here
-once, whenever an axis begins, falls silent or is stopped, so that the turn looks up and decides nothing.
+All axes have one cycle and one master, and no identifier is used twice. The routes are computed whenever an
+axis begins, falls silent or is stopped, so that a turn only looks them up.
 """
 
 from __future__ import annotations
@@ -17,28 +17,29 @@ if TYPE_CHECKING:
 
 
 Slot = tuple[int, Callable[[bytes], None], "AxisCycle"]
-"""One TPDO of a turn: its bit among those of the turn, what takes its data (`PdoLengthError` where the length
-is wrong), and whose it is. A plain tuple, which is unpacked in a third of the time of a named one."""
+"""One TPDO of a turn: its bit among those of the turn, the function that takes its data
+(`PdoLengthError` if the length is wrong), and its axis. A plain tuple unpacks in a third of the time
+of a named one."""
 
 
 class Routes(NamedTuple):
-    """Who is on the bus, and whose each identifier is."""
+    """Axes on the bus, and the axis of each identifier."""
 
     speaking: tuple[AxisCycle, ...]
     listening: tuple[AxisCycle, ...]
-    """Those that are silent."""
+    """Silent axes."""
     slots: dict[int, Slot]
-    """The TPDOs that may come with every SYNC."""
+    """TPDOs that may come with every SYNC, by identifier."""
     listeners: dict[int, AxisCycle]
-    """Whom any other frame concerns."""
+    """Axes that receive all other frames, by identifier."""
     awaited: int
-    """The bits of the TPDOs for which a turn waits."""
+    """Bits of the TPDOs that a turn waits for."""
     bits: int
-    """Most bits that SYNC, the awaited TPDOs and the RPDOs take on the wire."""
+    """Maximum number of bits that SYNC, the awaited TPDOs and the RPDOs take on the wire."""
 
 
 def routes(axes: Sequence[AxisCycle]) -> Routes:
-    """The routes as the axes are now; sets what each needs of a turn."""
+    """Returns the routes for the present states of the axes; also sets ``needed`` of each axis."""
     slots: dict[int, Slot] = {}
     listeners: dict[int, AxisCycle] = {}
     awaited, bits = 0, FRAME_BITS[0]
@@ -68,7 +69,7 @@ def routes(axes: Sequence[AxisCycle]) -> Routes:
 
 
 def check_members(axes: Sequence[AxisCycle], period_s: float) -> None:
-    """InputError that names both sides where these axes cannot run in one cycle of ``period_s``."""
+    """Raises InputError, naming both axes, if these cannot share one cycle of ``period_s``."""
     for axis in axes:
         config = axis.image.axis
         if config.drive.cycle_s != period_s:
@@ -88,7 +89,7 @@ def check_members(axes: Sequence[AxisCycle], period_s: float) -> None:
 
 
 def _check_identifiers(axes: Sequence[AxisCycle]) -> None:
-    """A drive whose identifiers cannot be changed need not make them of its node id."""
+    """Checks that no identifier is used twice; fixed identifiers need not derive from the node id."""
     owners: dict[int, AxisCycle] = {}
     for axis in axes:
         image = axis.image
@@ -103,7 +104,7 @@ def _check_identifiers(axes: Sequence[AxisCycle]) -> None:
 
 
 def _check_nodes(axes: Sequence[AxisCycle]) -> None:
-    """Nearly all identifiers of an axis are made of node ids, so these must differ."""
+    """Checks that node ids differ, because nearly all identifiers derive from them."""
     owners: dict[int, tuple[AxisCycle, str]] = {}
     for axis in axes:
         config = axis.image.axis

@@ -1,4 +1,4 @@
-"""Whether the caps of an axis file leave a model whole. Pure."""
+"""Check that the caps of an axis file do not cut a model's correction. Pure."""
 
 from __future__ import annotations
 
@@ -12,13 +12,15 @@ from hdbridge.effects.base import MEASURED
 from hdbridge.model import TransmissionModel
 
 _POINTS = 20_000
-"""Each way over the travel, at most: of 800 load degrees at a ratio of 50 every second motor degree."""
+"""Maximum number of points per direction: every second motor degree over 800 load degrees at a ratio of
+50."""
 
 
 def cap_remark(axis: AxisConfig, model: TransmissionModel) -> str | None:
-    """A line where ``compensation.maximum_arcsec`` cuts the model's correction, None where it does not.
+    """Returns a remark if ``compensation.maximum_arcsec`` cuts the model's correction, else None.
 
-    Looked at there and back over the travel at the limits' velocity, with the measured channels at rest.
+    The correction is evaluated over the travel in both directions at the limits' velocity, with the measured
+    channels at their defaults.
     """
     limits, cap_arcsec = axis.limits, axis.compensation.maximum_arcsec
     travel_deg = axis.gear.ratio * (limits.position_max_deg - limits.position_min_deg)

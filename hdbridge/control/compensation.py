@@ -1,18 +1,18 @@
-"""From a load target to the motor target that puts the load there: the transmission model's inverse.
+"""Inverse of the transmission model: the motor target that puts the load at its target.
 
 The compensated motor angle solves ``theta_M / N + w TE(theta_M) = theta_L``, where TE is the model's error
-coming from its present state and w the ramp's weight. Three choices matter:
+from its present state and w the ramp's weight. Three choices matter:
 
-* It is driven by the command, never by a measured angle: near a reversal the elastic law's slope is infinite
+* The command drives it, never a measured angle: near a reversal the slope of the elastic law is infinite,
   and one count of encoder chatter would become several arcseconds.
-* The root is bracketed. The left side rises with theta_M as long as the repeating part cannot fall faster
-  than the gear rises (refused otherwise; play is crossed more gently), so there is exactly one root; a naive
-  fixed point does not contract near a reversal.
-* The model's state moves on only when a command is issued (`Compensation.command`), with the angle issued,
-  whatever caps and ramps have made of it.
+* The root is bracketed. The left side rises with theta_M if the repeating part cannot fall faster than the
+  gear rises (otherwise the model is refused; play is crossed more gently), so there is exactly one root. A
+  plain fixed-point iteration does not converge near a reversal.
+* The model's state changes only when a command is issued (`Compensation.command`), with the angle issued,
+  after caps and ramps.
 
-An effect may need a channel that can be lost (`LOSABLE`). `Compensation.know` says which are there; the part
-of the correction that needs one that is not is faded out, as `disengage` does with the whole, and in again.
+An effect may need a channel that can be lost (`LOSABLE`). `Compensation.know` sets the available ones; the
+part of the correction that needs a lost one is faded out, as `disengage` does with the whole, and later in.
 
 In motion the servo filters the correction. If the model has the measured response of the axis, the correction
 passes through its filter (`prefilter`). The model's state follows the unfiltered path, which is the path that
@@ -38,28 +38,28 @@ from hdbridge.units import ARCSEC_PER_DEG
 _TOLERANCE_ARCSEC = 5e-7
 _STEEPEST_FALL = 0.9
 _SAFE = 0.9
-"""Of that, what is used where the choice is ours."""
+"""Share of the steepest allowed fall that gentle play uses, as a margin."""
 _NOWHERE = Moment()
 _TURNS = 32
-"""Reversals of the issued path that are kept for a model that takes over."""
+"""Number of reversals of the issued path that are kept for a model that takes over."""
 LOSABLE = frozenset(each for each in MEASURED if each.axis_key)
-"""The channels that come from sensors of their own."""
+"""Channels with their own sensors."""
 
 
 @dataclass(frozen=True, slots=True)
 class CompensationLimits:
-    """How far and how fast the compensation may move the motor away from the uncompensated target."""
+    """Limits of the compensation's offset from the uncompensated target."""
 
     maximum_arcsec: float = 300.0
     """Cap on the correction, arcsec at the load."""
     slew_arcsec_s: float = 20_000.0
-    """Cap on how fast the correction may change, arcsec at the load per second."""
+    """Cap on the rate of the correction, arcsec at the load per second."""
     ramp_s: float = 0.5
     """Time over which the correction is faded in or out."""
 
 
 class _Faded(Tracker):
-    """An effect's tracker with a weight on its error; it goes on following at any weight."""
+    """An effect's tracker with a weight on its error; it follows the motion at any weight."""
 
     __slots__ = ("_tracker", "needs", "weight")
 
@@ -76,7 +76,7 @@ class _Faded(Tracker):
 
 
 class Inverse:
-    """The model's inverse, coming from the state that `advance` has left."""
+    """Inverse of the model, from the state that `advance` has left."""
 
     __slots__ = (
         "_before_deg", "_error", "_fall", "_forward", "_known", "_motor_deg", "_peeked", "_rise", "_slope",
@@ -84,16 +84,16 @@ class Inverse:
     )  # fmt: skip
 
     def __init__(self, model: TransmissionModel, start: Start = Start.VIRGIN) -> None:
-        """Leaves out what cannot or must not be compensated, such as the load encoder's own errors.
+        """Leaves out effects that cannot or must not be compensated, such as the load encoder's errors.
 
-        Refuses (InputError) a model whose repeating part is too steep to have one inverse.
+        InputError if the repeating part of the model is too steep for a unique inverse.
         """
         model = replace(model, effects=compensable(model.effects))
         self._slope = ARCSEC_PER_DEG / model.ratio
         trackers, self._fall = _gentle(model.effects, start, _STEEPEST_FALL * self._slope)
         stateful = [not isinstance(each, Memoryless) for each in trackers]
         self.faded: list[_Faded] = []
-        """Those that need a channel that can be lost."""
+        """Effects that need a channel that can be lost."""
         for place, each in enumerate(model.effects):
             if sensed := each.needs() & LOSABLE:
                 trackers[place] = faded = _Faded(trackers[place], sensed)
@@ -109,43 +109,43 @@ class Inverse:
         self._motor_deg = self._before_deg = 0.0
         self._error = self._rise = 0.0
         self._peeked: tuple[float, float, Moment] | None = None
-        """Angle, error and moment of the solution that `solve` gave last."""
+        """Angle, error and moment of the last solution of `solve`."""
         self._standing = False
-        """To advance to the same angle once more changes nothing."""
-        # Without channels the error at rest is what it was when the command was issued: not asked twice.
+        """True if advancing to the same angle again changes nothing."""
+        # Without channels the error at rest does not change, so it is not evaluated again.
         self.needs = frozenset[Channel]().union(*(each.needs() for each in model.effects))
-        """The channels that the effects need."""
+        """Channels that the effects need."""
         self._timeless = not self.needs
         self.memory_deg = self._tracker.memory_deg
-        """Motor angle that, run in one direction, makes the state independent of where it began."""
+        """Motor travel in one direction after which the state no longer depends on the start."""
         self._forward: bool | None = None
         """Direction of the last motion."""
         self._known = not self.memory_deg
-        """Whether a run that is over was longer than the memory."""
+        """True if an earlier run in one direction was longer than the memory."""
         self._turns = deque([0.0], _TURNS)
-        """Where the path that was issued began, and where it has reversed since."""
+        """Motor angles at which the issued path began and reversed."""
 
     @property
     def error_arcsec(self) -> float:
-        """The model's error where the motor was last sent."""
+        """Model's error at the last motor target."""
         return self._error
 
     @property
     def path_deg(self) -> list[float]:
-        """Where the path that was issued began and reversed, and where it is, motor degrees."""
+        """Motor angles at which the issued path began and reversed, and its present end, degrees."""
         return [*self._turns, self._motor_deg]
 
     @property
     def memory_known(self) -> bool:
-        """Whether that path has run farther in one direction than the model remembers."""
+        """True if that path has run farther in one direction than the model remembers."""
         return self._known or abs(self._motor_deg - self._turns[-1]) >= self.memory_deg
 
     def error_at(self, motor_deg: float, moment: Moment = _NOWHERE) -> float:
-        """The model's error at a motor angle ahead, arcsec; the state does not change."""
+        """Returns the model's error at a motor angle ahead, arcsec; the state does not change."""
         return self._tracker.peek(motor_deg, moment)
 
     def begin(self, motor_deg: float, moment: Moment = _NOWHERE) -> None:
-        """The motor stands here, and how it came to is not known."""
+        """Starts at this motor angle, with an unknown past."""
         self.advance(motor_deg, moment)
         self._forward = None
         self._known = not self.memory_deg
@@ -153,12 +153,12 @@ class Inverse:
         self._turns.append(motor_deg)
 
     def advance(self, motor_deg: float, moment: Moment = _NOWHERE) -> float:
-        """The command is issued: move the state on; returns the model's error there, arcsec."""
+        """Advances the state to an issued command; returns the model's error there, arcsec."""
         if self._standing and motor_deg == self._motor_deg:
             return self._error
         peeked = self._peeked
         if peeked is not None and peeked[0] == motor_deg and peeked[2] is moment:
-            # The error is known; what has no state need not hear of it.
+            # The error is known, so only effects with a state need to advance.
             error = peeked[1]
             for each in self._stateful:
                 each.advance(motor_deg, moment)
@@ -178,17 +178,17 @@ class Inverse:
         return error
 
     def _turn(self, forward: bool) -> None:
-        """From where it stands the path goes the other way."""
+        """Notes a reversal at the present angle."""
         if self._forward is not None:
             self._known = self.memory_known
             self._turns.append(self._motor_deg)
         self._forward = forward
 
     def solve(self, load_deg: float, moment: Moment = _NOWHERE, weight: float = 1.0) -> float:
-        """Motor angle in degrees that puts the load at ``load_deg``; the state does not change.
+        """Returns the motor angle in degrees that puts the load at ``load_deg``; the state does not change.
 
-        ``weight`` scales the error (0: uncompensated). Exact to 1e-6 arcsec at the load, or to the
-        last bit of the motor angle where the law is so steep that this comes first.
+        ``weight`` scales the error (0: uncompensated). Exact to 1e-6 arcsec at the load, or to the last bit
+        of the motor angle if the law is so steep that this is coarser.
         """
         peek, slope, last = self._tracker.peek, self._slope, self._motor_deg
         self._peeked = None
@@ -197,7 +197,7 @@ class Inverse:
         gap = goal - slope * last - weight * here
         if abs(gap) <= _TOLERANCE_ARCSEC:
             return last
-        # In plain travel the last step tells the slope, and three points the next ones.
+        # In plain travel the last step gives the first slope, and three points the next ones.
         before, x0, f0, s0 = self._before_deg, last, -gap, slope + weight * self._rise
         x1 = last + gap / (s0 if 0.5 * slope < s0 < 2.0 * slope else slope)
         for _ in range(4):
@@ -210,7 +210,7 @@ class Inverse:
                 break
             s1 = (f1 - f0) / (x1 - x0)
             bend = (x1 - x0) * (s1 - s0) / (x1 - before) if x1 != before else 0.0
-            # After a reversal the points before it tell nothing, and the chord has to do.
+            # Points before a reversal do not predict the slope after it, so only the chord is used.
             s = s1 + bend if -0.5 < bend / s1 < 1.0 else s1
             before, x0, x1, f0, s0 = x0, x1, x1 - f1 / s, f1, s1
         # The error falls at most by `fall` per degree, so the root is no farther than this.
@@ -218,7 +218,7 @@ class Inverse:
         return self._bracketed(goal, moment, weight, last, -gap, far)
 
     def _bracketed(self, goal: float, moment: Moment, weight: float, a: float, fa: float, b: float) -> float:
-        """Chandrupatla's method: inverse quadratic steps where they are safe, bisection elsewhere."""
+        """Solves by Chandrupatla's method: inverse quadratic steps if they are safe, else bisection."""
         peek, slope = self._tracker.peek, self._slope
         fb = slope * b + weight * peek(b, moment) - goal
         c, fc = a, fa
@@ -246,11 +246,11 @@ class Inverse:
 
 
 def _gentle(effects: tuple[Effect, ...], start: Start, steepest: float) -> tuple[list[Tracker], float]:
-    """Trackers of the effects, and a bound on how steeply their sum falls, arcsec per motor degree.
+    """Returns trackers of the effects, and a bound on how steeply their sum falls, arcsec per motor degree.
 
-    The load rests while the motor crosses play, so play falls as steeply as the gear rises, or steeper where
-    noise has made the fit of it narrower than it can be. Where the sum would fall steeper than ``steepest``,
-    the play in it is crossed as steeply as the other effects leave room for.
+    The load rests while the motor crosses play, so play falls as steeply as the gear rises, or more steeply
+    if noise made the fitted play too narrow. If the sum would fall more steeply than ``steepest``, the play
+    in it is crossed only as steeply as the other effects allow.
     """
     trackers = [each.tracker(start) for each in effects]
     fall = fall_bound(effects)
@@ -267,10 +267,10 @@ def _gentle(effects: tuple[Effect, ...], start: Start, steepest: float) -> tuple
 
 
 class Compensation:
-    """The inverse with caps and ramps: what the control cycle asks, once per cycle.
+    """Inverse with caps and ramps, called once per control cycle.
 
     It begins disengaged: the motor target is N times the load target. `engage` and `disengage` fade the
-    correction in and out, so switching never jumps the axis.
+    correction in and out, so switching never makes the axis jump.
     """
 
     __slots__ = (
@@ -285,12 +285,12 @@ class Compensation:
         period_s: float,
         start: Start = Start.VIRGIN,
     ) -> None:
-        """``period_s`` is the control cycle; ``start`` what is known of the gear's past.
+        """``period_s`` is the control cycle; ``start`` the knowledge of the gear's past.
 
         InputError if the model's response was measured at another cycle.
         """
         self.model = model
-        """Whose inverse it is; `Bench` runs none of another axis, gear or drive."""
+        """Model that is inverted; `Bench` refuses one of another axis, gear or drive."""
         self._inverse = Inverse(model, start)
         self._ratio = model.ratio
         self._maximum = limits.maximum_arcsec
@@ -305,24 +305,24 @@ class Compensation:
         self._known = LOSABLE
         self._fading = False
         self.needs = self._inverse.needs
-        """The channels that it needs a `Moment` with; without any it may be left out."""
+        """Channels that a `Moment` must contain; it may be omitted if there are none."""
         self.limited = 0
-        """Cycles in which a cap or the slew limit was at work."""
+        """Number of cycles in which a cap or the slew limit acted."""
 
     @property
     def correction_arcsec(self) -> float:
-        """The correction at work, arcsec at the load: the error that the motor target makes up for."""
+        """Correction in force, arcsec at the load: the error that the motor target compensates."""
         return self._correction
 
     @property
     def predicted_arcsec(self) -> float:
-        """The model's error where the motor was last sent, arcsec at the load, whatever the weight."""
+        """Model's error at the last motor target, arcsec at the load, regardless of the weight."""
         return self._inverse.error_arcsec
 
     @property
     def memory_known(self) -> bool:
-        """Whether the state is that of the issued path alone: since `reset` it has run, in one direction,
-        farther than the model remembers. True for a model that remembers no path.
+        """True if the state depends only on the issued path, which since `reset` has run farther in one
+        direction than the model remembers. Always True for a model without memory.
         """
         return self._inverse.memory_known
 
@@ -333,34 +333,34 @@ class Compensation:
 
     @property
     def step_arcsec(self) -> float:
-        """By how much the correction may change in one cycle."""
+        """Maximum change of the correction in one cycle."""
         return self._slew_step
 
     @property
     def ramp_step(self) -> float:
-        """By how much a weight changes in one cycle."""
+        """Change of a weight in one cycle."""
         return self._weight_step
 
     @property
     def weight(self) -> float:
-        """The ramp's weight: 0 off, 1 fully on."""
+        """Weight of the ramp: 0 off, 1 fully on."""
         return self._weight
 
     def know(self, channels: frozenset[Channel]) -> None:
-        """From the next command on these of `LOSABLE` are known; what needs another is faded out."""
+        """Sets the available channels of `LOSABLE`; effects that need others fade out."""
         self._known = channels
         self._fading = bool(self._inverse.faded)
 
     def engage(self) -> None:
-        """Fade the correction in from the next command on."""
+        """Fades the correction in from the next command on."""
         self._target = 1.0
 
     def disengage(self) -> None:
-        """Fade the correction out from the next command on."""
+        """Fades the correction out from the next command on."""
         self._target = 0.0
 
     def reset(self, motor_deg: float, moment: Moment = _NOWHERE) -> None:
-        """The motor stands at ``motor_deg`` and nothing is being corrected: begin from there."""
+        """Restarts at ``motor_deg``, at standstill and without a correction."""
         self._weight = self._correction = self._static = 0.0
         if self._prefilter is not None:
             self._prefilter.reset(0.0)
@@ -369,7 +369,7 @@ class Compensation:
         self._inverse.begin(motor_deg, moment)
 
     def command(self, load_deg: float, moment: Moment = _NOWHERE) -> float:
-        """Motor target in degrees for this cycle's load target; the model's state moves on with it."""
+        """Returns the motor target in degrees for this cycle's load target; advances the model's state."""
         motor = self._solved(load_deg, moment)
         wanted = ARCSEC_PER_DEG * (load_deg - motor / self._ratio)
         prefilter, limited = self._prefilter, self.limited
@@ -391,7 +391,7 @@ class Compensation:
         return motor if correction == static else self._ratio * (load_deg - correction / ARCSEC_PER_DEG)
 
     def _limit(self, wanted: float, last: float) -> float:
-        """The correction within the slew limit and the cap; counts in `limited`."""
+        """Limits the correction to the slew limit and the cap; counts in `limited`."""
         slew, most = self._slew_step, self._maximum
         if last - slew <= wanted <= last + slew and -most <= wanted <= most:
             return wanted
@@ -399,12 +399,12 @@ class Compensation:
         return min(max(min(max(wanted, last - slew), last + slew), -most), most)
 
     def _predicted(self, load_deg: float, moment: Moment) -> float:
-        """Correction at a load target ahead, arcsec; the state stays."""
+        """Returns the correction at a load target ahead, arcsec; the state does not change."""
         motor = self._ratio * (load_deg - self._static / ARCSEC_PER_DEG)
         return self._weight * self._inverse.error_at(motor, moment)
 
     def _solved(self, load_deg: float, moment: Moment) -> float:
-        """One cycle's ramps, and the motor angle that is wanted then."""
+        """Advances the ramps by one cycle; returns the wanted motor angle."""
         weight = self._weight
         if weight != self._target:
             step = self._weight_step
@@ -415,9 +415,9 @@ class Compensation:
         return self._inverse.solve(load_deg, moment, weight)
 
     def wanted(self, load_deg: float, moment: Moment = _NOWHERE) -> float:
-        """The correction that `command` would go towards, arcsec, within the cap; its ramps move on.
+        """Returns the correction that `command` would approach, arcsec, within the cap; advances the ramps.
 
-        For two that share one motor (`switchover.Correction`): what becomes of it is told by `issued`.
+        For two compensations that share one motor (`switchover.Correction`), followed by a call of `issued`.
         """
         most = self._maximum
         wanted = ARCSEC_PER_DEG * (load_deg - self._solved(load_deg, moment) / self._ratio)
@@ -429,16 +429,16 @@ class Compensation:
         return min(max(wanted, -most), most)
 
     def issued(self, motor_deg: float, correction_arcsec: float, moment: Moment = _NOWHERE) -> None:
-        """This was sent to the motor, with this correction in it: the model's state moves on."""
+        """Advances the model's state to the motor target that was sent, which contains this correction."""
         if self._prefilter is not None:
             motor_deg += self._ratio * (correction_arcsec - self._static) / ARCSEC_PER_DEG
         self._correction = correction_arcsec
         self._inverse.advance(motor_deg, moment)
 
     def take_over(self, other: Compensation, moment: Moment = _NOWHERE) -> None:
-        """Begin where another one is, on the path that it has issued: for one that was just made.
+        """Continues from another compensation, on the path that it has issued; for a new object.
 
-        What has memory of the path is in the state that this path gives it, as far back as that is kept.
+        Effects with memory get the state that this path leaves, as far back as the path is kept.
         """
         self._known, self._fading = other._known, bool(self._inverse.faded)
         begin, *rest = other._inverse.path_deg
@@ -451,7 +451,7 @@ class Compensation:
             self._prefilter.take_over(other._prefilter, self._static)
 
     def _fade(self) -> None:
-        """One cycle nearer to what is known of the channels."""
+        """Moves the weights of the fading effects by one cycle."""
         settled = True
         for each in self._inverse.faded:
             target = float(each.needs <= self._known)
@@ -460,7 +460,7 @@ class Compensation:
         self._fading = not settled
 
     def hold(self, load_deg: float, moment: Moment = _NOWHERE) -> float:
-        """Motor target in degrees with the correction frozen: for a cycle whose feedback is missing."""
+        """Returns the motor target in degrees, with the correction frozen, for a cycle without feedback."""
         motor = self._ratio * (load_deg - self._correction / ARCSEC_PER_DEG)
         if self._prefilter is None:
             self._inverse.advance(motor, moment)
@@ -471,7 +471,7 @@ class Compensation:
 
 
 def _lead(response: Response, period_s: float) -> LeadFilter:
-    """The filter of a response; InputError if it was measured at another cycle."""
+    """Returns the filter of a response; InputError if it was measured at another cycle."""
     if response.fits_cycle(period_s):
         return response.filter
     raise InputError(

@@ -1,6 +1,6 @@
-"""The control cycle of a single axis, for a bench: `BusCycle` with one axis, whose stops are errors.
+"""Control cycle of a single axis for a bench: `BusCycle` with one axis, whose stops are raised as errors.
 
-One `Cycle.tick` runs one period. A quick stop is driven to its end before its `SafetyStop` is raised.
+One `Cycle.tick` runs one period. A quick stop is completed before its `SafetyStop` is raised.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ class Cycle:
     """Runs the process image over a link, one `tick` per period.
 
     ``image`` gives the controlword (``image.power.go``) and the scaling; ``supervision`` holds the latch and
-    the list of faults; ``monitor`` may be shared with the boot-up. ``plausibility`` is by default what the
-    axis file allows.
+    the list of faults; ``monitor`` may be shared with the boot-up. ``plausibility`` defaults to the limits of
+    the axis file.
     """
 
     __slots__ = (
@@ -67,41 +67,40 @@ class Cycle:
         self._bus.join(self._axis)
         self._exchange = self._bus.exchange
         self.histogram = self._bus.histogram
-        """How late each period began."""
+        """Lateness of the start of each period."""
         self.stopping: list[Feedback] = []
-        """Feedback of the cycles of the last quick stop, which `tick` drove by itself."""
+        """Feedback of the cycles that `tick` ran to complete the last quick stop."""
         self.restart()
 
     @property
     def overruns(self) -> int:
-        """Cycles that were given up for lateness."""
+        """Number of cycles that were skipped because they began too late."""
         return self._bus.overruns
 
     @property
     def skipped(self) -> int:
-        """Whole periods without a SYNC."""
+        """Number of whole periods without a SYNC."""
         return self._bus.skipped
 
     def restart(self) -> None:
-        """Begin anew at the next `tick`, at once; the numbers of the cycles go on.
+        """Restarts at once with the next `tick`, after a pause; the cycle numbers continue.
 
-        For when the cycle has rested: what arrived meanwhile, and how far the encoders moved, is not judged.
-        The latch and the histogram stay.
+        Frames and encoder motion during the pause are not judged. The latch and the histogram stay.
         """
         self._bus.restart()
         self._axis.begin()
 
     def tick(self, command: Command = None) -> Feedback:
-        """Run one period and give what it measured.
+        """Runs one period and returns its feedback.
 
-        ``command`` is the target in motor counts, or None to hold the last one, or a function of this cycle's
-        feedback that gives either. It is used while the drive is enabled; before that the target is the
-        actual position, so that enabling moves nothing.
+        ``command`` is the target in motor counts, or None to hold the last one, or a function of this
+        cycle's feedback that returns either. It is used while the drive is enabled; before that the target
+        is the actual position, so that enabling causes no motion.
 
-        Raises `SafetyStop` when the fault table says so, and again at each call until
-        ``supervision.reset()``. By then the drive has reported the quick stop and the motor stands, or the
-        time for that is over, or no RPDO is sent any more (`Reaction.LATCH`). Errors of ``command`` other
-        than `InputError` pass through: the caller then has to stop the axis.
+        Raises `SafetyStop` if the fault table requires it, and again at each call until
+        ``supervision.reset()``. By then the drive has reported the quick stop and the motor stands still, or
+        that has timed out, or no RPDO is sent any more (`Reaction.LATCH`). Errors of ``command`` other than
+        `InputError` pass through; the caller must then stop the axis.
         """
         supervision, axis = self.supervision, self._axis
         if supervision.stop is not None:

@@ -1,6 +1,6 @@
-"""How late a loop wakes up: a histogram of bounded memory, and which cycle time a machine carries.
+"""Wake-up lateness of a loop: a histogram of bounded memory, and the cycle time that a computer sustains.
 
-Measure on the machine that will run the loop, with its usual load, for minutes rather than seconds, before
+Measure on the computer that will run the loop, with its usual load, for minutes rather than seconds, before
 choosing ``cycle_ms``.
 """
 
@@ -24,7 +24,7 @@ _BINS: Final = _EXACT + (_TOP_BITS - _EXACT_BITS) * _STEPS
 
 
 def _bin_of(us: int) -> int:
-    """Bin of a lateness: exact below 64 us, then 32 bins to the octave."""
+    """Returns the bin of a lateness: exact below 64 us, then 32 bins to the octave."""
     if us < _EXACT:
         return us
     shift = us.bit_length() - _EXACT_BITS
@@ -32,7 +32,7 @@ def _bin_of(us: int) -> int:
 
 
 def _bin_top_us(index: int) -> int:
-    """Greatest whole lateness of a bin, us."""
+    """Returns the greatest whole lateness of a bin, us."""
     if index < _EXACT:
         return index
     octave, step = divmod(index - _EXACT, _STEPS)
@@ -40,9 +40,9 @@ def _bin_top_us(index: int) -> int:
 
 
 class Histogram:
-    """Lateness in whole microseconds: exact below 64 us, within 3 % above, up to a minute.
+    """Histogram of lateness in whole microseconds: exact below 64 us, within 3 % above, up to a minute.
 
-    It takes 704 integers, however long it runs.
+    Its size is fixed at 704 integers.
     """
 
     __slots__ = ("_counts", "maximum_us", "total")
@@ -50,12 +50,12 @@ class Histogram:
     def __init__(self) -> None:
         self._counts = [0] * _BINS
         self.total = 0
-        """How many were recorded."""
+        """Number of recorded values."""
         self.maximum_us = 0
-        """The greatest, exactly."""
+        """Greatest value, exact."""
 
     def record(self, late_s: float) -> None:
-        """Count one lateness in seconds; an early one counts as zero."""
+        """Counts one lateness in seconds; an early wake-up counts as zero."""
         us = int(late_s * 1e6)
         if us >= _EXACT:
             self._counts[min(_bin_of(us), _BINS - 1)] += 1
@@ -66,9 +66,9 @@ class Histogram:
         self.total += 1
 
     def percentile_us(self, percent: float) -> int:
-        """The lateness that ``percent`` of all did not exceed, us (0 of none); never too small.
+        """Returns the lateness that ``percent`` of all values do not exceed, us; 0 if there are none.
 
-        It is a bin's upper end, so at most 3 % too large.
+        It is a bin's upper end, so it is never too small and at most 3 % too large.
         """
         if not 0.0 <= percent <= 100.0:
             raise ValueError(f"a percentile lies in 0 .. 100, not at {percent}")
@@ -81,17 +81,17 @@ class Histogram:
         return self.maximum_us
 
     def later_than_us(self, us: int) -> int:
-        """How many were later than ``us``, to within a bin."""
+        """Returns the number of values above ``us``, to within a bin."""
         return sum(count for index, count in enumerate(self._counts) if _bin_top_us(index) > us)
 
     def merge(self, other: Histogram) -> None:
-        """Add another histogram's counts."""
+        """Adds another histogram's counts."""
         self._counts = [a + b for a, b in zip(self._counts, other._counts, strict=True)]
         self.total += other.total
         self.maximum_us = max(self.maximum_us, other.maximum_us)
 
     def octaves(self) -> list[tuple[int, int]]:
-        """(upper end in us, count) by powers of two, from the first to the last that is not empty."""
+        """Returns (upper end in us, count) by powers of two, from the first to the last that is not empty."""
         sums: dict[int, int] = {}
         for index, count in enumerate(self._counts):
             if count:
@@ -102,7 +102,7 @@ class Histogram:
         return [(1 << power, sums.get(power, 0)) for power in range(min(sums), max(sums) + 1)]
 
     def as_dict(self) -> dict[str, int]:
-        """Count, median, percentiles and maximum in us."""
+        """Returns count, median, percentiles and maximum in us."""
         return {
             "count": self.total,
             "p50_us": self.percentile_us(50.0),
@@ -114,7 +114,7 @@ class Histogram:
 
 
 CANDIDATES_S: Final = (0.001, 0.002, 0.004, 0.008, 0.010)
-"""Cycle times that are measured unless others are asked for."""
+"""Cycle times that are measured by default."""
 RULE_PERCENT: Final = 99.99
 RULE_SHARE: Final = 0.2
 RULE_MAXIMUM_SHARE: Final = 0.5
@@ -123,13 +123,13 @@ RULE: Final = (
     f"{100 * RULE_SHARE:g} % of it and none by more than {100 * RULE_MAXIMUM_SHARE:g} %"
 )
 ENOUGH: Final = 10_000
-"""Fewer wake-ups than this say nothing about their worst ten-thousandth."""
+"""Minimum number of wake-ups that determines the worst ten-thousandth."""
 
 
 def carries(histogram: Histogram, period_s: float) -> bool:
-    """Whether the rule (`RULE`) holds for a cycle of ``period_s``; an empty histogram carries nothing.
+    """Returns True if the rule (`RULE`) holds for a cycle of ``period_s``; False for an empty histogram.
 
-    Half a cycle is where the control cycle gives a period up and counts an overrun.
+    At half a cycle of lateness the control cycle skips a period and counts an overrun.
     """
     return (
         histogram.total > 0
@@ -145,25 +145,25 @@ class Measurement:
     period_s: float
     histogram: Histogram = field(repr=False)
     skipped: int
-    """Whole periods that were missed."""
+    """Number of whole periods that were missed."""
 
     @property
     def carried(self) -> bool:
-        """Whether the machine carries this period."""
+        """True if the computer sustains this period."""
         return self.skipped == 0 and carries(self.histogram, self.period_s)
 
 
 @dataclass(frozen=True, slots=True)
 class LatencyReport:
-    """What was measured, one `Measurement` per period, shortest first."""
+    """Latency measurements, one `Measurement` per period, shortest first."""
 
     measurements: tuple[Measurement, ...]
     conditions: str
-    """With or without a bus, real-time scheduling or not."""
+    """Measurement conditions in words: with or without a bus, real-time scheduling or not."""
 
     @property
     def carried_s(self) -> float | None:
-        """The shortest period from which on all measured ones are carried, or None."""
+        """Shortest period from which on all measured ones are sustained; None if there is none."""
         best = None
         for each in reversed(self.measurements):
             if not each.carried:
@@ -173,7 +173,7 @@ class LatencyReport:
 
     @property
     def verdict(self) -> str:
-        """One line for a person."""
+        """Result in one line."""
         if self.carried_s is None:
             return (
                 f"this machine carries none of these cycle times ({RULE}); "
@@ -184,7 +184,7 @@ class LatencyReport:
         return f"this machine carries a cycle of {1e3 * self.carried_s:g} ms ({RULE}){more}"
 
     def table(self) -> str:
-        """The measurements, and the histogram of all of them together, as plain text."""
+        """Returns the measurements and their combined histogram as plain text."""
         lines = [f"wake-up lateness, {self.conditions}", ""]
         lines.append(
             f"{'cycle':>8} {'wake-ups':>9} {'p50':>8} {'p99':>8} {'p99.9':>8} {'p99.99':>8} {'max':>8} "
@@ -208,7 +208,7 @@ class LatencyReport:
         return "\n".join([*lines, "", self.verdict])
 
     def as_dict(self) -> dict[str, Any]:
-        """The report for machines."""
+        """Returns the document of ``--json``, schema ``hdbridge.latency/1``."""
         return {
             "schema": "hdbridge.latency/1",
             "conditions": self.conditions,
@@ -229,10 +229,10 @@ class LatencyReport:
 def wake_ups(
     period_s: float, duration_s: float, clock: Clock, work: Callable[[], object] | None = None
 ) -> Measurement:
-    """Wake up every ``period_s`` for ``duration_s`` on absolute deadlines and record how late each was.
+    """Wakes up every ``period_s`` for ``duration_s`` on absolute deadlines and records the lateness of each.
 
-    ``work`` is done at each wake-up (an exchange on a bus, say); where it takes longer than a period, whole
-    periods are skipped and counted.
+    ``work`` is called at each wake-up (an exchange on a bus, for example); if it takes longer than a period,
+    whole periods are skipped and counted.
     """
     histogram, skipped = Histogram(), 0
     deadline = clock.now() + period_s
@@ -250,7 +250,7 @@ def wake_ups(
 
 
 def bus_exchange(link: Link, can_id: int) -> Callable[[], object]:
-    """Work for `measure`: send one frame, and read one if there is one.
+    """Returns work for `measure`: sends one frame and reads one if there is one.
 
     Choose an identifier that nothing on the bus listens to, or the master's own heartbeat.
     """
@@ -270,9 +270,9 @@ def measure(
     conditions: str = "without a bus",
     progress: Callable[[Measurement], object] | None = None,
 ) -> LatencyReport:
-    """Measure each period for ``duration_s`` seconds; takes their number times that.
+    """Measures each period for ``duration_s`` seconds.
 
-    ``progress`` is called after each period. ``conditions`` goes into the report as it is.
+    ``progress`` is called after each period. ``conditions`` is copied to the report.
     """
     measurements = []
     for period_s in sorted(periods_s):

@@ -1,18 +1,18 @@
-"""A slow loop over the load encoder: takes away what the model leaves of the mean error at rest.
+"""Slow loop over the load encoder: removes the mean error at rest that the model leaves.
 
-The compensation is feed-forward: a model that has aged leaves an error that nobody sees. This loop integrates
-the error (load target less load encoder) at rest and adds to the load target. In motion the error is mostly
+The compensation is feed-forward, so an aged model leaves an unseen error. This loop integrates the error
+(load target minus load encoder) at rest and adds the result to the load target. In motion the error is mostly
 delay, and the value is held. The value is bounded and its slew is limited. It fades out, for a reason that
 `LoadLoop.doubt` states, in three cases:
 
-    the error is too large             the bound is less than half of it. Over when it is smaller.
-    the load encoder moved at rest     without the motor. Over when it has moved back.
-    the load encoder does not follow   the motor that the loop moves at rest. Over when it follows.
+    the error is too large             more than twice the bound; ends when it is smaller
+    the load encoder moved at rest     without the motor; ends when it has moved back
+    the load encoder does not follow   the motor, which the loop moves at rest; ends when it follows
 
-The last two compare the load encoder with the load angle by motor encoder and model. What is explained is
-measured in units of the axis: one count of each encoder at the load, the noise of the difference, and for the
-last case the slack, which is what the model may miss of the hysteresis. The noise is measured at rest, and a
-slow drift of the load against the motor is followed. A doubt about the encoder that does not end at the same
+The last two compare the load encoder with the load angle by motor encoder and model. The explained difference
+follows from the axis: one count of each encoder at the load, the noise of the difference, and for the last
+case the slack, which is the possible error of the model's hysteresis. The noise is measured at rest, and a
+slow drift of the load against the motor is tracked. A doubt about the encoder that does not end at the same
 place ends when the two agree again at rests after motion in both directions.
 
 Pure: no clock, no bus.
@@ -28,37 +28,37 @@ from hdbridge.errors import InputError
 from hdbridge.model import TransmissionModel
 
 SETTLED_S: Final = 0.3
-"""Time at rest before the loop acts, in which the load settles."""
+"""Settling time of the load: time at rest before the loop acts."""
 _AVERAGED_S: Final = 0.05
 """Time constant of the averages at rest."""
 _NOISE_S: Final = 1.0
 """Time constant of the noise estimate."""
 _DRIFT_S: Final = 600.0
-"""Time constant with which a drift of the load against the motor is followed at rest."""
+"""Time constant for tracking a drift of the load against the motor at rest."""
 _AGREED_S: Final = 1.0
-"""Time at rest for which an encoder that has moved back is observed; doubled by each further doubt."""
+"""Time at rest for which an encoder that has moved back is observed; each further doubt doubles it."""
 _AGREED_MAX_S: Final = 600.0
 _SIGMAS: Final = 8.0
-"""Deviation in standard deviations that is still noise."""
+"""Maximum deviation that counts as noise, in standard deviations."""
 _SIGMA_OF_MEAN_DEVIATION: Final = math.sqrt(math.pi / 2.0)
-"""Standard deviation of normal readings by their mean absolute deviation."""
+"""Ratio of the standard deviation to the mean absolute deviation of normal readings."""
 _LEAST_SHARE: Final = 0.5
-"""Share of the error that the bound has to be."""
+"""Minimum ratio of the bound to the error."""
 _OUTLIERS: Final = 2
-"""Consecutive readings outside of what is explained that count as a move of the load encoder."""
+"""Number of consecutive unexplained readings that count as a move of the load encoder."""
 _AGREEMENT: Final = 1.0 / 3.0
 """Share of the greatest disagreement below which the encoders agree again."""
 _MODEL_ERROR: Final = 0.25
-"""Share of a hysteresis by which its model may be wrong."""
+"""Possible relative error of a model's hysteresis."""
 _PLACES: Final = 24
 """Positions at which the width of a hysteresis loop is evaluated."""
 _BOTH: Final = frozenset({-1, 1})
 
 
 def loop_width_arcsec(model: TransmissionModel) -> float:
-    """Greatest difference of a model's error between the two directions of motion, arcsec at the load.
+    """Returns the greatest width of a model's hysteresis loop, arcsec at the load.
 
-    0 for a model without memory of its path.
+    0 for a model without memory.
     """
     tracker, moment = model.tracker(Start.VIRGIN), Moment()
     span_deg = 2.0 * tracker.memory_deg
@@ -73,7 +73,7 @@ def loop_width_arcsec(model: TransmissionModel) -> float:
 
 
 class LoadLoop:
-    """The loop of one axis; one call of `step` per control period. Everything is arcsec at the load."""
+    """Load loop of one axis; `step` is called once per control period. All values are arcsec at the load."""
 
     __slots__ = (
         "_agreed", "_agreeing", "_beyond", "_counts", "_difference", "_doubt", "_drift_share", "_error",
@@ -91,10 +91,11 @@ class LoadLoop:
         *,
         counts_arcsec: float,
     ) -> None:
-        """``gain_1_s``: share of the error that is taken away per second; ``maximum_arcsec`` bounds it.
+        """``gain_1_s`` is the share of the error removed per second; ``maximum_arcsec`` bounds the value.
 
         ``counts_arcsec`` is one count of the motor encoder plus one of the load encoder, both at the load.
-        InputError for numbers that are not finite and above 0, and for a gain that makes the loop swing.
+        InputError for numbers that are not finite and above 0, and for a gain that would make the loop
+        oscillate.
         """
         for name, number in (
             ("gain_1_s", gain_1_s),
@@ -107,8 +108,8 @@ class LoadLoop:
                 raise InputError(f"load loop: {name} is {number!r}; expected a finite number above 0")
         if gain_1_s * _AVERAGED_S > 0.25:
             raise InputError(
-                f"load loop: gain_1_s is {gain_1_s:g}; expected at most {0.25 / _AVERAGED_S:g}: it is "
-                "meant to be slower than the drive and the gear settle"
+                f"load loop: gain_1_s is {gain_1_s:g}; expected at most {0.25 / _AVERAGED_S:g}: it must "
+                "be slower than the settling of drive and gear"
             )
         self._gain_step = gain_1_s * period_s
         self._maximum = maximum_arcsec
@@ -123,14 +124,14 @@ class LoadLoop:
         self._patience_max = math.ceil(_AGREED_MAX_S / period_s)
         self._settled = max(math.ceil(SETTLED_S / period_s), 1)
         self._slack = maximum_arcsec
-        """By how much the load may follow the motor less than the model says."""
+        """Amount by which the load may lag the motor beyond the model's hysteresis."""
         self._value = 0.0
         self._standing = self._outliers = 0
         """Periods at rest; consecutive readings outside of what is explained."""
         self._difference = self._motor = self._error = 0.0
-        """Averages at rest, of load encoder less load by motor encoder, of the latter, and of the error."""
+        """Averages at rest: load encoder minus load angle by motor encoder, the latter, and the error."""
         self._noise = 0.0
-        """Mean absolute deviation of the difference from its average, at rest, less that of the motor."""
+        """Mean absolute deviation of the difference from its average at rest, minus that of the motor."""
         self._noise_readings = 0
         self._reference = self._rest_motor = 0.0
         """Averages when the axis came to rest; during a doubt about the encoder, those before it."""
@@ -138,17 +139,16 @@ class LoadLoop:
         self._beyond = False
         """True if the doubt is about the size of the error and not about the encoder."""
         self._jumped = self._jumped_most = self._off = 0.0
-        """During a doubt about the encoder: sum of its moves at rest, the greatest sum, and the greatest
-        disagreement.
-        """
+        """During a doubt about the encoder: sum of its moves at rest, the greatest such sum, and the
+        greatest disagreement."""
         self._agreeing = 0
-        """Readings since that sum has become small."""
+        """Number of readings since that sum became small."""
         self._agreed = frozenset[int]()
         """Directions of motion after which the encoders have agreed again."""
 
     @property
     def value_arcsec(self) -> float:
-        """The present addition to the load target."""
+        """Present addition to the load target."""
         return self._value
 
     @property
@@ -157,10 +157,10 @@ class LoadLoop:
         return self._doubt
 
     def use_models(self, whole: TransmissionModel, predicting: TransmissionModel) -> None:
-        """``whole`` knows the hysteresis of the gear, ``predicting`` is the part of it in `step`'s ``motor``.
+        """Sets the models: ``whole`` has the full hysteresis, ``predicting`` gives ``motor`` of `step`.
 
-        The load may fail to follow the motor by the hysteresis that is not predicted, and by a share of the
-        hysteresis that is. If the hysteresis is not known, only the loop's own bound limits that.
+        The load may lag the motor by the hysteresis that is not predicted, and by a share of the one that
+        is. If the hysteresis is not known, only the loop's own bound limits the lag.
         """
         width = loop_width_arcsec(whole)
         known = (1.0 - _MODEL_ERROR) * loop_width_arcsec(predicting)
@@ -168,7 +168,7 @@ class LoadLoop:
         self._standing = 0
 
     def reset(self, value_arcsec: float = 0.0) -> None:
-        """Begin again without a doubt, at this value, which the load target already contains."""
+        """Restarts without a doubt, at this value, which the load target already contains."""
         if not math.isfinite(value_arcsec):
             raise InputError(f"load loop: a value of {value_arcsec!r} arcsec; expected a finite number")
         self._value = min(max(value_arcsec, -self._maximum), self._maximum)
@@ -177,9 +177,9 @@ class LoadLoop:
         self._standing = 0
 
     def step(self, target: float, load: float | None, motor: float, moving: bool) -> float:
-        """One period: arcsec to add to the load target; it changes by at most the slew limit.
+        """Runs one period; returns the slew-limited addition to the load target, arcsec.
 
-        ``target`` is the load target without what this adds, ``load`` the load encoder (None if there is no
+        ``target`` is the load target without this addition, ``load`` the load encoder (None if there is no
         fresh reading), ``motor`` the load angle by the motor encoder and the model.
         """
         if load is None or not math.isfinite(load) or not math.isfinite(motor):
@@ -205,7 +205,7 @@ class LoadLoop:
     # ---------------------------------------------------------------- at rest
 
     def _settle(self, error: float, difference: float, motor: float) -> None:
-        """One of the first readings at rest: an average that forgets those in which the load was settling."""
+        """Takes a reading while the load settles, into an average that forgets the first ones."""
         self._outliers = 0
         self._average(error, difference, motor, max(self._share, 1.0 / self._standing))
         if self._standing < self._settled:
@@ -218,7 +218,7 @@ class LoadLoop:
             self._end()
 
     def _observe(self, error: float, difference: float, motor: float) -> None:
-        """A reading at rest, after the load has settled."""
+        """Takes a reading at rest, after the load has settled."""
         deviation = difference - self._difference
         explained = self._explained() + 2.0 * abs(motor - self._motor)
         if abs(deviation) > explained:
@@ -264,13 +264,13 @@ class LoadLoop:
             self._noise += noise_share * (max(abs(deviation) - abs(moved), 0.0) - self._noise)
 
     def _explained(self) -> float:
-        """Difference of the encoders at rest that this axis explains without any motion of the load."""
+        """Returns the difference of the encoders at rest that is explained without motion of the load."""
         return self._counts + _SIGMAS * _SIGMA_OF_MEAN_DEVIATION * self._noise
 
     # ---------------------------------------------------------------- doubt about the encoder
 
     def _jump(self, size: float, explained: float) -> None:
-        """The load encoder has moved at rest; the averages go with it."""
+        """Notes that the load encoder moved at rest, and shifts the averages by it."""
         self._outliers = 0
         self._difference += size
         self._error -= size
@@ -291,7 +291,7 @@ class LoadLoop:
         self._patience = min(max(2 * self._patience, self._patience_min), self._patience_max)
 
     def _compare(self) -> None:
-        """At rest after a motion in doubt: whether the encoders have agreed after both directions."""
+        """Ends the doubt if the encoders have agreed at rest after motion in both directions."""
         off = abs(self._difference - self._reference)
         self._off = max(self._off, off)
         tolerance = max(self._explained(), min(_AGREEMENT * self._off, self._maximum))
@@ -307,7 +307,7 @@ class LoadLoop:
                     self._end()
 
     def _end(self) -> None:
-        """The doubt is over: the loop continues from the value that it has faded to."""
+        """Ends the doubt; the loop continues from the value that it has faded to."""
         self._doubt, self._beyond = "", False
         self._reference, self._rest_motor = self._difference, self._motor
 

@@ -1,8 +1,7 @@
-"""The correction that the load follows in motion: the filter of `Response` along the coming path.
+"""Prefilter of the correction in motion: the filter of `Response` along the predicted path.
 
-The correction is predicted for load targets that lie a few cycles ahead. They continue the last three
-targets at constant acceleration. At rest the prediction is the correction itself, and the filter changes no
-bit of it.
+The correction is predicted for load targets a few cycles ahead, which extend the last three targets at
+constant acceleration. At rest the prediction equals the correction, and the filter returns it unchanged.
 
 Pure: no clock, no bus.
 """
@@ -32,24 +31,24 @@ class Prefilter:
         self._output = self._before = 0.0
         """Outputs of the last two cycles, arcsec."""
         self._predicted = deque(repeat(0.0, len(lead.weights)), len(lead.weights))
-        """Predicted corrections, arcsec, the furthest ahead first."""
+        """Predicted corrections, arcsec, the farthest ahead first."""
         first, per_cycle = lead.lead_cycles, lead.per_cycle
         ahead = [first - j / per_cycle for j in range(per_cycle - 1, -1, -1)]
         self._reaches = tuple((s, 0.5 * s * (s + 1.0)) for s in ahead)
-        """Factors of the last step and of its change that give each new prediction's distance."""
+        """Factors of the last step and of its change that give the distance of each new prediction."""
         self._full_step = lead.full_speed_deg_s * period_s
         self._last: float | None = None
         self._step = 0.0
 
     def reset(self, correction_arcsec: float) -> None:
-        """Start at rest with this correction."""
+        """Starts at rest with this correction."""
         self._predicted.extend(repeat(correction_arcsec, len(self._weights)))
         self._output = self._before = correction_arcsec
         self._last = None
         self._step = 0.0
 
     def take_over(self, other: Prefilter | None, correction_arcsec: float) -> None:
-        """Continue where another filter is, or start with this correction if they differ in form."""
+        """Continues from another filter; starts with this correction if they differ in form."""
         self.reset(correction_arcsec)
         if other is not None and (other._reaches, len(other._weights)) == (self._reaches, len(self._weights)):
             self._predicted = other._predicted.copy()
@@ -63,7 +62,7 @@ class Prefilter:
         moment: Moment,
         predict: Callable[[float, Moment], float],
     ) -> float:
-        """Filtered correction of this cycle, arcsec.
+        """Returns the filtered correction of this cycle, arcsec.
 
         ``correction_arcsec`` belongs to the load target ``load_deg``; ``predict`` returns the correction at
         another load target without changing any state.
@@ -80,7 +79,7 @@ class Prefilter:
         grown = moment.motor_speed_deg_s * change / step if step else 0.0
         for by_step, by_change in self._reaches:
             ahead_deg = load_deg + by_step * step + by_change * change
-            if moment.direction:  # somebody needs the channels of the motion
+            if moment.direction:  # an effect needs the motion channels
                 then = moment._replace(
                     motor_speed_deg_s=moment.motor_speed_deg_s + by_step * grown, load_deg=ahead_deg
                 )

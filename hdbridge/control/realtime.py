@@ -1,7 +1,7 @@
-"""What a process can do for a punctual loop: no garbage collection, real-time priority, locked memory.
+"""Process settings for a punctual loop: no garbage collection, real-time priority, locked memory.
 
-Everything is put back on the way out. What the system does not permit is reported, not insisted on: the
-loop then runs with what it got, and its lateness histogram tells how well.
+Everything is restored on exit. Settings that the system refuses are reported, not required: the loop then
+runs with those it got, and its lateness histogram shows the result.
 """
 
 from __future__ import annotations
@@ -18,33 +18,32 @@ from typing import Final
 
 _MCL_CURRENT, _MCL_FUTURE = 1, 2
 PRIORITY: Final = 50
-"""SCHED_FIFO priority: above all ordinary work, and level with the kernel's interrupt threads.
+"""SCHED_FIFO priority: above all ordinary work, and equal to the kernel's interrupt threads.
 
-Linux gives threaded interrupts (under PREEMPT_RT nearly all are) SCHED_FIFO 50 as well: half of the 100, see
-sched_set_fifo. Of equals on one processor the one that runs goes on until it sleeps. So neither interrupts
-the other: the loop may wait for an interrupt thread, and the one that brings frames runs meanwhile.
-"""
+Linux runs threaded interrupts (nearly all under PREEMPT_RT) at SCHED_FIFO 50 too; see sched_set_fifo. Threads
+of equal priority on one processor do not preempt each other, so the loop may wait for an interrupt thread,
+and the one that delivers frames can run to its end."""
 
 SWITCH_INTERVAL_S: Final = 0.0002
 
 
 @dataclass(frozen=True, slots=True)
 class Realtime:
-    """What was obtained; a reason where it was not."""
+    """Settings obtained, with the reason for each that was refused."""
 
     scheduling: str | None
-    """None when the thread has SCHED_FIFO, else why not."""
+    """None if the thread has SCHED_FIFO, else the reason."""
     memory: str | None
-    """None when the memory is locked, else why not."""
+    """None if the memory is locked, else the reason."""
     affinity: str | None = None
-    """None when the thread is bound to the processors that were asked for (or none were), else why not."""
+    """None if the thread is bound to the requested processors or none were requested, else the reason."""
     priority: int = PRIORITY
-    """The SCHED_FIFO priority asked for; 0: none."""
+    """Requested SCHED_FIFO priority; 0 for none."""
     cpus: tuple[int, ...] = ()
-    """The processors asked for; none: any."""
+    """Requested processors; empty for any."""
 
     def __str__(self) -> str:
-        """One line for a person."""
+        """Describes the settings in one line."""
         parts = ["garbage collection off"]
         if not self.priority:
             parts.append("ordinary priority")
@@ -68,13 +67,13 @@ def _lock_memory(flags: int) -> str | None:
 
 @contextmanager
 def prepare_realtime(priority: int = PRIORITY, cpus: Collection[int] = ()) -> Iterator[Realtime]:
-    """Make the calling thread and its process punctual for as long as the block lasts.
+    """Makes the calling thread and its process punctual within the block.
 
-    ``priority`` is that of SCHED_FIFO, 1 to 99, or 0 to leave the scheduling alone; ``cpus`` are the numbers
-    of the processors that the thread may run on, none for any.
+    ``priority`` is the SCHED_FIFO priority, 1 to 99, or 0 to leave the scheduling alone; ``cpus`` are the
+    numbers of the processors that the thread may run on, empty for any.
 
-    Never around a loop that does not sleep, such as a bench on a virtual clock: with SCHED_FIFO it would
-    take a whole processor from everything else.
+    Do not use it around a loop that does not sleep, such as a bench on a virtual clock: with SCHED_FIFO it
+    would monopolise a processor.
     """
     held = _Held(priority, cpus)
     with held.stack:
@@ -88,10 +87,11 @@ def prepare_realtime(priority: int = PRIORITY, cpus: Collection[int] = ()) -> It
 
 @contextmanager
 def left_realtime() -> Iterator[None]:
-    """Out of the block of `prepare_realtime` for as long as this one lasts: for a fit between two motions.
+    """Suspends `prepare_realtime` within the block, for a fit between two motions, for example.
 
-    With SCHED_FIFO it would keep others from the processor for minutes, and without the collector, in locked
-    memory, take more of that than there is. `resumed_realtime` within goes back for a motion.
+    A long computation with SCHED_FIFO would block other processes for minutes, and without the garbage
+    collector, in locked memory, could exhaust it. `resumed_realtime` within the block resumes it for a
+    motion.
     """
     held = _held[-1] if _held else None
     if held is None or held.left:
@@ -106,7 +106,7 @@ def left_realtime() -> Iterator[None]:
 
 @contextmanager
 def resumed_realtime() -> Iterator[None]:
-    """Back in, where `left_realtime` has left; else nothing."""
+    """Resumes `prepare_realtime` within the block, if `left_realtime` has suspended it."""
     held = _held[-1] if _held else None
     if held is None or not held.left:
         yield
@@ -119,7 +119,7 @@ def resumed_realtime() -> Iterator[None]:
 
 
 class _Held:
-    """The conditions of one block, entered or left for a while."""
+    """Settings of one block, which can be suspended and resumed."""
 
     def __init__(self, priority: int, cpus: Collection[int]) -> None:
         self._priority, self._cpus = priority, cpus
@@ -136,7 +136,7 @@ class _Held:
 
 
 _held: Final[list[_Held]] = []
-"""The blocks that this process is in; the conditions are the process's, so is this."""
+"""Blocks that are active; module-level because the settings apply to the whole process."""
 
 
 @contextmanager
@@ -144,7 +144,7 @@ def _conditions(priority: int, cpus: Collection[int]) -> Iterator[Realtime]:
     policy, parameter = os.sched_getscheduler(0), os.sched_getparam(0)
     allowed = os.sched_getaffinity(0)
     collecting, switching_s = gc.isenabled(), sys.getswitchinterval()
-    # Another thread (a progress bar's) gives the interpreter back within this time when the loop wakes up.
+    # Another thread (a progress bar's) releases the interpreter within this time when the loop wakes up.
     sys.setswitchinterval(SWITCH_INTERVAL_S)
     affinity = _why_not(lambda: _bind(cpus)) if cpus else None
     scheduling = (
@@ -172,7 +172,7 @@ def _conditions(priority: int, cpus: Collection[int]) -> Iterator[Realtime]:
 
 
 def _why_not(attempt: Callable[[], None]) -> str | None:
-    """The system's reason for refusing; None when it did not."""
+    """Returns the system's reason for refusing; None on success."""
     try:
         attempt()
     except OSError as error:
@@ -181,7 +181,7 @@ def _why_not(attempt: Callable[[], None]) -> str | None:
 
 
 def _bind(cpus: Collection[int]) -> None:
-    """Linux takes those of the processors that exist and says nothing of the others."""
+    """Binds the thread to processors; checks them first, because Linux silently ignores missing ones."""
     here = set(range(os.cpu_count() or 1))
     if missing := set(cpus) - here:
         raise OSError(errno.EINVAL, f"there is no processor {min(missing)}, the last one is {max(here)}")

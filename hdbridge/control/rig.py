@@ -1,7 +1,7 @@
-"""Where procedures run: on a drive that this process masters, or on an axis that another process holds.
+"""Benches for procedures, on a drive that this process masters or on an axis that another process holds.
 
-A calibration, an improvement, a comparison of schemes need no more of it than this: whose axis it is, which
-drive answers, and benches to run procedures on.
+Calibration, improvement and the comparison of schemes need only this: the axis file, the identity of the
+drive, and benches to run procedures on.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ Outcome = TypeVar("Outcome")
 
 
 class ProcedureBench(Protocol):
-    """What runs procedures; `Bench` is one, and says what each of these does."""
+    """Interface for running procedures; `Bench` implements and documents it."""
 
     @property
     def legs(self) -> tuple[Segment, ...]: ...
@@ -38,20 +38,20 @@ class ProcedureBench(Protocol):
 
 
 class Rig(Protocol):
-    """An axis that is held elsewhere, with a booted drive."""
+    """Axis that another process holds, with a booted drive."""
 
     @property
     def axis(self) -> AxisConfig: ...
 
     @property
     def identity(self) -> Identity:
-        """Which drive answers."""
+        """Identity of the connected drive."""
         ...
 
     def bench(
         self, compensation: Compensation | None = None, *, interrupted: Callable[[], bool] = ...
     ) -> ProcedureBench:
-        """As `Bench` of a drive: ``interrupted`` is asked in each cycle of a run."""
+        """Returns a bench; ``interrupted`` is called in each cycle of a run, as in `Bench`."""
         ...
 
 
@@ -61,7 +61,7 @@ def bench_on(
     *,
     interrupted: Callable[[], bool] = lambda: False,
 ) -> ProcedureBench:
-    """A bench for a booted drive, or for an axis that is held elsewhere."""
+    """Returns a bench for a booted drive, or for an axis that another process holds."""
     if isinstance(place, Drive):
         return Bench(place, compensation, interrupted=interrupted)
     return place.bench(compensation, interrupted=interrupted)

@@ -1,4 +1,4 @@
-"""What a run went on in spite of: faults that the supervision let pass, counted. Pure."""
+"""Tolerated faults of a run: counts of the faults that the supervision let pass. Pure."""
 
 from __future__ import annotations
 
@@ -13,34 +13,34 @@ PERIODS_SKIPPED = "a period was skipped"
 
 
 class Survived(BaseModel):
-    """A kind of fault, and how often it was seen."""
+    """A kind of fault, with the number of cycles in which it occurred."""
 
     model_config = ConfigDict(defer_build=True, frozen=True, extra="forbid")
 
-    what: str = Field(description="what was seen, in the words of the fault table")
-    cycles: int = Field(ge=1, description="in how many cycles")
-    first: str = Field("", description="more about the first of them")
+    what: str = Field(description="the fault, in the words of the fault table")
+    cycles: int = Field(ge=1, description="number of cycles in which it occurred")
+    first: str = Field("", description="details of the first one")
 
     def __str__(self) -> str:
-        """``a TPDO is missing, in 3 cycles (first: 282h)``."""
+        """Formats as ``a TPDO is missing, in 3 cycles (first: 282h)``."""
         return f"{self.what}, in {self.cycles} cycle{'s' * (self.cycles > 1)}" + (
             f" (first: {self.first})" if self.first else ""
         )
 
 
 class Watch:
-    """Counts from where the supervision and the cycle stood when it was made."""
+    """Counts faults and skipped periods from its creation on."""
 
     __slots__ = ("_before", "_skipped", "_supervision")
 
     def __init__(self, supervision: Supervision, skipped: int) -> None:
-        """``skipped`` is how many periods had been given up by then."""
+        """``skipped`` is the number of periods skipped before."""
         self._supervision = supervision
         self._before = dict(supervision.counts)
         self._skipped = skipped
 
     def survived(self, skipped: int) -> tuple[Survived, ...]:
-        """What was seen since then, in the order of the fault table; the last is periods skipped."""
+        """Returns the faults since then, in the order of the fault table, and last the skipped periods."""
         counts = {
             fault: count - self._before[fault]
             for fault, count in self._supervision.counts.items()
@@ -59,7 +59,7 @@ class Watch:
 
 
 def lines(runs: Iterable[tuple[str, Sequence[Survived]]]) -> Iterator[str]:
-    """A line for each run that went on in spite of something; of each the name comes first."""
+    """Yields one line for each run that tolerated faults, with the run's name first."""
     for name, survived in runs:
         if survived:
-            yield f"{name} went on in spite of: {'; '.join(map(str, survived))}"
+            yield f"{name} continued despite: {'; '.join(map(str, survived))}"

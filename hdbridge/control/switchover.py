@@ -1,11 +1,10 @@
-"""Another model in motion, without a step: what the control cycle asks in place of one `Compensation`.
+"""Change of the model in motion, without a step: takes the place of one `Compensation` in the control cycle.
 
-While a change is under way both models follow the angle that is issued, and the correction goes from what
-the old one wants to what the new one wants: by a weight that rises over the ramp's time, within the slew
-limit and the caps. The new one begins on the path that was issued last, so that its hysteresis is in the
-state which that path gives it.
+During a change both models follow the issued angle, and the correction passes from that of the old model to
+that of the new one: by a weight that rises over the ramp's time, within the slew limit and the caps. The new
+one begins on the path that was issued last, which also determines the state of its hysteresis.
 
-A scheme (none, synchronous, hysteresis, both) is a model with other effects: switching it is the same.
+A scheme (none, synchronous, hysteresis, both) is a model with other effects and is switched in the same way.
 """
 
 from __future__ import annotations
@@ -23,75 +22,75 @@ _NOWHERE = Moment()
 
 
 class Correction:
-    """A compensation that can be exchanged for another; it has the same face.
+    """Compensation that can be exchanged for another; it has the same interface.
 
-    ``command`` and ``hold`` are those of the compensation itself while nothing is changing, so they cost
-    nothing more. They are others during a change: look them up in each cycle.
+    ``command`` and ``hold`` are those of the compensation itself while nothing changes, so they add no cost.
+    They are different functions during a change: look them up in each cycle.
     """
 
     __slots__ = ("_limited", "_new", "_now", "_weight", "command", "hold")
 
     command: Callable[[float, Moment], float]
-    """`Compensation.command`: motor target in degrees for this cycle's load target."""
+    """Motor target in degrees for this cycle's load target (`Compensation.command`)."""
     hold: Callable[[float, Moment], float]
-    """`Compensation.hold`: the same with the correction frozen; a change waits."""
+    """Same with the correction frozen (`Compensation.hold`); a change pauses."""
 
     def __init__(self, first: Compensation) -> None:
         self._now = first
         self._new: Compensation | None = None
         self._weight = 0.0
-        """The new one's, during a change."""
+        """Weight of the new one during a change."""
         self._limited = 0
         self.command, self.hold = first.command, first.hold
 
     @property
     def model(self) -> TransmissionModel:
-        """The model that is at work, or is about to be."""
+        """Model that is in force, or will be after the change."""
         return (self._new or self._now).model
 
     @property
     def changing(self) -> bool:
-        """Whether a change is under way."""
+        """True during a change."""
         return self._new is not None
 
     @property
     def needs(self) -> frozenset[Channel]:
-        """The channels that it needs a `Moment` with; more during a change."""
+        """Channels that a `Moment` must contain; those of both models during a change."""
         return self._now.needs if self._new is None else self._now.needs | self._new.needs
 
     @property
     def correction_arcsec(self) -> float:
-        """The correction at work, arcsec at the load."""
+        """Correction in force, arcsec at the load."""
         return self._now.correction_arcsec
 
     @property
     def predicted_arcsec(self) -> float:
-        """The model's error where the motor was last sent, arcsec, whatever the weight.
+        """Model's error at the last motor target, arcsec, regardless of the weight.
 
-        In a change it goes over from the one's to the other's.
+        During a change it passes from that of the old model to that of the new one.
         """
         now = self._now.predicted_arcsec
         return now if self._new is None else now + self._weight * (self._new.predicted_arcsec - now)
 
     @property
     def memory_known(self) -> bool:
-        """Whether the state is that of the issued path alone (`Compensation.memory_known`)."""
+        """True if the state depends on the issued path alone (`Compensation.memory_known`)."""
         return self._now.memory_known and (self._new is None or self._new.memory_known)
 
     @property
     def weight(self) -> float:
-        """The ramp's weight: 0 off, 1 fully on."""
+        """Weight of the ramp: 0 off, 1 fully on."""
         return self._now.weight
 
     @property
     def limited(self) -> int:
-        """Cycles in which a cap or the slew limit was at work."""
+        """Number of cycles in which a cap or the slew limit acted."""
         return self._limited + self._now.limited
 
     def change(self, new: Compensation) -> None:
-        """From the next command on go over to another one, just made; `changing` says until when.
+        """Changes to a new compensation from the next command on; `changing` is True until it is complete.
 
-        InputError, and nothing changes: for another gear ratio, and while a change is under way.
+        InputError, without any change, for another gear ratio and while a change is under way.
         """
         if self._new is not None:
             raise InputError("a change of the model is under way: wait until it is done")
@@ -105,22 +104,22 @@ class Correction:
         self.command = self._first_blended
 
     def know(self, channels: frozenset[Channel]) -> None:
-        """`Compensation.know`."""
+        """Sets the available channels (`Compensation.know`)."""
         for each in self._all():
             each.know(channels)
 
     def engage(self) -> None:
-        """Fade the correction in from the next command on."""
+        """Fades the correction in from the next command on."""
         for each in self._all():
             each.engage()
 
     def disengage(self) -> None:
-        """Fade the correction out from the next command on."""
+        """Fades the correction out from the next command on."""
         for each in self._all():
             each.disengage()
 
     def reset(self, motor_deg: float, moment: Moment = _NOWHERE) -> None:
-        """The motor stands here and nothing is being corrected; a change under way is done with."""
+        """Restarts at ``motor_deg``, at standstill and without a correction; completes a change at once."""
         if self._new is not None:
             self._new.take_over(self._now, moment)
             self._done(self._new)
@@ -130,7 +129,7 @@ class Correction:
         return (self._now,) if self._new is None else (self._now, self._new)
 
     def _first_blended(self, load_deg: float, moment: Moment = _NOWHERE) -> float:
-        """The first of a change: only now there is a moment to begin with."""
+        """Runs the first command of a change, which provides the moment for `Compensation.take_over`."""
         assert self._new is not None
         self._new.take_over(self._now, moment)
         self.command, self.hold = self._blended, self._held

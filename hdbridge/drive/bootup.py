@@ -252,8 +252,7 @@ class BootUp:
             if self._link.now() >= deadline_s:
                 raise DriveError(
                     f"{self._name(objects.STATUSWORD)}: the drive stays in '{state.value}' after 'disable "
-                    "voltage'; "
-                    "switch it off by its enable input and look at its error display"
+                    "voltage'; switch it off by its enable input and look at its error display"
                 )
             self._pause(_POLL_S)
             state = decode(self._sdo.fetch(objects.STATUSWORD))

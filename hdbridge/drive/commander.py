@@ -142,8 +142,7 @@ class Commander:
             if self.link.now() >= deadline_s:
                 raise DriveError(
                     f"{self.sdo.describe(0x6061, 0)}: shows {shown} after mode {mode.value} ({mode.name}) "
-                    "was "
-                    f"set; the drive does not take the mode now"
+                    "was set; the drive does not take the mode now"
                 )
             self.pause(POLL_S)
 

@@ -123,10 +123,6 @@ def drives_patience_s(axis: AxisConfig) -> float:
     return min(axis.drive.heartbeat_ms, set_point_timeout_ms(axis)) / 1000.0
 
 
-_WATCHDOGS: Final = frozenset({(0x1016, 1), (0x1400, 5)})
-"""Objects of the watchdogs: heartbeat consumer, and event timer of the set-points."""
-
-
 def _heartbeats(axis: AxisConfig) -> Iterator[PlannedWrite]:
     ms, master, field = axis.drive.heartbeat_ms, axis.drive.master_node_id, "drive.heartbeat_ms"
     why = "period of the drive's heartbeat, ms"

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hdbridge.errors import InputError
+from hdbridge.units import without_unit
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -63,8 +64,8 @@ class Channel(Enum):
 
     @property
     def title(self) -> str:
-        """Its name in words, without the unit."""
-        return str(self.value).rpartition("_")[0].replace("_", " ")
+        """Name of its column in words, without the unit."""
+        return without_unit(str(self.value)).removesuffix("_c").replace("_", " ")
 
 
 MEASURED: Final = tuple(each for each in Channel if each.about)

@@ -1,7 +1,7 @@
-"""What hours of work change in the gear, evenly from when it is switched on; see `hdbridge.sim.gear`.
+"""Ageing: gradual changes in the gear over hours of work, linear from switch-on; see `hdbridge.sim.gear`.
 
-Grease that stiffens and preload that settles change the loop, teeth that wear change the tooth error. Each
-piece is asked once per substep, in order of time.
+Stiffening grease and settling preload change the loop; wear of the teeth changes the tooth error. Each piece
+is evaluated once per substep, in order of time.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from hdbridge.sim.truth.gear import TrueAgeing
 
 @state
 class Age:
-    """Share of the ageing that is done: from 0 when the axis is switched on to 1, where it stays."""
+    """Completed share of the ageing: 0 when the axis is switched on, rises to 1 and stays there."""
 
     _share: float
     _step: float
@@ -27,7 +27,7 @@ class Age:
         self._share = 0.0
 
     def grown(self) -> float:
-        """The share after one more substep."""
+        """Returns the share after one more substep."""
         self._share = min(1.0, self._share + self._step)
         return self._share
 
@@ -44,13 +44,13 @@ class AgeFactor:
         self._growth = truth.hysteresis_growth
 
     def factor(self, now: Conditions) -> float:
-        """The factor after one more substep."""
+        """Returns the factor after one more substep."""
         return 1.0 + self._growth * self._age.grown()
 
 
 @state
 class WornTeeth:
-    """Tooth error by the motor's angle that comes with wear."""
+    """Tooth error by motor angle, caused by wear."""
 
     BY_MOTOR_ONLY: ClassVar[bool] = False
     _age: Age

@@ -1,7 +1,7 @@
-"""The axis from control cycle to control cycle: the loops, the heat, and what the encoders read at its end.
+"""Simulated axis, cycle by cycle: the loops, the heat, and the encoder readings at the end of a cycle.
 
-Everything that `hdbridge.sim.machine` does in a cycle but for chance: so it can be compiled as a whole, and
-one call leads it through a cycle.
+It contains everything that `hdbridge.sim.machine` does in a cycle except noise, so it can be compiled as a
+whole and advanced by one call per cycle.
 """
 
 from __future__ import annotations
@@ -16,15 +16,15 @@ from hdbridge.sim.truth import Truth
 from hdbridge.units import DEG_PER_TURN
 
 Told = tuple[float, float, float, int, float, float, int, int, float, float, float, float, float]
-"""The motor's and the load's encoder in counts, before they are rounded; the motor's torque (Nm), and in
-thousandths of the rated one; the temperature; the torque on the load (Nm); both encoders in whole counts; the
-motor's speed as the drive measures it (counts/s); the time since the axis was switched on; the angles of the
-motor, the load and the gear's output themselves (deg)."""
+"""Measurements at the end of a cycle: motor and load encoder in counts, before rounding; the motor's
+torque (Nm) and in thousandths of the rated one; the temperature; the torque on the load (Nm); both
+encoders in whole counts; the motor's speed as measured by the drive (counts/s); the time since
+switch-on; the true angles of the motor, the load and the gear's output (deg)."""
 
 
 @state
 class Axis:
-    """A servo axis; it begins at rest at the angle zero, its power stage off."""
+    """Servo axis, initially at rest at the angle zero with its power stage off."""
 
     heat: Heat
     loops: Loops
@@ -32,7 +32,7 @@ class Axis:
     _hold_counts: float
     _hold_deg: float
     _holds: bool
-    """The demand rests where the loops were switched on."""
+    """True while the demand stays where the loops were switched on."""
     _load_counts_per_deg: float
     _load_errors: FixedErrors
     _load_losses: Losses
@@ -47,7 +47,7 @@ class Axis:
     _torque_sense: float
 
     def __init__(self, truth: Truth, *, loaded: bool = False) -> None:
-        """``loaded``: there may be a torque on the load from outside."""
+        """``loaded`` allows an external torque on the load."""
         motor, load = truth.motor.encoder, truth.load_.encoder
         self.loops = Loops(truth, loaded=loaded)
         self.heat = Heat(truth)
@@ -65,7 +65,7 @@ class Axis:
         self._torque_sense = float(truth.load_.torque_sense)
 
     def at_first(self) -> Told:
-        """What there is to know before anything has happened."""
+        """Returns the initial state."""
         return self._told(self.loops.seen(), 0.0, 0.0, 0.0)
 
     def drive(
@@ -77,10 +77,10 @@ class Axis:
         noise_deg: float,
         outer_nm: float,
     ) -> Told:
-        """Closed loop: the demand moves evenly from start to end, in motor counts, at most with a torque.
+        """Runs a closed-loop cycle in which the demand moves linearly from start to end, in motor counts.
 
-        ``noise_deg`` is what the load encoder reads too much at the end, ``outer_nm`` the torque on the load
-        from outside.
+        ``limit_nm`` is the torque limit, ``noise_deg`` the noise of the load encoder at the end,
+        ``outer_nm`` the external torque on the load.
         """
         loops, per_deg = self.loops, self.motor_counts_per_deg
         slow = self._slow(limit_nm, outer_nm)
@@ -106,21 +106,21 @@ class Axis:
     def roll(
         self, brake_nm: float, substeps: int, limit_nm: float, noise_deg: float, outer_nm: float
     ) -> Told:
-        """Power stage off: friction, and the brake, slow the motor and hold it."""
+        """Runs a cycle with the power stage off: friction and the brake slow the motor and hold it."""
         self._powered = False
         seen = self.loops.coast(brake_nm, substeps, self._slow(limit_nm, outer_nm))
         return self._told(seen, substeps * self.loops.dt_s, noise_deg, outer_nm)
 
     def hold(self, torque_nm: float) -> None:
-        """At rest: the loops have come to hold the axis by this torque."""
+        """Sets the torque by which the loops hold the axis at rest."""
         self.loops.hold(torque_nm)
 
     def _slow(self, limit_nm: float, outer_nm: float) -> Slow:
-        """What the loops have to know for the next cycle."""
+        """Returns the slowly varying inputs of the loops for the next cycle."""
         return self.heat.body_c, self.heat.rub, limit_nm, self._lost_deg(), outer_nm
 
     def _told(self, seen: Seen, elapsed_s: float, noise_deg: float, outer_nm: float) -> Told:
-        """What the drive measures at the end of a cycle of which the loops say this."""
+        """Returns the drive's measurements at the end of a cycle, from the state of the loops."""
         (
             motor_deg,
             sampled_motor_deg,
@@ -148,7 +148,7 @@ class Axis:
             round(self._sense_permille * torque_nm / self._rated_nm),
             heat.body_c,
             self._torque_sense * (weight_nm + outer_nm),
-            # Multi-turn, never wrapped. A count's middle is its angle.
+            # Multi-turn, never wrapped. The middle of a count is its angle.
             math.floor(motor_reading + 0.5),
             math.floor(load_reading + 0.5),
             measured_deg_s * self.motor_counts_per_deg,
@@ -159,10 +159,10 @@ class Axis:
         )
 
     def _motor_reading(self, motor_deg: float) -> float:
-        """The motor encoder at an angle, before it is rounded."""
+        """Returns the motor encoder at an angle, in counts before rounding."""
         read_deg = motor_deg + self._motor_errors.at_deg(motor_deg) + self._lost_deg()
         return read_deg * self.motor_counts_per_deg + self._motor_zero
 
     def _lost_deg(self) -> float:
-        """What the motor encoder has lost."""
+        """Returns the angle that the motor encoder has lost."""
         return self._motor_losses.counts(self.heat.since_s) / self.motor_counts_per_deg

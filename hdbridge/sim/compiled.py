@@ -1,12 +1,13 @@
-"""The axis as machine code, made of the very classes that Python runs: the same numbers.
+"""Axis compiled to machine code from the same classes that Python runs, with the same numbers.
 
 An object of the classes that `hdbridge.sim.state` declares is laid out as a numpy record, attribute by
-attribute, and numba compiles the classes' methods for such records. The physics is written only once. Where
-an attribute may be of several classes (a law of hysteresis, a cause of transmission error) its record has
-room for each, and says which one it is.
+attribute, and numba compiles the classes' methods for such records. The physics is written only once. If an
+attribute may belong to one of several classes (a hysteresis law, a cause of transmission error), its record
+has space for each, and a field for the kind.
 
-Bit for bit, because nothing is reordered or fused (no ``fastmath``), and because exp, sin and their like are
-those of the C library that Python uses as well. What cannot be laid out (`Uncompilable`) runs in Python.
+Results are identical bit for bit, because nothing is reordered or fused (no ``fastmath``), and exp, sin and
+similar functions are those of the C library that Python uses. What cannot be laid out (`Uncompilable`) runs
+in Python.
 """
 
 from __future__ import annotations
@@ -33,21 +34,21 @@ from hdbridge.sim.plant import Plant
 from hdbridge.sim.state import STATES
 
 LEAST_ROOM: Final = 16
-"""Entries for which a list of numbers has room at least; each power of two is compiled apart."""
+"""Minimum capacity of a list of numbers; each power of two is compiled separately."""
 
 
-class Uncompilable(Exception):  # noqa: N818 - it is no failure: such an axis runs in Python
-    """There is something in the loops that cannot be compiled."""
+class Uncompilable(Exception):  # noqa: N818 - not a failure: such an axis runs in Python
+    """Raised if a part of the axis cannot be compiled."""
 
 
 class Kinds(NamedTuple):
-    """The classes that an attribute declared by what it does may be of."""
+    """Possible classes of an attribute that is declared by its protocol."""
 
     classes: tuple[type, ...]
     room: int
-    """How many of them a tuple has room for."""
+    """Capacity of a tuple of them."""
     neutral: float
-    """What an empty place in such a tuple gives."""
+    """Value of an empty place in such a tuple."""
 
 
 KINDS: Final[dict[Any, Kinds]] = {
@@ -91,10 +92,10 @@ _NUMBERS: Final = {float: "f8", int: "i8", bool: "?", complex: "c16"}
 
 
 class CompiledAxis:
-    """The state of an `Axis` as one record, and the compiled methods on it; to be used like it."""
+    """State of an `Axis` as one record, with compiled methods; has the interface of `Axis`."""
 
     def __init__(self, axis: Axis) -> None:
-        """Raises `Uncompilable`."""
+        """Lays out the axis; raises `Uncompilable` if that is not possible."""
         if getattr(numba.config, "USING_SVML", False):
             raise Uncompilable("numba would take sine and exponential from Intel's library")
         plant: Any = type(axis.loops.plant)
@@ -113,7 +114,7 @@ class CompiledAxis:
         noise_deg: float,
         outer_nm: float,
     ) -> Told:
-        """See `Axis`."""
+        """Runs a closed-loop cycle; see `Axis`."""
         told: Told = self._drive(
             self._record, start_counts, end_counts, substeps, limit_nm, noise_deg, outer_nm
         )
@@ -129,9 +130,9 @@ class CompiledAxis:
         held_nm: FloatArray,
         told: FloatArray,
     ) -> Told:
-        """`Axis.drive` over many cycles, each from the demand before it, and first held by ``held_nm``.
+        """Runs `Axis.drive` over many cycles, each from the demand before it, and first held by ``held_nm``.
 
-        ``told`` takes the first of what each tells (`machine.Cycles`).
+        ``told`` receives the first six values of each cycle (`machine.Cycles`).
         """
         last: Told = _methods()["drive_all"](
             self._record, counts, substeps, limit_nm, noise_deg, outer_nm, held_nm, told
@@ -141,23 +142,23 @@ class CompiledAxis:
     def roll(
         self, brake_nm: float, substeps: int, limit_nm: float, noise_deg: float, outer_nm: float
     ) -> Told:
-        """See `Axis`."""
+        """Runs a cycle with the power stage off; see `Axis`."""
         told: Told = self._entry_point("roll")(
             self._record, brake_nm, substeps, limit_nm, noise_deg, outer_nm
         )
         return told
 
     def hold(self, torque_nm: float) -> None:
-        """See `Axis`."""
+        """Sets the holding torque; see `Axis`."""
         self._entry_point("hold")(self._record, torque_nm)
 
 
 @cache
 def _entry_point(plant: Any, room: int, name: str) -> Callable[..., Any]:
-    """A compiled method of an `Axis` with this plant.
+    """Returns a compiled method of an `Axis` with this plant.
 
-    It takes its numbers as they come, whole ones too, where numba's dispatcher would look at the type of each
-    in each call, and compile once more for one that is whole.
+    It converts its arguments to the declared types. Numba's dispatcher would check the types in each call,
+    and compile again for whole numbers.
     """
     *hints, _ = get_type_hints(getattr(Axis, name)).values()
     numbers = [types.float64 if hint is float else types.int64 for hint in hints]
@@ -168,7 +169,7 @@ def _entry_point(plant: Any, room: int, name: str) -> Callable[..., Any]:
 
 @cache
 def _methods() -> dict[str, Any]:
-    """Numba's dispatchers of the methods; kept on disk by numba, for the sources as they are now."""
+    """Returns numba's dispatchers of the methods, cached on disk for the present sources."""
     _register()
     version = _version()
 
@@ -181,7 +182,7 @@ def _methods() -> dict[str, Any]:
         noise_deg: float,
         outer_nm: float,
     ) -> Any:
-        assert version  # numba's file is of this version
+        assert version  # ties numba's cache file to this version
         return axis[0].drive(start_counts, end_counts, substeps, limit_nm, noise_deg, outer_nm)
 
     def drive_all(
@@ -220,7 +221,7 @@ def _methods() -> dict[str, Any]:
 
 
 def _version() -> int:
-    """A number made of the sources of all that is compiled: numba itself looks at one file only."""
+    """Returns a hash of the sources of all compiled code; numba itself checks only one file."""
     digest = hashlib.sha256()
     for path in sorted(Path(__file__).parent.glob("*.py")):
         digest.update(path.read_bytes())
@@ -231,7 +232,7 @@ def _version() -> int:
 
 
 def _attributes(cls: type) -> dict[str, Any]:
-    """The declared attributes of a state class, its ancestors' included."""
+    """Returns the declared attributes of a state class and its ancestors."""
     if cls not in _ATTRIBUTES:
         hints = get_type_hints(cls)
         _ATTRIBUTES[cls] = {name: hint for name, hint in hints.items() if get_origin(hint) is not ClassVar}
@@ -239,11 +240,11 @@ def _attributes(cls: type) -> dict[str, Any]:
 
 
 _ATTRIBUTES: Final[dict[type, dict[str, Any]]] = {}
-"""`_attributes`, which take long to find out."""
+"""Cache of `_attributes`, which are slow to determine."""
 
 
 def _room(value: Any) -> int:
-    """The power of two that has room for the longest list of numbers in an object."""
+    """Returns the smallest power of two that holds the longest list of numbers in an object."""
     longest = LEAST_ROOM
     for name in _attributes(type(value)):
         each = getattr(value, name)
@@ -258,7 +259,7 @@ def _room(value: Any) -> int:
 
 @cache
 def _layout_of(plant: Any, room: int) -> Any:
-    """The numpy type of an `Axis` with this plant. One object for all: numba finds it at once."""
+    """Returns the numpy type of an `Axis` with this plant, as one object that numba recognises quickly."""
 
     def layout(declared: Any) -> Any:
         if declared in _NUMBERS:
@@ -272,7 +273,7 @@ def _layout_of(plant: Any, room: int) -> Any:
             _UNIONS[numba.from_dtype(union)] = declared
             return union
         cls = plant if declared is Plant else declared
-        mark = (f"is_{cls.__name__}", np.dtype("u1"))  # no two classes look alike
+        mark = (f"is_{cls.__name__}", np.dtype("u1"))  # makes each class's layout unique
         record = np.dtype([mark, *((n, layout(each)) for n, each in _attributes(cls).items())], align=True)
         _CLASSES[numba.from_dtype(record)] = cls
         return record
@@ -281,7 +282,7 @@ def _layout_of(plant: Any, room: int) -> Any:
 
 
 def _fill(record: Any, value: Any) -> None:
-    """Write an object's attributes to its record."""
+    """Writes an object's attributes to its record."""
     for name, hint in _attributes(type(value)).items():
         each = getattr(value, name)
         if hint in KINDS:
@@ -311,15 +312,15 @@ def _fill_union(record: Any, protocol: Any, value: Any) -> None:
 
 
 _CLASSES: Final[dict[Any, type]] = {}
-"""By numba's type of a record the class that it is of."""
+"""Class of each record type of numba."""
 _UNIONS: Final[dict[Any, Any]] = {}
-"""By numba's type of a record the protocol that it is one of the classes of."""
+"""Protocol of each record type of numba that may be one of several classes."""
 
 
 def _register() -> None:
-    """Tell numba the methods of all classes, and what to call the code that it makes of them."""
+    """Registers the methods of all classes with numba, and unique names for the compiled code."""
     types.Record.mangling_args = property(_name_in_code)  # type: ignore[method-assign, assignment]
-    # Each pass of numba's compiler writes types down: by their names, not by what is in them, made anew.
+    # Each pass of numba's compiler prints types: by their names, which is fast, not by their contents.
     types.Record.__repr__ = types.Type.__repr__  # type: ignore[method-assign]
     declared = {name for cls in STATES for name in _attributes(cls)}
     for cls in STATES:
@@ -330,20 +331,20 @@ def _register() -> None:
             if name not in _KNOWN:
                 _KNOWN[name] = len(parameters)
                 overload_method(types.Record, name, **_METHOD)(_chooser(name, parameters))
-            # numba tells what a record has apart by the name alone.
+            # numba distinguishes the members of a record by name alone.
             if _KNOWN[name] != len(parameters) or name in declared:
                 raise TypeError(f"{cls.__name__}.{name}: another class has it otherwise; rename one")
-    # What numba has for the attributes of records comes last: it takes each name for one of theirs.
+    # Numba's own template for record attributes comes last, because it claims every name.
     context = cpu_target.typing_context
     context.refresh()
     context._attributes[types.Record].sort(key=lambda each: isinstance(each, RecordAttribute))
 
 
 def _name_in_code(record: types.Record) -> tuple[str, tuple[str]]:
-    """What a record is called in the names of compiled functions: by what is in it.
+    """Returns the name of a record in compiled functions, derived from its contents.
 
-    numba itself counts the types of each process. Two layouts that were compiled by two processes then have
-    the same name, and a process that loads both from disk runs the code of one on the data of the other.
+    Numba itself numbers the types of each process. Two layouts compiled by two processes could then have the
+    same name, and a process that loads both from disk would run the code of one on the data of the other.
     """
     return "Record", (hashlib.sha256(record.name.encode()).hexdigest()[:32],)
 
@@ -352,13 +353,14 @@ _METHOD: Final[dict[str, Any]] = {
     "strict": False,
     "jit_options": {"no_cpython_wrapper": True, "no_cfunc_wrapper": True},
 }
-"""How numba makes a method: only compiled code calls it. Entries for Python and C take an eighth as long."""
+"""Numba's options for methods, which only compiled code calls: without entries for Python and C they
+compile in an eighth of the time."""
 _KNOWN: Final[dict[str, int]] = {}
-"""Methods that numba knows, with the number of their parameters."""
+"""Registered methods, with the number of their parameters."""
 
 
 def _chooser(name: str, parameters: tuple[str, ...]) -> Any:
-    """What numba asks for the method of a record."""
+    """Returns the function by which numba finds the method of a record."""
 
     def choose(record: Any) -> Any:
         if record in _UNIONS:
@@ -369,14 +371,14 @@ def _chooser(name: str, parameters: tuple[str, ...]) -> Any:
 
 
 def _function(name: str, parameters: Iterable[str], lines: Iterable[str], scope: dict[str, Any]) -> Any:
-    """A function of these parameters and lines: numba looks at both."""
+    """Builds a function from parameters and lines; numba inspects both."""
     exec("\n    ".join([f"def {name}({', '.join(parameters)}):", *lines]), scope)
     return scope[name]
 
 
 @cache
 def _dispatch(protocol: Any, name: str) -> Any:
-    """The method of a record that may be one of several classes."""
+    """Returns the method of a record that may be one of several classes."""
     kinds = KINDS[protocol]
     lines = [
         f"if self.kind == {kind}: return self.{cls.__name__}.{name}(argument)"
@@ -386,13 +388,13 @@ def _dispatch(protocol: Any, name: str) -> Any:
 
 
 def _of_the_c_library(function: Any) -> None:
-    """Let numba, which has no such function of two numbers, call the one that Python calls."""
+    """Makes numba call the C function that Python calls; numba has none of its own."""
     same = types.ExternalFunction(function.__name__, types.float64(types.float64, types.float64))
 
     @overload(function, strict=False)
     def _chosen(x: Any, y: Any) -> Any:
         floats = isinstance(x, types.Float) and isinstance(y, types.Float)
-        return (lambda x, y: same(x, y)) if floats else None  # noqa: PLW0108 - numba looks at its code
+        return (lambda x, y: same(x, y)) if floats else None  # noqa: PLW0108 - numba inspects its code
 
 
 _of_the_c_library(math.remainder)

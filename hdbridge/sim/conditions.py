@@ -1,4 +1,4 @@
-"""What the pieces of the gear may depend on."""
+"""Conditions that the pieces of the gear depend on."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from hdbridge.sim.state import state
 
 @state
 class Conditions:
-    """The conditions as they are now; the plant keeps them up to date."""
+    """Present conditions, updated by the plant."""
 
     motor_deg: float
     load_deg: float

@@ -1,6 +1,6 @@
-"""What an encoder makes of its shaft's angle: geometry of the disc, signals, cable, age, counts lost.
+"""Encoder errors: geometry of the disc, signals, cable, ageing, lost counts.
 
-Each error is a reading error in degrees of the encoder's shaft: the shaft itself does not move by it.
+Each error is a reading error in degrees of the encoder's shaft; the shaft itself does not move.
 """
 
 from __future__ import annotations
@@ -22,23 +22,23 @@ from hdbridge.sim.truth.encoder import (
 from hdbridge.units import ARCSEC_PER_DEG
 
 BACK_DEG: Final = 0.05
-"""Load travel within which a cable's drag turns over."""
+"""Load travel over which a cable's drag reverses."""
 
 
 class ReadingError(Protocol):
-    """One cause of a wrong reading, with its state."""
+    """One cause of a reading error, with its state."""
 
     def error_deg(self, shaft_deg: float) -> float:
-        """What is read beyond the shaft's angle."""
+        """Returns the reading minus the shaft's angle, degrees."""
         ...
 
 
 @state
 class Disc:
-    """A disc off its shaft's axis, and distorted twice per turn.
+    """Disc with eccentricity and with a distortion twice per turn.
 
-    The head stands still; from the graduation's centre, a distance e off the axis of radius R, it is seen at
-    another angle than from the axis: ``atan2(e sin a, R + e cos a)``, about e/R sin a.
+    The head is fixed. Seen from the graduation's centre, at a distance e from the axis of a disc of radius
+    R, its angle differs from that seen from the axis by ``atan2(e sin a, R + e cos a)``, about e/R sin a.
     """
 
     _eccentric_rad: float
@@ -62,9 +62,9 @@ class Disc:
 
 @state
 class Signals:
-    """The angle within a line, from a sine and a cosine that are not quite what they should be.
+    """Angle within a line, from imperfect sine and cosine signals.
 
-    Offsets make an error once per line, unequal amplitudes or phases twice, third harmonics four times.
+    Offsets cause an error once per line, unequal amplitudes or phases twice, third harmonics four times.
     """
 
     _cosine_offset: float
@@ -92,7 +92,7 @@ class Signals:
 
 @state
 class Cable:
-    """A cable that is taut beyond an angle and pulls the encoder's body along; it reads that much less."""
+    """Cable that is taut beyond an angle and turns the encoder's body, which reduces the reading."""
 
     _drag: float
     _from_deg: float
@@ -122,7 +122,7 @@ class Cable:
 
 @state
 class SensorWarming:
-    """A shift that follows the square of the speed as the encoder warms and cools."""
+    """Shift proportional to the square of the speed, with a lag, as the encoder warms and cools."""
 
     _exponent: float
     _goal: float
@@ -154,14 +154,14 @@ class SensorWarming:
 
 @state
 class Losses:
-    """Counts lost so far."""
+    """Lost counts of an encoder."""
 
     _counts: tuple[float, ...]
-    """Of each loss."""
+    """Counts of each loss."""
     _count: int
     _lost: float
     _past: int
-    """How many there were."""
+    """Number of losses so far."""
     _times_s: tuple[float, ...]
 
     def __init__(self, losses: Iterable[TrueLoss]) -> None:
@@ -172,7 +172,7 @@ class Losses:
         self._past, self._lost = 0, 0.0
 
     def counts(self, now_s: float) -> float:
-        """By how much the reading is off at a time; times never go back."""
+        """Returns the reading error at a time; times must not decrease."""
         while self._past < self._count and self._times_s[self._past] <= now_s:
             self._lost += self._counts[self._past]
             self._past += 1
@@ -181,12 +181,12 @@ class Losses:
 
 @state
 class Late:
-    """What a shaft's angle was some time ago; fed once per substep."""
+    """Delayed angle of a shaft; fed once per substep."""
 
     deg: float
-    """The delayed angle."""
+    """Delayed angle."""
     _angles: list[float]
-    """The angles since then, in a ring of which ``_oldest`` is the first."""
+    """Angles since then, in a ring that starts at ``_oldest``."""
     _kept: int
     _oldest: int
     _part: float
@@ -198,14 +198,14 @@ class Late:
         self.begin(start_deg)
 
     def begin(self, shaft_deg: float) -> None:
-        """The shaft has always stood at this angle."""
+        """Resets to a shaft that has always stood at this angle."""
         self._oldest = 0
         self.deg = shaft_deg
         for place in range(self._kept):
             self._angles[place] = shaft_deg
 
     def feed(self, shaft_deg: float) -> None:
-        """The angle after one more substep."""
+        """Takes the angle after one more substep."""
         angles, oldest = self._angles, self._oldest
         angles[oldest] = shaft_deg
         first = oldest + 1 if oldest + 1 < self._kept else 0
@@ -216,7 +216,7 @@ class Late:
 
 @state
 class FixedErrors:
-    """The reading errors that follow from the shaft's angle alone."""
+    """Reading errors that depend on the shaft's angle alone."""
 
     _disc: Disc
     _signals: Signals
@@ -230,7 +230,7 @@ class FixedErrors:
         self._signals = Signals(signals or TrueSignals(lines_per_turn=1))
 
     def at_deg(self, shaft_deg: float) -> float:
-        """What is read beyond the shaft's angle."""
+        """Returns the reading minus the shaft's angle, degrees."""
         error_deg = 0.0
         if self._with_disc:
             error_deg += self._disc.error_deg(shaft_deg)
@@ -241,13 +241,13 @@ class FixedErrors:
 
 @state
 class Body:
-    """What moves the load encoder's body against its shaft, by the travel of the shaft.
+    """Movement of the load encoder's body, caused by the travel of its shaft.
 
-    It has a state, so it is led once per substep, and read as often as one likes.
+    It has a state, so it is fed once per substep, and may be read at any time.
     """
 
     deg: float
-    """The present shift of the reading."""
+    """Present shift of the reading."""
     moves: bool
     _errors: tuple[ReadingError, ...]
 
@@ -262,7 +262,7 @@ class Body:
         self.deg = 0.0
 
     def feed(self, shaft_deg: float) -> None:
-        """The shaft's angle after one more substep."""
+        """Takes the shaft's angle after one more substep."""
         shift_deg = 0.0
         for each in self._errors:
             shift_deg += each.error_deg(shaft_deg)

@@ -1,7 +1,7 @@
-"""Lead the simulated axis through moves without a bus, and keep what its encoders say.
+"""Moves the simulated axis without a bus and records its encoders.
 
-This is how records are made in bulk: the same loops, mechanics and encoders as behind the firmware, 250 or
-more times faster than the axis itself. All moves begin and end at rest, with continuous speed.
+This produces records in bulk: the same loops, mechanics and encoders as behind the firmware, at least 250
+times faster than real time. All moves begin and end at rest, with continuous speed.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ Floats = NDArray[np.float64]
 
 
 class Readings(NamedTuple):
-    """What was read, one entry per sample; angles as the encoders tell them, multi-turn."""
+    """Readings, one entry per sample; angles as measured by the encoders, multi-turn."""
 
     time_s: Floats
     motor_deg: Floats
@@ -32,7 +32,7 @@ class Readings(NamedTuple):
 
 
 class Exercise:
-    """Moves of one machine, in degrees of the motor, from where it stands; one demand per cycle."""
+    """Moves of one machine, in motor degrees from its present position; one demand per cycle."""
 
     def __init__(self, machine: Machine, cycle_s: float = 0.004, cycles_per_sample: int = 1) -> None:
         self.machine = machine
@@ -53,29 +53,29 @@ class Exercise:
 
     @property
     def target_deg(self) -> float:
-        """The motor angle last demanded."""
+        """Last demanded motor angle."""
         return (self._target - self._zero) / self._counts_per_deg
 
     @property
     def samples(self) -> int:
-        """Samples kept so far."""
+        """Number of samples recorded so far."""
         return len(self._rows)
 
     def hold(self, duration_s: float) -> None:
-        """Stand."""
+        """Holds the position."""
         self.lead(lambda seconds: 0.0 * seconds, duration_s)
 
     def move(self, distance_deg: float, speed_deg_s: float, acceleration_deg_s2: float) -> None:
-        """Move by a distance; the speed rises and falls as half a cosine with that highest acceleration."""
+        """Moves by a distance; each speed ramp is half a cosine with the given peak acceleration."""
         distance = abs(distance_deg)
         ramp_s = 0.5 * math.pi * speed_deg_s / acceleration_deg_s2
-        if speed_deg_s * ramp_s > distance:  # short: it brakes before it is up to speed
+        if speed_deg_s * ramp_s > distance:  # short move: it brakes before it reaches full speed
             ramp_s = math.sqrt(0.5 * math.pi * distance / acceleration_deg_s2)
         speed = min(speed_deg_s, distance / ramp_s if ramp_s else speed_deg_s)
         even_s = max(0.0, distance / speed - ramp_s) if speed else 0.0
 
         def ramped(seconds: Floats | float) -> Floats:
-            """Way after a time of speeding up."""
+            """Returns the distance after a time of acceleration."""
             return 0.5 * speed * (seconds - ramp_s / math.pi * np.sin(math.pi * seconds / ramp_s))
 
         def way(seconds: Floats) -> Floats:
@@ -89,19 +89,19 @@ class Exercise:
             self.lead(way, 2.0 * ramp_s + even_s, distance_deg)
 
     def sine(self, amplitude_deg: float, frequency_hz: float, periods: float) -> None:
-        """Swing to the far side and back, twice the amplitude away, as 1 - cos."""
+        """Oscillates as 1 - cos, between here and twice the amplitude away."""
         turn = math.tau * frequency_hz
         self.lead(lambda seconds: amplitude_deg * (1.0 - np.cos(turn * seconds)), periods / frequency_hz)
 
     def readings(self) -> Readings:
-        """All that was kept so far."""
+        """Returns all samples recorded so far."""
         columns = np.array(self._rows, dtype=np.float64).reshape(-1, len(Readings._fields)).T
         return Readings(*columns)
 
     def lead(
         self, way: Callable[[Floats], Floats], duration_s: float, distance_deg: float | None = None
     ) -> None:
-        """Follow a way from here for a duration; where a distance is given, end exactly there."""
+        """Follows ``way``, distance by time, for a duration; ends exactly at ``distance_deg`` if given."""
         cycles = max(1, math.ceil(duration_s / self.cycle_s - 1e-9))
         ways = way(np.arange(1, cycles + 1, dtype=np.float64) * self.cycle_s)
         if distance_deg is not None:

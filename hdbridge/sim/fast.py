@@ -1,8 +1,8 @@
-"""When the simulated axis is compiled: where numba is installed, and once that pays.
+"""Decision when to compile the simulated axis: if numba is installed, and once compiling pays off.
 
-numba comes with the extra ``hdbridge[fast]``. Loading it takes a second, and compiling twelve more the first
-time on a machine; what is compiled is kept on disk. So a process begins in Python and goes on with the
-compiled axis after so many steps of the mechanics as would have paid for it; the numbers are the same.
+numba comes with the extra ``hdbridge[fast]``. Loading it takes a second, and compiling another twelve the
+first time on a computer; compiled code is kept on disk. So a process begins in Python and switches to the
+compiled axis after the number of steps that would have paid for it. The numbers are the same.
 """
 
 from __future__ import annotations
@@ -22,16 +22,16 @@ FloatArray = np.ndarray[Any, np.dtype[np.float64]]
 IntArray = np.ndarray[Any, np.dtype[np.int64]]
 
 PAYS_AFTER_SUBSTEPS: Final = 140_000
-"""Steps of the mechanics that take as much longer in Python as loading the compiled axis takes: 10
-microseconds each, where loading takes 1.4 s. A control cycle of 4 ms has eight."""
+"""Substeps after which compiling pays off: each takes 10 microseconds in Python, and loading the
+compiled axis takes 1.4 s. A control cycle of 4 ms has eight substeps."""
 SWITCH: Final = "HDBRIDGE_COMPILE"
-"""Environment variable: ``0`` keeps everything in Python."""
+"""Environment variable that keeps everything in Python if it is ``0``."""
 _PROOF_CYCLES: Final = 100
 _PROOF_STEP_DEG: Final = 0.9
 
 
 class AnyAxis(Protocol):
-    """`Axis`, compiled or not."""
+    """Interface of `Axis`, compiled or not."""
 
     def drive(
         self,
@@ -50,7 +50,7 @@ class AnyAxis(Protocol):
 
 @runtime_checkable
 class EvenAxis(AnyAxis, Protocol):
-    """`Axis` that goes through many cycles by itself; see `compiled.CompiledAxis`."""
+    """Interface of an `Axis` that runs many cycles in one call; see `compiled.CompiledAxis`."""
 
     def drive_all(
         self,
@@ -65,13 +65,13 @@ class EvenAxis(AnyAxis, Protocol):
 
 
 class _Waiting:
-    """Counts this process's substeps until compiling pays."""
+    """Counts this process's substeps until compiling pays off."""
 
     def __init__(self) -> None:
         self.left = PAYS_AFTER_SUBSTEPS
 
     def over(self, substeps: int) -> bool:
-        """So many more; whether enough have been run."""
+        """Counts substeps; returns True once the threshold is reached."""
         self.left -= substeps
         return self.left <= 0
 
@@ -80,7 +80,7 @@ waiting: Final = _Waiting()
 
 
 def compiled_axis(axis: Axis) -> AnyAxis:
-    """The axis, compiled from the state in which it is; as it was where that is not possible."""
+    """Returns the axis compiled in its present state, or the axis itself if that is not possible."""
     if os.environ.get(SWITCH) == "0" or importlib.util.find_spec("numba") is None:
         return axis
     from hdbridge.sim import compiled  # noqa: PLC0415 - takes half a second, and the extra
@@ -96,11 +96,11 @@ def compiled_axis(axis: Axis) -> AnyAxis:
 
 
 _agreeing: Final[dict[type[Plant], bool]] = {}
-"""Whether, on this machine, Python and the compiled axis agree bit for bit; tried once for each plant."""
+"""Results of `_agree` on this computer, one per class of plant."""
 
 
 def _agree(axis: Axis) -> bool:
-    """Move back and forth with both, and compare all that they say."""
+    """Runs both back and forth; returns True if all results are identical bit for bit."""
     from hdbridge.sim import compiled  # noqa: PLC0415
 
     other = compiled.CompiledAxis(axis)

@@ -1,8 +1,8 @@
-"""The gear's output: motor angle / ratio, and all that the gear adds to it.
+"""Gear output: motor angle / ratio, plus the transmission error.
 
-What is added is a sum of pieces, each one physical cause. A further cause is a further class in
-`hdbridge.sim.gear_pieces` (or in a file of its own) and a line in `pieces_of`; it reads what it depends on
-from the `Conditions`. A cause that is off has no piece, and costs nothing.
+The error is a sum of pieces, each one physical cause. To add a cause, write a class in
+`hdbridge.sim.gear_pieces` (or a file of its own) and a line in `pieces_of`; the class reads its inputs from
+the `Conditions`. A cause that is off has no piece and costs nothing.
 """
 
 from __future__ import annotations
@@ -33,10 +33,10 @@ from hdbridge.units import ARCSEC_PER_DEG
 
 
 class Factor(Protocol):
-    """What a cause grows by."""
+    """Factor on the size of a cause."""
 
     def factor(self, now: Conditions) -> float:
-        """The factor under these conditions, one substep after it was last asked."""
+        """Returns the factor under these conditions, one substep after the last call."""
         ...
 
 
@@ -44,16 +44,16 @@ class Piece(Protocol):
     """One cause of transmission error, with its state."""
 
     BY_MOTOR_ONLY: ClassVar[bool]
-    """Whether it cannot change while the motor stands."""
+    """True if it cannot change while the motor stands still."""
 
     def arcsec(self, now: Conditions) -> float:
-        """Its part of the output's error, once the axis has come to these conditions."""
+        """Returns its part of the output error under the new conditions, arcsec."""
         ...
 
 
 @state
 class MotorOrders:
-    """Tooth error by the motor's angle, and by the angle between wave generator and flexspline."""
+    """Tooth error by motor angle, or by the angle between wave generator and flexspline."""
 
     BY_MOTOR_ONLY: ClassVar[bool] = True
     _orders: Orders
@@ -70,7 +70,7 @@ class MotorOrders:
 
 @state
 class VaryingOrders:
-    """Tooth error by the motor's angle that depends on more: the flank that carries, torque, warmth."""
+    """Tooth error by motor angle that also depends on the loaded flank, the torque and the temperature."""
 
     BY_MOTOR_ONLY: ClassVar[bool] = False
     _factors: tuple[Factor, ...]
@@ -99,7 +99,7 @@ class VaryingOrders:
 
 @state
 class LoadOrders:
-    """Tooth error by the load's angle."""
+    """Tooth error by load angle."""
 
     BY_MOTOR_ONLY: ClassVar[bool] = False
     _orders: Orders
@@ -114,7 +114,7 @@ class LoadOrders:
 
 @state
 class ElasticHysteresis:
-    """The elastic part, by the travel of the motor."""
+    """Elastic hysteresis, by the travel of the motor."""
 
     BY_MOTOR_ONLY: ClassVar[bool] = True
     _law: Law
@@ -129,7 +129,7 @@ class ElasticHysteresis:
 
 @state
 class VaryingHysteresis:
-    """An elastic part that depends on speed or warmth too."""
+    """Elastic hysteresis that also depends on speed, temperature or age."""
 
     BY_MOTOR_ONLY: ClassVar[bool] = False
     _factors: tuple[Factor, ...]
@@ -149,7 +149,7 @@ class VaryingHysteresis:
 
 @state
 class ZeroDrift:
-    """A shift that goes with the temperature."""
+    """Shift proportional to the temperature."""
 
     BY_MOTOR_ONLY: ClassVar[bool] = False
     _ambient_c: float
@@ -166,7 +166,7 @@ class ZeroDrift:
 
 @state
 class SlowZeroDrift:
-    """A shift by the temperature of a housing that follows the measured one in its time."""
+    """Shift by the temperature of a housing that lags the measured one."""
 
     BY_MOTOR_ONLY: ClassVar[bool] = False
     _ambient_c: float
@@ -187,7 +187,7 @@ class SlowZeroDrift:
 
 
 def pieces_of(truth: Truth) -> list[Piece]:
-    """The causes that a truth file sets to work, at their start."""
+    """Returns the active causes of a truth file, in their initial states."""
     gear, dt_s = truth.gear, truth.substep_s
     pieces: list[Piece] = []
     if gear.motor_orders:
@@ -216,7 +216,7 @@ def pieces_of(truth: Truth) -> list[Piece]:
 
 
 def warmth_factor(truth: Truth, per_k: float) -> WarmthFactor | None:
-    """A growth with temperature, if there is one."""
+    """Returns the growth with temperature; None if there is none."""
     return WarmthFactor(per_k, truth.temperature.unchanged_c) if per_k else None
 
 
@@ -261,7 +261,7 @@ def _zero_drift(truth: Truth) -> list[Piece]:
 
 @state
 class Gear:
-    """The output of the gear before its spring, in degrees of the load."""
+    """Output of the gear before its spring, in degrees of the load."""
 
     by_motor_only: bool
     _pieces: tuple[Piece, ...]
@@ -272,10 +272,10 @@ class Gear:
         self._ratio = truth.gear.ratio
         self._pieces = tuple(pieces)
         self.by_motor_only = all(piece.BY_MOTOR_ONLY for piece in pieces)
-        """Whether the output cannot change while the motor stands."""
+        """True if the output cannot change while the motor stands still."""
 
     def turned_deg(self, now: Conditions) -> float:
-        """Where the output would turn an unloaded shaft."""
+        """Returns the angle to which the output would turn an unloaded shaft."""
         error = 0.0
         for piece in self._pieces:
             error += piece.arcsec(now)

@@ -1,6 +1,6 @@
 """Causes of transmission error in the gear other than orders and hysteresis; see `hdbridge.sim.gear`.
 
-Each piece is asked once per substep, in order of time, so those with a state advance by one substep.
+Each piece is evaluated once per substep, in order of time, so those with a state advance by one substep.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ from hdbridge.sim.truth.gear import (
 from hdbridge.units import ARCSEC_PER_DEG, DEG_PER_TURN
 
 SLIDING_DEG_S: Final = 0.5
-"""Motor speed by which the teeth's drag is there by half."""
+"""Motor speed at which the teeth's drag reaches half of its full value."""
 
 
 @state
 class Flank:
-    """Which flank of the teeth carries: -1 to 1, by the travel of the motor."""
+    """Loaded flank of the teeth, -1 to 1, by the travel of the motor."""
 
     _last_deg: float
     _share: float
@@ -43,7 +43,7 @@ class Flank:
         self._share = 0.0
 
     def shift_deg(self, motor_deg: float) -> float:
-        """Shift of the tooth error, in motor degrees, once the motor has come to this angle."""
+        """Returns the shift of the tooth error at the new motor angle, in motor degrees."""
         share = self._share + 2.0 * (motor_deg - self._last_deg) / self._travel_deg
         self._last_deg = motor_deg
         self._share = min(1.0, max(-1.0, share))
@@ -52,7 +52,7 @@ class Flank:
 
 @state
 class SpeedFactor:
-    """Growth of the rolling friction with the logarithm of speed, behind which it lags."""
+    """Growth of the rolling friction with the logarithm of speed, with a lag."""
 
     _dt: float
     _from_deg_s: float
@@ -70,7 +70,7 @@ class SpeedFactor:
         self._now = 0.0
 
     def factor(self, now: Conditions) -> float:
-        """The factor after one more substep."""
+        """Returns the factor after one more substep."""
         speed_deg_s = abs(now.motor_deg - self._last_deg) / self._dt
         self._last_deg = now.motor_deg
         goal = self._gain * math.log10(1.0 + speed_deg_s / self._from_deg_s)
@@ -88,13 +88,13 @@ class TorqueFactor:
         self._per_nm = per_nm
 
     def factor(self, now: Conditions) -> float:
-        """The factor under these conditions."""
+        """Returns the factor under these conditions."""
         return 1.0 + self._per_nm * abs(now.torque_nm)
 
 
 @state
 class WarmthFactor:
-    """Growth with the temperature; never below a twentieth."""
+    """Growth with temperature; the factor is at least 0.05."""
 
     _per_k: float
     _reference_c: float
@@ -104,17 +104,17 @@ class WarmthFactor:
         self._reference_c = reference_c
 
     def factor(self, now: Conditions) -> float:
-        """The factor under these conditions."""
+        """Returns the factor under these conditions."""
         return self.at(now.temperature_c)
 
     def at(self, temperature_c: float) -> float:
-        """The factor at a temperature."""
+        """Returns the factor at a temperature."""
         return max(0.05, 1.0 + self._per_k * (temperature_c - self._reference_c))
 
 
 @state
 class Wear:
-    """Lost motion between the teeth: the output lags in either direction, by what its travel has worn."""
+    """Lost motion between the teeth: the output lags in either direction, and the lag grows with wear."""
 
     BY_MOTOR_ONLY: ClassVar[bool] = True
     _exponent: float
@@ -145,10 +145,10 @@ class Wear:
 
 @state
 class Creep:
-    """Kelvin-Voigt elements in series: each yields, in its time, to the teeth's drag and to the load.
+    """Kelvin-Voigt elements in series, each yielding to the teeth's drag and to the load.
 
-    The drag acts while the motor turns, against the motion, and ceases when it stands: after a stop the
-    output creeps on. A torque at the load is yielded to for as long as it is there.
+    The drag acts against the motion while the motor turns, and ceases at standstill, so the output creeps on
+    after a stop. A torque at the load acts for as long as it lasts.
     """
 
     BY_MOTOR_ONLY: ClassVar[bool] = False
@@ -184,7 +184,7 @@ class Creep:
 
 @state
 class Jumps:
-    """Teeth jumped, each within its time."""
+    """Jumped teeth, each over its duration."""
 
     BY_MOTOR_ONLY: ClassVar[bool] = False
     _dt: float
@@ -242,7 +242,7 @@ class Damage:
 
 @state
 class Roller:
-    """A roller on the motor's hub that disturbs it by its own angle, most where the load presses it on."""
+    """Roller on the motor's hub: an error by its own angle, largest at the load angle that presses it on."""
 
     BY_MOTOR_ONLY: ClassVar[bool] = False
     _amplitude: float
@@ -266,7 +266,7 @@ class Roller:
 
 
 class Seat:
-    """A bearing ring carried along by the motion until it slips back, at random angles."""
+    """Bearing ring that is carried along by the motion and slips back at random angles."""
 
     BY_MOTOR_ONLY: ClassVar[bool] = True
     __slots__ = ("_carried", "_last_deg", "_per_deg", "_random", "_slip", "_slips_at")

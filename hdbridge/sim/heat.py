@@ -1,4 +1,4 @@
-"""The temperature of motor and gear, and what it does to the motor's friction."""
+"""Temperature of motor and gear, and its effect on the motor's friction."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from hdbridge.sim.truth import Truth
 
 @state
 class Heat:
-    """One body between its losses and its surroundings; stepped from control cycle to control cycle."""
+    """One heat store between its losses and its surroundings, advanced once per control cycle."""
 
     body_c: float
     """Temperature of motor and gear."""
     rub: float
-    """The motor's friction by it, against that of the truth file."""
+    """Motor friction at this temperature, relative to that of the truth file."""
     since_s: float
     """Time since the axis was switched on."""
     _ambient_c: float
@@ -51,7 +51,7 @@ class Heat:
         self.rub = self._growth.at(self.body_c) if self._friction_grows else 1.0
 
     def warm(self, torque_squares: float, friction_j: float, elapsed_s: float) -> None:
-        """Some substeps with these losses: the torque's squares (Nm^2) added up, and the friction's work."""
+        """Advances by some substeps, from the sum of the torque's squares (Nm^2) and the friction work."""
         self.since_s += elapsed_s
         copper_j = torque_squares * self._copper_loss_w * self._dt_s
         goal_c = self._ambient_c + self._resistance_k_per_w * ((copper_j + friction_j) / elapsed_s)

@@ -1,7 +1,7 @@
-"""Elastic hysteresis of the gear: how far its output is ahead, by the travel of the motor.
+"""Elastic hysteresis of the gear: lead of its output, by the travel of the motor.
 
-Each law is rate-independent and advances from one motor angle to the next. The output is ahead in the
-direction of motion, so a closed loop of the motor angle has a positive area, the integral of error by angle.
+Each law is rate-independent and advances from one motor angle to the next. The output leads in the direction
+of motion, so a closed loop of the motor angle has a positive area, the integral of error by angle.
 """
 
 from __future__ import annotations
@@ -13,19 +13,19 @@ from hdbridge.sim.state import state
 from hdbridge.sim.truth.hysteresis import BoucWen, Dahl, Hysteresis, MaxwellSlip, RollingFriction
 
 PIECE: Final = 0.05
-"""Longest piece of travel, in units of the yield, over which the Bouc-Wen law is integrated at once."""
+"""Longest step of the Bouc-Wen integration, in units of the yield travel."""
 
 
 class Law(Protocol):
-    """A hysteresis law with its state."""
+    """Hysteresis law with its state."""
 
     def advance(self, motor_deg: float) -> float:
-        """The error in arcsec once the motor has moved straight to this angle from the last one."""
+        """Returns the error in arcsec after monotonic motion of the motor to this angle."""
         ...
 
 
 def law_of(truth: Hysteresis | None, motor_deg: float) -> Law | None:
-    """The law that a truth file names, at its start, the motor at an angle."""
+    """Returns the law of a truth file in its initial state at a motor angle; None if there is none."""
     if isinstance(truth, RollingFriction):
         return RollingFrictionLaw(truth, motor_deg)
     if isinstance(truth, MaxwellSlip):
@@ -37,7 +37,7 @@ def law_of(truth: Hysteresis | None, motor_deg: float) -> Law | None:
 
 @state
 class RollingFrictionLaw:
-    """The article's law, continuous at reversals.
+    """Law of the article, continuous at reversals.
 
     After a reversal at angle a with error e the error is ``e + s 2 offset g(x)``, limited to ``s offset``; s
     is the direction and ``x = |motor - a| / width``, at most 1. ``g(x) = (x^(n-1) - (n-1) x) / (2-n)``, and
@@ -97,7 +97,7 @@ class RollingFrictionLaw:
 
 @state
 class MaxwellSlipLaw:
-    """Parallel springs with sliders (Prandtl-Ishlinskii stop operators). Has return-point memory."""
+    """Maxwell slip: parallel springs with sliders (Prandtl-Ishlinskii), with return-point memory."""
 
     _error: float
     _limits: tuple[float, ...]
@@ -134,9 +134,9 @@ class MaxwellSlipLaw:
 
 @state
 class BoucWenLaw:
-    """``dz/dx = (1 - |z|^n (beta sgn(dx z) + gamma)) / yield``, beta + gamma = 1; the error is offset * z.
+    """Bouc-Wen law: ``dz/dx = (1 - |z|^n (beta sgn(dx z) + gamma)) / yield``; the error is offset * z.
 
-    Integrated over the motor's travel x by the midpoint rule in pieces short against the yield travel.
+    beta + gamma = 1. Integrated over the motor's travel x by the midpoint rule, in short steps.
     """
 
     _beta: float
@@ -178,7 +178,7 @@ class BoucWenLaw:
 
 @state
 class DahlLaw:
-    """``dz/dx = (1 - z sgn dx)^i / yield``, exactly; the error is offset * z."""
+    """Dahl's law: ``dz/dx = (1 - z sgn dx)^i / yield``, solved exactly; the error is offset * z."""
 
     _exponent: float
     _motor_deg: float
@@ -204,7 +204,7 @@ class DahlLaw:
         return self._offset * self._z
 
     def _left(self, left: float, travel: float) -> float:
-        """What is left to the offset ahead (0 to 2) after a travel, in units of the yield."""
+        """Returns the distance left to the offset ahead (0 to 2) after a travel, in units of the yield."""
         if left <= 0.0:
             return 0.0
         rest = 1.0 - self._exponent

@@ -1,8 +1,8 @@
-"""The mechanics with a spring of several stages, a dead zone behind it, and torques on the load.
+"""Mechanics with a multi-stage spring, a dead zone behind it, and torques on the load.
 
-Gravity, drag, and shaking act on the load as a torque that is even within a substep; so does what the spring
-does otherwise than its linear first stage: the linear step then stays exact, and at rest the load stands
-exactly where the torques balance.
+Gravity, drag and shaking act on the load as a torque that is constant within a substep, and so does the
+deviation of the spring from its linear first stage. The linear step thus stays exact, and at rest the load
+stands exactly where the torques balance.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ GRAVITY_M_S2 = 9.80665
 
 @state
 class Spring:
-    """Torque by wind-up: nothing within the dead zone, then three stages."""
+    """Spring: torque by wind-up, zero within the dead zone, then three stages."""
 
     _first_deg: float
     _first_nm: float
@@ -44,7 +44,7 @@ class Spring:
             self._second_deg = self._first_deg + (self._second_nm - self._first_nm) / self._k2
 
     def pull_nm(self, wind_up_deg: float) -> float:
-        """Torque on the load for a wind-up (output before load) in degrees."""
+        """Returns the torque on the load for a wind-up (output minus load) in degrees."""
         size = abs(wind_up_deg) - self._gap_deg
         if size <= 0.0:
             return 0.0
@@ -57,13 +57,13 @@ class Spring:
         return torque if wind_up_deg > 0.0 else -torque
 
     def touches(self, wind_up_deg: float) -> bool:
-        """Whether the sides of the dead zone touch."""
+        """Returns True if the sides of the dead zone touch."""
         return abs(wind_up_deg) > self._gap_deg or self._gap_deg == 0.0
 
 
 @state
 class LoadedPlant(Plant):
-    """A `Plant` with all that the truth file can put on its spring and load."""
+    """`Plant` with every load and spring property of the truth file."""
 
     _arm_nm: float
     _breakaway: float
@@ -126,7 +126,7 @@ class LoadedPlant(Plant):
 
     @staticmethod
     def needed(truth: Truth) -> bool:
-        """Whether a truth file asks for anything that `Plant` does not have."""
+        """Returns True if a truth file needs anything that `Plant` does not have."""
         gear, load = truth.gear, truth.load_
         coupling = load.encoder.coupling
         return bool(
@@ -141,17 +141,17 @@ class LoadedPlant(Plant):
         )
 
     def weight_nm(self, load_deg: float) -> float:
-        """See `Plant`."""
+        """Returns the torque of gravity; see `Plant`."""
         return -self._arm_nm * math.sin((load_deg - self._down_deg) * RAD_PER_DEG)
 
     def step(self, torque_nm: float, brake_nm: float) -> None:
-        """See `Plant`."""
+        """Runs one substep; see `Plant`."""
         now, dt = self.now, self._dt
         output, load = self.output_deg, now.load_deg
         load_speed = self.load_deg_s
         lag = output - load
 
-        # What the spring does beyond its linear first stage, halfway through the substep.
+        # Torque of the spring beyond its linear first stage, halfway through the substep.
         closing = self.motor_deg_s / self._ratio - load_speed
         halfway = lag + 0.5 * dt * closing
         beyond = self._spring.pull_nm(halfway) - self._stiffness * halfway
@@ -190,7 +190,7 @@ class LoadedPlant(Plant):
         self._turn_encoder(load, new_load)
 
     def _outer_nm(self, load_deg: float, load_speed: float) -> float:
-        """What comes from outside, gravity, viscous drag and shaking, on the load."""
+        """Returns the torque on the load from outside, gravity, viscous drag, sliders and shaking."""
         outer = self.outer_nm
         if self._arm_nm:
             outer += self.weight_nm(load_deg)
@@ -199,7 +199,7 @@ class LoadedPlant(Plant):
             if self._thinning_exponent:
                 turning = abs(load_speed) * RAD_PER_DEG
                 viscous /= (1.0 + turning / self._thinning_from) ** self._thinning_exponent
-            # No more than stops the load within the substep.
+            # At most the torque that stops the load within the substep.
             inertia = self._whole_inertia
             outer += inertia * math.expm1(-viscous / inertia * self._dt) / self._dt * load_speed
         if self._slides:
@@ -215,19 +215,19 @@ class LoadedPlant(Plant):
         return outer
 
     def _held_at(self, slider: int, load_deg: float) -> float:
-        """The friction of a slider once the load has moved straight to this angle."""
+        """Returns the friction of a slider after monotonic motion of the load to this angle."""
         limit = self._slider_limit[slider]
         held = self._held_nm[slider] + self._slider_stiffness[slider] * (load_deg - self._held_deg)
         return min(limit, max(-limit, held))
 
     def _play(self, load_deg: float) -> float:
-        """The coupling's near side, which the load takes along once the play is used up."""
+        """Moves the near side of the coupling, which the load carries along once the play is used up."""
         played = min(load_deg + self._play_deg, max(load_deg - self._play_deg, self._played_deg))
         self._played_deg = played
         return played
 
     def _settle(self) -> None:
-        """Let the load hang on its spring before the start: the wind-up that balances gravity."""
+        """Finds the initial wind-up that balances gravity."""
         output, low, high = self.output_deg, self.output_deg - 10.0, self.output_deg + 10.0
         if not self._arm_nm:
             return

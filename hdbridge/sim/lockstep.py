@@ -1,9 +1,9 @@
-"""A bench without real time: master and simulated drives in one thread, on one virtual clock.
+"""Simulated bench without real time: master and simulated drives in one thread, on one virtual clock.
 
-The master talks through ``LockstepBus`` and sleeps on ``VirtualClock``. Its sending and waiting is what lets
-the drives run: a frame it sends is answered before ``send`` returns, and time passes only while it waits,
-from one event of a drive to the next. So nothing sleeps, nothing races, and the same run gives the same
-frames. The frames themselves are real: python-can messages over python-can ``virtual`` buses.
+The master uses ``LockstepBus`` and sleeps on ``VirtualClock``. Its sending and waiting makes the drives run:
+a frame it sends is answered before ``send`` returns, and time passes only while it waits, from one event of a
+drive to the next. So nothing sleeps, there are no races, and the same run gives the same frames. The frames
+are real python-can messages over python-can ``virtual`` buses.
 """
 
 from __future__ import annotations
@@ -36,38 +36,38 @@ LONGEST_WAIT_S: Final = 3600.0
 
 
 class Node(Protocol):
-    """A bus participant that runs when it is polled."""
+    """Bus participant that runs when it is polled."""
 
     def poll(self, now_s: float) -> None:
-        """Take in what has come, and do what is due until ``now_s``."""
+        """Processes received frames and everything that is due until ``now_s``."""
         ...
 
     def next_event_s(self) -> float:
-        """When it must be polled at the latest."""
+        """Returns the latest time of the next poll."""
         ...
 
 
 class VirtualClock:
-    """A ``hdbridge.clock.Clock`` that moves when somebody waits on it, and lets the nodes run on the way."""
+    """``hdbridge.clock.Clock`` that advances when it is waited on, and runs the nodes meanwhile."""
 
     def __init__(self, start_s: float = 0.0) -> None:
         self.now_s = start_s
-        """Virtual seconds."""
+        """Virtual time in seconds."""
         self.nodes: list[Node] = []
 
     def now(self) -> float:
-        """Virtual seconds."""
+        """Returns the virtual time in seconds."""
         return self.now_s
 
     def sleep_until(self, deadline_s: float) -> None:
-        """Advance to ``deadline_s``, through every event of a node that comes before it."""
+        """Advances to ``deadline_s``, through every event of a node before it."""
         while self.step(deadline_s):
             pass
 
     def step(self, deadline_s: float) -> bool:
-        """Advance to the next event of a node or to ``deadline_s``, and let the nodes run.
+        """Advances to the next event of a node or to ``deadline_s``, and polls the nodes.
 
-        False, and nothing happened but the clock's advance, when no event comes before the deadline.
+        Returns False if no event comes before the deadline; then only the clock advances.
         """
         until_s, happens = deadline_s, False
         for node in self.nodes:
@@ -83,18 +83,18 @@ class VirtualClock:
 
 
 class _PolledQueue(Queue[can.Message]):
-    """A queue on which nobody waits: to put something in needs no lock, and wakes nobody."""
+    """Queue without waiting readers, so that adding an item needs no lock or wake-up."""
 
     def put(self, item: can.Message, block: bool = True, timeout: float | None = None) -> None:
         self.queue.append(item)
 
 
 class _PolledBus(VirtualBus):
-    """python-can's virtual bus, polled by one thread, with less overhead for each frame.
+    """Virtual bus of python-can, polled by one thread, with less overhead per frame.
 
-    The general ``recv`` reads the wall clock and takes two locks, though in lockstep most polls find nothing;
-    the general ``send`` makes a deep copy and takes another. Ordinary virtual buses on the same channel work
-    with it. It never waits, whatever time-out ``recv`` is given.
+    The general ``recv`` reads the wall clock and takes two locks, although in lockstep most polls find
+    nothing; the general ``send`` makes a deep copy and takes another lock. Ordinary virtual buses on the
+    same channel work with it. It never waits, whatever time-out ``recv`` is given.
     """
 
     def __init__(self, channel: str) -> None:
@@ -104,9 +104,9 @@ class _PolledBus(VirtualBus):
             self.channel[place] = self.queue = _PolledQueue()
         self._waiting = self.queue.queue
         self._met: list[Queue[can.Message]] = []
-        """The queues on the channel when it was last looked at."""
+        """Queues on the channel at the last `_meet`."""
         self._puts: list[Callable[[can.Message], None]] = []
-        """What gives a frame to each of the others there."""
+        """Functions that deliver a frame to each of the other queues."""
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
         if type(msg) is not DataFrame:
@@ -120,10 +120,10 @@ class _PolledBus(VirtualBus):
             put(msg)
 
     def _meet(self) -> None:
-        """Somebody has joined or left."""
+        """Updates the receivers after a bus has joined or left."""
         self._met = list(self.channel)
         self._puts = [
-            # Nobody here changes it: one for all. Others get a copy each.
+            # Polled queues never modify a message and share it; others get a copy each.
             each.queue.append if type(each) is _PolledQueue else partial(self._put_copy, each)
             for each in self._met
             if each is not self.queue
@@ -142,7 +142,7 @@ class _PolledBus(VirtualBus):
 
 
 class LockstepBus(can.BusABC):
-    """The master's end of a virtual channel whose other participants run in ``clock.nodes``.
+    """Master's end of a virtual channel whose other participants run in ``clock.nodes``.
 
     ``recv`` is overridden as a whole, because that of the base class measures its time-out by the wall clock.
     """
@@ -153,11 +153,11 @@ class LockstepBus(can.BusABC):
         self._clock = clock
         super().__init__(channel=channel, **kwargs)
         self.private = False
-        """Nobody but the master and the drives of the clock knows the channel."""
+        """True if only the master and the drives of the clock know the channel."""
         self.channel_info = "the simulated bus"
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
-        """Send, and let every node take it in and answer."""
+        """Sends a frame; every node receives and answers it before this returns."""
         self._inner.send(msg, timeout)
         clock = self._clock
         now_s = clock.now_s
@@ -165,9 +165,9 @@ class LockstepBus(can.BusABC):
             node.poll(now_s)
 
     def recv(self, timeout: float | None = None) -> can.Message | None:
-        """The next frame; while there is none, time passes up to ``timeout`` virtual seconds.
+        """Returns the next frame; while there is none, time passes up to ``timeout`` virtual seconds.
 
-        Raises CanOperationError after ``LONGEST_WAIT_S`` without a frame where no time-out is given.
+        Raises CanOperationError after ``LONGEST_WAIT_S`` without a frame if no time-out is given.
         """
         clock = self._clock
         if self._waiting and (message := self._take()) is not None:
@@ -178,7 +178,7 @@ class LockstepBus(can.BusABC):
                 return message
         message = None
         if not (self.private and len(clock.nodes) == 1):
-            for node in clock.nodes:  # somebody else on the channel may have sent to them
+            for node in clock.nodes:  # another bus on the channel may have sent to them
                 node.poll(deadline_s)
             message = self._take()
         if message is None and timeout is None:
@@ -186,7 +186,7 @@ class LockstepBus(can.BusABC):
         return message
 
     def _take(self) -> can.Message | None:
-        """The next frame that has come already."""
+        """Returns the next frame that has already arrived."""
         waiting = self._waiting
         while waiting:
             message: can.Message = waiting.popleft()
@@ -199,17 +199,17 @@ class LockstepBus(can.BusABC):
         return self.recv(timeout), True
 
     def shutdown(self) -> None:
-        """Leave the channel."""
+        """Leaves the channel."""
         super().shutdown()
         self._inner.shutdown()
 
 
 @contextmanager
 def _unsearched() -> Iterator[None]:
-    """The garbage collector leaves out what has been loaded by now.
+    """Excludes everything loaded so far from garbage collection.
 
-    The samples of a long run make it search everything again and again: 160,000 objects of the libraries take
-    it as long as 1000 control cycles.
+    The samples of a long run trigger collections again and again, and a search of the libraries' 160,000
+    objects takes as long as 1000 control cycles.
     """
     gc.freeze()
     try:
@@ -232,11 +232,11 @@ def lockstep_bench(
     others: Sequence[Node] = (),
     behaviour: Behaviour | None = None,
 ) -> Iterator[tuple[LockstepBus, VirtualClock, DriveNode]]:
-    """A simulated drive that moves ``machine``, and the master's bus and clock to it.
+    """Provides a simulated drive that moves ``machine``, with the master's bus and clock.
 
-    The drive has been switched on, and its boot-up message sent, before the master joins the bus.
-    ``channel`` names the python-can virtual channel (by default one of its own), so that a test may listen
-    or interfere there. ``others`` are further nodes to be polled.
+    The drive is switched on, and its boot-up message sent, before the master joins the bus. ``channel``
+    names the python-can virtual channel (a private one by default), so that a test may listen or interfere
+    there. ``others`` are further nodes to poll.
     """
     private = channel is None
     channel = channel or f"hdbridge-{uuid4()}"
@@ -259,7 +259,7 @@ def simulated_bench(
     channel: str | None = None,
     load_object: tuple[int, int] = LOAD_OBJECT,
 ) -> Iterator[tuple[LockstepBus, VirtualClock, DriveNode]]:
-    """The simulated axis of a truth file on a bench; the same truth and seed give the same frames.
+    """Provides the simulated axis of a truth file; the same truth and seed give the same frames.
 
     ``load_object`` is the index and sub-index from which its load encoder is read.
     """
@@ -272,10 +272,10 @@ def simulated_bench(
 
 @dataclass(frozen=True)
 class SimulatedAxis:
-    """One simulated axis of several on a bus."""
+    """One of several simulated axes on a bus."""
 
     truth: Truth | Path | str
-    """What moves, or the truth file that says so."""
+    """Truth, or the path of its file."""
     eds_path: Path
     node_id: int
     seed: int = 0
@@ -286,10 +286,10 @@ class SimulatedAxis:
 def simulated_benches(
     axes: Sequence[SimulatedAxis], channel: str | None = None, clock: VirtualClock | None = None
 ) -> Iterator[tuple[LockstepBus, VirtualClock, tuple[DriveNode, ...]]]:
-    """Several simulated axes on one bus and one clock, and the master's bus to them; as `lockstep_bench`.
+    """Provides several simulated axes on one bus and one clock, with the master's bus; see `lockstep_bench`.
 
-    The same axes give the same frames, whatever the others do: each has its own noise. ``clock`` is by
-    default one that begins at zero. InputError where two have the same node id.
+    Each axis has its own noise, so the same axis gives the same frames, whatever the others do. ``clock``
+    starts at zero by default. InputError if two axes have the same node id.
     """
     node_ids = [axis.node_id for axis in axes]
     twice = next((node_id for node_id in node_ids if node_ids.count(node_id) > 1), None)
@@ -320,8 +320,8 @@ def simulated_benches(
 
 
 def nameplate_of(truth: Truth, serial: int = 1, load_object: tuple[int, int] = LOAD_OBJECT) -> Nameplate:
-    """What a drive that controls this axis says of itself."""
-    # The drive knows the ratio that the gear was sold with, not by how little the real one is off.
+    """Returns the nameplate of a drive that controls this axis."""
+    # The drive knows the nominal ratio of the gear, not the small deviation of the real one.
     ratio = Fraction(truth.gear.ratio).limit_denominator(100)
     return Nameplate(
         serial=serial,

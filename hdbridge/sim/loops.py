@@ -1,7 +1,7 @@
-"""What happens in every substep: the drive's loops, the mechanics, and what the encoders keep of them.
+"""Substeps of the simulated axis: the drive's loops, the mechanics, and the sampling of the encoders.
 
-`hdbridge.sim.machine` calls it once per control cycle. All that it needs to know of the rest comes in as
-numbers, and all that the rest has to know of it comes back as numbers: so it can be compiled as a whole.
+`hdbridge.sim.machine` calls it once per control cycle. All inputs and outputs are numbers, so that it can be
+compiled as a whole.
 """
 
 from __future__ import annotations
@@ -15,20 +15,21 @@ from hdbridge.sim.truth import Truth
 from hdbridge.sim.truth.encoder import TrueDisc
 
 Seen = tuple[float, float, float, float, float, float, float, float, float, float, float]
-"""The motor's angle, and as it was when its encoder was sampled; the load's angle; that of its encoder's
-shaft when it was sampled, and the shift of that encoder's body; the gear's output (all deg); the motor's
-speed as the drive measures it (deg/s); gravity's torque on the load (Nm); the motor's torque (Nm), and its
-square, added up over the substeps; the friction's work at the motor shaft (J)."""
+"""Results of a cycle: the motor's angle, and when its encoder was sampled; the load's angle; that of its
+encoder's shaft when it was sampled, and the shift of that encoder's body; the gear's output (all
+deg); the motor's speed as measured by the drive (deg/s); gravity's torque on the load (Nm); the
+motor's torque (Nm), and the sum of its squares over the substeps; the friction work at the motor
+shaft (J)."""
 
 Slow = tuple[float, float, float, float, float]
-"""What changes only from cycle to cycle: the temperature, the motor's friction by it against that of the
-truth file, the torque limit (Nm), what the motor encoder has lost (deg), the torque on the load from outside
+"""Inputs that change only from cycle to cycle: the temperature, the motor's friction at it relative to the
+truth file, the torque limit (Nm), the lost angle of the motor encoder (deg), the external torque on the load
 (Nm)."""
 
 
 @state
 class Loops:
-    """A servo axis, substep by substep."""
+    """Servo axis, substep by substep."""
 
     servo: Servo
     plant: Plant
@@ -40,7 +41,7 @@ class Loops:
     _late_load: Late
     _late_motor: Late
     _plain: bool
-    """Nothing stands between loops and mechanics: the demand is not late, the encoders are true."""
+    """True if the demand is not delayed and the encoders are ideal."""
     _torque_nm: float
     _with_body: bool
     _with_disc: bool
@@ -49,7 +50,7 @@ class Loops:
     _with_late_motor: bool
 
     def __init__(self, truth: Truth, *, loaded: bool = False) -> None:
-        """``loaded``: there may be a torque on the load from outside."""
+        """``loaded`` allows an external torque on the load."""
         dt_s = self.dt_s = truth.substep_s
         motor, load = truth.motor.encoder, truth.load_.encoder
         self.plant = LoadedPlant(truth) if loaded or LoadedPlant.needed(truth) else Plant(truth)
@@ -70,23 +71,23 @@ class Loops:
         self._plain = not (wrong or late or self._with_body)
 
     def power_on(self, slow: Slow) -> float:
-        """The power stage is switched on: start from where the motor is; its angle as the loops see it."""
+        """Switches the power stage on at the motor's angle, as the loops see it, and returns that angle."""
         return self._engage(self._take(slow))
 
     def _engage(self, lost_deg: float) -> float:
         return self.servo.engage(self._seen_deg(self.plant.now.motor_deg, lost_deg), self.plant.motor_deg_s)
 
     def begin_demand(self, demand_deg: float) -> None:
-        """The demand has always been this one."""
+        """Resets to a demand that has always been this one."""
         self._late_demand.begin(demand_deg)
 
     def hold(self, torque_nm: float) -> None:
-        """At rest: the integral has come to where the motor's torque is this one."""
+        """Shifts the integral so that the motor's torque at rest is ``torque_nm``."""
         self.servo.shift(torque_nm - self._torque_nm)
         self._torque_nm = torque_nm
 
     def follow(self, demand_deg: float, demand_deg_s: float, substeps: int, slow: Slow) -> Seen:
-        """Closed loop over some substeps, in which the demand moves evenly."""
+        """Runs some substeps in closed loop, in which the demand moves linearly."""
         lost_deg = self._take(slow)
         servo, plant, dt = self.servo, self.plant, self.dt_s
         now = plant.now
@@ -114,7 +115,7 @@ class Loops:
         return self._seen(squares)
 
     def coast(self, brake_nm: float, substeps: int, slow: Slow) -> Seen:
-        """The power stage is off for some substeps."""
+        """Runs some substeps with the power stage off."""
         lost_deg = self._take(slow)
         self._torque_nm = 0.0
         for _ in range(substeps):
@@ -125,11 +126,11 @@ class Loops:
         return self._seen(0.0)
 
     def seen(self) -> Seen:
-        """What there is to know before anything has happened."""
+        """Returns the initial state."""
         return self._seen(0.0)
 
     def _take(self, slow: Slow) -> float:
-        """What changes only from cycle to cycle; what the motor encoder has lost."""
+        """Applies the slowly varying inputs; returns the lost angle of the motor encoder."""
         temperature_c, friction, self.servo.limit_nm, lost_deg, outer_nm = slow
         self.plant.now.temperature_c = temperature_c
         self.plant.outer_nm = outer_nm
@@ -137,7 +138,7 @@ class Loops:
         return lost_deg
 
     def _seen(self, squares: float) -> Seen:
-        """What the rest has to know; the friction's work begins anew."""
+        """Returns the results of a cycle, and resets the friction work."""
         plant = self.plant
         now, loss_j = plant.now, plant.loss_j
         plant.loss_j = 0.0
@@ -156,13 +157,13 @@ class Loops:
         )
 
     def _seen_deg(self, motor_deg: float, lost_deg: float) -> float:
-        """The motor's angle as its encoder sees it, before it is rounded."""
+        """Returns the motor's angle as seen by its encoder, before rounding."""
         if self._with_disc:
             motor_deg += self._disc.error_deg(motor_deg)
         return motor_deg + lost_deg
 
     def _watch(self) -> None:
-        """What the encoders keep of each substep."""
+        """Feeds the delays and the encoder's body with one substep."""
         plant = self.plant
         if self._with_late_motor:
             self._late_motor.feed(plant.now.motor_deg)

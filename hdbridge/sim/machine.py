@@ -1,7 +1,7 @@
-"""The simulated axis as a drive's firmware has it: loops, motor, gear, load and two encoders.
+"""Simulated axis as seen by a drive's firmware: loops, motor, gear, load and two encoders.
 
-Deterministic: the same truth and seed, driven alike, give the same numbers bit for bit. It knows no clock;
-each call advances it by whole substeps.
+Deterministic: the same truth, seed and commands give the same numbers bit for bit. It has no clock; each call
+advances it by whole substeps.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ FloatArray = fast.FloatArray
 
 
 class Cycles(NamedTuple):
-    """What a machine tells at the end of each of many cycles, by its attributes of the same names."""
+    """Measurements of a machine at the end of many cycles, named as its attributes; shape (n,) each."""
 
     motor_reading: FloatArray
     load_reading: FloatArray
@@ -33,39 +33,41 @@ class Cycles(NamedTuple):
 
 
 class Machine:
-    """A servo axis at rest at the angle zero, its power stage off."""
+    """Servo axis, initially at rest at the angle zero with its power stage off."""
 
     motor_counts: int
-    """Motor encoder: whole counts, multi-turn, never wrapped. A count's middle is its angle."""
+    """Motor encoder: whole counts, multi-turn, never wrapped. The middle of a count is its angle."""
     load_counts: int
-    """Load encoder: whole counts, multi-turn, never wrapped; with the noise of this instant."""
+    """Load encoder: whole counts, multi-turn, never wrapped; includes noise."""
     torque_permille: int
-    """The motor's torque, in thousandths of the rated one, in the sense of the motor encoder."""
+    """Motor torque, in thousandths of the rated one, in the sense of the motor encoder."""
     motor_reading: float
-    """The motor encoder in counts, before it is rounded."""
+    """Motor encoder in counts, before rounding."""
     load_reading: float
-    """The load encoder in counts, before it is rounded."""
+    """Load encoder in counts, before rounding."""
     velocity_counts_s: float
-    """The motor's speed as the drive measures it."""
+    """Motor speed as measured by the drive."""
     torque_nm: float
-    """The motor's torque, not rounded, in the sense of the motor encoder."""
+    """Motor torque, not rounded, in the sense of the motor encoder."""
     temperature_c: float
     """Temperature of motor and gear."""
     load_torque_nm: float
-    """Torque of gravity, and of what acts from outside, on the load, as a sensor at the load's flange tells
-    it; its sense is the file's. Drag of the gear's own bearings and the load's inertia are not in it."""
+    """Torque of gravity and external torque on the load, as measured at the load's flange, with the sign
+    that the truth file states. Friction of the gear's bearings and the load's inertia are not
+    included."""
     elapsed_s: float
     """Time since the axis was switched on."""
     true_motor_deg: float
-    """The motor's angle itself, for tests."""
+    """True motor angle, for tests."""
     true_load_deg: float
-    """The load's angle itself, for tests."""
+    """True load angle, for tests."""
     true_output_deg: float
-    """The gear's output before its spring, for tests: where the load comes to rest."""
+    """True output of the gear before its spring, for tests: the angle at which the load comes to rest."""
 
     def __init__(self, truth: Truth, seed: int, *, may_compile: bool = False, loaded: bool = False) -> None:
-        """``may_compile``: it may stand still for some seconds until it goes on faster; see `sim.fast`.
-        ``loaded``: `follow_all` may tell a torque on the load from outside.
+        """``may_compile`` allows a pause of some seconds, after which it runs faster; see `sim.fast`.
+
+        ``loaded`` allows an external torque on the load in `follow_all`.
         """
         self.truth = truth
         self.dt_s = truth.substep_s
@@ -81,9 +83,9 @@ class Machine:
         self._take(axis.at_first())
 
     def follow(self, start_counts: float, end_counts: float, substeps: int, outer_nm: float = 0.0) -> None:
-        """Closed loop: the demand moves evenly from start to end, in motor counts (may be fractional).
+        """Runs a closed-loop cycle: the demand moves linearly from start to end, in motor counts.
 
-        When the power stage was off before, the loops start from where the motor stands: a demand that rests
+        If the power stage was off before, the loops start at the motor's position, so a resting demand
         within a count of it does not move the axis.
         """
         if substeps < 1:
@@ -101,11 +103,12 @@ class Machine:
         outer_nm: FloatArray | None = None,
         held_nm: FloatArray | None = None,
     ) -> Cycles:
-        """Closed loop over many cycles, each from the demand before it; the same numbers as by `follow`.
+        """Runs many closed-loop cycles, each from the demand before it, with the same numbers as `follow`.
 
-        ``counts`` has the demand at the begin and at the end of each cycle, ``substeps`` how many each has,
-        ``outer_nm`` the torque on the load from outside in each, in addition to its weight, ``held_nm`` the
-        torque by which the loops hold the axis before each, positive forward; NaN where they go on.
+        ``counts`` has the demand at the start of the first and at the end of each cycle, shape (n + 1,);
+        ``substeps`` the substeps of each cycle; ``outer_nm`` the external torque on the load in each, in
+        addition to its weight; ``held_nm`` the torque by which the loops hold the axis before each, positive
+        forward, or NaN to leave it.
         """
         outer_nm = np.zeros(len(substeps)) if outer_nm is None else outer_nm
         held_nm = np.full(len(substeps), np.nan) if held_nm is None else held_nm
@@ -129,13 +132,13 @@ class Machine:
         return Cycles(*told.T)
 
     def coast(self, substeps: int, braked: bool, outer_nm: float = 0.0) -> None:
-        """Power stage off: friction, or the brake, slows the motor and holds it."""
+        """Runs a cycle with the power stage off; friction and, if ``braked``, the brake slow the motor."""
         brake_nm = self.truth.motor.brake_nm if braked else 0.0
         self._take(self._axis.roll(brake_nm, substeps, self._limit_nm, self._chance_deg(), outer_nm))
 
     @property
     def torque_limit_permille(self) -> float:
-        """Highest torque, in thousandths of the rated one; set it up to what the truth file allows."""
+        """Torque limit, in thousandths of the rated one; the truth file's limit is the maximum."""
         return self._limit_permille
 
     @torque_limit_permille.setter
@@ -145,11 +148,11 @@ class Machine:
         self._limit_permille = 1000.0 * self._limit_nm / self._rated_nm
 
     def _chance_deg(self) -> float:
-        """A sample of the load encoder's noise."""
+        """Returns a sample of the load encoder's noise."""
         return self._noise.gauss(0.0, self._noise_deg) if self._noise_deg else 0.0
 
     def _take(self, told: Told) -> None:
-        """What the axis tells after a cycle."""
+        """Stores the axis's measurements after a cycle."""
         (
             self.motor_reading,
             self.load_reading,

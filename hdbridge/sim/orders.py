@@ -21,12 +21,12 @@ class Orders:
         terms = {
             each.order: cmath.rect(each.amplitude_arcsec, math.radians(each.phase_deg)) for each in orders
         }
-        # Highest order first, as Horner's rule takes them; the last one, order 0, is always zero.
+        # Highest order first, for Horner's rule; the last one, order 0, is always zero.
         self._coefficients = tuple(terms.get(order, 0j) for order in range(max(terms, default=0), 0, -1))
         self._count = len(self._coefficients)
 
     def at(self, angle_rad: float) -> float:
-        """The sum in arcsec."""
+        """Returns the sum in arcsec."""
         turn = complex(math.cos(angle_rad), math.sin(angle_rad))
         total = 0j
         for place in range(self._count):

@@ -1,4 +1,4 @@
-"""A damped mass on a spring whose base moves: the exact step for a base that moves evenly within the step."""
+"""Damped mass on a spring with a moving base: exact step for linear motion of the base."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class Step(NamedTuple):
 
 
 class Oscillator(Protocol):
-    """A damped mass on a spring as a truth file describes it."""
+    """Damped mass on a spring, as a truth file describes it."""
 
     @property
     def frequency_hz(self) -> float: ...
@@ -28,7 +28,7 @@ class Oscillator(Protocol):
 
 @state
 class Transition:
-    """A `Step` in the state of the simulation."""
+    """`Step` as part of the simulation's state."""
 
     distance_by_distance: float
     distance_by_rate: float
@@ -40,14 +40,14 @@ class Transition:
 
 
 def transition(truth: Oscillator | None, step_s: float) -> Transition:
-    """The exact step of an oscillator; where there is none, of one that goes with its base."""
+    """Returns the exact step of an oscillator; without one, the step of a mass that is fixed to its base."""
     if truth is None:
         return Transition(Step(0.0, 0.0, 0.0, 0.0))
     return Transition(exact_step(math.tau * truth.frequency_hz, truth.damping_ratio, step_s))
 
 
 def exact_step(frequency_rad_s: float, damping_ratio: float, step_s: float) -> Step:
-    """The matrix exponential of ``u'' = -w^2 u - 2 d w u'`` over a step, for any damping ratio."""
+    """Returns the matrix exponential of ``u'' = -w^2 u - 2 d w u'`` over a step, for any damping ratio."""
     w, decay = frequency_rad_s, damping_ratio * frequency_rad_s
     fade = math.exp(-decay * step_s)
     inside = 1.0 - damping_ratio**2
@@ -58,7 +58,7 @@ def exact_step(frequency_rad_s: float, damping_ratio: float, step_s: float) -> S
         c, s = math.cos(damped * step_s), math.sin(damped * step_s) / damped
     else:
         damped = w * math.sqrt(-inside)
-        # Both decays as they are: cosh and sinh have no number where the damping is very large.
+        # Separate exponentials, because cosh and sinh overflow if the damping is very large.
         slow, fast = math.exp(-w * w / (decay + damped) * step_s), math.exp(-(decay + damped) * step_s)
         fade, c, s = 1.0, 0.5 * (slow + fast), 0.5 * (slow - fast) / damped
     return Step(fade * (c + decay * s), fade * s, -fade * w * w * s, fade * (c - decay * s))

@@ -1,7 +1,7 @@
-"""A virtual clock that does not run ahead of real time: for simulated drives that somebody looks at.
+"""Virtual clock that does not run ahead of real time, for simulated drives under observation.
 
-Where the machine is late, virtual time is late with it: nothing is skipped, and what was lost is not made up
-for in a rush. So a machine that stalls is no fault of a simulated bus.
+If the computer is late, virtual time is late with it: nothing is skipped, and lost time is not caught up in
+a rush. A stall of the computer is therefore not a fault of a simulated bus.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from hdbridge.errors import InputError
 from hdbridge.sim.lockstep import VirtualClock
 
 FORGIVEN_S: Final = 0.1
-"""Real time that is made up for; where more was lost, the pace begins anew."""
+"""Longest delay in real time that is caught up; after a longer one the pace restarts."""
 
 
 class PacedClock(VirtualClock):
@@ -28,7 +28,7 @@ class PacedClock(VirtualClock):
         real_s: Callable[[], float] = time.monotonic,
         sleep: Callable[[float], None] = time.sleep,
     ) -> None:
-        """``real_s`` and ``sleep`` are the machine's own clock. InputError for a speed that is none."""
+        """``real_s`` and ``sleep`` are the computer's clock. InputError if ``speed`` is not above 0."""
         if not (math.isfinite(speed) and speed > 0.0):
             raise InputError(f"a simulation at {speed!r} times real time; expected a finite number above 0")
         super().__init__(start_s)
@@ -37,7 +37,7 @@ class PacedClock(VirtualClock):
         self._anchor_s, self._anchor_real_s = start_s, real_s()
 
     def sleep_until(self, deadline_s: float) -> None:
-        """Advance to ``deadline_s``, and there no sooner than real time."""
+        """Advances to ``deadline_s``, not before the corresponding real time."""
         due_s = self._anchor_real_s + (deadline_s - self._anchor_s) / self._speed
         wait_s = due_s - self._real_s()
         if wait_s > 0.0:

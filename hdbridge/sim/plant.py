@@ -1,13 +1,13 @@
-"""The mechanics: motor and load, the gear's spring between them, friction, the coupling to the load encoder.
+"""Mechanics: motor and load, the gear's spring between them, friction, and the coupling to the load encoder.
 
 The stiff linear parts (load on the gear's spring, encoder on its coupling) are stepped exactly for a base
-that moves evenly within a step. The motor is stepped implicitly in its friction: Coulomb friction is a
-set-valued force, so a motor whose torque does not exceed it stands still exactly, without creep or chatter.
+that moves linearly within a step. The step of the motor is implicit in its friction: Coulomb friction is a
+set-valued force, so a motor whose torque does not exceed it stands perfectly still, without creep or chatter.
 
-The gear's reaction on the motor is the spring's torque divided by the ratio; that the tooth error makes the
-momentary ratio differ from it by a hundredth or two is left out there, not in the angles.
+The gear's reaction on the motor is the spring's torque divided by the ratio. The tooth error changes the
+momentary ratio by one or two per cent; the reaction neglects this, the angles do not.
 
-`Plant` has a linear spring and a load without outer torques; `hdbridge.sim.loaded_plant` has the rest.
+`Plant` has a linear spring and a load without external torques; `hdbridge.sim.loaded_plant` has the rest.
 """
 
 from __future__ import annotations
@@ -28,15 +28,15 @@ class Plant:
     """State of the mechanics. Angles in degrees, rates in degrees per second, torques in newton metres."""
 
     now: Conditions
-    """The motor's and the load's angle, and what else the gear depends on."""
+    """Angles of motor and load, and the other conditions of the gear."""
     motor_deg_s: float
     load_deg_s: float
     output_deg: float
     encoder_deg: float
     loss_j: float
-    """Friction work at the motor shaft since it was last set to zero."""
+    """Friction work at the motor shaft since it was last reset."""
     outer_nm: float
-    """Torque on the load from outside, in addition to its weight; only a `LoadedPlant` yields to it."""
+    """External torque on the load, in addition to its weight; only `LoadedPlant` applies it."""
     _arm: float
     _cold_coulomb: float
     _cold_drag: float
@@ -96,7 +96,7 @@ class Plant:
         self.loss_j = self.outer_nm = 0.0
 
     def step(self, torque_nm: float, brake_nm: float) -> None:
-        """One substep under a motor torque; the brake adds to the Coulomb friction."""
+        """Runs one substep with a motor torque; the brake adds to the Coulomb friction."""
         now, dt = self.now, self._dt
         output, load = self.output_deg, now.load_deg
         load_speed = self.load_deg_s
@@ -123,23 +123,24 @@ class Plant:
 
     @property
     def outer_torque_nm(self) -> float:
-        """Torque of gravity on the load, as a sensor at its flange tells; positive forward."""
+        """Torque of gravity on the load, as measured at its flange; positive forward."""
         return self.weight_nm(self.now.load_deg)
 
     def weight_nm(self, load_deg: float) -> float:
-        """Torque of gravity on the load at an angle; positive forward."""
+        """Returns the torque of gravity on the load at an angle; positive forward."""
         return 0.0
 
     def scale_friction(self, factor: float) -> None:
-        """Set the motor's friction to so many times what the truth file says."""
+        """Sets the motor's friction to ``factor`` times that of the truth file."""
         self._coulomb = self._cold_coulomb * factor
         self._sticking = self._cold_sticking * factor
         self._drag = self._cold_drag * factor
 
     def _turn_motor(self, torque_nm: float, brake_nm: float, spring: float) -> bool:
-        """The motor's part of a substep; whether it moved.
+        """Runs the motor's part of a substep; returns True if it moved.
 
-        ``spring`` is the spring's torque without the motor's own share in it, arm * (old speed + new speed).
+        ``spring`` is the spring's torque without the share that the motor's own motion adds: arm * (old
+        speed + new speed).
         """
         now, dt, speed = self.now, self._dt, self.motor_deg_s
         held = self._coulomb + brake_nm
@@ -163,7 +164,7 @@ class Plant:
         return moved
 
     def _turn_encoder(self, load: float, new_load: float) -> None:
-        """The load encoder's part of a substep, seen from the load."""
+        """Runs the load encoder's part of a substep, relative to the load."""
         if not self._coupled:
             self.encoder_deg = new_load
             return
@@ -175,7 +176,7 @@ class Plant:
         self._encoder_rate = rate + step.rate_by_distance * ahead + step.rate_by_rate * slip
 
     def _rub(self, before: float, load: float, speed: float, loss: float) -> tuple[float, float]:
-        """Coulomb friction at the load: takes a speed away, and holds a load that it can hold."""
+        """Applies Coulomb friction at the load: reduces its speed, or holds it if the friction suffices."""
         if abs(speed) <= loss:
             return before, 0.0
         loss = math.copysign(loss, speed)

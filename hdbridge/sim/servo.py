@@ -1,10 +1,10 @@
-"""The drive's loops: filters on the demand, position and velocity cascade with feed-forward, torque filters.
+"""Servo loops of the drive: demand filters, position and velocity cascade with feed-forward, torque filters.
 
 The blocks in their order: moving average and two lags of the demand, position P, velocity PI on the filtered
-speed (whose integral may add up the position error instead: PIV), feed-forwards, notch, torque filter, limit.
+speed (whose integral may sum the position error instead: PIV), feed-forwards, notch, torque filter, limit.
 
-Like real drives of this class it closes its loops on an interpolated encoder: a motor that has settled
-stands on the middle of the commanded count, not anywhere within it.
+Like real drives of this class it closes its loops on an interpolated encoder: a settled motor stands at the
+middle of the commanded count, not anywhere within it.
 """
 
 from __future__ import annotations
@@ -21,12 +21,13 @@ RAD_PER_DEG = math.pi / 180.0
 HIGHEST_NOTCH = 0.45
 """Frequency of a notch over the rate of the substeps: at half of it the bilinear transform ends."""
 AT_REST_DEG_S = 0.05
-"""Below this speed the demand rests: friction feed-forward keeps its direction, the integral may rest."""
+"""Speed below which the demand is at rest: friction feed-forward keeps its direction, the integral may
+rest."""
 
 
 @state
 class MovingAverage:
-    """Mean of the demand over a time, by its integral now and then."""
+    """Moving average of the demand, from its integral now and a duration ago."""
 
     _duration_s: float
     _integral: float
@@ -39,16 +40,16 @@ class MovingAverage:
         self.start_at(0.0)
 
     def start_at(self, demand_deg: float) -> None:
-        """The demand has always been this one."""
+        """Resets to a demand that has always been this one."""
         self._start_deg, self._integral = demand_deg, 0.0
         self._late_integral.begin(0.0)
 
     def mean_deg(self) -> float:
-        """The mean up to now."""
+        """Returns the present mean."""
         return self._start_deg + (self._integral - self._late_integral.deg) / self._duration_s
 
     def add_up(self, demand_deg: float, duration_s: float) -> None:
-        """Advance by a time in which the demand is this one on average."""
+        """Advances by a time with this mean demand."""
         self._integral += (demand_deg - self._start_deg) * duration_s
         self._late_integral.feed(self._integral)
 
@@ -75,12 +76,12 @@ class Notch:
         self.rest_at(0.0)
 
     def rest_at(self, torque_nm: float) -> None:
-        """This torque has always gone in and come out."""
+        """Resets to a torque that has always been this one, at input and output."""
         self._first = (1.0 - self._b0) * torque_nm
         self._second = (self._b2 - self._a2) * torque_nm
 
     def notched_nm(self, torque_nm: float) -> float:
-        """One sample."""
+        """Filters one sample."""
         notched = self._b0 * torque_nm + self._first
         self._first = self._a1 * (torque_nm - notched) + self._second
         self._second = self._b2 * torque_nm - self._a2 * notched
@@ -89,10 +90,10 @@ class Notch:
 
 @state
 class Servo:
-    """State of the loops. The demand and the motor's angle come in degrees of the motor."""
+    """State of the loops. Demand and motor angle are in motor degrees."""
 
     limit_nm: float
-    """Highest torque in either direction."""
+    """Torque limit in either direction."""
     measured_deg_s: float
     _acceleration_gain: float
     _average: MovingAverage
@@ -162,7 +163,7 @@ class Servo:
         self.engage(0.0, 0.0)
 
     def engage(self, motor_deg: float, motor_deg_s: float) -> float:
-        """Start from where the motor is, without torque or error; returns its angle as the loops see it."""
+        """Starts at the motor's position, without torque or error; returns its angle as the loops see it."""
         self._measured = self._interpolated(motor_deg)
         self._reference = self._last_reference = self._measured
         self._reference_speed = self.measured_deg_s = motor_deg_s
@@ -177,14 +178,14 @@ class Servo:
         return self._measured
 
     def shift(self, torque_nm: float) -> None:
-        """Let the integral be larger by so much."""
+        """Adds ``torque_nm`` to the integral."""
         self._integral += torque_nm
         if self._with_filters:
             self._filtered_nm += torque_nm
             self._notch.rest_at(self._filtered_nm)
 
     def answer_nm(self, demand_deg: float, demand_deg_s: float, motor_deg: float) -> float:
-        """The torque for one substep, in which the demand moves evenly from ``demand_deg`` on."""
+        """Returns the torque for one substep, in which the demand moves linearly from ``demand_deg``."""
         dt = self._dt
         measured = math.floor(motor_deg * self._steps_per_deg + 0.5) * self._step_deg
         measured_speed = (measured - self._measured) / dt
@@ -199,8 +200,8 @@ class Servo:
             average.add_up(demand_deg + 0.5 * dt * demand_deg_s, dt)
             demand_deg, demand_deg_s = before_deg, (average.mean_deg() - before_deg) / dt
 
-        # The reference: the demand behind two equal lags, stepped exactly. It never overshoots a demand that
-        # does not turn back, and it has a speed and an acceleration where a demand in whole counts has steps.
+        # Reference: the demand after two equal lags, stepped exactly. It never overshoots a demand that
+        # does not reverse, and its speed and acceleration stay finite at the steps of a demand in counts.
         reference, speed = self._reference, self._reference_speed
         w, decay = self._filter, self._decay
         behind = reference - demand_deg + 2.0 * demand_deg_s / w
@@ -211,7 +212,7 @@ class Servo:
         )
         self._reference_speed = new_speed
 
-        # The speeds compared are both averages over the substep that has passed.
+        # Both speeds are averages over the last substep.
         error = reference - measured
         wanted_speed = (reference - self._last_reference) / dt
         self._last_reference = reference
@@ -239,7 +240,7 @@ class Servo:
             torque = self._filtered_nm
         limit = self.limit_nm
         if torque > limit:
-            # At the limit the integral may only go back.
+            # At the limit the integral may only decrease.
             self._integral = min(integral, self._integral)
             return limit
         if torque < -limit:
@@ -249,7 +250,7 @@ class Servo:
         return torque
 
     def _load_torque(self, reference_speed: float) -> float:
-        """What a load on a spring needs, on average over the substep, to come along with the reference."""
+        """Returns the mean torque over the substep that makes a load on a spring follow the reference."""
         step, ahead, speed = self._load_model, self._load_ahead, self._load_speed
         slip = speed - reference_speed
         self._load_ahead = step.distance_by_distance * ahead + step.distance_by_rate * slip
@@ -259,7 +260,7 @@ class Servo:
         return self._load_gain * (new_speed - speed)
 
     def _turn(self, direction: float) -> float:
-        """Reverse the friction feed-forward; what the integral had already done of it is taken off."""
+        """Reverses the friction feed-forward; returns the integral without the part that this provides."""
         standing = self._integral + self._friction * self._direction
         self._direction = direction
         return direction * max(0.0, direction * standing - self._friction)
@@ -269,5 +270,5 @@ class Servo:
 
 
 def _share(time_s: float, step_s: float) -> float:
-    """Gain per step of a first-order lag; one without a time."""
+    """Returns the gain per step of a first-order lag; 1 without a time constant."""
     return -math.expm1(-step_s / time_s) if time_s > 0.0 else 1.0

@@ -1,7 +1,7 @@
-"""Classes that hold the state of the simulation, each attribute declared with its type.
+"""Classes for the state of the simulation, each attribute declared with its type.
 
-What is declared can be laid out in memory, so that the methods can be compiled (`hdbridge.sim.compiled`).
-Their attributes are numbers, tuples and lists of numbers, and further objects of such classes.
+Declared attributes can be laid out in memory, so that the methods can be compiled (`hdbridge.sim.compiled`).
+They are numbers, tuples and lists of numbers, and further objects of such classes.
 """
 
 from __future__ import annotations
@@ -12,11 +12,11 @@ from typing import Final, TypeVar
 T = TypeVar("T")
 
 STATES: Final[list[type]] = []
-"""All such classes."""
+"""All state classes."""
 
 
 def state(cls: type[T]) -> type[T]:
-    """The class with a slot for each declared attribute; it writes its own ``__init__``."""
+    """Gives a class a slot for each declared attribute; the class writes its own ``__init__``."""
     made = dataclass(init=False, repr=False, eq=False, slots=True)(cls)
     STATES.append(made)
     return made

@@ -304,7 +304,7 @@ def test_without_sdo_traffic_the_mapping_is_that_of_the_axis_file(tmp_path: Path
 
 def test_another_order_than_that_of_the_axis_file_is_noticed(tmp_path: Path, logged: Logged) -> None:
     path = in_order_of_axis_file(logged, swapped=True).write(tmp_path / "bus.log")
-    with pytest.raises(InputError, match="the mapping is that of the axis file: is it the one of this log"):
+    with pytest.raises(InputError, match="the mapping is that of the axis file, the log may use another"):
         import_log(path, AXIS)
 
 

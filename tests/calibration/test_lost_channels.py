@@ -63,7 +63,7 @@ def test_a_channel_lost_on_the_way_is_told_and_kept_in_mind(cell):
     ]
     ((name, row),) = missing
     assert row["cycles"] == 1
-    said = f"rec/{name} went on in spite of: a TPDO is missing, in 1 cycle (first: {row['first']})"
+    said = f"rec/{name} continued despite: a TPDO is missing, in 1 cycle (first: {row['first']})"
     assert any(each.startswith(f"note: {said}") for each in done.stdout.splitlines())
     assert any(each.startswith(said) for each in cell.json("result.json")["warnings"])
     assert said in (cell.folder / "rec" / "report.html").read_text()

@@ -1,4 +1,4 @@
-"""An axis at work under an adaptation: the simulated drive over real frames, its gear changing."""
+"""Simulated axis at work with adaptation, over real frames, while its gear changes."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ SPAN_DEG = 60.0
 
 
 def truth_of(duration_s: float = 3600.0, growth: float = 0.2, second_order_arcsec: float = 3.0) -> Truth:
-    """The article's axis, whose loop and second order grow within that time; a usual load encoder."""
+    """Returns the article's axis with a growing loop and second order, and usual encoder noise."""
     data = yaml.safe_load((ARTICLE / "truth.yaml").read_text())
     data["gear"]["ageing"] = {
         "duration_s": duration_s,
@@ -66,10 +66,10 @@ def work(
     zero_arcsec: float = 0.0,
     seed: int = 0,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Moves of the motor from target to target with stands of 0.12 s, as times (n,) and AXIS_SAMPLE (n,).
+    """Returns moves of the motor between targets, with 0.12 s of rest, as times (n,) and AXIS_SAMPLE (n,).
 
-    Not simulated: the load is where ``truth`` says, without dynamics. ``before_deg`` are targets before
-    these, which the samples do not show; the last of them is where the first move begins.
+    Not simulated: the load is where ``truth`` puts it, without dynamics. ``before_deg`` are earlier targets
+    that the samples do not contain; the first move starts at the last of them.
     """
     shown = len(before_deg)
     targets_deg = [*before_deg, *targets_deg]
@@ -95,14 +95,14 @@ def work(
 
 
 def wandering(stands: int, seed: int = 0, span_deg: float = 2000.0) -> list[float]:
-    """Motor angles of a machine at work: small moves and large ones, both ways."""
+    """Returns motor angles of a machine at work: small and large moves in both directions."""
     steps = np.random.default_rng(seed).normal(0.0, 150.0, stands)
     folded = np.abs(np.mod(np.cumsum(steps) + span_deg, 2 * span_deg) - span_deg)
     return np.round(folded, 3).tolist()
 
 
 def worn(offset_arcsec: float = 0.0, second_order_arcsec: float = 0.0) -> TransmissionModel:
-    """The article's model, its offset and the cosine of its second order changed by so much."""
+    """Returns the article's model with changed offset and cosine of the second order."""
     regressors = Regressors(MODEL)
     change = np.zeros(regressors.followed)
     for each in regressors.terms:
@@ -113,7 +113,7 @@ def worn(offset_arcsec: float = 0.0, second_order_arcsec: float = 0.0) -> Transm
 
 
 class Sampler:
-    """Records as the control process would have written them, one after the other."""
+    """Converts records to consecutive samples, as the control process would write them."""
 
     def __init__(self, axis: AxisConfig, model: TransmissionModel) -> None:
         self.axis = axis
@@ -122,13 +122,13 @@ class Sampler:
         self.use(model)
 
     def use(self, model: TransmissionModel) -> None:
-        """Another model predicts from here on; it has followed the path."""
+        """Predicts with another model from here on, after it has followed the last path."""
         self._tracker = model.tracker(Start.VIRGIN)
         for angle in self._demand.tolist():
             self._tracker.advance(angle, Moment())
 
     def samples(self, record: Record) -> SampleArray:
-        """All samples of a record, shape (n,); time goes on where the last one ended."""
+        """Returns all samples of a record, shape (n,); their time continues from the last record."""
         columns, ratio = record.columns, self.axis.gear.ratio
         demand = columns["motor_target_deg"]
         count, period_s = len(demand), self.axis.drive.cycle_s
@@ -151,16 +151,16 @@ class Sampler:
 
 
 class Work:
-    """The axis, test by test; the adaptation hears what was measured and may change the model."""
+    """Axis that runs tests; the adaptation receives the samples and may change the model."""
 
     def __init__(self, drive: Drive, node: DriveNode, settings: AdaptationSettings | None) -> None:
         self.history: list[Entry] = []
         self.adaptation = settings and Adaptation(MODEL, settings, reading_of(AXIS), self.history.append)
         self.health = EncoderHealth(AXIS, MODEL)
         self.disbelieved: list[str] = []
-        """Why the load encoder was not believed, each reason once."""
+        """Reasons for not trusting the load encoder, each once."""
         self.errors_arcsec: list[list[float]] = []
-        """Where the load *really* stood, less its target; one list per test."""
+        """True load position minus its target; one list per test."""
         self.faults = node.faults
         self._drive = drive
         self._machine = node.firmware.motion.machine
@@ -170,11 +170,11 @@ class Work:
 
     @property
     def time_s(self) -> float:
-        """Since the axis was switched on."""
+        """Time since the axis was switched on."""
         return self._drive.link.clock.now()
 
     def step(self, count: int = 16, step_deg: float = 43.56) -> None:
-        """A stepping test. Each begins elsewhere: the same angles again and again show no single order."""
+        """Runs a stepping test, each at other angles, because repeated angles do not separate the orders."""
         start_deg = SPAN_DEG * math.fmod(GOLDEN * len(self.errors_arcsec), 1.0)
         self._loads_deg.clear()
         run = self._bench.run(Stepping(count=count, step_deg=step_deg, start_deg=start_deg))
@@ -190,12 +190,12 @@ class Work:
         self._adapt(self._sampler.samples(run.record))
 
     def until(self, time_s: float) -> None:
-        """Stepping tests up to that time."""
+        """Runs stepping tests up to that time."""
         while self.time_s < time_s:
             self.step()
 
     def three_sigma_arcsec(self, tests: int = 4) -> list[float]:
-        """Of the true load's errors, over so many neighbouring tests each."""
+        """Three sigma of the true load's errors, over each run of ``tests`` consecutive tests."""
         errors = self.errors_arcsec
         return [
             Scatter.of([each for test in errors[at : at + tests] for each in test]).three_sigma_arcsec
@@ -229,7 +229,7 @@ Misreading = Callable[[int], int]
 
 
 def _drifts(work: Work) -> Misreading:
-    """By half an arcsec a second."""
+    """Adds a drift of half an arcsec per second."""
     begun_s = work.time_s
     return lambda counts: counts + round(0.5 * (work.time_s - begun_s) / LOAD_COUNT_ARCSEC)
 
@@ -246,12 +246,12 @@ def _freezes(_: Work) -> Misreading:
 
 
 def _jumps(_: Work) -> Misreading:
-    """By 100 arcsec."""
+    """Adds 100 arcsec."""
     return lambda counts: counts + round(100.0 / LOAD_COUNT_ARCSEC)
 
 
 def _scatters(_: Work) -> Misreading:
-    """Ten times as much as it did."""
+    """Adds ten times the usual noise."""
     noise = random.Random(1)
     return lambda counts: counts + round(noise.gauss(0.0, 10.0 * NOISE_ARCSEC) / LOAD_COUNT_ARCSEC)
 
@@ -259,12 +259,12 @@ def _scatters(_: Work) -> Misreading:
 FAULTS: dict[str, Callable[[Work], Misreading]] = {
     "drift": _drifts, "freeze": _freezes, "jump": _jumps, "noise x 10": _scatters,
 }  # fmt: skip
-"""What a load encoder's faults make of its counts, from when they are made."""
+"""Faults of a load encoder: functions of its counts, active from their creation on."""
 
 
 @contextmanager
 def at_work(truth: Truth, settings: AdaptationSettings | None) -> Iterator[Work]:
-    """A booted axis with the article's model in use; without settings nothing is adapted."""
+    """Provides a booted axis with the article's model; nothing is adapted without settings."""
     with (
         simulated_bench(truth, AXIS.eds_path, AXIS.drive.node_id, 1) as (bus, clock, node),
         Drive(bus, AXIS, clock) as drive,

@@ -1,4 +1,4 @@
-"""The API as clients meet it: served by uvicorn in a thread, over a Unix socket and TCP."""
+"""API for clients: served by uvicorn in a thread, over a Unix socket and TCP."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ TOKEN = "a-token-that-nobody-guesses"
 
 @dataclass(frozen=True)
 class Served:
-    """Where the API is."""
+    """Addresses of the API, and its server."""
 
     bridge: FakeBridge
     socket: Path
     port: int
     server: ApiServer
 
-    # Without TLS: to load the system's certificates takes longer than most of these tests.
+    # Without TLS, because loading the system's certificates takes longer than most of these tests.
     def over_socket(self, **headers: str) -> httpx.Client:
         transport = httpx.HTTPTransport(uds=str(self.socket), verify=False)
         return httpx.Client(
@@ -50,7 +50,7 @@ class Served:
 
 @contextmanager
 def served(bridge: FakeBridge, folder: Path) -> Iterator[Served]:
-    """Serve a machine until the end of the block."""
+    """Serves a machine until the end of the block."""
     tcp = tcp_socket(0)
     port = tcp.getsockname()[1]
     path = folder / "cell.sock"

@@ -1,8 +1,8 @@
-"""What the loop would tell of an axis, without a loop: samples made from a path, a model and the truth.
+"""Samples of an axis without a control loop, made from a path, a model and the truth.
 
-The truth is a model too: the gear obeys the laws that the model knows, with other numbers. What a watch has
-to notice is a change of the numbers. The motor follows its target one cycle late, both encoders count, the
-load encoder is noisy.
+The truth is also a model: the gear obeys the laws that the model knows, with other numbers, and a watch must
+notice changes of the numbers. The motor follows its target one cycle late, both encoders count, and the load
+encoder is noisy.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ FloatArray = NDArray[np.float64]
 
 @dataclass
 class SampleMaker:
-    """Makes samples that follow each other."""
+    """Makes consecutive samples."""
 
     axis: AxisConfig
     model: TransmissionModel
@@ -37,7 +37,7 @@ class SampleMaker:
     compensated: bool = True
 
     def make(self, load_target_deg: FloatArray, first_cycle: int = 1000) -> Any:
-        """One sample per cycle."""
+        """Returns one sample per cycle."""
         random = np.random.default_rng([self.seed, first_cycle])
         count = len(load_target_deg)
         period_s, ratio = self.axis.drive.cycle_s, self.model.ratio
@@ -80,7 +80,7 @@ class SampleMaker:
 
 
 def counted(angle_deg: FloatArray, counts_per_turn: int) -> FloatArray:
-    """As an encoder reads it."""
+    """Rounds an angle to whole counts."""
     counted_deg: FloatArray = np.round(angle_deg * counts_per_turn / 360.0) * 360.0 / counts_per_turn
     return counted_deg
 
@@ -88,8 +88,8 @@ def counted(angle_deg: FloatArray, counts_per_turn: int) -> FloatArray:
 def moves_and_rests(
     duration_s: float, period_s: float, seed: int = 0, speed_deg_s: float = 10.0
 ) -> FloatArray:
-    """Load targets of an axis at work: moves to random places at several speeds, and rests; smooth (minimum
-    jerk) and within 60 degrees.
+    """Returns load targets of an axis at work: smooth moves to random places within 60 degrees,
+    at several speeds, and rests.
     """
     random = np.random.default_rng(seed)
     parts: list[FloatArray] = []
@@ -107,7 +107,7 @@ def moves_and_rests(
 
 
 def _ramped(start: float, goal: float, steps: int, period_s: float) -> FloatArray:
-    """Constant speed between two smooth ramps of 0.2 s."""
+    """Returns a move at constant speed between two smooth ramps of 0.2 s."""
     ramp = min(int(0.2 / period_s), steps // 3 + 1)
     window = np.hanning(ramp + 2)[1:-1]
     speed = np.convolve(np.ones(steps), window / np.sum(window))

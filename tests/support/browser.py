@@ -1,4 +1,4 @@
-"""A headless Chromium, driven by its own DevTools protocol: what a person would see and press."""
+"""Headless Chromium, driven by its DevTools protocol: shows and operates a page as a person would."""
 
 from __future__ import annotations
 
@@ -30,28 +30,28 @@ DROPPED = (
     "Cannot find context with specified id",
     "Cannot find default execution context",
 )
-"""What Chromium answers to an expression whose document went away before it was known."""
+"""Chromium's answers to an expression whose document was replaced before its value was known."""
 
 
 class Navigated(AssertionError):
-    """The page went to another document before an expression had its value."""
+    """Raised if the page changed to another document before an expression had its value."""
 
 
 class Page:
-    """One page of the browser."""
+    """Page of the browser."""
 
     def __init__(self, line: ClientConnection) -> None:
         self._line = line
         self._asked = 0
         self.complaints: list[str] = []
-        """Errors that the page raised, and what it wrote to the console as an error."""
+        """Errors that the page raised or wrote to the console."""
         for domain in ("Page", "Runtime", "Log", "Network"):
             self.call(f"{domain}.enable")
         self.requested: list[str] = []
-        """Addresses that the page has asked for."""
+        """Addresses that the page has requested."""
 
     def call(self, method: str, **parameters: Any) -> dict[str, Any]:
-        """One command of the protocol and its answer; what happens meanwhile is noted."""
+        """Sends a command of the protocol and returns its answer; notes events that arrive meanwhile."""
         self._asked += 1
         self._line.send(json.dumps({"id": self._asked, "method": method, "params": parameters}))
         while True:
@@ -73,7 +73,7 @@ class Page:
             self.requested.append(told["request"]["url"])
 
     def open(self, url: str, *, width: int = 1280, height: int = 900, dark: bool = False) -> None:
-        """Load a page in a window of this size."""
+        """Loads a page in a window of this size."""
         self.call(
             "Emulation.setDeviceMetricsOverride",
             width=width, height=height, deviceScaleFactor=1, mobile=width < 600,
@@ -84,29 +84,29 @@ class Page:
         self.until("document.readyState === 'complete'")
 
     def reload(self) -> None:
-        """Load the page again, and wait until it is another document."""
+        """Reloads the page, and waits until the document is a new one."""
         self.evaluate("window.hasBeenReloaded = false")
         self.call("Page.reload")
         self.until("window.hasBeenReloaded === undefined && document.readyState === 'complete'")
 
     def evaluate(self, expression: str) -> Any:
-        """The value of an expression in the page; a promise is awaited."""
+        """Returns the value of an expression in the page; awaits a promise."""
         answer = self.call("Runtime.evaluate", expression=expression, awaitPromise=True, returnByValue=True)
         assert "exceptionDetails" not in answer, answer["exceptionDetails"]
         return answer["result"].get("value")
 
     def _settled(self, expression: str) -> Any:
-        """The value of an expression, or None where the document went away before it was known."""
+        """Returns the value of an expression, or None if the document changed first."""
         try:
             return self.evaluate(expression)
         except Navigated:
             return None
 
     def until(self, condition: str) -> Any:
-        """Wait until an expression is true in the page; its value.
+        """Waits until an expression is true in the page; returns its value.
 
-        The page may be on its way to another document meanwhile: Chromium then drops what it was asked,
-        which answers nothing, so it is asked again.
+        If the page changes to another document meanwhile, Chromium drops the expression without a value, so
+        it is evaluated again.
         """
         return until(
             lambda: self._settled(condition),
@@ -114,28 +114,28 @@ class Page:
         )
 
     def text(self, selector: str) -> str:
-        """What stands in an element."""
+        """Returns the text of an element."""
         return str(self.evaluate(f"document.querySelector({json.dumps(selector)}).innerText"))
 
     def click(self, selector: str) -> None:
-        """Press a button."""
+        """Clicks an element."""
         self.evaluate(f"document.querySelector({json.dumps(selector)}).click()")
 
     def press(self, key: str, *, hold_s: float = 0.0) -> None:
-        """Press a key, hold it, let it go."""
+        """Presses a key, holds it and releases it."""
         self.call("Input.dispatchKeyEvent", type="keyDown", key=key)
         time.sleep(hold_s)
         self.call("Input.dispatchKeyEvent", type="keyUp", key=key)
 
     def screenshot(self, path: Path) -> None:
-        """The whole page as PNG."""
+        """Saves the whole page as PNG."""
         picture = self.call("Page.captureScreenshot", captureBeyondViewport=True)["data"]
         path.write_bytes(base64.b64decode(picture))
 
 
 @contextmanager
 def browser() -> Iterator[Page]:
-    """A page of a new Chromium; the test is skipped, and says so, where there is none to be had."""
+    """Provides a page of a new Chromium; skips the test with a reason if there is none."""
     found = subprocess.run([FINDER], capture_output=True, text=True, check=False)
     if found.returncode:
         pytest.skip(found.stderr.strip())
@@ -145,7 +145,7 @@ def browser() -> Iterator[Page]:
         [found.stdout.strip(), *flags, f"--user-data-dir={home}", "--remote-debugging-port=0", "about:blank"],
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
-        start_new_session=True,  # what Debian installs is a script that waits for the browser
+        start_new_session=True,  # Debian's chromium is a script that waits for the browser
     )
     try:
         with connect(_address(Path(home), process), max_size=None) as line:
@@ -157,7 +157,7 @@ def browser() -> Iterator[Page]:
 
 
 def _address(home: Path, process: subprocess.Popen[bytes]) -> str:
-    """The WebSocket of the first page: Chromium writes its port into its folder once it listens."""
+    """Returns the WebSocket of the first page; Chromium writes its port to its folder once it listens."""
     port_file = home / "DevToolsActivePort"
 
     def opened() -> str | None:

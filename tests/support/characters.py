@@ -1,4 +1,4 @@
-"""Drives that all keep to CiA 402 and behave differently where it leaves the choice to the firmware."""
+"""Drives that all conform to CiA 402 but behave differently where it leaves the choice to the firmware."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from hdbridge.sim.truth import Truth
 
 @dataclass(frozen=True)
 class Character:
-    """A firmware, what a quick stop ends in, and the mode of the control cycle."""
+    """Behaviour of a firmware, its quick stop option code, and the mode of the control cycle."""
 
     name: str
     behaviour: Behaviour = Behaviour()
@@ -43,17 +43,17 @@ _SLUGGISH: Final = {
 }
 FRIENDLY: Final = Character("friendly")
 RESTLESS: Final = Character("restless", Behaviour(**_RESTLESS), 6)
-"""It resumes whenever it can."""
+"""Drive that resumes whenever it can."""
 SLUGGISH: Final = Character("sluggish", Behaviour(**_SLUGGISH), 6)
-"""It shows late what it does."""
+"""Drive that reports its state late."""
 AWKWARD: Final = Character("awkward", Behaviour(**_RESTLESS, **_SLUGGISH), 2)
 INTERPOLATED: Final = Character("interpolated", Behaviour(**_RESTLESS), 6, "ip")
-"""It resumes whenever it can, in interpolated position mode."""
+"""Drive that resumes whenever it can, in interpolated position mode."""
 CHARACTERS: Final = (FRIENDLY, RESTLESS, SLUGGISH, AWKWARD, INTERPOLATED)
 
 
 def every_character() -> list[Character]:
-    """All combinations of all choices."""
+    """Returns all combinations of all choices."""
     return list(_every_character())
 
 
@@ -66,7 +66,7 @@ def _every_character() -> Iterator[Character]:
 
 
 class PowerCount:
-    """Counts how often a drive enters 'operation enabled'."""
+    """Counts the times that a drive enters 'operation enabled'."""
 
     def __init__(self, node: DriveNode) -> None:
         self.times = 0

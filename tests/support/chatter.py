@@ -1,4 +1,4 @@
-"""Somebody else on a virtual bus."""
+"""Another participant of a virtual bus."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import can
 
 
 class Chatter:
-    """Sends the same frames again and again, from one period on."""
+    """Sends the same frames periodically, from one period on."""
 
     def __init__(self, bus: can.BusABC, *frames: tuple[int, bytes], period_s: float = 0.1) -> None:
         self.bus, self.frames, self.period_s, self.due_s = bus, frames, period_s, period_s

@@ -1,4 +1,4 @@
-"""The example of docs/ci.md as files."""
+"""Example files of docs/ci.md."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ WORKFLOW = ".github/workflows/motion.yml"
 
 
 def files() -> dict[str, str]:
-    """Text by path."""
+    """Returns the text of each file by its path."""
     return dict(_FILE.findall(PAGE.read_text(encoding="utf-8")))
 
 
 def write(folder: Path) -> Path:
-    """Write them all into a folder."""
+    """Writes all files into a folder."""
     for name, text in files().items():
         path = folder / name
         path.parent.mkdir(parents=True, exist_ok=True)

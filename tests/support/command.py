@@ -1,4 +1,4 @@
-"""``hdbridge ARGS...`` in the tests' own process, which spares its start (half a second each time)."""
+"""Runs ``hdbridge ARGS...`` in the tests' own process, which saves half a second of start-up each time."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from hdbridge.cli import main
 
 
 def run_here(folder: Path, *arguments: object) -> subprocess.CompletedProcess[str]:
-    """The command in ``folder``, without a terminal; nobody answers its questions."""
+    """Runs the command in ``folder``, without a terminal and with an empty standard input."""
     out, err = io.StringIO(), io.StringIO()
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)

@@ -1,7 +1,7 @@
-"""The daemon's control loop with simulated drives, in one thread on virtual time: `SteppedDaemon`.
+"""Control loop of the daemon with simulated drives, in one thread on virtual time: `SteppedDaemon`.
 
-Whoever waits on the service's side turns the loop: `SteppedClock.sleep_until` and `SteppedRelay.recv` run as
-many turns as fit. So everything of the service runs here as it is, and as fast as the processor.
+Waiting on the service's side turns the loop: `SteppedClock.sleep_until` and `SteppedRelay.recv` run as many
+turns as fit. So the service runs here unchanged, as fast as the processor allows.
 """
 
 from __future__ import annotations
@@ -40,13 +40,13 @@ EVENTS_KEPT = 1000
 
 
 class SpoiltBus(LockstepBus):
-    """The loop's end of the channel: an interface that can fail, with a spy who sees what is sent."""
+    """Loop's end of the channel: an interface that can fail, with a spy that sees the frames sent."""
 
     def __init__(self, channel: str, clock: VirtualClock) -> None:
         super().__init__(channel, clock)
         self.clock = clock
         self.no_room_for: int | None = None
-        """Identifier of a frame for which the transmit queue is full, once."""
+        """Identifier of a frame for which the transmit queue is full once."""
         self.spy: Callable[[int, bytes], None] | None = None
         self.down: int | None = None
         """Error number of every call while the interface is down (ENETDOWN) or deleted (ENODEV)."""
@@ -68,7 +68,7 @@ class SpoiltBus(LockstepBus):
 
 
 class SteppedClock:
-    """The service's clock: to wait on it turns the loop."""
+    """Clock of the service; waiting on it turns the loop."""
 
     def __init__(self, daemon: SteppedDaemon) -> None:
         self._daemon = daemon
@@ -82,7 +82,7 @@ class SteppedClock:
 
 
 class SteppedRelay(can.BusABC):
-    """The service's end of the relay: the loop sends what it sends, and turns while it waits."""
+    """Service's end of the relay: the loop sends its frames, and turns while it waits."""
 
     def __init__(self, daemon: SteppedDaemon) -> None:
         super().__init__(channel=None)
@@ -94,7 +94,7 @@ class SteppedRelay(can.BusABC):
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
         if msg.arbitration_id >= 0x700:
-            return  # the master's heartbeat is the loop's
+            return  # the loop sends the master's heartbeat
         self._daemon.memory.outgoing.put(0, msg.arbitration_id, bytes(msg.data))
 
     def recv(self, timeout: float | None = None) -> can.Message | None:
@@ -113,7 +113,7 @@ class SteppedRelay(can.BusABC):
 
 
 class SteppedDaemon:
-    """A control loop, its simulated drives, and a service's hands."""
+    """Control loop with its simulated drives, and the actions of a service."""
 
     def __init__(
         self,
@@ -133,7 +133,7 @@ class SteppedDaemon:
         self.samples = memory.reader()
         self._events = memory.event_reader()
         self.events: deque[Event] = deque(maxlen=EVENTS_KEPT)
-        """What the loop has told, the newest."""
+        """Newest events of the loop."""
         self.drives: list[Drive] = []
         self._relay = SteppedRelay(self)
         self._streams = 0
@@ -143,7 +143,7 @@ class SteppedDaemon:
     def turn(self, turns: int = 1) -> None:
         for _ in range(turns):
             self.controller.turn()
-        self.intruder.queue.queue.clear()  # nobody reads there; it would grow
+        self.intruder.queue.queue.clear()  # never read, so it would grow
         events, lost = self._events.read()
         assert lost == 0
         self.events.extend(events)
@@ -173,7 +173,7 @@ class SteppedDaemon:
         return self.memory.commands.post(kind, axis, **fields)  # type: ignore[arg-type]
 
     def order(self, kind: CommandKind, axis: int = 0, timeout_s: float = 5.0, **fields: float) -> Event:
-        """Post a command and turn until it is answered."""
+        """Posts a command and turns until it is answered."""
         id_ = self.post(kind, axis, **fields)
         answers = (EventKind.DONE, EventKind.REFUSED)
         found: list[Event] = []
@@ -186,7 +186,7 @@ class SteppedDaemon:
         return found[0]
 
     def done(self, kind: CommandKind, axis: int = 0, **fields: float) -> None:
-        """`order`, and it has to be done."""
+        """Runs `order`; AssertionError if the command is refused."""
         answer = self.order(kind, axis, **fields)
         assert answer.kind is EventKind.DONE, answer.text
 
@@ -194,36 +194,36 @@ class SteppedDaemon:
         self, axis: int = 0, scheme: Scheme = Scheme.EXTENDED, model: TransmissionModel | None = None,
         *, load_loop: bool = False,
     ) -> CompensationSetting:  # fmt: skip
-        """A compensation setting of an axis; of the article's model by default."""
+        """Returns a compensation setting of an axis; with the article's model by default."""
         config = self.axes[axis].config
         model = model or TransmissionModel.load(PROFILE / "model.yaml").bound_to(config)
         return CompensationSetting(model, scheme, load_loop=load_loop)
 
     def use(self, setting: CompensationSetting, axis: int = 0) -> None:
-        """Have the loop compensate by a setting."""
+        """Makes the loop compensate by a setting."""
         self.done(CommandKind.CHANGE, axis, i=self.memory.settings[axis].put(setting.to_json()))
 
     def drive(self, axis: int) -> Drive:
-        """The service's drive object of an axis, over the relay."""
+        """Returns the service's drive object of an axis, over the relay."""
         while len(self.drives) <= axis:
             config = self.axes[len(self.drives)].config
             self.drives.append(Drive(self._relay, config, self.service_clock, force=True))
         return self.drives[axis]
 
     def seeds(self, axis: int) -> dict[str, int]:
-        """Counts of both encoders and statusword, read by SDO: the fields of VERIFIED and ENABLE."""
+        """Returns both encoders' counts and the statusword, by SDO: the fields of VERIFIED and ENABLE."""
         drive = self.drive(axis)
         positions = drive.read_positions()
         drive.state()
         return {"i": positions.motor_counts, "j": positions.load_counts, "k": drive.image.statusword or 0}
 
     def verify(self, axis: int = 0) -> None:
-        """Boot the drive by SDO over the relay, and say so."""
+        """Boots the drive by SDO over the relay, and reports it as verified."""
         self.drive(axis).boot()
         self.done(CommandKind.VERIFIED, axis, **self.seeds(axis))
 
     def prepare(self, axis: int = 0) -> dict[str, int]:
-        """What is done by SDO before ENABLE; the command's fields."""
+        """Prepares the drive by SDO for ENABLE; returns the command's fields."""
         drive = self.drive(axis)
         drive.enable()
         image = drive.image
@@ -233,7 +233,7 @@ class SteppedDaemon:
         self.done(CommandKind.ENABLE, axis, **self.prepare(axis))
 
     def move(self, target_deg: float, axis: int = 0, velocity_deg_s: float = math.nan) -> int:
-        """Begin a move; the command's id."""
+        """Begins a move; returns the command's id."""
         answer = self.order(CommandKind.MOVE, axis, a=target_deg, b=velocity_deg_s, c=math.nan)
         assert answer.kind is EventKind.DONE, answer.text
         return answer.id
@@ -242,7 +242,7 @@ class SteppedDaemon:
         return any(each.kind is EventKind.MOTION_ENDED and each.id == id_ for each in self.events)
 
     def stream(self, knots: dict[int, Sequence[tuple[float, float, float]]], timeout_s: float = 0.5) -> Event:
-        """Begin a stream of one axis or several, its knots (time, position, velocity) queued before."""
+        """Begins a stream of one or several axes, with knots (time, position, velocity) queued before."""
         self._streams += 1
         for axis, points in knots.items():
             wanted = [Knot(self._streams, *point) for point in points]
@@ -258,17 +258,17 @@ class SteppedDaemon:
         self.intruder.send(can.Message(arbitration_id=can_id, data=data, **kind))
 
     def begin_again(self) -> None:
-        """The control process has been killed, and the keeper starts another with the same memory."""
+        """Restarts the control process on the same memory, as the keeper does after a kill."""
         self.controller = self._begin()
         self.axes = self.controller.axes
 
     def hang(self, duration_s: float) -> None:
-        """The control process does nothing for so long; the drives go on."""
+        """Stalls the control process for ``duration_s`` while the drives continue."""
         self.clock.sleep_until(self.clock.now() + duration_s)
 
 
 def article_axes(count: int = 1, profile: Path = PROFILE) -> list[AxisConfig]:
-    """So many axes of one kind on one bus: nodes 1, 2, ..."""
+    """Returns ``count`` axes of one kind on one bus: nodes 1, 2, ..."""
     first = AxisConfig.load(profile)
     return [
         first.model_copy(
@@ -287,7 +287,7 @@ def stepped_daemon(
     character: Character = FRIENDLY,
     bitrate_bps: int | None = 1_000_000,
 ) -> Iterator[SteppedDaemon]:
-    """A control loop with simulated axes, none verified yet; with the article's model by default."""
+    """Provides a control loop with simulated axes, none verified yet; with the article's model by default."""
     configs = [character.of_axis(each) for each in (article_axes(axes) if isinstance(axes, int) else axes)]
     plant = character.of_truth(truth if isinstance(truth, Truth) else Truth.load(truth))
     known = model if model is not None else TransmissionModel.load(PROFILE / "model.yaml")

@@ -1,4 +1,4 @@
-"""A whole daemon on a real CAN stack, as a bench for rows of faults: its cable, its witness, its way back."""
+"""Bench for the fault rows of a whole daemon on a real CAN stack: its cable, its listener, its recovery."""
 
 from __future__ import annotations
 
@@ -21,25 +21,25 @@ from tests.support.reliability import DAEMON_VCAN, Seen, record
 from tests.support.running import Daemon
 
 OURS, THEIRS = "hdvx0", "hdvx1"
-"""The daemon's end of the cable, and the drive's."""
+"""Ends of the cable: the daemon's and the drive's."""
 NODE: Final = 1
 STATE_TPDO: Final = 0x180 + NODE
 EMERGENCY: Final = 0x080 + NODE
 FAR_DEG: Final = 60.0
 SLOW_DEG_S: Final = 2.0
 STANDS: Final = 3
-"""Cycles in which the motor keeps its place when it stands."""
+"""Cycles without motion after which the motor counts as standing still."""
 
 
 class Cable:
-    """A vxcan pair, the simulated drive at its far end: what is done to one end, the other does not see."""
+    """A vxcan pair with the simulated drive at its far end; the ends can be disturbed separately."""
 
     def __init__(self, profile: Path) -> None:
         self._profile = profile
         self._drive: subprocess.Popen[str] | None = None
 
     def plug(self) -> None:
-        """Make the pair and the drive; skips where this kernel or this user cannot."""
+        """Makes the pair and the drive; skips the test if the kernel or the user's rights do not allow it."""
         made = _run("ip", "link", "add", "dev", OURS, "type", "vxcan", "peer", "name", THEIRS)
         if made.returncode:
             pytest.skip(f"no vxcan pair: {made.stderr.strip()}")
@@ -54,7 +54,7 @@ class Cable:
         assert "simulated drive: node" in self._drive.stderr.readline()
 
     def unplug(self) -> None:
-        """Delete the pair; the drive ends with it."""
+        """Deletes the pair and ends the drive."""
         if self._drive is not None:
             self._drive.kill()
             self._drive.wait()
@@ -71,7 +71,7 @@ class Cable:
 
     @contextmanager
     def spoilt(self, end: str, *how: str) -> Iterator[None]:
-        """What leaves an end is lost, doubled, delayed (tc-netem); skips where the kernel cannot."""
+        """Loses, doubles or delays frames that leave an end (tc-netem); skips if the kernel cannot."""
         done = _run("tc", "qdisc", "replace", "dev", end, "root", "netem", *how)
         if done.returncode:
             pytest.skip(f"no netem: {done.stderr.strip()}")
@@ -88,7 +88,7 @@ def _run(*command: str) -> subprocess.CompletedProcess[str]:
 
 
 class Witness:
-    """Another node's end of the bus: it only listens, and counts time in cycles of the master."""
+    """Passive node on the bus; measures time in cycles of the master."""
 
     def __init__(self, channel: str, period_s: float) -> None:
         self._bus = can.Bus(interface="socketcan", channel=channel, ignore_config=True)
@@ -96,13 +96,13 @@ class Witness:
         self._begun_s = time.time()
 
     def begin(self) -> None:
-        """Forget what was heard; count from now on."""
+        """Discards received frames and starts counting."""
         while self._bus.recv(0) is not None:
             pass
         self._begun_s = time.time()
 
     def cycles_until(self, met: Callable[[can.Message], bool], most: int) -> int:
-        """After how many cycles a frame came, its own included; AssertionError when not within ``most``."""
+        """Returns the cycles up to and including that of a frame; AssertionError after ``most``."""
         while (waited_s := time.time() - self._begun_s) < (most + 1) * self._period_s:
             message = self._bus.recv((most + 1) * self._period_s - waited_s)
             if message is not None and met(message):
@@ -110,7 +110,7 @@ class Witness:
         raise AssertionError(f"not within {most} cycles")
 
     def cycles_until_standing(self, most: int) -> int:
-        """The same until the motor stands, by what the drive sends of it."""
+        """Returns the cycles until the motor stands still, by the drive's TPDO."""
         places: list[int] = []
 
         def standing(message: can.Message) -> bool:
@@ -121,7 +121,7 @@ class Witness:
         return self.cycles_until(standing, most)
 
     def cycles_until_disabled(self, most: int) -> int:
-        """The same until the motor is without power; AssertionError where it was in motion just before."""
+        """Returns the cycles until the motor has no power; AssertionError if it was in motion just before."""
         places: list[int] = []
 
         def disabled(message: can.Message) -> bool:
@@ -136,7 +136,7 @@ class Witness:
         return cycles
 
     def send(self, can_id: int, data: bytes = b"", *, is_error_frame: bool = False) -> None:
-        """Be another node, once."""
+        """Sends a frame as another node."""
         self._bus.send(
             can.Message(arbitration_id=can_id, data=data, is_extended_id=False, is_error_frame=is_error_frame)
         )
@@ -147,7 +147,7 @@ class Witness:
 
 @dataclass(frozen=True)
 class Made:
-    """When a fault was made: cycles before it began and when it was there for certain."""
+    """Cycles before a fault was made, and after it."""
 
     begun: int
     done: int
@@ -155,26 +155,26 @@ class Made:
 
 @dataclass
 class DaemonBench:
-    """A daemon that holds one axis on a real interface, and what can be done to both."""
+    """Daemon with one axis on a real interface, and the means to disturb both."""
 
     daemon: Daemon
     cable: Cable
     disk: Path
-    """Where it records."""
+    """Folder of its recordings."""
     period_s: float
     heartbeat_timeout_s: float
     witness: Witness
     target_deg: float = FAR_DEG
     since: int = 0
-    """The newest event before the axis was under way."""
+    """Newest event before the axis was under way."""
 
     def look_again(self) -> None:
-        """The far end of the cable was made anew."""
+        """Listens again after the far end of the cable was replaced."""
         self.witness.close()
         self.witness = Witness(THEIRS, self.period_s)
 
     def under_way(self) -> None:
-        """The axis moves, slowly and for long, whatever there was before."""
+        """Starts a long slow motion of the axis, from any state."""
         daemon = self.daemon
         state = daemon.until(
             lambda: daemon.axis().get("state") not in {"", None, "unverified"} and daemon.axis(), "verified"
@@ -191,7 +191,7 @@ class DaemonBench:
         self.witness.begin()
 
     def told(self, made: Made, kind: str, within: int, words: str = "", reaction: str = "") -> int:
-        """How many cycles after a fault was made a client was told it; AssertionError when it was later."""
+        """Returns the cycles from a fault until its event; AssertionError if it took more than ``within``."""
 
         def found() -> dict[str, Any] | None:
             for each in self.daemon.events_since(self.since):
@@ -206,18 +206,18 @@ class DaemonBench:
         return max(taken, 1)
 
     def made(self, fault: Callable[[], object]) -> Made:
-        """Make a fault; a program that does it may need some cycles to begin."""
+        """Makes a fault; a program that does it may need some cycles to begin."""
         begun = self.daemon.cycle()
         fault()
         return Made(begun, self.daemon.cycle())
 
     def stopped(self, state: str, fault: str) -> None:
-        """An axis that a client sees stopped in this state, for this fault."""
+        """Checks that clients see the axis stopped in this state, for this fault."""
         axis = self.daemon.until_axis(state)
         assert axis["fault"]["name"] == fault, axis["fault"]
 
     def goes_on(self, cycles: int = 50) -> None:
-        """Nothing has stopped the axis, now and for so many cycles."""
+        """Checks that the axis keeps moving for this number of cycles."""
         first = self.daemon.cycle()
         axis = self.daemon.until(
             lambda: self.daemon.cycle() > first + cycles and self.daemon.axis(), "the cycle goes on"
@@ -228,20 +228,20 @@ class DaemonBench:
 
 @dataclass(frozen=True)
 class DaemonRow:
-    """One fault: how it is made and what has to come of it, and within how many cycles."""
+    """One fault, with its expected effect and the number of cycles allowed."""
 
     name: str
     expected: str
     within: str
-    """In words, for the page."""
+    """Time limit in words, for the page."""
     try_out: Callable[[DaemonBench], tuple[str, int, int]]
-    """Makes it and checks what comes of it: in words, the cycles that it took, those allowed."""
+    """Makes the fault and checks its effect; returns it in words, the cycles it took, and those allowed."""
     last: bool = False
-    """It ends the daemon."""
+    """True if it ends the daemon."""
 
 
 def try_out(row: DaemonRow, bench: DaemonBench) -> None:
-    """Make a row's fault on an axis under way, check it, and note what came of it."""
+    """Makes a row's fault on an axis under way, checks its effect and records it."""
     bench.under_way()
     seen, cycles, allowed = row.try_out(bench)
     assert cycles <= allowed, f"{row.name}: {cycles} cycles, allowed are {allowed}"

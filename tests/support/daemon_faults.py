@@ -1,4 +1,4 @@
-"""What the whole daemon has to survive on a real CAN stack, as rows for `docs/reliability.md`."""
+"""Faults that the whole daemon must survive on a real CAN stack, as rows for `docs/reliability.md`."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from tests.support.daemon_bench import EMERGENCY, OURS, SLOW_DEG_S, THEIRS, Daem
 from tests.support.running import gone
 
 CAN_ERR_BUSOFF: Final = 0x40
-"""Of linux/can/error.h."""
+"""Constant of linux/can/error.h."""
 
 # ------------------------------------------------------------------ the bus
 
 
 def _is_back(bench: DaemonBench) -> None:
-    """The bus is opened again and the drive verified, in the same processes; the axis is disabled."""
+    """Checks that the same processes reopen the bus and verify the drive, with the axis disabled."""
     daemon = bench.daemon
     daemon.until(lambda: (daemon.state() or {}).get("bus", {}).get("up"), "the bus is opened again")
     axis = daemon.until_axis("disabled")
@@ -69,7 +69,7 @@ def _bus_off(bench: DaemonBench) -> tuple[str, int, int]:
 
 
 def _stops(bench: DaemonBench, fault: str, end: str, *how: str) -> tuple[str, int, int]:
-    """What leaves an end of the cable is spoilt so that the axis has to stop; then it is whole again."""
+    """Disturbs the frames that leave an end so that the axis must stop, then stops disturbing them."""
     with ExitStack() as spoilt:
         made = bench.made(lambda: spoilt.enter_context(bench.cable.spoilt(end, *how)))
         cycles = bench.told(made, "fault", NOTICED, Fault[fault].value, "quick stop")
@@ -88,7 +88,7 @@ def _pulled(bench: DaemonBench) -> tuple[str, int, int]:
 
 
 def _delayed(bench: DaemonBench) -> tuple[str, int, int]:
-    # After the window and before the next SYNC. Later ones would pass for those of the next SYNC.
+    # After the window and before the next SYNC. Later ones would count for the next SYNC.
     return _stops(bench, "LOST_TPDO", THEIRS, "delay", f"{900 * bench.period_s:.0f}ms")
 
 
@@ -97,7 +97,7 @@ def _queue_full(bench: DaemonBench) -> tuple[str, int, int]:
 
 
 def _doubled(bench: DaemonBench) -> tuple[str, int, int]:
-    bench.goes_on(60)  # what changes nothing is told once a second: nothing has been for so long
+    bench.goes_on(60)  # faults without a reaction are reported at most once a second
     with ExitStack() as spoilt:
         made = bench.made(lambda: spoilt.enter_context(bench.cable.spoilt(THEIRS, "duplicate", "100%")))
         cycles = bench.told(made, "fault", NOTICED, Fault.DUPLICATE_TPDO.value, "go")
@@ -204,7 +204,9 @@ def _second_daemon(bench: DaemonBench) -> tuple[str, int, int]:
 
 
 def _drive_stops_by_itself(bench: DaemonBench, number: signal.Signals) -> tuple[int, int]:
-    """The control process gets a signal; cycles until the drive has missed its master, and those allowed."""
+    """Sends a signal to the control process; returns the cycles until the drive has missed its master, and
+    those allowed.
+    """
     allowed = int(bench.heartbeat_timeout_s / bench.period_s) + 2
     bench.witness.begin()
     os.kill(bench.daemon.pids("control")[-1], number)
@@ -297,12 +299,12 @@ def _keeper_killed(bench: DaemonBench) -> tuple[str, int, int]:
 
 
 NOTICED: Final = 3
-"""Cycles from a command of a shell to what the loop says: one for the fault, the others for who looks."""
+"""Cycles from a shell command to the loop's report: one for the fault, the others for the observer."""
 JOG_S: Final = 0.5
 BRAKING: Final = 15
-"""Cycles to brake from a slow jog, until it is seen that the motor keeps its place."""
+"""Cycles to brake from a slow jog, until the motor is seen to stand still."""
 IN_ORDER: Final = 25
-"""The same, with the signal's way from process to process."""
+"""Cycles to brake, including the signal's path from process to process."""
 
 _SAME: Final = "latch; verified again, disabled, no restart"
 _BY_ITSELF: Final = "the drive stops by itself; another process, disabled"

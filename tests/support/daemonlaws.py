@@ -1,4 +1,4 @@
-"""What a spy on the bus holds the daemon's control loop to, frame by frame, whatever is going on."""
+"""Laws of the daemon's control loop, which a spy on the bus checks frame by frame."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ if TYPE_CHECKING:
     from support.daemon import SteppedDaemon
 
 POWERLESS = frozenset({0x00, 0x02, 0x80})
-"""Controlwords that leave a drive without power or take it away: disable voltage, quick stop, fault reset."""
+"""Controlwords that leave a drive without power or remove it: disable voltage, quick stop, fault reset."""
 ENABLE_OPERATION = 0x0F
 SILENT = frozenset({AxisState.UNVERIFIED, AxisState.LENT, AxisState.LATCHED})
 LATCHES = frozenset({AxisState.QUICK_STOPPED, AxisState.LATCHED})
 STANDING_COUNTS = 4
-"""By which an axis at rest may have moved since its last TPDO."""
+"""Maximum motion of an axis at rest since its last TPDO."""
 
 
 class AxisLaws:
-    """The RPDOs of one axis."""
+    """Laws of the RPDOs of one axis."""
 
     def __init__(self, daemon: SteppedDaemon, index: int) -> None:
         self.axis = daemon.axes[index]
@@ -34,11 +34,11 @@ class AxisLaws:
         self.least, self.greatest = position_limits_counts(self.axis.config)
         self.most = most_counts(self.axis.config)
         self.allowed = False
-        """An ENABLE command was given since power was last taken away."""
+        """True if an ENABLE command was given since power was last removed."""
         self.begun = False
-        """Power has been asked for since."""
+        """True if power has been requested since."""
         self.latched = False
-        """The loop has told of a stop, and of no reset since."""
+        """True if the loop has reported a stop, and no reset since."""
         self.word = 0
         self.target = 0
         self.enabled = 0
@@ -68,14 +68,14 @@ class AxisLaws:
 
 
 def most_counts(config: AxisConfig) -> int:
-    """Most that a target may differ from the last one, from the axis file alone."""
+    """Returns the maximum change of a target in one cycle, in counts, from the axis file alone."""
     slew_deg_s = config.compensation.slew_arcsec_s / ARCSEC_PER_DEG
     motor_deg = (config.limits.velocity_deg_s + slew_deg_s) * config.drive.cycle_s * config.gear.ratio
     return math.ceil(abs(config.motor_encoder.counts(motor_deg))) + 2
 
 
 class Laws:
-    """Everything on one bus."""
+    """Laws of everything on one bus."""
 
     def __init__(self, daemon: SteppedDaemon) -> None:
         self.daemon = daemon
@@ -83,18 +83,18 @@ class Laws:
         self.relayed = 0
         self.frames = 0
         self.asked: dict[int, CommandKind | int] = {}
-        """Commands that are not answered yet."""
+        """Commands without an answer yet."""
         self._last_sequence = 0
         daemon.bus.spy = self.spy
 
     def post(self, kind: CommandKind | int, axis: int, id_: int) -> None:
-        """A command is in the mailbox."""
+        """Notes a command in the mailbox."""
         self.asked[id_] = kind
         if kind == CommandKind.ENABLE and 0 <= axis < len(self.daemon.axes):
             self.axes[self.daemon.axes[axis].config.drive.node_id].allowed = True
 
     def spy(self, can_id: int, data: bytes) -> None:
-        """A frame of the master."""
+        """Checks a frame of the master."""
         self.frames += 1
         node, function = can_id & 0x7F, can_id & 0x780
         if function == 0x200:
@@ -107,13 +107,13 @@ class Laws:
             assert can_id in (0x080, 0x77F), f"{can_id:03X}h was sent"
 
     def turn(self) -> None:
-        """One turn, and what it has told."""
+        """Runs one turn and checks its events."""
         self.relayed = 0
         self.daemon.turn()
         assert self.relayed <= 1
 
     def take(self, events: list[Event]) -> None:
-        """Each command is answered once."""
+        """Checks that each command is answered once."""
         for event in events:
             if event.kind in (EventKind.DONE, EventKind.REFUSED) and event.id:
                 assert event.id in self.asked, f"answered twice, or not asked: {event}"
@@ -129,7 +129,7 @@ class Laws:
         return self.axes[self.daemon.axes[axis].config.drive.node_id]
 
     def samples(self) -> None:
-        """Every turn has left one sample, and it makes sense."""
+        """Checks that every turn has left one consistent sample."""
         samples, lost = self.daemon.samples.read()
         assert lost == 0
         for sample in samples:

@@ -46,7 +46,7 @@ ratios = st.floats(20, 200)
 
 
 def orders(numbers):
-    """Some of these orders, each with its own amplitude and phase."""
+    """Draws some of these orders, each with its own amplitude and phase."""
     return st.lists(numbers, min_size=1, max_size=6, unique=True).flatmap(
         lambda ks: st.tuples(
             *[
@@ -155,7 +155,7 @@ EXAMPLES = {name: st.just(kind.candidate(50.0, BASE)) for name, kind in CATALOGU
         ratio=ratios, height_arcsec=signed, centre_deg=st.floats(0, 360), half_width_deg=st.floats(0.1, 20),
     ),
 }  # fmt: skip
-"""Effect name -> strategy for effects of that kind; as a rule one of typical size."""
+"""Strategies for effects of each kind, usually of typical size, by effect name."""
 
 angle_steps = st.lists(
     st.one_of(st.sampled_from([0.0, 1e-6, -1e-6]), st.floats(-30, 30, allow_subnormal=False)),
@@ -166,7 +166,7 @@ starts = st.sampled_from(list(Start))
 
 
 def _motion(first, steps, seed, even):
-    """A path, with the other channels drawn at random; every channel is there."""
+    """Makes a path with all other channels drawn at random."""
     angle = np.cumsum(np.array([first, *steps]))
     draw = np.random.default_rng(seed)
     count = len(angle)

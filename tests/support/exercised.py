@@ -11,7 +11,7 @@ from hdbridge.sim.truth import Truth
 
 
 def record_of(truth: Truth, lead: Callable[[Exercise], None], seed: int = 0) -> Record:
-    """What the encoders of a simulated axis say while it is led through moves; every channel is there."""
+    """Returns the record of a simulated axis that ``lead`` moves, with every channel."""
     bench = Exercise(Machine(truth, seed, may_compile=True))
     lead(bench)
     readings = bench.readings()

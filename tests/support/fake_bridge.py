@@ -1,6 +1,7 @@
-"""A machine without drives behind the API: it keeps what was asked of it, and holds nothing to be moved.
+"""Machine without drives behind the API: it records requests and moves nothing.
 
-The lease is the real one, so who may move is decided as in the daemon; targets are held to the axis's limits.
+The lease is the real one, so permission to move is decided as in the daemon; targets are checked against the
+axis's limits.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ STATUSWORD = Object(0x6041, 0, "Statusword", 6, IntegerType("uint16"))
 
 
 class FakeAxis:
-    """One axis that is wherever it was sent to."""
+    """Axis that is always at its last target."""
 
     def __init__(self, bridge: FakeBridge, name: str) -> None:
         self._bridge = bridge
@@ -43,7 +44,7 @@ class FakeAxis:
         self.load_loop = messages.LoadLoopState(configured=True)
         self.queued: list[WayPoint] = []
         self.moving_s = 0.0
-        """Time that a move takes."""
+        """Duration of a move."""
 
     def state(self) -> messages.AxisState:
         fault = None
@@ -170,7 +171,7 @@ class FakeAxis:
 
 
 class FakeStream:
-    """Keeps what it is given; refuses a point that leaves the limits."""
+    """Records the points of a stream; refuses a point outside the limits."""
 
     def __init__(self, axis: FakeAxis) -> None:
         self._axis = axis
@@ -198,11 +199,11 @@ class FakeStream:
 
 
 class FakeBridge:
-    """A machine of some axes. ``moved`` is everything that needed the lease, ``stopped`` what did not."""
+    """Machine with some axes; ``moved`` lists requests that needed the lease, ``stopped`` all others."""
 
     def __init__(self, *names: str, lease_s: float = 10.0) -> None:
         self.now_s: float | None = None
-        """The lease's clock, where a test holds it; else the machine's."""
+        """Time of the lease if the test sets it; None for the computer's clock."""
         self.lease = Lease(lease_s, lambda: time.monotonic() if self.now_s is None else self.now_s)
         self.axes = {name: FakeAxis(self, name) for name in names or ("joint-1", "joint-2")}
         self.moved: list[tuple[Any, ...]] = []
@@ -214,7 +215,7 @@ class FakeBridge:
         self.batch_s = 0.005
         self.rows = 5
         self.sent_cycles = 0
-        """Cycles that were offered to subscribers."""
+        """Number of cycles that were offered to subscribers."""
 
     def state(self) -> messages.MachineState:
         holder = self.lease.holder
@@ -251,7 +252,7 @@ class FakeBridge:
             await self.axes[name].move(holder, target_deg, wait=wait)
 
     async def subscribe(self, most: int = 512) -> AsyncIterator[Batch]:
-        """Batches for ever; of what was not fetched in time the newest ``most`` rows, the rest is lost."""
+        """Yields batches without end; of rows not fetched in time only the newest ``most`` are kept."""
         queue: asyncio.Queue[None] = asyncio.Queue(1)
         waiting: list[int] = []
         cycle = lost = 0

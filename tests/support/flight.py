@@ -17,7 +17,7 @@ from hdbridge.daemon.recorder.store import Store
 AXIS = AxisConfig.load("profiles/demo")
 PERIOD_S = 0.004
 START_NS = 1_790_000_000_000_000_000
-"""Time of day when the samples' clock is zero."""
+"""Time of day at the zero of the samples' clock."""
 ROOM = 10**12
 
 
@@ -32,7 +32,7 @@ def about(axes: int = 1) -> About:
 
 
 def samples(count: int, first: int = 1, axes: int = 1, seed: int = 0) -> Any:
-    """Numbers that are all different: what is mixed up shows."""
+    """Returns samples whose values all differ, so that a mix-up is detected."""
     random = np.random.default_rng([seed, first])
     made = np.zeros(count, sample_dtype(axes))
     made["sequence"] = first + np.arange(count)
@@ -58,7 +58,7 @@ def event(time_s: float, kind: EventKind = EventKind.STOPPED, text: str = "the a
 
 
 class Clock:
-    """Time of day that goes with the samples."""
+    """Time of day that matches the samples."""
 
     def __init__(self) -> None:
         self.ns = START_NS
@@ -68,7 +68,7 @@ class Clock:
 
 
 def flight_log(folder: Path, told: list[str] | None = None, free: Any = None, axes: int = 1, **limits: float):
-    """The recorder without its thread, and its clock."""
+    """Returns the recorder without its thread, and its clock."""
     clock = Clock()
     settings = RecorderSettings(**{"free_mb": 0.0, **limits})
     store = Store(folder, settings, free or (lambda _: ROOM))

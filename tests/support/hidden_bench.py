@@ -1,7 +1,7 @@
-"""A bench on the virtual bus with something hidden in its axis: measure, diagnose, extend, step.
+"""Bench on the virtual bus with hidden causes in its axis: measure, diagnose, extend, step.
 
-The axis is that of profiles/demo with sensors for torque and temperature. What is hidden is drawn by a seed
-and put into the truth by its physics; the model that the diagnosis is given is an earlier calibration, a few
+The axis is that of profiles/demo with sensors for torque and temperature. The hidden causes are drawn by a
+seed and put into the truth by their physics. The diagnosis gets the model of an earlier calibration, a few
 per cent off. Everything in between is what a user has: frames on a python-can bus, a recording folder,
 ``hdbridge diagnose``, model files.
 """
@@ -35,19 +35,21 @@ from support.hidden import Hidden, Run, hide_all
 
 DEMO = Path(__file__).parents[2] / "profiles" / "demo"
 CYCLE_MS = 40
-"""A quarter of the samples of `FAST_MS` shows the same of most causes."""
+"""Cycle time for most causes: with a quarter of the samples of `FAST_MS` they are as visible."""
 MORE_MS = 20
-"""For what is small in each sample, or shows in a part of the record only."""
+"""Cycle time for causes that are small in each sample, or visible only in a part of the record."""
 FAST_MS = 10
-"""For what depends on speed or acceleration, and for play, which the axis crosses within some samples."""
+"""Cycle time for causes that depend on speed or acceleration, and for play, which is crossed in a few
+samples."""
 MOTOR_COUNTS = 32_768
-"""A command in whole counts is followed at a fixed fraction of a count: half a count is a bias of a sweep."""
+"""Motor resolution: whole-count commands are followed at a fixed fraction of a count, so half a count
+biases a sweep."""
 SPEED_DEG_S = 6.1
-"""Of the load. Faster, and the load's resonance shows in the higher orders of the motor."""
+"""Speed of the load. At a higher one the load's resonance appears in the higher orders of the motor."""
 ACCELERATION_DEG_S2 = 5.0
-"""Of the load: gentle, because what accelerates winds the spring up."""
+"""Acceleration of the load: low, because acceleration winds the spring up."""
 REACH_DEG = (0.0, 372.0)
-"""Of the load: a little more than a turn."""
+"""Range of the load: a little more than a turn."""
 SENSORS = """
 load_torque:
   source: {index: 0x2101, type: int32}
@@ -60,13 +62,13 @@ temperature:
 
 @dataclass(frozen=True)
 class Nested:
-    """Reversals within reversals, some of them beyond an earlier turning point; motor degrees."""
+    """Nested reversals, some of them beyond an earlier turning point; motor degrees."""
 
     depths_deg: tuple[float, ...] = (2.0, 5.0, 9.0, 16.0)
     velocity_deg_s: float = 0.5
 
     def moves(self, axis: AxisView) -> Steps[None]:
-        """About the load's zero, each from the forward branch."""
+        """Yields the moves about the load's zero, each from the forward branch."""
         for depth in self.depths_deg:
             yield MoveTo(-40.0 / axis.ratio)
             for part in (0.0, -1.0, -0.3, -0.8, -0.5, -1.4, 0.0):
@@ -75,21 +77,21 @@ class Nested:
 
 @dataclass(frozen=True)
 class Still:
-    """Stand where the axis is."""
+    """Standstill."""
 
     duration_s: float
 
     def moves(self, axis: AxisView) -> Steps[None]:
-        """No motion."""
+        """Yields a dwell."""
         yield Dwell(self.duration_s)
 
 
 STEPPING = Stepping(count=20, step_deg=403.56)
-"""At every phase of the motor, over most of a load turn."""
+"""Stepping test at every phase of the motor, over most of a load turn."""
 
 
 def axis_config(folder: Path, cycle_ms: int) -> AxisConfig:
-    """The axis file, written into a folder."""
+    """Writes the axis file into a folder and loads it."""
     text = (DEMO / "axis.yaml").read_text() + SENSORS
     for old, new in (
         ("cycle_ms: 4", f"cycle_ms: {cycle_ms}"),
@@ -104,7 +106,7 @@ def axis_config(folder: Path, cycle_ms: int) -> AxisConfig:
 
 
 def bare_truth() -> Truth:
-    """The axis before anything is hidden in it."""
+    """Returns the truth of the axis without hidden causes."""
     data = Truth.load(DEMO).model_dump(by_alias=True)
     data["substep_ms"] = 1.0
     data["motor"]["encoder"].update(counts_per_turn=MOTOR_COUNTS, interpolation=16)
@@ -114,7 +116,7 @@ def bare_truth() -> Truth:
 
 
 def model_text(truth: Truth, rng: random.Random) -> str:
-    """What an earlier calibration left: right in kind, a few per cent off in its numbers."""
+    """Returns an earlier calibration's model file: the right effects, parameters a few per cent off."""
     law = truth.gear.hysteresis
     rows = "\n".join(
         f"        - {{order: {each.order}, amplitude_arcsec: "
@@ -140,7 +142,7 @@ provenance:
 
 
 class Cell:
-    """A booted drive whose axis has something hidden in it, and a folder for what comes of it."""
+    """Booted drive with hidden causes in its axis, and a folder for the results."""
 
     def __init__(self, drive: Drive, folder: Path, bare: Truth, hidden: Sequence[Hidden]) -> None:
         self.drive = drive
@@ -152,22 +154,22 @@ class Cell:
         self.stepping = STEPPING
 
     def measure(self, parts: Sequence[Procedure[Any]]) -> None:
-        """Run the procedures as one and keep them as a recording."""
+        """Runs the procedures as one and saves them as a recording."""
         Bench(self.drive).run(Chain(tuple(parts), ACCELERATION_DEG_S2)).save(self.recording)
 
     @cached_property
     def diagnosis(self) -> Diagnosis:
-        """Of the recording folder, against the model file."""
+        """Diagnosis of the recording folder against the model file."""
         return diagnose(Recording.load(self.recording), TransmissionModel.load(self.model))
 
     def step(self, model: TransmissionModel) -> float:
-        """Pooled three sigma of the load error at rest with a model, arcsec."""
+        """Returns the pooled three sigma of the load error at rest with a model, arcsec."""
         run = Bench(self.drive, compensation_for(self.drive.axis, model)).run(self.stepping)
         return SchemeResult.of(run.outcome).pooled.three_sigma_arcsec
 
     @property
     def floor_arcsec(self) -> float:
-        """Three sigma that the counts of the motor target and the load encoder's noise leave."""
+        """Three sigma due to the counts of the motor target and the load encoder's noise alone."""
         axis, encoder = self.drive.axis, self.bare.load_.encoder
         rounding = quantisation_floor_arcsec(axis.motor_encoder.counts_per_turn, axis.gear.ratio)
         readings = self.stepping.settle.window_s / axis.drive.cycle_s
@@ -175,7 +177,7 @@ class Cell:
 
 
 def run_of(parts: Sequence[Procedure[Any]], axis: AxisConfig, highest_deg_s2: float) -> Run:
-    """What a plan means for the size of a cause; ``highest_deg_s2`` is the load's highest acceleration."""
+    """Returns the properties of a plan that set the size of a cause; accelerations are of the load."""
     view = axis_view(axis)
     procedure = Chain(tuple(parts), ACCELERATION_DEG_S2)
     ahead = rehearse(procedure, view)
@@ -210,7 +212,7 @@ def hidden_bench(
     truth: Truth | None = None,
     cycle_ms: int = CYCLE_MS,
 ) -> Iterator[Cell]:
-    """An axis with causes of given sizes in it, measured."""
+    """Provides an axis with causes of given sizes in it, already measured."""
     rng = random.Random(f"hidden {seed} {causes}")
     folder.mkdir(parents=True, exist_ok=True)
     axis = axis_config(folder, cycle_ms)

@@ -1,4 +1,4 @@
-"""Legs of made-up arrays, one after the other, as a measurement to be identified."""
+"""Synthetic legs, joined into a measurement for identification."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from hdbridge.records.record import Record
 
 @dataclass(frozen=True)
 class Leg:
-    """What the axis did for a while; arrays of one length, multi-turn degrees."""
+    """Samples of one leg; arrays of one length, multi-turn degrees."""
 
     time_s: np.ndarray
     motor_deg: np.ndarray
-    """The command, or with ``commanded`` false what was measured."""
+    """Command, or the measured angle if ``commanded`` is false."""
     load_deg: np.ndarray
     kind: str = "unknown"
     position_deg: np.ndarray | None = None
-    """What was measured in addition to the command."""
+    """Measured motor angle in addition to the command."""
     commanded: bool = True
     zero: int = 0
 
@@ -32,7 +32,7 @@ class Leg:
 
 
 def measured(legs: Sequence[Leg], name: str = "") -> Measured:
-    """The axis moves straight from one leg to the next, but where the zero is another one."""
+    """Joins legs; motion is continuous between two legs unless their zeros differ."""
     columns = {
         "time_s": [each.time_s for each in legs],
         "motor_position_deg": [
@@ -53,5 +53,5 @@ def measured(legs: Sequence[Leg], name: str = "") -> Measured:
 
 
 def fit(legs: Sequence[Leg], ratio: float, options: FitOptions | None = None, name: str = "") -> FitResult:
-    """Identify an axis."""
+    """Identifies an axis from legs."""
     return identify.fit(measured(legs, name), ratio, options)

@@ -1,4 +1,4 @@
-"""What another process does to a file just before this one opens it."""
+"""Hook that acts as another process does on a file just before this one opens it."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ def _audit(event: str, arguments: tuple[object, ...]) -> None:
             each(event, Path(arguments[0]))
 
 
-sys.addaudithook(_audit)  # it cannot be removed; without hooks it does nothing
+sys.addaudithook(_audit)  # an audit hook cannot be removed; with no entries in `_hooks` it does nothing
 
 
 @contextmanager
 def before_each(hook: Callable[[str, Path], None]) -> Iterator[None]:
-    """Call ``hook`` before any file is opened, and before any folder is listed."""
+    """Calls ``hook`` before any file is opened, and before any folder is listed."""
     _hooks.append(hook)
     try:
         yield

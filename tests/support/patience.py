@@ -1,4 +1,4 @@
-"""How long tests wait for another thread or process: a bound for what hangs, not a measure of speed."""
+"""Time-out of tests that wait for another thread or process: a bound for hangs, not a measure of speed."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Callable
 from typing import Final, TypeVar
 
 PATIENCE_S: Final = 600.0
-"""A hundred times what the longest wait takes on an idle machine."""
+"""A hundred times the longest wait on an idle computer."""
 
 T = TypeVar("T")
 
@@ -18,5 +18,5 @@ def until(met: Callable[[], T], why: Callable[[], object] = lambda: "it did not 
     while not (found := met()):
         assert time.monotonic() < end_s, why()
         time.sleep(pause_s)
-        pause_s = min(1.2 * pause_s, 0.25)  # to look may take more of a processor than what is waited for
+        pause_s = min(1.2 * pause_s, 0.25)  # frequent polling would slow down the work it waits for
     return found

@@ -1,9 +1,8 @@
-"""Records from formulas, for the tests of the diagnosis: it shares no code with the effects that are tested.
+"""Records from formulas, for the tests of the diagnosis; shares no code with the tested effects.
 
-An axis of ratio 50 goes through a bench plan (standstill, sweeps at two speeds, sines, nested reversals,
-steps, holds,
-sweeps again) at a fine time step; the elastic law is one of several, with a state that is carried through
-everything; effects are put in by formula; encoders are quantised; slow noise is added.
+An axis of ratio 50 runs a bench plan (standstill, sweeps at two speeds, sines, nested reversals, steps,
+holds, sweeps again) at a fine time step. The elastic law is one of several, with a state that continues
+through the whole run. Effects are added by formula, encoders are quantised, and slow noise is added.
 """
 
 from __future__ import annotations
@@ -30,7 +29,7 @@ RATIO = 50.0
 
 @dataclass
 class Plan:
-    """How long everything takes; ``scale`` shortens it."""
+    """Durations of the plan's parts; ``scale`` shortens them."""
 
     rate_hz: float = 25.0
     scale: float = 1.0
@@ -40,7 +39,7 @@ class Plan:
 
 
 def path(plan: Plan, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Time, motor angle at ten times the sampling rate, and the number of the leg at each."""
+    """Returns time, motor angle and leg number, at ten times the sampling rate."""
     dt = 1.0 / (plan.rate_hz * 10)
     pieces: list[np.ndarray] = []
     legs: list[np.ndarray] = []
@@ -51,7 +50,7 @@ def path(plan: Plan, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, 
         pieces.append(np.full(max(1, round(seconds / dt)), here))
 
     def move(goal: float, speed: float) -> None:
-        """A smooth move: the speed rises and falls in a raised cosine."""
+        """Makes a smooth move whose speed rises and falls in a raised cosine."""
         nonlocal here
         way = abs(goal - here)
         if way < 1e-9:
@@ -138,14 +137,14 @@ def rise(xi: np.ndarray | float, n: float) -> Any:
 
 
 def kept(direction: np.ndarray) -> np.ndarray:
-    """The sense of the last motion where there is none; forward before the first."""
+    """Fills zeros with the direction of the last motion; forward before the first."""
     last = np.maximum.accumulate(np.where(direction != 0, np.arange(len(direction)), -1))
     return np.where(last < 0, 1.0, direction[last])
 
 
 def loop(motor: np.ndarray, law: str, offset: float, width: float, n: float) -> np.ndarray:
-    """The elastic part, from a saturated start forwards; carried through the whole motion."""
-    if offset < 0.0:  # the load lags
+    """Returns the elastic part of the error, from a saturated forward start."""
+    if offset < 0.0:  # negative offset: the load lags
         return -loop(motor, law, -offset, width, n)
     step = np.sign(np.diff(motor, prepend=motor[0] - 1e-9))
     if law == "plain":
@@ -164,7 +163,7 @@ def loop(motor: np.ndarray, law: str, offset: float, width: float, n: float) -> 
             out[a:b] = sign * np.minimum(sign * branch, offset)
             value = float(out[b - 1])
         return out
-    if law == "memory":  # Masing's rule by many stop operators whose thresholds follow the branch
+    if law == "memory":  # Masing's rule, by many stop operators whose thresholds follow the branch
         grid = width * np.linspace(0, 1, 161)[1:] ** 2 / 1.0
         virgin = rise(grid / width, n)
         slope = np.diff(np.concatenate([[0], virgin])) / np.diff(np.concatenate([[0], grid]))
@@ -202,7 +201,7 @@ def loop(motor: np.ndarray, law: str, offset: float, width: float, n: float) -> 
 
 
 def stop(motor: np.ndarray, width: float) -> np.ndarray:
-    """Stop operator of full crossing ``width``, saturated forwards at the start."""
+    """Returns the stop operator of full crossing ``width``, from a saturated forward start."""
     turning = [0, *(np.flatnonzero(np.diff(np.sign(np.diff(motor))) != 0) + 1).tolist(), len(motor) - 1]
     value, out = 1.0, np.empty(len(motor))
     out[0] = 1.0
@@ -213,7 +212,7 @@ def stop(motor: np.ndarray, width: float) -> np.ndarray:
 
 
 def crept(going: np.ndarray, dt: float, tau: float, build: float = 0.1, **_: float) -> np.ndarray:
-    """Builds up with the sense of motion, faster than it relaxes at rest."""
+    """Returns creep that builds up with the direction of motion, faster than it relaxes at rest."""
     up, down = math.exp(-dt / (build * tau)), math.exp(-dt / tau)
     y, out = 0.0, np.empty(len(going))
     for i, sense in enumerate(going.tolist()):
@@ -224,7 +223,7 @@ def crept(going: np.ndarray, dt: float, tau: float, build: float = 0.1, **_: flo
 
 @dataclass
 class Truth:
-    """What the axis is like."""
+    """Properties of the axis."""
 
     law: str = "plain"
     offset: float = 40.0
@@ -239,7 +238,7 @@ class Truth:
 
 
 def record(truth: Truth, plan: Plan, seed: int, command: bool = True) -> dict[str, np.ndarray]:
-    """Columns as in a CSV file."""
+    """Returns the columns of a CSV file."""
     rng = np.random.default_rng(seed)
     t, motor, _ = path(plan, rng)
     dt = t[1] - t[0]
@@ -257,7 +256,7 @@ def record(truth: Truth, plan: Plan, seed: int, command: bool = True) -> dict[st
         carried["worn"] = run / run[-1] * stop(motor, e["wear"].get("width", 0.3))
     if "creep" in e:
         carried["creep"] = crept(np.sign(v), dt, **e["creep"])
-    # All that is not carried through the motion is only needed where it is read.
+    # Quantities without a state are only computed at the samples.
     pick = slice(None, None, 10)
     at = slice(None) if "channel_skew" in e else pick
     t, motor, v, a, d = (np.ascontiguousarray(each[at]) for each in (t, motor, v, a, d))
@@ -340,7 +339,7 @@ def record(truth: Truth, plan: Plan, seed: int, command: bool = True) -> dict[st
 def unknown(
     kind: dict[str, Any], t: np.ndarray, motor: np.ndarray, load: np.ndarray, d: np.ndarray, v: np.ndarray
 ) -> np.ndarray:
-    """Errors that no catalogue has."""
+    """Returns an error that is not in the catalogue."""
     size = kind["size"]
     if kind["kind"] == "saw":  # a saw tooth over the load angle, not periodic in the turn
         return size * (np.mod(load, 137.0) / 68.5 - 1)
@@ -371,7 +370,7 @@ def unknown(
 
 
 def model_text(seed: int, wrong: float = 0.03, truth: Truth | None = None) -> str:
-    """The model file, its parameters some per cent off."""
+    """Returns the model file with parameters some per cent off."""
     rng = np.random.default_rng(seed + 77)
     truth = truth or Truth()
 

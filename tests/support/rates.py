@@ -1,13 +1,13 @@
-"""A claimed rate against what was counted."""
+"""Test of a claimed rate against a count."""
 
 from __future__ import annotations
 
 from support.filters import binomial_quantile
 
 CHANCE = 0.01
-"""Of a right claim to be refused."""
+"""Probability of refusing a correct claim."""
 
 
 def least(trials: int, rate: float) -> int:
-    """So many successes at least: fewer have a probability below `CHANCE` where the rate is as claimed."""
+    """Returns the minimum count of successes; fewer have a probability below `CHANCE` at this rate."""
     return binomial_quantile(CHANCE, trials, rate)

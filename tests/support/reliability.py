@@ -1,9 +1,9 @@
-"""The faults that an axis under way has to survive, as rows, and where each is tried.
+"""Faults that an axis under way must survive, as rows, with the places at which each is tried.
 
 A *place* is a control cycle on a bus: the bench's on the virtual bus and on vcan, the daemon's on the virtual
-bus. Each has a `Bench`. What only a daemon can show is in `FURTHER`, each with a test of its own, and in
-`daemon_faults`, for a daemon in processes of its own on vcan.
-`docs/reliability.md` is made of what came of all, by ``tools/reliability_page.py``.
+bus. Each has a `Bench`. `FURTHER` lists faults that only a daemon can show, each with a test of its own, and
+`daemon_faults` those of a daemon in its own processes on vcan. ``tools/reliability_page.py`` makes
+`docs/reliability.md` from the results.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from hdbridge.errors import SafetyStop
 from tests.support.characters import FRIENDLY, Character
 
 RECORD: Final = "HDBRIDGE_RELIABILITY"
-"""Environment variable: the file to which a line of JSON is added for each row that was tried."""
+"""Environment variable: file to which a line of JSON is added for each row that was tried."""
 WORDS: Final = {
     Reaction.GO: "go on, count",
     Reaction.FREEZE: "freeze",
@@ -34,30 +34,30 @@ WORDS: Final = {
 }
 VIRTUAL, VCAN, DAEMON = "virtual", "vcan", "daemon"
 DAEMON_VCAN = "daemon, vcan"
-"""Where: the bench twice, the daemon's loop, the whole daemon in processes."""
+"""Places: the bench twice, the daemon's loop, and the whole daemon in processes."""
 
 
 class Bench(Protocol):
-    """An axis under way at constant speed, and what can be done to it."""
+    """Axis under way at constant speed, and the means to disturb it."""
 
     node: DriveNode
     supervision: Supervision
     period_s: float
 
     def move(self) -> Any:
-        """One cycle further at constant speed."""
+        """Runs one cycle at constant speed."""
 
     def interfere(self, can_id: int, data: bytes = b"", **kind: bool) -> None:
-        """A frame from another node, on the bus before the next cycle."""
+        """Sends a frame from another node, before the next cycle."""
 
     def hang(self, duration_s: float) -> None:
-        """This process does nothing for so long."""
+        """Stalls this process for ``duration_s``."""
 
     def interface_down(self) -> None: ...
     def interface_deleted(self) -> None: ...
     def transmit_queue_full(self) -> None: ...
     def bad_target(self, counts: float) -> None:
-        """What the next cycle is to command, motor counts."""
+        """Makes the next cycle command this target, motor counts."""
 
 
 Wish = Callable[[Bench], object]
@@ -65,41 +65,41 @@ Wish = Callable[[Bench], object]
 
 @dataclass(frozen=True)
 class Row:
-    """One fault: how it is made, and what has to come of it within how many cycles."""
+    """One fault, with its expected reaction and the number of cycles allowed."""
 
     name: str
     make: Wish
     fault: Fault
     reaction: Reaction
     allowed: int | str
-    """Cycles; or ``heartbeats``: until the drive's heartbeat counts as lost."""
+    """Allowed cycles; ``heartbeats`` for the time until the drive's heartbeat counts as lost."""
     again: bool = False
-    """Made before each cycle, not once."""
+    """True if it is made before each cycle, not once."""
     places: tuple[str, ...] = (VIRTUAL, VCAN, DAEMON)
     everybody: bool = False
-    """It concerns every axis of the bus, not one."""
+    """True if it affects every axis of the bus."""
     without_a_word: bool = False
-    """Only the statusword shows it."""
+    """True if only the statusword shows it."""
 
     def unseen_on(self, character: Character) -> bool:
-        """Whether a drive of this character shows nothing of the fault.
+        """Returns True if a drive of this character shows nothing of the fault.
 
-        One that stops without an EMCY, and resumes at SYNC before it takes the values of its TPDOs, shows
+        One that stops without an EMCY, and resumes at SYNC before it samples the values of its TPDOs, shows
         nothing. An option 605Ah below 5 rules that out.
         """
         return self.resumptions_on(character) > 0 and character.behaviour.rpdo_before_tpdo
 
     def resumptions_on(self, character: Character) -> int:
-        """How often a drive of this character may resume before a master can know that it has stopped.
+        """Returns how often a drive of this character may resume before a master can detect its stop.
 
-        If it stops without an EMCY, the first SYNC after that makes it resume by the buffered RPDO; its
-        TPDO of the same SYNC shows the stop. An option 605Ah below 5 rules that out.
+        If it stops without an EMCY, the next SYNC makes it resume by the buffered RPDO; its TPDO of the same
+        SYNC shows the stop. An option 605Ah below 5 rules that out.
         """
         by_level = character.behaviour.controlword is Controlword.LEVEL
         return int(self.without_a_word and by_level and character.quick_stop_option >= 5)
 
     def allowed_cycles(self, heartbeat_timeout_s: float, period_s: float) -> int:
-        """The same in cycles of an axis."""
+        """Returns the allowed cycles as a number."""
         if isinstance(self.allowed, int):
             return self.allowed
         return math.ceil(heartbeat_timeout_s / period_s) + 1
@@ -114,7 +114,7 @@ def _drive(**wishes: Any) -> Wish:
 
 
 def _stale(bench: Bench) -> None:
-    """The TPDO of the last SYNC comes once more."""
+    """Repeats the TPDO of the last SYNC."""
     bench.interfere(0x181, bench.node._tpdos[0].pack())
 
 
@@ -127,13 +127,13 @@ def _frame(can_id: int, data: bytes = b"", times: int = 1, **kind: bool) -> Wish
 
 
 def _glitch(bench: Bench, counts: int) -> None:
-    """The next sample of the load encoder is wrong by so much."""
+    """Shifts the next sample of the load encoder."""
     jumps = [counts]
     bench.node.faults.load_reading = lambda right: right + (jumps.pop() if jumps else 0)
 
 
 def _miss(code: int) -> Wish:
-    """The drive stops because it missed its master, and says so."""
+    """Makes the drive stop, with its EMCY, as if it had missed its master."""
 
     def make(bench: Bench) -> None:
         bench.node.faults.miss_master(code)
@@ -142,7 +142,7 @@ def _miss(code: int) -> Wish:
 
 
 def patience_s(bench: Bench) -> float:
-    """How long the drive waits for set-points: four cycles, at least 10 ms."""
+    """Returns the drive's time-out for set-points: four cycles, at least 10 ms."""
     return max(4.0 * bench.period_s, 0.01)
 
 
@@ -171,7 +171,7 @@ ROWS: Final = (
         _F.DROPPED_OUT, _R.QUICK_STOP, 2, without_a_word=True),
     Row("the drive has dropped out between two SYNCs", _frame(0x181, b"\x07\x16" + bytes(6)),
         _F.DROPPED_OUT, _R.QUICK_STOP, 1),
-    # Two cycles: the emergency message may come behind the TPDOs of its cycle.
+    # Two cycles, because the emergency message may follow the TPDOs of its cycle.
     Row("the drive misses the master's heartbeat (8130h)", _miss(0x8130), _F.MASTER_LOST, _R.QUICK_STOP, 2),
     Row("the drive misses set-points (8250h)", _miss(0x8250), _F.MASTER_LOST, _R.QUICK_STOP, 2),
     Row("the load encoder jumps and stays away", _drive(load_jump_counts=100_000), _F.ENCODER_JUMP,
@@ -213,14 +213,14 @@ ROWS: Final = (
 
 @dataclass(frozen=True)
 class Further:
-    """What the daemon's loop shows that a bench cannot; each has a test of its own."""
+    """Fault that a bench cannot show but the daemon's loop can; each has a test of its own."""
 
     name: str
     expected: str
     allowed: float
 
     def show(self, taken: float) -> None:
-        """It was seen, after so many cycles; AssertionError where that was too long."""
+        """Records the observed reaction; AssertionError if it took too many cycles."""
         assert taken <= self.allowed, f"{self.name}: {taken:g}, allowed are {self.allowed:g}"
         record(Seen(DAEMON, self.name, self.expected, taken, self.allowed))
 
@@ -244,42 +244,42 @@ FURTHER: Final = (
     Further("the interface comes back", "opened; verified again; disabled", 126),
     Further("the disk is full", "the recorder drops and says so; no cycle is missed", 0),
 )  # fmt: skip
-"""In the order of the page."""
+"""Further faults, in the order of the page."""
 
 
 def further(name: str) -> Further:
-    """The one of that name."""
+    """Returns the further fault of that name."""
     (found,) = (each for each in FURTHER if each.name == name)
     return found
 
 
 @dataclass(frozen=True)
 class Seen:
-    """What came of a row at a place."""
+    """Result of a row at a place."""
 
     place: str
     name: str
     seen: str
     taken: float
-    """Cycles."""
+    """Cycles that it took."""
     allowed: float
     character: str = FRIENDLY.name
 
 
 def read_record(path: Path) -> list[Seen]:
-    """What was written for each row that was tried."""
+    """Reads the recorded results."""
     return [Seen(**json.loads(line)) for line in path.read_text(encoding="utf-8").splitlines()]
 
 
 def rows_of(place: str) -> list[Row]:
-    """The rows that can be shown there."""
+    """Returns the rows that can be tried at a place."""
     return [row for row in ROWS if place in row.places]
 
 
 def try_out(
     row: Row, bench: Bench, place: str, heartbeat_timeout_s: float, character: Character = FRIENDLY
 ) -> Seen:
-    """Make the fault on an axis under way; AssertionError where its reaction does not come in time."""
+    """Makes the fault on an axis under way; AssertionError if its reaction does not come in time."""
     allowed = row.allowed_cycles(heartbeat_timeout_s, bench.period_s)
     bench.supervision.events.clear()
     row.make(bench)
@@ -316,7 +316,7 @@ def _words(supervision: Supervision, hit: Event) -> str:
 
 
 def record(seen: Seen) -> None:
-    """Write down what was seen, where somebody wants it (`RECORD`)."""
+    """Records a result if `RECORD` is set."""
     path = os.environ.get(RECORD)
     if path:
         with Path(path).open("a", encoding="utf-8") as file:

@@ -1,4 +1,4 @@
-"""The daemon as a bench for the rows of `reliability`: two axes in motion on virtual time."""
+"""Bench of the daemon for the rows of `reliability`: two axes in motion on virtual time."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ from support.characters import FRIENDLY, Character
 from support.service import Service, play, stepped_service, until
 
 FAR_DEG = 390.0
-"""Where the axes are on the way to, or the other way."""
+"""Target of the axes, of either sign."""
 RPDO = 0x200
 ENABLE_OPERATION = 0x0F
 SETTLED_S = 1.2
-"""By then a stop is over, one that the drive makes by itself included."""
+"""Time after which any stop is over, including one that the drive makes on its own."""
 _NOWHERE = Moment()
 STATES = {
     Reaction.GO: AxisState.ENABLED,
@@ -37,7 +37,7 @@ STATES = {
 
 
 class WrongOnce(Compensation):
-    """A compensation that gives, once, what a test wants."""
+    """Compensation that returns a chosen target once."""
 
     wrong_deg: float | None = None
 
@@ -48,7 +48,7 @@ class WrongOnce(Compensation):
 
 
 class DaemonBench:
-    """Two axes under way; what goes wrong concerns the first."""
+    """Two axes under way; faults affect the first."""
 
     def __init__(self, service: Service) -> None:
         self.service = service
@@ -59,7 +59,7 @@ class DaemonBench:
         self._counts_per_turn = daemon.axes[0].config.motor_encoder.counts_per_turn
 
     def set_off(self) -> None:
-        """Both axes at constant speed, enabled if they are not."""
+        """Moves both axes at constant speed, and enables them if necessary."""
         daemon = self.daemon
         for axis, state in enumerate(daemon.states):
             if state is not AxisState.ENABLED:
@@ -102,17 +102,17 @@ class DaemonBench:
         return self.daemon.states
 
     def motor_counts(self, axis: int = 0) -> int:
-        """Where the motor really is."""
+        """Returns the true motor position."""
         return self.daemon.nodes[axis].firmware.motion.machine.motor_counts
 
     def moves_on(self, axis: int) -> bool:
-        """Whether an axis is on its way as if nothing had been."""
+        """Returns True if an axis moves on undisturbed."""
         before = self.motor_counts(axis)
         self.daemon.run(0.1)
         return self.states[axis] is AxisState.ENABLED and abs(self.motor_counts(axis) - before) > 500
 
     def stays_stopped(self, axis: int) -> None:
-        """It comes to rest and stays there whatever is commanded; nothing asks for power any more."""
+        """Checks that the axis comes to rest and stays there, whatever is commanded, without power."""
         daemon, state = self.daemon, self.states[axis]
         sent: list[int] = []
 
@@ -134,7 +134,7 @@ class DaemonBench:
         daemon.bus.spy = None
 
     def mend(self) -> None:
-        """What was wrong is put right."""
+        """Removes the faults."""
         self.daemon.bus.down = None
         faults = self.node.faults
         faults.silent = faults.mute_heartbeat = False
@@ -143,7 +143,7 @@ class DaemonBench:
         self.daemon.run(0.6)
 
     def leads_back(self) -> None:
-        """The service resets each stopped axis: it is disabled, and where it was. Enabled again, it moves."""
+        """Checks that each stopped axis, once reset, is disabled in its place, and moves once enabled."""
         stopped = [axis for axis, state in enumerate(self.states) if state is not AxisState.ENABLED]
         places = [self.motor_counts(axis) for axis in range(2)]
 
@@ -166,7 +166,7 @@ class DaemonBench:
 
 
 def free(axis: ServiceAxis) -> bool:
-    """Whether nothing has its drive to itself."""
+    """Returns True if no job or client has exclusive use of the drive."""
     try:
         axis.check_free()
     except RefusedError:
@@ -182,6 +182,6 @@ def _wrong_once(config: AxisConfig, made: AxisSetup) -> AxisSetup:
 
 @contextmanager
 def daemon_bench(folder: Path, character: Character = FRIENDLY) -> Iterator[DaemonBench]:
-    """Two axes, at rest and not verified."""
+    """Provides two axes, at rest and not verified."""
     with stepped_service(folder, axes=2, setup=_wrong_once, character=character) as service:
         yield DaemonBench(service)

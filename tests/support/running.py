@@ -1,4 +1,4 @@
-"""A whole daemon in processes of its own, and the little of a client that its tests need."""
+"""Whole daemon in its own processes, and the parts of a client that its tests need."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ from tests.support import patience
 
 
 class Daemon:
-    """``hdbridge run ...``: its processes, its API, its log."""
+    """Running ``hdbridge run ...``: its processes, its API, its log."""
 
     def __init__(self, folder: Path, arguments: Sequence[object], name: str) -> None:
-        """``folder`` is its runtime folder's and its own to write into; ``name`` that of the machine."""
+        """``folder`` contains its runtime folder and output; ``name`` is that of the machine."""
         self.folder, self.arguments, self.name = folder, arguments, name
         self.events: list[dict[str, Any]] = []
-        """Of its log, all processes together."""
+        """Events in its log, of all processes."""
         self._manager = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
         self._manager.bind(str(folder / "notify"))
         environment = {
@@ -38,7 +38,7 @@ class Daemon:
             env=environment, cwd=folder, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True,
         )  # fmt: skip
         self.told: list[str] = []
-        """What the service manager was told."""
+        """Messages to the service manager."""
         self._reader = threading.Thread(target=self._read, daemon=True)
         self._reader.start()
         self._listener = threading.Thread(target=self._listen, daemon=True)
@@ -52,7 +52,7 @@ class Daemon:
         self._lease: str | None = None
 
     def _listen(self) -> None:
-        """At once: of messages that are not read, the kernel keeps ten."""
+        """Reads messages at once, because the kernel queues only ten."""
         while line := self._manager.recv(4096).decode():
             self.told.append(line)
 
@@ -67,11 +67,11 @@ class Daemon:
     # ------------------------------------------------------------------ what it says
 
     def until_told(self, line: str) -> None:
-        """The service manager has been told this."""
+        """Waits until the service manager has received this message."""
         self.until(lambda: line in self.told, line)
 
     def until(self, met: Callable[[], Any], what: str) -> Any:
-        """Wait for something that is asked for again and again; what it gave."""
+        """Polls ``met`` until it returns something true, and returns it."""
 
         def still() -> Any:
             if not (found := met()):
@@ -85,24 +85,24 @@ class Daemon:
         return "\n".join(json.dumps(each) for each in (*told, self.axis()))
 
     def names(self) -> list[str]:
-        """Of the events in its log."""
+        """Returns the names of the events in its log."""
         return [str(event["event"]) for event in self.events]
 
     def pids(self, which: str) -> list[int]:
-        """Of the ``control`` or ``service`` processes that were started, oldest first."""
+        """Returns the process ids of the ``control`` or ``service`` processes, oldest first."""
         return [event["pid"] for event in self.events if event["event"] == f"{which} process started"]
 
     # ------------------------------------------------------------------ what it is asked
 
     def state(self) -> dict[str, Any] | None:
-        """The machine; None while the API does not answer."""
+        """Returns the state of the machine; None while the API does not answer."""
         try:
             return dict(self.client.get("/state").raise_for_status().json())
         except httpx.HTTPError:
             return None
 
     def events_since(self, since: int = 0) -> list[dict[str, Any]]:
-        """Events after a numbered one; none while the API does not answer."""
+        """Returns the events after a numbered one; none while the API does not answer."""
         try:
             answer = self.client.get("/events", params={"since": since}).raise_for_status()
         except httpx.HTTPError:
@@ -110,30 +110,30 @@ class Daemon:
         return list(answer.json()["events"])
 
     def newest_event(self) -> int:
-        """Number of the newest."""
+        """Returns the number of the newest event."""
         newest = 0
         while told := self.events_since(newest):
             newest = int(told[-1]["sequence"])
         return newest
 
     def axis(self, place: int = 0) -> dict[str, Any]:
-        """An axis; empty while the API does not answer."""
+        """Returns the state of an axis; empty while the API does not answer."""
         state = self.state()
         return dict(state["axes"][place]) if state else {}
 
     def cycle(self) -> int:
-        """Number of the newest cycle; -1 while the API does not answer."""
+        """Returns the number of the newest cycle; -1 while the API does not answer."""
         state = self.state()
         return int(state["cycle"]["cycle"]) if state else -1
 
     def until_axis(self, state: str, place: int = 0) -> dict[str, Any]:
-        """Wait until an axis is in a state of the loop."""
+        """Waits until an axis is in a state of the loop."""
         return dict(self.until(lambda: (found := self.axis(place)).get("state") == state and found, state))
 
     def ask(self, name: str, **body: object) -> httpx.Response:
-        """A request to the first axis, with the lease; AssertionError where it is refused.
+        """Sends a request to the first axis, with the lease; AssertionError if it is refused.
 
-        Where it has to wait, for the drive that is being verified or brought to rest, it does.
+        Repeats it while the drive is being verified or brought to rest.
         """
         axis = self.axis()["name"]
 
@@ -156,19 +156,19 @@ class Daemon:
         return self._lease
 
     def forget_lease(self) -> None:
-        """A new service knows of no lease, and one that is not used runs out."""
+        """Discards the lease, which a new service does not know and which expires if unused."""
         self._lease = None
 
     # ------------------------------------------------------------------ its end
 
     def ended(self) -> int:
-        """Wait for the end of the keeper; its exit status."""
+        """Waits for the end of the keeper; returns its exit status."""
         status = self.process.wait()
         self._reader.join()
         return status
 
     def close(self) -> None:
-        """End it where it still runs, and every process of it."""
+        """Ends the daemon and all its processes if they still run."""
         if self.process.poll() is None:
             self.process.send_signal(signal.SIGTERM)
             try:
@@ -192,7 +192,7 @@ class Daemon:
 
 @contextmanager
 def running(folder: Path, *arguments: object, name: str) -> Iterator[Daemon]:
-    """A daemon that is told to end on the way out."""
+    """Provides a daemon, which is ended on exit."""
     folder.mkdir(parents=True, exist_ok=True)
     daemon = Daemon(folder, arguments, name)
     try:
@@ -202,7 +202,7 @@ def running(folder: Path, *arguments: object, name: str) -> Iterator[Daemon]:
 
 
 def gone(pid: int) -> bool:
-    """Whether a process has ended, waited for or not."""
+    """Returns True if a process has ended, even as a zombie."""
     try:
         return Path(f"/proc/{pid}/stat").read_text(encoding="ascii").rpartition(")")[2].split()[0] in "ZX"
     except OSError:

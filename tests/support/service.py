@@ -1,4 +1,4 @@
-"""The daemon's service on a stepped control loop: one thread, virtual time, asyncio where it waits."""
+"""Service of the daemon on a stepped control loop: one thread, virtual time, asyncio."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ Result = TypeVar("Result")
 
 
 class SteppedTiming:
-    """Whoever waits turns the loop; what blocks is called where it is."""
+    """Timing in which waiting turns the loop, and blocking calls run in the same thread."""
 
     def __init__(self, daemon: SteppedDaemon) -> None:
         self._daemon = daemon
@@ -48,12 +48,12 @@ class SteppedTiming:
 
 
 def in_this_thread(work: Work, rig: DaemonRig, told: Told) -> dict[str, Any]:
-    """A job without a process of its own."""
+    """Runs a job without a process of its own."""
     return run(work, rig, told)
 
 
 def article_profiles(folder: Path, count: int) -> list[Profile]:
-    """Profiles that a test may change: so many axes of the article's kind on one bus, nodes 1, 2, ..."""
+    """Makes ``count`` profiles of the article's axis on one bus, nodes 1, 2, ..., which tests may change."""
     made = []
     for node in range(1, count + 1):
         own = folder / f"axis{node}"
@@ -71,7 +71,7 @@ def article_profiles(folder: Path, count: int) -> list[Profile]:
 
 
 class Service:
-    """A stepped daemon, and bridges on it."""
+    """Stepped daemon, with bridges to it."""
 
     def __init__(self, daemon: SteppedDaemon, machine: Machine, folder: Path) -> None:
         self.daemon = daemon
@@ -80,13 +80,13 @@ class Service:
         self.timing = SteppedTiming(daemon)
 
     def bridge(self, **options: Any) -> ServiceBridge:
-        """A service that begins now."""
+        """Returns a new service."""
         options = {"runner": in_this_thread, **options}
         return ServiceBridge(self.machine, self.daemon.memory, self.timing, **options)
 
     @asynccontextmanager
     async def ready(self, **options: Any) -> AsyncIterator[ServiceBridge]:
-        """A bridge whose axes are verified."""
+        """Provides a bridge whose axes are verified."""
         async with self.bridge(**options) as bridge:
             await until(
                 bridge, lambda: all(each.state().state == "disabled" for each in bridge.axes.values())
@@ -95,7 +95,7 @@ class Service:
 
     @asynccontextmanager
     async def enabled(self, **options: Any) -> AsyncIterator[tuple[ServiceBridge, str]]:
-        """A bridge whose axes are enabled, and the token of the lease."""
+        """Provides a bridge whose axes are enabled, and the token of the lease."""
         async with self.ready(**options) as bridge:
             token = bridge.lease.take("test")
             for axis in bridge.axes.values():
@@ -104,7 +104,7 @@ class Service:
 
 
 async def until(bridge: ServiceBridge, done: Callable[[], bool], timeout_s: float = 20.0) -> None:
-    """Turn the loop until ``done``."""
+    """Turns the loop until ``done``."""
     timing = bridge.core.timing
     end_s = timing.clock.now() + timeout_s
     while not done():
@@ -123,7 +123,7 @@ def stepped_service(
     character: Character = FRIENDLY,
     **options: Any,
 ) -> Iterator[Service]:
-    """A control loop with simulated drives, nothing verified yet, and the machine that it is."""
+    """Provides a service on a control loop with simulated drives, none verified yet."""
     files = article_profiles(folder, axes)
     configs = [character.of_axis(AxisConfig.load(each.axis)) for each in files]
     with stepped_daemon(configs, character=character, **options) as daemon:
@@ -136,7 +136,7 @@ def stepped_service(
 
 
 def play(coroutine: Coroutine[Any, Any, Result] | Awaitable[Result]) -> Result:
-    """Run a test's coroutine to its end."""
+    """Runs a test's coroutine to its end."""
 
     async def main() -> Result:
         return await coroutine

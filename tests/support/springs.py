@@ -1,4 +1,4 @@
-"""A model that knows a spring of its axis."""
+"""Model with a spring of its axis."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from hdbridge.model import TransmissionModel
 
 
 def with_spring(model: TransmissionModel, compliance: float) -> TransmissionModel:
-    """The model, with a straight spring that its calibration found, arcsec per Nm."""
+    """Returns the model with a linear spring, arcsec per Nm, as if its calibration had found it."""
     zones = ", ".join(f"c{zone}_arcsec_per_nm: {compliance:.6g}" for zone in (1, 2, 3))
     return TransmissionModel.from_text(
         model.dump().replace(

@@ -1,4 +1,4 @@
-"""Causes hidden at random in records from formulas, and whether a diagnosis named them.
+"""Trials of the diagnosis: random causes hidden in records from formulas, and the verdict on its result.
 
 The plant (plant.py) shares no code with the effects.
 """
@@ -16,14 +16,14 @@ from hdbridge.records.record import Record
 from support import plant
 
 SHORT = plant.Plan(rate_hz=16.0, scale=0.2, load_turns=1.05, steps=16)
-"""Some 15,000 samples."""
+"""Plan of about 15,000 samples."""
 SYNONYMS = {"motor_encoder_eccentricity": {"motor_order"}, "motor_order": {"motor_encoder_eccentricity"}}
 FORMS = frozenset({"at", "width", "tau", "hz", "lines", "reference", "shear", "t1", "build"})
-"""Parameters of an effect that are no size of it."""
+"""Parameters of an effect that are not a size."""
 
 
 def drawn(cause: str, rng: np.random.Generator) -> tuple[dict[str, dict[str, object]], dict[str, object]]:
-    """An effect of about three arcsec and more, and what the axis needs for it."""
+    """Draws an effect of about three arcsec or more; returns it and the axis properties that it needs."""
     size = float(3.0 * (1 + rng.random()) * rng.choice([-1, 1]))
     phase = float(rng.uniform(0, 360))
     big = abs(size)
@@ -64,7 +64,7 @@ def drawn(cause: str, rng: np.random.Generator) -> tuple[dict[str, dict[str, obj
 
 
 def times(effects: Mapping[str, Mapping[str, Any]], factor: float) -> dict[str, dict[str, Any]]:
-    """Effects so many times as large."""
+    """Scales the sizes of effects by a factor."""
 
     def scaled(name: str, value: Any) -> Any:
         if name == "orders":
@@ -113,7 +113,7 @@ LOOPS = {"hysteresis_memory", "hysteresis_parameters"}
 def planted(
     name: str, seed: int, plan: plant.Plan | None = None
 ) -> tuple[set[str], Record, TransmissionModel]:
-    """What is there, the record, and the model that is put to the test."""
+    """Returns the causes present, the record, and the model to be tested."""
     rng = np.random.default_rng(1000 * seed + 17)
     effects: dict[str, dict[str, object]] = {}
     axis: dict[str, object] = {}
@@ -142,18 +142,18 @@ def planted(
 
 @dataclass(frozen=True)
 class Verdict:
-    """How well what was found agrees with what is there."""
+    """Agreement of the reported causes with those present."""
 
     all_right: bool
-    """Each hidden cause is named, or an alias of what is named."""
+    """True if each hidden cause is reported, or an alias of a reported one."""
     first_right: bool
     wrong: tuple[str, ...]
-    """Names of what is not there."""
+    """Reported causes that are not present."""
     unexplained: bool
 
 
 def verdict(name: str, there: Set[str], found: Mapping[str, Set[str]]) -> Verdict:
-    """Judge the names (most important first, each with its aliases) in the record ``name`` of `planted`."""
+    """Judges the reported names (most important first, with aliases) in the record ``name`` of `planted`."""
     right = [
         any(
             each == cause or each in aliases or cause in SYNONYMS.get(each, ())

@@ -1,4 +1,4 @@
-"""Load torque and temperature: lines for an axis file, and the TPDO that carries both, off and on."""
+"""Load torque and temperature: lines for an axis file, and switches for the TPDO that carries both."""
 
 CHANNELS = """
 load_torque:
@@ -14,10 +14,10 @@ OFF = 0x8000_0000
 
 
 def stops(node):
-    """Object 2101h stays away from now on."""
+    """Stops the TPDO of object 2101h."""
     node.dictionary[0x1802, 1].put(TPDO3 | OFF)
 
 
 def resumes(node):
-    """It comes again."""
+    """Resumes the TPDO."""
     node.dictionary[0x1802, 1].put(TPDO3)

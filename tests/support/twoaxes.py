@@ -27,14 +27,14 @@ STEP_COUNTS: Final = 40
 
 
 def axis_of(node_id: int, name: str = "", profile: Path = PROFILE, **drive: object) -> AxisConfig:
-    """The article's axis under another node id."""
+    """Returns the article's axis with another node id."""
     axis = AxisConfig.load(profile)
     changed = axis.drive.model_copy(update={"node_id": node_id, **drive})
     return axis.model_copy(update={"drive": changed, "name": name or f"axis {node_id}"})
 
 
 class RelayBus(can.BusABC):
-    """What commissioning sees of the bus while the cycle runs: its frames go out between the cycle's."""
+    """Bus for commissioning while the cycle runs; its frames are sent between those of the cycle."""
 
     def __init__(self, cycle: BusCycle) -> None:
         super().__init__("relay")
@@ -49,7 +49,7 @@ class RelayBus(can.BusABC):
         return self.cycle.clock.now()
 
     def sleep_until(self, deadline_s: float) -> None:
-        """Time passes by turns of the cycle."""
+        """Runs turns of the cycle until the deadline."""
         while self.now() < deadline_s:
             self.cycle.exchange()
 
@@ -71,7 +71,7 @@ class RelayBus(can.BusABC):
 
 @dataclass
 class TwoAxes:
-    """Two axes under way, and everything a test may turn."""
+    """Two axes under way, and everything that a test may change."""
 
     bus: LockstepBus
     clock: VirtualClock
@@ -82,10 +82,10 @@ class TwoAxes:
     intruder: can.BusABC
     moving: list[bool] = field(default_factory=lambda: [False, False])
     fresh: list[list[bool]] = field(default_factory=lambda: [[], []])
-    """Of each turn, whether the feedback of each axis was fresh."""
+    """Freshness of each axis's feedback in each turn."""
 
     def enable(self, place: int) -> None:
-        """Begin with an axis whose drive has been prepared, and turn until its power is on."""
+        """Begins with an axis whose drive is prepared, and turns until its power is on."""
         axis = self.axes[place]
         axis.command = None
         axis.begin()
@@ -99,7 +99,7 @@ class TwoAxes:
         self.moving[place] = True
 
     def turn(self, turns: int = 1) -> None:
-        """Both go on at constant speed."""
+        """Runs turns with both axes at constant speed."""
         for _ in range(turns):
             for axis, moves in zip(self.axes, self.moving, strict=True):
                 if moves and isinstance(axis.command, int):
@@ -109,26 +109,26 @@ class TwoAxes:
                 fresh.append(axis.feedback.fresh)
 
     def interfere(self, can_id: int, data: bytes = b"", **kind: bool) -> None:
-        """A frame from another node, on the bus before the next cycle."""
+        """Sends a frame from another node, before the next cycle."""
         kind = {"is_extended_id": False, **kind}
         self.intruder.send(can.Message(arbitration_id=can_id, data=data, **kind))
 
     def hang(self, duration_s: float) -> None:
-        """The master does nothing for so long."""
+        """Stalls the master for ``duration_s``."""
         self.clock.sleep_until(self.clock.now() + duration_s)
 
     def reactions(self, place: int, fault: Fault) -> list[Reaction]:
         return [event.reaction for event in self.axes[place].supervision.events if event.fault is fault]
 
     def stands(self, place: int) -> bool:
-        """The axis itself is at rest over the next turns."""
+        """Returns True if the axis is truly at rest over the next turns."""
         machine = self.nodes[place].firmware.motion.machine
         before = machine.motor_counts
         self.turn(20)
         return abs(machine.motor_counts - before) <= 2
 
     def follows(self, place: int, turns: int = 60) -> bool:
-        """The axis goes on: each feedback fresh, a target in each turn, and the motor moves with it."""
+        """Returns True if the axis keeps moving: feedback fresh and a target in each turn."""
         axis, machine = self.axes[place], self.nodes[place].firmware.motion.machine
         before, seen = machine.motor_counts, len(self.fresh[place])
         self.turn(turns)
@@ -144,9 +144,9 @@ class TwoAxes:
 def two_axes(
     make_bus: object = None, boot: tuple[int, ...] = (0, 1), bitrate_bps: int | None = 1_000_000
 ) -> Iterator[TwoAxes]:
-    """Two axes of which those in ``boot`` are booted and ready to be enabled; nothing moves yet.
+    """Provides two axes, those in ``boot`` booted and ready to be enabled; nothing moves yet.
 
-    ``make_bus(bus, channel, clock)`` may put another bus in place of the master's.
+    ``make_bus(bus, channel, clock)`` may replace the master's bus.
     """
     configs = [axis_of(node_id) for node_id in (1, 2)]
     channel = f"two-{uuid4()}"

@@ -1,4 +1,4 @@
-"""The truth file: every parameter of the simulated axis, as it really is; one file per section."""
+"""Truth file: the true values of all parameters of the simulated axis; one module per section."""
 
 from hdbridge.sim.truth.gear import TrueGear
 from hdbridge.sim.truth.hysteresis import (

@@ -1,4 +1,4 @@
-"""The truth file's encoders: geometry of the disc, signals, delayed samples, counts lost."""
+"""Encoders of the truth file: geometry of the disc, signals, delayed samples, lost counts."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ Direction = Literal[1, -1]
 
 
 class TrueDisc(Part):
-    """How the graduated disc sits on its shaft; one reading head."""
+    """Mounting of the graduated disc on its shaft; one reading head."""
 
     radius_mm: float = Field(gt=0, le=1_000, description="radius of the graduation")
     eccentricity_um: float = Field(
@@ -40,7 +40,7 @@ class TrueDisc(Part):
 
 
 class TrueSignals(Part):
-    """The sine and cosine signals that the lines make, and what is wrong with them."""
+    """Sine and cosine signals of the lines, and their imperfections."""
 
     lines_per_turn: int = Field(ge=1, le=1_000_000, description="signal periods per turn")
     sine_offset: float = Field(0.0, ge=-0.5, le=0.5, description="offset of the sine, of its amplitude")
@@ -55,14 +55,14 @@ class TrueSignals(Part):
 
 
 class TrueLoss(Part):
-    """Counts that are lost once: the reading stays off by them."""
+    """One loss of counts, which remains in the reading."""
 
     time_s: float = Field(ge=0, le=1e8, description="time since the axis was switched on")
     counts: int = Field(ge=-(2**31), le=2**31 - 1, description="counts that the reading jumps by")
 
 
 class TrueEncoder(Part):
-    """What every encoder has."""
+    """Properties of every encoder."""
 
     counts_per_turn: int = Field(ge=4, le=2**31 - 1, description="counts per turn of its shaft")
     direction: Direction = Field(1, description="-1: counts down as the shaft turns forward")
@@ -77,7 +77,7 @@ class TrueEncoder(Part):
 
 
 class TrueMotorEncoder(TrueEncoder):
-    """The encoder on the motor shaft. It reports whole counts; the drive's loops see finer."""
+    """Encoder on the motor shaft. It reports whole counts; the drive's loops have finer steps."""
 
     interpolation: int = Field(
         64, ge=1, le=65_536, description="steps per count that the drive's own loops see (sine/cosine tracks)"
@@ -85,7 +85,7 @@ class TrueMotorEncoder(TrueEncoder):
 
 
 class TrueCoupling(Part):
-    """The flexible coupling between the load and the load encoder's shaft."""
+    """Flexible coupling between the load and the load encoder's shaft."""
 
     frequency_hz: float = Field(
         ge=10, le=5_000, description="natural frequency of the encoder on its coupling"
@@ -95,7 +95,7 @@ class TrueCoupling(Part):
 
 
 class TrueCable(Part):
-    """The encoder's cable: taut beyond an angle, it pulls the encoder's body along."""
+    """Cable of the encoder: taut beyond an angle, where it turns the encoder's body."""
 
     taut_from_deg: float = Field(ge=-36_000, le=36_000, description="load angle from which it is taut")
     arcsec_per_deg: float = Field(ge=-3_600, le=3_600, description="turn of the body per degree beyond")
@@ -114,7 +114,7 @@ class TrueSensorWarming(Part):
 
 
 class TrueLoadEncoder(TrueEncoder):
-    """The encoder at the load."""
+    """Encoder at the load."""
 
     coupling: TrueCoupling | None = Field(None, description="flexible coupling; without it: rigid")
     noise_arcsec: float = Field(0.0, ge=0, le=3_600, description="noise of each reading, rms")

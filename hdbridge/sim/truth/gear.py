@@ -1,4 +1,4 @@
-"""The truth file's section ``gear``."""
+"""Section ``gear`` of the truth file."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from hdbridge.units import ARCSEC_PER_DEG
 
 
 class TrueStiffening(Part):
-    """The spring's later stages: beyond each torque it is stiffer (or softer) than before."""
+    """Later stages of the spring: beyond each torque it is stiffer (or softer) than before."""
 
     first_torque_nm: float = Field(gt=0, le=1e6, description="torque T1 at which the first stage ends")
     second_stiffness_nm_per_rad: float = Field(gt=0, le=1e9, description="stiffness K2 beyond T1")
@@ -32,7 +32,7 @@ class TrueStiffening(Part):
 
 
 class TrueFlank(Part):
-    """Teeth touch with the other flank after a reversal, and there the tooth error is shifted."""
+    """Other flank of the teeth, which carries after a reversal, with a shifted tooth error."""
 
     shift_deg: float = Field(
         ge=-90,
@@ -43,7 +43,7 @@ class TrueFlank(Part):
 
 
 class TrueRate(Part):
-    """The elastic hysteresis grows with speed: the grease's share in the rolling friction."""
+    """Growth of the elastic hysteresis with speed: the grease's share in the rolling friction."""
 
     growth_per_decade: float = Field(ge=-1, le=5, description="growth of the loop per decade of motor speed")
     from_deg_s: float = Field(gt=0, le=1e5, description="motor speed at which the growth sets in")
@@ -60,7 +60,7 @@ class TrueWear(Part):
 
 
 class TrueAgeing(Part):
-    """What hours of work change, evenly from the time that the axis is switched on, and then no further."""
+    """Gradual change over hours of work, linear from switch-on, then constant."""
 
     duration_s: float = Field(gt=0, le=1e8, description="time that it takes")
     hysteresis_growth: float = Field(
@@ -72,7 +72,7 @@ class TrueAgeing(Part):
 
 
 class TrueCreep(Part):
-    """A spring with a dashpot in parallel (Kelvin-Voigt), in series with the gear."""
+    """Spring with a dashpot in parallel (Kelvin-Voigt), in series with the gear."""
 
     time_constant_s: float = Field(gt=0, le=1e6, description="time constant of the element")
     amplitude_arcsec: float = Field(
@@ -84,7 +84,7 @@ class TrueCreep(Part):
 
 
 class TrueJump(Part):
-    """Teeth jumped: the output is off by them from then on."""
+    """Jump of teeth, which remains in the output."""
 
     time_s: float = Field(ge=0, le=1e8, description="time since the axis was switched on")
     teeth: int = Field(ge=-100, le=100, description="teeth that the output jumps forward by")
@@ -92,7 +92,7 @@ class TrueJump(Part):
 
 
 class TrueDamage(Part):
-    """A damaged tooth: a bump of the output at one load angle."""
+    """Damaged tooth: a bump of the output at one load angle."""
 
     at_deg: float = Field(ge=-360, le=360, description="load angle of its middle")
     width_deg: float = Field(gt=0, le=180, description="width from foot to foot, of the load")
@@ -100,7 +100,7 @@ class TrueDamage(Part):
 
 
 class TrueRoller(Part):
-    """A roller on the motor's hub, pressed on at some load angles more than at others."""
+    """Roller on the motor's hub, pressed on at some load angles more than at others."""
 
     order: float = Field(gt=0, le=512, description="its turns per motor turn, not a whole number")
     amplitude_arcsec: float = Field(ge=0, le=36_000, description="amplitude where it is pressed on most")
@@ -110,7 +110,7 @@ class TrueRoller(Part):
 
 
 class TrueSeat(Part):
-    """A bearing ring that sticks in its seat, is carried along, and slips at random angles."""
+    """Bearing ring that sticks in its seat, is carried along, and slips at random angles."""
 
     slip_arcsec: float = Field(gt=0, le=36_000, description="how far it is carried at most; it slips before")
     travel_deg: float = Field(gt=0, le=1e6, description="motor travel that carries it as far as that")
@@ -118,7 +118,7 @@ class TrueSeat(Part):
 
 
 class TrueGear(Part):
-    """The harmonic gear: what its output does in addition to turning by motor angle / ratio."""
+    """Harmonic gear: its output, beyond motor angle / ratio."""
 
     ratio: float = Field(ge=1, le=1_000, description="motor turns per load turn")
     stiffness_nm_per_rad: float = Field(gt=0, le=1e9, description="flexspline's spring to the load")
@@ -154,7 +154,7 @@ class TrueGear(Part):
 
     @property
     def stiffest_nm_per_rad(self) -> float:
-        """The spring where it is stiffest."""
+        """Stiffness of the stiffest stage of the spring."""
         later = self.stiffening
         if later is None:
             return self.stiffness_nm_per_rad

@@ -1,4 +1,4 @@
-"""The truth file's tooth errors and hysteresis laws."""
+"""Tooth errors and hysteresis laws of the truth file."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from hdbridge.sim.truth.part import Part
 
 
 class TrueOrder(Part):
-    """A term of the tooth error: amplitude * cos(order * angle + phase)."""
+    """Term of the tooth error: amplitude * cos(order * angle + phase)."""
 
     order: int = Field(ge=1, le=512, description="periods per turn of the angle it belongs to")
     amplitude_arcsec: float = Field(ge=0, le=36_000, description="amplitude, at the load")
@@ -19,7 +19,7 @@ class TrueOrder(Part):
 
 
 class RollingFriction(Part):
-    """The article's law: after a reversal the error crosses to the other side within a width."""
+    """Law of the article: after a reversal the error crosses to the other side within a width."""
 
     law: Literal["rolling_friction"] = Field(description="the article's law; no return-point memory")
     offset_arcsec: float = Field(ge=0, le=36_000, description="error after long motion in one direction")
@@ -39,14 +39,14 @@ class RollingFriction(Part):
 
 
 class SlipElement(Part):
-    """A spring in series with a slider."""
+    """Spring in series with a slider."""
 
     limit_arcsec: float = Field(ge=0, le=36_000, description="error at which it slips")
     yield_deg: float = Field(gt=0, le=36_000, description="motor travel from zero to slipping")
 
 
 class MaxwellSlip(Part):
-    """Parallel elasto-plastic elements; remembers every reversal that a larger one has not wiped out."""
+    """Parallel elasto-plastic elements; a reversal is remembered until a larger one wipes it out."""
 
     law: Literal["maxwell_slip"] = Field(description="Maxwell slip, Prandtl-Ishlinskii; return-point memory")
     elements: tuple[SlipElement, ...] = Field(
@@ -55,7 +55,7 @@ class MaxwellSlip(Part):
 
 
 class BoucWen(Part):
-    """A differential equation in the motor's travel, not in time."""
+    """Bouc-Wen law: a differential equation in the motor's travel, not in time."""
 
     law: Literal["bouc_wen"] = Field(description="Bouc-Wen, the smooth law")
     offset_arcsec: float = Field(ge=0, le=36_000, description="error after long motion in one direction")
@@ -67,7 +67,7 @@ class BoucWen(Part):
 
 
 class Dahl(Part):
-    """Dahl's law: the slope falls with a power of what is left to the offset ahead."""
+    """Dahl's law: the slope is a power of the remaining distance to the offset ahead."""
 
     law: Literal["dahl"] = Field(description="Dahl's law; no return-point memory")
     offset_arcsec: float = Field(ge=0, le=36_000, description="error after long motion in one direction")

@@ -1,4 +1,4 @@
-"""The truth file's section ``load``."""
+"""Section ``load`` of the truth file."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from hdbridge.sim.truth.part import Part
 
 
 class TrueGravity(Part):
-    """A mass on the axis."""
+    """Mass on the axis."""
 
     mass_kg: float = Field(gt=0, le=1e5, description="mass")
     arm_m: float = Field(gt=0, le=100, description="its distance from the axis")
@@ -36,7 +36,7 @@ class TrueThinning(Part):
 
 
 class TrueVibration(Part):
-    """A machine nearby that shakes the load."""
+    """Machine nearby that shakes the load."""
 
     frequency_hz: float = Field(gt=0, le=500, description="frequency")
     torque_nm: float = Field(ge=0, le=1e6, description="amplitude of the torque on the load")
@@ -44,14 +44,14 @@ class TrueVibration(Part):
 
 
 class TrueSlip(Part):
-    """A spring between load and ground that slips at its limit."""
+    """Spring between load and ground that slips at its limit."""
 
     limit_nm: float = Field(gt=0, le=1e6, description="friction at which it slips")
     travel_deg: float = Field(gt=0, le=360, description="load travel from no friction to slipping")
 
 
 class TrueLoad(Part):
-    """The load with its encoder."""
+    """Load with its encoder."""
 
     inertia_kg_m2: float = Field(gt=0, le=1e6, description="inertia of the load, at the load")
     coulomb_nm: float = Field(
@@ -72,12 +72,12 @@ class TrueLoad(Part):
 
     @property
     def presliding_nm_per_deg(self) -> float:
-        """Stiffness of what holds the load before it slips."""
+        """Stiffness of the presliding friction that holds the load before it slips."""
         return sum(each.limit_nm / each.travel_deg for each in self.presliding)
 
     @property
     def whole_inertia_kg_m2(self) -> float:
-        """The load's inertia with the mass on it."""
+        """Inertia of the load with the mass on it."""
         if self.gravity is None:
             return self.inertia_kg_m2
         return self.inertia_kg_m2 + self.gravity.mass_kg * self.gravity.arm_m**2

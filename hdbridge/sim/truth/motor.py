@@ -1,4 +1,4 @@
-"""The truth file's sections ``motor`` and ``servo``."""
+"""Sections ``motor`` and ``servo`` of the truth file."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from hdbridge.sim.truth.part import Part
 
 
 class TrueMotorStribeck(Part):
-    """Friction on the motor's shaft that is higher near rest, where no film of lubricant carries yet."""
+    """Friction on the motor's shaft that is higher near rest, before a lubricant film forms."""
 
     rise: float = Field(
         ge=0, le=10, description="share of the Coulomb friction by which it is higher at rest"
@@ -20,7 +20,7 @@ class TrueMotorStribeck(Part):
 
 
 class TrueMotor(Part):
-    """The motor with the wave generator, and the friction on their shaft."""
+    """Motor with the wave generator, and the friction on their shaft."""
 
     inertia_kg_m2: float = Field(gt=0, le=100, description="inertia of motor and wave generator")
     rated_torque_nm: float = Field(gt=0, le=10_000, description="rated torque, the unit of 6077h")
@@ -36,7 +36,7 @@ class TrueMotor(Part):
 
 
 class TrueLoadFeedforward(Part):
-    """The drive's own picture of the load behind the gear's spring, as its commissioning has set it."""
+    """Drive's model of the load behind the gear's spring, as commissioned."""
 
     inertia_kg_m2: float = Field(gt=0, le=100, description="inertia of the load, seen by the motor")
     frequency_hz: float = Field(ge=1, le=500, description="natural frequency of the load, the motor held")
@@ -44,7 +44,7 @@ class TrueLoadFeedforward(Part):
 
 
 class TrueNotch(Part):
-    """A notch on the torque, exact at its frequency (bilinear transform)."""
+    """Notch on the torque, exact at its frequency (bilinear transform)."""
 
     frequency_hz: float = Field(gt=0, le=900, description="centre, at most 0.45 of the rate of the substeps")
     depth: float = Field(ge=0, le=1, description="gain at the centre")
@@ -52,7 +52,7 @@ class TrueNotch(Part):
 
 
 class TrueServo(Part):
-    """The drive's loops: position and velocity cascade with feed-forward, limited in torque."""
+    """Loops of the drive: position and velocity cascade with feed-forward, limited in torque."""
 
     position_gain_per_s: float = Field(gt=0, le=5_000, description="position loop: speed per position error")
     velocity_gain_nm_s_per_rad: float = Field(

@@ -1,4 +1,4 @@
-"""What all parts of a truth file have in common."""
+"""Base class of all parts of a truth file."""
 
 from __future__ import annotations
 
@@ -6,4 +6,4 @@ from hdbridge.strictness import Strict
 
 
 class Part(Strict):
-    """A mapping of the file: frozen, no unknown keys, finite numbers."""
+    """Mapping of the file: frozen, no unknown keys, finite numbers."""

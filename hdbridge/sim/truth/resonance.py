@@ -1,4 +1,4 @@
-"""The fastest resonance of the simulated axis, which its time step has to resolve."""
+"""Fastest resonance of the simulated axis, which its time step must resolve."""
 
 from __future__ import annotations
 
@@ -10,20 +10,20 @@ from typing import Any, Self
 
 @dataclass(frozen=True, slots=True)
 class Resonance:
-    """The load between the gear's spring and sliders that hold it, the motor at the other end."""
+    """Resonance of the load, between the sliders that hold it and the gear's spring to the motor."""
 
     stiffness_nm_per_rad: float
-    """The gear's spring where it is stiffest."""
+    """Stiffness of the gear's spring at its stiffest stage."""
     held_nm_per_rad: float
-    """Sliders on the load before they slip."""
+    """Stiffness of the sliders on the load before they slip."""
     inertia_kg_m2: float
-    """The load's own, without the mass that hangs on it: that may be taken off."""
+    """Inertia of the load without the mass on it, which may be removed."""
     reflected_kg_m2: float
-    """The motor's, seen from the load."""
+    """Inertia of the motor, seen from the load."""
 
     @classmethod
     def of(cls, data: Mapping[str, Any]) -> Self:
-        """That of a truth file's content."""
+        """Returns the resonance of a truth file's content."""
         gear, load = data["gear"], data["load"]
         later = gear.get("stiffening") or {}
         stages = (later.get(f"{stage}_stiffness_nm_per_rad", 0.0) for stage in ("second", "third"))
@@ -37,16 +37,19 @@ class Resonance:
 
     @property
     def rad_s(self) -> float:
-        """How fast it is."""
+        """Angular frequency of the resonance."""
         held = (self.stiffness_nm_per_rad + self.held_nm_per_rad) / self.inertia_kg_m2
         return math.sqrt(held + self.stiffness_nm_per_rad / self.reflected_kg_m2)
 
     def stiffest_nm_per_rad(self, rad_s: float) -> float:
-        """The spring with which it would be so fast, the sliders as they are; not positive where they are."""
+        """Returns the spring stiffness for a resonance at this frequency, with the same sliders.
+
+        Not positive if the sliders alone exceed it.
+        """
         left = rad_s**2 - self.held_nm_per_rad / self.inertia_kg_m2
         return left / (1.0 / self.inertia_kg_m2 + 1.0 / self.reflected_kg_m2)
 
     def most_held_nm_per_rad(self, rad_s: float) -> float:
-        """The sliders with which it would be so fast, the spring as it is."""
+        """Returns the slider stiffness for a resonance at this frequency, with the same spring."""
         share = 1.0 + self.inertia_kg_m2 / self.reflected_kg_m2
         return self.inertia_kg_m2 * rad_s**2 - self.stiffness_nm_per_rad * share

@@ -1,8 +1,8 @@
-"""The truth file: every parameter of the simulated axis, as it really is.
+"""Truth file: the true values of all parameters of the simulated axis.
 
-A calibration does not read this file; it has to find out. docs/truth-file.md describes each key, and
+A calibration does not read this file; it must find the values. docs/truth-file.md describes each key, and
 `profiles/article/truth.yaml` is the article's bench. Angles and torques of the gear are at the load.
-The sections have their own files in this folder.
+Other modules of this package define the sections.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from hdbridge.sim.truth.resonance import Resonance
 
 
 class TrueTemperature(Part):
-    """One heat store, warmed by losses, cooled by the surroundings."""
+    """Heat store that is warmed by losses and cooled by the surroundings."""
 
     ambient_c: float = Field(22.0, ge=-60, le=100, description="temperature of the surroundings")
     start_c: float | None = Field(None, ge=-60, le=200, description="temperature at the start; else ambient")
@@ -53,12 +53,12 @@ class TrueTemperature(Part):
 
     @property
     def unchanged_c(self) -> float:
-        """The temperature at which nothing has grown."""
+        """Temperature at which nothing has grown."""
         return self.ambient_c if self.reference_c is None else self.reference_c
 
 
 class Truth(Part):
-    """The simulated axis."""
+    """Truth of the simulated axis."""
 
     schema_: Literal["hdbridge.truth/1"] = Field(alias="schema", description="kind and version of this file")
     name: str = Field(
@@ -82,13 +82,13 @@ class Truth(Part):
 
     @classmethod
     def load(cls, path: Path | str) -> Self:
-        """Read a truth file, or the one in a profile's folder; InputError with file:line:column."""
+        """Reads a truth file, or the one in a profile's folder; InputError with file:line:column."""
         path = Path(path)
         return read_yaml(path / "truth.yaml" if path.is_dir() else path).validate(cls)
 
     @classmethod
     def from_text(cls, text: str, path: Path | str = "truth.yaml") -> Self:
-        """A truth file's text; ``path`` names it in complaints."""
+        """Reads a truth file's text; ``path`` names it in error messages."""
         return document_from_text(text, path).validate(cls)
 
     @property
@@ -103,7 +103,7 @@ class Truth(Part):
 
     @property
     def resonance(self) -> Resonance:
-        """The fastest one."""
+        """Fastest resonance."""
         return Resonance(
             self.gear.stiffest_nm_per_rad,
             math.degrees(self.load_.presliding_nm_per_deg),
@@ -113,7 +113,7 @@ class Truth(Part):
 
     @property
     def highest_stiffness_nm_per_rad(self) -> float:
-        """The stiffest spring whose resonance the time step resolves."""
+        """Stiffness of the stiffest spring whose resonance the time step resolves."""
         return self.resonance.stiffest_nm_per_rad(1.0 / self.substep_s)
 
     @model_validator(mode="after")
