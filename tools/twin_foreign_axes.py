@@ -36,8 +36,12 @@ from hdbridge.records.recording import Recording
 from hdbridge.sim.truth import Truth
 from hdbridge.twin.comparison import compare
 from hdbridge.twin.defaults import default_truth
+from hdbridge.twin.fitting import FIT_S
 from hdbridge.twin.making import fit_twin
+from hdbridge.twin.misfit import coarse, prepare
 from hdbridge.twin.replay import replay_directly
+from hdbridge.twin.replays import Replays
+from hdbridge.twin.structures import fit_structures
 from hdbridge.twin.verdict import judge
 
 
@@ -78,6 +82,23 @@ def start(axis: AxisConfig, foreign: Foreign) -> Truth:
     return Truth.model_validate(truth)
 
 
+def servo_only(recording: Recording, axis: AxisConfig, begun: Truth, workers: int) -> Truth:
+    """The fit of servo structures alone, without the fit of the usual servo before it."""
+    with Replays(coarse(prepare(recording, axis, begun), FIT_S), workers) as replays:
+        return fit_structures(replays, begun).truth
+
+
+def shares(other: Recording, axis: AxisConfig, truth: Truth, seed: int) -> str:
+    """Following error and torque on the other motion, per cent of the signal."""
+    again = replay_directly(other, axis, without_noise(truth), seed)
+    told = compare(other.record, again, other.segments, axis.gear.ratio)
+    return ", ".join(
+        f"{name.split('_')[0]} {100.0 * row.share:.1f} %"
+        for name in ("following_error", "motor_torque")
+        if (row := told.row(name)) is not None
+    )
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -86,6 +107,7 @@ def main() -> None:
     parser.add_argument("--axes", type=int, default=2)
     parser.add_argument("--first", type=int, default=1, help="seed of the first axis")
     parser.add_argument("--workers", type=int, default=1)
+    parser.add_argument("--servo-only", action="store_true", help="only the fit of servo structures")
     options = parser.parse_args()
     another = Plan.model_validate(yaml.safe_load(ANOTHER))
     for seed in range(options.first, options.first + options.axes):
@@ -98,19 +120,18 @@ def main() -> None:
                 print(f"{structure} {seed}: left out: {stop}", flush=True)
                 continue
             began_s = time.process_time()
+            if options.servo_only:
+                truth = servo_only(recording, axis, start(axis, foreign), options.workers)
+                took_s = time.process_time() - began_s
+                print(f"{structure} {seed}: {shares(other, axis, truth, seed)}; {took_s:.0f} s", flush=True)
+                continue
             twin = fit_twin([recording], axis, start(axis, foreign), workers=options.workers)
             took_s = time.process_time() - began_s
-            again = replay_directly(other, axis, without_noise(twin.truth), seed)
-            told = compare(other.record, again, other.segments, axis.gear.ratio)
-            shares = [
-                f"{name.split('_')[0]} {100.0 * row.share:.1f} %"
-                for name in ("following_error", "motor_torque")
-                if (row := told.row(name)) is not None
-            ]
             true = foreign.by_place()
             given = {place: pair for place, pair in twin.intervals.items() if place in true}
             held = [place for place, (low, high) in given.items() if low <= true[place] <= high]
-            print(f"{structure} {seed}: {', '.join(shares)}; {len(held)} of {len(given)} intervals; ", end="")
+            figures = shares(other, axis, twin.truth, seed)
+            print(f"{structure} {seed}: {figures}; {len(held)} of {len(given)} intervals; ", end="")
             print(f"{took_s:.0f} s\n    {judge(twin).text}")
             for each in twin.unexplained:
                 print(f"    unexplained: {each}")
