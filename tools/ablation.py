@@ -1,14 +1,14 @@
-"""What each deciding number of the diagnosis is good for: each at its neutral value, on the same records.
+"""Ablation of the diagnosis: sets each deciding number to its neutral value, on the same records.
 
 python tools/ablation.py [--seed 1] [--records 40] [--only NAME ...] [--kinds KIND ...] [--jobs 2] [--json F]
 
 The records come from formulas that share no code with the effects (tests/support/plant.py): each cause alone,
-near the noise too, two together, nothing under four elastic laws, and what the catalogue does not have. A
-number without which no figure is worse is not needed for these records: it can go, unless other records are
-named that need it.
+also near the noise, two together, none under four elastic laws, and causes outside the catalogue. A number is
+not needed for these records if no figure is worse without it: it can be removed, unless other records are
+known that need it.
 
-A record is diagnosed again only with those numbers on which a comparison depends there (tools/whatif.py): all
-of them at once, and where that changes the answer, one half and the other, down to single ones.
+A record is diagnosed again only with the numbers on which a comparison depends in it (tools/whatif.py): first
+with all of them neutral, and if that changes the answer, with one half and the other, down to single ones.
 """
 
 from __future__ import annotations
@@ -36,17 +36,17 @@ from hdbridge.model import TransmissionModel
 from hdbridge.records.record import Record
 
 PLAN = plant.Plan(rate_hz=14.0, scale=0.2, load_turns=1.05, steps=14)
-"""Short: some 13,000 samples, a diagnosis of 2 to 10 s."""
+"""Short plan: some 13,000 samples, a diagnosis of 2 to 10 s."""
 LAWS = ("plain", "memory", "changed", "bouc_wen", "dahl")
 UNKNOWN = ("saw", "square", "chirp", "one_way", "beat", "bursts")
 SAME = {"motor_encoder_eccentricity": "motor_order"}
-"""Causes that no record of one mounting of the encoder distinguishes."""
+"""Causes that a record with one mounting of the encoder does not distinguish."""
 Answer = list[str]
 
 
 @dataclass(frozen=True)
 class Case:
-    """A record to be made, and what is hidden in it."""
+    """Recipe of a record, with its hidden causes."""
 
     name: str
     hidden: tuple[str, ...]
@@ -56,13 +56,13 @@ class Case:
 
     @property
     def kind(self) -> str:
-        """The row that it counts in."""
+        """Row of the table in which it counts."""
         return self.name.partition(":")[0]
 
 
 def cases(seed: int, count: int) -> Iterator[Case]:
-    """About ``count``: two fifths single causes, an eighth of them small, a quarter two or three at once, the
-    rest empty, other laws and unknown.
+    """Yields about ``count`` cases: two fifths single causes, an eighth of them small, a quarter two or three
+    at once, the rest empty, other laws and unknown.
     """
     rng = np.random.default_rng(seed)
     names = [CAUSES[i] for i in rng.permutation(len(CAUSES))]
@@ -109,8 +109,8 @@ def cases(seed: int, count: int) -> Iterator[Case]:
 
 
 def walked(case: Case, chosen: Mapping[str, float]) -> tuple[Answer, dict[str, Answer], int]:
-    """The names as the numbers are, the other answers by the number without which they come, and the number
-    of those on which a comparison depends.
+    """Returns the causes reported with all numbers, the different answers without a number (by that number),
+    and how many numbers a comparison depends on.
     """
     record = Record(plant.record(plant.Truth(effects=dict(case.effects), **case.axis), PLAN, case.seed))
     model = TransmissionModel.from_text(plant.model_text(case.seed))
@@ -140,7 +140,7 @@ def walked(case: Case, chosen: Mapping[str, float]) -> tuple[Answer, dict[str, A
 
 
 def figures(judged: Sequence[tuple[Case, Sequence[str]]]) -> dict[str, int]:
-    """Counts over the records: more is better, but for what begins with ``false`` or ``wrong``."""
+    """Returns counts over the records; more is better, except for names with ``false`` or ``wrong``."""
     rows = dict.fromkeys(
         ("right_first", "wrong_first", "recalled", "wrong_names", "false_none", "false_other_law",
          "led_unknown", "false_unknown"), 0,
@@ -164,7 +164,7 @@ def figures(judged: Sequence[tuple[Case, Sequence[str]]]) -> dict[str, int]:
 
 
 def worse(before: Mapping[str, int], after: Mapping[str, int]) -> dict[str, int]:
-    """The rows that lose, and by how much."""
+    """Returns the loss of each row that is worse."""
     lost = {}
     for name, count in before.items():
         change = after[name] - count
@@ -175,7 +175,7 @@ def worse(before: Mapping[str, int], after: Mapping[str, int]) -> dict[str, int]
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Parse the command line, walk every record, print a table."""
+    """Parses the command line, analyses every record, and prints a table."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

@@ -1,11 +1,11 @@
-"""Why the article's Tables 1 and 2 cannot give its Table 3: every figure of docs/article-table-3.md.
+"""Shows why the article's Tables 1 and 2 cannot give its Table 3: all figures of docs/article-table-3.md.
 
     python tools/article_table3.py [--json FILE] [--simulate] [--as-data]
 
-The axis is taken as ideal but for the article's own error model and its two encoders: no dynamics, no noise.
-The law comes from the project's effects; the inverse and the statistics are computed here, on their own, so
-that they also check the compensation. ``--simulate`` runs the same test on the simulated drive (half a
-minute) and compares it step by step.
+The axis is ideal except for the article's own error model and its two encoders: no dynamics, no noise. The
+law comes from the project's effects; the inverse and the statistics are computed here independently, so that
+they also check the compensation. ``--simulate`` runs the same test on the simulated drive (half a minute)
+and compares it step by step.
 """
 
 from __future__ import annotations
@@ -45,14 +45,14 @@ TABLE_3 = {
 }
 NOW = Moment()
 BRACKET_DEG = 5.0
-"""Motor degrees to either side in which the compensated angle is looked for: 360 arcsec at the load."""
+"""Half-width of the bracket for the compensated angle, motor degrees: 360 arcsec at the load."""
 
 Target = Callable[[Tracker, float], float]
 Parts = dict[str, tuple[float, float]]
 
 
 def exact(model: Tracker, load_deg: float) -> float:
-    """Motor angle that solves theta_M / N + TE(theta_M) = load target, by a bracketed root."""
+    """Returns the motor angle that solves theta_M / N + TE(theta_M) = load target, by a bracketed root."""
 
     def off(motor_deg: float) -> float:
         return motor_deg / RATIO + model.peek(motor_deg, NOW) / 3600.0 - load_deg
@@ -63,7 +63,7 @@ def exact(model: Tracker, load_deg: float) -> float:
 
 
 def as_printed(model: Tracker, load_deg: float) -> float:
-    """The article's own formula: the error is looked up at the angle before compensation."""
+    """Returns the angle by the article's own formula, with the error at the angle before compensation."""
     return load_deg * RATIO - RATIO * model.advance(load_deg * RATIO, NOW) / 3600.0
 
 
@@ -73,7 +73,7 @@ def step_errors(
     motor_counts: int = MOTOR_COUNTS,
     target: Target = exact,
 ) -> tuple[list[float], list[float]]:
-    """Load error at rest of each step, arcsec, there (240) and back (240), both encoders quantised."""
+    """Returns each load error at rest, arcsec, outward (240) and back (240), with quantised encoders."""
     told, real = compensated.tracker(Start.FORWARD), gear.tracker(Start.FORWARD)
     told.advance(0.0, NOW)
     real.advance(0.0, NOW)
@@ -90,23 +90,23 @@ def step_errors(
 
 
 def quantised(angle_deg: float, counts_per_turn: int) -> float:
-    """The nearest whole count, in degrees."""
+    """Returns the nearest whole count, in degrees."""
     return round(angle_deg / 360.0 * counts_per_turn) * 360.0 / counts_per_turn
 
 
 def statistics(there: Sequence[float], back: Sequence[float]) -> Parts:
-    """3 sigma and mean, arcsec, per direction and pooled."""
+    """Returns 3 sigma and mean, arcsec, per direction and pooled."""
     parts = {"cw": there, "ccw": back, "pooled": [*there, *back]}
     return {name: (3.0 * float(np.std(errors)), float(np.mean(errors))) for name, errors in parts.items()}
 
 
 def rms(three_sigma: float, mean: float) -> float:
-    """Root mean square about zero."""
+    """Returns the root mean square about zero."""
     return math.hypot(three_sigma / 3.0, mean)
 
 
 def figures() -> dict[str, Any]:
-    """Every figure, by name."""
+    """Returns all figures by name."""
     model = TransmissionModel.load(bundled_profile("article") / "model.yaml")
     law = next(effect for effect in model.effects if isinstance(effect, Hysteresis))
     errors = {scheme.value: step_errors(model, scheme.of(model)) for scheme in SCHEMES}
@@ -133,12 +133,12 @@ def figures() -> dict[str, Any]:
 
 
 def _about_table_3(computed: Mapping[str, Parts]) -> dict[str, Any]:
-    """What Table 3 says by itself, and against what its means and scatters could be."""
+    """Returns the figures of Table 3 alone, and against its possible means and scatters."""
     three_sigma = {name: each[0] for name, each in TABLE_3.items()}
     mean = {name: each[1] for name, each in TABLE_3.items()}
     wave = computed["none"]["cw"][0]
     offset = computed["synchronous"]["cw"][1]
-    # of a share p forward the variance gains (2 offset)^2 p (1 - p): which p gives the scatter of "none"?
+    # A share p of forward steps adds (2 offset)^2 p (1 - p) to the variance; solve for the scatter of "none".
     both_ways = (three_sigma["none"] ** 2 - wave**2) / (3.0 * 2.0 * offset) ** 2
     forward = 0.5 + math.sqrt(0.25 - both_ways)
     return {
@@ -166,7 +166,7 @@ def _about_table_3(computed: Mapping[str, Parts]) -> dict[str, Any]:
 
 
 def _about_the_test(model: TransmissionModel, law: Hysteresis) -> dict[str, Any]:
-    """What the stepping test samples and what it cannot see."""
+    """Returns what the stepping test samples and what it misses."""
     turn = np.linspace(0.0, 360.0, 100_001)
     stops = np.concatenate([np.arange(COUNT + 1), np.arange(COUNT - 1, -1, -1)]) * STEP_DEG
     reached = law.predict(Motion(stops), Start.FORWARD)[1:]
@@ -194,7 +194,7 @@ def _about_the_test(model: TransmissionModel, law: Hysteresis) -> dict[str, Any]
 
 
 def alias(order: int, samples_per_turn: float) -> float:
-    """Where a motor order appears in the spectrum of a stepping test, orders per motor turn."""
+    """Returns the aliased frequency of a motor order in a stepping test, orders per motor turn."""
     folded = order % samples_per_turn
     return min(folded, samples_per_turn - folded)
 
@@ -223,10 +223,10 @@ def _about_the_law(law: Hysteresis) -> dict[str, Any]:
 
 
 def memory_gaps(law: Hysteresis) -> tuple[float, float]:
-    """The largest difference to the same branch with return-point memory (Masing's rules), arcsec.
+    """Returns the largest differences to the same branch with return-point memory (Masing's rules), arcsec.
 
-    On two rising paths after a saturated start: a rise with one 2 deg step back, over all places of the step,
-    and a staircase of 1 deg up and 0.5 deg down.
+    On two rising paths after a saturated start: a rise with one 2 deg step back, over all positions of the
+    step, and a staircase of 1 deg up and 0.5 deg down.
     """
     memory = HysteresisMemory.model_validate(law.parameters())
 
@@ -244,7 +244,7 @@ def memory_gaps(law: Hysteresis) -> tuple[float, float]:
 
 
 def as_data(result: Mapping[str, Any]) -> dict[str, Any]:
-    """Table 3 taken as a measurement."""
+    """Returns the figures of Table 3 taken as a measurement."""
     from table3_budget import budget  # noqa: PLC0415 - found only where this file is run as a script
 
     computed = result["computed"]
@@ -254,7 +254,7 @@ def as_data(result: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def simulated() -> dict[str, Any]:
-    """The same test on the simulated drive: its figures, and how far its steps are from the computed ones."""
+    """Runs the test on the simulated drive; returns its figures and the differences of its steps."""
     profile = bundled_profile("article")
     axis = AxisConfig.load(profile / "axis.yaml")
     model = TransmissionModel.load(profile / "model.yaml")
@@ -318,7 +318,7 @@ def _words(value: object) -> str:
 
 
 def main() -> None:
-    """Print the figures, and write them where asked."""
+    """Prints the figures, and writes them to a file on request."""
     parser = argparse.ArgumentParser(description="Why Tables 1 and 2 cannot give Table 3.")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures for machines")
     parser.add_argument("--simulate", action="store_true", help="run the test on the simulated drive too")

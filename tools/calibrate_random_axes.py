@@ -1,12 +1,12 @@
-"""Calibrate axes drawn at random on the simulated drive, and hold what is found against what they are.
+"""Calibrates random axes on the simulated drive and compares the results with the truth.
 
     .venv/bin/python tools/calibrate_random_axes.py --axes 20 --workers 2
 
-Each axis has orders and phases, offset (15-80 arcsec), width (5-40 deg), exponent (1.2-2.8), ratio
-(30-160), encoder resolutions and directions and noise (0.5-3 arcsec) of its own. The calibration is the
-command's: a plan on the bench, the fit, the stepping test before and after. Printed for each axis: the errors
-of the parameters, what share of the 95 % intervals holds the truth, the stepping test over the floor of the
-axis's counts and noise, and how much faster than the axis it was.
+Each axis has its own orders and phases, offset (15-80 arcsec), width (5-40 deg), exponent (1.2-2.8), ratio
+(30-160), encoder resolutions and directions, and noise (0.5-3 arcsec). The calibration is that of the
+command: a plan on the bench, the fit, the stepping test before and after. Prints for each axis the errors of
+the parameters, the share of the 95 % intervals that contain the truth, the stepping test relative to the
+best possible with the axis's counts and noise, and the speed relative to real time.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from multiprocessing import Pool
 from pathlib import Path
 from typing import Any, NamedTuple
 
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # the matrices are small: threads only cost
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # the matrices are small, so threads only cost time
 
 import numpy as np
 import yaml
@@ -42,11 +42,11 @@ class Outcome(NamedTuple):
     counts: int
     noise: float
     offset: tuple[float, float, bool]
-    """True value, error, whether the interval holds it."""
+    """True value, error, and whether the interval contains it."""
     width: tuple[float, float, bool]
     exponent: tuple[float, float, bool]
     amplitude: float
-    """Largest error of an amplitude over its tolerance, 0.15 arcsec or 2 %."""
+    """Largest ratio of an amplitude's error to its tolerance, 0.15 arcsec or 2 %."""
     missed: int
     invented: int
     held: int
@@ -61,7 +61,7 @@ class Outcome(NamedTuple):
 
 
 def draw(seed: int) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Axis file and truth file of a random axis; motor and servo are the demo's, so are its frequencies."""
+    """Draws axis file and truth file of a random axis; motor, servo and frequencies are the demo's."""
     rng = np.random.default_rng(seed)
     axis, truth = (yaml.safe_load((DEMO / name).read_text()) for name in ("axis.yaml", "truth.yaml"))
     ratio = float(rng.integers(60, 321)) / 2.0

@@ -1,4 +1,4 @@
-"""Write docs/causes.md from the descriptions in the catalogue; `--check` only compares.
+"""Writes docs/causes.md from the descriptions in the catalogue; `--check` only compares.
 
 python tools/catalogue_docs.py
 """
@@ -62,7 +62,7 @@ ahead of motor angle / N, in arcsec at the load.
 
 
 def page() -> str:
-    """The whole page."""
+    """Returns the whole page."""
     sections = (line for kind in CATALOGUE.values() for line in _section(kind))
     return "\n".join([_INTRODUCTION, *_overview(), *sections])
 
@@ -166,7 +166,7 @@ def _cell(text: str) -> str:
 
 
 def main(arguments: list[str]) -> int:
-    """Write the page, or with `--check` say whether it is up to date."""
+    """Writes the page, or with `--check` reports if it is up to date."""
     text = page()
     if "--check" in arguments:
         same = PAGE.exists() and PAGE.read_text(encoding="utf-8") == text

@@ -1,4 +1,4 @@
-"""Write docs/commands.md from the command line itself; `--check` only compares.
+"""Writes docs/commands.md from the command line itself; `--check` only compares.
 
 python tools/command_reference.py
 """
@@ -64,12 +64,12 @@ _VALUES = {int: "INTEGER", float: "NUMBER", str: "TEXT", Path: "FILE"}
 
 @dataclass(frozen=True)
 class Parameter:
-    """An argument or option of a command."""
+    """Argument or option of a command."""
 
     names: tuple[str, ...]
-    """Of an option: its names with dashes; of an argument: what stands for it."""
+    """Names of an option with dashes; placeholder of an argument."""
     value: str
-    """What stands for its value; empty for a switch."""
+    """Placeholder of its value; empty for a switch."""
     help: str
     default: str
     is_option: bool
@@ -79,7 +79,7 @@ class Parameter:
 
 @dataclass(frozen=True)
 class Command:
-    """A command as a person types it."""
+    """Command as typed by a user."""
 
     name: str
     text: str
@@ -87,7 +87,7 @@ class Command:
 
     @property
     def usage(self) -> str:
-        """The line that begins its section."""
+        """First line of its section."""
         words = ["hdbridge", self.name]
         for each in self.parameters:
             if not each.is_option:
@@ -97,7 +97,7 @@ class Command:
 
 
 def commands() -> Iterator[Command]:
-    """All commands, those of groups with the group's name before them, in the order of the overview."""
+    """Yields all commands in the order of the overview, with a group's name before those of the group."""
     for panel in PANELS.values():
         for name in panel:
             loaded = load(name)
@@ -110,7 +110,7 @@ def commands() -> Iterator[Command]:
 
 
 def page() -> str:
-    """The whole page."""
+    """Returns the whole page."""
     known = list(commands())
     parts = [_INTRODUCTION]
     for panel, names in PANELS.items():
@@ -137,7 +137,7 @@ def _command(prefix: str, registered: Any) -> Command:
         _parameter(name, hints[name], each.default)
         for name, each in inspect.signature(function).parameters.items()
     )
-    # Arguments first, as they are typed.
+    # Arguments come first, as typed.
     ordered = sorted(parameters, key=lambda each: each.is_option)
     text = inspect.cleandoc(function.__doc__ or "")
     return Command(prefix + (registered.name or function.__name__), text, tuple(ordered))
@@ -152,7 +152,7 @@ def _parameter(name: str, hint: Any, default: Any) -> Parameter:
         label = (info.metavar or name.upper()).removesuffix("...")
         return Parameter((label,), "", info.help or "", shown, False, required, many)
     assert isinstance(info, OptionInfo)
-    # In an Annotated hint the first name stands where else a default would.
+    # An Annotated hint has the first name in the place of a default.
     declared = (*((info.default,) if isinstance(info.default, str) else ()), *(info.param_decls or ()))
     names = tuple(part for each in declared for part in each.split("/"))
     if not names:
@@ -166,7 +166,7 @@ def _parameter(name: str, hint: Any, default: Any) -> Parameter:
 
 
 def _plain(kind: Any) -> tuple[Any, bool]:
-    """The type without "or nothing" and without "a list of"; whether it may stand several times."""
+    """Returns the type without None and without the list around it, and whether it may be repeated."""
     if isinstance(kind, UnionType) or typing.get_origin(kind) is typing.Union:
         (kind,) = (each for each in typing.get_args(kind) if each is not NoneType)
     if typing.get_origin(kind) is list:
@@ -194,9 +194,9 @@ def _text(default: Any) -> str:
 
 
 def refused(line: str) -> str | None:
-    """Why a command line as docs print it is not one of hdbridge; None if it is.
+    """Returns the reason why a command line in the docs is not valid; None if it is.
 
-    Values may be placeholders; of an option only whether it exists and takes a value is looked at.
+    Values may be placeholders; options are checked only for existence and for taking a value.
     """
     words = shlex.split(re.sub(r"\s+(#|>|&|\|).*$", "", line.strip()))[1:]
     known = {each.name: each for each in commands()}
@@ -227,7 +227,7 @@ def refused(line: str) -> str | None:
 
 
 def main(arguments: list[str]) -> int:
-    """Rewrite, or check with ``--check``."""
+    """Rewrites the page, or compares it with ``--check``."""
     new = page()
     if "--check" in arguments:
         same = PAGE.exists() and PAGE.read_text(encoding="utf-8") == new

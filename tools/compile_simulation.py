@@ -1,4 +1,4 @@
-"""Compile the simulated axis's loops once and keep them on disk, for tests of several processes."""
+"""Compiles the loops of the simulated axis once and keeps them on disk, for tests in several processes."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ SUBSTEPS = 8
 
 
 def compile_all() -> None:
-    """Each method of the loops, for the plant with a bare load and the one with more on it."""
+    """Compiles each method of the loops, for both kinds of plant."""
     fast.waiting.left = 0
     for loaded in (False, True):
         machine = Machine(Truth.load(bundled_profile("article")), 0, may_compile=True, loaded=loaded)

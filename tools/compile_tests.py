@@ -1,9 +1,9 @@
-"""Rewrite the assertions of all tests once, and keep them: else each worker of pytest-xdist rewrites all.
+"""Rewrites the assertions of all tests once and caches them; otherwise each worker of pytest-xdist does.
 
     python tools/compile_tests.py [FOLDER]
 
-What pytest does when it imports a test, without importing it. It has no interface for that: where another
-version of it does not have these parts, nothing is done here, and the workers do it.
+It does what pytest does when it imports a test, without importing it. Pytest has no interface for that; if
+another version lacks these parts, nothing is done here, and the workers rewrite the tests.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ TESTS = Path(__file__).resolve().parents[1] / "tests"
 
 
 def main(tests: Path) -> None:
-    """Write what pytest would write into the folders ``__pycache__``."""
+    """Writes the files that pytest would write into the folders ``__pycache__``."""
     config = get_config()
     config.parse(["--disable-plugin-autoload"])
     for path in sorted((*tests.rglob("test_*.py"), *tests.rglob("conftest.py"))):

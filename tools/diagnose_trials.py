@@ -1,8 +1,8 @@
 """Blind trials of the diagnosis on records from formulas: `python tools/diagnose_trials.py [seeds]
 [only,these]`.
 
-The plant (tests/support/plant.py) shares no code with the effects. Each line is one record; the table at
-the end gives right names, wrong names apart from abstentions, and the time that a diagnosis takes.
+The plant (tests/support/plant.py) shares no code with the effects. Each line is one record. The table at the
+end gives right names, wrong names, abstentions, and the time per diagnosis.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from hdbridge.analysis.diagnosis import diagnose
 
 
 def trial(name: str, seed: int) -> tuple[set[str], list[dict[str, object]], float, dict[str, object]]:
-    """What is there, what was found, the time it took, the whole result."""
+    """Returns the true causes, the reported ones, the time taken, and the whole result."""
     there, record, model = planted(name, seed)
     begin = time.process_time()
     result = diagnose(record, model).as_dict()

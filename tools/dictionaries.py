@@ -1,9 +1,9 @@
-"""The tables of docs/drives.md: answers of `hdbridge check` to the dictionaries (EDS, DCF) of a folder.
+"""Prints the tables of docs/drives.md: answers of `hdbridge check` to a folder of dictionaries (EDS, DCF).
 
     python tools/dictionaries.py FOLDER
 
-The folder holds OWNER/REPOSITORY/PATH for each file, so that a row gives its public source. Each file gets a
-profile as a user would make it: `hdbridge new --from article`, the file beside the axis file, and the keys
+The folder holds OWNER/REPOSITORY/PATH for each file, so that a row states its public source. Each file gets a
+profile as a user would make it: `hdbridge new --from article`, the file next to the axis file, and the keys
 `drive.eds`, `drive.mode` and `load_encoder.source` edited. The load encoder is 60E4h:01 if the dictionary has
 it, else a node of its own. The other values are the article's.
 """
@@ -25,7 +25,7 @@ from typing import Any
 from hdbridge.files.edsfile import decode
 
 OWN = "{index: 0x60E4, subindex: 1, type: int32, via: tpdo}"
-"""The load encoder of the article."""
+"""Load encoder of the article."""
 NODE = "{index: 0x6004, subindex: 0, type: uint32, node: 2}"
 MODES = ("csp", "ip")
 LEFT = re.compile(r"(\w{4}h:\w\w), (.*?): (.*?)(?: \([^()]*: [\w.]+\))?")
@@ -36,23 +36,23 @@ STOPPED_BY = {
     (True, False): "event timer",
     (True, True): "**nothing**",
 }
-"""By whether 1016h:01 and 1400h:05 are left to the drive."""
+"""Consequences, by whether 1016h:01 and 1400h:05 are left to the drive."""
 
 
 @dataclass
 class Checked:
-    """One dictionary and the answers of `hdbridge check`."""
+    """Dictionary with the answers of `hdbridge check`."""
 
     source: Path
     text: str
     verdicts: dict[str, str] = field(default_factory=dict)
     load_encoder: str = ""
     left: dict[str, dict[str, tuple[str, str]]] = field(default_factory=dict)
-    """By mode: object, why it is left to the drive, and what follows."""
+    """Objects left to the drive, with reason and consequence, by mode."""
     remarks: list[str] = field(default_factory=list)
 
     def key(self, section: str, key: str) -> str:
-        """A value of the file, empty if it has none."""
+        """Returns a value of the file, empty if it has none."""
         found = re.search(
             rf"^\[{section}\]\s*$(?:(?!^\[).)*?^{key}[ \t]*=([^\r\n]*)",
             self.text,
@@ -62,7 +62,7 @@ class Checked:
 
 
 def main() -> None:
-    """Print the tables of the folder named on the command line."""
+    """Prints the tables of the folder named on the command line."""
     if len(sys.argv) != 2 or not Path(sys.argv[1]).is_dir():
         sys.exit("expected one argument: a folder with EDS and DCF files in OWNER/REPOSITORY/PATH")
     folder = Path(sys.argv[1])
@@ -79,7 +79,7 @@ def main() -> None:
 
 
 def check(folder: Path, file: Path, article: Path) -> Checked:
-    """Check one dictionary in each mode, in a copy of the article's profile."""
+    """Checks one dictionary in each mode, in a copy of the article's profile."""
     found = Checked(file.relative_to(folder), decode(file.read_bytes()))
     with tempfile.TemporaryDirectory() as scratch:
         profile = Path(shutil.copytree(article, Path(scratch) / "axis"))
@@ -102,20 +102,20 @@ def check(folder: Path, file: Path, article: Path) -> Checked:
 
 
 def hdbridge(*arguments: str) -> subprocess.CompletedProcess[str]:
-    """Run the command line of this checkout."""
+    """Runs the command line of this checkout."""
     command = [sys.executable, "-m", "hdbridge", *arguments]
     return subprocess.run(command, capture_output=True, text=True, check=False)
 
 
 def brief(complaint: str, file: str) -> str:
-    """A complaint without the key of the axis file and the advice."""
+    """Returns an error message without the key of the axis file and the advice."""
     text = re.sub(r"^[\w.]+: ", "", complaint.partition(";")[0])
     text = text.replace(f" among the modes of {file}", " among its modes").replace(file, "it")
     return text.replace(", which hdbridge cannot do without", "")
 
 
 def add(found: Checked, mode: str, answer: dict[str, Any]) -> None:
-    """Take over what `check` lists of a dictionary that is all right."""
+    """Adds the report of `check` on a valid dictionary."""
     left: dict[str, tuple[str, str]] = {}
     for line in answer["left to the drive"]:
         match = LEFT.fullmatch(line)
@@ -131,20 +131,20 @@ def add(found: Checked, mode: str, answer: dict[str, Any]) -> None:
 
 
 def short(reason: str, file: str) -> str:
-    """Why an object is left to the drive, in few words; empty if the dictionary lacks it."""
+    """Returns a short reason why an object is left to the drive; empty if the dictionary lacks it."""
     if reason == f"which {file} lacks":
         return ""
     return re.sub(rf"^(which is|which|for which) | (in|of) {re.escape(file)}.*?(?= can carry|$)", "", reason)
 
 
 def name(found: Checked) -> str:
-    """Vendor and product as the file gives them."""
+    """Returns vendor and product as stated in the file."""
     names = (found.key("DeviceInfo", "VendorName"), found.key("DeviceInfo", "ProductName"))
     return ", ".join(filter(None, names)) or "(not given)"
 
 
 def print_drives(checked: list[Checked]) -> None:
-    """One row for each dictionary."""
+    """Prints one row for each dictionary."""
     print(
         "| vendor, product | file (revision, date): source | csp | ip | load encoder | "
         "master dies: stopped by | left to the drive |"
@@ -169,7 +169,7 @@ def print_drives(checked: list[Checked]) -> None:
 
 
 def objects(found: Checked) -> str:
-    """The objects that are left to the drive, in all modes that work."""
+    """Returns the objects that are left to the drive, in all modes that work."""
     texts = []
     every: dict[str, str] = {}
     for mode, left in found.left.items():
@@ -183,7 +183,7 @@ def objects(found: Checked) -> str:
 
 
 def print_left(checked: list[Checked]) -> None:
-    """What follows from each object that a drive keeps, and how many dictionaries it concerns."""
+    """Prints the consequence of each object left to the drive, and the number of dictionaries concerned."""
     usable = [each for each in checked if each.left]
     rows = {
         row

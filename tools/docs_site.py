@@ -1,7 +1,7 @@
-"""What the site of `make docs` has beyond the pages in docs/: MkDocs calls these functions (mkdocs.yml).
+"""Hooks of the `make docs` site, called by MkDocs (mkdocs.yml): pages in addition to those in docs/.
 
-The API reference is made from the docstrings of what `import hdbridge` gives. CONTRIBUTING.md and
-CHANGELOG.md stand at the top of the project, where one looks for them; the site takes them in.
+The API reference is made from the docstrings of the public names of `import hdbridge`. CONTRIBUTING.md and
+CHANGELOG.md are at the top of the project, where readers look for them; the site includes them.
 """
 
 from pathlib import Path
@@ -20,7 +20,7 @@ together, with examples: [library](api.md).
 
 
 def reference() -> str:
-    """The page of the API: every public name, the errors last."""
+    """Returns the page of the API: every public name, the errors last."""
     public = {name: getattr(hdbridge, name) for name in getattr(hdbridge, "__all__", ())}
     errors = {name for name, each in public.items() if isinstance(each, type) and issubclass(each, Exception)}
     groups: tuple[tuple[str, list[str]], ...] = (
@@ -37,7 +37,7 @@ def reference() -> str:
 
 
 def generated() -> dict[str, str]:
-    """Pages by their path in the site, as Markdown."""
+    """Returns the generated pages as Markdown, by their path in the site."""
     pages = {
         page: (ROOT / source).read_text(encoding="utf-8").replace("](docs/", "](")
         for page, source in FROM_THE_TOP.items()
@@ -46,7 +46,7 @@ def generated() -> dict[str, str]:
 
 
 def on_files(files: Any, config: Any) -> Any:
-    """Add the generated pages."""
+    """Adds the generated pages."""
     from mkdocs.structure.files import File  # noqa: PLC0415  the tests of this file need no MkDocs
 
     for path, text in generated().items():
@@ -55,17 +55,17 @@ def on_files(files: Any, config: Any) -> Any:
 
 
 def on_page_markdown(markdown: str, **_: Any) -> str:
-    """Links to the top of the project lead to where the site has those pages."""
+    """Redirects links to files at the top of the project to their pages in the site."""
     for page, source in FROM_THE_TOP.items():
         markdown = markdown.replace(f"](../{source})", f"]({page})")
     return markdown
 
 
 def on_post_template(output_content: str, **_: Any) -> str:
-    """The same for what is no page of docs/ (404.html)."""
+    """Applies `on_post_page` to pages outside docs/ (404.html)."""
     return on_post_page(output_content)
 
 
 def on_post_page(output: str, **_: Any) -> str:
-    """The one script that the theme would fetch, which lets the search run from files, is with the site."""
+    """Redirects the theme's only external script, which makes the search work from files, to a local copy."""
     return output.replace("https://unpkg.com/iframe-worker/shim", "assets/iframe-worker.js")

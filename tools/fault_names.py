@@ -1,4 +1,4 @@
-"""Write the table of faults in docs/ci.md from the table of `hdbridge.testing`.
+"""Writes the table of faults in docs/ci.md from the table of `hdbridge.testing`.
 
 python tools/fault_names.py
 """
@@ -15,7 +15,7 @@ _BLOCK = re.compile(r"(<!-- faults: .*? -->\n).*?(<!-- end -->)", re.DOTALL)
 
 
 def table() -> str:
-    """The rows."""
+    """Returns the rows."""
     rows = [
         f"| `{name}` | {f'`{arguments}`' if arguments else ''} | {what} |"
         for name, arguments, what in sentences()
@@ -24,7 +24,7 @@ def table() -> str:
 
 
 def page() -> str:
-    """The page as it should be."""
+    """Returns the up-to-date page."""
     return _BLOCK.sub(
         lambda found: f"{found[1]}\n{table()}\n{found[2]}", PAGE.read_text(encoding="utf-8"), count=1
     )

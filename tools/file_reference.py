@@ -1,8 +1,8 @@
 """Writes the tables of docs/files.md and of plans (docs/calibration.md) from the models that read the files,
-that of faults (docs/daemon.md) from the table that judges them, that of docs/twin.md from the translation.
+that of faults (docs/daemon.md) from the fault table, and that of docs/twin.md from the translation.
 
 python tools/file_reference.py           rewrite the tables
-python tools/file_reference.py --check   say whether they are up to date (exit status 1 if not)
+python tools/file_reference.py --check   report if they are up to date (exit status 1 if not)
 """
 
 from __future__ import annotations
@@ -65,14 +65,14 @@ ENTRIES: tuple[type[BaseModel], ...] = (
 
 
 def key_table(model: type[BaseModel]) -> str:
-    """Every key of a file with what it expects, its default and its meaning."""
+    """Returns every key of a file with its expected values, default and meaning."""
     lines = ["| key | expected | default | meaning |", "|---|---|---|---|"]
     lines += (f"| `{key}` | {what} | {default} | {about} |" for key, what, default, about in _rows(model))
     return "\n".join(lines) + "\n"
 
 
 def column_table() -> str:
-    """The columns of a record."""
+    """Returns the columns of a record."""
     lines = ["| column | required | meaning |", "|---|---|---|"]
     for columns, needed in ((REQUIRED, "yes"), (OPTIONAL, "no")):
         lines += (f"| `{name}` | {needed} | {about} |" for name, about in columns.items())
@@ -80,7 +80,7 @@ def column_table() -> str:
 
 
 def procedure_table() -> str:
-    """What a plan may ask for: the keys of each procedure."""
+    """Returns the procedures of a plan, with the keys of each."""
     lines = ["| procedure | key | expected | default | meaning |", "|---|---|---|---|---|"]
     for entry in ENTRIES:
         _, *keys = _rows(entry)
@@ -93,7 +93,7 @@ def procedure_table() -> str:
 
 
 def fault_table() -> str:
-    """What each fault leads to, and what a person does about it."""
+    """Returns the reactions to each fault, and the advice."""
     lines = ["| fault | at once | again in the next cycles | what to do |", "|---|---|---|---|"]
     for row in TABLE:
         later = REACTION_WORDS[row.then] if row.then is not row.first else ""
@@ -102,7 +102,7 @@ def fault_table() -> str:
 
 
 def translation_table() -> str:
-    """Where each effect of the catalogue goes in a truth file."""
+    """Returns the place of each effect of the catalogue in a truth file."""
     lines = ["| effect | | place in the truth file |", "|---|---|---|"]
     for name, effect in CATALOGUE.items():
         places = re.sub(r"[a-z_]+\.[a-z0-9_.]+", lambda place: f"`{place[0]}`", TRANSLATED[name].counterpart)
@@ -126,7 +126,7 @@ BLOCKS: Mapping[str, Any] = {
 
 
 def updated(page: str) -> str:
-    """The page with its tables as they must be."""
+    """Returns the page with up-to-date tables."""
     return _BLOCK.sub(lambda match: match[1] + BLOCKS[match["name"]]() + match[3], page)
 
 
@@ -143,7 +143,7 @@ def _rows(model: type[BaseModel], prefix: str = "") -> Iterator[tuple[str, str, 
 
 
 def _inner(place: Field) -> tuple[type[BaseModel] | None, bool]:
-    """The model of a nested mapping, or of the items of a list."""
+    """Returns the model of a nested mapping, or of the items of a list, and whether it is a list."""
     for member in place.types():
         if isinstance(member, type) and issubclass(member, BaseModel):
             return member, False
@@ -171,7 +171,7 @@ def _default(key: str, info: FieldInfo) -> str:
 
 
 def main(arguments: list[str]) -> int:
-    """Rewrite, or check with ``--check``."""
+    """Rewrites the tables, or compares them with ``--check``."""
     behind = []
     for path in PAGES:
         page = path.read_text(encoding="utf-8")

@@ -1,12 +1,11 @@
-"""Fit the formula of the probabilities: `python tools/fit_probabilities.py [--suite FOLDER]... [--trials N]
+"""Fits the formula of the probabilities: `python tools/fit_probabilities.py [--suite FOLDER]... [--trials N]
 [--keep TABLE.json]`.
 
 Diagnoses records whose causes are known: blind suites (tools/blind/generate.py) and short records from the
 formulas of tests/support/plant.py, N seeds of each cause. Each finding gives the terms of the formula
 (hdbridge/analysis/probability.py) and whether the name was right. A logistic formula with a ridge is fitted,
-every term with the sign that it must have; how well it fares is told by cross-validation that leaves whole
-records out. The table that is kept is read again where it is there. Prints the coefficients for
-`Scales`.
+every term with its required sign, and tested by cross-validation that leaves whole records out. An existing
+table of `--keep` is read instead of made again. Prints the coefficients for `Scales`.
 """
 
 from __future__ import annotations
@@ -39,7 +38,7 @@ FOLDS = 10
 FREE = frozenset({"constant"})
 AGAINST = frozenset({"excess", "unexplained"})
 PRIOR = {"unexplained": -1.0}
-"""What the ridge draws to where these records say little; else to nought."""
+"""Coefficients that the ridge draws towards where these records say little; 0 for all others."""
 BINS = (0.0, 0.5, 0.7, 0.8, 0.9, 0.95, 0.99, 1.01)
 Row = dict[str, Any]
 
@@ -47,7 +46,7 @@ Row = dict[str, Any]
 def judged(
     source: str, name: str, result: Diagnosis, there: set[str], also: set[str], loop: bool
 ) -> Iterator[Row]:
-    """One row for each name; what is there besides (``also``) is neither right nor wrong."""
+    """Yields one row for each reported cause; those in ``also`` count neither right nor wrong."""
     met: set[str] = set()
     for each in result.findings:
         names = {each.cause, *each.aliases}
@@ -63,7 +62,7 @@ def judged(
 
 
 def from_suite(folder: Path) -> Iterator[Row]:
-    """The findings in the cases of a blind suite."""
+    """Yields the findings in the cases of a blind suite."""
     for case in sorted(each.parent for each in folder.glob("[!.]*/sealed.json")):
         hidden = unsealed(case)
         recording = Recording.load(*record_of(case))
@@ -75,7 +74,7 @@ def from_suite(folder: Path) -> Iterator[Row]:
 
 
 def from_trials(seeds: int) -> Iterator[Row]:
-    """The findings in short records from formulas."""
+    """Yields the findings in short records from formulas."""
     for seed in range(seeds):
         for name in (*CAUSES, *SPECIAL, *NONE, *UNKNOWN, *PAIRS):
             there, record, model = planted(name, seed + 100, SHORT)
@@ -85,7 +84,7 @@ def from_trials(seeds: int) -> Iterator[Row]:
 
 
 def fitted(terms: np.ndarray, right: np.ndarray, names: list[str]) -> np.ndarray:
-    """Coefficients of the logistic formula, shape (terms,)."""
+    """Returns the coefficients of the logistic formula, shape (terms,)."""
     bounds = [
         (None, None) if each in FREE else ((None, 0) if each in AGAINST else (0, None)) for each in names
     ]
@@ -107,7 +106,7 @@ def probabilities(terms: np.ndarray, values: np.ndarray) -> np.ndarray:
 
 
 def reliability(title: str, given: np.ndarray, right: np.ndarray) -> None:
-    """The share of right names by the probability that was given, and the Brier score."""
+    """Prints the share of right names by predicted probability, and the Brier score."""
     print(
         f"{title}: {len(right)} names, {int(np.sum(right))} right; Brier {np.mean((given - right) ** 2):.4f}"
     )

@@ -1,11 +1,11 @@
-"""How true the identification's intervals are, and how near its parameters, over many random axes.
+"""Coverage of the identification's intervals and accuracy of its parameters, over many random axes.
 
     .venv/bin/python tools/identify_coverage.py --axes 100
 
 Each axis is drawn at random (ratio 30-160, offset 15-80 arcsec, width 5-40 deg, exponent 1.2-2.8, noise 0.5-3
-arcsec, other encoders), moved through a bench plan and identified from the record alone. Printed: coverage of
-the 95 % intervals, share within the tolerances (amplitudes 0.15 arcsec or 2 %, offset 1 %, width 4 %,
-exponent 0.04) and within tolerance or interval, orders invented and missed.
+arcsec, other encoders), moved through a bench plan and identified from the record alone. Prints the coverage
+of the 95 % intervals, the share within the tolerances (amplitudes 0.15 arcsec or 2 %, offset 1 %, width 4 %,
+exponent 0.04) and within tolerance or interval, and the false and missed orders.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
-"""Records of made-up axes for measuring the identification: from the formulas, not from hdbridge's models.
+"""Records of synthetic axes for measuring the identification, from formulas, not from hdbridge's models.
 
 An axis is drawn at random (`draw`), moved through a bench plan and read through quantised encoders
-(`record`). It has what the identification does not model as such: a motor that lags behind its command
-and stops short within a count, a slow wander, a load encoder read a little later.
+(`record`). It also has properties that the identification does not model: a motor that lags its command and
+stops short within a count, a slow drift, a load encoder that is read a little later.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class Truth:
 
 
 def draw(rng: np.random.Generator) -> Truth:
-    """A random axis in the ranges that a calibration has to master."""
+    """Draws a random axis in the ranges that a calibration must handle."""
     numbers = rng.choice(np.arange(1, 13), size=rng.integers(3, 8), replace=False)
     return Truth(
         ratio=float(rng.integers(30, 161)),
@@ -56,7 +56,7 @@ def draw(rng: np.random.Generator) -> Truth:
 
 
 def branch(xi: np.ndarray, n: float) -> np.ndarray:
-    """g of the rolling-friction law."""
+    """Returns g of the rolling-friction law."""
     xi = np.clip(xi, 0.0, 1.0)
     if abs(n - 2.0) < 1e-9:
         return np.where(xi > 0, xi * (1.0 - np.log(np.maximum(xi, 1e-300))), 0.0)
@@ -64,7 +64,7 @@ def branch(xi: np.ndarray, n: float) -> np.ndarray:
 
 
 def hysteresis(motor_deg: np.ndarray, offset: float, width: float, n: float, state: float) -> np.ndarray:
-    """Branch after branch; starts saturated in the sense of ``state``."""
+    """Returns the hysteresis error along a path, from saturation in the direction ``state``."""
     out = np.empty(len(motor_deg))
     out[0] = value = state * offset
     steps = np.diff(motor_deg)
@@ -85,7 +85,7 @@ def hysteresis(motor_deg: np.ndarray, offset: float, width: float, n: float, sta
 
 
 def ramp(begin: float, end: float, speed: float, acceleration: float = 100.0) -> np.ndarray:
-    """Trapezoidal move at `RATE_HZ`, without its first point."""
+    """Returns a trapezoidal move at `RATE_HZ`, without its first point."""
     way = abs(end - begin)
     speed = min(speed, np.sqrt(way * acceleration))
     rise = speed / acceleration
@@ -103,10 +103,10 @@ def ramp(begin: float, end: float, speed: float, acceleration: float = 100.0) ->
 def plan(
     ratio: float, turns: float = 2.0, speed: float = 4.0, steps: int = 60, periods: int = 2
 ) -> list[tuple[str, np.ndarray]]:
-    """Legs of load targets: pre-conditioning, rest, sweeps, sines, nested reversals, steps."""
+    """Returns legs of load targets: pre-conditioning, rest, sweeps, sines, nested reversals, steps."""
     legs: list[tuple[str, np.ndarray]] = []
     at = 0.0
-    speed *= 1.00713  # or it may keep step with the encoder's counts
+    speed *= 1.00713  # avoids synchronism with the encoder's counts
 
     def go(kind: str, end: float, velocity: float) -> None:
         nonlocal at
@@ -143,7 +143,7 @@ def plan(
 def record(
     truth: Truth, rng: np.random.Generator, legs: list[tuple[str, np.ndarray]], every: int = 1
 ) -> list[dict[str, np.ndarray | str]]:
-    """Read the legs through the axis; each a dict of kind, time_s, target_deg, position_deg, load_deg."""
+    """Records the legs; each is a dict of kind, time_s, target_deg, position_deg, load_deg."""
     load_target = np.concatenate([each for _, each in legs])
     count = 360.0 / truth.motor_counts
     target = np.round(load_target * truth.ratio / count) * count
@@ -152,7 +152,7 @@ def record(
     at = 0
     for _, leg in legs:
         part = slice(at, at + len(leg))
-        demand = target[part]  # a drive is told whole counts
+        demand = target[part]  # a drive receives whole counts
         # First-order lag behind the command.
         response = np.empty(len(demand))
         for index, wanted in enumerate(demand.tolist()):
@@ -195,7 +195,7 @@ def record(
 
 
 def recording(rows: list[dict[str, np.ndarray | str]]) -> Recording:
-    """The legs of `record` as the bench would have recorded them."""
+    """Returns the legs of `record` as a recording of the bench."""
     names = {
         "time_s": "time_s",
         "motor_target_deg": "target_deg",
@@ -211,7 +211,7 @@ def recording(rows: list[dict[str, np.ndarray | str]]) -> Recording:
 def _stopping_short(
     motor: np.ndarray, load_target: np.ndarray, count: float, rng: np.random.Generator
 ) -> np.ndarray:
-    """At each rest the motor stays up to half a count short of where it should be, where it came from."""
+    """Leaves the motor up to half a count short of its target at each rest, on the side that it came from."""
     result = motor.copy()
     moving = np.diff(load_target, prepend=load_target[0]) != 0
     edges = np.flatnonzero(np.diff(np.concatenate([[False], ~moving, [False]]).astype(np.int8)))

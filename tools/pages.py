@@ -42,11 +42,11 @@ SERVERS = {
     "hdbridge simulate ": "Ctrl-C ends it",
     "hdbridge ctl watch": "",
 }
-"""Commands that run until Ctrl-C, each with what it prints when it is ready."""
+"""Commands that run until Ctrl-C, with the output of each when it is ready."""
 LONGEST_S = 900.0
-"""A command that takes longer is stopped and reported."""
+"""Time after which a command is stopped and reported."""
 ABSOLUTE = 0.3
-"""Arcsec by which a figure may differ: ten times the scatter of a 3 sigma of 240 steps at the floor."""
+"""Tolerance of a figure, arcsec: ten times the scatter of a 3 sigma of 240 steps at the best possible."""
 RELATIVE = 0.02
 NUMBER = re.compile(r"[-+]?\d+(?:\.\d+)?")
 DATE = re.compile(r"\d{8}T\d{6}Z|\d{8}-\d{6}|\d{4}-\d\d-\d\d[T ]\d\d:\d\d:\d\dZ?")
@@ -62,20 +62,20 @@ NOTE = re.compile(
 
 @dataclass(frozen=True, slots=True)
 class Command:
-    """A command of a page, with the lines that the page shows of its output."""
+    """Command of a page, with the lines of its output that the page shows."""
 
     line: int
     shell: str
     shown: tuple[str, ...] = ()
     at: tuple[int, ...] = ()
-    """Numbers of the shown lines in the page."""
+    """Line numbers of the shown lines in the page."""
     status: int | None = 0
     exact: bool = True
 
 
 @dataclass(slots=True)
 class Page:
-    """The commands of a page in order, and the blocks that are not run, each with the reason."""
+    """Commands of a page in order, and the blocks that are not run, each with the reason."""
 
     commands: list[Command] = field(default_factory=list)
     left_out: list[tuple[int, str]] = field(default_factory=list)
@@ -122,7 +122,7 @@ def _number(text: str, at: int) -> int:
 
 
 def _joined(number: int, lines: Sequence[str]) -> Iterator[tuple[int, str]]:
-    """Each command with the number of its first line; a backslash and a here-document continue it."""
+    """Yields each command with the number of its first line; backslashes and here-documents continue it."""
     first, held, until = number, "", None
     for line in lines:
         held = f"{held}\n{line}" if held else line
@@ -138,7 +138,7 @@ def _joined(number: int, lines: Sequence[str]) -> Iterator[tuple[int, str]]:
 
 
 def _session(number: int, lines: Sequence[str], exact: bool) -> list[Command]:
-    """The commands of a console block with the output of each."""
+    """Returns the commands of a console block with the output of each."""
     starts = [at for at, line in enumerate(lines) if line.startswith("$ ")]
     commands = []
     for start, end in zip(starts, [*starts[1:], len(lines)], strict=True):
@@ -161,7 +161,7 @@ def _session(number: int, lines: Sequence[str], exact: bool) -> list[Command]:
 
 
 class Shell:
-    """A bash session in a folder: variables, folders and background jobs stay from command to command."""
+    """Bash session in a folder; variables, working folder and background jobs persist between commands."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -247,12 +247,12 @@ class Shell:
 
 
 def words(line: str) -> str:
-    """A line without what may differ from run to run: figures, dates, widths of tables."""
+    """Returns a line without the parts that vary from run to run: figures, dates, widths of tables."""
     return re.sub(r"[\s━─]+", " ", NUMBER.sub("#", DATE.sub("@", line))).strip()
 
 
 def compared(command: Command, printed: str) -> tuple[list[str], dict[int, str]]:
-    """What the page shows that was not printed, and the printed line for each shown one."""
+    """Returns the shown lines that were not printed, and the printed line for each shown one."""
     lines = [line.rstrip() for line in printed.splitlines() if line.strip()]
     wrong: list[str] = []
     found: dict[int, str] = {}
@@ -274,7 +274,7 @@ def compared(command: Command, printed: str) -> tuple[list[str], dict[int, str]]
 
 
 def differing(shown: str, printed: str) -> list[str]:
-    """The figures of a line that differ beyond the tolerance."""
+    """Returns the figures of a line that differ by more than the tolerance."""
     pairs = zip(NUMBER.findall(DATE.sub("", shown)), NUMBER.findall(DATE.sub("", printed)), strict=True)
     return [
         f"{a} and {b}"
@@ -284,7 +284,7 @@ def differing(shown: str, printed: str) -> list[str]:
 
 
 def run(path: Path, folder: Path) -> tuple[list[str], dict[int, str]]:
-    """Runs a page in a folder. Returns what is not as the page says, and the printed lines by line number."""
+    """Runs a page in a folder. Returns the deviations from the page, and the printed lines by line number."""
     wrong: list[str] = []
     found: dict[int, str] = {}
     shutil.copytree(ROOT / "profiles", folder / "profiles")
@@ -310,7 +310,7 @@ def run(path: Path, folder: Path) -> tuple[list[str], dict[int, str]]:
 
 
 def rewritten(text: str, found: dict[int, str]) -> str:
-    """The page with the printed lines in place of the shown ones; dates stay."""
+    """Returns the page with the printed lines in place of the shown ones; dates stay."""
     lines = text.split("\n")
     for number, printed in found.items():
         old = lines[number - 1]
@@ -322,7 +322,7 @@ def rewritten(text: str, found: dict[int, str]) -> str:
 
 
 def main() -> int:
-    """Runs pages; 1 if a page is not as it says."""
+    """Runs pages; returns 1 if a page differs from its output."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

@@ -1,4 +1,4 @@
-"""Measure the simulated axis by itself: what docs/truth-file.md says of its accuracy and its cost.
+"""Measures accuracy and cost of the simulated axis alone, for docs/truth-file.md.
 
 .venv/bin/python tools/plant_figures.py [--steps 240]
 """
@@ -23,7 +23,7 @@ DEG_PER_COUNT = 360.0 / 8000.0
 
 
 def trajectory() -> list[int]:
-    """One step of 43.56 motor degrees in whole counts per cycle, within the limits of the axis files."""
+    """Returns a step of 43.56 motor degrees, in counts per cycle, within the limits of the axis files."""
     otg = ruckig.Ruckig(1, CYCLE_S)
     way, out = ruckig.InputParameter(1), ruckig.OutputParameter(1)
     way.current_position = way.current_velocity = way.current_acceleration = [0.0]
@@ -40,7 +40,7 @@ def trajectory() -> list[int]:
 
 
 def static_arcsec(truth: Truth, motor_deg: float, direction: int) -> float:
-    """Tooth error and saturated hysteresis, the limit of infinitely slow motion."""
+    """Returns tooth error plus saturated hysteresis, the limit of infinitely slow motion."""
     assert isinstance(truth.gear.hysteresis, RollingFriction)
     tooth = (
         each.amplitude_arcsec * math.cos(math.radians(each.order * motor_deg + each.phase_deg))
@@ -50,7 +50,7 @@ def static_arcsec(truth: Truth, motor_deg: float, direction: int) -> float:
 
 
 def step_test(truth: Truth, steps: int) -> str:
-    """Step both ways, 0.3 s to settle; one line of figures."""
+    """Runs a stepping test in both directions with 0.3 s to settle; returns one line of figures."""
     machine = Machine(truth, 1)
     substeps = round(CYCLE_S / machine.dt_s)
     move = trajectory()
@@ -96,7 +96,7 @@ def step_test(truth: Truth, steps: int) -> str:
 
 
 def main() -> None:
-    """Print the table of the documentation."""
+    """Prints the table of the documentation."""
     parser = argparse.ArgumentParser(description=main.__doc__)
     parser.add_argument("--steps", type=int, default=240, help="steps each way")
     steps = parser.parse_args().steps

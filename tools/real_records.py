@@ -1,4 +1,4 @@
-"""The figures of docs/real-records.md, from the measured records (which are not part of the project).
+"""Prints the figures of docs/real-records.md, from measured records (which are not part of the project).
 
     HDBRIDGE_REAL_RECORDS=FOLDER python tools/real_records.py          # ten minutes of CPU
     HDBRIDGE_REAL_RECORDS=FOLDER python tools/real_records.py twins    # only those
@@ -54,11 +54,11 @@ gear: {ratio: 100}
 limits: {position_min_deg: -400, position_max_deg: 400, velocity_deg_s: 60,
          acceleration_deg_s2: 300, jerk_deg_s3: 6000, torque_percent: 300}
 """
-"""An axis file for the robot's joints: steps of the encoders as the records have them, the rest assumed."""
+"""Axis file for the robot's joints: encoder resolutions from the records, the rest assumed."""
 
 
 def main() -> None:
-    """Print them."""
+    """Prints the figures."""
     named = os.environ.get("HDBRIDGE_REAL_RECORDS")
     if named is None:
         sys.exit("HDBRIDGE_REAL_RECORDS is not set; expected the folder of the measured records")
@@ -69,7 +69,7 @@ def main() -> None:
 
 
 def _causes(folder: Path) -> None:
-    """What is said of the robot's joints, and of the damper."""
+    """Prints the diagnoses of the robot's joints and of the damper."""
     for name, joint in product(("cobot", "cobot-command"), (4, 5)):
         records = [Record.read_csv(each) for each in sorted(folder.glob(f"{name}/joint{joint}-*.csv"))]
         print(f"{name}, joint {joint}, all recordings")
@@ -88,19 +88,19 @@ def _causes(folder: Path) -> None:
 
 
 def joint_axis() -> AxisConfig:
-    """The axis that stands for either joint."""
+    """Returns the axis that represents either joint."""
     return AxisConfig.from_text(JOINT, Path("joint.yaml"))
 
 
 def joint_recordings(folder: Path, joint: int) -> list[Recording]:
-    """A joint's four recordings with their commands; the torque, told at the output, as the motor's.
+    """Returns a joint's four recordings with their commands, with the output torque as the motor's.
 
-    The robot tells the torque on the load as what the gear delivers: where a joint rests against its weight,
-    it has the sense of the motor's. Here it is what pushes the load forward.
+    The robot reports the load torque as delivered by the gear: at rest against its weight, it has the sign
+    of the motor's torque. Here it is the torque that pushes the load forward.
 
-    The joint's zero is some thirty motor turns away. Whole turns are taken off, for a replay begins at the
-    zero of the simulated drive. Its way there goes backwards, as the recordings do: so friction holds the
-    axis in the same sense before them.
+    The joint's zero is some thirty motor turns away. Whole turns are subtracted, because a replay begins at
+    the zero of the simulated drive. The replay's approach then goes backwards, as do the recordings, so
+    friction holds the axis in the same direction before them.
     """
     recordings = []
     for path in sorted(folder.glob(f"cobot-command/joint{joint}-*.csv")):
@@ -120,7 +120,7 @@ def joint_recordings(folder: Path, joint: int) -> list[Recording]:
 
 
 def twin_of_others(recordings: Sequence[Recording], out: int) -> tuple[Twin, dict[str, Comparison]]:
-    """A twin of all recordings but one, and how usual values, model and twin compare with that one."""
+    """Fits a twin to all recordings but one; compares usual values, model and twin with that one."""
     axis = joint_axis()
     others = [each for number, each in enumerate(recordings) if number != out]
     found = diagnose(others, NOTHING, independent_zeros=True)
@@ -131,13 +131,13 @@ def twin_of_others(recordings: Sequence[Recording], out: int) -> tuple[Twin, dic
 
 
 def held_against(recording: Recording, truth: Truth) -> Comparison:
-    """A recording and its replay."""
+    """Compares a recording with its replay."""
     simulated = replay_directly(recording, joint_axis(), truth)
     return compare(recording.record, simulated, (), NOTHING.ratio)
 
 
 def _twins(folder: Path) -> None:
-    """What a twin of three recordings gets right and wrong in the fourth."""
+    """Prints the errors of a twin of three recordings in the fourth."""
     for joint in (4, 5):
         recordings = joint_recordings(folder, joint)
         left: dict[tuple[str, str], list[float]] = {}
@@ -197,7 +197,7 @@ def _damper(folder: Path, name: str) -> tuple[np.ndarray, np.ndarray, np.ndarray
 
 
 def _laws(folder: Path) -> None:
-    """Both laws fitted to the sine, and what they say of the earthquake; widths in mm."""
+    """Fits both laws to the sine and predicts the earthquake; widths in mm."""
     _, angle, force = _damper(folder, "sine")
     _, other, measured = _damper(folder, "earthquake")
     bands = (CHATTER_COUNTS * reading_of(each).unaided_deg for each in (angle, other))

@@ -1,7 +1,7 @@
-"""Write docs/reliability.md: what came of every fault of the suite, wherever it is tried, as tables.
+"""Writes docs/reliability.md: results of every fault of the suite, wherever it is tried, as tables.
 
 python tools/reliability_page.py            try them (minutes; vcan by tools/socketcan.sh), write the page
-python tools/reliability_page.py --check    only say whether the page has the suite's rows
+python tools/reliability_page.py --check    only report if the page has the suite's rows
 """
 
 from __future__ import annotations
@@ -87,20 +87,20 @@ notices a fault within a cycle or two; the rest of what is allowed is the time o
 
 
 def rows() -> list[str]:
-    """The first three columns of each row, as the page has to have them."""
+    """Returns the required first three columns of each row."""
     further = [f"| {each.name} | {each.expected} | {each.allowed:g} |" for each in FURTHER]
     processes = [f"| {each.name} | {each.expected} | {each.within} |" for each in DAEMON_ROWS]
     return [*(f"| {row.name} | {_expected(row)} | {_within(row)} |" for row in ROWS), *further, *processes]
 
 
 def rows_of_page(text: str) -> list[str]:
-    """The same of a page."""
+    """Returns the first three columns of each row of a page."""
     lines = [line for line in text.splitlines() if line.startswith("| ") and not line.startswith("| fault |")]
     return ["|".join(line.split("|")[:4]) + "|" for line in lines]
 
 
 def page(seen: list[Seen]) -> str:
-    """The page of what was seen; SystemExit where a row was not tried or failed."""
+    """Returns the page of the results; SystemExit if a row was not tried or failed."""
     found = {(each.name, each.place, each.character): each for each in seen}
 
     def seen_of(name: str, place: str, character: str = FRIENDLY.name) -> Seen:
@@ -140,7 +140,7 @@ def _whole(row: DaemonRow, seen: Seen) -> str:
 
 
 def _behaviour(character: Character) -> str:
-    """The keys of the truth file in which a drive differs from the default."""
+    """Returns the keys of the truth file in which a drive differs from the default."""
     keys = character.behaviour.model_dump(mode="json", exclude_defaults=True)
     chosen = [f"`{name}: {str(value).lower()}`" for name, value in keys.items()]
     return ", ".join([*chosen, f"605Ah = {character.quick_stop_option}"])
@@ -155,7 +155,7 @@ def _within(row: Row) -> str:
 
 
 def try_all() -> list[Seen]:
-    """Run the suite everywhere."""
+    """Runs the suite at every place."""
     with tempfile.TemporaryDirectory() as folder:
         record = Path(folder) / "record.jsonl"
         environment = {**os.environ, RECORD: str(record)}
@@ -170,7 +170,7 @@ def try_all() -> list[Seen]:
 
 
 def main() -> None:
-    """Write or check the page."""
+    """Writes or checks the page."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--check", action="store_true")
     if parser.parse_args().check:

@@ -1,13 +1,13 @@
-"""What the article's Table 3, taken as a measurement, says the model lacks: `article_table3.py --as-data`.
+"""Error budget of the article's Table 3, taken as a measurement: `article_table3.py --as-data`.
 
-Four runs of one test give four scatters and four means. If the four share one uncompensated error e, of which
-the runs took off a synchronous correction w, a hysteresis correction h, or both, then
+Four runs of one test give four scatters and four means. If the four share one uncompensated error e, from
+which the runs removed a synchronous correction w, a hysteresis correction h, or both, then
 
-    var(e - w) = var e + var w - 2 cov(e, w)                               and so on for h and w + h,
+    var(e - w) = var e + var w - 2 cov(e, w)                               and likewise for h and w + h,
 
 so the four scatters give cov(e, w), cov(w, h) and, for each var h, cov(e, h). A covariance matrix has no
-negative eigenvalue: that bounds var h, and with the means the size of h and the share of the steps that went
-one way. Nothing is assumed of the shape of any part.
+negative eigenvalue. That bounds var h, and with the means the size of h and the share of the steps in one
+direction. No assumption is made about the shape of any part.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ from typing import Any
 import numpy as np
 
 Row = tuple[float, float]
-"""3 sigma and mean, arcsec."""
+"""3 sigma and mean of one run, arcsec."""
 
 
 def budget(table: Mapping[str, Row], wave: float, offset: float, floor: float) -> dict[str, Any]:
-    """All that four rows can say; arcsec.
+    """Returns everything that follows from four rows; arcsec.
 
     ``wave`` and ``floor`` are 3 sigma of Table 1's wave and of one motor count, ``offset`` is Table 2's.
     """
@@ -51,7 +51,7 @@ def budget(table: Mapping[str, Row], wave: float, offset: float, floor: float) -
 
 
 def _means(table: Mapping[str, Row]) -> dict[str, float]:
-    """Whether the two corrections add up in the means, as corrections of one error must."""
+    """Returns the means of the corrections; corrections of one error must be additive in them."""
     mean = {name: each[1] for name, each in table.items()}
     apart = mean["both"] - mean["synchronous"] - mean["hysteresis"] + mean["none"]
     return {
@@ -74,7 +74,7 @@ def _between(variance: Mapping[str, float]) -> float:
 
 
 def _two_values(table: Mapping[str, Row], wave: float) -> dict[str, Any]:
-    """The hysteresis correction: its scatter, and its size where it has one value for each direction."""
+    """Returns the scatter of the hysteresis correction, and its size if it has one value per direction."""
     variance = {name: (each[0] / 3.0) ** 2 for name, each in table.items()}
     shift = 0.5 * (table["none"][1] - table["hysteresis"][1] + table["synchronous"][1] - table["both"][1])
     possible = possible_variances(variance, wave)
@@ -94,14 +94,17 @@ def _two_values(table: Mapping[str, Row], wave: float) -> dict[str, Any]:
 
 
 def possible_variances(variance: Mapping[str, float], wave: float, most: float = 1e4) -> np.ndarray:
-    """The variances of the hysteresis correction, arcsec^2, for which all covariances can be, ascending."""
+    """Returns the possible variances of the hysteresis correction, arcsec^2, ascending.
+
+    A variance is possible if the resulting covariance matrix has no negative eigenvalue.
+    """
     grid = np.geomspace(1e-2, most, 6_001)
     matrices = np.array([_covariances(variance, wave, float(each)) for each in grid])
     return np.asarray(grid[np.linalg.eigvalsh(matrices)[:, 0] >= 0.0])
 
 
 def _covariances(variance: Mapping[str, float], wave: float, correction: float) -> list[list[float]]:
-    """Of the error, the synchronous and the hysteresis correction."""
+    """Returns the covariances of the error, the synchronous and the hysteresis correction."""
     error = variance["none"]
     along_wave = (error + wave - variance["synchronous"]) / 2.0
     along = (error + correction - variance["hysteresis"]) / 2.0
@@ -110,11 +113,11 @@ def _covariances(variance: Mapping[str, float], wave: float, correction: float) 
 
 
 def _neither(variance: Mapping[str, float], wave: float, correction: float) -> float:
-    """Variance of the error that no size of the two corrections takes away."""
+    """Returns the variance of the error that remains for any sizes of the two corrections."""
     whole = np.array(_covariances(variance, wave, correction))
     return float(whole[0, 0] - whole[0, 1:] @ np.linalg.pinv(whole[1:, 1:]) @ whole[1:, 0])
 
 
 def _share(deviation: float, mean: float) -> float:
-    """Share, per cent, of the more frequent of two equal and opposite values, from their scatter and mean."""
+    """Returns the share, per cent, of the more frequent of two opposite values, by scatter and mean."""
     return 50.0 * (1.0 + abs(mean) / math.hypot(deviation, mean))

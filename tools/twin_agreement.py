@@ -1,11 +1,11 @@
-"""Calibrate and step axes drawn at random and their twins, and hold the two against each other.
+"""Calibrates and steps random axes and their twins, and compares the two.
 
     .venv/bin/python tools/twin_agreement.py --first 500 --axes 2
 
-The axes are those of tools/twin_random_axes.py. Each goes the way of an axis at a bench: calibrated with the
-stepping test, recorded on the plan ``dynamics``, twinned from usual values that err as the model says. Then
-the twin is calibrated and stepped in the same way. Printed for each axis: 3 sigma of the stepping test
-without compensation, the offset of the loop, and how far apart the orders are.
+The axes are those of tools/twin_random_axes.py. Each is treated as an axis on a bench: calibrated with the
+stepping test, recorded on the plan ``dynamics``, twinned from usual values, with the error of its model. Then
+the twin is calibrated and stepped in the same way. Prints for each axis 3 sigma of the stepping test without
+compensation, the offset of the loop, and the differences of the orders.
 """
 
 from __future__ import annotations
@@ -35,11 +35,11 @@ from hdbridge.twin.translation import translate
 
 DATE = datetime(2026, 1, 1, tzinfo=UTC)
 STEPPING, ORDERS_ARCSEC, OFFSET = 0.05, 0.3, 0.02
-"""How far a twin may be off: a share of 3 sigma, each order's phasor, a share of the offset."""
+"""Tolerances of a twin: a share of 3 sigma, each order's phasor, a share of the offset."""
 
 
 def calibrated(axis: AxisConfig, truth: Truth, plan: str, seed: int) -> Calibration:
-    """A calibration with its stepping test, of an axis without a model."""
+    """Calibrates an axis without a model, with its stepping test."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         content = axis.model_dump(mode="json", by_alias=True, exclude_none=True)
@@ -54,19 +54,19 @@ def calibrated(axis: AxisConfig, truth: Truth, plan: str, seed: int) -> Calibrat
 
 
 def three_sigma_arcsec(found: Calibration) -> float:
-    """Of the stepping test without compensation."""
+    """Returns 3 sigma of the stepping test without compensation."""
     return found.validation.before.pooled.three_sigma_arcsec if found.validation else float("nan")
 
 
 def offset_arcsec(model: TransmissionModel) -> float:
-    """Of the loop; none is zero."""
+    """Returns the offset of the loop; 0 without one."""
     return sum(
         each.offset_arcsec for each in model.effects if isinstance(each, Hysteresis | HysteresisMemory)
     )
 
 
 def phasors(model: TransmissionModel) -> dict[int, complex]:
-    """By order of the motor."""
+    """Returns the phasor of each motor order."""
     return {
         each.order: each.amplitude_arcsec * np.exp(1j * np.radians(each.phase_deg))
         for effect in model.effects
@@ -76,7 +76,7 @@ def phasors(model: TransmissionModel) -> dict[int, complex]:
 
 
 def one(seed: int, plan: str, workers: int) -> str:
-    """One axis, in a line."""
+    """Runs one axis; returns one line."""
     began_s = time.perf_counter()
     axis, truth = draw(seed)
     own = calibrated(axis, truth, plan, seed)
@@ -89,7 +89,7 @@ def one(seed: int, plan: str, workers: int) -> str:
 
 
 def compared(own: Calibration, again: Calibration) -> str:
-    """Two calibrations, of the axis and of its twin."""
+    """Compares the calibrations of an axis and of its twin."""
     stepped = three_sigma_arcsec(own), three_sigma_arcsec(again)
     offsets = offset_arcsec(own.model), offset_arcsec(again.model)
     one, other = phasors(own.model), phasors(again.model)

@@ -3,9 +3,9 @@
     PYTHONPATH=tests .venv/bin/python tools/twin_foreign_axes.py --structures piv observed --first 20 --axes 2
 
 Each axis is recorded on the plan ``dynamics`` and on another motion. Its twin starts at usual values with the
-gear's true transmission error, as a calibration would give it. Printed for each axis: following error and
-torque of the twin on the other motion, per cent of the measured signal; how many intervals were given and how
-many of them hold the truth; what was said of the twin; and the CPU time of the fit.
+gear's true transmission error, as from a calibration. Prints for each axis the twin's errors of following
+error and torque on the other motion, per cent of the measured signal; the number of intervals, and of those
+that contain the truth; the remarks on the twin; and the CPU time of the fit.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import tempfile
 import time
 from pathlib import Path
 
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # the matrices are small: threads only cost
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # the matrices are small, so threads only cost time
 
 import yaml
 from foreign.bench import bench_of
@@ -46,7 +46,7 @@ from hdbridge.twin.verdict import judge
 
 
 def bench(foreign: Foreign, plan: Plan) -> Recording:
-    """A plan on the foreign axis, over frames, task by task."""
+    """Runs a plan on the foreign axis, over frames, task by task."""
     parts = []
     with (
         tempfile.TemporaryDirectory() as folder,
@@ -62,13 +62,13 @@ def bench(foreign: Foreign, plan: Plan) -> Recording:
 
 
 def axis_of(foreign: Foreign) -> AxisConfig:
-    """The axis file of a foreign axis."""
+    """Returns the axis file of a foreign axis."""
     with tempfile.TemporaryDirectory() as folder, bench_of(foreign, Path(folder)) as axis:
         return axis.axis
 
 
 def start(axis: AxisConfig, foreign: Foreign) -> Truth:
-    """Usual values, and the gear's own transmission error."""
+    """Returns usual values with the gear's own transmission error."""
     law, truth = foreign.mechanics.hysteresis, default_truth(axis).model_dump(by_alias=True)
     truth["gear"]["motor_orders"] = [each._asdict() for each in foreign.mechanics.motor_orders]
     truth["gear"]["hysteresis"] = (

@@ -1,17 +1,16 @@
-"""Twin axes drawn at random on the simulated drive, and hold the twins against what the axes are.
+"""Fits twins of random axes on the simulated drive and compares them with the truth.
 
     .venv/bin/python tools/twin_random_axes.py --axes 8 --checks
 
-Each axis has its own inertias, friction, loops and feed-forward (half to double the usual), dead time (0 to 3
-ms), resonance (15 to 80 Hz), ratio (30 to 160), law of hysteresis, tooth orders and noise. Its axis file
-allows the following error that such a drive needs, and gains that are next to unstable are drawn again. It is
-benched over frames on the plan ``dynamics``, twinned from the usual values (`hdbridge.twin.defaults`), and
-judged on another motion that the fit has not seen. Printed for each axis: the differences on that motion, how
-many of the 95 % intervals hold the truth, and what the check says after one thing, two, or nothing in the
-plant has changed.
+Each axis has its own inertias, friction, loops and feed-forward (half to double the usual), dead time (0 to
+3 ms), resonance (15 to 80 Hz), ratio (30 to 160), law of hysteresis, tooth orders and noise. Its axis file
+allows the following error that such a drive needs; gains near instability are drawn again. It is benched
+over frames on the plan ``dynamics``, twinned from the usual values (`hdbridge.twin.defaults`), and judged on
+another motion that the fit has not seen. Prints for each axis the differences on that motion, the number of
+95 % intervals that contain the truth, and the result of the check after one, two or no changes of the plant.
 
-The gear's own transmission error is given, as a calibration gives it (tools/calibrate_random_axes.py measures
-that): this tool is about the rest.
+The gear's own transmission error is given, as from a calibration (tools/calibrate_random_axes.py measures
+that): this tool measures the rest.
 """
 
 from __future__ import annotations
@@ -27,7 +26,7 @@ from itertools import combinations
 from pathlib import Path
 from typing import Any
 
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # the matrices are small: threads only cost
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # the matrices are small, so threads only cost time
 
 import numpy as np
 import yaml
@@ -72,14 +71,14 @@ CHANGES: dict[str, tuple[str, Callable[[Truth], dict[str, float]]]] = {
     ),
     "warmer gear": ("warmth", lambda t: {"temperature": t.temperature.ambient_c + 15.0}),
 }
-"""By name: the cause that is to be named, and what becomes of the plant."""
+"""Cause that should be reported, and the change of the plant, by name."""
 PAIRS = 3
-"""Pairs of changes, drawn for each axis."""
+"""Number of pairs of changes drawn for each axis."""
 WINDOWS = 3.0
-"""The following error allowed, over what the delay makes at the highest speed: `hdbridge bringup` asks
-for three times what it has seen."""
+"""Ratio of the allowed following error to that of the delay at the highest speed; `hdbridge bringup` sets
+three times the observed one."""
 GAIN_MARGIN = 2.0
-"""Least: 6 dB, the least that textbooks tune a loop to."""
+"""Minimum gain margin: 6 dB, the minimum of textbooks for tuning a loop."""
 
 
 @dataclass
@@ -87,21 +86,22 @@ class Outcome:
     seed: int
     about: str
     channels: dict[str, tuple[float, float]] = field(default_factory=dict)
-    """By channel, on the other motion: the difference as a share of the measured signal, and in its noise."""
+    """Differences on the other motion as a share of the measured signal and in units of its noise, by
+    channel."""
     held: int = 0
     intervals: int = 0
     missed: list[str] = field(default_factory=list)
     fit_s: float = 0.0
     checks: list[tuple[str, set[str], set[str]]] = field(default_factory=list)
-    """What was changed, the causes that are to be named, and those that were."""
+    """Change of the plant, causes that should be reported, and reported causes."""
 
 
 def draw(seed: int, *, sticking: bool = False) -> tuple[AxisConfig, Truth]:
-    """A random axis; ``sticking``: with friction that is higher near rest, too."""
+    """Draws a random axis; with ``sticking`` it also has higher friction near rest."""
     rng = np.random.default_rng(seed)
 
     def some() -> float:
-        """Half to double."""
+        """Returns a factor from one half to two."""
         return float(np.exp(rng.uniform(math.log(0.5), math.log(2.0))))
 
     ratio = float(rng.integers(60, 321)) / 2.0
@@ -137,7 +137,7 @@ def draw(seed: int, *, sticking: bool = False) -> tuple[AxisConfig, Truth]:
         }
         for order in sorted(rng.choice(np.arange(1, 11), 5, replace=False))
     ]
-    # A reference of its own: without one the friction would follow the surroundings' own warmth.
+    # An explicit reference, because by default the friction would depend on the ambient temperature.
     truth.setdefault("temperature", {}).update(friction_growth_per_k=-0.015, reference_c=22.0)
     while _gain_margin(truth) < GAIN_MARGIN:
         for name in ("position_gain_per_s", "velocity_gain_nm_s_per_rad", "integral_time_ms"):
@@ -158,10 +158,10 @@ def draw(seed: int, *, sticking: bool = False) -> tuple[AxisConfig, Truth]:
 
 
 def _gain_margin(truth: dict[str, Any]) -> float:
-    """By how much the velocity gain may fall or rise until the loops are unstable.
+    """Returns the factor by which the velocity gain may fall or rise before the loops are unstable.
 
-    It may fall until those of a rigid axis are (Routh). It may rise until the motor alone is: the loop
-    sees the mean speed of the substep before, so at two inertias in a substep.
+    It may fall until the loops of a rigid axis are unstable (Routh), and rise until the motor alone is: the
+    loop uses the mean speed of the previous substep, which limits the gain to two inertias per substep.
     """
     servo, motor, ratio = truth["servo"], truth["motor"], truth["gear"]["ratio"]
     gain, inertia = servo["velocity_gain_nm_s_per_rad"], motor["inertia_kg_m2"]
@@ -187,7 +187,7 @@ def _law(law: str, rng: np.random.Generator) -> dict[str, Any]:
 
 
 def usual(axis: AxisConfig, truth: Truth) -> Truth:
-    """Where the fit begins: usual values, with the gear's transmission error as a calibration gives it."""
+    """Returns the start of the fit: usual values with the gear's true transmission error."""
     start = default_truth(axis)
     known = {"motor_orders": truth.gear.motor_orders, "hysteresis": truth.gear.hysteresis}
     return start.model_copy(
@@ -204,13 +204,13 @@ def usual(axis: AxisConfig, truth: Truth) -> Truth:
 
 
 def without_noise(truth: Truth) -> Truth:
-    """So that a difference is not that of two draws of noise."""
+    """Removes the noise, so that differences do not come from two noise samples."""
     encoder = truth.load_.encoder.model_copy(update={"noise_arcsec": 0.0})
     return truth.model_copy(update={"load_": truth.load_.model_copy(update={"encoder": encoder})})
 
 
 def bench(axis: AxisConfig, truth: Truth, plan: Plan, seed: int) -> Recording:
-    """A plan on the bench, over frames, task by task."""
+    """Runs a plan on the bench, over frames, task by task."""
     parts = []
     with (
         simulated_bench(truth, axis.eds_path, axis.drive.node_id, seed) as (bus, clock, _),
@@ -225,7 +225,7 @@ def bench(axis: AxisConfig, truth: Truth, plan: Plan, seed: int) -> Recording:
 
 
 def recorded(seed: int, axis: AxisConfig, truth: Truth) -> tuple[Recording, Recording] | None:
-    """An axis on both plans; None where its drive cannot follow them and stops."""
+    """Records an axis on both plans; returns None if its drive cannot follow them and stops."""
     another = Plan.model_validate(yaml.safe_load(ANOTHER))
     try:
         return bench(axis, truth, Plan.load("dynamics"), seed), bench(axis, truth, another, seed + 1000)
@@ -244,7 +244,7 @@ def one(
     checks: bool,
     workers: int,
 ) -> Outcome:
-    """Twin and judge."""
+    """Fits a twin and judges it."""
     began_s = time.perf_counter()
     twin = fit_twin([recording], axis, usual(axis, truth), workers=workers)
     law = truth.gear.hysteresis.law if truth.gear.hysteresis else "none"
@@ -281,20 +281,20 @@ def one(
 
 
 def _saturated(recording: Recording, axis: AxisConfig) -> str:
-    """Says where a drive is at its torque limit: there loops and load oscillate, and no axis is left so."""
+    """Returns a remark if the drive is at its torque limit, where loops and load oscillate."""
     most_nm = 0.01 * axis.limits.torque_percent * axis.drive.rated_torque_nm
     share = float(np.mean(np.abs(recording.record.columns["motor_torque_nm"]) > 0.99 * most_nm))
     return f" {share:.1%} at the torque limit" if share else ""
 
 
 def patient(axis: AxisConfig) -> AxisConfig:
-    """The axis with twice the following error allowed: one that a change makes late is to be recorded."""
+    """Returns the axis with twice the allowed following error, for changes that increase its lag."""
     drive = axis.drive.model_copy(update={"following_error_deg": 2.0 * axis.drive.following_error_deg})
     return axis.model_copy(update={"drive": drive})
 
 
 def changed_plants(truth: Truth, seed: int) -> Iterator[tuple[str, set[str], Truth]]:
-    """Nothing changed, each change alone, and some pairs."""
+    """Yields the unchanged plant, each change alone, and some pairs."""
     pairs = list(combinations(CHANGES, 2))
     drawn = np.random.default_rng(seed + 4000).choice(len(pairs), PAIRS, replace=False)
     for names in ((), *((name,) for name in CHANGES), *(pairs[place] for place in drawn)):
@@ -304,7 +304,7 @@ def changed_plants(truth: Truth, seed: int) -> Iterator[tuple[str, set[str], Tru
 
 
 def line(each: Outcome) -> str:
-    """One axis."""
+    """Returns the line of one axis."""
     parts = [
         f"{name.split('_')[0]} {share:.3f} {noise:.2f}" for name, (share, noise) in each.channels.items()
     ]
@@ -313,7 +313,7 @@ def line(each: Outcome) -> str:
 
 
 def bounds(hits: int, n: int) -> str:
-    """A count with its 95 % interval (Clopper-Pearson)."""
+    """Formats a count with its 95 % interval (Clopper-Pearson)."""
     if not n:
         return "none tried"
     low = float(beta.ppf(0.025, hits, n - hits + 1)) if hits else 0.0

@@ -1,12 +1,12 @@
-"""Thermal constants drawn at random on the demo's axis, and how often a twin's intervals hold them.
+"""Draws thermal constants of the demo's axis at random and measures the coverage of a twin's intervals.
 
     python tools/twin_warmth.py --first 100 --axes 30 --minutes 30
 
-Each axis has its own surroundings (14 to 32 deg C), thermal resistance (0.8 to 5 K/W), time constant (240 to
-1500 s) and copper loss (0 to 30 W), and works for three quarters of the time: slow moves, moves at high
-acceleration and rests, in spells of 20 to 180 s; then it rests. Its temperature is read in steps of 0.1 K.
-The twin begins at usual values; its mechanics are the axis's own but for friction, which is off by chance,
-by as much as a fit is said to have left open: half a per cent (Coulomb) and three (viscous).
+Each axis has its own ambient temperature (14 to 32 deg C), thermal resistance (0.8 to 5 K/W), time constant
+(240 to 1500 s) and copper loss (0 to 30 W). It works for three quarters of the time: slow moves, moves at
+high acceleration and rests, in spells of 20 to 180 s; then it rests. Its temperature is read in steps of 0.1
+K. The twin begins at usual values. Its mechanics are the axis's own except for friction, which is wrong at
+random by the uncertainty of a fit: half a per cent (Coulomb) and three per cent (viscous).
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ FRICTION = {"Coulomb friction": 0.005, "viscous friction": 0.03}
 
 
 def draw(rng: np.random.Generator) -> Truth:
-    """The demo's axis with a body and surroundings of its own."""
+    """Returns the demo's axis with random thermal constants and surroundings."""
 
     def some() -> float:
         return float(np.exp(rng.uniform(-1.0, 1.0) * math.log(2.5)))
@@ -53,7 +53,7 @@ def draw(rng: np.random.Generator) -> Truth:
 
 
 def recorded(truth: Truth, rng: np.random.Generator, minutes: float) -> Recording:
-    """Work of several kinds, and a rest."""
+    """Records work of several kinds, and a rest."""
     machine = Machine(truth, 0, may_compile=True)
     machine.torque_limit_permille = 10.0 * AXIS.limits.torque_percent
     bench = Exercise(machine)
@@ -82,7 +82,7 @@ def recorded(truth: Truth, rng: np.random.Generator, minutes: float) -> Recordin
 
 
 def fitted(rng: np.random.Generator) -> Fitted:
-    """The axis's mechanics, as a fit may have them."""
+    """Returns the axis's mechanics with the errors of a fit."""
     parameters, spread = tuple(BY_NAME[name] for name in FRICTION), np.array(list(FRICTION.values()))
     place = np.array(coordinates(TRUTH, parameters)) + spread * rng.standard_normal(len(spread))
     truth = at_coordinates(TRUTH, parameters, place.tolist())

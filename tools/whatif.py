@@ -1,8 +1,9 @@
-"""Numbers that know another value of theirs, and tell which comparison would come out otherwise with it.
+"""Numbers with alternative values, which record the comparisons that would turn out differently with them.
 
-A number of `Scales` matters to a record only where some comparison depends on it. So each is replaced by one
-that goes through the arithmetic with both values, its own deciding; names of those for which a comparison
-differs are gathered. What leaves this arithmetic (`float(...)`) counts as differing, so none is overlooked.
+A number of `Scales` matters to a record only if some comparison depends on it. So each is replaced by one
+that passes through the arithmetic with both values, its own deciding; the names of those for which a
+comparison differs are collected. A value that leaves this arithmetic (`float(...)`) counts as differing, so
+none is missed.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ import numpy as np
 
 
 class WhatIf:
-    """A value, and what it would be were one of the named numbers another one."""
+    """Value, with its alternatives if one of the named numbers had another value."""
 
     __slots__ = ("differing", "instead", "value")
 
