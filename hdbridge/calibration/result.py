@@ -42,7 +42,7 @@ class Calibration:
     """Date and time of the recording, ISO 8601."""
     plan: str | None = None
     shortened: tuple[str, ...] = ()
-    """How the plan was shortened for this axis, in words."""
+    """Parts of the plan that were shortened for this axis, in words."""
     validation: Validation | None = None
     motion: MotionTest | None = None
     """Motion test, which measures the response; None if the plan has none."""

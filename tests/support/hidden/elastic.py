@@ -1,4 +1,4 @@
-"""Hiding causes in the spring, the friction, the load, and the hysteresis."""
+"""Hides causes in the spring, the friction, the load, and the hysteresis."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from support.hidden.site import ARCSEC_PER_RAD, Hidden, Site, solve
 
 
 def hang_mass(site: Site, torque_nm: float) -> float:
-    """Put a mass on the axis that pulls with a highest torque; returns the angle at which it hangs down."""
+    """Adds a mass to the axis with this peak torque; returns the angle at which it hangs down."""
     arm_m = site.uniform(0.08, 0.25)
     down_deg = site.angle_deg()
     site.load["gravity"] = {
@@ -25,11 +25,11 @@ def hang_mass(site: Site, torque_nm: float) -> float:
 
 
 def compliance(site: Site) -> Hidden:
-    """A mass on the axis, on a spring with or without stages."""
+    """Hides a mass on the axis, on a spring with or without stages."""
     stiffness = site.truth.gear.stiffness_nm_per_rad
     torque_nm = site.size_arcsec / ARCSEC_PER_RAD * stiffness
     if site.rng.random() < 0.5:
-        # As catalogues have it; no stiffer than the simulation's time step can follow.
+        # Usual in catalogues; no stiffer than the simulation's time step resolves.
         third = min(site.uniform(1.4, 2.0), 0.98 * site.truth.highest_stiffness_nm_per_rad / stiffness)
         second = site.uniform(1.0 + 0.3 * (third - 1.0), 1.0 + 0.7 * (third - 1.0))
         first_nm, second_nm = site.uniform(0.3, 0.5) * torque_nm, site.uniform(0.6, 0.9) * torque_nm
@@ -60,7 +60,7 @@ def compliance(site: Site) -> Hidden:
 
 
 def inertial_windup(site: Site) -> Hidden:
-    """A heavier load on a softer spring; no less wind-up than the axis has already."""
+    """Hides a heavier load on a softer spring; the wind-up is at least that of the axis before."""
     acceleration = math.radians(site.run.load_acceleration_deg_s2)
     inertia = site.truth.load_.whole_inertia_kg_m2
     present = inertia * acceleration / site.truth.gear.stiffness_nm_per_rad * ARCSEC_PER_RAD
@@ -83,7 +83,7 @@ def inertial_windup(site: Site) -> Hidden:
 
 
 def _tell_servo(site: Site, heavier: float, frequency_hz: float) -> None:
-    """Commission the drive for the load that is really there."""
+    """Commissions the drive for the true load."""
     known = site.part("servo")["load_feedforward"]
     if known is not None:
         known["inertia_kg_m2"] *= heavier
@@ -91,7 +91,7 @@ def _tell_servo(site: Site, heavier: float, frequency_hz: float) -> None:
 
 
 def velocity_windup(site: Site) -> Hidden:
-    """Grease at the output that thins with shear, with a little Coulomb friction."""
+    """Hides grease at the output that thins with shear, with a little Coulomb friction."""
     stiffness = site.truth.gear.stiffness_nm_per_rad
     torque_nm = site.size_arcsec / ARCSEC_PER_RAD * stiffness
     speed = math.radians(site.run.load_speed_deg_s)
@@ -116,13 +116,13 @@ def velocity_windup(site: Site) -> Hidden:
 
 
 def backlash(site: Site) -> Hidden:
-    """A dead zone behind the gear: between spring and load, or in the load encoder's coupling."""
+    """Hides a dead zone behind the gear: between spring and load, or in the load encoder's coupling."""
     play_arcsec = 2.0 * site.size_arcsec
     if site.load["encoder"]["coupling"] is not None and site.rng.random() < 0.5:
         site.load["encoder"]["coupling"]["play_arcsec"] += play_arcsec
         where = "the coupling to the load encoder"
     else:
-        # Friction holds the load in the dead zone. It costs some wind-up of its own, which is taken off.
+        # Friction holds the load in the dead zone. It adds some wind-up, which is subtracted.
         inertia = site.truth.load_.whole_inertia_kg_m2
         friction_nm = 1.5 * inertia * math.radians(site.run.load_acceleration_deg_s2)
         per_nm = ARCSEC_PER_RAD / site.truth.gear.stiffness_nm_per_rad
@@ -147,7 +147,7 @@ def _rolling(site: Site) -> RollingFriction:
 
 
 def remembering(law: RollingFriction, share: float = 1.0, elements: int = 18) -> MaxwellSlip:
-    """The Maxwell slip law whose branches from saturation are those of a rolling friction law."""
+    """Returns the Maxwell slip law whose branches from saturation are those of a rolling friction law."""
     n = law.exponent
 
     def crossed(part: float) -> float:
@@ -155,7 +155,7 @@ def remembering(law: RollingFriction, share: float = 1.0, elements: int = 18) ->
             return part * (1.0 - math.log(part))
         return float((part ** (n - 1.0) - (n - 1.0) * part) / (2.0 - n))
 
-    # Points between which the branch is straight, spaced so that it is nowhere further off than elsewhere.
+    # Ends of the branch's straight pieces, spaced for the same maximum error in each piece.
     points = [(each / elements) ** (2.0 / (n - 1.0)) for each in range(elements + 1)]
     heights = [0.0] + [crossed(each) for each in points[1:]]
     pairs = zip(zip(points, heights, strict=True), zip(points[1:], heights[1:], strict=False), strict=False)
@@ -175,7 +175,7 @@ def remembering(law: RollingFriction, share: float = 1.0, elements: int = 18) ->
 
 
 def hysteresis_memory(site: Site) -> Hidden:
-    """A part of the loop, or all of it, remembers the points where it turned."""
+    """Hides return-point memory in a part of the loop, or in all of it."""
     law = _rolling(site)
     whole = _missed_arcsec(law)
     share = min(1.0, site.size_arcsec / whole)
@@ -196,7 +196,7 @@ def hysteresis_memory(site: Site) -> Hidden:
 
 
 def _missed_arcsec(law: RollingFriction) -> float:
-    """How far the two laws come apart on nested loops of a few sizes."""
+    """Returns the greatest difference of the two laws on nested loops of a few sizes."""
     worst = 0.0
     for back in (0.05, 0.1, 0.2, 0.4):
         forgetting, memory = law_of(law, 0.0), law_of(remembering(law), 0.0)
@@ -212,7 +212,7 @@ def _missed_arcsec(law: RollingFriction) -> float:
 
 
 def hysteresis_parameters(site: Site) -> Hidden:
-    """A loop that is higher, or wider, than the one that was calibrated."""
+    """Hides a loop that is higher, or wider, than the calibrated one."""
     law = _rolling(site)
     changed = {"start_arcsec": 0.0}
     size = site.size_arcsec
@@ -251,7 +251,7 @@ def _crossing_miss(one: RollingFriction, other: RollingFriction) -> float:
 
 
 def rate_dependence(site: Site) -> Hidden:
-    """A loop that grows with speed."""
+    """Hides a loop that grows with speed."""
     law = site.truth.gear.hysteresis
     if law is None:
         raise ValueError("this needs an axis with hysteresis")
@@ -277,7 +277,7 @@ def rate_dependence(site: Site) -> Hidden:
 
 
 def vibration(site: Site) -> Hidden:
-    """A machine nearby."""
+    """Hides the vibration of a machine nearby."""
     frequency_hz = site.stretched(2.0, 18.0)
     gear, load = site.truth.gear, site.truth.load_
     turn = math.tau * frequency_hz

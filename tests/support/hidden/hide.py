@@ -1,11 +1,11 @@
-"""Hide a physical cause in the simulated axis: what a diagnosis is then asked to find.
+"""Hides a physical cause in the simulated axis, for a diagnosis to find.
 
-`hide` draws physically sensible parameters, off any grid, so that the cause has a wanted size, and returns
-the truth with the cause in it and a description of what was hidden. The size is a peak in arcsec at the load,
-reached somewhere in the run that is meant (`Run`); each description says what exactly it is.
+`hide` draws physically plausible parameters, off any grid, so that the cause has a wanted size, and returns
+the truth with the cause and a description of it. The size is a peak in arcsec at the load, reached somewhere
+in the intended run (`Run`); each description defines it exactly.
 
 The names of the causes are those of the catalogue in docs/causes.md. ``unexplained`` draws one of several
-causes that are not in the catalogue; ``unexplained:roller`` and so on choose one of them.
+causes outside the catalogue; ``unexplained:roller`` and the like choose one of them.
 """
 
 from __future__ import annotations
@@ -57,17 +57,17 @@ CAUSES: Mapping[str, Callable[[Site], Hidden]] = MappingProxyType(
         "local_defect": teeth.local_defect,
     }
 )
-"""The catalogue's causes."""
+"""Causes of the catalogue."""
 
 
 def hide(
     truth: Truth, cause: str, rng: random.Random, size_arcsec: float, run: Run | None = None
 ) -> tuple[Truth, Hidden]:
-    """Put a cause of about a size into an axis, beside what is in it already.
+    """Adds a cause of about this size to an axis, in addition to those that it has.
 
-    ``Hidden.size_arcsec`` is the size that it really has: some causes have limits (a tooth error cannot be
-    shifted by more than itself). ValueError for an unknown cause, a size that is not above 0, or an axis that
-    cannot have it (a loop without hysteresis cannot have another width).
+    ``Hidden.size_arcsec`` is the true size, because some causes have limits (a tooth error cannot be shifted
+    by more than itself). ValueError for an unknown cause, a size that is not above 0, or an axis that cannot
+    have it (a loop without hysteresis cannot have another width).
     """
     if size_arcsec <= 0.0:
         raise ValueError(f"size_arcsec: found {size_arcsec:g}; expected a number above 0")
@@ -83,7 +83,7 @@ def hide(
 def hide_all(
     truth: Truth, wanted: Iterable[tuple[str, float]], rng: random.Random, run: Run | None = None
 ) -> tuple[Truth, list[Hidden]]:
-    """Put several causes, each of its size in arcsec, into an axis, one after the other."""
+    """Adds several causes, each of its size in arcsec, to an axis, one after the other."""
     hidden = []
     for cause, size_arcsec in wanted:
         truth, one = hide(truth, cause, rng, size_arcsec, run)

@@ -1,4 +1,4 @@
-"""Hiding causes in the encoders: geometry, signals, late samples, counts lost."""
+"""Hides causes in the encoders: geometry, signals, late samples, lost counts."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from support.hidden.site import ARCSEC_PER_RAD, ARCSEC_PER_TURN, Hidden, Site
 
 
 def _disc(site: Site, arcsec: float, second: float) -> dict[str, Any]:
-    """A disc whose reading errs by an amplitude once per turn and a part of that twice, at its shaft."""
+    """Returns a disc with this reading error at its shaft once per turn, and ``second`` of it twice."""
     radius_mm = site.stretched(12.0, 60.0)
     off_um = arcsec / ARCSEC_PER_RAD * radius_mm * 1000.0
     return {
@@ -24,7 +24,7 @@ def _disc(site: Site, arcsec: float, second: float) -> dict[str, Any]:
 
 
 def motor_encoder_eccentricity(site: Site) -> Hidden:
-    """The motor encoder's disc off its shaft's axis."""
+    """Hides an eccentric disc of the motor encoder."""
     second = site.rng.choice((0.0, site.uniform(0.1, 0.3)))
     disc = _disc(site, site.size_arcsec * site.truth.gear.ratio, second)
     site.part("motor", "encoder")["disc"] = disc
@@ -38,7 +38,7 @@ def motor_encoder_eccentricity(site: Site) -> Hidden:
 
 
 def load_order(site: Site) -> Hidden:
-    """The load encoder's disc off its shaft's axis, or a pitch error of the spline."""
+    """Hides an eccentric disc of the load encoder, or a pitch error of the spline."""
     second = site.rng.choice((0.0, site.uniform(0.1, 0.4)))
     if site.rng.random() < 0.5:
         disc = _disc(site, site.size_arcsec, second)
@@ -64,7 +64,7 @@ def load_order(site: Site) -> Hidden:
 
 
 def channel_skew(site: Site) -> Hidden:
-    """One encoder's sample is older than the other's."""
+    """Hides a delay of one encoder's sample against the other's."""
     late_ms = site.size_arcsec / (site.run.load_speed_deg_s * 3600.0) * 1000.0
     load = site.rng.random() < 0.5
     encoder = site.load["encoder"] if load else site.part("motor", "encoder")
@@ -79,7 +79,7 @@ def channel_skew(site: Site) -> Hidden:
 
 
 def subdivisional_error(site: Site) -> Hidden:
-    """Signals of the load encoder that are not quite sine and cosine."""
+    """Hides imperfect sine and cosine signals of the load encoder."""
     part = site.stretched(0.006, 0.04)
     lines = max(180, min(15_000, round(part * ARCSEC_PER_TURN / site.size_arcsec)))
     shares = [site.uniform(0.2, 1.0), site.uniform(0.0, 1.0), site.uniform(0.0, 0.4)]
@@ -109,7 +109,7 @@ def subdivisional_error(site: Site) -> Hidden:
 
 
 def count_loss(site: Site) -> Hidden:
-    """Counts lost at a time that nobody knows."""
+    """Hides a loss of counts at an unknown time."""
     motor = site.rng.random() < 0.4
     encoder = site.part("motor", "encoder") if motor else site.load["encoder"]
     per_count = ARCSEC_PER_TURN / encoder["counts_per_turn"] / (site.truth.gear.ratio if motor else 1.0)

@@ -1,4 +1,4 @@
-"""Where a cause is hidden: the axis, the run that is meant, the wanted size, and the source of chance."""
+"""Site of a hidden cause: the axis, the intended run, the wanted size, and the random generator."""
 
 from __future__ import annotations
 
@@ -19,38 +19,38 @@ ARCSEC_PER_RAD = math.degrees(1.0) * ARCSEC_PER_DEG
 
 @dataclass(frozen=True)
 class Run:
-    """What a bench will do with the axis, as far as a size depends on it."""
+    """Run of the axis on a bench, as far as the sizes of causes depend on it."""
 
     duration_s: float = 600.0
     load_speed_deg_s: float = 10.0
-    """The fastest even motion, of the load."""
+    """Highest constant speed of the load."""
     load_acceleration_deg_s2: float = 50.0
-    """The highest acceleration, of the load."""
+    """Highest acceleration of the load."""
     motor_turns: float = 400.0
-    """Way of the motor, both directions added up."""
+    """Travel of the motor, both directions added up."""
     load_reach_deg: tuple[float, float] = (-360.0, 360.0)
-    """Load angles that are passed."""
+    """Range of the load angle."""
 
 
 @dataclass(frozen=True)
 class Hidden:
-    """What was hidden."""
+    """Description of a hidden cause."""
 
     cause: str
     size_arcsec: float
     size_is: str
-    """What the size is, in words."""
+    """Meaning of the size, in words."""
     text: str
-    """What was done to the axis, in one line."""
+    """Change of the axis, in one line."""
     parameters: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({}))
-    """Numbers of it that a finding may be compared with; names carry their units."""
+    """Parameters to compare a finding with; names include their units."""
     brings: tuple[str, ...] = ()
-    """Other causes that it cannot be without, and that it is right to find too."""
+    """Causes that necessarily come with it, and that are also right findings."""
 
 
 @dataclass
 class Site:
-    """An axis in which a cause is being hidden; ``data`` is its truth file, to be changed."""
+    """Axis in which a cause is being hidden; ``data`` is its truth file, to be changed."""
 
     truth: Truth
     rng: random.Random
@@ -63,44 +63,44 @@ class Site:
 
     @property
     def gear(self) -> dict[str, Any]:
-        """The section ``gear``."""
+        """Section ``gear``."""
         return self.part("gear")
 
     @property
     def load(self) -> dict[str, Any]:
-        """The section ``load``."""
+        """Section ``load``."""
         return self.part("load")
 
     def part(self, *names: str) -> dict[str, Any]:
-        """A section of a section."""
+        """Returns a nested section."""
         place = self.data
         for name in names:
             place = place[name]
         return place
 
     def uniform(self, low: float, high: float) -> float:
-        """A number between two, evenly."""
+        """Draws a number between two, uniformly."""
         return self.rng.uniform(low, high)
 
     def stretched(self, low: float, high: float) -> float:
-        """A number between two, evenly by its logarithm."""
+        """Draws a number between two, uniformly in its logarithm."""
         return math.exp(self.rng.uniform(math.log(low), math.log(high)))
 
     def angle_deg(self) -> float:
-        """Any angle."""
+        """Draws an angle."""
         return self.rng.uniform(-180.0, 180.0)
 
     def sign(self) -> float:
-        """Plus or minus one."""
+        """Draws plus or minus one."""
         return self.rng.choice((1.0, -1.0))
 
     def load_angle_deg(self) -> float:
-        """An angle of the load well within the run's reach."""
+        """Draws a load angle well within the run's range."""
         low, high = self.run.load_reach_deg
         return self.rng.uniform(low + 0.1 * (high - low), high - 0.1 * (high - low))
 
     def tooth_peak_arcsec(self, shift_deg: float | None = None) -> float:
-        """Peak of the tooth error by motor angle, or of how far it changes with a shift of that angle."""
+        """Returns the peak of the tooth error by motor angle, or of its change when that angle is shifted."""
         orders = Orders(self.truth.gear.motor_orders)
         if not self.truth.gear.motor_orders:
             raise ValueError("this axis has no tooth error by motor angle")
@@ -113,7 +113,7 @@ class Site:
 
 
 def solve(of: Callable[[float], float], goal: float, low: float, high: float) -> float:
-    """Where a function that grows reaches a goal, by bisection; an end if it does not within the range."""
+    """Finds where an increasing function reaches a goal, by bisection; clipped to the range."""
     if of(high) <= goal:
         return high
     if of(low) >= goal:

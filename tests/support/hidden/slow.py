@@ -1,4 +1,4 @@
-"""Hiding causes that take their time: warmth, wear, creep."""
+"""Hides slow causes: temperature, wear, creep."""
 
 from __future__ import annotations
 
@@ -8,17 +8,17 @@ from support.hidden.site import Hidden, Site
 
 
 def _warm(site: Site) -> float:
-    """Let the axis warm up or cool down during the run; returns by how many kelvin."""
+    """Makes the axis warm up or cool down during the run; returns the change in kelvin."""
     heat = site.part("temperature")
     duration_s = site.run.duration_s
     change_k = site.sign() * site.uniform(4.0, 12.0)
     heat["time_constant_s"] = site.uniform(0.25, 0.8) * duration_s
     if site.rng.random() < 0.6:
-        # Started cold or warm, on its way to the surroundings.
+        # It starts cold or warm and approaches the ambient temperature.
         passed = -math.expm1(-duration_s / heat["time_constant_s"])
         heat["start_c"] = heat["ambient_c"] - change_k / passed
     else:
-        # The surroundings change, and the axis follows.
+        # The ambient temperature changes, and the axis follows.
         tau = heat["time_constant_s"]
         followed = duration_s - tau * -math.expm1(-duration_s / tau)
         heat["ambient_k_per_hour"] = change_k / followed * 3600.0
@@ -26,7 +26,7 @@ def _warm(site: Site) -> float:
 
 
 def zero_drift(site: Site) -> Hidden:
-    """A zero that moves with temperature."""
+    """Hides a zero that moves with temperature."""
     change_k = _warm(site)
     per_k = site.sign() * site.size_arcsec / abs(change_k)
     site.part("temperature")["zero_drift_arcsec_per_k"] = per_k
@@ -40,7 +40,7 @@ def zero_drift(site: Site) -> Hidden:
 
 
 def amplitude_drift(site: Site) -> Hidden:
-    """A tooth error that changes with temperature, and sometimes friction with it."""
+    """Hides a tooth error that changes with temperature, sometimes together with the friction."""
     change_k = _warm(site)
     heat = site.part("temperature")
     heat["reference_c"] = heat["ambient_c"] if heat["start_c"] is None else heat["start_c"]
@@ -58,7 +58,7 @@ def amplitude_drift(site: Site) -> Hidden:
 
 
 def wear(site: Site) -> Hidden:
-    """Play between the teeth that grows as the axis runs."""
+    """Hides play between the teeth that grows as the axis runs."""
     exponent = site.uniform(0.7, 1.0)
     per_1000 = site.size_arcsec / (site.run.motor_turns / 1000.0) ** exponent
     site.gear["wear"] = {"arcsec_per_1000_turns": per_1000, "exponent": exponent}
@@ -72,7 +72,7 @@ def wear(site: Site) -> Hidden:
 
 
 def creep(site: Site) -> Hidden:
-    """The gear yields while it turns, and comes back after a stop."""
+    """Hides creep of the gear, which yields in motion and recovers after a stop."""
     times = [site.stretched(1.0, 4.0)]
     shares = [1.0]
     if site.rng.random() < 0.5:

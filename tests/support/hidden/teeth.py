@@ -1,4 +1,4 @@
-"""Hiding causes in the teeth: orders, flanks, damage, the number of teeth."""
+"""Hides causes in the teeth: orders, flanks, damage, the number of teeth."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from support.hidden.site import ARCSEC_PER_RAD, ARCSEC_PER_TURN, Hidden, Site, s
 
 
 def motor_order(site: Site) -> Hidden:
-    """An order of the motor that the axis does not have yet."""
+    """Hides a motor order that the axis does not have yet."""
     taken = {each.order for each in site.truth.gear.motor_orders}
     order = site.rng.choice([k for k in (3, 5, 7, 9, 10, 11, 12) if k not in taken])
     term = {"order": order, "amplitude_arcsec": site.size_arcsec, "phase_deg": site.angle_deg()}
@@ -19,7 +19,7 @@ def motor_order(site: Site) -> Hidden:
 
 
 def flexspline_order(site: Site) -> Hidden:
-    """An order of the angle between wave generator and flexspline."""
+    """Hides an order of the angle between wave generator and flexspline."""
     taken = {each.order for each in site.truth.gear.flexspline_orders}
     order = site.rng.choice([k for k in (1, 2, 2, 3, 4, 5, 6) if k not in taken])
     term = {"order": order, "amplitude_arcsec": site.size_arcsec, "phase_deg": site.angle_deg()}
@@ -29,7 +29,7 @@ def flexspline_order(site: Site) -> Hidden:
 
 
 def direction_phase(site: Site) -> Hidden:
-    """Teeth that touch with the other flank after a reversal."""
+    """Hides a shifted tooth error of the other flank, which carries after a reversal."""
     shift_deg = solve(site.tooth_peak_arcsec, site.size_arcsec, 0.01, 15.0)
     flank = {"shift_deg": site.sign() * shift_deg, "travel_deg": site.stretched(0.2, 2.0)}
     site.gear["flank"] = flank
@@ -43,12 +43,12 @@ def direction_phase(site: Site) -> Hidden:
 
 
 def torque_modulation(site: Site) -> Hidden:
-    """A tooth error that grows with the torque of a mass on the axis."""
+    """Hides a tooth error that grows with the torque of a mass on the axis."""
     load, size = site.truth.load_, site.size_arcsec
     nm_per_arcsec = site.truth.gear.stiffness_nm_per_rad / ARCSEC_PER_RAD
     brings: tuple[str, ...] = ("compliance",)
     if load.gravity is None:
-        # Teeth give way by less than the spring behind them.
+        # Teeth yield less than the spring behind them.
         torque_nm = site.uniform(3.0, 6.0) * size * nm_per_arcsec
         hang_mass(site, torque_nm)
     else:
@@ -68,7 +68,7 @@ def torque_modulation(site: Site) -> Hidden:
 
 
 def ratio_error(site: Site) -> Hidden:
-    """A ratio other than the axis file says."""
+    """Hides a ratio that differs from the axis file."""
     ratio = site.truth.gear.ratio
     part = site.sign() * site.size_arcsec / ARCSEC_PER_TURN
     site.gear["ratio"] = ratio / (1.0 + part)
@@ -82,7 +82,7 @@ def ratio_error(site: Site) -> Hidden:
 
 
 def local_defect(site: Site) -> Hidden:
-    """A damaged tooth."""
+    """Hides a damaged tooth."""
     bump = {
         "at_deg": (site.load_angle_deg() + 180.0) % 360.0 - 180.0,
         "width_deg": site.stretched(2.0, 10.0),
