@@ -386,3 +386,17 @@ def test_the_slope_bound_is_what_the_steepest_fall_reaches(effect):
     falls = falls[1:]  # in the first step the direction changes, which is the command's doing
     bound = effect.slope_bound_arcsec_per_deg()
     assert 0.99 * bound <= falls.max() <= bound * (1 + 1e-6)
+
+
+def test_the_title_of_a_channel_is_its_name_without_the_unit():
+    """Units of several words, or of one letter, too; a name without one stays whole."""
+    assert {each.value: each.title for each in Channel} == {
+        "load_torque_nm": "load torque",
+        "motor_torque_nm": "motor torque",
+        "temperature_c": "temperature",
+        "time_s": "time",
+        "motor_speed_deg_s": "motor speed",
+        "motor_acceleration_deg_s2": "motor acceleration",
+        "direction": "direction",
+        "load_deg": "load",
+    }

@@ -195,7 +195,7 @@ class Work:
             self.step()
 
     def three_sigma_arcsec(self, tests: int = 4) -> list[float]:
-        """Three sigma of the true load's errors, over each run of ``tests`` consecutive tests."""
+        """Returns three sigma of the true load's errors, for each ``tests`` consecutive tests."""
         errors = self.errors_arcsec
         return [
             Scatter.of([each for test in errors[at : at + tests] for each in test]).three_sigma_arcsec

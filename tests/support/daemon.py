@@ -253,7 +253,7 @@ class SteppedDaemon:
     # ---------------------------------------------------------------- what goes wrong
 
     def interfere(self, can_id: int, data: bytes = b"", **kind: bool) -> None:
-        """A frame from another node, on the bus before the next turn."""
+        """Sends a frame from another node, before the next turn."""
         kind = {"is_extended_id": False, **kind}
         self.intruder.send(can.Message(arbitration_id=can_id, data=data, **kind))
 
