@@ -25,12 +25,13 @@ FINDINGS: Final = "findings"
 INCREMENTS: Final = "increments"
 PREFIXES: Final = "0123456789abcdef"
 SCHEMA: Final = "hdbridge.fleet/1"
-_NESTED: Final = {
+NESTED: Final = {
     "figures": ("name: text", "value", "half_width"),
     "limits": ("cause: text", "arcsec"),
     "orders": ("order: integer", "cos_arcsec", "sin_arcsec"),
     "parameters": ("name: text", "value", "low", "high", "unit: text"),
 }
+"""Parts of the columns that are lists; without a type they are numbers."""
 COLUMNS: Final[Mapping[str, Mapping[str, tuple[str, str]]]] = {
     RECORDINGS: {
         "key": (
@@ -107,7 +108,7 @@ def schema(name: str) -> pa.Schema:
     def kind(word: str) -> pa.DataType:
         if word in plain:
             return plain[word]
-        parts = [each.partition(": ") for each in _NESTED[word]]
+        parts = [each.partition(": ") for each in NESTED[word]]
         return pa.list_(pa.struct([(part, plain[of or "number"]) for part, _, of in parts]))
 
     fields = [pa.field(column, kind(word)) for column, (word, _) in COLUMNS[name].items()]

@@ -29,7 +29,7 @@ BATCH: Final = 64
 """Rows that are written together ..."""
 BATCH_S: Final = 30.0
 """... or after this time."""
-POLL_S: Final = 0.1
+POLL_S: Final = 0.25
 AHEAD: Final = 2000
 """Tasks that the scheduler holds at a time."""
 KILLED: Final = (
@@ -81,7 +81,7 @@ class Cluster:
                 n_workers=self.workers,
                 threads_per_worker=1,
                 memory_limit=self.memory,
-                dashboard_address=None,
+                dashboard_address="127.0.0.1:0",
                 silence_logs=50,
             ) as cluster,
             Client(cluster, set_as_default=False) as client,
@@ -164,7 +164,7 @@ class _Run:
         for place, axes in self._results((axes_of, (path,)) for path in paths):
             described = flights[paths[place]]
             if isinstance(axes, list):
-                result += with_axes(described[0], axes, described)
+                result += with_axes(paths[place], axes, described)
             else:
                 self._take(lost(described[0], axes or KILLED))
         return sorted(result, key=lambda each: (each.path, each.axis or ""))
@@ -243,7 +243,7 @@ class _Run:
                 future.release()
                 yield number, result
             submit()
-            if time.monotonic() - seen_s > 1.0:
+            if time.monotonic() - seen_s > 5.0:
                 seen_s = time.monotonic()
                 self._measure()
             if not batch:

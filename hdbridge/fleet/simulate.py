@@ -195,6 +195,7 @@ def _truth(joint: Joint, number: int, base: Mapping[str, Any], rng: Random) -> T
         }
         for each in joint.orders
     ]
+    data["gear"]["hysteresis"]["start_arcsec"] = 0.0
     data["gear"]["hysteresis"]["offset_arcsec"] = joint.offset_arcsec * rng.gauss(1.0, EVERYDAY)
     if joint.cause is not None:
         CAUSES[joint.cause](data, joint.arcsec_per_1000_hours * joint.hours[number] / 1000.0)

@@ -215,10 +215,10 @@ def _described(row: Mapping[str, Any], manifest: Path, number: int) -> Source:
     return source
 
 
-def with_axes(source: Source, axes: Iterable[str], described: Iterable[Source]) -> list[Source]:
+def with_axes(path: str, axes: Iterable[str], described: Iterable[Source]) -> list[Source]:
     """A flight recording as one source for each of its axes; rows of the manifest name some of them."""
     rows = {each.axis: each for each in described}
-    common = rows.get(None, source)
+    common = rows.get(None, Source(path))
     return [rows.get(name) or replace(common, axis=name, joint=common.joint or name) for name in axes]
 
 

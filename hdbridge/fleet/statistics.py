@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.special import betaln, expit, logsumexp
-from scipy.stats import beta as beta_distribution
 from scipy.stats import chi2, norm
 
 from hdbridge.effects import FloatArray
@@ -56,25 +55,24 @@ def prevalence(cases: Mapping[str, tuple[int, int]]) -> dict[str, Interval]:
         return {}
     hits = np.array([each[0] for each in cases.values()], dtype=float)
     sizes = np.array([each[1] for each in cases.values()], dtype=float)
-    mean, strength = np.meshgrid(np.linspace(0.005, 0.995, 100), np.geomspace(1.0, 1000.0, 25), indexing="ij")
+    mean, strength = np.meshgrid(np.linspace(0.01, 0.99, 50), np.geomspace(1.0, 1000.0, 13), indexing="ij")
     a, b = (mean * strength).ravel(), ((1.0 - mean) * strength).ravel()
     marginal = sum(
         betaln(a + hit, b + size - hit) - betaln(a, b) for hit, size in zip(hits, sizes, strict=True)
     )
     weight = np.exp(marginal - logsumexp(marginal))
-    grid = np.linspace(0.0, 1.0, 2001)
-    heavy = np.argsort(weight)[::-1][: int(np.searchsorted(np.cumsum(np.sort(weight)[::-1]), 0.999)) + 1]
+    a, b, weight = a[weight > 1e-6], b[weight > 1e-6], weight[weight > 1e-6]
+    share = (np.arange(1000) + 0.5) / 1000.0
+    odds = np.vstack([np.log(share), np.log1p(-share)])
     result = {}
     for name, hit, size in zip(cases, hits, sizes, strict=True):
-        below = np.zeros_like(grid)
-        average = 0.0
-        for place in heavy:
-            one, other = a[place] + hit, b[place] + size - hit
-            below += weight[place] * beta_distribution.cdf(grid, one, other)
-            average += float(weight[place]) * float(one / (one + other))
-        below /= below[-1]
-        low, high = (float(np.interp(each, below, grid)) for each in INTERVAL)
-        result[name] = Interval(low, average / float(np.sum(weight[heavy])), high)
+        one, other = a + hit, b + size - hit
+        density = np.exp(np.column_stack([one - 1.0, other - 1.0]) @ odds - betaln(one, other)[:, np.newaxis])
+        below = np.cumsum(weight @ density)
+        low, middle, high = (
+            float(np.interp(each, below / below[-1], share)) for each in (INTERVAL[0], 0.5, INTERVAL[1])
+        )
+        result[name] = Interval(low, middle, high)
     return result
 
 
@@ -103,38 +101,35 @@ def repeats(named: Sequence[Sequence[bool]]) -> Repeats:
     priors).
     """
     share, often, rarely = 0.05, 0.8, 0.02
-    patterns, place = np.unique([_packed(each) for each in named], return_inverse=True)
-    arrays = [np.array(each.split(), dtype=float) for each in patterns.tolist()]
-    count = np.bincount(place, minlength=len(arrays)).astype(float)
-    probability = np.zeros(len(arrays))
+    lengths = np.array([len(each) for each in named], dtype=int)
+    tables = {}
+    for length in np.unique(lengths[lengths > 0]).tolist():
+        own = np.flatnonzero(lengths == length)
+        tables[length] = own, np.array([named[place] for place in own], dtype=float)
+    probability = np.zeros(len(named))
     for _ in range(200):
         hits = hits_of = misses = misses_of = 0.0
-        for number, y in enumerate(arrays):
+        probability[lengths == 0] = share
+        for length, (own, y) in tables.items():
             with_it = np.where(y > 0, math.log(often), math.log1p(-often))
             without = np.where(y > 0, math.log(rarely), math.log1p(-rarely))
-            total = float(np.sum(without))
-            # From each recording on: what comes before is as without the cause.
-            onset = np.cumsum((with_it - without)[::-1])[::-1] + total if len(y) else np.zeros(1)
-            log_odds = math.log(share / (1.0 - share)) + logsumexp(onset) - math.log(len(onset)) - total
-            probability[number] = expit(log_odds)
-            if len(y):
-                since = np.cumsum(np.exp(onset - logsumexp(onset)))  # that it has begun by then
-                ill = probability[number] * since
-                hits += count[number] * float(ill @ y)
-                hits_of += count[number] * float(np.sum(ill))
-                misses += count[number] * float((1.0 - ill) @ y)
-                misses_of += count[number] * float(np.sum(1.0 - ill))
+            # The likelihood ratio of each onset: what comes before is as without the cause.
+            onset = np.cumsum((with_it - without)[:, ::-1], axis=1)[:, ::-1]
+            whole = logsumexp(onset, axis=1, keepdims=True)
+            probability[own] = expit(math.log(share / (1.0 - share)) + whole[:, 0] - math.log(length))
+            since = np.cumsum(np.exp(onset - whole), axis=1)  # that it has begun by then
+            ill = probability[own][:, np.newaxis] * since
+            hits += float(np.sum(ill * y))
+            hits_of += float(np.sum(ill))
+            misses += float(np.sum((1.0 - ill) * y))
+            misses_of += float(np.sum(1.0 - ill))
         before = (share, often, rarely)
-        share = (float(count @ probability) + 0.5) / (float(np.sum(count)) + 10.0)
+        share = (float(np.sum(probability)) + 0.5) / (len(named) + 10.0)
         often = min(max((hits + 8.0) / (hits_of + 10.0), 0.5), 0.995)
         rarely = min(max((misses + 0.1) / (misses_of + 10.0), 1e-4), 0.4)
-        if max(abs(x - y) for x, y in zip(before, (share, often, rarely), strict=True)) < 1e-6:
+        if max(abs(x - y) for x, y in zip(before, (share, often, rarely), strict=True)) < 1e-5:
             break
-    return Repeats(probability[place], share, often, rarely)
-
-
-def _packed(pattern: Sequence[bool]) -> str:
-    return " ".join("1" if each else "0" for each in pattern)
+    return Repeats(probability, share, often, rarely)
 
 
 def within_false_discoveries(probability: FloatArray, rate: float) -> FloatArray:
@@ -228,7 +223,7 @@ def trends(series: Sequence[Series]) -> list[Trend | None]:
     share. Slopes come from two kinds of joints, those that stay and those that change (a normal mixture,
     fitted to the fleet), so a joint with three noisy recordings is drawn to zero, and a steep one is not.
     """
-    usable = [place for place, each in enumerate(series) if np.ptp(each.hours) > 0.0] if series else []
+    usable = [place for place, each in enumerate(series) if len(np.unique(each.hours)) > 1]
     if not usable:
         return [None] * len(series)
     scatter = _scatter([series[place] for place in usable])

@@ -301,7 +301,8 @@ def _first(
             recent = any(_peak(row, cause) is not None for row in rows[-2:])
             trend = sizes[cause][name]
             growing = trend is not None and trend.growing() >= SURE and trend.changing >= SURE
-            if len(named) < REPEATED or not recent or (common[rows[-1]["gear"]] and not growing):
+            appeared = _peak(rows[0], cause) is None and not common[rows[-1]["gear"]]
+            if len(named) < REPEATED or not recent or not (growing or appeared):
                 continue
             last = next(each for each in named[-1]["findings"] if each["cause"] == cause)
             claims.append(
