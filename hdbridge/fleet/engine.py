@@ -135,7 +135,7 @@ class _Run:
             self._total = len(sources) + len(self._present)
             given = self._models(sources, model, models)
             known = self._dataset.known()
-            shared = self._client.scatter(known, broadcast=True, hash=False) if known else ()
+            shared = self._client.scatter([known], broadcast=True, hash=False)[0] if known else ()
             tasks = ((diagnosed, (each, given[each.joint or ""], shared)) for each in sources)
             again = []
             for place, row in self._results(tasks):
