@@ -63,11 +63,9 @@ class Cluster:
     def client(self) -> Iterator[Client]:
         """The connected client. InputError if there is no scheduler, or Dask is not installed."""
         try:
-            import dask
             from distributed import Client, LocalCluster
         except ImportError:
             raise InputError("a fleet needs Dask: python -m pip install 'hdbridge[fleet]'") from None
-        dask.config.set({"distributed.comm.timeouts.connect": "20s", "distributed.worker.daemon": True})
         if self.scheduler is not None:
             try:
                 client = Client(self.scheduler, set_as_default=False)

@@ -63,7 +63,7 @@ def _verdict(summary: Summary) -> str:
         soonest = summary.first[0]
         text = f"{count} of {summary.joints:,} joints {'need' if count > 1 else 'needs'} a look; first "
         text += f"{soonest.joint}: {_words(soonest.cause)}, {soonest.peak_arcsec:.1f} arcsec"
-        if soonest.remaining is not None:
+        if soonest.remaining is not None and soonest.remaining.high > 0.0:
             text += f", {summary.limit_arcsec:g} arcsec in {hours_words(soonest.remaining)} h"
         text += "."
     else:
@@ -75,11 +75,11 @@ def _verdict(summary: Summary) -> str:
 
 def _first(summary: Summary, folder: Path) -> Section:
     text = (
-        "Joints with a cause that repeats over their recordings more often than the fleet's rate of wrong "
-        "names "
-        "explains, and that is not common to their gear type, or grows. Of these lines no more than 1 in "
-        "100 is "
-        f"expected to be wrong. Limit: a peak of {summary.limit_arcsec:g} arcsec."
+        "Joints with a cause that appeared after the first recording and repeats, or that grows: more "
+        "often than "
+        "the fleet's rate of wrong names explains. No more than 1 in 100 of these lines is expected to be "
+        "wrong. "
+        f"Limit: a peak of {summary.limit_arcsec:g} arcsec."
     )
     if not summary.first:
         return Section("Look at first", f"{text}\n\nThere is none.")
@@ -90,12 +90,12 @@ def _first(summary: Summary, folder: Path) -> Section:
                 each.joint,
                 _words(each.cause)
                 + (f" (or {', '.join(map(_words, each.aliases))})" if each.aliases else ""),
-                f"{each.probability:.2f}",
+                hours_words(each.remaining),
                 each.peak_arcsec,
                 _growth(each),
-                hours_words(each.remaining),
+                f"{each.probability:.2f}",
                 f"{each.named} of {each.recordings}",
-                "; ".join(map(_words, each.what_changed)) or "nothing else",
+                "; ".join(map(_words, each.what_changed)),
                 f"{len(each.remarks)} remark{'s' * (len(each.remarks) != 1)}" if each.remarks else "good",
                 posixpath.basename(each.path),
             ]
@@ -103,10 +103,10 @@ def _first(summary: Summary, folder: Path) -> Section:
     header: list[str | Heading] = [
         "joint",
         "cause",
-        Heading("probability", ""),
+        Heading("to the limit", "h"),
         Heading("peak"),
         Heading("growth", "arcsec per 1000 h"),
-        Heading("to the limit", "h"),
+        Heading("probability", ""),
         "named in",
         "what else changed",
         "data",
@@ -115,8 +115,8 @@ def _first(summary: Summary, folder: Path) -> Section:
     commands = [(each.joint, _diagnose(each, folder)) for each in summary.first[:20]]
     return Section(
         "Look at first",
-        text,
-        [Table(header, rows, _more(len(summary.first))), Facts([("the page of a joint", ""), *commands])],
+        f"{text} The commands below the table write the page of a joint.",
+        [Table(header, rows, _more(len(summary.first))), Facts(commands)],
     )
 
 

@@ -9,22 +9,25 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
-from scipy.special import betaln, expit, logsumexp
-from scipy.stats import chi2, norm
+from scipy.special import betaln, chdtri, expit, logsumexp, ndtr, ndtri
 
-from hdbridge.effects import FloatArray
+from hdbridge.effects import FloatArray, IntArray
 
 Complexes = NDArray[np.complex128]
 MAD: Final = 1.4826
 """Standard deviation of a normal distribution per median absolute deviation."""
 DRAWS: Final = 4001
+GOLDEN: Final = 0.6180339887498949
 INTERVAL: Final = (0.05, 0.95)
 """Of hours and prevalences: 90 %."""
+SCATTER_SERIES: Final = 200
+"""Series from which the common scatter is estimated: its error is then 5 % or less."""
 PHASE_STEP_DEG: Final = 0.25
 EVERYDAY_SHARE: Final = 0.05
 """Share of an order's amplitude by which it may differ between two recordings of one joint."""
@@ -102,10 +105,10 @@ def repeats(named: Sequence[Sequence[bool]]) -> Repeats:
     """
     share, often, rarely = 0.05, 0.8, 0.02
     lengths = np.array([len(each) for each in named], dtype=int)
-    tables = {}
+    tables: dict[int, tuple[IntArray, FloatArray]] = {}
     for length in np.unique(lengths[lengths > 0]).tolist():
         own = np.flatnonzero(lengths == length)
-        tables[length] = own, np.array([named[place] for place in own], dtype=float)
+        tables[length] = own, np.array([named[place] for place in own.tolist()], dtype=np.float64)
     probability = np.zeros(len(named))
     for _ in range(200):
         hits = hits_of = misses = misses_of = 0.0
@@ -159,7 +162,7 @@ def outliers(values: FloatArray, rate: float = 0.05) -> NDArray[np.bool_]:
     scale = MAD * float(np.median(np.abs(values - np.median(values)))) if len(values) else 0.0
     if len(values) < 8 or scale == 0.0:
         return np.zeros(len(values), dtype=bool)
-    chance = 2.0 * norm.sf(np.abs(values - np.median(values)) / scale)
+    chance = 2.0 * ndtr(-np.abs(values - np.median(values)) / scale)
     order = np.argsort(chance)
     passed = np.flatnonzero(chance[order] <= rate * np.arange(1, len(values) + 1) / len(values))
     result = np.zeros(len(values), dtype=bool)
@@ -183,32 +186,55 @@ class Series:
 
 @dataclass(frozen=True, eq=False)
 class Trend:
-    """How a figure changes: draws of level and slope from their posterior."""
+    """How a figure changes: the line that was fitted, and the slopes of the fleet as its prior."""
 
-    level: FloatArray
-    """At the last recording, shape (draws,)."""
-    slope: FloatArray
-    """Per 1000 hours, shape (draws,)."""
+    line: FloatArray
+    """Level at the last recording, and slope per 1000 hours."""
+    covariance: FloatArray
+    """Of these two, by the errors and the scatter alone, shape (2, 2)."""
+    stay: float
+    """Standard deviation of the slopes of joints that stay."""
+    change: tuple[float, float]
+    """Mean and standard deviation of the slopes of joints that change."""
     changing: float
-    """Probability that the joint belongs to those that change, rather than to those that stay."""
+    """Probability that the joint belongs to those that change."""
+
+    @cached_property
+    def _draws(self) -> tuple[FloatArray, FloatArray]:
+        """Levels and slopes of the posterior, by quantiles: the same data give the same interval."""
+        slope, cov = float(self.line[1]), self.covariance
+        count = round(self.changing * DRAWS)
+        slopes = []
+        for centre, deviation, number in ((0.0, self.stay, DRAWS - count), (*self.change, count)):
+            variance = 1.0 / (1.0 / deviation**2 + 1.0 / float(cov[1, 1]))
+            middle = variance * (centre / deviation**2 + slope / float(cov[1, 1]))
+            slopes.append(middle + math.sqrt(variance) * ndtri((np.arange(number) + 0.5) / max(number, 1)))
+        drawn = np.concatenate(slopes)
+        # The level given the slope; its own part runs through the quantiles in an order unlike the slope's.
+        level = self.line[0] + cov[0, 1] / cov[1, 1] * (drawn - slope)
+        rest = math.sqrt(max(float(cov[0, 0] - cov[0, 1] ** 2 / cov[1, 1]), 0.0))
+        return level + rest * ndtri((np.arange(1, DRAWS + 1) * GOLDEN) % 1.0), drawn
 
     @property
     def per_1000_hours(self) -> Interval:
         """The slope with its interval."""
-        return Interval(*(float(each) for each in np.quantile(self.slope, (INTERVAL[0], 0.5, INTERVAL[1]))))
+        return Interval(
+            *(float(each) for each in np.quantile(self._draws[1], (INTERVAL[0], 0.5, INTERVAL[1])))
+        )
 
     def growing(self) -> float:
         """Probability that the slope is positive."""
-        return float(np.mean(self.slope > 0.0))
+        return float(np.mean(self._draws[1] > 0.0))
 
     def hours_to(self, limit: float) -> Interval | None:
         """Hours from the last recording until the line reaches a limit; None if that is not known yet.
 
         It is not known if the line may as well never reach it.
         """
-        with np.errstate(divide="ignore", invalid="ignore"):
-            hours = np.where(self.slope > 0.0, 1000.0 * (limit - self.level) / self.slope, np.inf)
-        hours = np.maximum(np.where(self.level >= limit, 0.0, hours), 0.0)
+        level, slope = self._draws
+        hours = np.full(DRAWS, np.inf)
+        np.divide(1000.0 * (limit - level), slope, out=hours, where=slope > 0.0)
+        hours = np.maximum(np.where(level >= limit, 0.0, hours), 0.0)
         low, middle, high = (
             float(np.quantile(hours, each, method="lower")) for each in (INTERVAL[0], 0.5, INTERVAL[1])
         )
@@ -231,10 +257,18 @@ def trends(series: Sequence[Series]) -> list[Trend | None]:
     slopes = np.array([mean[1] for mean, _ in lines])
     errors = np.sqrt(np.array([cov[1, 1] for _, cov in lines]))
     stay, change, share = _two_kinds(slopes, errors)
+    wide = _log_normal(slopes, change[0], np.hypot(change[1], errors)) + math.log(share)
+    narrow = _log_normal(slopes, 0.0, np.hypot(stay, errors)) + math.log1p(-share)
+    changing = expit(wide - narrow).tolist()
     result: list[Trend | None] = [None] * len(series)
-    for place, (mean, cov) in zip(usable, lines, strict=True):
-        result[place] = _posterior(mean, cov, stay, change, share)
+    for number, (place, (mean, cov)) in enumerate(zip(usable, lines, strict=True)):
+        result[place] = Trend(mean, cov, stay, change, changing[number])
     return result
+
+
+def _log_normal(value: FloatArray, mean: float, deviation: FloatArray) -> FloatArray:
+    """Logarithm of the normal density, but for a constant."""
+    return np.asarray(-0.5 * ((value - mean) / deviation) ** 2 - np.log(deviation))
 
 
 def _design(each: Series) -> FloatArray:
@@ -257,12 +291,12 @@ def _line(each: Series, scatter: float) -> tuple[FloatArray, FloatArray]:
 def _scatter(series: Sequence[Series]) -> float:
     """The scatter from recording to recording that makes the residuals of all lines most likely (REML)."""
     chosen = [each for each in series if len(each.hours) > _design(each).shape[1]]
-    chosen = chosen[:: max(1, len(chosen) // 400)]
+    chosen = chosen[:: max(1, math.ceil(len(chosen) / SCATTER_SERIES))]
     if not chosen:
         return 0.0
     typical = float(np.median(np.concatenate([each.sd for each in chosen])))
     spread = float(np.median([np.std(each.value) for each in chosen]))
-    choices = np.concatenate([[0.0], np.geomspace(0.05, 20.0, 40) * max(typical, spread, 1e-12)])
+    choices = np.concatenate([[0.0], np.geomspace(0.05, 10.0, 18) * max(typical, spread, 1e-12)])
 
     def likelihood(scatter: float) -> float:
         total = 0.0
@@ -288,8 +322,8 @@ def _two_kinds(slopes: FloatArray, errors: FloatArray) -> tuple[float, tuple[flo
     stay = 0.3 * max(middle, float(np.median(errors)))
     mean, deviation, share = 0.0, max(3.0 * float(np.std(slopes)), 3.0 * stay, 1e-12), 0.1
     for _ in range(200):
-        narrow = norm.logpdf(slopes, 0.0, np.hypot(stay, errors)) + math.log(1.0 - share)
-        wide = norm.logpdf(slopes, mean, np.hypot(deviation, errors)) + math.log(share)
+        narrow = _log_normal(slopes, 0.0, np.hypot(stay, errors)) + math.log(1.0 - share)
+        wide = _log_normal(slopes, mean, np.hypot(deviation, errors)) + math.log(share)
         changing = expit(wide - narrow)
         # Expected true slopes of either kind, and their spread; the priors keep a small fleet from extremes.
         shrink = deviation**2 / (deviation**2 + errors**2)
@@ -309,28 +343,6 @@ def _two_kinds(slopes: FloatArray, errors: FloatArray) -> tuple[float, tuple[flo
         if moved < 1e-6:
             break
     return stay, (mean, deviation), share
-
-
-def _posterior(
-    mean: FloatArray, cov: FloatArray, stay: float, change: tuple[float, float], share: float
-) -> Trend:
-    """Draws by quantiles, so that the same data give the same interval."""
-    slope, error = float(mean[1]), math.sqrt(float(cov[1, 1]))
-    narrow = norm.logpdf(slope, 0.0, math.hypot(stay, error)) + math.log(1.0 - share)
-    wide = norm.logpdf(slope, change[0], math.hypot(change[1], error)) + math.log(share)
-    changing = float(expit(wide - narrow))
-    count = round(changing * DRAWS)
-    slopes = []
-    for centre, deviation, number in ((0.0, stay, DRAWS - count), (*change, count)):
-        variance = 1.0 / (1.0 / deviation**2 + 1.0 / error**2)
-        middle = variance * (centre / deviation**2 + slope / error**2)
-        slopes.append(middle + math.sqrt(variance) * norm.ppf((np.arange(number) + 0.5) / max(number, 1)))
-    drawn = np.concatenate(slopes)
-    # The level given the slope; its own part runs through the quantiles in an order unlike the slope's.
-    conditional = mean[0] + cov[0, 1] / cov[1, 1] * (drawn - slope)
-    rest = math.sqrt(max(float(cov[0, 0] - cov[0, 1] ** 2 / cov[1, 1]), 0.0))
-    golden = (np.arange(1, DRAWS + 1) * 0.6180339887498949) % 1.0
-    return Trend(conditional + rest * norm.ppf(golden), drawn, changing)
 
 
 # -- Identity
@@ -374,7 +386,7 @@ def identities(orders: Complexes, joint: Sequence[int], time: Sequence[Any]) -> 
     scale = np.hypot(absolute, EVERYDAY_SHARE * np.median(np.abs(references), axis=0))
     tree = cKDTree(np.hstack([references.real / scale, references.imag / scale]))
     degrees = 2 * orders.shape[1]
-    agree, disagree = float(chi2.isf(AGREE, degrees)), float(chi2.isf(DISAGREE, degrees))
+    agree, disagree = float(chdtri(degrees, AGREE)), float(chdtri(degrees, DISAGREE))
     turns = np.radians(np.arange(0.0, 360.0, PHASE_STEP_DEG))
     turned_by = np.exp(1j * np.outer(turns, np.arange(1, orders.shape[1] + 1)))
 

@@ -2,7 +2,7 @@
 
 The diagnosis of one recording names too much on everyday records for a list that people act on. A joint is
 listed only if a cause repeats over its recordings more often than the fleet's own rate of wrong names
-explains, and if it is not common to all joints of its type, or grows.
+explains, and if it appeared after the first recording, or grows.
 """
 
 from __future__ import annotations
