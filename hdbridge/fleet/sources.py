@@ -105,9 +105,10 @@ def _recordings(place: str, described: Iterable[str]) -> Iterator[str]:
 
         try:
             system, root = fsspec.core.url_to_fs(place)
+            host = place.rstrip("/").removesuffix(root)  # with the protocol: what a path of the system lacks
             matched = system.glob(root) if glob.has_magic(root) else [root]
             files = [
-                system.unstrip_protocol(file)
+                host + file
                 for each in matched
                 for file in (system.find(each) if system.isdir(each) else [each])
             ]

@@ -88,7 +88,7 @@ def test_urls_are_listed_and_fetched(tmp_path):
     system.put(str(tmp_path / "rec"), "/fleet/rec", recursive=True)
     system.pipe("/fleet/b.csv", b"time_s\n")
     found = find_sources(["memory://fleet"])
-    assert [each.path for each in found] == ["memory:///fleet/b.csv", "memory:///fleet/rec"]
+    assert [each.path for each in found] == ["memory://fleet/b.csv", "memory://fleet/rec"]
     assert found[1].joint == "J7"
     with fetched(found[1].path) as path:
         assert Recording.load(path).record == record(1)
