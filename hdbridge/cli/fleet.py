@@ -128,15 +128,21 @@ def run(
             words = f"{now.done} of {now.total}" + f", {now.failed} failed" * bool(now.failed)
             bar.update(task, completed=now.done, total=max(now.total, 1), description=words)
 
-        end = run_fleet(
-            found,
-            dataset,
-            Cluster(scheduler, workers, memory),
-            model=model,
-            models=models,
-            progress=tell,
-            interrupted=interrupted,
-        )
+        try:
+            end = run_fleet(
+                found,
+                dataset,
+                Cluster(scheduler, workers, memory),
+                model=model,
+                models=models,
+                progress=tell,
+                interrupted=interrupted,
+            )
+        except KeyboardInterrupt:
+            notes.print(
+                f"interrupted; {out} keeps what is done, and the same command continues", soft_wrap=True
+            )
+            raise
     _say(
         f"{out}: {end.done} recordings, {end.known} of them known already, {end.failed} newly failed; "
         f"largest memory of a worker {end.memory_mb:.0f} MB"

@@ -53,6 +53,7 @@ COLUMNS: Final[Mapping[str, Mapping[str, tuple[str, str]]]] = {
         ),
         "model_sha256": ("text", "of the model without its provenance"),
         "version": ("text", "version of hdbridge"),
+        "model": ("text", "model file; `models/JOINT.yaml` is in OUT"),
         "ratio": ("number", "motor turns per load turn"),
         "samples": ("integer", "rows of the recording"),
         "duration_s": ("number", "time in its parts"),
@@ -218,7 +219,7 @@ class Dataset:
 
 def _mark_duplicates(rows: Sequence[dict[str, Any]]) -> None:
     first: dict[str, str] = {}
-    for row in sorted(rows, key=lambda row: (row["date"] or "", row["path"])):
+    for row in sorted(rows, key=lambda row: (row["date"] or "", len(row["path"]), row["path"])):
         row["duplicate_of"] = None
         if samples := row["samples_sha256"]:
             original = first.setdefault(samples, row["path"])

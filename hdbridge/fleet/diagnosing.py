@@ -119,6 +119,7 @@ def diagnosed(source: Source, model: Model, known: Collection[tuple[str, str]] =
         "hours": source.hours,
         "date": source.date,
         "version": __version__,
+        "model": model.where or None,
         "findings": [],
     }
     try:

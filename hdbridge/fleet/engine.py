@@ -11,7 +11,7 @@ import time
 from collections import defaultdict
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 from urllib.parse import quote
@@ -187,11 +187,11 @@ class _Run:
             elif model is not None:
                 found[joint] = local_model(str(model))
             elif kept.is_file():
-                found[joint] = local_model(str(kept))
+                found[joint] = replace(local_model(str(kept)), where=f"models/{kept.name}")
             else:
                 to_fit.append((joint, own, kept))
         total, self._total = self._total, self._total + len(to_fit)
-        fits = ((fitted, (own, str(kept))) for _, own, kept in to_fit)
+        fits = ((fitted, (own, f"models/{kept.name}")) for _, own, kept in to_fit)
         for place, made in self._results(fits):
             joint, _, kept = to_fit[place]
             found[joint] = made or Model(reason=f"no model could be fitted: {KILLED}")

@@ -69,7 +69,9 @@ def _verdict(summary: Summary) -> str:
     else:
         text = f"No joint of {summary.joints:,} stands out by a cause that repeats and is not common to all."
     if wrong := len(summary.failed):
-        text += f" {wrong:,} of {summary.recordings:,} recordings have no diagnosis."
+        text += (
+            f" {wrong:,} of {summary.recordings:,} recordings {'have' if wrong > 1 else 'has'} no diagnosis."
+        )
     return text
 
 
@@ -93,7 +95,7 @@ def _first(summary: Summary, folder: Path) -> Section:
                 hours_words(each.remaining),
                 each.peak_arcsec,
                 _growth(each),
-                f"{each.probability:.2f}",
+                _sure(each.probability),
                 f"{each.named} of {each.recordings}",
                 "; ".join(map(_words, each.what_changed)),
                 f"{len(each.remarks)} remark{'s' * (len(each.remarks) != 1)}" if each.remarks else "good",
@@ -122,7 +124,7 @@ def _first(summary: Summary, folder: Path) -> Section:
 
 def _diagnose(each: Candidate, folder: Path) -> str:
     recording = shlex.quote(each.path)
-    model = shlex.quote(str(folder / "models" / f"{each.joint}.yaml"))
+    model = shlex.quote(str(folder / each.model) if each.model.startswith("models/") else each.model)
     return f"hdbridge diagnose {recording} --model {model} --html {shlex.quote(f'{each.joint}.html')}"
 
 
@@ -152,7 +154,7 @@ def _prevalence(summary: Summary) -> Iterator[Section]:
         if rows:
             yield Section(
                 f"Causes by {attribute}",
-                "Joints in which the cause was named at least twice and is more likely there than not. "
+                "Joints in which the cause was named at least twice and is there with 95 % probability. "
                 "The share is "
                 "partially pooled: a small group is drawn to the others.",
                 [
@@ -285,6 +287,10 @@ def _more(count: int) -> str:
 
 def _words(cause: str) -> str:
     return cause.replace("_", " ")
+
+
+def _sure(probability: float) -> str:
+    return f"{probability:.2f}" if probability < 0.995 else "above 0.99"
 
 
 def _two(value: float) -> str:

@@ -67,6 +67,8 @@ class Candidate:
     path: str
     """Its last recording."""
     gear: str
+    model: str
+    """Model file; `models/...` is in the folder of the data set."""
 
 
 @dataclass(frozen=True)
@@ -145,11 +147,14 @@ def summarise(rows: Sequence[Row], limit_arcsec: float) -> Summary:
             joints[row["joint"]].append(row)
     has, rates, sizes = _causes(joints)
     changed = _figures(joints)
+    first = _first(joints, has, sizes, changed, limit_arcsec)
+    explained = {each.joint for each in first}
+    mistaken = tuple(each for each in mistaken if each.kind != "changed" or each.joint not in explained)
     return Summary(
         recordings=len(rows),
         joints=len({row["joint"] for row in rows if row["joint"]}),
         limit_arcsec=limit_arcsec,
-        first=_first(joints, has, sizes, changed, limit_arcsec),
+        first=first,
         prevalence=_prevalence(joints, has),
         rates=rates,
         odd=_odd(joints),
@@ -321,6 +326,7 @@ def _first(
                     remarks=tuple(rows[-1]["remarks"] or ()),
                     path=rows[-1]["path"],
                     gear=rows[-1]["gear"],
+                    model=rows[-1]["model"],
                 )
             )
     kept = within_false_discoveries(np.array([each.probability for each in claims]), FALSE_DISCOVERIES)
