@@ -124,8 +124,12 @@ def _first(summary: Summary, folder: Path) -> Section:
 
 def _diagnose(each: Candidate, folder: Path) -> str:
     recording = shlex.quote(each.path)
-    model = shlex.quote(str(folder / each.model) if each.model.startswith("models/") else each.model)
+    model = shlex.quote(_model(each, folder))
     return f"hdbridge diagnose {recording} --model {model} --html {shlex.quote(f'{each.joint}.html')}"
+
+
+def _model(each: Candidate, folder: Path) -> str:
+    return str(folder / each.model) if each.model.startswith("models/") else each.model
 
 
 def _growth(each: Candidate) -> str:

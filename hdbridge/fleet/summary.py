@@ -120,19 +120,20 @@ class Summary:
     def lines(self) -> Iterator[str]:
         """What is wrong with data, one line for each kind."""
         for kind, count in Counter(each.kind for each in self.mistaken).items():
-            yield f"{count} recordings {_KINDS[kind]}"
-        if self.duplicates:
-            yield f"{len(self.duplicates)} recordings are there twice"
-        if self.silent:
-            yield f"{len(self.silent)} joints without a usable or a fresh recording"
-        if self.failed:
-            yield f"{len(self.failed)} recordings without a diagnosis"
+            yield f"recordings {_KINDS[kind]}: {count}"
+        for words, found in (
+            ("recordings that are there twice", self.duplicates),
+            ("joints without a usable or a fresh recording", self.silent),
+            ("recordings without a diagnosis", self.failed),
+        ):
+            if found:
+                yield f"{words}: {len(found)}"
 
 
 _KINDS: Final = {
-    "swapped": "are of another joint than they are filed under",
-    "turned": "were made after the motor encoder was exchanged or its zero set",
-    "changed": "have orders unlike those of the joint's first recording",
+    "swapped": "of another joint than they are filed under",
+    "turned": "after the motor encoder was exchanged or its zero set",
+    "changed": "with orders unlike those of the joint's first recording",
 }
 
 
@@ -326,7 +327,7 @@ def _first(
                     remarks=tuple(rows[-1]["remarks"] or ()),
                     path=rows[-1]["path"],
                     gear=rows[-1]["gear"],
-                    model=rows[-1]["model"],
+                    model=rows[-1]["model"] or "MODEL.yaml",
                 )
             )
     kept = within_false_discoveries(np.array([each.probability for each in claims]), FALSE_DISCOVERIES)
