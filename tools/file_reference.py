@@ -24,6 +24,9 @@ from hdbridge.device.behaviour import Behaviour
 from hdbridge.drive.supervision import TABLE, Reaction
 from hdbridge.effects import CATALOGUE
 from hdbridge.files.expectation import Field, field_at, key_of, type_words
+from hdbridge.fleet.dataset import COLUMNS as FLEET_COLUMNS
+from hdbridge.fleet.dataset import NESTED
+from hdbridge.fleet.sources import MANIFEST
 from hdbridge.model.file import ModelFile
 from hdbridge.model.store import LogFile
 from hdbridge.procedures.plan import (
@@ -43,6 +46,7 @@ PAGES = (
     DOCS / "files.md",
     DOCS / "calibration.md",
     DOCS / "daemon.md",
+    DOCS / "fleet.md",
     DOCS / "twin.md",
     DOCS / "truth-file.md",
 )
@@ -110,6 +114,23 @@ def translation_table() -> str:
     return "\n".join(lines) + "\n"
 
 
+def fleet_table(name: str) -> str:
+    """The columns of a data set of a fleet."""
+    lines = ["| column | type | meaning |", "|---|---|---|"]
+    for column, (kind, about) in FLEET_COLUMNS[name].items():
+        parts = NESTED.get(kind)
+        words = f"list of ({', '.join(parts)})" if parts else kind.replace("texts", "list of text")
+        lines.append(f"| `{column}` | {words} | {about} |")
+    return "\n".join(lines) + "\n"
+
+
+def manifest_table() -> str:
+    """The columns of a manifest."""
+    lines = ["| column | meaning |", "|---|---|"]
+    lines += (f"| `{name}` | {about} |" for name, about in MANIFEST.items())
+    return "\n".join(lines) + "\n"
+
+
 BLOCKS: Mapping[str, Any] = {
     "axis": lambda: key_table(AxisConfig),
     "machine": lambda: key_table(MachineFile),
@@ -122,6 +143,9 @@ BLOCKS: Mapping[str, Any] = {
     "plan": lambda: key_table(Plan),
     "procedures": procedure_table,
     "translation": translation_table,
+    "fleet-recordings": lambda: fleet_table("recordings"),
+    "fleet-findings": lambda: fleet_table("findings"),
+    "manifest": manifest_table,
 }
 
 

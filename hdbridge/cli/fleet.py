@@ -1,0 +1,242 @@
+"""``hdbridge fleet``: many joints at once, from their recordings to whom to look at first."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from hdbridge.cli.interrupt import deferred_interrupt
+from hdbridge.cli.options import (
+    JsonOption,
+    console,
+    notes,
+    print_table,
+    progress_bar,
+    write_json,
+    write_result,
+)
+from hdbridge.errors import InputError
+from hdbridge.files.outputs import Kind
+
+if TYPE_CHECKING:
+    from hdbridge.fleet.summary import Summary
+
+PAGE_NAME = "fleet.html"
+
+OutArgument = Annotated[Path, typer.Argument(metavar="OUT", help="The --out folder of a run.")]
+LimitOption = Annotated[
+    float,
+    typer.Option(
+        "--limit",
+        metavar="ARCSEC",
+        min=0.1,
+        max=3600.0,
+        help="Peak of a cause that a joint may reach; the page says in how many hours it will.",
+    ),
+]
+JoinsOption = Annotated[
+    list[str] | None,
+    typer.Argument(metavar="SOURCE...", help="Folders, globs or URLs (s3://, sftp://, ...) of recordings."),
+]
+OutOption = Annotated[
+    Path | None,
+    typer.Option("--out", metavar="FOLDER", help="Folder of the results; a run resumes what is there."),
+]
+ManifestOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--manifest", metavar="M.csv|M.parquet", help="What is known of each recording: docs/fleet.md."
+    ),
+]
+ModelOption = Annotated[
+    Path | None,
+    typer.Option("--model", metavar="MODEL.yaml", help="Model of each joint that has none of its own."),
+]
+ModelsOption = Annotated[
+    Path | None,
+    typer.Option("--models", metavar="FOLDER", help="Folder with the model of each joint, JOINT.yaml."),
+]
+SchedulerOption = Annotated[
+    str | None,
+    typer.Option(
+        "--scheduler", metavar="ADDRESS", help="A Dask scheduler that runs already: tcp://HOST:8786."
+    ),
+]
+WorkersOption = Annotated[
+    int | None,
+    typer.Option("--workers", min=1, max=1000, help="Processes on this computer; else one per core."),
+]
+MemoryOption = Annotated[str, typer.Option("--memory", metavar="SIZE", help="Memory limit of each of them.")]
+
+
+def register(app: typer.Typer) -> None:
+    """Add the commands."""
+    group = typer.Typer(
+        help="Diagnose recordings of many joints on Dask; report which joints to look at first.",
+        no_args_is_help=True,
+        rich_markup_mode="markdown",
+    )
+    group.command()(run)
+    group.command()(report)
+    group.command()(simulate)
+    app.add_typer(group, name="fleet")
+
+
+def run(
+    sources: JoinsOption = None,
+    out: OutOption = None,
+    manifest: ManifestOption = None,
+    model: ModelOption = None,
+    models: ModelsOption = None,
+    scheduler: SchedulerOption = None,
+    workers: WorkersOption = None,
+    memory: MemoryOption = "2GB",
+    limit_arcsec: LimitOption = 10.0,
+) -> None:
+    """Diagnose every recording that is not in FOLDER yet, and write Parquet and a page there.
+
+    A joint without a model gets one fitted to its earliest recording. A recording that cannot be used is a
+    row with the reason. Ctrl-C keeps what is done; the same command continues.
+    """
+    from hdbridge.fleet.dataset import Dataset
+    from hdbridge.fleet.engine import Cluster, Progress
+    from hdbridge.fleet.engine import run as run_fleet
+    from hdbridge.fleet.sources import find_sources
+
+    _need_extra()
+    if out is None:
+        raise InputError("--out is missing; name a new folder, or one of an earlier run")
+    if not sources and manifest is None:
+        raise InputError(
+            "no source; name folders, globs or URLs of recordings, or a manifest with --manifest"
+        )
+    if scheduler is not None and workers is not None:
+        raise InputError(
+            "--workers: a cluster that exists has its own workers; leave out --workers or --scheduler"
+        )
+    _check_memory(memory)
+    found = find_sources(sources or [], manifest)
+    dataset = Dataset(out)
+    dataset.create()
+    notes.print(f"{len(found)} sources, {len({each.joint for each in found})} joints")
+    with deferred_interrupt() as interrupted, progress_bar() as bar:
+        task = bar.add_task("diagnosing", total=len(found))
+
+        def tell(now: Progress) -> None:
+            words = f"{now.done} of {now.total}" + f", {now.failed} failed" * bool(now.failed)
+            bar.update(task, completed=now.done, total=max(now.total, 1), description=words)
+
+        try:
+            end = run_fleet(
+                found,
+                dataset,
+                Cluster(scheduler, workers, memory),
+                model=model,
+                models=models,
+                progress=tell,
+                interrupted=interrupted,
+            )
+        except KeyboardInterrupt:
+            notes.print(
+                f"interrupted; {out} keeps what is done, and the same command continues", soft_wrap=True
+            )
+            raise
+    _say(
+        f"{out}: {end.done} recordings, {end.known} of them known already, {end.failed} newly failed; "
+        f"largest memory of a worker {end.memory_mb:.0f} MB"
+    )
+    _summarise(dataset, limit_arcsec, out / PAGE_NAME)
+
+
+def report(
+    out: OutArgument,
+    html_file: Annotated[
+        Path | None,
+        typer.Option("--html", metavar="PAGE", help="Where the page goes; else OUT/fleet.html."),
+        Kind.PAGE,
+    ] = None,
+    json_file: JsonOption = None,
+    limit_arcsec: LimitOption = 10.0,
+) -> None:
+    """Write the page of a run again, and print which joints to look at first."""
+    from hdbridge.fleet.dataset import Dataset
+
+    _need_extra()
+    dataset = Dataset(out)
+    dataset.check()
+    _summarise(dataset, limit_arcsec, html_file or out / PAGE_NAME, json_file)
+
+
+def simulate(
+    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="A new folder.")],
+    joints: Annotated[int, typer.Option("--joints", min=4, max=100_000, help="How many joints.")] = 12,
+    recordings: Annotated[int, typer.Option("--recordings", min=3, max=1000, help="Recordings of each.")] = 4,
+    seed: Annotated[int, typer.Option("--seed", help="Another seed draws another fleet.")] = 0,
+) -> None:
+    """Make recordings of a simulated fleet: known causes that grow over a year, damaged files, exchanged
+    joints.
+
+    FOLDER gets the recordings, `manifest.csv`, and `answers.json` with what was hidden.
+    """
+    from hdbridge.fleet.simulate import simulate as make
+
+    with progress_bar() as bar:
+        task = bar.add_task("simulating", total=1.0)
+        make(folder, joints, recordings, seed, lambda share: bar.update(task, completed=share))
+    _say(f"{folder}: {joints} joints with {recordings} recordings each")
+
+
+def _summarise(dataset: object, limit_arcsec: float, page: Path, json_file: Path | None = None) -> None:
+    from rich.table import Table
+
+    from hdbridge.fleet.dataset import Dataset
+    from hdbridge.fleet.report import fleet_page, hours_words
+    from hdbridge.fleet.summary import summarise
+    from hdbridge.report.page import render
+
+    assert isinstance(dataset, Dataset)
+    summary: Summary = summarise(dataset.recordings(), limit_arcsec)
+    write_json(json_file, summary.as_dict())
+    table = Table("joint", "cause", "probability", "peak, arcsec", "hours to the limit")
+    for each in summary.first:
+        table.add_row(
+            each.joint,
+            each.cause,
+            f"{each.probability:.2f}",
+            f"{each.peak_arcsec:.1f}",
+            hours_words(each.remaining),
+        )
+    if summary.first:
+        print_table(table)
+    else:
+        _say("No joint stands out.")
+    for line in summary.lines():
+        _say(line)
+    write_result(page, render(fleet_page(summary, dataset.folder)))
+
+
+def _check_memory(text: str) -> None:
+    from dask.utils import parse_bytes
+
+    try:
+        enough = parse_bytes(text) >= 200_000_000
+    except ValueError:
+        raise InputError(f"--memory: found '{text}'; expected a size such as 2GB") from None
+    if not enough:
+        raise InputError(
+            f"--memory: found '{text}'; expected at least 200MB: the libraries alone need so much"
+        )
+
+
+def _need_extra() -> None:
+    from importlib.util import find_spec
+
+    lacking = [name for name in ("distributed", "pyarrow", "fsspec") if find_spec(name) is None]
+    if lacking:
+        raise InputError(f"a fleet needs {', '.join(lacking)}: python -m pip install 'hdbridge[fleet]'")
+
+
+def _say(line: str) -> None:
+    console.print(line, markup=False, soft_wrap=True)

@@ -1,0 +1,244 @@
+"""The rows of a fleet as Parquet: written piece by piece during a run, and compacted at its end.
+
+`OUT/recordings` and `OUT/findings` hold the result, in parts by the first digit of the key and sorted, so
+that the same recordings give the same bytes however the run went. `OUT/increments` holds what a run has
+added and nothing has compacted yet; a killed run leaves it behind, and the next one includes it.
+docs/files.md describes the columns, which are a contract.
+"""
+
+from __future__ import annotations
+
+import os
+from collections import defaultdict
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+from hdbridge.errors import InputError, OutputError
+from hdbridge.files.atomic import make_folder
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+RECORDINGS: Final = "recordings"
+FINDINGS: Final = "findings"
+INCREMENTS: Final = "increments"
+PREFIXES: Final = "0123456789abcdef"
+SCHEMA: Final = "hdbridge.fleet/1"
+NESTED: Final = {
+    "figures": ("name: text", "value", "half_width"),
+    "limits": ("cause: text", "arcsec"),
+    "orders": ("order: integer", "cos_arcsec", "sin_arcsec"),
+    "parameters": ("name: text", "value", "low", "high", "unit: text"),
+}
+"""Parts of the columns that are lists; without a type they are numbers."""
+COLUMNS: Final[Mapping[str, Mapping[str, tuple[str, str]]]] = {
+    RECORDINGS: {
+        "key": (
+            "text",
+            "SHA-256 of what the row was made from: see below",
+        ),
+        "path": ("text", "recording: path or URL"),
+        "joint": ("text", "name of the joint; empty if nothing says it"),
+        "axis": ("text", "axis of a flight recording, or axis file of a bus log"),
+        "gear": ("text", "type of the gear: the manifest's, else the ratio"),
+        "batch": ("text", "from the manifest"),
+        "cell": ("text", "from the manifest"),
+        "lubricant": ("text", "from the manifest"),
+        "hours": ("number", "operating hours, from the manifest"),
+        "date": ("text", "when it was recorded, ISO 8601"),
+        "samples_sha256": (
+            "text",
+            "of time, motor angle and load angle, little-endian float64, one after the other",
+        ),
+        "model_sha256": ("text", "of the model without its provenance"),
+        "version": ("text", "version of hdbridge"),
+        "model": ("text", "model file; `models/JOINT.yaml` is in OUT"),
+        "ratio": ("number", "motor turns per load turn"),
+        "samples": ("integer", "rows of the recording"),
+        "duration_s": ("number", "time in its parts"),
+        "travel_deg": ("number", "range of the load angle"),
+        "temperature_c": ("number", "mean, if the recording has the channel"),
+        "rms_arcsec": ("number", "model as given against measurement"),
+        "refitted_rms_arcsec": ("number", "the same with its parameters refitted"),
+        "extended_rms_arcsec": ("number", "the same with the causes that were found"),
+        "floor_arcsec": ("number", "noise of a reading"),
+        "figures": ("figures", "parameters of the extended model, with 95 % half widths"),
+        "limits": (
+            "limits",
+            "smallest peak from which each cause would be named; no entry if it cannot be seen",
+        ),
+        "orders": (
+            "orders",
+            "orders of the motor angle in the samples, without any model; empty below two turns",
+        ),
+        "remarks": ("texts", "restrictions of the data"),
+        "reason": ("text", "why there is no diagnosis; null if there is one"),
+        "duplicate_of": ("text", "path of the first recording with the same samples; null for that one"),
+    },
+    FINDINGS: {
+        "key": ("text", "of the recording"),
+        "path": ("text", "of the recording"),
+        "joint": ("text", "of the recording"),
+        "rank": ("integer", "1 is what the diagnosis names first"),
+        "cause": ("text", "name in the catalogue, or `unexplained`"),
+        "probability": ("number", "that this cause, or one of its aliases, is there"),
+        "aliases": ("texts", "causes that the recording cannot distinguish from it"),
+        "peak_arcsec": ("number", "half the span of what it does in the recording"),
+        "held_out_before_arcsec": ("number", "rms on held-out data without it; null if nothing was held out"),
+        "held_out_after_arcsec": ("number", "the same with it"),
+        "parameters": ("parameters", "its parameters, with 95 % intervals"),
+        "lives_in": ("text", "of `unexplained`: the coordinate that it depends on"),
+        "note": ("text", "restriction"),
+    },
+}
+"""Columns of the two data sets: kind, and meaning."""
+
+
+def schema(name: str) -> pa.Schema:
+    """The Arrow schema of ``recordings`` or ``findings``."""
+    import pyarrow as pa
+
+    plain = {
+        "text": pa.string(),
+        "number": pa.float64(),
+        "integer": pa.int64(),
+        "texts": pa.list_(pa.string()),
+    }
+
+    def kind(word: str) -> pa.DataType:
+        if word in plain:
+            return plain[word]
+        parts = [each.partition(": ") for each in NESTED[word]]
+        return pa.list_(pa.struct([(part, plain[of or "number"]) for part, _, of in parts]))
+
+    fields = [pa.field(column, kind(word)) for column, (word, _) in COLUMNS[name].items()]
+    return pa.schema(fields, {"schema": SCHEMA, "dataset": name})
+
+
+class Dataset:
+    """The rows in a folder. One process writes it at a time."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+
+    def create(self) -> None:
+        """Makes the folder; InputError if it cannot be made or holds something else."""
+        if self.folder.is_dir() and any(self.folder.iterdir()) and not self._is_one():
+            raise InputError(
+                f"{self.folder}: is not empty and was not written by hdbridge fleet; expected a new "
+                "folder, or one "
+                "of an earlier run"
+            )
+        make_folder(self.folder / INCREMENTS)
+
+    def check(self) -> None:
+        """InputError unless this is the folder of a run."""
+        if not self._is_one():
+            raise InputError(
+                f"{self.folder}: no {RECORDINGS} in this folder; expected the --out of hdbridge fleet run"
+            )
+
+    def _is_one(self) -> bool:
+        return any((self.folder / each).is_dir() for each in (RECORDINGS, INCREMENTS))
+
+    def known(self) -> frozenset[tuple[str, str]]:
+        """Key and path of every row."""
+        return frozenset((row["key"], row["path"]) for row in self._rows(RECORDINGS, ["key", "path"]))
+
+    def add(self, rows: Sequence[Mapping[str, Any]]) -> None:
+        """Keeps rows of recordings, each with its ``findings``; a crash keeps all of them or none."""
+        if not rows:
+            return
+        folder = self.folder / INCREMENTS
+        number = (
+            max((int(each.stem.partition("-")[2]) for each in folder.glob("*-*.parquet")), default=-1) + 1
+        )
+        findings = [
+            {"key": row["key"], "path": row["path"], "joint": row["joint"], **each}
+            for row in rows
+            for each in row["findings"]
+        ]
+        # Findings without their recording are ignored, so the recordings come last.
+        _write(folder / f"{FINDINGS}-{number:06d}.parquet", findings, FINDINGS)
+        _write(folder / f"{RECORDINGS}-{number:06d}.parquet", rows, RECORDINGS)
+
+    def compact(self, present: Collection[tuple[str, str]] = ()) -> None:
+        """Merges the increments into the parts, marks duplicates and sorts.
+
+        ``present`` are key and path of what the last run has seen: any other row of the same path is of a
+        file, a model or a version that has changed since, and is dropped.
+        """
+        current: dict[str, set[str]] = defaultdict(set)
+        for key, path in present:
+            current[path].add(key)
+        found = {
+            (row["key"], row["path"]): row
+            for row in self._rows(RECORDINGS)
+            if row["path"] not in current or row["key"] in current[row["path"]]
+        }
+        rows = [found[each] for each in sorted(found)]
+        _mark_duplicates(rows)
+        findings = {
+            (row["key"], row["path"], row["rank"]): row
+            for row in self._rows(FINDINGS)
+            if (row["key"], row["path"]) in found
+        }
+        for name, each in ((FINDINGS, [findings[key] for key in sorted(findings)]), (RECORDINGS, rows)):
+            folder = make_folder(self.folder / name)
+            for prefix in PREFIXES:
+                part = [row for row in each if row["key"].startswith(prefix)]
+                target = folder / f"part-{prefix}.parquet"
+                if part:
+                    _write(target, part, name)
+                else:
+                    target.unlink(missing_ok=True)
+        for done in sorted((self.folder / INCREMENTS).glob("*.parquet"), reverse=True):  # recordings go first
+            done.unlink()
+
+    def recordings(self) -> list[dict[str, Any]]:
+        """The rows of all recordings, each with its ``findings`` in the order of their rank."""
+        rows = {(row["key"], row["path"]): {**row, "findings": []} for row in self._rows(RECORDINGS)}
+        for each in sorted(self._rows(FINDINGS), key=lambda row: row["rank"]):
+            if (each["key"], each["path"]) in rows:
+                rows[each["key"], each["path"]]["findings"].append(each)
+        return [rows[each] for each in sorted(rows)]
+
+    def _rows(self, name: str, columns: list[str] | None = None) -> Iterable[dict[str, Any]]:
+        import pyarrow as pa
+        import pyarrow.parquet as pq
+
+        parts = sorted((self.folder / name).glob("part-*.parquet"))
+        parts += sorted((self.folder / INCREMENTS).glob(f"{name}-*.parquet"))
+        for path in parts:
+            try:
+                rows = pq.ParquetFile(path).read(columns).to_pylist()
+            except (OSError, pa.ArrowException) as problem:
+                raise InputError(f"{path}: cannot be read: {problem}; remove it and run again") from None
+            missing = dict.fromkeys(columns or COLUMNS[name])  # of a column that was not there yet
+            yield from ({**missing, **row} for row in rows)
+
+
+def _mark_duplicates(rows: Sequence[dict[str, Any]]) -> None:
+    first: dict[str, str] = {}
+    for row in sorted(rows, key=lambda row: (row["date"] or "", len(row["path"]), row["path"])):
+        row["duplicate_of"] = None
+        if samples := row["samples_sha256"]:
+            original = first.setdefault(samples, row["path"])
+            row["duplicate_of"] = original if original != row["path"] else None
+
+
+def _write(path: Path, rows: Sequence[Mapping[str, Any]], name: str) -> None:
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    table = pa.Table.from_pylist([dict(row) for row in rows], schema=schema(name))
+    aside = path.with_name(f".{path.name}.tmp")
+    try:
+        pq.write_table(table, aside)
+        with aside.open("rb") as file:
+            os.fsync(file.fileno())
+        aside.replace(path)
+    except OSError as problem:
+        aside.unlink(missing_ok=True)
+        raise OutputError(f"{path}: cannot be written: {problem.strerror}") from None

@@ -1,0 +1,280 @@
+"""A run over a fleet: one Dask task for each recording, on a local cluster or on one that exists.
+
+Dask schedules, restarts workers and repeats what a dead worker had. A recording that kills its worker
+again and again is diagnosed once more when everything else is done, alone; if that fails too, its row says
+so.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import defaultdict
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+from urllib.parse import quote
+
+from hdbridge.errors import InputError
+from hdbridge.files.atomic import write_atomically
+from hdbridge.fleet.dataset import Dataset
+from hdbridge.fleet.diagnosing import Model, Row, axes_of, diagnosed, fitted, local_model, lost
+from hdbridge.fleet.sources import Source, with_axes
+
+if TYPE_CHECKING:
+    from distributed import Client
+
+BATCH: Final = 64
+"""Rows that are written together ..."""
+BATCH_S: Final = 30.0
+"""... or after this time."""
+POLL_S: Final = 0.25
+AHEAD: Final = 2000
+"""Tasks that the scheduler holds at a time."""
+KILLED: Final = (
+    "it kills its worker each time, most likely for memory; raise --memory, or shorten the recording"
+)
+
+
+@dataclass(frozen=True)
+class Progress:
+    """How far a run has come."""
+
+    done: int
+    total: int
+    failed: int
+    known: int
+    memory_mb: float
+    """Largest memory of a worker that was seen so far."""
+
+
+@dataclass(frozen=True)
+class Cluster:
+    """Where a run takes place."""
+
+    scheduler: str | None = None
+    """Address of a scheduler that exists; None for a cluster of its own on this computer."""
+    workers: int | None = None
+    memory: str = "2GB"
+    """Memory limit of each worker of its own cluster."""
+
+    @contextmanager
+    def client(self) -> Iterator[Client]:
+        """The connected client. InputError if there is no scheduler, or Dask is not installed."""
+        try:
+            from distributed import Client, LocalCluster
+        except ImportError:
+            raise InputError("a fleet needs Dask: python -m pip install 'hdbridge[fleet]'") from None
+        if self.scheduler is not None:
+            try:
+                client = Client(self.scheduler, set_as_default=False)
+            except (OSError, ValueError) as problem:
+                raise InputError(f"--scheduler {self.scheduler}: cannot be reached: {problem}") from None
+            with client:
+                yield client
+            return
+        with (
+            LocalCluster(
+                n_workers=self.workers,
+                threads_per_worker=1,
+                memory_limit=self.memory,
+                dashboard_address="127.0.0.1:0",
+                silence_logs=50,
+            ) as cluster,
+            Client(cluster, set_as_default=False) as client,
+        ):
+            yield client
+
+
+def run(
+    sources: Sequence[Source],
+    dataset: Dataset,
+    cluster: Cluster,
+    *,
+    model: Path | None = None,
+    models: Path | None = None,
+    progress: Callable[[Progress], None] = lambda _: None,
+    interrupted: Callable[[], bool] = lambda: False,
+) -> Progress:
+    """Diagnose what is not in the data set yet, and add it.
+
+    ``model`` is the model of every joint, ``models`` a folder of JOINT.yaml; a joint without one gets a model
+    fitted to its earliest recording, kept in OUT/models. Raises KeyboardInterrupt when it was interrupted;
+    what was done until then is kept.
+    """
+    dataset.create()
+    with cluster.client() as client:
+        return _Run(client, dataset, progress, interrupted).of(sources, model, models)
+
+
+class _Run:
+    def __init__(
+        self,
+        client: Client,
+        dataset: Dataset,
+        progress: Callable[[Progress], None],
+        interrupted: Callable[[], bool],
+    ) -> None:
+        self._client = client
+        self._dataset = dataset
+        self._tell = progress
+        self._interrupted = interrupted
+        self._rows: list[Row] = []
+        self._present: list[tuple[str, str]] = []
+        self._written_s = time.monotonic()
+        self._failed = self._known = self._total = 0
+        self._memory = 0.0
+
+    def of(self, sources: Sequence[Source], model: Path | None, models: Path | None) -> Progress:
+        """The whole run; whatever ends it, what is done is kept."""
+        try:
+            sources = self._split_flights(sources)
+            self._total = len(sources) + len(self._present)
+            given = self._models(sources, model, models)
+            known = self._dataset.known()
+            shared = self._client.scatter([known], broadcast=True, hash=False)[0] if known else ()
+            tasks = ((diagnosed, (each, given[each.joint or ""], shared)) for each in sources)
+            again = []
+            for place, row in self._results(tasks):
+                if row is None:
+                    again.append(place)
+                else:
+                    self._take(row)
+            for place in again:  # alone, so that none is blamed for another
+                task = (diagnosed, (sources[place], given[sources[place].joint or ""], shared))
+                for _, row in self._results([task]):
+                    self._take(row if row is not None else lost(sources[place], KILLED))
+        finally:
+            self._write()
+            self._dataset.compact(self._present)
+        self._report()
+        return self._state()
+
+    def _split_flights(self, sources: Sequence[Source]) -> list[Source]:
+        """Each flight recording as one source for each axis."""
+        result = [each for each in sources if not each.is_flight]
+        flights: dict[str, list[Source]] = defaultdict(list)
+        for each in sources:
+            if each.is_flight:
+                flights[each.path].append(each)
+        paths = list(flights)
+        for place, axes in self._results((axes_of, (path,)) for path in paths):
+            described = flights[paths[place]]
+            if isinstance(axes, list):
+                result += with_axes(paths[place], axes, described)
+            else:
+                self._take(lost(described[0], axes or KILLED))
+        return sorted(result, key=lambda each: (each.path, each.axis or ""))
+
+    def _models(self, sources: Sequence[Source], model: Path | None, models: Path | None) -> dict[str, Model]:
+        """The model of each joint; those that are missing are fitted."""
+        joints: dict[str, list[Source]] = defaultdict(list)
+        for each in sources:
+            joints[each.joint or ""].append(each)
+        folder = self._dataset.folder / "models"
+        found: dict[str, Model] = {"": Model(reason="the joint is not known")}
+        to_fit = []
+        for joint in sorted(filter(None, joints)):
+            own = sorted(joints[joint], key=lambda each: each.order)
+            said = next((each.model for each in own if each.model), None)
+            kept = folder / f"{quote(joint, safe='')}.yaml"
+            in_folder = models / f"{quote(joint, safe='')}.yaml" if models else None
+            if said:
+                found[joint] = local_model(said)
+            elif in_folder is not None and in_folder.is_file():
+                found[joint] = local_model(str(in_folder))
+            elif model is not None:
+                found[joint] = local_model(str(model))
+            elif kept.is_file():
+                found[joint] = replace(local_model(str(kept)), where=f"models/{kept.name}")
+            else:
+                to_fit.append((joint, own, kept))
+        total, self._total = self._total, self._total + len(to_fit)
+        fits = ((fitted, (own, f"models/{kept.name}")) for _, own, kept in to_fit)
+        for place, made in self._results(fits):
+            joint, _, kept = to_fit[place]
+            found[joint] = made or Model(reason=f"no model could be fitted: {KILLED}")
+            if not found[joint].reason:
+                folder.mkdir(exist_ok=True)
+                write_atomically(kept, found[joint].text)
+        self._total = total
+        return found
+
+    def _results(
+        self, tasks: Iterable[tuple[Callable[..., Any], tuple[Any, ...]]]
+    ) -> Iterator[tuple[int, Any]]:
+        """The number and the result of each task as they are done; None for one that kills its workers."""
+        from distributed import KilledWorker, as_completed
+
+        numbered = enumerate(tasks)
+        numbers: dict[Any, int] = {}
+        done = as_completed([], loop=self._client.loop)
+        more, waiting = True, 0
+
+        def submit() -> None:
+            nonlocal more, waiting
+            while more and waiting < AHEAD:
+                found = next(numbered, None)
+                if found is None:
+                    more = False
+                    return
+                number, (work, arguments) = found
+                future = self._client.submit(work, *arguments, pure=False)
+                numbers[future.key] = number
+                done.add(future)
+                waiting += 1
+
+        submit()
+        seen_s = time.monotonic()
+        while waiting or more:
+            if self._interrupted():
+                raise KeyboardInterrupt
+            batch = done.next_batch(block=False) if waiting else []
+            for future in batch:
+                waiting -= 1
+                number = numbers.pop(future.key)
+                try:
+                    result = future.result()
+                except KilledWorker:
+                    result = None
+                future.release()
+                yield number, result
+            submit()
+            if time.monotonic() - seen_s > 5.0:
+                seen_s = time.monotonic()
+                self._measure()
+            if not batch:
+                time.sleep(POLL_S)
+
+    def _measure(self) -> None:
+        """Takes note of the workers' memory; one that is not there yet is waited for."""
+        with suppress(OSError):
+            workers: Collection[Mapping[str, Any]] = self._client.scheduler_info(n_workers=-1)[
+                "workers"
+            ].values()
+            self._memory = max(
+                self._memory, *(each["metrics"].get("memory", 0) / 1e6 for each in workers), 0.0
+            )
+
+    def _take(self, row: Row) -> None:
+        self._present.append((row["key"], row["path"]))
+        if "findings" not in row:
+            self._known += 1
+        else:
+            self._failed += bool(row.get("reason"))
+            self._rows.append(row)
+        if len(self._rows) >= BATCH or time.monotonic() - self._written_s > BATCH_S:
+            self._write()
+        self._report()
+
+    def _write(self) -> None:
+        self._dataset.add(self._rows)
+        self._rows.clear()
+        self._written_s = time.monotonic()
+
+    def _state(self) -> Progress:
+        return Progress(len(self._present), self._total, self._failed, self._known, self._memory)
+
+    def _report(self) -> None:
+        self._tell(self._state())

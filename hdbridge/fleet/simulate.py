@@ -1,0 +1,263 @@
+"""A fleet that does not exist: joints drawn at random, which age over a year, and what goes wrong with files.
+
+Each joint is the bundled demo axis with a gear of its own. Its recordings come from the simulated axis
+(`hdbridge.sim`), which shares no code with the diagnosis. What was hidden goes to `answers.json`.
+"""
+
+from __future__ import annotations
+
+import gzip
+import json
+import shutil
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, field
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from random import Random
+from typing import Any, Final
+
+from hdbridge.errors import InputError
+from hdbridge.files.atomic import make_folder, write_atomically
+from hdbridge.files.profile import Profile
+from hdbridge.records.record import Record
+from hdbridge.sim.exercise import Exercise
+from hdbridge.sim.machine import Machine
+from hdbridge.sim.truth import Truth
+
+YEAR_HOURS: Final = 8000.0
+BEGIN: Final = datetime(2026, 1, 5, 6, 0, tzinfo=UTC)
+LUBRICANTS: Final = ("grease A", "grease B")
+CELLS: Final = ("cell 1", "cell 2", "cell 3")
+BATCHES: Final = ("2025-07", "2025-08", "2025-09")
+SICK: Final = 0.2
+"""Share of joints that age by a cause; three times as many in the last batch."""
+ODD: Final = 0.1
+"""Share of healthy joints that are unlike the others from the beginning."""
+EVERYDAY: Final = 0.015
+"""Standard deviation of what changes between two recordings of a healthy joint: orders and loop,
+relatively.
+"""
+
+
+@dataclass
+class Joint:
+    """What a joint is, and what happens to it."""
+
+    name: str
+    batch: str
+    cell: str
+    lubricant: str
+    orders: list[dict[str, float]]
+    offset_arcsec: float
+    cause: str | None = None
+    arcsec_per_1000_hours: float = 0.0
+    """Growth of the cause's peak from zero at 0 hours."""
+    odd: bool = False
+    turned_at: int | None = None
+    """Recording from which on the motor encoder is another one."""
+    turned_deg: float = 0.0
+    hours: list[float] = field(default_factory=list)
+
+
+def _load_order(data: dict[str, Any], size: float) -> None:
+    radius_mm = 30.0
+    shift_um = size / 206264.8 * radius_mm * 1e3
+    data["load"]["encoder"]["disc"] = {
+        "radius_mm": radius_mm,
+        "eccentricity_um": shift_um,
+        "eccentric_at_deg": 40.0,
+    }
+
+
+def _backlash(data: dict[str, Any], size: float) -> None:
+    data["gear"]["backlash_arcsec"] = 2.0 * size
+    data["load"]["coulomb_nm"] = 0.3
+
+
+def _flexspline(data: dict[str, Any], size: float) -> None:
+    data["gear"]["flexspline_orders"] = [{"order": 2, "amplitude_arcsec": size, "phase_deg": 70.0}]
+
+
+def _motor_order(data: dict[str, Any], size: float) -> None:
+    data["gear"]["motor_orders"].append({"order": 5, "amplitude_arcsec": size, "phase_deg": 25.0})
+
+
+def _loop(data: dict[str, Any], size: float) -> None:
+    data["gear"]["hysteresis"]["offset_arcsec"] += size
+
+
+CAUSES: Final[Mapping[str, Callable[[dict[str, Any], float], None]]] = {
+    "load_order": _load_order,
+    "backlash": _backlash,
+    "flexspline_order": _flexspline,
+    "motor_order": _motor_order,
+    "hysteresis_parameters": _loop,
+}
+"""What joints age by: each makes a peak of a size, in arcsec."""
+
+
+def simulate(
+    folder: Path,
+    joints: int,
+    recordings: int,
+    seed: int,
+    progress: Callable[[float], None] = lambda _: None,
+) -> None:
+    """Write recordings, `manifest.csv` and `answers.json` to a new folder.
+
+    One file in a hundred is damaged, and one in fifty is there twice; there is at least one of each. Two
+    joints are exchanged for each other, and one gets another motor encoder. InputError for fewer than 4
+    joints or 3 recordings, and for a folder that is not empty.
+    """
+    if joints < 4 or recordings < 3:
+        raise InputError(
+            f"found {joints} joints with {recordings} recordings; expected at least 4 with at least 3"
+        )
+    if folder.is_dir() and any(folder.iterdir()):
+        raise InputError(f"{folder}: is not empty; expected a new folder")
+    make_folder(folder)
+    rng = Random(seed)
+    base = Truth.load(Profile.find("demo").truth).model_dump(by_alias=True, mode="json")
+    fleet = [_drawn(number, recordings, base, rng) for number in range(1, joints + 1)]
+    healthy = [each for each in fleet if each.cause is None]
+    for each in fleet if len(healthy) < 3 else ():
+        each.cause, each.arcsec_per_1000_hours = None, 0.0
+    healthy = rng.sample([each for each in fleet if each.cause is None], 3)
+    swapped, turned = healthy[:2], healthy[2]
+    swapped_at = rng.randrange(1, recordings)
+    turned.turned_at, turned.turned_deg = rng.randrange(1, recordings), rng.uniform(30.0, 330.0)
+    for number in range(recordings):  # exchanged: what is filed under one name is the other joint
+        for one, other in (swapped, swapped[::-1]):
+            one.hours[number] = max(one.hours[number], other.hours[number])
+    rows, paths = [], []
+    for done, each in enumerate(fleet):
+        for number in range(recordings):
+            filed = each
+            if number >= swapped_at and each in swapped:
+                filed = swapped[1 - swapped.index(each)]
+            path = folder / filed.name / f"{round(each.hours[number]):06d}.csv.gz"
+            make_folder(path.parent)
+            _recorded(each, number, base, rng).write_csv(path)
+            paths.append(path)
+            rows.append(_row(path.relative_to(folder), filed, each.hours[number]))
+        progress((done + 1) / joints)
+    answers = {"swapped": [each.name for each in swapped], "swapped_from": swapped_at}
+    answers |= _spoiled(folder, paths, rows, rng)
+    content = {
+        "schema": "hdbridge.fleet-answers/1",
+        "seed": seed,
+        **answers,
+        "joints": [asdict(each) for each in fleet],
+    }
+    write_atomically(folder / "answers.json", json.dumps(content, indent=2) + "\n")
+    lines = [
+        ",".join(rows[0]),
+        *(",".join(each.values()) for each in sorted(rows, key=lambda each: each["path"])),
+    ]
+    write_atomically(folder / "manifest.csv", "\n".join(lines) + "\n")
+
+
+def _drawn(number: int, recordings: int, base: Mapping[str, Any], rng: Random) -> Joint:
+    batch = rng.choice(BATCHES)
+    joint = Joint(f"J{number:04d}", batch, rng.choice(CELLS), rng.choice(LUBRICANTS), [], 0.0)
+    joint.odd = rng.random() < ODD
+    scale = rng.uniform(2.0, 2.5) if joint.odd else 1.0
+    joint.orders = [
+        {
+            "order": each["order"],
+            "amplitude_arcsec": scale * each["amplitude_arcsec"] * rng.uniform(0.7, 1.3),
+            "phase_deg": rng.uniform(-180.0, 180.0),
+        }
+        for each in base["gear"]["motor_orders"]
+    ]
+    joint.offset_arcsec = base["gear"]["hysteresis"]["offset_arcsec"] * rng.uniform(0.9, 1.1)
+    if rng.random() < SICK * (3.0 if batch == BATCHES[-1] else 1.0) and not joint.odd:
+        joint.cause = rng.choice(list(CAUSES))
+        joint.arcsec_per_1000_hours = rng.uniform(0.6, 2.0)
+    step = YEAR_HOURS / recordings
+    joint.hours = [round((k + rng.uniform(0.0, 0.6)) * step + 20.0, 1) for k in range(recordings)]
+    return joint
+
+
+def _truth(joint: Joint, number: int, base: Mapping[str, Any], rng: Random) -> Truth:
+    """The axis at one of its recordings."""
+    data = json.loads(json.dumps(base))
+    data["substep_ms"] = 1.0
+    data["motor"]["encoder"].update(counts_per_turn=65536, interpolation=16)
+    data["gear"].update(stiffness_nm_per_rad=45_000.0, damping_nm_s_per_rad=40.0)
+    data["servo"]["load_feedforward"]["frequency_hz"] = 65.0
+    turned = joint.turned_at is not None and number >= joint.turned_at
+    data["gear"]["motor_orders"] = [
+        {
+            **each,
+            "amplitude_arcsec": each["amplitude_arcsec"] * rng.gauss(1.0, EVERYDAY),
+            "phase_deg": (each["phase_deg"] + turned * each["order"] * joint.turned_deg) % 360.0,
+        }
+        for each in joint.orders
+    ]
+    data["gear"]["hysteresis"]["start_arcsec"] = 0.0
+    data["gear"]["hysteresis"]["offset_arcsec"] = joint.offset_arcsec * rng.gauss(1.0, EVERYDAY)
+    if joint.cause is not None:
+        CAUSES[joint.cause](data, joint.arcsec_per_1000_hours * joint.hours[number] / 1000.0)
+    return Truth.model_validate(data)
+
+
+def _recorded(joint: Joint, number: int, base: Mapping[str, Any], rng: Random) -> Record:
+    """A minute of motion: a turn of the load there and back, and swings of several sizes."""
+    exercise = Exercise(
+        Machine(_truth(joint, number, base, rng), rng.randrange(2**31), may_compile=True), cycles_per_sample=4
+    )
+    exercise.hold(0.5)
+    exercise.move(-720.0, 600.0, 2000.0)
+    exercise.move(18_000.0 + 720.0, 720.0, 2000.0)
+    exercise.hold(0.5)
+    exercise.move(-18_000.0, 720.0, 2000.0)
+    for amplitude_deg in (90.0, 30.0, 8.0):
+        exercise.sine(amplitude_deg, 0.25, 1.0)
+    exercise.hold(0.5)
+    found = exercise.readings()
+    return Record(
+        {
+            "time_s": found.time_s,
+            "motor_position_deg": found.motor_deg,
+            "load_position_deg": found.load_deg,
+            "motor_target_deg": found.target_deg,
+        }
+    )
+
+
+def _row(path: Path, joint: Joint, hours: float) -> dict[str, str]:
+    date = BEGIN + timedelta(hours=hours)
+    return {
+        "path": path.as_posix(),
+        "joint": joint.name,
+        "ratio": "50",
+        "batch": joint.batch,
+        "cell": joint.cell,
+        "lubricant": joint.lubricant,
+        "hours": f"{hours:g}",
+        "date": date.isoformat(timespec="seconds"),
+    }
+
+
+def _spoiled(folder: Path, paths: list[Path], rows: list[dict[str, str]], rng: Random) -> dict[str, Any]:
+    """Damages some files and copies others; says which."""
+    bad = rng.sample(range(len(paths)), max(1, len(paths) // 100))
+    twice = rng.sample([each for each in range(len(paths)) if each not in bad], max(1, len(paths) // 50))
+    for place in bad:
+        path = paths[place]
+        how = rng.randrange(3)
+        if how == 0:  # the transfer broke off
+            path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+        elif how == 1:
+            path.write_bytes(b"")
+        else:
+            path.write_bytes(gzip.compress(b"<html>404 Not Found</html>\n", mtime=0))
+    copies = []
+    for place in twice:
+        path = paths[place]
+        copy = path.with_name(path.name.replace(".csv.gz", "-copy.csv.gz"))
+        shutil.copyfile(path, copy)
+        rows.append({**rows[place], "path": copy.relative_to(folder).as_posix()})
+        copies.append(rows[-1]["path"])
+    return {"damaged": [rows[each]["path"] for each in bad], "copies": copies}

@@ -1,0 +1,414 @@
+"""What many joints say that one does not: pure statistics on arrays, without files and without randomness.
+
+Every rate, scatter and prior is estimated from the fleet itself, so that a joint is compared with what the
+same diagnosis says of the others on everyday records. Where the data do not decide, the answer is None.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+from scipy.special import betaln, chdtri, expit, logsumexp, ndtr, ndtri
+
+from hdbridge.effects import FloatArray, IntArray
+
+Complexes = NDArray[np.complex128]
+MAD: Final = 1.4826
+"""Standard deviation of a normal distribution per median absolute deviation."""
+DRAWS: Final = 4001
+GOLDEN: Final = 0.6180339887498949
+INTERVAL: Final = (0.05, 0.95)
+"""Of hours and prevalences: 90 %."""
+SCATTER_SERIES: Final = 200
+"""Series from which the common scatter is estimated: its error is then 5 % or less."""
+PHASE_STEP_DEG: Final = 0.25
+EVERYDAY_SHARE: Final = 0.05
+"""Share of an order's amplitude by which it may differ between two recordings of one joint."""
+AGREE: Final = 1e-4
+DISAGREE: Final = 1e-12
+"""Probabilities of a chi square as large, below which orders do not agree, and certainly do not."""
+
+
+@dataclass(frozen=True, slots=True)
+class Interval:
+    """A value with its 90 % interval; infinite ends are open."""
+
+    low: float
+    value: float
+    high: float
+
+
+# -- Prevalence
+
+
+def prevalence(cases: Mapping[str, tuple[int, int]]) -> dict[str, Interval]:
+    """Share of joints with a cause in each group, from (cases, joints), partially pooled over the groups.
+
+    A beta-binomial model; its mean and concentration are integrated out over a grid, so a group of three
+    joints is drawn to the others and a group of three hundred is not.
+    """
+    if not cases:
+        return {}
+    hits = np.array([each[0] for each in cases.values()], dtype=float)
+    sizes = np.array([each[1] for each in cases.values()], dtype=float)
+    mean, strength = np.meshgrid(np.linspace(0.01, 0.99, 50), np.geomspace(1.0, 1000.0, 13), indexing="ij")
+    a, b = (mean * strength).ravel(), ((1.0 - mean) * strength).ravel()
+    marginal = sum(
+        betaln(a + hit, b + size - hit) - betaln(a, b) for hit, size in zip(hits, sizes, strict=True)
+    )
+    weight = np.exp(marginal - logsumexp(marginal))
+    a, b, weight = a[weight > 1e-6], b[weight > 1e-6], weight[weight > 1e-6]
+    share = (np.arange(1000) + 0.5) / 1000.0
+    odds = np.vstack([np.log(share), np.log1p(-share)])
+    result = {}
+    for name, hit, size in zip(cases, hits, sizes, strict=True):
+        one, other = a + hit, b + size - hit
+        density = np.exp(np.column_stack([one - 1.0, other - 1.0]) @ odds - betaln(one, other)[:, np.newaxis])
+        below = np.cumsum(weight @ density)
+        low, middle, high = (
+            float(np.interp(each, below / below[-1], share)) for each in (INTERVAL[0], 0.5, INTERVAL[1])
+        )
+        result[name] = Interval(low, middle, high)
+    return result
+
+
+# -- What repeats
+
+
+@dataclass(frozen=True, eq=False)
+class Repeats:
+    """What the fleet says of one cause."""
+
+    probability: FloatArray
+    """That each joint has it, shape (joints,)."""
+    share: float
+    """Of joints that have it."""
+    named: float
+    """Rate at which a recording of a joint that has it names it."""
+    wrongly: float
+    """Rate at which a recording of a joint that does not have it names it."""
+
+
+def repeats(named: Sequence[Sequence[bool]]) -> Repeats:
+    """Which joints have a cause, from whether each of their recordings names it, in the order of time.
+
+    A joint without the cause is named at a constant rate; one with it is named at a higher rate from some
+    recording on, which is unknown. Shares and rates are the fleet's own (expectation maximisation, weak
+    priors).
+    """
+    share, often, rarely = 0.05, 0.8, 0.02
+    lengths = np.array([len(each) for each in named], dtype=int)
+    tables: dict[int, tuple[IntArray, FloatArray]] = {}
+    for length in np.unique(lengths[lengths > 0]).tolist():
+        own = np.flatnonzero(lengths == length)
+        tables[length] = own, np.array([named[place] for place in own.tolist()], dtype=np.float64)
+    probability = np.zeros(len(named))
+    for _ in range(200):
+        hits = hits_of = misses = misses_of = 0.0
+        probability[lengths == 0] = share
+        for length, (own, y) in tables.items():
+            with_it = np.where(y > 0, math.log(often), math.log1p(-often))
+            without = np.where(y > 0, math.log(rarely), math.log1p(-rarely))
+            # The likelihood ratio of each onset: what comes before is as without the cause.
+            onset = np.cumsum((with_it - without)[:, ::-1], axis=1)[:, ::-1]
+            whole = logsumexp(onset, axis=1, keepdims=True)
+            probability[own] = expit(math.log(share / (1.0 - share)) + whole[:, 0] - math.log(length))
+            since = np.cumsum(np.exp(onset - whole), axis=1)  # that it has begun by then
+            ill = probability[own][:, np.newaxis] * since
+            hits += float(np.sum(ill * y))
+            hits_of += float(np.sum(ill))
+            misses += float(np.sum((1.0 - ill) * y))
+            misses_of += float(np.sum(1.0 - ill))
+        before = (share, often, rarely)
+        share = (float(np.sum(probability)) + 0.5) / (len(named) + 10.0)
+        often = min(max((hits + 8.0) / (hits_of + 10.0), 0.5), 0.995)
+        rarely = min(max((misses + 0.1) / (misses_of + 10.0), 1e-4), 0.4)
+        if max(abs(x - y) for x, y in zip(before, (share, often, rarely), strict=True)) < 1e-5:
+            break
+    return Repeats(probability, share, often, rarely)
+
+
+def within_false_discoveries(probability: FloatArray, rate: float) -> FloatArray:
+    """Which of the claims may be made together so that no more than a share ``rate`` of them is wrong."""
+    order = np.argsort(-probability, kind="stable")
+    wrong = np.cumsum(1.0 - probability[order]) / np.arange(1, len(order) + 1)
+    chosen = np.zeros(len(probability), dtype=bool)
+    chosen[order[: int(np.sum(np.maximum.accumulate(wrong) <= rate))]] = True
+    return chosen
+
+
+# -- Normal ranges
+
+
+def normal_range(values: FloatArray) -> Interval:
+    """Median, and the range that 95 % of normal values are in, by the median absolute deviation."""
+    middle = float(np.median(values))
+    half = 1.96 * MAD * float(np.median(np.abs(values - middle)))
+    return Interval(middle - half, middle, middle + half)
+
+
+def outliers(values: FloatArray, rate: float = 0.05) -> NDArray[np.bool_]:
+    """Which values are outside the normal range, with a false discovery rate (Benjamini and Hochberg 1995).
+
+    None of fewer than eight, and none if more than half of the values are equal.
+    """
+    scale = MAD * float(np.median(np.abs(values - np.median(values)))) if len(values) else 0.0
+    if len(values) < 8 or scale == 0.0:
+        return np.zeros(len(values), dtype=bool)
+    chance = 2.0 * ndtr(-np.abs(values - np.median(values)) / scale)
+    order = np.argsort(chance)
+    passed = np.flatnonzero(chance[order] <= rate * np.arange(1, len(values) + 1) / len(values))
+    result = np.zeros(len(values), dtype=bool)
+    result[order[: passed[-1] + 1 if len(passed) else 0]] = True
+    return result
+
+
+# -- Trends
+
+
+@dataclass(frozen=True, eq=False)
+class Series:
+    """One figure of one joint over its hours; arrays of shape (n,)."""
+
+    hours: FloatArray
+    value: FloatArray
+    sd: FloatArray
+    """Standard deviation of each value, by the diagnosis itself."""
+    temperature_c: FloatArray | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Trend:
+    """How a figure changes: the line that was fitted, and the slopes of the fleet as its prior."""
+
+    line: FloatArray
+    """Level at the last recording, and slope per 1000 hours."""
+    covariance: FloatArray
+    """Of these two, by the errors and the scatter alone, shape (2, 2)."""
+    stay: float
+    """Standard deviation of the slopes of joints that stay."""
+    change: tuple[float, float]
+    """Mean and standard deviation of the slopes of joints that change."""
+    changing: float
+    """Probability that the joint belongs to those that change."""
+
+    @cached_property
+    def _draws(self) -> tuple[FloatArray, FloatArray]:
+        """Levels and slopes of the posterior, by quantiles: the same data give the same interval."""
+        slope, cov = float(self.line[1]), self.covariance
+        count = round(self.changing * DRAWS)
+        slopes = []
+        for centre, deviation, number in ((0.0, self.stay, DRAWS - count), (*self.change, count)):
+            variance = 1.0 / (1.0 / deviation**2 + 1.0 / float(cov[1, 1]))
+            middle = variance * (centre / deviation**2 + slope / float(cov[1, 1]))
+            slopes.append(middle + math.sqrt(variance) * ndtri((np.arange(number) + 0.5) / max(number, 1)))
+        drawn = np.concatenate(slopes)
+        # The level given the slope; its own part runs through the quantiles in an order unlike the slope's.
+        level = self.line[0] + cov[0, 1] / cov[1, 1] * (drawn - slope)
+        rest = math.sqrt(max(float(cov[0, 0] - cov[0, 1] ** 2 / cov[1, 1]), 0.0))
+        return level + rest * ndtri((np.arange(1, DRAWS + 1) * GOLDEN) % 1.0), drawn
+
+    @property
+    def per_1000_hours(self) -> Interval:
+        """The slope with its interval."""
+        return Interval(
+            *(float(each) for each in np.quantile(self._draws[1], (INTERVAL[0], 0.5, INTERVAL[1])))
+        )
+
+    def growing(self) -> float:
+        """Probability that the slope is positive."""
+        return float(np.mean(self._draws[1] > 0.0))
+
+    def hours_to(self, limit: float) -> Interval | None:
+        """Hours from the last recording until the line reaches a limit; None if that is not known yet.
+
+        It is not known if the line may as well never reach it.
+        """
+        level, slope = self._draws
+        hours = np.full(DRAWS, np.inf)
+        np.divide(1000.0 * (limit - level), slope, out=hours, where=slope > 0.0)
+        hours = np.maximum(np.where(level >= limit, 0.0, hours), 0.0)
+        low, middle, high = (
+            float(np.quantile(hours, each, method="lower")) for each in (INTERVAL[0], 0.5, INTERVAL[1])
+        )
+        return None if math.isinf(high) else Interval(low, middle, high)
+
+
+def trends(series: Sequence[Series]) -> list[Trend | None]:
+    """The trend of one figure in every joint; None of a joint with fewer than two recordings at different
+    hours.
+
+    Straight lines with the figure's own errors and a scatter from recording to recording that all joints
+    share. Slopes come from two kinds of joints, those that stay and those that change (a normal mixture,
+    fitted to the fleet), so a joint with three noisy recordings is drawn to zero, and a steep one is not.
+    """
+    usable = [place for place, each in enumerate(series) if len(np.unique(each.hours)) > 1]
+    if not usable:
+        return [None] * len(series)
+    scatter = _scatter([series[place] for place in usable])
+    lines = [_line(series[place], scatter) for place in usable]
+    slopes = np.array([mean[1] for mean, _ in lines])
+    errors = np.sqrt(np.array([cov[1, 1] for _, cov in lines]))
+    stay, change, share = _two_kinds(slopes, errors)
+    wide = _log_normal(slopes, change[0], np.hypot(change[1], errors)) + math.log(share)
+    narrow = _log_normal(slopes, 0.0, np.hypot(stay, errors)) + math.log1p(-share)
+    changing = expit(wide - narrow).tolist()
+    result: list[Trend | None] = [None] * len(series)
+    for number, (place, (mean, cov)) in enumerate(zip(usable, lines, strict=True)):
+        result[place] = Trend(mean, cov, stay, change, changing[number])
+    return result
+
+
+def _log_normal(value: FloatArray, mean: float, deviation: FloatArray) -> FloatArray:
+    """Logarithm of the normal density, but for a constant."""
+    return np.asarray(-0.5 * ((value - mean) / deviation) ** 2 - np.log(deviation))
+
+
+def _design(each: Series) -> FloatArray:
+    """Level at the last recording, slope per 1000 hours, and temperature if it varies."""
+    columns = [np.ones(len(each.hours)), (each.hours - each.hours.max()) / 1000.0]
+    temperature = each.temperature_c
+    if temperature is not None and len(temperature) >= 4 and np.ptp(temperature) > 3.0:
+        columns.append(temperature - temperature[-1])
+    return np.column_stack(columns)
+
+
+def _line(each: Series, scatter: float) -> tuple[FloatArray, FloatArray]:
+    design = _design(each)
+    weight = 1.0 / (each.sd**2 + scatter**2)
+    cov = np.linalg.pinv(design.T @ (weight[:, np.newaxis] * design))
+    best: FloatArray = cov @ (design.T @ (weight * each.value))
+    return best[:2], np.asarray(cov[:2, :2], dtype=np.float64)
+
+
+def _scatter(series: Sequence[Series]) -> float:
+    """The scatter from recording to recording that makes the residuals of all lines most likely (REML)."""
+    chosen = [each for each in series if len(each.hours) > _design(each).shape[1]]
+    chosen = chosen[:: max(1, math.ceil(len(chosen) / SCATTER_SERIES))]
+    if not chosen:
+        return 0.0
+    typical = float(np.median(np.concatenate([each.sd for each in chosen])))
+    spread = float(np.median([np.std(each.value) for each in chosen]))
+    choices = np.concatenate([[0.0], np.geomspace(0.05, 10.0, 18) * max(typical, spread, 1e-12)])
+
+    def likelihood(scatter: float) -> float:
+        total = 0.0
+        for each in chosen:
+            design = _design(each)
+            variance = each.sd**2 + scatter**2
+            inner = design.T @ (design / variance[:, np.newaxis])
+            best = np.linalg.pinv(inner) @ (design.T @ (each.value / variance))
+            rest = each.value - design @ best
+            total -= 0.5 * float(
+                np.sum(np.log(variance)) + np.linalg.slogdet(inner)[1] + rest @ (rest / variance)
+            )
+        return total
+
+    return float(choices[int(np.argmax([likelihood(float(each)) for each in choices]))])
+
+
+def _two_kinds(slopes: FloatArray, errors: FloatArray) -> tuple[float, tuple[float, float], float]:
+    """Standard deviation of the slopes that stay, mean and deviation of those that change, and their
+    share.
+    """
+    middle = float(np.median(np.abs(slopes)))
+    stay = 0.3 * max(middle, float(np.median(errors)))
+    mean, deviation, share = 0.0, max(3.0 * float(np.std(slopes)), 3.0 * stay, 1e-12), 0.1
+    for _ in range(200):
+        narrow = _log_normal(slopes, 0.0, np.hypot(stay, errors)) + math.log(1.0 - share)
+        wide = _log_normal(slopes, mean, np.hypot(deviation, errors)) + math.log(share)
+        changing = expit(wide - narrow)
+        # Expected true slopes of either kind, and their spread; the priors keep a small fleet from extremes.
+        shrink = deviation**2 / (deviation**2 + errors**2)
+        true, left = mean + shrink * (slopes - mean), shrink * errors**2
+        total = float(np.sum(changing))
+        new_mean = float(changing @ true) / (total + 1.0)
+        new_deviation = math.sqrt(
+            (float(changing @ ((true - new_mean) ** 2 + left)) + deviation**2) / (total + 1.0)
+        )
+        shrink = stay**2 / (stay**2 + errors**2)
+        true, left = shrink * slopes, shrink * errors**2
+        rest = 1.0 - changing
+        new_stay = math.sqrt((float(rest @ (true**2 + left)) + stay**2) / (float(np.sum(rest)) + 1.0))
+        new_share = min(max((total + 0.5) / (len(slopes) + 5.0), 1e-3), 0.8)
+        moved = abs(new_share - share) + abs(new_mean - mean) / deviation
+        stay, mean, deviation, share = max(new_stay, 1e-9), new_mean, max(new_deviation, 1e-9), new_share
+        if moved < 1e-6:
+            break
+    return stay, (mean, deviation), share
+
+
+# -- Identity
+
+
+@dataclass(frozen=True, slots=True)
+class Identity:
+    """Why a recording does not belong to its joint as it was."""
+
+    kind: str
+    """``swapped``: its orders are another joint's; ``turned``: its motor encoder was exchanged or its zero
+    set; ``changed``: they are nobody's.
+    """
+    other: int | None = None
+    """Of ``swapped``: the joint whose orders these are."""
+    angle_deg: float | None = None
+    """Of ``turned``: by which angle of the motor."""
+
+
+def identities(orders: Complexes, joint: Sequence[int], time: Sequence[Any]) -> list[Identity | None]:
+    """What is wrong with the identity of each recording, by the orders of the motor, shape (recordings,
+    orders).
+
+    ``orders`` are amplitude times exp(i phase) of the order 1, 2, ... of each recording; rows with NaN
+    have none. The first recording of a joint is what it is compared with. None means that it agrees.
+    """
+    numbers = np.asarray(joint)
+    known = np.all(np.isfinite(orders), axis=1) if len(orders) else np.zeros(0, dtype=bool)
+    first: dict[int, int] = {}
+    for place in sorted(range(len(numbers)), key=lambda each: time[each]):
+        if known[place]:
+            first.setdefault(int(numbers[place]), place)
+    result: list[Identity | None] = [None] * len(numbers)
+    later = [place for place in range(len(numbers)) if known[place] and first[int(numbers[place])] != place]
+    if not later:
+        return result
+    apart = np.abs(orders[later] - orders[[first[int(numbers[place])] for place in later]])
+    absolute = np.maximum(np.median(apart, axis=0) / 1.1774, 0.02)  # of a Rayleigh distribution
+    joints = list(first)
+    references = orders[[first[each] for each in joints]]
+    scale = np.hypot(absolute, EVERYDAY_SHARE * np.median(np.abs(references), axis=0))
+    tree = cKDTree(np.hstack([references.real / scale, references.imag / scale]))
+    degrees = 2 * orders.shape[1]
+    agree, disagree = float(chdtri(degrees, AGREE)), float(chdtri(degrees, DISAGREE))
+    turns = np.radians(np.arange(0.0, 360.0, PHASE_STEP_DEG))
+    turned_by = np.exp(1j * np.outer(turns, np.arange(1, orders.shape[1] + 1)))
+
+    def distance(seen: Complexes, reference: Complexes) -> FloatArray:
+        spread = np.hypot(absolute, EVERYDAY_SHARE * np.abs(reference))
+        return np.asarray(np.sum(np.abs(seen - reference) ** 2 / spread**2, axis=-1))
+
+    for place in later:
+        own, seen = orders[first[int(numbers[place])]], orders[place]
+        if float(distance(seen, own)) < disagree:
+            continue
+        _, near = tree.query(np.concatenate([seen.real / scale, seen.imag / scale]), k=min(4, len(joints)))
+        others = [each for each in np.atleast_1d(near).tolist() if joints[each] != numbers[place]]
+        best = min(others, key=lambda each: float(distance(seen, references[each])), default=None)
+        if best is not None and float(distance(seen, references[best])) < agree:
+            result[place] = Identity("swapped", other=joints[best])
+            continue
+        rotated = distance(seen, own * turned_by)
+        angle = int(np.argmin(rotated))
+        strong = int(np.sum(np.abs(own) > 3.0 * np.hypot(absolute, EVERYDAY_SHARE * np.abs(own))))
+        if float(rotated[angle]) < agree and strong >= 3:
+            result[place] = Identity("turned", angle_deg=angle * PHASE_STEP_DEG)
+        else:
+            result[place] = Identity("changed")
+    return result

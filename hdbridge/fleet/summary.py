@@ -1,0 +1,441 @@
+"""The fleet as a whole: whom to look at first, what is common where, what is wrong with the data.
+
+The diagnosis of one recording names too much on everyday records for a list that people act on. A joint is
+listed only if a cause repeats over its recordings more often than the fleet's own rate of wrong names
+explains, and if it appeared after the first recording, or grows.
+"""
+
+from __future__ import annotations
+
+from collections import Counter, defaultdict
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from datetime import UTC, datetime
+from typing import Any, Final
+
+import numpy as np
+
+from hdbridge.fleet.statistics import (
+    Interval,
+    Series,
+    Trend,
+    identities,
+    normal_range,
+    outliers,
+    prevalence,
+    repeats,
+    trends,
+    within_false_discoveries,
+)
+
+SCHEMA: Final = "hdbridge.fleet-summary/1"
+FALSE_DISCOVERIES: Final = 0.01
+"""Share of the listed joints that may be wrong."""
+COMMON: Final = 0.4
+"""A cause of more than this share of a gear type's joints belongs to the type; a joint is listed if it
+grows.
+"""
+SURE: Final = 0.95
+REPEATED: Final = 2
+"""Minimum number of recordings that name a cause."""
+SILENT: Final = 3.0
+"""A joint is silent after so many of its usual intervals without a recording."""
+ATTRIBUTES: Final = ("batch", "cell", "lubricant")
+Row = Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A joint to look at, and why."""
+
+    joint: str
+    cause: str
+    probability: float
+    """That the joint has it: by the names in all its recordings, against the fleet's rate of wrong names."""
+    aliases: tuple[str, ...]
+    peak_arcsec: float
+    """In its last recording."""
+    named: int
+    recordings: int
+    growth: Interval | None
+    """Arcsec per 1000 hours; None if the hours are not known."""
+    growing: bool
+    remaining: Interval | None
+    """Hours until the peak reaches the limit; None if that is not known yet."""
+    what_changed: tuple[str, ...]
+    remarks: tuple[str, ...]
+    path: str
+    """Its last recording."""
+    gear: str
+    model: str
+    """Model file; `models/...` is in the folder of the data set."""
+
+
+@dataclass(frozen=True)
+class Odd:
+    """A figure of a joint outside the normal range of its gear type."""
+
+    joint: str
+    gear: str
+    figure: str
+    value: float
+    normal: Interval
+
+
+@dataclass(frozen=True)
+class Mistaken:
+    """A recording that does not belong to its joint as it was."""
+
+    joint: str
+    path: str
+    kind: str
+    text: str
+
+
+@dataclass(frozen=True)
+class Summary:
+    """All that a page of the fleet says."""
+
+    recordings: int
+    joints: int
+    limit_arcsec: float
+    first: tuple[Candidate, ...]
+    prevalence: Mapping[str, Mapping[str, Mapping[str, tuple[int, int, Interval]]]]
+    """By attribute, cause and group: joints with it, joints, and the share."""
+    rates: Mapping[str, tuple[float, float, float]]
+    """By cause: share of joints, rate of names with it, and rate of wrong names."""
+    odd: tuple[Odd, ...]
+    mistaken: tuple[Mistaken, ...]
+    duplicates: tuple[tuple[str, str, str], ...]
+    """Joint, path and path of the first."""
+    silent: tuple[tuple[str, str], ...]
+    """Joint and reason."""
+    failed: tuple[tuple[str, str, str], ...]
+    """Joint, path and reason."""
+
+    def as_dict(self) -> dict[str, Any]:
+        """For machines, schema hdbridge.fleet-summary/1."""
+        return {"schema": SCHEMA, **asdict(self)}
+
+    def lines(self) -> Iterator[str]:
+        """What is wrong with data, one line for each kind."""
+        for kind, count in Counter(each.kind for each in self.mistaken).items():
+            yield f"recordings {_KINDS[kind]}: {count}"
+        for words, found in (
+            ("recordings that are there twice", self.duplicates),
+            ("joints without a usable or a fresh recording", self.silent),
+            ("recordings without a diagnosis", self.failed),
+        ):
+            if found:
+                yield f"{words}: {len(found)}"
+
+
+_KINDS: Final = {
+    "swapped": "of another joint than they are filed under",
+    "turned": "after the motor encoder was exchanged or its zero set",
+    "changed": "with orders unlike those of the joint's first recording",
+}
+
+
+def summarise(rows: Sequence[Row], limit_arcsec: float) -> Summary:
+    """The summary of the recordings of a data set (`Dataset.recordings`)."""
+    good = [row for row in rows if row["reason"] is None and row["duplicate_of"] is None]
+    good.sort(key=_when)
+    mistaken, foreign = _mistaken(good)
+    joints: dict[str, list[Row]] = defaultdict(list)
+    for row in good:
+        if (row["key"], row["path"]) not in foreign:
+            joints[row["joint"]].append(row)
+    has, rates, sizes = _causes(joints)
+    changed = _figures(joints)
+    first = _first(joints, has, sizes, changed, limit_arcsec)
+    explained = {each.joint for each in first}
+    mistaken = tuple(each for each in mistaken if each.kind != "changed" or each.joint not in explained)
+    return Summary(
+        recordings=len(rows),
+        joints=len({row["joint"] for row in rows if row["joint"]}),
+        limit_arcsec=limit_arcsec,
+        first=first,
+        prevalence=_prevalence(joints, has),
+        rates=rates,
+        odd=_odd(joints),
+        mistaken=mistaken,
+        duplicates=tuple(
+            (row["joint"], row["path"], row["duplicate_of"]) for row in rows if row["duplicate_of"]
+        ),
+        silent=_silent(rows),
+        failed=tuple((row["joint"], row["path"], row["reason"]) for row in rows if row["reason"] is not None),
+    )
+
+
+def _when(row: Row) -> tuple[float, str, str]:
+    return (row["hours"] if row["hours"] is not None else -1.0, row["date"] or "", row["path"])
+
+
+def _mistaken(good: Sequence[Row]) -> tuple[tuple[Mistaken, ...], set[tuple[str, str]]]:
+    """Recordings of another joint or after another encoder, and those that say nothing of their joint as
+    it was.
+    """
+    result: list[Mistaken] = []
+    foreign: set[tuple[str, str]] = set()
+    gears: dict[str, list[Row]] = defaultdict(list)
+    for row in good:
+        gears[f"{row['gear']}"].append(row)
+    for rows in gears.values():
+        names = sorted({row["joint"] for row in rows})
+        count = max((len(row["orders"] or ()) for row in rows), default=0)
+        orders = np.full((len(rows), count), np.nan + 0j)
+        for place, row in enumerate(rows):
+            if count and len(row["orders"] or ()) == count:
+                orders[place] = [complex(each["cos_arcsec"], -each["sin_arcsec"]) for each in row["orders"]]
+        found = identities(orders, [names.index(row["joint"]) for row in rows], [_when(row) for row in rows])
+        for row, each in zip(rows, found, strict=True):
+            if each is None:
+                continue
+            if each.kind == "swapped":
+                assert each.other is not None
+                text = f"its orders are those of {names[each.other]}"
+            elif each.kind == "turned":
+                text = f"all its orders are turned by {each.angle_deg:.1f} deg of the motor: fit a new model"
+            else:
+                text = "its orders are neither those of the joint's first recording nor another joint's"
+            result.append(Mistaken(row["joint"], row["path"], each.kind, text))
+            if each.kind != "changed":
+                foreign.add((row["key"], row["path"]))
+    return tuple(result), foreign
+
+
+def _causes(
+    joints: Mapping[str, Sequence[Row]],
+) -> tuple[
+    dict[str, dict[str, float]], dict[str, tuple[float, float, float]], dict[str, dict[str, Trend | None]]
+]:
+    """By cause: the probability that each joint has it, the fleet's rates, and the trend of its peak."""
+    causes = sorted({each["cause"] for rows in joints.values() for row in rows for each in row["findings"]})
+    names = list(joints)
+    has: dict[str, dict[str, float]] = {}
+    rates: dict[str, tuple[float, float, float]] = {}
+    sizes: dict[str, dict[str, Trend | None]] = {}
+    for cause in causes:
+        found = repeats([[_peak(row, cause) is not None for row in joints[name]] for name in names])
+        has[cause] = dict(zip(names, found.probability.tolist(), strict=True))
+        rates[cause] = (found.share, found.named, found.wrongly)
+        sizes[cause] = dict(zip(names, trends([_size(joints[name], cause) for name in names]), strict=True))
+    return has, rates, sizes
+
+
+def _peak(row: Row, cause: str) -> float | None:
+    return next((each["peak_arcsec"] for each in row["findings"] if each["cause"] == cause), None)
+
+
+def _size(rows: Sequence[Row], cause: str) -> Series:
+    """The peak of a cause over the hours; where it was not named it is between nothing and what would be."""
+    known = [row for row in rows if row["hours"] is not None]
+    values, errors = [], []
+    for row in known:
+        limit = next((each["arcsec"] for each in row["limits"] or () if each["cause"] == cause), None)
+        peak = _peak(row, cause)
+        floor = limit if limit is not None else max(row["rms_arcsec"] or 0.0, 1.0)
+        values.append(0.5 * floor if peak is None else peak)
+        errors.append(
+            0.29 * floor if peak is None else max(0.25 * floor, 0.02 * peak)
+        )  # 0.29: of an even spread
+    return Series(
+        np.array([row["hours"] for row in known], dtype=float),
+        np.array(values, dtype=float),
+        np.array(errors, dtype=float),
+        _temperatures(known),
+    )
+
+
+def _temperatures(rows: Sequence[Row]) -> Any:
+    values = [row["temperature_c"] for row in rows]
+    return None if any(each is None for each in values) or not values else np.array(values, dtype=float)
+
+
+def _figures(joints: Mapping[str, Sequence[Row]]) -> dict[str, list[tuple[float, str]]]:
+    """What changes in each joint: figures of the model with a trend that is sure, the largest first."""
+    table: dict[str, dict[str, list[tuple[Row, float, float]]]] = defaultdict(lambda: defaultdict(list))
+    for name, rows in joints.items():
+        for row in rows:
+            for each in row["figures"] or ():
+                if (
+                    row["hours"] is not None
+                    and each["half_width"] > 0.0
+                    and not each["name"].endswith("phase_deg")
+                ):
+                    table[each["name"]][name].append((row, each["value"], each["half_width"] / 1.96))
+    result: dict[str, list[tuple[float, str]]] = defaultdict(list)
+    for figure, of_joint in table.items():
+        if figure.split(".")[0] not in {"synchronous", "hysteresis"}:
+            continue
+        names = list(of_joint)
+        series = [
+            Series(
+                np.array([row["hours"] for row, _, _ in of_joint[name]]),
+                np.array([value for _, value, _ in of_joint[name]]),
+                np.array([sd for _, _, sd in of_joint[name]]),
+                _temperatures([row for row, _, _ in of_joint[name]]),
+            )
+            for name in names
+        ]
+        for name, trend in zip(names, trends(series), strict=True):
+            if (
+                trend is not None
+                and trend.changing > SURE
+                and max(trend.growing(), 1.0 - trend.growing()) > SURE
+            ):
+                slope = trend.per_1000_hours
+                strength = abs(slope.value) / max(slope.high - slope.low, 1e-12)
+                result[name].append((strength, f"{figure} {slope.value:+.2g} per 1000 h"))
+    return result
+
+
+def _first(
+    joints: Mapping[str, Sequence[Row]],
+    has: Mapping[str, Mapping[str, float]],
+    sizes: Mapping[str, Mapping[str, Trend | None]],
+    changed: Mapping[str, Sequence[tuple[float, str]]],
+    limit_arcsec: float,
+) -> tuple[Candidate, ...]:
+    claims: list[Candidate] = []
+    for cause, of_joint in has.items():
+        common = _common(joints, of_joint)
+        for name, probability in of_joint.items():
+            rows = joints[name]
+            named = [row for row in rows if _peak(row, cause) is not None]
+            recent = any(_peak(row, cause) is not None for row in rows[-2:])
+            trend = sizes[cause][name]
+            growing = trend is not None and trend.growing() >= SURE and trend.changing >= SURE
+            appeared = _peak(rows[0], cause) is None and not common[rows[-1]["gear"]]
+            if len(named) < REPEATED or not recent or not (growing or appeared):
+                continue
+            last = next(each for each in named[-1]["findings"] if each["cause"] == cause)
+            claims.append(
+                Candidate(
+                    joint=name,
+                    cause=cause,
+                    probability=probability,
+                    aliases=tuple(last["aliases"] or ()),
+                    peak_arcsec=last["peak_arcsec"],
+                    named=len(named),
+                    recordings=len(rows),
+                    growth=trend.per_1000_hours if trend else None,
+                    growing=growing,
+                    remaining=trend.hours_to(limit_arcsec) if trend and growing else None,
+                    what_changed=tuple(text for _, text in sorted(changed.get(name, ()), reverse=True)[:2]),
+                    remarks=tuple(rows[-1]["remarks"] or ()),
+                    path=rows[-1]["path"],
+                    gear=rows[-1]["gear"],
+                    model=rows[-1]["model"] or "MODEL.yaml",
+                )
+            )
+    kept = within_false_discoveries(np.array([each.probability for each in claims]), FALSE_DISCOVERIES)
+    chosen: dict[str, Candidate] = {}
+    for each, keep in zip(claims, kept.tolist(), strict=True):
+        # One line for a joint: the others are consequences, or come after the first is mended.
+        if keep and (each.joint not in chosen or _weight(each) > _weight(chosen[each.joint])):
+            chosen[each.joint] = each
+    return tuple(sorted(chosen.values(), key=_urgency))
+
+
+def _common(joints: Mapping[str, Sequence[Row]], of_joint: Mapping[str, float]) -> dict[str, bool]:
+    shares: dict[str, list[float]] = defaultdict(list)
+    for name, probability in of_joint.items():
+        shares[joints[name][-1]["gear"]].append(probability)
+    return {gear: float(np.mean(each)) > COMMON for gear, each in shares.items()}
+
+
+def _weight(each: Candidate) -> tuple[bool, float]:
+    return (each.cause != "unexplained", each.peak_arcsec * each.probability)
+
+
+def _urgency(each: Candidate) -> tuple[float, float, str]:
+    return (each.remaining.value if each.remaining else float("inf"), -each.peak_arcsec, each.joint)
+
+
+def _prevalence(
+    joints: Mapping[str, Sequence[Row]], has: Mapping[str, Mapping[str, float]]
+) -> dict[str, dict[str, dict[str, tuple[int, int, Interval]]]]:
+    result: dict[str, dict[str, dict[str, tuple[int, int, Interval]]]] = {}
+    for attribute in ATTRIBUTES:
+        groups = {
+            name: rows[-1][attribute] for name, rows in joints.items() if rows[-1][attribute] is not None
+        }
+        if len(set(groups.values())) < 2:
+            continue
+        result[attribute] = {}
+        for cause, of_joint in has.items():
+            sick = {
+                name
+                for name in groups
+                if of_joint[name] > 0.5
+                and sum(_peak(row, cause) is not None for row in joints[name]) >= REPEATED
+            }
+            if not sick:
+                continue
+            cases = {
+                group: (
+                    sum(name in sick for name, each in groups.items() if each == group),
+                    sum(each == group for each in groups.values()),
+                )
+                for group in sorted(set(groups.values()))
+            }
+            shares = prevalence(cases)
+            result[attribute][cause] = {group: (*cases[group], shares[group]) for group in cases}
+    return result
+
+
+def _odd(joints: Mapping[str, Sequence[Row]]) -> tuple[Odd, ...]:
+    """Figures outside the normal range of their gear type: the median of each joint's recordings counts."""
+    table: dict[tuple[str, str], dict[str, list[float]]] = defaultdict(lambda: defaultdict(list))
+    for name, rows in joints.items():
+        for row in rows:
+            for each in row["orders"] or ():
+                figure = f"order {each['order']}, arcsec"
+                table[row["gear"], figure][name].append(
+                    float(np.hypot(each["cos_arcsec"], each["sin_arcsec"]))
+                )
+            for each in row["figures"] or ():
+                if each["name"] in {"hysteresis.offset_arcsec", "hysteresis.width_deg"}:
+                    table[row["gear"], each["name"]][name].append(each["value"])
+    found = []
+    for (gear, figure), of_joint in table.items():
+        values = np.array([float(np.median(each)) for each in of_joint.values()])
+        chosen = outliers(values)
+        if not chosen.any():
+            continue
+        normal = normal_range(values)
+        for name, value, odd in zip(of_joint, values.tolist(), chosen.tolist(), strict=True):
+            if odd:
+                found.append(Odd(name, gear, figure, value, normal))
+    return tuple(sorted(found, key=lambda each: -abs(each.value - each.normal.value)))
+
+
+def _silent(rows: Sequence[Row]) -> tuple[tuple[str, str], ...]:
+    """Joints without a usable recording, or without one for long."""
+    usable: dict[str, list[datetime]] = {row["joint"]: [] for row in rows if row["joint"]}
+    diagnosed = {row["joint"] for row in rows if row["reason"] is None}
+    for row in rows:
+        if row["reason"] is None and row["date"]:
+            try:
+                date = datetime.fromisoformat(row["date"])
+            except ValueError:
+                continue
+            usable[row["joint"]].append(date if date.tzinfo else date.replace(tzinfo=UTC))
+    newest = max((each for dates in usable.values() for each in dates), default=None)
+    result = []
+    for joint, dates in sorted(usable.items()):
+        if joint not in diagnosed:
+            result.append((joint, "no usable recording"))
+        elif newest is not None and len(set(dates)) > 1:
+            days = np.diff(sorted(each.timestamp() for each in set(dates))) / 86_400.0
+            since = (newest - max(dates)).total_seconds() / 86_400.0
+            if since > SILENT * float(np.median(days)):
+                result.append(
+                    (
+                        joint,
+                        f"no recording for {since:.0f} days; one in {float(np.median(days)):.0f} is usual",
+                    )
+                )
+    return tuple(result)

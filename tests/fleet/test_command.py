@@ -1,0 +1,71 @@
+"""``hdbridge fleet`` as a person types it."""
+
+import json
+
+import pytest
+from support.command import run_here
+
+
+def test_run_and_report_print_and_write_what_they_say(fleet, scheduler, tmp_path):
+    model, manifest = fleet / "model.yaml", fleet / "manifest.csv"
+    done = run_here(
+        tmp_path, "fleet", "run", "--manifest", manifest, "--out", "out", "--model", model,
+        "--scheduler", scheduler,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert "12 recordings, 0 of them known already, 2 newly failed" in done.stdout
+    page = (tmp_path / "out" / "fleet.html").read_text()
+    assert "<!doctype html>" in page
+    assert "broken.csv" in page
+    again = run_here(tmp_path, "fleet", "report", "out", "--html", "page.html", "--json", "fleet.json")
+    assert again.returncode == 0, again.stderr
+    found = json.loads((tmp_path / "fleet.json").read_text())
+    assert found["joints"] == 3
+    assert len(found["failed"]) == 2
+    assert (tmp_path / "page.html").exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "complaint"),
+    [
+        (["run", "--out", "out"], "no source"),
+        (["run", "somewhere"], "--out is missing"),
+        (["run", "somewhere", "--out", "out"], "no such file or folder"),
+        (["run", ".", "--out", "out", "--memory", "much"], "--memory: found 'much'"),
+        (["run", ".", "--out", "out", "--memory", "1MB"], "at least 200MB"),
+        (["run", ".", "--out", "out", "--scheduler", "tcp://a:1", "--workers", "2"], "--workers"),
+        (["report", "."], "no recordings in this folder"),
+        (["simulate", "."], "is not empty"),
+    ],
+)
+def test_what_is_wrong_is_refused_before_anything_is_written(tmp_path, arguments, complaint):
+    (tmp_path / "mine.csv").write_text("mine")
+    done = run_here(tmp_path, "fleet", *arguments)
+    assert done.returncode == 2
+    assert complaint in done.stderr
+    assert [each.name for each in tmp_path.iterdir()] == ["mine.csv"]
+
+
+def test_a_scheduler_that_is_not_there_is_an_error_of_one_line(tmp_path):
+    dask = pytest.importorskip("dask")
+    (tmp_path / "mine.csv").write_text("mine")
+    with dask.config.set({"distributed.comm.timeouts.connect": "1s"}):
+        done = run_here(tmp_path, "fleet", "run", ".", "--out", "out", "--scheduler", "tcp://127.0.0.1:9")
+    assert done.returncode == 2
+    assert done.stderr.splitlines()[-1].startswith("hdbridge: --scheduler")
+
+
+@pytest.mark.slow
+def test_a_simulated_fleet_is_the_same_for_the_same_seed(tmp_path):
+    pytest.importorskip("numba")
+    for name in ("a", "b"):
+        done = run_here(
+            tmp_path, "fleet", "simulate", name, "--joints", "4", "--recordings", "3", "--seed", "2"
+        )
+        assert done.returncode == 0, done.stderr
+    files = {path.relative_to(tmp_path / "a") for path in (tmp_path / "a").rglob("*") if path.is_file()}
+    assert all((tmp_path / "a" / each).read_bytes() == (tmp_path / "b" / each).read_bytes() for each in files)
+    answers = json.loads((tmp_path / "a" / "answers.json").read_text())
+    assert len(answers["swapped"]) == 2
+    assert len(answers["damaged"]) == len(answers["copies"]) == 1
+    assert len((tmp_path / "a" / "manifest.csv").read_text().splitlines()) == 1 + 4 * 3 + 1

@@ -1,0 +1,128 @@
+"""Recordings that lie elsewhere: in S3 and behind SFTP, on real servers here; in flight recordings."""
+
+import asyncio
+import gc
+import threading
+from contextlib import suppress
+from dataclasses import replace
+
+import fsspec
+import numpy as np
+import pytest
+from support.fleet import MODEL, record
+from support.flight import flight_log, samples
+
+from hdbridge.daemon.recorder.flightlog import Batch
+from hdbridge.fleet.diagnosing import Model, axes_of, diagnosed
+from hdbridge.fleet.sources import Source, find_sources, with_axes
+from hdbridge.records.recording import Recording
+
+KNOWN = Model(MODEL)
+pytestmark = pytest.mark.filterwarnings("ignore")  # of the servers and clients
+
+
+def check_fleet_at(url):
+    """One folder with a recording, and one CSV file."""
+    found = find_sources([url])
+    assert [each.path.removeprefix(f"{url}/") for each in found] == ["a.csv.gz", "rec"]
+    rows = [diagnosed(replace(each, joint="J7", ratio=50.0), KNOWN) for each in found]
+    assert [row.get("reason") for row in rows] == [None, None]
+    assert rows[0]["samples_sha256"] == rows[1]["samples_sha256"]
+    assert url in diagnosed(Source(f"{url}/none.csv", joint="J7"), KNOWN)["reason"]
+
+
+@pytest.fixture(autouse=True)
+def collected():
+    """What clients leave open is closed within the test that opened it."""
+    yield
+    for protocol in ("s3", "sftp"):
+        with suppress(ImportError):
+            fsspec.get_filesystem_class(protocol).clear_instance_cache()
+    gc.collect()
+
+
+@pytest.fixture
+def files(tmp_path):
+    folder = tmp_path / "fleet"
+    Recording(record(1), axis="J7", ratio=50.0).save(folder / "rec")
+    record(1).write_csv(folder / "a.csv.gz")
+    return folder
+
+
+def test_recordings_in_s3(files, monkeypatch):
+    pytest.importorskip("s3fs")
+    server = pytest.importorskip("moto.server").ThreadedMotoServer("127.0.0.1", 0, verbose=False)
+    server.start()
+    try:
+        host, port = server.get_host_and_port()
+        access = {"key": "k", "secret": "s", "endpoint_url": f"http://{host}:{port}"}
+        monkeypatch.setitem(fsspec.config.conf, "s3", access)
+        system = fsspec.filesystem("s3", skip_instance_cache=True)
+        system.mkdir("bucket")
+        system.put(f"{files}/", "bucket/fleet/", recursive=True)
+        check_fleet_at("s3://bucket/fleet")
+    finally:
+        server.stop()
+
+
+def test_recordings_behind_sftp(files, monkeypatch, tmp_path):
+    pytest.importorskip("paramiko")
+    asyncssh = pytest.importorskip("asyncssh")
+    ready, where = threading.Event(), {}
+
+    class AnyPassword(asyncssh.SSHServer):
+        def password_auth_supported(self):
+            return True
+
+        def validate_password(self, username, password):
+            return password == "p"
+
+    async def serve():
+        where.update(loop=asyncio.get_running_loop(), end=asyncio.Event())
+        key = asyncssh.generate_private_key("ssh-ed25519")
+        server = await asyncssh.listen(
+            "127.0.0.1", 0, server_factory=AnyPassword, server_host_keys=[key], sftp_factory=True
+        )
+        where["port"] = server.get_port()
+        ready.set()
+        await where["end"].wait()
+        server.close()
+        await server.wait_closed()
+
+    thread = threading.Thread(target=asyncio.run, args=(serve(),), daemon=True)
+    thread.start()
+    assert ready.wait(60)
+    monkeypatch.setitem(fsspec.config.conf, "sftp", {"username": "u", "password": "p"})
+    try:
+        check_fleet_at(f"sftp://127.0.0.1:{where['port']}{files}")
+    finally:
+        fsspec.get_filesystem_class("sftp").clear_instance_cache()
+        where["loop"].call_soon_threadsafe(where["end"].set)
+        thread.join(60)
+
+
+def test_each_axis_of_a_flight_recording_is_a_joint(tmp_path):
+    made = samples(5000, axes=2)
+    known = record(3, samples=5000)
+    for place, scale in ((0, 1.0), (1, 1.0)):
+        for name, column in (
+            ("motor_position_deg", known.motor_position_deg),
+            ("motor_target_deg", known.motor_position_deg),
+            ("load_position_deg", known.load_position_deg * scale + place),
+        ):
+            made["axes"][name][:, place] = column
+    log, clock = flight_log(tmp_path, axes=2)
+    for first in range(0, len(made), 250):
+        log.put(Batch(made[first : first + 250]))
+        clock.ns += 10**9
+        log.flush()
+    log.close()
+    (source,) = find_sources([str(tmp_path)])
+    axes = axes_of(source.path)
+    assert axes == ["demo", "tilt"]
+    rows = [diagnosed(each, KNOWN) for each in with_axes(source.path, axes, [source])]
+    assert [row["joint"] for row in rows] == ["demo", "tilt"]
+    assert [row.get("reason") for row in rows] == [None, None]
+    assert rows[0]["date"]
+    assert len({row["key"] for row in rows}) == 2
+    assert np.isfinite([row["rms_arcsec"] for row in rows]).all()

@@ -1,0 +1,132 @@
+"""Runs over small fleets on a real Dask cluster: the same Parquet however they went."""
+
+import os
+import signal
+from pathlib import Path
+
+import pyarrow.parquet as pq
+import pytest
+from distributed import Client
+
+from hdbridge.errors import InputError
+from hdbridge.fleet.dataset import COLUMNS, Dataset
+from hdbridge.fleet.diagnosing import diagnosed, local_model
+from hdbridge.fleet.engine import Cluster, run
+from hdbridge.fleet.sources import Source, find_sources
+from hdbridge.fleet.summary import summarise
+
+
+def go(fleet, out, scheduler, **options):
+    sources = find_sources([], fleet / "manifest.csv")
+    return run(sources, Dataset(out), Cluster(scheduler), model=fleet / "model.yaml", **options)
+
+
+def files(out: Path) -> dict[str, bytes]:
+    return {str(each.relative_to(out)): each.read_bytes() for each in sorted(out.rglob("*.parquet"))}
+
+
+@pytest.fixture(scope="module")
+def whole(fleet, scheduler, tmp_path_factory):
+    out = tmp_path_factory.mktemp("whole") / "out"
+    return out, go(fleet, out, scheduler)
+
+
+def test_every_recording_is_a_row_and_a_bad_one_says_why(fleet, whole):
+    out, end = whole
+    rows = {Path(row["path"]).name: row for row in Dataset(out).recordings()}
+    assert len(rows) == end.done == end.total == 12
+    assert end.failed == 2
+    assert {name for name, row in rows.items() if row["reason"]} == {"broken.csv", "missing.csv"}
+    assert "broken.csv:2" in rows["broken.csv"]["reason"]
+    assert rows["again.csv.gz"]["duplicate_of"] or rows["J1-1.csv.gz"]["duplicate_of"]
+    assert "motor_order" in [each["cause"] for each in rows["J0-2.csv.gz"]["findings"]]
+    assert rows["J1-0.csv.gz"]["extended_rms_arcsec"] == pytest.approx(0.3, abs=0.05)
+    assert rows["J1-0.csv.gz"]["batch"] == "A"
+
+
+def test_the_columns_are_those_of_the_contract(whole):
+    out, _ = whole
+    for name, columns in COLUMNS.items():
+        for part in (out / name).glob("*.parquet"):
+            assert pq.read_schema(part).names == list(columns)
+
+
+def test_what_is_done_is_not_done_again(fleet, scheduler, whole):
+    out, _ = whole
+    before = files(out)
+    end = go(fleet, out, scheduler)
+    assert (end.known, end.failed) == (12, 0)
+    assert files(out) == before
+
+
+def test_an_interrupted_run_resumes_and_ends_with_the_same_bytes(fleet, scheduler, whole, tmp_path):
+    seen = []
+    with pytest.raises(KeyboardInterrupt):
+        go(fleet, tmp_path, scheduler, progress=seen.append, interrupted=lambda: bool(seen))
+    assert 1 <= len(Dataset(tmp_path).recordings()) < 12
+    end = go(fleet, tmp_path, scheduler)
+    assert end.known >= 1
+    assert files(tmp_path) == files(whole[0])
+
+
+def test_a_worker_that_is_killed_loses_nothing(fleet, scheduler, whole, tmp_path):
+    with Client(scheduler, set_as_default=False) as client:
+        victims = list(client.run(os.getpid).values())
+
+    def kill(now):
+        if now.done and victims:
+            os.kill(victims.pop(), signal.SIGKILL)
+            victims.clear()
+
+    assert go(fleet, tmp_path, scheduler, progress=kill).done == 12
+    assert files(tmp_path) == files(whole[0])
+
+
+def test_a_changed_model_replaces_the_rows(fleet, scheduler, whole, tmp_path):
+    go(fleet, tmp_path, scheduler)
+    other = tmp_path / "model.yaml"
+    other.write_text((fleet / "model.yaml").read_text().replace("30.0", "31.0"))
+    sources = find_sources([], fleet / "manifest.csv")
+    end = run(sources, Dataset(tmp_path), Cluster(scheduler), model=other)
+    rows = Dataset(tmp_path).recordings()
+    assert len(rows) == 12
+    assert end.known == 2  # what could not be read
+    assert len({row["model_sha256"] for row in rows if row["reason"] is None}) == 1
+
+
+def test_a_joint_without_a_model_gets_one_from_its_earliest_recording(fleet, scheduler, tmp_path):
+    (tmp_path / "m.csv").write_text(f"path,joint,ratio,hours\n{fleet / 'J1-0.csv.gz'},J/1,50,5\n")
+    run(find_sources([], tmp_path / "m.csv"), Dataset(tmp_path / "out"), Cluster(scheduler))
+    (row,) = Dataset(tmp_path / "out").recordings()
+    assert row["reason"] is None
+    assert row["rms_arcsec"] < 0.5
+    assert [each.name for each in (tmp_path / "out" / "models").iterdir()] == ["J%2F1.yaml"]
+
+
+def test_a_folder_of_something_else_is_refused(fleet, scheduler, tmp_path):
+    (tmp_path / "mine.txt").write_text("mine")
+    with pytest.raises(InputError, match="not empty"):
+        go(fleet, tmp_path, scheduler)
+
+
+def test_nothing_that_is_wrong_with_a_recording_is_raised(fleet, tmp_path):
+    model = local_model(str(fleet / "model.yaml"))
+    (tmp_path / "empty.csv").write_bytes(b"")
+    (tmp_path / "no.mcap").write_bytes(b"no")
+    (tmp_path / "folder").mkdir()
+    for path in ("empty.csv", "no.mcap", "folder", "nothing.log"):
+        row = diagnosed(Source(str(tmp_path / path), joint="J"), model)
+        assert path in row["reason"] or "axis" in row["reason"]
+    assert "joint" in diagnosed(Source(str(fleet / "J1-0.csv.gz")), model)["reason"]
+    assert (
+        "cannot be read"
+        in diagnosed(Source(str(fleet / "J1-0.csv.gz"), joint="J"), local_model("x.yaml"))["reason"]
+    )
+
+
+def test_the_summary_of_a_run_is_plain_data(whole):
+    found = summarise(Dataset(whole[0]).recordings(), 10.0)
+    assert found.joints == 3
+    assert len(found.failed) == 2
+    assert len(found.duplicates) == 1
+    assert found.as_dict()["schema"] == "hdbridge.fleet-summary/1"
