@@ -83,13 +83,13 @@ def start(axis: AxisConfig, foreign: Foreign) -> Truth:
 
 
 def servo_only(recording: Recording, axis: AxisConfig, begun: Truth, workers: int) -> Truth:
-    """The fit of servo structures alone, without the fit of the usual servo before it."""
+    """Fits servo structures alone, without the usual servo first."""
     with Replays(coarse(prepare(recording, axis, begun), FIT_S), workers) as replays:
         return fit_structures(replays, begun).truth
 
 
 def shares(other: Recording, axis: AxisConfig, truth: Truth, seed: int) -> str:
-    """Following error and torque on the other motion, per cent of the signal."""
+    """Returns errors of following error and torque on the other motion, per cent of the signal."""
     again = replay_directly(other, axis, without_noise(truth), seed)
     told = compare(other.record, again, other.segments, axis.gear.ratio)
     return ", ".join(

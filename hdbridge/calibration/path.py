@@ -1,8 +1,8 @@
 """Path errors: deviation of the load from its path during a move and after it.
 
-The motor lags behind its target, and the load winds the gear's spring up. Both would be the same on a gear
-without error. They are fitted to the runs as responses to the target, and taken out. The error of the gear
-depends on the angle, so that no response to a smooth target reproduces it.
+The motor's lag and the wind-up of the gear's spring would be the same on a gear without error. They are
+fitted to the runs as responses to the target, and removed. The gear's error depends on the angle, so a
+response to a smooth target cannot reproduce it.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ AT_REST_S = 0.2
 
 
 LAGS = (0, 1, 2, 4, 8, 16, 32, 64)
-"""Cycles between which the speed is averaged, for the response of the motor."""
+"""Lags in cycles between which the speed is averaged, for the response of the motor."""
 WIND_UP_LAGS = LAGS[:6]
-"""The same of the acceleration, for the wind-up; longer ones would take the hysteresis for it."""
+"""Lags of the acceleration, for the wind-up; longer ones would absorb the hysteresis."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,8 +47,8 @@ class PathError:
 def path_errors(variants: Sequence[Sequence[PathRun]], ratio: float) -> list[list[PathError]]:
     """Returns the errors of the same paths run with several corrections, the first without one.
 
-    The motor's response comes from the motor encoder of the first one, the wind-up from the others: in the
-    first one the hysteresis hides it.
+    The motor's response is fitted to the motor encoder of the first, and the wind-up to the others, because
+    in the first the hysteresis hides it.
     """
     servo = _fit(
         [_servo_columns(run) for run in variants[0]],
@@ -83,18 +83,18 @@ def _judged(run: PathRun, error_arcsec: FloatArray) -> PathError:
 
 
 def _servo_columns(run: PathRun) -> FloatArray:
-    """Speed of the load target over past cycles, and its sign for the friction, shape (n, columns)."""
+    """Returns past speeds of the load target, and the sign of the speed for friction, shape (n, columns)."""
     speed = _speed(run)
     return np.column_stack([*_averages(speed, LAGS), np.sign(speed)])
 
 
 def _wind_up_columns(run: PathRun) -> FloatArray:
-    """Acceleration of the load target over past cycles, shape (n, columns)."""
+    """Returns past accelerations of the load target, shape (n, columns)."""
     return np.column_stack(_averages(np.gradient(_speed(run)), WIND_UP_LAGS))
 
 
 def _averages(values: FloatArray, lags: Sequence[int]) -> list[FloatArray]:
-    """Mean of the values between two lags, for each pair of neighbours; it starts at rest."""
+    """Returns the means of the values between neighbouring lags, (n,) each; zero before the first value."""
     total = np.concatenate([np.zeros(lags[-1] + 1), np.cumsum(values)])
     end = len(total)
     count = len(values)
@@ -105,7 +105,7 @@ def _averages(values: FloatArray, lags: Sequence[int]) -> list[FloatArray]:
 
 
 def _speed(run: PathRun) -> FloatArray:
-    """Speed of the load target, degrees per cycle."""
+    """Returns the speed of the load target, degrees per cycle, shape (n,)."""
     target = np.array([each.load_target_deg for each in run.samples])
     return np.diff(target, prepend=target[0])
 

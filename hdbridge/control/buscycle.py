@@ -137,7 +137,7 @@ class BusCycle:
         self.woke_s = clock.now()
         """Clock time at which the last turn began."""
         self.due_s = self.woke_s
-        """Clock time at which it was due."""
+        """Clock time at which the last turn was due."""
         self.late_s = 0.0
         """Lateness of the last turn."""
         self.busy_s = 0.0
