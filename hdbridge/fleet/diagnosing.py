@@ -25,7 +25,7 @@ from hdbridge.records.recording import Recording
 from hdbridge.units import DEG_PER_TURN
 
 if TYPE_CHECKING:
-    from hdbridge.diagnose import Diagnosis
+    from hdbridge.analysis.findings import Diagnosis
     from hdbridge.model import TransmissionModel
 
 ORDERS: Final = (1, 2, 3, 4, 5, 6, 7, 8)
@@ -140,7 +140,7 @@ def diagnosed(source: Source, model: Model, known: Collection[tuple[str, str]] =
             return {"path": row["path"], "key": row["key"]}
         row |= _orders(recording.record, ratio)
         recording = replace(recording, ratio=ratio)
-        from hdbridge.diagnose import diagnose
+        from hdbridge.analysis.diagnosis import diagnose
 
         row |= _of_diagnosis(diagnose(recording, used))
         origin = recording.record.origin
@@ -201,7 +201,7 @@ def _key(row: Mapping[str, Any]) -> str:
 
 
 def _of_diagnosis(diagnosis: Diagnosis) -> Row:
-    from hdbridge.estimation.intervals import leaves
+    from hdbridge.analysis.intervals import leaves
 
     model = diagnosis.model
     figures = []
