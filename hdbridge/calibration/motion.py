@@ -284,12 +284,10 @@ def _ripple_test(runner: _Runner, model: TransmissionModel, measure: bool) -> Mo
             break
         filtered = runner.run("filtered correction", replace(model, response=response))
         found = MotionTest(_ripples(runner, none, static, filtered, response), response)
-        if explore:
-            pass
-        elif found.harms_at:
+        if not explore and found.harms_at:
             # The cause is not known, but it lies within the range of the filter.
             highest = 0.7 * response.known_to_hz
-        elif best.response is None or found.remaining < best.remaining:
+        elif not explore and (best.response is None or found.remaining < best.remaining):
             best = found
         trials.append(Trial(filtered, response.filter))
     if best.response is not None:

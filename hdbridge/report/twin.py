@@ -97,8 +97,8 @@ def twin_page(report: TwinReport) -> Page:
     sections = [
         Section(
             "How far simulation and axis are apart",
-            "Each figure is the rms difference of the two records, sample by sample or stop by stop, and "
-            "what it is in units of the noise of the measured channel: two equal axes differ by about one.",
+            "Each figure is the rms difference of the two records, sample by sample or stop by stop, also "
+            "in units of the noise of the measured channel. Two equal axes differ by less than one.",
             [_figures(report)],
         )
     ]
