@@ -89,7 +89,7 @@ def _defaults(axis: AxisConfig, settings: GatewaySettings) -> Mapping[str, int |
         "2000": axis.name,
         "6065": unsigned(_FOLLOWING_TIME_S * limits.velocity_deg_s),
         "6066": round(1000.0 * _FOLLOWING_TIME_S),
-        "6067": max(1, unsigned(axis.motor_encoder.degrees(2) / axis.gear.ratio)),
+        "6067": max(1, unsigned(abs(axis.motor_encoder.degrees(20)) / axis.gear.ratio)),
         "6068": 10,
         "6072": min(round(10.0 * limits.torque_percent), 0xFFFF),
         "6076": plate.rated_torque_mnm,
