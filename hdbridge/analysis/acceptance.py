@@ -97,6 +97,11 @@ def gate(estimator: Estimator, fitted: Fitted, place: int) -> Gate:
             return Gate(robust, needed, "not seen in enough independent stretches")
         return Gate(robust, needed, "may be what the law of another cause is wrong by")
     if effect.tracker().memory_deg > 0.0:
+        others = fitted.hypothesis.without(place)
+        laws = np.hstack([laws, estimator.turn_discrepancy(others.effects, others.start)])
+        robust = min(robust, robust_chi_square(estimator, fitted, place, laws=laws))
+        if robust < needed:
+            return Gate(robust, needed, "may be errors of the turning points")
         free = estimator.weighted(estimator.free_loop(fitted.hypothesis.start).columns)
         robust = min(robust, robust_chi_square(estimator, fitted, place, free, laws=laws))
         if robust < needed:
@@ -111,6 +116,19 @@ def gate(estimator: Estimator, fitted: Fitted, place: int) -> Gate:
             return Gate(robust, needed, stretch.otherwise)
     changes = _changes(estimator, fitted, place)
     return Gate(robust, needed, "not the same everywhere" if changes else "")
+
+
+def gate_of_change(estimator: Estimator, fitted: Fitted, without: Fitted) -> Gate:
+    """Judge a change of the model's own loop; ``without`` is the fit that has the loop as it was."""
+    change = without.residual - fitted.residual
+    columns = np.column_stack([without.tangent, change])
+    known = np.vstack([without.linearised.known, np.zeros(2)])
+    fit = Linearised(columns, without.residual, known)
+    turns = estimator.turn_discrepancy(without.hypothesis.effects, without.hypothesis.start)
+    laws = np.hstack([law_discrepancies(estimator, without.hypothesis), turns])
+    robust = block_robust(estimator, fit, [without.count()], np.zeros(1), laws=laws)
+    needed = estimator.scales.robust
+    return Gate(robust, needed, "may be errors of the turning points" if robust < needed else "")
 
 
 def evident(effect: Effect) -> list[int]:

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from hdbridge.analysis.acceptance import gate_of_change
 from hdbridge.analysis.calibrated import CalibratedPart, calibrated, variances
 from hdbridge.analysis.findings import UNWEIGHED, Finding, Parameter, next_experiment
 from hdbridge.analysis.gain import held_out, held_out_change
@@ -39,8 +40,8 @@ def findings(
         if given.part is Part.LOOP:
             if estimator.data.reversals >= 2:  # a loop shows only where the axis reverses
                 same = type(given) is type(precise.hypothesis.effects[place])
-                law = _loop(estimator, fitted, precise, usual[0], given, spread) if same else None
-                result.append(law if same else _another_law(estimator, fitted, precise, place, given, spread))
+                law = _loop(search, fitted, precise, usual[0], given, spread) if same else None
+                result.append(law if same else _another_law(search, fitted, precise, place, given, spread))
         elif given.part is Part.ORDERS:
             result.append(_orders(estimator, precise, usual, given, spread) if usual else None)
         else:
@@ -49,15 +50,19 @@ def findings(
 
 
 def _another_law(
-    estimator: Estimator, fitted: Fitted, precise: Fitted, place: int, given: Effect, spread: FloatArray
+    search: Search, fitted: Fitted, precise: Fitted, place: int, given: Effect, spread: FloatArray
 ) -> Finding | None:
     """Where another elastic law does better than the ``given`` one."""
-    scales, now = estimator.scales, precise.hypothesis.effects[place]
+    estimator, now = search.estimator, precise.hypothesis.effects[place]
+    scales = estimator.scales
     causes = causes_of(given, now)
     old = estimator.fit(fitted.hypothesis.instead(place, type(given)(**now.parameters())))
     peak = _apart_arcsec(estimator, old, fitted)
     gain = old.chi_square - fitted.chi_square
     if gain < scales.enter + scales.penalty or peak < scales.plain_arcsec or not causes:
+        return None
+    if reason := gate_of_change(estimator, fitted, old).reason:
+        search.refusals[causes[0].name] = reason
         return None
     name, parameters = causes[0].name, parameters_of(estimator, precise, place, spread)
     return Finding(
@@ -67,7 +72,7 @@ def _another_law(
 
 
 def _loop(
-    estimator: Estimator,
+    search: Search,
     fitted: Fitted,
     precise: Fitted,
     usual: CalibratedPart,
@@ -75,13 +80,17 @@ def _loop(
     spread: FloatArray,
 ) -> Finding | None:
     """Where the loop has other parameters, or a form that neither law has."""
-    place, scales = usual.place, estimator.scales
+    estimator, place = search.estimator, usual.place
+    scales = estimator.scales
     change = _change(estimator, precise, place, given)
     peak = 0.5 * float(np.ptp(change))
     lawless = _lawless_arcsec(estimator, fitted)
     small = peak < scales.floor_arcsec or strain(precise, usual, spread) < scales.calibrations**2
     causes = causes_of(given, precise.hypothesis.effects[place])
     if (small and not lawless) or not causes:
+        return None
+    if reason := gate_of_change(estimator, fitted, search.with_given(fitted, place, given)).reason:
+        search.refusals[causes[0].name] = reason
         return None
     # A loop that obeys no law may follow another one in part.
     laws = [kind.name for kind in CATALOGUE.values() if kind.part is Part.LOOP and kind.changes is Part.LOOP]

@@ -24,6 +24,8 @@ MOST_COUNTS = 2**32
 """Counts of the largest counter that wraps within a record."""
 TURNS_SEEN = 4.0
 """Minimum motor turns in which an error is seen to repeat."""
+PLACES = 8
+"""Places within a motor turn that are counted as different."""
 REPEATS_SHARE = 0.5
 """Minimum share of the error's variance that repeats with each turn of the motor."""
 FOLLOWS_SHARE = 0.1
@@ -210,8 +212,10 @@ def _check_speed(path: Path, record: Record) -> None:
 def _check_turn(path: Path, record: Record, ratio: float) -> None:
     """Refuse angles in radians: the error repeats with each turn of the motor, which is 2 pi then."""
     origin, motor = record.origin, record.motor_position_deg
-    if origin is None or "motor" in origin.stated or float(np.ptp(motor)) < TURNS_SEEN * math.tau:
+    if origin is None or "motor" in origin.stated:
         return
+    if len(np.unique(np.floor(PLACES / math.tau * motor))) < PLACES * TURNS_SEEN:
+        return  # a few places agree with any period
     direction = np.sign(np.gradient(motor))
     base = np.column_stack([np.ones_like(motor), motor, direction])
     turns = np.column_stack([f(order * motor) for order in (1, 2) for f in (np.cos, np.sin)])

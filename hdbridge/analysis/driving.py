@@ -159,7 +159,9 @@ def _driving(
     # A motor that sticks where it reverses, or overshoots where it stops, is where its encoder says.
     cell = max(0.5 * count, 3.0 * noise)
     line = np.clip(line, lag - cell, lag + cell)
-    return steadied(target + line, target + line, CHATTER_COUNTS * reading.resolution_deg)
+    # Without a reversal the path may change sides of its cell, and the cell moves with a noisy reading.
+    band = max(CHATTER_COUNTS * reading.resolution_deg, 4.0 * cell)
+    return steadied(target + line, target + line, band)
 
 
 def _noise(lag: FloatArray, count: float) -> float:

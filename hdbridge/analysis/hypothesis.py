@@ -11,15 +11,18 @@ from functools import cached_property
 
 import numpy as np
 
+from hdbridge.analysis.blocks import missed_deg
 from hdbridge.analysis.calibrated import CalibratedPart, priors
+from hdbridge.analysis.driving import CHATTER_COUNTS
 from hdbridge.analysis.linear import LOCAL, Column, Effort, Linearised, Nuisances, Prior, Terms, unknown
 from hdbridge.analysis.noise import White
-from hdbridge.analysis.nuisances import zeros
+from hdbridge.analysis.nuisances import COUNTS, zeros
 from hdbridge.analysis.prepared import Observed
 from hdbridge.analysis.regressors import Regressors
 from hdbridge.analysis.scales import Scales
 from hdbridge.analysis.separable import Separable, Solution, unit
 from hdbridge.effects import Channel, Effect, FloatArray, IntArray, Motion, Moves, Part, Start
+from hdbridge.effects.path import branches
 from hdbridge.effects.play import stop
 from hdbridge.units import ARCSEC_PER_DEG
 
@@ -31,6 +34,8 @@ SMOOTH = 15
 """Samples about whose parabola a reading of such a channel is noise,"""
 WHITE = 1.17
 """... of which that shows five sixths; less 3 %, as well as it is known."""
+MOST_TURNS = 100
+"""Maximum number of turning points with an error of their own; of more, the mean is known well enough."""
 SHORT = 10_000
 """Samples: what is rare in a shorter record is rarer in proportion."""
 STOPS_DEG = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0)
@@ -180,6 +185,28 @@ class Estimator:
             if each.tracker().memory_deg > 0.0:
                 change = change + each.predict(other, start) - each.predict(full.motion, start)
         return self.weighted(self.at_points(change)[:, np.newaxis])
+
+    def turn_discrepancy(self, effects: Sequence[Effect], start: Start) -> FloatArray:
+        """Errors of turning points within their counts, a weighted column per standard deviation, (m, k).
+
+        A motor with friction stops short of all turns alike, and of each by its own amount. One column is for
+        all turns, and unless there are more than `MOST_TURNS`, one for each.
+        """
+        full, loops = self.data.full, [each for each in effects if each.tracker().memory_deg > 0.0]
+        turning, signs = branches(full.motor_deg, start)
+        turns = np.array(turning[1:-1], dtype=np.intp)
+        if not loops or not len(turns):
+            return np.empty((len(self.index), 0))
+        count = full.reading.resolution_deg if full.commanded else CHATTER_COUNTS * full.reading.unaided_deg
+        moved = full.motor_deg.copy()
+        moved[turns] += (COUNTS * count + missed_deg(full.motor_deg, turns)) * np.array(signs[:-1])
+        other = replace(full.motion, motor_deg=moved)
+        change = sum(each.predict(other, start) - each.predict(full.motion, start) for each in loops)
+        columns = [self.at_points(np.asarray(change))]
+        if len(turns) <= MOST_TURNS:
+            leg = np.searchsorted(turns, self.data.runs[self.index], "right")
+            columns += [np.where(leg == each, columns[0], 0.0) for each in range(1, len(turns) + 1)]
+        return self.weighted(np.column_stack(columns))
 
     def free_loop(self, start: Start) -> Nuisances:
         """A free-form hysteresis: stop operators of `STOPS_DEG`, which make a loop of any shape with

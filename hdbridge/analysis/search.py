@@ -300,8 +300,12 @@ class Search:
         ``given``.
         """
         with self.held({place}):
-            without = self.estimator.fit(fitted.hypothesis.instead(place, given))
-            return self.as_well(fitted, without, given.name)
+            return self.as_well(fitted, self.with_given(fitted, place, given), given.name)
+
+    def with_given(self, fitted: Fitted, place: int, given: Effect) -> Fitted:
+        """The fit with the model's part at ``place`` exactly as ``given``."""
+        with self.held({place}):
+            return self.estimator.fit(fitted.hypothesis.instead(place, given))
 
     @contextmanager
     def held(self, places: Set[int]) -> Iterator[None]:

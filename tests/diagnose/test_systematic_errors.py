@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from itertools import accumulate
 from types import ModuleType
 from typing import Any
 
@@ -13,6 +14,7 @@ from support.filters import filtered
 from support.rates import least
 
 from hdbridge.analysis.acceptance import gate
+from hdbridge.analysis.diagnosis import diagnose
 from hdbridge.analysis.findings import Diagnosis, Parameter
 from hdbridge.analysis.hypothesis import Estimator, Hypothesis
 from hdbridge.analysis.parameters import covariance, parameters_of, precisely
@@ -113,6 +115,26 @@ def test_a_motor_that_comes_back_within_its_counts_at_rest_is_no_evidence_of_cre
     creep = Creep(parts=(Relaxation(amplitude_arcsec=1.0, tau_s=0.3),), build_up=0.1)
     found = gate(estimator, estimator.fit(base.plus(creep)), len(model.effects))
     assert found.robust < 0.5 * found.needed
+
+
+def test_a_motor_that_stops_short_of_its_turns_within_a_count_is_not_a_change_of_the_loop(
+    plant: ModuleType, columns: Columns, model: TransmissionModel, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Friction holds it 0.4 counts from its command at every turn."""
+    path, commands = plant.path, []
+
+    def short(plan: Any, rng: np.random.Generator) -> Any:
+        time_s, motor, legs = path(plan, rng)
+        commands.append(motor)
+        slack = 0.4 * 360.0 / 8000.0
+        followed = accumulate(motor, lambda at, to: min(max(at, to - slack), to + slack))
+        return time_s, np.array(list(followed)), legs
+
+    monkeypatch.setattr(plant, "path", short)
+    record = columns(slow_noise=0.0)
+    found = diagnose(Record({**record, "motor_target_deg": commands[0][::10]}), model)
+    loops = {"backlash", "hysteresis_memory", "hysteresis_parameters"}
+    assert not loops & {each.cause for each in found.findings}
 
 
 def test_the_wind_up_of_a_load_that_swings_on_its_spring_is_within_its_interval(

@@ -1,8 +1,10 @@
 """The angle that the hysteresis sees: without chatter, turned round only where the motor turned."""
 
+from itertools import accumulate
+
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hdbridge.analysis.driving import kinematics
@@ -54,6 +56,27 @@ def test_a_lagging_motor_turns_where_it_turned_and_not_where_it_was_told_to():
     path = driving_angle(command, np.round(motor / count) * count)
     assert turns(path) == turns(motor)
     assert np.max(np.abs(path - motor)) < 1.5 * count
+
+
+@given(
+    counts=st.sampled_from([8000, 20_000, 65_536, 2**18, 2**20]),
+    flicker=st.sampled_from([0.0, 0.1, 0.2, 0.5]),
+    seed=st.integers(0, 2**31),
+)
+@settings(max_examples=60, deadline=None, derandomize=True)
+def test_a_motor_that_rests_and_continues_in_the_same_direction_does_not_turn(counts, flicker, seed):
+    rng = np.random.default_rng(seed)
+    rate_hz, count = 250.0, 360.0 / counts
+    parts = [np.zeros(50)]
+    for _ in range(12):
+        way = 0.5 * (1.0 - np.cos(np.pi * np.linspace(0.0, 1.0, int(rate_hz * rng.uniform(0.1, 0.6)))))
+        parts.append(parts[-1][-1] + rng.uniform(2.0, 60.0) * way)
+        parts.append(np.full(int(rate_hz * rng.uniform(0.1, 0.5)), parts[-1][-1]))
+    command = np.round(np.concatenate(parts) / count) * count
+    follows = 1.0 - np.exp(-1.0 / (rate_hz * rng.uniform(0.003, 0.02)))
+    motor = np.array(list(accumulate(command, lambda at, target: at + follows * (target - at))))
+    measured = np.round(motor / count + flicker * rng.standard_normal(len(motor))) * count
+    assert turns(driving_angle(command, measured)) == 0
 
 
 @pytest.mark.parametrize("rate_hz", [25.0, 50.0, 100.0, 250.0])

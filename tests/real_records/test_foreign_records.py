@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from typer.testing import CliRunner
 
@@ -380,6 +380,18 @@ def test_zeros_that_differ_between_records_neither_make_nor_hide_a_wrap(
     assert (found is not None) == wrapped
     if found is not None:
         assert len(found.rows) == len(zeros_deg)
+
+
+@given(seed=st.integers(0, 2**31))
+@settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+def test_errors_at_a_few_places_are_not_a_turn_in_radians(tmp_path: Path, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    places = np.sort(rng.uniform(0.0, 900.0, 11))
+    motor = np.repeat(places, 5)
+    load = motor / RATIO + np.repeat(rng.normal(scale=5.0 / 3600.0, size=11), 5)
+    path = tmp_path / "bench.csv"
+    path.write_text(text(0.1 * np.arange(len(motor)), motor, load))
+    check_records({path: Record.read_csv(path)}, RATIO)
 
 
 def test_a_clock_that_wraps_is_named_with_its_period(tmp_path: Path) -> None:
