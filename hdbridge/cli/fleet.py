@@ -104,6 +104,7 @@ def run(
     from hdbridge.fleet.engine import Cluster, Progress
     from hdbridge.fleet.engine import run as run_fleet
     from hdbridge.fleet.sources import find_sources
+    from hdbridge.model import TransmissionModel
 
     _need_extra()
     if out is None:
@@ -117,6 +118,14 @@ def run(
             "--workers: a cluster that exists has its own workers; leave out --workers or --scheduler"
         )
     _check_memory(memory)
+    if scheduler == "":
+        raise InputError("--scheduler: found no address; expected one such as tcp://HOST:8786")
+    if "" in (sources or []):
+        raise InputError("SOURCE: found an empty name; expected a folder, a glob or a URL")
+    if model is not None:
+        TransmissionModel.load(model)
+    if models is not None and not models.is_dir():
+        raise InputError(f"--models: '{models}' is not a folder; expected one with JOINT.yaml for each joint")
     found = find_sources(sources or [], manifest)
     dataset = Dataset(out)
     dataset.create()
@@ -154,7 +163,7 @@ def report(
     out: OutArgument,
     html_file: Annotated[
         Path | None,
-        typer.Option("--html", metavar="PAGE", help="Where the page goes; else OUT/fleet.html."),
+        typer.Option("--html", metavar="PAGE", help="Write the page here; without it OUT/fleet.html."),
         Kind.PAGE,
     ] = None,
     json_file: JsonOption = None,
@@ -170,7 +179,9 @@ def report(
 
 
 def simulate(
-    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="A new folder.")],
+    folder: Annotated[
+        Path, typer.Argument(metavar="FOLDER", help="Write the fleet here: a new folder."), Kind.FOLDER
+    ],
     joints: Annotated[int, typer.Option("--joints", min=4, max=100_000, help="How many joints.")] = 12,
     recordings: Annotated[int, typer.Option("--recordings", min=3, max=1000, help="Recordings of each.")] = 4,
     seed: Annotated[int, typer.Option("--seed", help="Another seed draws another fleet.")] = 0,

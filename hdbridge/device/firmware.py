@@ -98,7 +98,7 @@ class Firmware:
         self._awaits_power = False
         self._resetting = False
         self._stopped_itself = False
-        """In QUICK STOP ACTIVE without a command: a repeated controlword does not lead out of it."""
+        """In QUICK STOP ACTIVE without a command: only a level-read controlword leads out by repetition."""
         self._beyond_window_s = 0.0
         self._following_error = False
         self._error_code = 0
@@ -214,7 +214,7 @@ class Firmware:
             return
         if word != self._word:
             self._delay_status()
-        elif self._stopped_itself:
+        elif self._stopped_itself and not self._by_level:
             return
         rising = word & ~self._word
         self._word = word

@@ -156,7 +156,7 @@ def test_what_is_wrong_is_named(
 
 
 GAIN_EDS = {
-    "[OptionalObjects]\nSupportedObjects=84\n": "[OptionalObjects]\nSupportedObjects=85\n85=0x60FB\n",
+    "[OptionalObjects]\nSupportedObjects=89\n": "[OptionalObjects]\nSupportedObjects=90\n90=0x60FB\n",
     "[6085]": """[60FB]
 ParameterName=Position control parameter set
 ObjectType=0x9

@@ -35,12 +35,19 @@ RIGHT = {
     "SPEED": "1", "JOB": "step-1",
     "TEXT": "words", "VERSION": "1", "FILE.mcap": "flight.mcap", "FILE.mcap|FOLDER": "flight.mcap",
     "SCHEME": "both", "KIND": "step", "BEFORE": "active", "AFTER": "active", "MODE": "on",
-    "--method": "35", "--model": "axis/model.yaml", "--on": "", "--out": "out",
+    "--method": "35", "--model": "axis/model.yaml", "--on": "", "--out": "out", "--manifest": "fleet.csv",
+    "OUT": "axis", "FOLDER": "out",
 }  # fmt: skip
 """What a command is given in addition to the wrong value; nothing is ever done with it."""
-NEEDED = {("diagnose", "--model"), ("record", "export", "--out"), ("record", "import", "--out")}
+NEEDED = {
+    ("diagnose", "--model"), ("record", "export", "--out"), ("record", "import", "--out"),
+    ("fleet", "run", "--out"), ("fleet", "run", "--manifest"),
+}  # fmt: skip
 """Options that a command cannot do without, except in another use of it."""
-PARENTS_MADE = {("new", "NAME"), ("record", "export", "--out"), ("record", "import", "--out")}
+PARENTS_MADE = {
+    ("new", "NAME"), ("record", "export", "--out"), ("record", "import", "--out"),
+    ("fleet", "run", "--out"), ("fleet", "simulate", "FOLDER"),
+}  # fmt: skip
 """A folder that is not there is right, with its parents."""
 BY_ANOTHER = {("setup", "NAME"), ("setup", "--eds")}
 """Refused by the command that `setup` prints and runs."""
@@ -129,6 +136,7 @@ def place(tmp_path):
     rows = "".join(f"{number},{number},{number / 50}\n" for number in range(9))
     (tmp_path / "record.csv").write_text("time_s,motor_position_deg,load_position_deg\n" + rows)
     (tmp_path / "bus.log").write_text("(1.000000) can0 080#\n")
+    (tmp_path / "fleet.csv").write_text("path,joint\nrecord.csv,J1\n")
     (tmp_path / "junk").write_bytes(bytes(range(256)))
     (tmp_path / "empty").touch()
     (tmp_path / "circle").symlink_to("circle")

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import os
 import signal
-import time
 from pathlib import Path
 
 import canopen
 import pytest
 from canopen.profiles.p402 import BaseNode402
-from support.running import Daemon, running
+from support import patience
+from support.running import running
 
 from hdbridge.daemon.gateway.objects import eds
 from hdbridge.daemon.machine import Machine
@@ -34,14 +34,6 @@ class Patient(BaseNode402):
     TIMEOUT_SWITCH_STATE_SINGLE = 30.0
     TIMEOUT_CHECK_TPDO = 30.0
     TIMEOUT_SWITCH_OP_MODE = 30.0
-
-
-def until(done, daemon: Daemon, timeout_s: float = 120.0):
-    """Waits for what a process does; `timeout_s` is only for what hangs."""
-    end_s = time.monotonic() + timeout_s
-    while not done():
-        assert time.monotonic() < end_s, daemon.events[-12:]
-        time.sleep(0.02)
 
 
 @pytest.mark.filterwarnings("ignore")
@@ -75,16 +67,18 @@ def test_a_foreign_master_moves_the_axis_and_a_dead_gateway_does_not(tmp_path: P
             assert daemon.axis()["outer"]["node_id"] == 5
             node.sdo[0x607A].raw = 3 * COUNTS_PER_DEG
             node.sdo[0x6040].raw = 0x1F
-            until(lambda: node.sdo[0x6041].raw & 0x1400 == 0x1400, daemon)
-            assert node.sdo[0x6064].raw == pytest.approx(3 * COUNTS_PER_DEG, abs=100)
-            assert daemon.axis()["load_target_deg"] == pytest.approx(3.0, abs=1e-6)
+            patience.until(lambda: node.sdo[0x6041].raw & 0x1400 == 0x1400, lambda: daemon.events[-12:])
+            window = node.sdo[0x6067].raw
+            assert node.sdo[0x6064].raw == pytest.approx(3 * COUNTS_PER_DEG, abs=window)
+            patience.until(lambda: abs(daemon.axis()["load_target_deg"] - 3.0) < 1e-6)
+            patience.until(lambda: abs(node.sdo[0x6064].raw - 3 * COUNTS_PER_DEG) < 100)
 
             (process,) = daemon.pids("gateway")
             os.kill(process, signal.SIGKILL)
-            until(lambda: daemon.axis()["state"] == "disabled", daemon)
-            until(lambda: len(daemon.pids("gateway")) == 2, daemon)
-            until(lambda: daemon.axis()["outer"]["alive"], daemon)
-            until(lambda: node.sdo[0x6041].raw & 0x4F == 0x40, daemon)
+            patience.until(lambda: daemon.axis()["state"] == "disabled", lambda: daemon.events[-12:])
+            patience.until(lambda: len(daemon.pids("gateway")) == 2, lambda: daemon.events[-12:])
+            patience.until(lambda: daemon.axis()["outer"]["alive"], lambda: daemon.events[-12:])
+            patience.until(lambda: node.sdo[0x6041].raw & 0x4F == 0x40, lambda: daemon.events[-12:])
             assert daemon.axis()["state"] == "disabled"
         finally:
             network.disconnect()
