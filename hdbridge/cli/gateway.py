@@ -88,7 +88,9 @@ def gateway_axis(machine: str, name: str | None) -> tuple[AxisConfig, GatewaySet
 
     found = Machine.find(machine)
     if found.gateway is None:
-        raise InputError(f"{found.path}: has no gateway; expected a key 'gateway' (docs/gateway.md)")
+        raise InputError(
+            f"{found.path}: has no gateway; expected a machine file with a key 'gateway' (docs/gateway.md)"
+        )
     names = [*found.gateway.nodes]
     if name is None and len(names) > 1:
         raise InputError(

@@ -98,7 +98,7 @@ def test_positions_have_to_fit_into_32_bits(tmp_path):
 def test_a_machine_without_a_gateway_says_which_key_is_missing(tmp_path):
     done = run_here(tmp_path, "gateway", "eds", "article")
     assert done.returncode == 2
-    assert "has no gateway; expected a key 'gateway'" in done.stderr
+    assert "expected a machine file with a key 'gateway'" in done.stderr
     done = run_here(tmp_path, "gateway", "eds", machine(tmp_path), "--axis", "arm")
     assert done.returncode == 2
     assert "--axis arm: is not in the gateway; expected one of: article" in done.stderr
