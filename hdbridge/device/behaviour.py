@@ -10,10 +10,10 @@ from hdbridge.strictness import Strict
 
 
 class Controlword(Enum):
-    """How the drive reads a controlword that only repeats the last one."""
+    """Reaction of the drive to a repeated controlword."""
 
     EDGE = "edge"
-    """It asks for nothing new."""
+    """It is ignored."""
     LEVEL = "level"
     """It is evaluated again: a repeated 000Fh in *quick stop active* is transition 16."""
 

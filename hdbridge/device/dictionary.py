@@ -1,9 +1,9 @@
-"""The object dictionary of the simulated drive: what its EDS declares, and the values that live behind it.
+"""The object dictionary of the simulated drive: the objects that its EDS declares, and their values.
 
-An entry is a stored value, or is bound to a function that reads the drive at this moment. Writing checks
-access, length and range as CiA 301 demands, and then asks the entry's guard, which may refuse. PDO mappings
-are compiled from entries once (``pdo.py``), so nothing here runs in the cyclic path but stored values and
-bound functions.
+An entry holds a stored value, or is bound to a function that returns the drive's present value. A write is
+checked for access, length and range as CiA 301 demands, and then by the entry's guard, which may refuse it.
+PDO mappings are compiled from entries once (``pdo.py``), so the cyclic path only reads stored values and
+calls bound functions.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from hdbridge.files.bundled import bundled_folder
 from hdbridge.files.edsfile import shared_eds
 
 BUNDLED: Final = bundled_folder("eds") / "hdbridge-402.eds"
-"""The objects that the firmware works with."""
+"""EDS of the objects that the firmware works with."""
 NUMBERS: Final = {
     datatypes.BOOLEAN: "B",
     datatypes.INTEGER8: "b",
@@ -38,7 +38,7 @@ NUMBERS: Final = {
 """Data types of numbers, as ``struct`` format characters; an object of any other type holds bytes."""
 _VENDORS: Final = (0x2000, 0x5FFF)
 _PDOS: Final = (0x1400, 0x1BFF)
-"""PDOs exist or not: the firmware does without those that the EDS does not list."""
+"""Indices of the PDO parameters. A PDO that the EDS does not list does not exist."""
 
 MAX_STRING: Final = 64
 """Longest string, in bytes, that can be written to a writable string object."""
@@ -69,7 +69,7 @@ class Abort(IntEnum):
 
 
 class SdoAbortError(Exception):
-    """An access that the drive refuses, with the abort code it answers."""
+    """An access that the drive refuses, with the abort code of its answer."""
 
     def __init__(self, code: Abort, what: str = "") -> None:
         super().__init__(what or f"{code.name} ({code:08X}h)")
@@ -80,9 +80,9 @@ class Entry:
     """One (index, sub-index).
 
     ``value`` is what is stored; ``bind`` makes reads call a function instead; ``guard`` is asked with a new
-    value before it is stored and refuses by raising ``SdoAbortError``; ``follower`` is told after it was
-    stored. The firmware uses a ``hidden`` entry, and the bus does not see it. The firmware does not
-    use an entry that is not ``is_known``.
+    value before it is stored and refuses by raising ``SdoAbortError``; ``follower`` is called after it was
+    stored. The firmware uses a ``hidden`` entry, but the bus does not see it. The firmware uses only entries
+    that are ``is_known``.
     """
 
     __slots__ = (
@@ -128,7 +128,7 @@ class Entry:
             self.default = self.default.encode()
         elif self._bits and isinstance(self.default, int):
             self.default = self._wrapped(self.default)
-        self.value: Any = self.default  # of what the codec says
+        self.value: Any = self.default  # of the codec's type
         self.bound: Callable[[], int] | None = None
         self.guard: Callable[[int], None] | None = None
         self.follower: Callable[[int], None] | None = None
@@ -142,27 +142,27 @@ class Entry:
         return 8 * self.codec.size if self.codec else 0
 
     def bind(self, read: Callable[[], int]) -> None:
-        """Make reads, by SDO and by PDO, call ``read``."""
+        """Makes reads, by SDO and by PDO, call ``read``."""
         self.bound = (lambda: self._wrapped(read())) if self._bits else read
 
     def _wrapped(self, value: int) -> int:
-        """A value of any integer type in the type of this EDS."""
+        """Converts a value of any integer type to the type that the EDS declares (modulo its range)."""
         assert self.codec is not None
         size = self.codec.size
         wrapped: int = self.codec.unpack((value % (1 << 8 * size)).to_bytes(size, "little"))[0]
         return wrapped
 
     def reader(self) -> Callable[[], int]:
-        """What a TPDO calls to get the value."""
+        """Returns the function that a TPDO calls to read the value."""
         return self.bound if self.bound is not None else self.number
 
     def number(self) -> int:
-        """The present value of an integer entry."""
+        """Returns the present value of an integer entry."""
         value: int = self.value if self.bound is None else self.bound()
         return value
 
     def read(self) -> bytes:
-        """The present value as an SDO server sends it."""
+        """Returns the present value as an SDO server sends it."""
         if not self.readable:
             raise SdoAbortError(Abort.WRITE_ONLY)
         if self.codec is None:
@@ -171,7 +171,7 @@ class Entry:
         return self.codec.pack(self.number())
 
     def check_length(self, size: int) -> None:
-        """Refuse a read-only entry and a length that does not fit."""
+        """Refuses a read-only entry, and a length that does not match the data type."""
         if not self.writable:
             raise SdoAbortError(Abort.READ_ONLY)
         longest = self.codec.size if self.codec else MAX_STRING
@@ -181,7 +181,7 @@ class Entry:
             raise SdoAbortError(Abort.TOO_SHORT)
 
     def write(self, data: bytes) -> None:
-        """Check and store what an SDO client wrote."""
+        """Checks and stores the bytes that an SDO client wrote."""
         self.check_length(len(data))
         if self.codec is None:
             self.value = bytes(data)
@@ -189,7 +189,7 @@ class Entry:
             self.put(self.codec.unpack(data)[0])
 
     def put(self, value: int) -> None:
-        """Check and store a number, whoever wrote it."""
+        """Checks and stores a number, written by SDO or PDO."""
         if self.high is not None and value > self.high:
             raise SdoAbortError(Abort.TOO_HIGH)
         if self.low is not None and value < self.low:
@@ -211,7 +211,7 @@ class Entry:
         return (self.low is None or value >= self.low) and (self.high is None or value <= self.high)
 
     def writer(self) -> Callable[[int], None]:
-        """What an RPDO calls with a received value; one out of range is refused by ``SdoAbortError``."""
+        """Returns the function that an RPDO calls with a received value; it raises ``SdoAbortError``."""
         plain = self.low is None and self.high is None and self.guard is None and self.follower is None
         return self._store if plain else self.put
 
@@ -222,9 +222,9 @@ class Entry:
 class Dictionary:
     """All entries of one node, by (index, sub-index).
 
-    The firmware works with every object of the bundled EDS, except those whose numbers ``eds_path`` gives to
-    other objects of the vendor. Those that ``eds_path`` does not list are hidden: no SDO or PDO reaches them,
-    and they keep the bundled default.
+    The firmware works with every object of the bundled EDS, except those whose indices the vendor uses for
+    other objects in ``eds_path``. Objects that ``eds_path`` does not list are hidden: no SDO or PDO reaches
+    them, and they keep the bundled default.
     """
 
     def __init__(self, eds_path: Path, node_id: int) -> None:
@@ -263,11 +263,11 @@ class Dictionary:
         self._indices = {entry.index for entry in self}
 
     def __getitem__(self, key: tuple[int, int]) -> Entry:
-        """An entry for the firmware, hidden or not."""
+        """Returns an entry to the firmware, hidden or not."""
         return self._entries[key]
 
     def open(self, index: int, sub: int) -> Entry:
-        """An entry for the bus; refuses those that the drive does not show."""
+        """Returns an entry to the bus; refuses missing and hidden ones."""
         entry = self._entries.get((index, sub))
         if entry is None or entry.hidden:
             code = Abort.NO_SUBINDEX if index in self._indices else Abort.NO_OBJECT
@@ -282,23 +282,23 @@ class Dictionary:
         return (entry for entry in self._entries.values() if not entry.hidden)
 
     def remove(self, index: int, sub: int) -> None:
-        """Be a drive that does not have this object."""
+        """Hides an object, as on a drive that does not have it."""
         self._entries[index, sub].hidden = True
         self._note_indices()
 
     def value(self, index: int, sub: int = 0) -> int:
-        """The present number behind an integer entry."""
+        """Returns the present value of an integer entry."""
         return self._entries[index, sub].number()
 
     def restore(self, first: int = 0x0000, last: int = 0xFFFF) -> None:
-        """Put the defaults back into all stored values of these indices; no guard is asked."""
+        """Restores the default of every entry in this range of indices, without asking the guards."""
         for entry in self._entries.values():
             if first <= entry.index <= last:
                 entry.value = entry.default
 
 
 def _is_vendors(variable: ODVariable, own: ODVariable) -> bool:
-    """A manufacturer-specific object of another type: the number is the same by chance."""
+    """Returns True for a manufacturer-specific object of another type: the index is equal by chance."""
     return _VENDORS[0] <= variable.index <= _VENDORS[1] and variable.data_type != own.data_type
 
 

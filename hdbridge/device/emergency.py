@@ -1,4 +1,4 @@
-"""Errors of the simulated drive: what is active, the error register, the history, and EMCY messages."""
+"""Errors of the simulated drive: active errors, error register, history and EMCY messages."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _DISABLED: Final = 1 << 31
 
 
 class ErrorCode(IntEnum):
-    """Emergency error codes that the drive produces by itself (CiA 301, CiA 402)."""
+    """Emergency error codes that the drive raises without fault injection (CiA 301, CiA 402)."""
 
     NONE = 0x0000
     COMMUNICATION = 0x8100
@@ -29,7 +29,7 @@ class ErrorCode(IntEnum):
 
 
 class Emergency:
-    """The EMCY producer. An error occurs once, stays active, and is cleared once."""
+    """EMCY producer. An error is sent once, stays active, and is cleared once."""
 
     def __init__(self, dictionary: Dictionary, send: Callable[[int, bytes], None]) -> None:
         self._dictionary = dictionary
@@ -46,7 +46,7 @@ class Emergency:
             dictionary[0x1003, sub].bind(partial(self._past, sub - 1))
 
     def reset(self) -> None:
-        """As after power-on; nothing is sent."""
+        """Returns to the state after power-on; sends nothing."""
         self.active.clear()
         self._history.clear()
 
@@ -54,7 +54,7 @@ class Emergency:
         return self._history[age] if age < len(self._history) else 0
 
     def occur(self, code: int, additional: bytes = b"") -> None:
-        """Make ``code`` active and send it, unless it already is; ``additional`` are up to five bytes."""
+        """Activates and sends ``code`` unless it is active; ``additional`` holds up to five bytes."""
         if code in self.active:
             return
         self.active.append(code)
@@ -63,13 +63,13 @@ class Emergency:
         self._transmit(code, additional)
 
     def clear(self, code: int) -> None:
-        """End one error; the last one to end sends 'error reset'."""
+        """Ends one error and sends the latest one still active, or 'error reset' after the last."""
         if code in self.active:
             self.active.remove(code)
             self._transmit(self.active[-1] if self.active else ErrorCode.NONE, b"")
 
     def clear_all(self) -> None:
-        """End all errors, as a fault reset does."""
+        """Ends all errors, as a fault reset does."""
         if self.active:
             self.active.clear()
             self._transmit(ErrorCode.NONE, b"")
@@ -80,7 +80,7 @@ class Emergency:
             self._send(can_id & 0x7FF, _FRAME.pack(code, self._register(), additional))
 
     def _register(self) -> int:
-        """Object 1001h: bit 0 any error, bits 1 to 7 by the class of the code."""
+        """Returns object 1001h: bit 0 for any error, bits 1 to 7 by the class of the code."""
         register = 0
         for code in self.active:
             register |= 1 | _register_bit(code)

@@ -1,7 +1,7 @@
-"""What can go wrong with a drive, on purpose: for tests of a master.
+"""Fault injection in the simulated drive, for tests of a master.
 
-``node.faults`` is the only door. Each wish is counted down or switched off by itself or by the caller; with
-no wish pending the cyclic path pays one attribute look-up.
+``node.faults`` is the only access. Counted faults end automatically; the caller switches the others off.
+Without a pending fault, the cyclic path pays for one attribute look-up.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ Outgoing = tuple[int, bytes]
 
 @dataclass
 class Faults:
-    """Wishes, all off at first."""
+    """Faults to inject, all off at first."""
 
     drop_tpdos: int = 0
     """The next n TPDOs are lost."""
@@ -28,31 +28,31 @@ class Faults:
     reverse_tpdos: int = 0
     """Those of the next n SYNCs come in reverse order."""
     mute_heartbeat: bool = False
-    """The heartbeat stops, the rest goes on."""
+    """The heartbeat stops; everything else continues."""
     silent: bool = False
-    """As good as unplugged: it hears nothing and says nothing; its own watchdogs stop the axis."""
+    """The drive neither receives nor sends, as if unplugged; its own watchdogs stop the axis."""
     deaf: bool = False
-    """It hears nothing and goes on speaking: as if its master hung."""
+    """The drive receives nothing but continues to send, as if its master hung."""
     muted_ids: frozenset[int] = frozenset()
-    """Frames with these identifiers are not sent: one TPDO, the answers to SDO requests."""
+    """Identifiers of frames that are not sent, for example those of one TPDO or of the SDO answers."""
     load_jump_counts: int = 0
     """Added to the load encoder from the next sample on."""
     motor_jump_counts: int = 0
     """Added to the motor encoder from the next sample on; the servo loops act on it."""
     load_reading: Callable[[int], int] | None = None
-    """What the load encoder makes of its counts from the next sample on: a drift, a freeze, noise."""
+    """Maps the counts of the load encoder to its reading from the next sample on: drift, freeze, noise."""
     ignore_lost_heartbeat: bool = False
-    """It does not notice that the master's heartbeat stays away."""
+    """The drive does not notice that the master's heartbeat is missing."""
     only_report_lost_heartbeat: bool = False
-    """It sends its EMCY for that and goes on."""
+    """The drive sends the EMCY of a lost heartbeat and continues."""
     stay_operational: bool = False
     """A lost heartbeat does not take it out of OPERATIONAL, whatever 1029h says."""
     ignore_missing_set_points: bool = False
-    """It does not notice that RPDOs stay away."""
+    """The drive does not notice that RPDOs are missing."""
     deceleration_counts_s2: float | None = None
-    """How it brakes, whatever its objects say."""
+    """Deceleration of every ramp, in place of the one that the objects demand; counts/s2."""
     concerns_poll: bool = False
-    """For the node: whether something is to be done at this poll."""
+    """For the node: True if a fault is due at this poll."""
     _held: list[Outgoing] = field(default_factory=list)
     _errors: list[tuple[int, bytes]] = field(default_factory=list)
     _lost_masters: list[int] = field(default_factory=list)
@@ -67,12 +67,12 @@ class Faults:
         self.concerns_poll = True
 
     def lose_master(self, code: int) -> None:
-        """At the next poll: react as 6007h says to the loss of the master, without a word of it."""
+        """At the next poll: react as 6007h says to the loss of the master, without an EMCY."""
         self._lost_masters.append(code)
         self.concerns_poll = True
 
     def miss_master(self, code: int) -> None:
-        """At the next poll: the same, with the EMCY ``code`` (8130h or 8250h)."""
+        """At the next poll: as ``lose_master``, with the EMCY ``code`` (8130h or 8250h)."""
         self._missed_masters.append(code)
         self.concerns_poll = True
 
@@ -82,48 +82,48 @@ class Faults:
         self.concerns_poll = True
 
     def leave_operational(self) -> None:
-        """At the next poll: into PRE-OPERATIONAL, whatever the axis does, with a heartbeat that says so."""
+        """At the next poll: enter PRE-OPERATIONAL, whatever the axis does, and report it by heartbeat."""
         self._departures += 1
         self.concerns_poll = True
 
     def open_enable_input(self) -> None:
-        """At the next poll: the power stage goes off without a word, as by a hardware enable input."""
+        """At the next poll: switch the power stage off without an EMCY, as a hardware enable input does."""
         self._openings += 1
         self.concerns_poll = True
 
     def take_errors(self) -> list[tuple[int, bytes]]:
-        """For the node: the errors to raise now."""
+        """For the node: returns the pending errors and clears them."""
         errors, self._errors = self._errors, []
         return errors
 
     def take_lost_masters(self) -> list[int]:
-        """For the node: with which codes to lose its master now."""
+        """For the node: returns the pending codes of ``lose_master`` and clears them."""
         codes, self._lost_masters = self._lost_masters, []
         return codes
 
     def take_missed_masters(self) -> list[int]:
-        """For the node: with which codes to miss its master now."""
+        """For the node: returns the pending codes of ``miss_master`` and clears them."""
         codes, self._missed_masters = self._missed_masters, []
         return codes
 
     def take_boot_up(self) -> bool:
-        """For the node: whether to reset now."""
+        """For the node: returns True if a reset is pending, and clears it."""
         wanted, self._boot_ups = self._boot_ups > 0, 0
         return wanted
 
     def take_departure(self) -> bool:
-        """For the node: whether to leave OPERATIONAL now."""
+        """For the node: returns True if leaving OPERATIONAL is pending, and clears it."""
         wanted, self._departures = self._departures > 0, 0
         return wanted
 
     def take_opening(self) -> bool:
-        """For the node: whether the enable input opens now."""
+        """For the node: returns True if opening the enable input is pending, and clears it."""
         wanted, self._openings = self._openings > 0, 0
         return wanted
 
     @property
     def concerns_tpdos(self) -> bool:
-        """For the node: whether TPDOs go through ``spoil``."""
+        """For the node: True if TPDOs must pass through ``spoil``."""
         return bool(
             self._held
             or self.drop_tpdos
@@ -134,7 +134,7 @@ class Faults:
         )
 
     def spoil(self, tpdos: list[Outgoing]) -> list[Outgoing]:
-        """What really goes out in place of ``tpdos``, the TPDOs of one SYNC."""
+        """Applies the faults to ``tpdos``, the TPDOs of one SYNC, and returns the frames to send."""
         late, self._held = self._held, []
         sent: list[Outgoing] = []
         for can_id, data in tpdos:

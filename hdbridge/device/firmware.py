@@ -1,7 +1,7 @@
 """The CiA-402 firmware of the simulated drive: power states, stopping, supervision, and the objects of 6000h.
 
-The node calls ``advance`` once per period, and ``control`` through the controlword object; everything else is
-the dictionary. Times are counted in periods: the firmware looks at no clock.
+The node calls ``advance`` once per period, and ``control`` through the controlword object; everything else
+goes through the dictionary. The firmware reads no clock: it adds up the periods.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from hdbridge.device.profile import Profile, stop
 SLOW_DOWN_RAMP: Final = (1, 5)
 QUICK_STOP_RAMP: Final = (2, 6)
 STAY_STOPPED: Final = 5
-"""Option codes of 605Ah from here on stay in QUICK STOP ACTIVE."""
+"""Lowest option code of 605Ah that stays in QUICK STOP ACTIVE."""
 WINDOW_OFF: Final = 0xFFFFFFFF
 
 # For the cyclic path: to look a member up in its class takes five times as long as a name of the module.
@@ -42,7 +42,7 @@ _REFERENCED: Final = int(Status.REFERENCED)
 
 
 class _Braking:
-    """A stop under way: its ramp, the state that follows (None: stay), whether a mode begins after it."""
+    """A stop in progress: its ramp, and the state (None: unchanged) or mode that follows it."""
 
     def __init__(self, ramp: Profile, then: State | None) -> None:
         self.ramp = ramp
@@ -56,7 +56,7 @@ class _Braking:
 
 
 class Firmware:
-    """One drive. ``state`` is its power state, ``motion`` where its axis is."""
+    """Firmware of one drive. ``state`` is its power state, ``motion`` the position of its axis."""
 
     def __init__(
         self,
@@ -90,7 +90,7 @@ class Firmware:
         self.reset()
 
     def reset(self) -> None:
-        """The state after power-on; the encoders and the reference keep what they had."""
+        """Returns to the state after power-on; encoder positions and the home reference are kept."""
         self._braking: _Braking | None = None
         self._halted = False
         self._word = 0
@@ -98,7 +98,7 @@ class Firmware:
         self._awaits_power = False
         self._resetting = False
         self._stopped_itself = False
-        """In QUICK STOP ACTIVE without a command: only a level-read controlword leads out by repetition."""
+        """In QUICK STOP ACTIVE without a command; a repeated controlword ends it only if levels are read."""
         self._beyond_window_s = 0.0
         self._following_error = False
         self._error_code = 0
@@ -149,7 +149,7 @@ class Firmware:
         return -1 if self._dictionary.value(0x607E) & 0x40 else 1
 
     def statusword(self) -> int:
-        """Object 6041h now."""
+        """Returns object 6041h."""
         return self._old_statusword if self._old_status_s > 0.0 else self._statusword()
 
     def _statusword(self) -> int:
@@ -170,7 +170,7 @@ class Firmware:
         return word
 
     def _delay_status(self) -> None:
-        """Keep showing the present status for a while: a command has come."""
+        """Keeps 6041h and 6061h at their present values for the delay that follows a command."""
         if self._status_delay_s:
             if self._old_status_s <= 0.0:
                 self._old_statusword, self._old_mode = self._statusword(), self._mode.number
@@ -209,7 +209,7 @@ class Firmware:
         self._state_bits = state.value | _ALWAYS
 
     def control(self, word: int) -> None:
-        """Take a controlword. One that repeats the last asks for nothing new, unless levels are read."""
+        """Evaluates a controlword. A repeated one is ignored, unless the drive reads levels."""
         if word == self._word and not self._waits_for_rest and not self._by_level:
             return
         if word != self._word:
@@ -312,7 +312,7 @@ class Firmware:
             self._mode.resume()
 
     def _brake(self, option: int, then: State | None) -> None:
-        """Stop on the ramp that an option code of 605Ah to 605Eh names, then go to ``then``."""
+        """Stops on the ramp that an option code of 605Ah to 605Eh selects, then enters ``then``."""
         value = self._dictionary.value
         deceleration: float = value(0x60C6)  # 'current limit' and 'voltage limit': as hard as it goes
         if option in SLOW_DOWN_RAMP:
@@ -338,7 +338,7 @@ class Firmware:
     # ---------------------------------------------------------------- errors
 
     def fault(self, code: int, additional: bytes = b"") -> None:
-        """A malfunction: report it, stop by 605Eh, end in FAULT."""
+        """Reports a malfunction, stops the axis as 605Eh says and ends in FAULT."""
         self._emergency.occur(code, additional)
         self._error_code = code
         if self.state in (State.FAULT, State.FAULT_REACTION_ACTIVE):
@@ -352,12 +352,12 @@ class Firmware:
         self._brake(option, State.FAULT)
 
     def power_cut(self) -> None:
-        """The power stage goes off by itself, and no error tells of it: a hardware enable input opened."""
+        """Switches the power stage off without an error, as a hardware enable input does when it opens."""
         if self.state is not State.FAULT:
             self._power_off(State.SWITCH_ON_DISABLED)
 
     def connection_lost(self, code: int) -> None:
-        """The master is gone, as ``code`` says: react as 6007h says."""
+        """Reacts to the loss of the master as 6007h says; ``code`` is the EMCY code of the loss."""
         option = self._dictionary.value(0x6007)
         if option == 1 and self.state in POWERED:
             self.fault(code)
@@ -369,7 +369,7 @@ class Firmware:
 
     @property
     def follows_the_bus(self) -> bool:
-        """Whether set-points must keep coming: enabled in a cyclic mode."""
+        """True if the axis needs cyclic set-points: enabled in a cyclic mode."""
         return self.state is State.OPERATION_ENABLED and isinstance(self._mode, CyclicSynchronousPosition)
 
     def _judge_stage(self) -> None:
@@ -398,7 +398,7 @@ class Firmware:
     # ---------------------------------------------------------------- time
 
     def advance(self, period_s: float) -> None:
-        """Run the axis for one period."""
+        """Runs the axis for one period."""
         if self._old_status_s > 0.0:
             self._old_status_s -= period_s
         stage = self._stage

@@ -15,9 +15,9 @@ from hdbridge.device.powerstate import Control, Status
 from hdbridge.device.profile import Profile, move
 
 INDEX_PULSE: Final = {33: -1, 34: 1}
-"""Methods that move to the next index pulse, and in which direction."""
+"""Homing methods that move to the next index pulse, and their directions."""
 HOMING_METHODS: Final = (*INDEX_PULSE, 35, 37)
-"""35 is the old number of 37."""
+"""Supported homing methods; 35 is the old number of 37."""
 
 _NEW: Final = int(Control.NEW_SET_POINT)
 _IMMEDIATELY: Final = int(Control.CHANGE_IMMEDIATELY)
@@ -28,7 +28,7 @@ _BIT_13: Final = int(Status.MODE_13)
 
 
 class Mode:
-    """An operating mode while OPERATION ENABLED. This one, 0, is 'no mode': it holds the position."""
+    """An operating mode in OPERATION ENABLED. The base class is mode 0, 'no mode', and holds the position."""
 
     number: ClassVar[int] = 0
 
@@ -36,28 +36,28 @@ class Mode:
         self.motion = motion
 
     def enter(self) -> None:
-        """Begin at the present demand, at rest."""
+        """Starts the mode at the present demand, at rest."""
 
     def resume(self) -> None:
-        """Go on after a halt."""
+        """Continues after a halt."""
 
     def control(self, word: int, rising: int) -> None:
-        """A controlword came; ``rising`` are the bits that it sets anew."""
+        """Evaluates a controlword; ``rising`` holds the bits that changed from 0 to 1."""
 
     def step(self, period_s: float) -> tuple[float, float]:
-        """Demand (counts) and its velocity (counts/s) at the end of the next period."""
+        """Returns demand (counts) and velocity (counts/s) at the end of the next period."""
         return self.motion.demand_counts, 0.0
 
     def observe(self, period_s: float) -> None:
-        """Look at the encoders after a period."""
+        """Evaluates the encoder positions after a period."""
 
     def status(self) -> int:
-        """Bits 10, 12 and 13 of the statusword."""
+        """Returns bits 10, 12 and 13 of the statusword."""
         return 0
 
 
 class CyclicSynchronousPosition(Mode):
-    """CSP: interpolate linearly to the target over one period, no faster than the motor may turn."""
+    """CSP: interpolates linearly to the target over one period, within the motor's maximum speed."""
 
     number = 8
 
@@ -67,7 +67,7 @@ class CyclicSynchronousPosition(Mode):
         self._offset = motion.dictionary[0x60B0, 0]
 
     def _aim(self) -> int:
-        """The user's position to be reached with the next period."""
+        """Returns the user's position to reach at the end of the next period."""
         target: int = self._target.value + self._offset.value
         return target
 
@@ -88,7 +88,7 @@ class CyclicSynchronousPosition(Mode):
 
 
 class InterpolatedPosition(CyclicSynchronousPosition):
-    """IP: interpolate linearly to 60C1h:01 over one period while bit 4 is set; hold the position else."""
+    """IP: interpolates linearly to 60C1h:01 over one period while bit 4 is set, else holds the position."""
 
     number = 7
 
@@ -116,7 +116,7 @@ class InterpolatedPosition(CyclicSynchronousPosition):
 
 
 class ProfilePosition(Mode):
-    """PP: trapezoidal moves to set-points, of which one may wait while another is under way."""
+    """PP: trapezoidal moves to set-points; one more set-point may be queued during a move."""
 
     number = 1
 
@@ -153,14 +153,14 @@ class ProfilePosition(Mode):
     def _set_point(self, *, relative: bool) -> float:
         motion = self.motion
         target = motion.dictionary.value(0x607A)
-        if relative:  # CiA 402: to the preceding set-point, not to where the axis happens to be
+        if relative:  # CiA 402: to the preceding set-point, not to the actual position
             before = self._goal if self._waiting is None else self._waiting
             target = wrap_int32(motion.user(before) + target)
         motion.limited = False
         return motion.goal(target)
 
     def _release(self) -> None:
-        """Withdraw the acknowledgement when the request is gone and another set-point can be taken."""
+        """Withdraws the acknowledgement when the request has ended and a new set-point can be accepted."""
         if self._acknowledged and not self._requested and self._waiting is None:
             self._acknowledged = False
 
@@ -211,7 +211,7 @@ class ProfilePosition(Mode):
 class Homing(Mode):
     """HM: methods 33 and 34 move to the next index pulse, 35 and 37 take the present position.
 
-    Where the axis then is becomes 607Ch. The index pulse comes once per motor turn.
+    The position found is set to 607Ch. There is one index pulse per motor turn.
     """
 
     number = 6
@@ -263,7 +263,7 @@ class Homing(Mode):
         return demand, velocity
 
     def _attain(self, counts: int) -> None:
-        """Declare a position of the motor encoder to be 607Ch."""
+        """Sets a position of the motor encoder to 607Ch."""
         motion = self.motion
         motion.home_counts = motion.dictionary.value(0x607C) - motion.sign * counts
         motion.preload_target()

@@ -1,7 +1,7 @@
-"""Where the simulated drive's axis is and is told to be, in the plant's counts and in the user's.
+"""Actual and demanded position of the simulated axis, in the plant's counts and in the user's.
 
 The plant counts without bound and knows no home; the user has int32 positions with polarity and home offset.
-Everything that moves is computed in the plant's counts; int32 appears only where objects are read or written.
+All motion is computed in the plant's counts; int32 appears only when objects are read or written.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ _MASK: Final = (1 << 32) - 1
 
 
 def wrap_int32(value: int) -> int:
-    """``value`` modulo 2**32, in the range of an int32."""
+    """Returns ``value`` modulo 2**32 in the range of an int32."""
     return ((value + _HALF) & _MASK) - _HALF
 
 
@@ -50,9 +50,9 @@ class Machine(Protocol):
 class Motion:
     """Demand and actual position of the axis, shared by the firmware and its operating modes.
 
-    ``demand_counts`` and ``velocity_counts_s`` are of the demand, in the plant's coordinates;
-    ``motor_counts`` and ``load_counts`` are the encoders as last sampled. ``limited`` becomes true when a
-    limit cut a target.
+    ``demand_counts`` and ``velocity_counts_s`` are position and velocity of the demand, in the plant's
+    coordinates; ``motor_counts`` and ``load_counts`` are the latest encoder samples. ``limited`` becomes true
+    when a limit cuts a target.
     """
 
     def __init__(self, dictionary: Dictionary, machine: Machine) -> None:
@@ -75,10 +75,10 @@ class Motion:
         self.take_parameters()
 
     def take_parameters(self) -> None:
-        """Work out what depends on objects that only SDO writes, so that no period has to."""
+        """Caches values derived from objects that only SDO writes, to keep them out of the cycle."""
         value = self.dictionary.value
         self.sign = -1 if value(0x607E) & 0x80 else 1
-        """-1 where object 607Eh reverses positions, else 1."""
+        """-1 if object 607Eh reverses positions, else 1."""
         self.max_speed_counts_s: float = value(0x6080) * value(0x608F, 1) / 60.0
         """Object 6080h in counts/s."""
         low, high = value(0x607D, 1), value(0x607D, 2)
@@ -86,11 +86,11 @@ class Motion:
         self._low, self._high = low, high
 
     def user(self, counts: float) -> int:
-        """The user's (unbounded) position of a plant position."""
+        """Converts a plant position to the user's (unbounded) position."""
         return self.sign * round(counts) + self.home_counts
 
     def goal(self, target: int) -> float:
-        """The plant position of a user's int32 target: the one nearest to the demand, within the limits.
+        """Converts a user's int32 target to the plant position nearest to the demand, within the limits.
 
         An axis that already is beyond a software limit may stay where it is and come back; it is not
         dragged inside.
@@ -110,29 +110,29 @@ class Motion:
         return sign * (here + distance - self.home_counts)
 
     def actual_position(self) -> int:
-        """Object 6064h."""
+        """Returns object 6064h."""
         return ((self.sign * self.motor_counts + self.home_counts + _HALF) & _MASK) - _HALF
 
     def demand_position(self) -> int:
-        """Object 6062h."""
+        """Returns object 6062h."""
         return ((self.sign * round(self.demand_counts) + self.home_counts + _HALF) & _MASK) - _HALF
 
     def load_position(self) -> int:
-        """Object 60E4h:01, to which neither homing nor polarity applies."""
+        """Returns object 60E4h:01, to which neither homing nor polarity applies."""
         return ((self.load_counts + _HALF) & _MASK) - _HALF
 
     def preload_target(self) -> None:
-        """Make the demand the target, so that a mode that begins does not move."""
+        """Sets the target to the demand, so that the axis does not move when a mode begins."""
         for target in self._targets:
             target.value = wrap_int32(self.user(self.demand_counts))
 
     def take_actual_as_demand(self) -> None:
-        """Demand rest where the axis is."""
+        """Sets the demand to the actual position, at rest."""
         self.demand_counts = float(self.motor_counts)
         self.velocity_counts_s = 0.0
 
     def follow(self, demand_counts: float, velocity_counts_s: float, period_s: float) -> None:
-        """Move the demand, and the plant after it, for one period."""
+        """Moves the demand, and the plant with it, for one period."""
         substeps = self._substeps(period_s)
         if substeps:
             jump = self.motor_jump_counts  # the loops close on the encoder as it reads
@@ -142,7 +142,7 @@ class Motion:
         self._sample(period_s)
 
     def coast(self, period_s: float) -> None:
-        """Let the plant go for one period; the holding brake closes at rest."""
+        """Runs the plant without power for one period; the holding brake closes at rest."""
         substeps = self._substeps(period_s)
         at_rest = abs(self.machine.velocity_counts_s) * period_s < 1.0
         if substeps:
@@ -151,7 +151,7 @@ class Motion:
         self.take_actual_as_demand()
 
     def _substeps(self, period_s: float) -> int:
-        """Whole substeps of the plant in this period; what is left over is kept for the next."""
+        """Returns the whole substeps of the plant in this period; the remainder is added to the next."""
         dt_s = self.machine.dt_s
         self._owed_s += period_s
         substeps = int(self._owed_s / dt_s + 1e-6)

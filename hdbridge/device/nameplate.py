@@ -1,4 +1,4 @@
-"""What distinguishes one simulated drive from the next: serial number, encoders, gear, rated torque."""
+"""Data that distinguish simulated drives: serial number, encoders, gear, rated torque."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ class Nameplate:
     """Index and sub-index of the object that the load encoder is read from."""
 
     def engrave(self, dictionary: Dictionary) -> None:
-        """Make these the values, and the defaults to which a reset returns."""
-        # Positions are counts of the motor: with one of gear ratio and feed alone, they do not know the gear.
+        """Writes these values to the dictionary, as present values and as defaults."""
+        # Positions are motor counts. If gear ratio or feed is missing, they do not include the gear.
         motor_turns, load_turns = self.gear_motor_turns, self.gear_load_turns
         if (0x6091, 1) not in dictionary or (0x6092, 1) not in dictionary:
             motor_turns = load_turns = 1

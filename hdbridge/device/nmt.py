@@ -6,7 +6,7 @@ from enum import IntEnum
 
 
 class Nmt(IntEnum):
-    """NMT states as a heartbeat tells them."""
+    """NMT states, as a heartbeat reports them."""
 
     INITIALISING = 0x00
     STOPPED = 0x04

@@ -3,8 +3,8 @@
 Upon SYNC the node first sends its synchronous TPDOs with the values of that moment, then applies the
 synchronous RPDOs that came since the last one, then runs its axis for exactly one period of object 60C2h.
 (Some drives apply RPDOs first: `Behaviour` has this and other choices of a firmware.)
-When SYNC stays away for one and a half periods, and before the first, the axis runs on the clock instead: a
-drive without a master stops by itself. Single-threaded: everything happens inside ``poll``.
+Before the first SYNC, and when SYNC is missing for one and a half periods, the clock drives the axis instead,
+so a drive without a master can still stop. Single-threaded: everything happens inside ``poll``.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from hdbridge.device.syncclock import SyncClock
 
 PDO_COUNT: Final = 512
 LONGEST_CATCH_UP_S: Final = 1.0
-"""A node that was not polled for longer than this does not make up for it."""
+"""Maximum time that a late poll makes up for."""
 
 FRAMES_PER_POLL: Final = 64
 
@@ -111,13 +111,13 @@ class DriveNode:
             entry[0x60C2, sub].follower = lambda _: self._take_period()
 
     def _pdos(self, first: int) -> list[int]:
-        """Numbers of the PDOs that the dictionary has, by their first communication parameter."""
+        """Returns the numbers of the PDOs in the dictionary; ``first`` is the index of PDO 1."""
         own = self.dictionary
         numbers = range(1, PDO_COUNT + 1)
         return [n for n in numbers if (first + n - 1, 1) in own and (first + 0x200 + n - 1, 0) in own]
 
     def _begin(self) -> None:
-        """Start from the dictionary as it stands; the boot-up message is still to come."""
+        """Initialises the communication from the dictionary, before the boot-up message."""
         self.nmt = Nmt.INITIALISING
         self._sdo.reset()
         self._sdo_from_s = self._now_s + self.behaviour.sdo_delay_s
@@ -157,7 +157,7 @@ class DriveNode:
         return self._period_s
 
     def _watch_heartbeat(self) -> None:
-        """Object 1016h:01; supervision begins with the first heartbeat (CiA 301)."""
+        """Evaluates object 1016h:01; supervision begins with the first heartbeat (CiA 301)."""
         word = self.dictionary.value(0x1016, 1)
         self._watched_s = (word & 0xFFFF) * 1e-3
         self._watched_id = _HEARTBEAT + (word >> 16 & 0x7F) if self._watched_s and word >> 16 & 0x7F else None
@@ -165,12 +165,12 @@ class DriveNode:
         self._watch_ended = False
 
     def _stop_guarding(self) -> None:
-        """Life guarding (100Ch, 100Dh) is off until the next request of the master (CiA 301)."""
+        """Stops life guarding (100Ch, 100Dh) until the master's next request (CiA 301)."""
         self._life_s = self.dictionary.value(0x100C) * self.dictionary.value(0x100D) * 1e-3
         self._life_due_s = _NEVER
 
     def _on_guarding(self, now_s: float) -> None:
-        """Answers a remote frame by which the master asks for the state."""
+        """Answers the remote frame of node guarding with the NMT state."""
         if self.faults.silent or self.faults.deaf:
             return
         self._send(_HEARTBEAT + self.node_id, bytes([self.nmt | self._guard_toggle]))
@@ -190,7 +190,7 @@ class DriveNode:
         self._due_s = self._now_s
 
     def _route(self) -> None:
-        """Note which frames and which SYNCs concern which PDO."""
+        """Assigns frames and SYNC to the PDOs that are active now."""
         running = self.nmt is Nmt.OPERATIONAL
         tpdos = [pdo for pdo in self._tpdos if running and pdo.valid]
         rpdos = [pdo for pdo in self._rpdos if running and pdo.valid]
@@ -203,7 +203,7 @@ class DriveNode:
         self._listen()
 
     def _listen(self) -> None:
-        """Note what takes the data of each frame that concerns the node as it is now."""
+        """Assigns a handler to each CAN identifier that the node receives in its present state."""
         takers: dict[int | None, Callable[[bytearray, float], None]] = {
             self._watched_id: self._on_watched_heartbeat,
             0x000: self._on_nmt,
@@ -218,13 +218,13 @@ class DriveNode:
     # ---------------------------------------------------------------- the outside
 
     def poll(self, now_s: float) -> None:
-        """Take in the frames that have come, answer them, and do what is due until ``now_s``."""
+        """Receives and answers the waiting frames, and runs all events due until ``now_s``."""
         self._now_s = now_s
         if self.nmt is _INITIALISING:
             self._boot()
         receive, now = self.bus.recv, self._clock.now
-        # Bounded, and each frame at its own time: a master that answers at once (as in an SDO transfer) can
-        # keep this loop busy for long, and the watchdogs must not be behind then.
+        # Bounded, and each frame at its own time: a master that answers immediately (as in an SDO transfer)
+        # can keep this loop busy for long, and the watchdogs must not fall behind.
         left = FRAMES_PER_POLL
         while left and (message := receive(0)) is not None:
             left -= 1
@@ -233,7 +233,7 @@ class DriveNode:
         self.run_until(now_s)
 
     def run_until(self, now_s: float) -> None:
-        """Do what is due until ``now_s`` without looking at the bus; ``poll`` ends with it."""
+        """Runs all events due until ``now_s`` without reading the bus, as the last step of ``poll``."""
         self._now_s = now_s
         if self.nmt is _INITIALISING:
             self._boot()
@@ -246,11 +246,11 @@ class DriveNode:
             self._send_events(now_s)
 
     def next_event_s(self) -> float:
-        """When ``poll`` must be called at the latest, on the clock's scale."""
+        """Returns the time by which ``poll`` must be called, on the clock's scale."""
         return self._now_s if self.faults.concerns_poll else self._due_s
 
     def handle(self, message: can.Message, now_s: float) -> None:
-        """Take in one frame that came at ``now_s``; what is not a plain 11-bit data frame is ignored."""
+        """Processes a frame received at ``now_s``; ignores all but data frames with 11-bit identifiers."""
         self._now_s = now_s
         take = self._takers.get(message.arbitration_id)
         if take is None and message.is_remote_frame and message.arbitration_id == _HEARTBEAT + self.node_id:
@@ -366,7 +366,7 @@ class DriveNode:
         self._route()
 
     def _leave_operational(self, state: Nmt) -> None:
-        """Stop the PDOs; an axis that lives on them has lost its master (6007h)."""
+        """Stops the PDOs; an axis that depends on them has lost its master (6007h)."""
         lost = state is Nmt.STOPPED or (self.nmt is Nmt.OPERATIONAL and self.firmware.follows_the_bus)
         if lost:
             self.firmware.connection_lost(ErrorCode.COMMUNICATION)
@@ -463,7 +463,7 @@ class DriveNode:
             self._enter(state)
 
     def _lose_sync(self) -> None:
-        """SYNC is overdue, so an axis that follows the bus has lost its set-points; pending ones are old."""
+        """Discards pending set-points when SYNC is overdue, and stops an axis that follows the bus."""
         self._sync_due_s = _NEVER
         for rpdo in self._sync_rpdos:
             rpdo.pending = None
@@ -478,7 +478,7 @@ class DriveNode:
         self.firmware.connection_lost(ErrorCode.COMMUNICATION)
 
     def _miss_rpdo(self, now_s: float) -> None:
-        """An RPDO is overdue: that matters to an axis that follows the bus. The next one arms it again."""
+        """Stops an axis that follows the bus if an RPDO is overdue. The next RPDO re-arms the timer."""
         for pdo in self._rpdo_by_id.values():
             if pdo.deadline_s <= now_s:
                 pdo.deadline_s = _NEVER

@@ -15,11 +15,11 @@ from hdbridge.files.atomic import write_atomically
 SAVE: Final = 0x65766173
 LOAD: Final = 0x64616F6C
 _NEVER_STORED: Final = frozenset({0x1003, 0x1010, 0x1011, 0x6040, 0x607A, 0x60B0, 0x60C1})
-"""Commands, targets and records, which are not parameters."""
+"""Indices of commands, targets and logs, which are not parameters."""
 
 
 class StoredParameters:
-    """The values of a dictionary to which a reset returns."""
+    """Stored values of a dictionary, which a reset restores."""
 
     def __init__(
         self, dictionary: Dictionary, may_store: Callable[[], bool], file: Path | None = None
@@ -43,7 +43,7 @@ class StoredParameters:
             entry.guard = check
 
     def restore(self, first: int = 0x0000, last: int = 0xFFFF) -> None:
-        """Put stored values in place of the defaults of these indices."""
+        """Restores the stored values, or else the defaults, in this range of indices."""
         self._dictionary.restore(first, last)
         for (index, sub), value in self._stored.items():
             if first <= index <= last and (index, sub) in self._dictionary:
@@ -72,7 +72,7 @@ class StoredParameters:
         self._stored = values
 
     def _read(self) -> dict[tuple[int, int], int]:
-        """The values in the file, as far as they are those of present parameters."""
+        """Returns the values in the file that belong to existing parameters and are valid."""
         if self._file is None:
             return {}
         found: dict[tuple[int, int], int] = {}

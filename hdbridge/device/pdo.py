@@ -1,4 +1,4 @@
-"""The PDOs of the simulated drive: configured over SDO as CiA 301 says, compiled once, then fast.
+"""The PDOs of the simulated drive: configured over SDO as in CiA 301, and compiled once for speed.
 
 Each PDO guards its communication and mapping parameters in the dictionary. Whenever they change, the mapping
 is compiled to one ``struct`` and the bound readers or writers; a cycle only calls those.
@@ -27,7 +27,7 @@ DUMMIES: Final = range(0x0002, 0x0008)
 
 
 class Pdo:
-    """What transmit and receive PDOs have in common: parameters, guards, compilation.
+    """Base class of transmit and receive PDOs: parameters, guards, compilation.
 
     ``changed`` is called after every change that concerns the node: identifier, type, mapping, timers.
     """
@@ -43,7 +43,7 @@ class Pdo:
         self.can_id = 0
         self.transmission_type = 0
         self.is_synchronous = True
-        """Whether SYNC drives it."""
+        """True if SYNC triggers the PDO."""
         self.event_timer_s = 0.0
         self.inhibit_s = 0.0
         self._codec = struct.Struct("<")
@@ -73,7 +73,7 @@ class Pdo:
         self._changed()
 
     def compile(self) -> None:
-        """Take over the parameters as they stand."""
+        """Takes over the present parameters from the dictionary."""
         can_id = self._parameter(1)
         self.valid = not can_id & INVALID
         self.can_id = can_id & 0x7FF
@@ -92,12 +92,12 @@ class Pdo:
         self._link(entries)
 
     def _parameter(self, sub: int) -> int:
-        """A communication parameter; 0 if the drive does not have it."""
+        """Returns a communication parameter; 0 if the drive does not have it."""
         there = (self._communication, sub) in self._dictionary
         return self._dictionary.value(self._communication, sub) if there else 0
 
     def _entries(self, count: int) -> list[Entry]:
-        """The mapped entries; refuses what cannot be mapped here."""
+        """Returns the mapped entries; refuses objects that cannot be mapped to this PDO."""
         words = [self._dictionary.open(self._mapping, sub).number() for sub in range(1, count + 1)]
         entries = [self._mapped(word) for word in words]
         if sum(entry.bits for entry in entries) > MAX_BITS:
@@ -108,14 +108,14 @@ class Pdo:
         raise NotImplementedError
 
     def restart(self) -> None:
-        """Forget the past, as on entering NMT state OPERATIONAL."""
+        """Resets timers and pending data, as on entering NMT state OPERATIONAL."""
         raise NotImplementedError
 
     def _may_map(self, entry: Entry) -> bool:
         raise NotImplementedError
 
     def _mapped(self, word: int) -> Entry:
-        """The entry that a mapping word names; refuses what cannot be mapped here."""
+        """Returns the entry that a mapping word names; refuses one that cannot be mapped to this PDO."""
         index, sub = word >> 16, word >> 8 & 0xFF
         entry = _gap(index) if index in DUMMIES and sub == 0 else self._dictionary.open(index, sub)
         if not entry.mappable or not self._may_map(entry) or entry.bits != word & 0xFF:
@@ -154,14 +154,14 @@ class TransmitPdo(Pdo):
 
     def __init__(self, dictionary: Dictionary, number: int, changed: Callable[[], None]) -> None:
         self.pack: Callable[[], bytes] = bytes
-        """The mapped values now."""
+        """Returns the mapped values now."""
         self.sent: bytes | None = None
         self.sent_s = -float("inf")
         self.syncs_to_go = 1
         self.sync_start = 0
-        """Counter of the SYNC from which it counts; 0 once it has begun."""
+        """SYNC counter at which the PDO starts (SYNC start value); 0 once it has started."""
         self.on_sync: Callable[[], bytes | None] = bytes
-        """The data to send upon a SYNC, None when this one is not its turn."""
+        """Returns the data to send upon a SYNC, or None if the PDO is not due at this SYNC."""
         super().__init__(dictionary, 0x1800 + number - 1, 0x1A00 + number - 1, changed)
 
     def _may_map(self, entry: Entry) -> bool:
@@ -174,7 +174,7 @@ class TransmitPdo(Pdo):
         self.restart()
 
     def restart(self) -> None:
-        """Forget what was sent, as on entering NMT state OPERATIONAL."""
+        """Forgets the data sent, as on entering NMT state OPERATIONAL."""
         self.sent = None
         self.sent_s = -float("inf")
         self.syncs_to_go = max(1, self.transmission_type)
@@ -202,7 +202,7 @@ class TransmitPdo(Pdo):
         return self.pack()
 
     def on_event(self, now_s: float) -> bytes | None:
-        """The data of an event-driven TPDO that is due: changed and not inhibited, or its timer ran out."""
+        """Returns the data of an event-driven TPDO that is due (changed, or timer elapsed), else None."""
         if now_s < self.sent_s + self.inhibit_s:
             return None
         data = self.pack()
@@ -213,7 +213,7 @@ class TransmitPdo(Pdo):
         return data
 
     def due_s(self, now_s: float) -> float:
-        """When to look at it again after ``now_s``: its event timer, or the end of its inhibit time."""
+        """Returns the next time after ``now_s`` at which it may be due: event timer or end of inhibit."""
         due_s = self.sent_s + self.event_timer_s if self.event_timer_s > 0.0 else float("inf")
         inhibited_until_s = self.sent_s + self.inhibit_s
         return min(due_s, inhibited_until_s) if inhibited_until_s > now_s else due_s
@@ -222,17 +222,17 @@ class TransmitPdo(Pdo):
 class ReceivePdo(Pdo):
     """An RPDO: synchronous data waits in ``pending`` for the next SYNC.
 
-    ``deadline_s`` is when the next one must have come (event timer), armed by the first that comes.
+    ``deadline_s`` is the time by which the next one must arrive (event timer), armed by the first one.
     """
 
     def __init__(
         self, dictionary: Dictionary, number: int, changed: Callable[[], None], *, holds: bool = False
     ) -> None:
-        """``holds``: data that waits for SYNC survives a change of the NMT state."""
+        """``holds``: data waiting for SYNC survive a change of the NMT state."""
         self._holds = holds
         self._writers: tuple[Callable[[int], None], ...] = ()
         self.length = 0
-        """Bytes that are mapped."""
+        """Length of the mapped data; bytes."""
         self.pending: bytearray | None = None
         self.deadline_s = float("inf")
         super().__init__(dictionary, 0x1400 + number - 1, 0x1600 + number - 1, changed)
@@ -247,18 +247,18 @@ class ReceivePdo(Pdo):
         self.restart()
 
     def restart(self) -> None:
-        """Disarm the deadline, and discard data that has not taken effect unless the drive holds it."""
+        """Disarms the deadline and, unless the drive holds them, discards data that wait for SYNC."""
         if not self._holds:
             self.pending = None
         self.deadline_s = float("inf")
 
     def apply(self, data: bytearray) -> None:
-        """Write ``data``, ``length`` bytes or more, to the mapped entries; refused values are dropped."""
+        """Writes ``data``, ``length`` bytes or more, to the mapped entries; drops refused values."""
         for write, value in zip(self._writers, self._unpack_from(data), strict=True):
             try:
                 write(value)
             except SdoAbortError:
-                continue  # nobody to tell: a PDO has no answer
+                continue  # a PDO has no answer that could report it
 
 
 def _gap(data_type: int) -> Entry:
@@ -273,7 +273,7 @@ def _format(entry: Entry) -> str:
 
 
 def _packer(codec: struct.Struct, readers: Sequence[Callable[[], int]]) -> Callable[[], bytes]:
-    """What packs what the readers give, with the calls written out: half the time of a loop over them."""
+    """Returns a function that packs the readers' values; unrolled, it takes half the time of a loop."""
     called = {f"read{place}": reader for place, reader in enumerate(readers)}
     pack: Callable[[], bytes] = eval(
         f"lambda: pack({', '.join(f'{name}()' for name in called)})", {"pack": codec.pack, **called}

@@ -1,7 +1,6 @@
 """The CiA-402 power state machine of the simulated drive, as tables.
 
-Written from the profile for this side of the bus alone; the master has its own table, so that one checks the
-other. Only tables and the three functions that read them live here.
+Written from the profile, independently of the master's table, so that one checks the other.
 """
 
 from __future__ import annotations
@@ -11,7 +10,7 @@ from typing import Final
 
 
 class State(Enum):
-    """Power states; the value is what statusword bits 0 to 3, 5 and 6 say."""
+    """Power states; the value holds statusword bits 0 to 3, 5 and 6."""
 
     NOT_READY = 0x00
     SWITCH_ON_DISABLED = 0x40
@@ -27,7 +26,7 @@ class State(Enum):
 
 
 class Command(Enum):
-    """What a controlword asks for (device control commands)."""
+    """Device control commands of a controlword."""
 
     SHUTDOWN = "shutdown"
     SWITCH_ON = "switch on"  # also 'disable operation': the same bits
@@ -60,7 +59,7 @@ class Status(IntEnum):
 
 
 class PowerStage:
-    """The power stage as the firmware sees it. This one switches at once and never fails.
+    """The power stage as the firmware sees it. This one switches immediately and never fails.
 
     The firmware asks for power with ``switch`` and operates the axis only while ``is_on``. ``error_code`` is
     the emergency error code of a failure (0: none) and stays until a ``reset`` has removed it. The firmware
@@ -102,14 +101,14 @@ TRANSITIONS: Final[dict[tuple[State, Command], State]] = {
     (_S.QUICK_STOP_ACTIVE, _C.DISABLE_VOLTAGE): _S.SWITCH_ON_DISABLED,  # 12
     (_S.QUICK_STOP_ACTIVE, _C.ENABLE): _S.OPERATION_ENABLED,  # 16, only if 605Ah is 5 to 8
 }
-"""What a command does in a state; anything else does nothing. Numbers are those of the profile's transitions.
+"""Next state by state and command; all other pairs change nothing. Comments give the profile's numbers.
 
 Transitions 0, 1 (start), 13, 14 (fault reaction) and 15 (fault reset, by the edge of bit 7) are not commands.
 """
 
 
 def command_of(controlword: int) -> Command | None:
-    """The command in bits 0 to 3 and 7; with bit 7 set a controlword carries none (CiA 402)."""
+    """Returns the command in bits 0 to 3 and 7, or None if bit 7 (fault reset) is set (CiA 402)."""
     if controlword & 0x80:
         return None
     if not controlword & 0x02:
@@ -122,6 +121,6 @@ def command_of(controlword: int) -> Command | None:
 
 
 def next_state(state: State, controlword: int) -> State:
-    """The state that ``controlword`` asks for in ``state``; the same where it asks for nothing."""
+    """Returns the state that ``controlword`` requests in ``state``, or ``state`` if it requests none."""
     command = command_of(controlword)
     return state if command is None else TRANSITIONS.get((state, command), state)

@@ -1,4 +1,4 @@
-"""Trapezoidal velocity profiles: how the simulated drive moves and stops by itself."""
+"""Trapezoidal velocity profiles of the moves and stops that the simulated drive generates."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Segment:
-    """Constant acceleration for a while (counts, counts/s, counts/s2, s)."""
+    """Motion at constant acceleration (counts, counts/s, counts/s2, s)."""
 
     duration_s: float
     position: float
@@ -16,7 +16,7 @@ class Segment:
     acceleration: float
 
     def at(self, time_s: float) -> tuple[float, float]:
-        """Position and velocity ``time_s`` into the segment."""
+        """Returns position and velocity ``time_s`` after the start of the segment."""
         return (
             self.position + (self.velocity + 0.5 * self.acceleration * time_s) * time_s,
             self.velocity + self.acceleration * time_s,
@@ -25,18 +25,18 @@ class Segment:
 
 @dataclass(frozen=True)
 class Profile:
-    """Segments in a row, and rest at ``end`` after them."""
+    """A sequence of segments, with rest at ``end`` after them."""
 
     segments: tuple[Segment, ...]
     end: float
 
     @property
     def duration_s(self) -> float:
-        """Time until rest."""
+        """Time until rest; s."""
         return sum(segment.duration_s for segment in self.segments)
 
     def at(self, time_s: float) -> tuple[float, float]:
-        """Position and velocity ``time_s`` after the start."""
+        """Returns position and velocity ``time_s`` after the start."""
         for segment in self.segments:
             if time_s < segment.duration_s:
                 return segment.at(time_s)
@@ -51,14 +51,14 @@ class _Builder:
         self.segments: list[Segment] = []
 
     def ramp_to(self, velocity: float, acceleration: float) -> None:
-        """Change velocity at ``acceleration`` (its magnitude)."""
+        """Changes the velocity at ``acceleration`` (a magnitude)."""
         change = velocity - self.velocity
         if change:
             signed = math.copysign(acceleration, change)
             self._add(Segment(change / signed, self.position, self.velocity, signed), velocity)
 
     def cruise(self, distance: float) -> None:
-        """Go on at the present velocity, over ``distance`` in its direction."""
+        """Continues at the present velocity over ``distance``, in its direction."""
         if self.velocity and distance > 0.0:
             duration = distance / abs(self.velocity)
             self._add(Segment(duration, self.position, self.velocity, 0.0), self.velocity)
@@ -70,7 +70,7 @@ class _Builder:
 
 
 def stop(position: float, velocity: float, deceleration: float) -> Profile:
-    """Brake from ``velocity`` to rest."""
+    """Returns the profile that brakes from ``velocity`` to rest."""
     builder = _Builder(position, velocity)
     builder.ramp_to(0.0, deceleration)
     return Profile(tuple(builder.segments), builder.position)
@@ -84,9 +84,9 @@ def move(
     acceleration: float,
     deceleration: float,
 ) -> Profile:
-    """Reach ``target`` at rest from any state of motion, in the least time within the limits.
+    """Returns the fastest profile within the limits from any state of motion to rest at ``target``.
 
-    A start too fast, or in the wrong direction, or too near to stop in time is braked first and then returns.
+    If the start is too fast, in the wrong direction or too near, the profile brakes first and then returns.
     """
     builder = _Builder(position, velocity)
     overshoots = (target - stop(position, velocity, deceleration).end) * velocity < 0.0

@@ -1,4 +1,4 @@
-"""Nodes in real time, on any bus: one thread waits for a frame or the next event of a node."""
+"""Runs nodes in real time on any bus: one thread waits for a frame or the next event of a node."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from hdbridge.clock import Clock
 from hdbridge.errors import BusError
 
 LONGEST_WAIT_S: Final = 0.1
-"""How long ``should_stop`` may go unasked, unless a shorter time is wanted."""
+"""Default maximum interval between calls of ``should_stop``."""
 
 PATIENCE_S: Final = 5.0
-"""How long reading the bus may fail without a break: an interface that is down may come up again."""
+"""Maximum time of continuous read failures: an interface that is down may come up again."""
 
 
 class Served(Protocol):
@@ -35,11 +35,11 @@ def run(
     should_stop: Callable[[], bool],
     longest_wait_s: float = LONGEST_WAIT_S,
 ) -> None:
-    """Serve ``node``, whose bus is ``bus``, until ``should_stop`` says so.
+    """Serves ``node``, whose bus is ``bus``, until ``should_stop`` returns True.
 
-    ``longest_wait_s`` is how long a new event of the node's may go unnoticed. A failure of the interface
-    stops the axis as 6007h says, and the node goes on by its own clock. Raises BusError when reading has
-    failed for ``PATIENCE_S``.
+    ``longest_wait_s`` is the maximum delay until a new event of the node is noticed. A failure of the
+    interface stops the axis as 6007h says, and the node continues on its own clock. Raises BusError when
+    reading has failed for ``PATIENCE_S``.
     """
     failing_since_s: float | None = None
     while not should_stop():
@@ -64,9 +64,10 @@ def run(
 
 
 def _age_s(message: can.Message) -> float:
-    """Time for which a frame has waited for this process, by the stamp of SocketCAN; 0 for other interfaces.
+    """Returns how long a frame waited for this process, by its SocketCAN time stamp; else 0.
 
-    The stamp is of the wall clock. Only the few milliseconds from it until now count, not the clock's steps.
+    The stamp is wall-clock time. A difference that is negative or longer than ``LONGEST_WAIT_S`` comes from a
+    step of that clock and is ignored.
     """
     age_s = time.time() - message.timestamp
     return age_s if 0.0 < age_s < LONGEST_WAIT_S else 0.0

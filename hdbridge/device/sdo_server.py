@@ -1,6 +1,6 @@
 """The SDO server of a device (CiA 301): expedited, segmented and block transfers in both directions.
 
-Bytes in, bytes out: the node passes eight data bytes and sends what comes back.
+It does no I/O: the node passes eight data bytes and sends the answers that are returned.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ _MOST_SEGMENTS: Final = 127
 
 
 class SdoServer:
-    """One transfer at a time, as one client needs it."""
+    """SDO server for one client: one transfer at a time."""
 
     def __init__(self, dictionary: Dictionary) -> None:
         self._dictionary = dictionary
@@ -57,17 +57,17 @@ class SdoServer:
         self._block = _Block.NONE
         self._block_size = _MOST_SEGMENTS
         self._sequence = 0
-        """Segments of the present block that have come in order."""
+        """Number of segments of the present block received in order."""
         self._checks_crc = False
         self._sent = 0
-        """Bytes of a block upload that are acknowledged."""
+        """Number of acknowledged bytes of a block upload."""
 
     def reset(self) -> None:
-        """Forget a transfer that has begun."""
+        """Discards the present transfer."""
         self._entry, self._block = None, _Block.NONE
 
     def respond(self, request: bytes) -> list[bytes]:
-        """The answers to a request of eight bytes."""
+        """Returns the answers to a request of eight bytes."""
         if len(request) != 8:
             return []
         command = request[0]
@@ -101,7 +101,7 @@ class SdoServer:
             return [_ABORT.pack(0x80, *self._object, abort.code)]
 
     def _open(self, request: bytes) -> Entry:
-        """Begin a transfer; one that was under way is forgotten, as the client evidently has."""
+        """Opens the entry for a new transfer; an unfinished one is discarded, as the client abandoned it."""
         self._entry = None
         _, *self._object = _HEAD.unpack_from(request)
         return self._dictionary.open(self._object[0], self._object[1])
@@ -229,7 +229,7 @@ class SdoServer:
         return size
 
     def _segments(self) -> list[bytes]:
-        """One block from ``_sent`` on."""
+        """Returns the segments of one block, starting at ``_sent``."""
         data, frames = self._buffer, []
         for number in range(1, self._block_size + 1):
             at = self._sent + 7 * (number - 1)

@@ -1,4 +1,4 @@
-"""Time and period of SYNC, freed of the jitter with which it is received."""
+"""Time and period of SYNC without its reception jitter."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ from typing import Final
 LONGEST_PERIOD_S: Final = 1.0
 SHORTEST_PERIOD_S: Final = 0.000_5
 _GAIN: Final = 0.05
-"""Final share of a deviation by which the time is corrected; that of the period is half its square."""
+"""Final gain of the time correction; the gain of the period is half its square."""
 _ASTRAY: Final = 0.5
-"""Deviation, in periods, from which on the series of SYNCs is taken to begin again."""
+"""Deviation beyond which the tracking restarts at the present SYNC; periods."""
 _ANOTHER: Final = 0.1
 _AGREEING: Final = 3
-"""Successive intervals that agree within `_ANOTHER`, but not with the period, are another period."""
+"""Number of successive intervals, equal within `_ANOTHER`, that replace a different period."""
 
 
 class SyncClock:
