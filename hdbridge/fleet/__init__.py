@@ -1,6 +1,6 @@
-"""The fleet: recordings of many joints, diagnosed on Dask, kept as Parquet, and read as a whole.
+"""The fleet: recordings of many joints, diagnosed on Dask, stored as Parquet, and evaluated together.
 
-`sources` finds the recordings, `diagnosing` makes rows of one, `engine` runs that on a cluster, `dataset`
-keeps the rows, `statistics` and `summary` read them, `report` draws the page. docs/fleet.md describes the
-command.
+`sources` finds the recordings, `diagnosing` turns one into rows, `engine` runs that on a cluster, `dataset`
+stores the rows, `statistics` and `summary` evaluate them, `report` makes the page. docs/fleet.md describes
+the command.
 """

@@ -1,9 +1,9 @@
-"""The rows of a fleet as Parquet: written piece by piece during a run, and compacted at its end.
+"""The rows of a fleet as Parquet: written in increments during a run, and compacted at its end.
 
-`OUT/recordings` and `OUT/findings` hold the result, in parts by the first digit of the key and sorted, so
-that the same recordings give the same bytes however the run went. `OUT/increments` holds what a run has
-added and nothing has compacted yet; a killed run leaves it behind, and the next one includes it.
-docs/files.md describes the columns, which are a contract.
+`OUT/recordings` and `OUT/findings` hold the result, sorted and partitioned by the first digit of the key, so
+the same recordings always give the same bytes. `OUT/increments` holds rows that are not compacted yet; a
+killed run leaves them behind, and the next run includes them. docs/files.md describes the columns, which are
+a contract.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ NESTED: Final = {
     "orders": ("order: integer", "cos_arcsec", "sin_arcsec"),
     "parameters": ("name: text", "value", "low", "high", "unit: text"),
 }
-"""Parts of the columns that are lists; without a type they are numbers."""
+"""Fields of the list columns; numbers unless a type is given."""
 COLUMNS: Final[Mapping[str, Mapping[str, tuple[str, str]]]] = {
     RECORDINGS: {
         "key": (
@@ -96,7 +96,7 @@ COLUMNS: Final[Mapping[str, Mapping[str, tuple[str, str]]]] = {
 
 
 def schema(name: str) -> pa.Schema:
-    """The Arrow schema of ``recordings`` or ``findings``."""
+    """Returns the Arrow schema of ``recordings`` or ``findings``."""
     import pyarrow as pa
 
     plain = {
@@ -117,13 +117,13 @@ def schema(name: str) -> pa.Schema:
 
 
 class Dataset:
-    """The rows in a folder. One process writes it at a time."""
+    """Data set in a folder. Only one process may write to it at a time."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
 
     def create(self) -> None:
-        """Makes the folder; InputError if it cannot be made or holds something else."""
+        """Creates the folder; InputError if that fails or the folder holds something else."""
         if self.folder.is_dir() and any(self.folder.iterdir()) and not self._is_one():
             raise InputError(
                 f"{self.folder}: is not empty and was not written by hdbridge fleet; expected a new "
@@ -133,7 +133,7 @@ class Dataset:
         make_folder(self.folder / INCREMENTS)
 
     def check(self) -> None:
-        """InputError unless this is the folder of a run."""
+        """Raises InputError unless this is the folder of a run."""
         if not self._is_one():
             raise InputError(
                 f"{self.folder}: no {RECORDINGS} in this folder; expected the --out of hdbridge fleet run"
@@ -143,11 +143,11 @@ class Dataset:
         return any((self.folder / each).is_dir() for each in (RECORDINGS, INCREMENTS))
 
     def known(self) -> frozenset[tuple[str, str]]:
-        """Key and path of every row."""
+        """Returns key and path of every row."""
         return frozenset((row["key"], row["path"]) for row in self._rows(RECORDINGS, ["key", "path"]))
 
     def add(self, rows: Sequence[Mapping[str, Any]]) -> None:
-        """Keeps rows of recordings, each with its ``findings``; a crash keeps all of them or none."""
+        """Writes rows of recordings, each with its ``findings``; after a crash all of them or none exist."""
         if not rows:
             return
         folder = self.folder / INCREMENTS
@@ -164,10 +164,10 @@ class Dataset:
         _write(folder / f"{RECORDINGS}-{number:06d}.parquet", rows, RECORDINGS)
 
     def compact(self, present: Collection[tuple[str, str]] = ()) -> None:
-        """Merges the increments into the parts, marks duplicates and sorts.
+        """Merges the increments into the parts, marks duplicates and sorts the rows.
 
-        ``present`` are key and path of what the last run has seen: any other row of the same path is of a
-        file, a model or a version that has changed since, and is dropped.
+        ``present`` holds key and path of each recording of the last run. Other rows of the same paths belong
+        to an older file, model or version and are dropped.
         """
         current: dict[str, set[str]] = defaultdict(set)
         for key, path in present:
@@ -197,7 +197,7 @@ class Dataset:
             done.unlink()
 
     def recordings(self) -> list[dict[str, Any]]:
-        """The rows of all recordings, each with its ``findings`` in the order of their rank."""
+        """Returns the rows of all recordings, each with its ``findings`` in the order of their rank."""
         rows = {(row["key"], row["path"]): {**row, "findings": []} for row in self._rows(RECORDINGS)}
         for each in sorted(self._rows(FINDINGS), key=lambda row: row["rank"]):
             if (each["key"], each["path"]) in rows:
@@ -215,7 +215,7 @@ class Dataset:
                 rows = pq.ParquetFile(path).read(columns).to_pylist()
             except (OSError, pa.ArrowException) as problem:
                 raise InputError(f"{path}: cannot be read: {problem}; remove it and run again") from None
-            missing = dict.fromkeys(columns or COLUMNS[name])  # of a column that was not there yet
+            missing = dict.fromkeys(columns or COLUMNS[name])  # columns that an older version did not write
             yield from ({**missing, **row} for row in rows)
 
 

@@ -1,7 +1,7 @@
-"""One recording of the fleet as plain rows: what a worker does. Nothing that is wrong with it is raised.
+"""The task of a worker: turns one recording of the fleet into plain rows. Errors go into the row.
 
-A row is keyed by the content of what it was made from: samples, model and version. The orders of the motor
-are estimated from the samples alone, so that two joints are distinguished without trusting either model.
+The key of a row is a hash of its samples, model and version. The motor orders are estimated from the samples
+alone, so that joints can be distinguished without trusting their models.
 """
 
 from __future__ import annotations
@@ -29,17 +29,17 @@ if TYPE_CHECKING:
     from hdbridge.model import TransmissionModel
 
 ORDERS: Final = (1, 2, 3, 4, 5, 6, 7, 8)
-"""The orders of the motor that identify a joint."""
+"""Motor orders that identify a joint."""
 SETTLED_DEG: Final = 90.0
-"""Motor travel after a reversal that is left out of the orders: the loop is not crossed yet."""
+"""Motor travel after a reversal that is excluded from the orders, because the loop is not yet crossed."""
 TURNS: Final = 2.0
-"""Minimum motor turns that orders are estimated from."""
+"""Minimum travel for estimating orders; motor turns."""
 Row = dict[str, Any]
 
 
 @dataclass(frozen=True)
 class Model:
-    """The model of a joint as text, or why it has none."""
+    """Model of a joint as text, or the reason why there is none."""
 
     text: str = ""
     where: str = ""
@@ -47,7 +47,7 @@ class Model:
 
 
 def model_in(text: str, where: str) -> Model:
-    """A model file that was read; one that is wrong is its reason."""
+    """Checks the text of a model file; an invalid one returns a `Model` with the reason."""
     from hdbridge.model import TransmissionModel
 
     try:
@@ -58,7 +58,7 @@ def model_in(text: str, where: str) -> Model:
 
 
 def fitted(sources: Sequence[Source], where: str) -> Model:
-    """The model of a joint, fitted to the first of its recordings that can be used."""
+    """Fits the model of a joint to the first usable one of its recordings."""
     from hdbridge.calibration import fit
 
     reasons = []
@@ -72,7 +72,7 @@ def fitted(sources: Sequence[Source], where: str) -> Model:
 
 
 def axes_of(path: str) -> list[str] | str:
-    """The axes of a flight recording, or why it cannot be read."""
+    """Returns the axes of a flight recording, or the reason why it cannot be read."""
     from hdbridge.daemon.recorder.reading import overview
 
     try:
@@ -83,7 +83,7 @@ def axes_of(path: str) -> list[str] | str:
 
 
 def read(source: Source) -> Recording:
-    """The recording of a source. InputError for whatever is wrong with it."""
+    """Reads the recording of a source. InputError if anything is wrong with it."""
     with fetched(source.path) as path:
         try:
             if source.is_flight:
@@ -107,7 +107,7 @@ def read(source: Source) -> Recording:
 
 
 def diagnosed(source: Source, model: Model, known: Collection[tuple[str, str]] = ()) -> Row:
-    """The row of a recording; of one whose key and path are ``known`` only these two."""
+    """Diagnoses a recording and returns its row; only key and path if these are ``known``."""
     row: Row = {
         "path": source.path,
         "joint": source.joint or "",
@@ -156,7 +156,7 @@ def diagnosed(source: Source, model: Model, known: Collection[tuple[str, str]] =
 
 
 def lost(source: Source, reason: str) -> Row:
-    """The row of a recording that no worker survived, or that was not diagnosed for another reason."""
+    """Returns the row of a recording without a diagnosis, for example because it kills its worker."""
     row = {"path": source.path, "joint": source.joint or "", "axis": source.axis, "version": __version__}
     row |= {name: getattr(source, name) for name in ("gear", "batch", "cell", "lubricant", "hours", "date")}
     return {**row, "findings": [], "reason": reason, "key": _key({**row, "reason": reason})}
@@ -192,7 +192,7 @@ def _of_model(model: TransmissionModel) -> str:
 
 
 def _key(row: Mapping[str, Any]) -> str:
-    """Of samples, model and version; without a diagnosis of the joint and the reason."""
+    """Hashes samples, model and version, or samples, joint, reason and version if there is no diagnosis."""
     if row.get("reason"):
         parts = [row.get("samples_sha256", ""), row["joint"], row["reason"], row["version"]]
     else:
@@ -245,7 +245,7 @@ def _of_diagnosis(diagnosis: Diagnosis) -> Row:
 
 
 def _orders(record: Record, ratio: float) -> Row:
-    """Cosine and sine of each order of the motor, by least squares on what is clear of reversals."""
+    """Fits cosine and sine of each motor order by least squares to the samples clear of reversals."""
     rows, designs, kept = [], [], 0.0
     for number, part in enumerate(record.parts()):
         clear = _clear(part.motor_position_deg)
@@ -271,7 +271,7 @@ def _orders(record: Record, ratio: float) -> Row:
 
 
 def _clear(motor_deg: FloatArray) -> np.ndarray[Any, np.dtype[np.bool_]]:
-    """The samples in motion that are `SETTLED_DEG` or more beyond the last reversal."""
+    """Selects moving samples more than `SETTLED_DEG` beyond the last reversal; mask of shape (n,)."""
     steps = np.diff(motor_deg, prepend=motor_deg[:1])
     moving = np.abs(steps) > 1e-9
     sign = np.sign(steps)
@@ -285,7 +285,7 @@ def _clear(motor_deg: FloatArray) -> np.ndarray[Any, np.dtype[np.bool_]]:
 
 
 def local_model(path: str) -> Model:
-    """The model file at a local path or URL."""
+    """Reads the model file at a local path or URL; errors become the reason of the `Model`."""
     try:
         with fetched(path) as file:
             return model_in(Path(file).read_text(encoding="utf-8"), path)

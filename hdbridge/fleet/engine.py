@@ -1,8 +1,7 @@
-"""A run over a fleet: one Dask task for each recording, on a local cluster or on one that exists.
+"""A run over a fleet: one Dask task for each recording, on a local or an existing cluster.
 
-Dask schedules, restarts workers and repeats what a dead worker had. A recording that kills its worker
-again and again is diagnosed once more when everything else is done, alone; if that fails too, its row says
-so.
+Dask schedules the tasks, restarts workers and repeats the tasks of a dead worker. A recording that repeatedly
+kills its worker is diagnosed once more at the end, alone; if that fails too, its row reports it.
 """
 
 from __future__ import annotations
@@ -26,12 +25,12 @@ if TYPE_CHECKING:
     from distributed import Client
 
 BATCH: Final = 64
-"""Rows that are written together ..."""
+"""Number of rows after which an increment is written."""
 BATCH_S: Final = 30.0
-"""... or after this time."""
+"""Time after which an increment is written."""
 POLL_S: Final = 0.25
 AHEAD: Final = 2000
-"""Tasks that the scheduler holds at a time."""
+"""Maximum number of tasks submitted to the scheduler at a time."""
 KILLED: Final = (
     "it kills its worker each time, most likely for memory; raise --memory, or shorten the recording"
 )
@@ -39,29 +38,29 @@ KILLED: Final = (
 
 @dataclass(frozen=True)
 class Progress:
-    """How far a run has come."""
+    """Progress of a run; numbers of recordings."""
 
     done: int
     total: int
     failed: int
     known: int
     memory_mb: float
-    """Largest memory of a worker that was seen so far."""
+    """Largest memory of a worker seen so far."""
 
 
 @dataclass(frozen=True)
 class Cluster:
-    """Where a run takes place."""
+    """Dask cluster of a run."""
 
     scheduler: str | None = None
-    """Address of a scheduler that exists; None for a cluster of its own on this computer."""
+    """Address of an existing scheduler; None starts a local cluster."""
     workers: int | None = None
     memory: str = "2GB"
-    """Memory limit of each worker of its own cluster."""
+    """Memory limit of each worker of a local cluster."""
 
     @contextmanager
     def client(self) -> Iterator[Client]:
-        """The connected client. InputError if there is no scheduler, or Dask is not installed."""
+        """Provides a connected client. InputError if the scheduler is unreachable or Dask is missing."""
         try:
             from distributed import Client, LocalCluster
         except ImportError:
@@ -97,11 +96,11 @@ def run(
     progress: Callable[[Progress], None] = lambda _: None,
     interrupted: Callable[[], bool] = lambda: False,
 ) -> Progress:
-    """Diagnose what is not in the data set yet, and add it.
+    """Diagnoses the recordings that are not in the data set yet, and adds them.
 
     ``model`` is the model of every joint, ``models`` a folder of JOINT.yaml; a joint without one gets a model
-    fitted to its earliest recording, kept in OUT/models. Raises KeyboardInterrupt when it was interrupted;
-    what was done until then is kept.
+    fitted to its earliest usable recording, kept in OUT/models. Raises KeyboardInterrupt when interrupted;
+    the rows made until then are kept.
     """
     dataset.create()
     with cluster.client() as client:
@@ -127,7 +126,7 @@ class _Run:
         self._memory = 0.0
 
     def of(self, sources: Sequence[Source], model: Path | None, models: Path | None) -> Progress:
-        """The whole run; whatever ends it, what is done is kept."""
+        """Performs the run. However it ends, the rows made until then are kept."""
         try:
             sources = self._split_flights(sources)
             self._total = len(sources) + len(self._present)
@@ -141,7 +140,7 @@ class _Run:
                     again.append(place)
                 else:
                     self._take(row)
-            for place in again:  # alone, so that none is blamed for another
+            for place in again:  # alone, so that no recording is blamed for another
                 task = (diagnosed, (sources[place], given[sources[place].joint or ""], shared))
                 for _, row in self._results([task]):
                     self._take(row if row is not None else lost(sources[place], KILLED))
@@ -152,7 +151,7 @@ class _Run:
         return self._state()
 
     def _split_flights(self, sources: Sequence[Source]) -> list[Source]:
-        """Each flight recording as one source for each axis."""
+        """Replaces each flight recording by one source for each of its axes."""
         result = [each for each in sources if not each.is_flight]
         flights: dict[str, list[Source]] = defaultdict(list)
         for each in sources:
@@ -168,7 +167,7 @@ class _Run:
         return sorted(result, key=lambda each: (each.path, each.axis or ""))
 
     def _models(self, sources: Sequence[Source], model: Path | None, models: Path | None) -> dict[str, Model]:
-        """The model of each joint; those that are missing are fitted."""
+        """Returns the model of each joint; fits the missing ones."""
         joints: dict[str, list[Source]] = defaultdict(list)
         for each in sources:
             joints[each.joint or ""].append(each)
@@ -204,7 +203,7 @@ class _Run:
     def _results(
         self, tasks: Iterable[tuple[Callable[..., Any], tuple[Any, ...]]]
     ) -> Iterator[tuple[int, Any]]:
-        """The number and the result of each task as they are done; None for one that kills its workers."""
+        """Yields number and result of each task as it completes; None for one that kills its workers."""
         from distributed import KilledWorker, as_completed
 
         numbered = enumerate(tasks)
@@ -248,7 +247,7 @@ class _Run:
                 time.sleep(POLL_S)
 
     def _measure(self) -> None:
-        """Takes note of the workers' memory; one that is not there yet is waited for."""
+        """Updates the largest memory of a worker."""
         with suppress(OSError):
             workers: Collection[Mapping[str, Any]] = self._client.scheduler_info(n_workers=-1)[
                 "workers"

@@ -1,5 +1,5 @@
-"""The page of a fleet: whom to look at first, causes by batch, what the recordings cannot say, what
-failed.
+"""The page of a fleet: joints to inspect first, causes by batch, mistaken and failed recordings, and the
+rates at which causes are named.
 """
 
 from __future__ import annotations
@@ -17,14 +17,14 @@ from hdbridge.fleet.summary import Candidate, Mistaken, Summary
 from hdbridge.report.page import Command, Facts, Heading, Page, Section, Status, Table
 
 ROWS: Final = 200
-"""Rows of a table; a page of ten thousand joints shall open at once, and nobody reads more."""
+"""Maximum number of rows of a table, so that the page of ten thousand joints opens quickly."""
 NOT_KNOWN: Final = "not known yet"
 _FAILURES: Final = 40
-"""Length of the beginning by which reasons of failures are counted as one."""
+"""Length of the prefix by which failure reasons are grouped; characters."""
 
 
 def hours_words(remaining: Interval | None) -> str:
-    """Hours to a limit with their interval, or that they are not known yet."""
+    """Formats the hours to a limit with their interval, or reports that they are not known yet."""
     if remaining is None:
         return NOT_KNOWN
     if remaining.high == 0.0:
@@ -33,7 +33,7 @@ def hours_words(remaining: Interval | None) -> str:
 
 
 def fleet_page(summary: Summary, folder: Path) -> Page:
-    """The page of a summary; ``folder`` is where the data set lies."""
+    """Returns the page of a summary; ``folder`` holds the data set."""
     sections = [
         _first(summary, folder),
         *_prevalence(summary),
@@ -298,5 +298,5 @@ def _sure(probability: float) -> str:
 
 
 def _two(value: float) -> str:
-    """Two significant digits, without an exponent."""
+    """Formats a value with two significant digits, without an exponent."""
     return f"{float(f'{value:.2g}'):,.0f}"

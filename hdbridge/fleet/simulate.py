@@ -1,7 +1,7 @@
-"""A fleet that does not exist: joints drawn at random, which age over a year, and what goes wrong with files.
+"""A simulated fleet: random joints that age over a year, and recordings with typical file faults.
 
 Each joint is the bundled demo axis with a gear of its own. Its recordings come from the simulated axis
-(`hdbridge.sim`), which shares no code with the diagnosis. What was hidden goes to `answers.json`.
+(`hdbridge.sim`), which shares no code with the diagnosis. `answers.json` holds the hidden causes and faults.
 """
 
 from __future__ import annotations
@@ -30,18 +30,16 @@ LUBRICANTS: Final = ("grease A", "grease B")
 CELLS: Final = ("cell 1", "cell 2", "cell 3")
 BATCHES: Final = ("2025-07", "2025-08", "2025-09")
 SICK: Final = 0.2
-"""Share of joints that age by a cause; three times as many in the last batch."""
+"""Share of joints with a growing cause; three times as large in the last batch."""
 ODD: Final = 0.1
-"""Share of healthy joints that are unlike the others from the beginning."""
+"""Share of joints whose orders are unusually large from the beginning."""
 EVERYDAY: Final = 0.015
-"""Standard deviation of what changes between two recordings of a healthy joint: orders and loop,
-relatively.
-"""
+"""Relative standard deviation of orders and loop between recordings of a healthy joint."""
 
 
 @dataclass
 class Joint:
-    """What a joint is, and what happens to it."""
+    """A simulated joint: its properties, its ageing and the faults of its recordings."""
 
     name: str
     batch: str
@@ -51,10 +49,10 @@ class Joint:
     offset_arcsec: float
     cause: str | None = None
     arcsec_per_1000_hours: float = 0.0
-    """Growth of the cause's peak from zero at 0 hours."""
+    """Growth rate of the cause's peak, which is zero at 0 hours."""
     odd: bool = False
     turned_at: int | None = None
-    """Recording from which on the motor encoder is another one."""
+    """Number of the first recording after an exchange of the motor encoder."""
     turned_deg: float = 0.0
     hours: list[float] = field(default_factory=list)
 
@@ -93,7 +91,7 @@ CAUSES: Final[Mapping[str, Callable[[dict[str, Any], float], None]]] = {
     "motor_order": _motor_order,
     "hysteresis_parameters": _loop,
 }
-"""What joints age by: each makes a peak of a size, in arcsec."""
+"""Causes of ageing: functions that add a peak of a given size, in arcsec, to the data of a truth."""
 
 
 def simulate(
@@ -103,10 +101,10 @@ def simulate(
     seed: int,
     progress: Callable[[float], None] = lambda _: None,
 ) -> None:
-    """Write recordings, `manifest.csv` and `answers.json` to a new folder.
+    """Writes recordings, `manifest.csv` and `answers.json` to a new folder.
 
-    One file in a hundred is damaged, and one in fifty is there twice; there is at least one of each. Two
-    joints are exchanged for each other, and one gets another motor encoder. InputError for fewer than 4
+    One file in a hundred is damaged, and one in fifty is duplicated; there is at least one of each. Two
+    joints are exchanged for each other, and one has its motor encoder replaced. InputError for fewer than 4
     joints or 3 recordings, and for a folder that is not empty.
     """
     if joints < 4 or recordings < 3:
@@ -126,7 +124,7 @@ def simulate(
     swapped, turned = healthy[:2], healthy[2]
     swapped_at = rng.randrange(1, recordings)
     turned.turned_at, turned.turned_deg = rng.randrange(1, recordings), rng.uniform(30.0, 330.0)
-    for number in range(recordings):  # exchanged: what is filed under one name is the other joint
+    for number in range(recordings):  # exchanged: each joint's recordings are filed under the other's name
         for one, other in (swapped, swapped[::-1]):
             one.hours[number] = max(one.hours[number], other.hours[number])
     rows, paths = [], []
@@ -180,7 +178,7 @@ def _drawn(number: int, recordings: int, base: Mapping[str, Any], rng: Random) -
 
 
 def _truth(joint: Joint, number: int, base: Mapping[str, Any], rng: Random) -> Truth:
-    """The axis at one of its recordings."""
+    """Returns the parameters of the axis at one of its recordings."""
     data = json.loads(json.dumps(base))
     data["substep_ms"] = 1.0
     data["motor"]["encoder"].update(counts_per_turn=65536, interpolation=16)
@@ -203,7 +201,7 @@ def _truth(joint: Joint, number: int, base: Mapping[str, Any], rng: Random) -> T
 
 
 def _recorded(joint: Joint, number: int, base: Mapping[str, Any], rng: Random) -> Record:
-    """A minute of motion: a turn of the load there and back, and swings of several sizes."""
+    """Records a minute of motion: a load turn there and back, and sine motions of several amplitudes."""
     exercise = Exercise(
         Machine(_truth(joint, number, base, rng), rng.randrange(2**31), may_compile=True), cycles_per_sample=4
     )
@@ -241,7 +239,7 @@ def _row(path: Path, joint: Joint, hours: float) -> dict[str, str]:
 
 
 def _spoiled(folder: Path, paths: list[Path], rows: list[dict[str, str]], rng: Random) -> dict[str, Any]:
-    """Damages some files and copies others; says which."""
+    """Damages some files, duplicates others and returns their paths."""
     bad = rng.sample(range(len(paths)), max(1, len(paths) // 100))
     twice = rng.sample([each for each in range(len(paths)) if each not in bad], max(1, len(paths) // 50))
     for place in bad:

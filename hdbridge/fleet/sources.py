@@ -1,7 +1,7 @@
-"""The recordings of a fleet: folders, globs and fsspec URLs, and a manifest that describes them.
+"""The recordings of a fleet: folders, globs, fsspec URLs, and the manifest that describes them.
 
-A source is one recording of one joint that nobody has read yet. Whatever is wrong with a single one is found
-later, by the worker that reads it; a wrong manifest or a source that matches nothing is an InputError.
+A source is one recording of one joint that has not been read yet. Errors in a single recording are found
+later, by the worker that reads it; a wrong manifest or a place without recordings is an InputError.
 """
 
 from __future__ import annotations
@@ -40,12 +40,12 @@ MANIFEST: Final[Mapping[str, str]] = {
     "units": "`--units` of a CSV file",
     "unwrap": "`--unwrap` of a CSV file",
 }
-"""The columns of a manifest. Only ``path`` is required."""
+"""Columns of a manifest. Only ``path`` is required."""
 
 
 @dataclass(frozen=True)
 class Source:
-    """One recording of one joint, and what is known of it before it is read."""
+    """One recording of one joint, with the data known before it is read."""
 
     path: str
     joint: str | None = None
@@ -64,17 +64,17 @@ class Source:
 
     @property
     def is_flight(self) -> bool:
-        """Whether it is a flight recording, which may hold several axes."""
+        """True for a flight recording, which may hold several axes."""
         return self.path.endswith(FLIGHT)
 
     @property
     def order(self) -> tuple[float, str, str]:
-        """Sorts the recordings of a joint by time: hours, else date, else name."""
+        """Sort key of a joint's recordings by time: hours, else date, else name."""
         return (self.hours if self.hours is not None else -1.0, self.date or "", self.path)
 
 
 def find_sources(given: Sequence[str], manifest: Path | None = None) -> list[Source]:
-    """All recordings under the given places and in the manifest, each once, in the order of their paths.
+    """Returns all recordings at the given places and in the manifest, each once, sorted by path.
 
     InputError for a place that does not exist or holds no recording, and for a wrong manifest.
     """
@@ -96,7 +96,7 @@ def find_sources(given: Sequence[str], manifest: Path | None = None) -> list[Sou
 
 
 def _recordings(place: str, described: Iterable[str]) -> Iterator[str]:
-    """The recordings at one place: a folder, a glob, a file or a URL."""
+    """Yields the recordings at one place: a folder, a glob, a file or a URL."""
     if "://" not in place:
         matched = sorted(glob.glob(place, recursive=True)) if glob.has_magic(place) else [place]  # noqa: PTH207
         files = [file for each in matched for file in _local(Path(each))]
@@ -105,7 +105,7 @@ def _recordings(place: str, described: Iterable[str]) -> Iterator[str]:
 
         try:
             system, root = fsspec.core.url_to_fs(place)
-            host = place.rstrip("/").removesuffix(root)  # with the protocol: what a path of the system lacks
+            host = place.rstrip("/").removesuffix(root)  # protocol and host, which `system` paths lack
             matched = system.glob(root) if glob.has_magic(root) else [root]
             files = [
                 host + file
@@ -131,11 +131,11 @@ def _local(path: Path) -> list[str]:
 
 
 def _about(path: str) -> Source:
-    """A recording that no manifest describes: the axis and the date of its recording.yaml, if it has one."""
+    """Returns the source of a path that no manifest describes; joint and date come from recording.yaml."""
     source = Source(path)
     if path.endswith(CSV + FLIGHT + BUS_LOGS):
         return source
-    with suppress(Exception):  # whatever is wrong with it, the worker that reads it reports
+    with suppress(Exception):  # the worker that reads the recording reports the error
         import fsspec
         import yaml
 
@@ -152,7 +152,7 @@ def _about(path: str) -> Source:
 
 
 def read_manifest(path: Path) -> dict[tuple[str, str | None], Source]:
-    """The rows of a manifest, CSV or Parquet, by path and axis; InputError names the row that is wrong."""
+    """Reads a manifest, CSV or Parquet; sources by path and axis. InputError names the wrong row."""
     if not path.is_file():
         raise InputError(f"{path}: no such file; expected a manifest, CSV or Parquet")
     try:
@@ -164,7 +164,7 @@ def read_manifest(path: Path) -> dict[tuple[str, str | None], Source]:
             with path.open(encoding="utf-8-sig", newline="") as file:
                 reader = csv.DictReader(file, strict=True)
                 names, rows = list(reader.fieldnames or ()), list(reader)
-    except Exception as problem:  # readers raise what their parsing meets
+    except Exception as problem:  # the readers raise many types of errors
         raise InputError(f"{path}: cannot be read: {str(problem).splitlines()[0]}") from None
     for name in names:
         if name not in MANIFEST:
@@ -217,7 +217,7 @@ def _described(row: Mapping[str, Any], manifest: Path, number: int) -> Source:
 
 
 def with_axes(path: str, axes: Iterable[str], described: Iterable[Source]) -> list[Source]:
-    """A flight recording as one source for each of its axes; rows of the manifest name some of them."""
+    """Returns one source for each axis of a flight recording; rows of the manifest describe some of them."""
     rows = {each.axis: each for each in described}
     common = rows.get(None, Source(path))
     return [rows.get(name) or replace(common, axis=name, joint=common.joint or name) for name in axes]
@@ -225,7 +225,7 @@ def with_axes(path: str, axes: Iterable[str], described: Iterable[Source]) -> li
 
 @contextmanager
 def fetched(path: str) -> Iterator[Path]:
-    """The recording as a local path; a remote one is copied to a temporary folder for the block.
+    """Provides a recording as a local path; a remote one is copied to a temporary folder for the block.
 
     InputError if it cannot be fetched.
     """

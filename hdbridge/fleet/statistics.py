@@ -1,7 +1,7 @@
-"""What many joints say that one does not: pure statistics on arrays, without files and without randomness.
+"""Statistics over many joints: pure functions of arrays, without files and without randomness.
 
-Every rate, scatter and prior is estimated from the fleet itself, so that a joint is compared with what the
-same diagnosis says of the others on everyday records. Where the data do not decide, the answer is None.
+Every rate, scatter and prior is estimated from the fleet itself, so a joint is compared with the same
+diagnosis of the other joints on everyday records. If the data do not decide, the answer is None.
 """
 
 from __future__ import annotations
@@ -25,20 +25,20 @@ MAD: Final = 1.4826
 DRAWS: Final = 4001
 GOLDEN: Final = 0.6180339887498949
 INTERVAL: Final = (0.05, 0.95)
-"""Of hours and prevalences: 90 %."""
+"""Quantiles of the 90 % intervals of hours and prevalences."""
 SCATTER_SERIES: Final = 200
-"""Series from which the common scatter is estimated: its error is then 5 % or less."""
+"""Number of series for estimating the common scatter; its error is then 5 % or less."""
 PHASE_STEP_DEG: Final = 0.25
 EVERYDAY_SHARE: Final = 0.05
-"""Share of an order's amplitude by which it may differ between two recordings of one joint."""
+"""Relative difference of an order's amplitude that is normal between two recordings of one joint."""
 AGREE: Final = 1e-4
 DISAGREE: Final = 1e-12
-"""Probabilities of a chi square as large, below which orders do not agree, and certainly do not."""
+"""Chi-square tail probabilities below which orders do not agree (`AGREE`), or certainly differ."""
 
 
 @dataclass(frozen=True, slots=True)
 class Interval:
-    """A value with its 90 % interval; infinite ends are open."""
+    """A value with its 90 % interval; an infinite bound is open."""
 
     low: float
     value: float
@@ -49,10 +49,10 @@ class Interval:
 
 
 def prevalence(cases: Mapping[str, tuple[int, int]]) -> dict[str, Interval]:
-    """Share of joints with a cause in each group, from (cases, joints), partially pooled over the groups.
+    """Estimates the share of joints with a cause in each group from (cases, joints), partially pooled.
 
-    A beta-binomial model; its mean and concentration are integrated out over a grid, so a group of three
-    joints is drawn to the others and a group of three hundred is not.
+    The model is beta-binomial with mean and concentration integrated out over a grid, so a group of three
+    joints is drawn towards the others and a group of three hundred is not.
     """
     if not cases:
         return {}
@@ -79,17 +79,17 @@ def prevalence(cases: Mapping[str, tuple[int, int]]) -> dict[str, Interval]:
     return result
 
 
-# -- What repeats
+# -- Repetition
 
 
 @dataclass(frozen=True, eq=False)
 class Repeats:
-    """What the fleet says of one cause."""
+    """Prevalence of one cause, and the rates at which recordings name it."""
 
     probability: FloatArray
-    """That each joint has it, shape (joints,)."""
+    """Probability that each joint has the cause, shape (joints,)."""
     share: float
-    """Of joints that have it."""
+    """Share of joints that have the cause."""
     named: float
     """Rate at which a recording of a joint that has it names it."""
     wrongly: float
@@ -97,11 +97,11 @@ class Repeats:
 
 
 def repeats(named: Sequence[Sequence[bool]]) -> Repeats:
-    """Which joints have a cause, from whether each of their recordings names it, in the order of time.
+    """Estimates which joints have a cause; ``named`` holds, by joint, if each recording in time names it.
 
-    A joint without the cause is named at a constant rate; one with it is named at a higher rate from some
-    recording on, which is unknown. Shares and rates are the fleet's own (expectation maximisation, weak
-    priors).
+    Recordings of a joint without the cause name it at a constant rate; those of a joint with it name it at a
+    higher rate from an unknown onset on. Shares and rates are estimated from the fleet by expectation
+    maximisation with weak priors.
     """
     share, often, rarely = 0.05, 0.8, 0.02
     lengths = np.array([len(each) for each in named], dtype=int)
@@ -116,11 +116,11 @@ def repeats(named: Sequence[Sequence[bool]]) -> Repeats:
         for length, (own, y) in tables.items():
             with_it = np.where(y > 0, math.log(often), math.log1p(-often))
             without = np.where(y > 0, math.log(rarely), math.log1p(-rarely))
-            # The likelihood ratio of each onset: what comes before is as without the cause.
+            # Likelihood ratio of each onset; earlier recordings are like those without the cause.
             onset = np.cumsum((with_it - without)[:, ::-1], axis=1)[:, ::-1]
             whole = logsumexp(onset, axis=1, keepdims=True)
             probability[own] = expit(math.log(share / (1.0 - share)) + whole[:, 0] - math.log(length))
-            since = np.cumsum(np.exp(onset - whole), axis=1)  # that it has begun by then
+            since = np.cumsum(np.exp(onset - whole), axis=1)  # probability that the onset has passed
             ill = probability[own][:, np.newaxis] * since
             hits += float(np.sum(ill * y))
             hits_of += float(np.sum(ill))
@@ -136,7 +136,7 @@ def repeats(named: Sequence[Sequence[bool]]) -> Repeats:
 
 
 def within_false_discoveries(probability: FloatArray, rate: float) -> FloatArray:
-    """Which of the claims may be made together so that no more than a share ``rate`` of them is wrong."""
+    """Selects the largest set of claims of which an expected share of at most ``rate`` is wrong."""
     order = np.argsort(-probability, kind="stable")
     wrong = np.cumsum(1.0 - probability[order]) / np.arange(1, len(order) + 1)
     chosen = np.zeros(len(probability), dtype=bool)
@@ -148,16 +148,16 @@ def within_false_discoveries(probability: FloatArray, rate: float) -> FloatArray
 
 
 def normal_range(values: FloatArray) -> Interval:
-    """Median, and the range that 95 % of normal values are in, by the median absolute deviation."""
+    """Returns the median and the range of 95 % of normal values, by the median absolute deviation."""
     middle = float(np.median(values))
     half = 1.96 * MAD * float(np.median(np.abs(values - middle)))
     return Interval(middle - half, middle, middle + half)
 
 
 def outliers(values: FloatArray, rate: float = 0.05) -> NDArray[np.bool_]:
-    """Which values are outside the normal range, with a false discovery rate (Benjamini and Hochberg 1995).
+    """Selects outliers at a false discovery rate (Benjamini and Hochberg 1995); mask of shape (n,).
 
-    None of fewer than eight, and none if more than half of the values are equal.
+    There are none among fewer than eight values, or if more than half of the values are equal.
     """
     scale = MAD * float(np.median(np.abs(values - np.median(values)))) if len(values) else 0.0
     if len(values) < 8 or scale == 0.0:
@@ -175,33 +175,33 @@ def outliers(values: FloatArray, rate: float = 0.05) -> NDArray[np.bool_]:
 
 @dataclass(frozen=True, eq=False)
 class Series:
-    """One figure of one joint over its hours; arrays of shape (n,)."""
+    """One figure of one joint over its operating hours; arrays of shape (n,)."""
 
     hours: FloatArray
     value: FloatArray
     sd: FloatArray
-    """Standard deviation of each value, by the diagnosis itself."""
+    """Standard deviation of each value, from the diagnosis."""
     temperature_c: FloatArray | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class Trend:
-    """How a figure changes: the line that was fitted, and the slopes of the fleet as its prior."""
+    """Trend of a figure: the fitted line, and the distribution of the fleet's slopes as its prior."""
 
     line: FloatArray
     """Level at the last recording, and slope per 1000 hours."""
     covariance: FloatArray
-    """Of these two, by the errors and the scatter alone, shape (2, 2)."""
+    """Covariance of level and slope without the prior, shape (2, 2)."""
     stay: float
-    """Standard deviation of the slopes of joints that stay."""
+    """Standard deviation of the slopes of joints that do not change."""
     change: tuple[float, float]
     """Mean and standard deviation of the slopes of joints that change."""
     changing: float
-    """Probability that the joint belongs to those that change."""
+    """Probability that the joint is one of those that change."""
 
     @cached_property
     def _draws(self) -> tuple[FloatArray, FloatArray]:
-        """Levels and slopes of the posterior, by quantiles: the same data give the same interval."""
+        """Posterior levels and slopes, drawn by quantiles so that equal data give equal intervals."""
         slope, cov = float(self.line[1]), self.covariance
         count = round(self.changing * DRAWS)
         slopes = []
@@ -210,26 +210,26 @@ class Trend:
             middle = variance * (centre / deviation**2 + slope / float(cov[1, 1]))
             slopes.append(middle + math.sqrt(variance) * ndtri((np.arange(number) + 0.5) / max(number, 1)))
         drawn = np.concatenate(slopes)
-        # The level given the slope; its own part runs through the quantiles in an order unlike the slope's.
+        # Level given the slope; its own variance takes the quantiles in another order than the slope's.
         level = self.line[0] + cov[0, 1] / cov[1, 1] * (drawn - slope)
         rest = math.sqrt(max(float(cov[0, 0] - cov[0, 1] ** 2 / cov[1, 1]), 0.0))
         return level + rest * ndtri((np.arange(1, DRAWS + 1) * GOLDEN) % 1.0), drawn
 
     @property
     def per_1000_hours(self) -> Interval:
-        """The slope with its interval."""
+        """Slope with its interval."""
         return Interval(
             *(float(each) for each in np.quantile(self._draws[1], (INTERVAL[0], 0.5, INTERVAL[1])))
         )
 
     def growing(self) -> float:
-        """Probability that the slope is positive."""
+        """Returns the probability that the slope is positive."""
         return float(np.mean(self._draws[1] > 0.0))
 
     def hours_to(self, limit: float) -> Interval | None:
-        """Hours from the last recording until the line reaches a limit; None if that is not known yet.
+        """Returns the hours from the last recording until the line reaches a limit, or None if unknown.
 
-        It is not known if the line may as well never reach it.
+        It is unknown if the line may never reach the limit (upper bound of the interval infinite).
         """
         level, slope = self._draws
         hours = np.full(DRAWS, np.inf)
@@ -242,12 +242,11 @@ class Trend:
 
 
 def trends(series: Sequence[Series]) -> list[Trend | None]:
-    """The trend of one figure in every joint; None of a joint with fewer than two recordings at different
-    hours.
+    """Fits the trend of one figure in every joint; None for a joint without two different hours.
 
-    Straight lines with the figure's own errors and a scatter from recording to recording that all joints
-    share. Slopes come from two kinds of joints, those that stay and those that change (a normal mixture,
-    fitted to the fleet), so a joint with three noisy recordings is drawn to zero, and a steep one is not.
+    The trends are straight lines; errors are the figure's own plus a scatter between recordings that is
+    common to all joints. The prior of the slopes is a normal mixture of joints that change and joints that do
+    not, fitted to the fleet, so the slope of three noisy recordings is drawn to zero and a steep one is not.
     """
     usable = [place for place, each in enumerate(series) if len(np.unique(each.hours)) > 1]
     if not usable:
@@ -267,12 +266,12 @@ def trends(series: Sequence[Series]) -> list[Trend | None]:
 
 
 def _log_normal(value: FloatArray, mean: float, deviation: FloatArray) -> FloatArray:
-    """Logarithm of the normal density, but for a constant."""
+    """Returns the logarithm of the normal density up to a constant."""
     return np.asarray(-0.5 * ((value - mean) / deviation) ** 2 - np.log(deviation))
 
 
 def _design(each: Series) -> FloatArray:
-    """Level at the last recording, slope per 1000 hours, and temperature if it varies."""
+    """Returns the columns of level at the last recording, slope per 1000 hours and varying temperature."""
     columns = [np.ones(len(each.hours)), (each.hours - each.hours.max()) / 1000.0]
     temperature = each.temperature_c
     if temperature is not None and len(temperature) >= 4 and np.ptp(temperature) > 3.0:
@@ -289,7 +288,7 @@ def _line(each: Series, scatter: float) -> tuple[FloatArray, FloatArray]:
 
 
 def _scatter(series: Sequence[Series]) -> float:
-    """The scatter from recording to recording that makes the residuals of all lines most likely (REML)."""
+    """Estimates the common scatter between recordings by restricted maximum likelihood (REML)."""
     chosen = [each for each in series if len(each.hours) > _design(each).shape[1]]
     chosen = chosen[:: max(1, math.ceil(len(chosen) / SCATTER_SERIES))]
     if not chosen:
@@ -315,9 +314,7 @@ def _scatter(series: Sequence[Series]) -> float:
 
 
 def _two_kinds(slopes: FloatArray, errors: FloatArray) -> tuple[float, tuple[float, float], float]:
-    """Standard deviation of the slopes that stay, mean and deviation of those that change, and their
-    share.
-    """
+    """Fits the mixture of slopes: deviation without change, mean and deviation with change, its share."""
     middle = float(np.median(np.abs(slopes)))
     stay = 0.3 * max(middle, float(np.median(errors)))
     mean, deviation, share = 0.0, max(3.0 * float(np.std(slopes)), 3.0 * stay, 1e-12), 0.1
@@ -325,7 +322,7 @@ def _two_kinds(slopes: FloatArray, errors: FloatArray) -> tuple[float, tuple[flo
         narrow = _log_normal(slopes, 0.0, np.hypot(stay, errors)) + math.log(1.0 - share)
         wide = _log_normal(slopes, mean, np.hypot(deviation, errors)) + math.log(share)
         changing = expit(wide - narrow)
-        # Expected true slopes of either kind, and their spread; the priors keep a small fleet from extremes.
+        # Expected true slopes of both kinds, and their spread; the priors prevent extremes in a small fleet.
         shrink = deviation**2 / (deviation**2 + errors**2)
         true, left = mean + shrink * (slopes - mean), shrink * errors**2
         total = float(np.sum(changing))
@@ -350,24 +347,23 @@ def _two_kinds(slopes: FloatArray, errors: FloatArray) -> tuple[float, tuple[flo
 
 @dataclass(frozen=True, slots=True)
 class Identity:
-    """Why a recording does not belong to its joint as it was."""
+    """Reason why the orders of a recording differ from its joint's first recording."""
 
     kind: str
-    """``swapped``: its orders are another joint's; ``turned``: its motor encoder was exchanged or its zero
-    set; ``changed``: they are nobody's.
+    """``swapped``: they are another joint's; ``turned``: the motor encoder was exchanged or its zero set;
+    ``changed``: they match no joint.
     """
     other: int | None = None
-    """Of ``swapped``: the joint whose orders these are."""
+    """For ``swapped``: the joint that the orders match."""
     angle_deg: float | None = None
-    """Of ``turned``: by which angle of the motor."""
+    """For ``turned``: the offset of the motor angle."""
 
 
 def identities(orders: Complexes, joint: Sequence[int], time: Sequence[Any]) -> list[Identity | None]:
-    """What is wrong with the identity of each recording, by the orders of the motor, shape (recordings,
-    orders).
+    """Checks by the motor orders that each recording belongs to its joint; None if it does.
 
-    ``orders`` are amplitude times exp(i phase) of the order 1, 2, ... of each recording; rows with NaN
-    have none. The first recording of a joint is what it is compared with. None means that it agrees.
+    ``orders``, shape (recordings, orders), are amplitude times exp(i phase) of the orders 1, 2, ...; rows
+    with NaN have none. Each recording is compared with the first one of its joint.
     """
     numbers = np.asarray(joint)
     known = np.all(np.isfinite(orders), axis=1) if len(orders) else np.zeros(0, dtype=bool)

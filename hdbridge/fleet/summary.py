@@ -1,8 +1,8 @@
-"""The fleet as a whole: whom to look at first, what is common where, what is wrong with the data.
+"""Summary of a fleet: joints to inspect first, prevalence of causes, and faults of the data.
 
-The diagnosis of one recording names too much on everyday records for a list that people act on. A joint is
-listed only if a cause repeats over its recordings more often than the fleet's own rate of wrong names
-explains, and if it appeared after the first recording, or grows.
+On everyday records, the diagnosis of one recording names too many causes for a list that people act on. A
+joint is listed only if a cause repeats over its recordings more often than the fleet's own rate of wrong
+names explains, and if it appeared after the first recording or grows.
 """
 
 from __future__ import annotations
@@ -30,31 +30,31 @@ from hdbridge.fleet.statistics import (
 
 SCHEMA: Final = "hdbridge.fleet-summary/1"
 FALSE_DISCOVERIES: Final = 0.01
-"""Share of the listed joints that may be wrong."""
+"""Maximum expected share of wrong joints in the list."""
 COMMON: Final = 0.4
-"""A cause of more than this share of a gear type's joints belongs to the type; a joint is listed if it
+"""Share of a gear type's joints above which a cause belongs to the type; joints are then listed only if it
 grows.
 """
 SURE: Final = 0.95
 REPEATED: Final = 2
 """Minimum number of recordings that name a cause."""
 SILENT: Final = 3.0
-"""A joint is silent after so many of its usual intervals without a recording."""
+"""Time without a recording after which a joint is silent; multiples of its median interval."""
 ATTRIBUTES: Final = ("batch", "cell", "lubricant")
 Row = Mapping[str, Any]
 
 
 @dataclass(frozen=True)
 class Candidate:
-    """A joint to look at, and why."""
+    """A joint to inspect, with its cause."""
 
     joint: str
     cause: str
     probability: float
-    """That the joint has it: by the names in all its recordings, against the fleet's rate of wrong names."""
+    """Probability that the joint has the cause, from all its recordings and the fleet's rates."""
     aliases: tuple[str, ...]
     peak_arcsec: float
-    """In its last recording."""
+    """Peak of the cause in the latest recording that names it."""
     named: int
     recordings: int
     growth: Interval | None
@@ -65,7 +65,7 @@ class Candidate:
     what_changed: tuple[str, ...]
     remarks: tuple[str, ...]
     path: str
-    """Its last recording."""
+    """Path of its last recording."""
     gear: str
     model: str
     """Model file; `models/...` is in the folder of the data set."""
@@ -84,7 +84,7 @@ class Odd:
 
 @dataclass(frozen=True)
 class Mistaken:
-    """A recording that does not belong to its joint as it was."""
+    """A recording whose orders differ from its joint's first recording."""
 
     joint: str
     path: str
@@ -94,31 +94,31 @@ class Mistaken:
 
 @dataclass(frozen=True)
 class Summary:
-    """All that a page of the fleet says."""
+    """Contents of the page of a fleet."""
 
     recordings: int
     joints: int
     limit_arcsec: float
     first: tuple[Candidate, ...]
     prevalence: Mapping[str, Mapping[str, Mapping[str, tuple[int, int, Interval]]]]
-    """By attribute, cause and group: joints with it, joints, and the share."""
+    """Joints with the cause, joints, and share, by attribute, cause and group."""
     rates: Mapping[str, tuple[float, float, float]]
-    """By cause: share of joints, rate of names with it, and rate of wrong names."""
+    """Share of joints, and rates at which recordings name it in joints with and without it, by cause."""
     odd: tuple[Odd, ...]
     mistaken: tuple[Mistaken, ...]
     duplicates: tuple[tuple[str, str, str], ...]
-    """Joint, path and path of the first."""
+    """Joint, path and path of the original."""
     silent: tuple[tuple[str, str], ...]
     """Joint and reason."""
     failed: tuple[tuple[str, str, str], ...]
     """Joint, path and reason."""
 
     def as_dict(self) -> dict[str, Any]:
-        """For machines, schema hdbridge.fleet-summary/1."""
+        """Returns the summary for JSON, schema hdbridge.fleet-summary/1."""
         return {"schema": SCHEMA, **asdict(self)}
 
     def lines(self) -> Iterator[str]:
-        """What is wrong with data, one line for each kind."""
+        """Yields one line for each kind of fault in the data."""
         for kind, count in Counter(each.kind for each in self.mistaken).items():
             yield f"recordings {_KINDS[kind]}: {count}"
         for words, found in (
@@ -138,7 +138,7 @@ _KINDS: Final = {
 
 
 def summarise(rows: Sequence[Row], limit_arcsec: float) -> Summary:
-    """The summary of the recordings of a data set (`Dataset.recordings`)."""
+    """Summarises the recordings of a data set (`Dataset.recordings`)."""
     good = [row for row in rows if row["reason"] is None and row["duplicate_of"] is None]
     good.sort(key=_when)
     mistaken, foreign = _mistaken(good)
@@ -173,9 +173,7 @@ def _when(row: Row) -> tuple[float, str, str]:
 
 
 def _mistaken(good: Sequence[Row]) -> tuple[tuple[Mistaken, ...], set[tuple[str, str]]]:
-    """Recordings of another joint or after another encoder, and those that say nothing of their joint as
-    it was.
-    """
+    """Returns the mistaken recordings, and key and path of those excluded from the other results."""
     result: list[Mistaken] = []
     foreign: set[tuple[str, str]] = set()
     gears: dict[str, list[Row]] = defaultdict(list)
@@ -210,7 +208,7 @@ def _causes(
 ) -> tuple[
     dict[str, dict[str, float]], dict[str, tuple[float, float, float]], dict[str, dict[str, Trend | None]]
 ]:
-    """By cause: the probability that each joint has it, the fleet's rates, and the trend of its peak."""
+    """Returns, by cause, the probability that each joint has it, the fleet's rates and its peak's trend."""
     causes = sorted({each["cause"] for rows in joints.values() for row in rows for each in row["findings"]})
     names = list(joints)
     has: dict[str, dict[str, float]] = {}
@@ -229,7 +227,7 @@ def _peak(row: Row, cause: str) -> float | None:
 
 
 def _size(rows: Sequence[Row], cause: str) -> Series:
-    """The peak of a cause over the hours; where it was not named it is between nothing and what would be."""
+    """Returns the peak of a cause over the hours; if not named, it lies between 0 and the detection limit."""
     known = [row for row in rows if row["hours"] is not None]
     values, errors = [], []
     for row in known:
@@ -239,7 +237,7 @@ def _size(rows: Sequence[Row], cause: str) -> Series:
         values.append(0.5 * floor if peak is None else peak)
         errors.append(
             0.29 * floor if peak is None else max(0.25 * floor, 0.02 * peak)
-        )  # 0.29: of an even spread
+        )  # 0.29: standard deviation of a uniform distribution
     return Series(
         np.array([row["hours"] for row in known], dtype=float),
         np.array(values, dtype=float),
@@ -254,7 +252,7 @@ def _temperatures(rows: Sequence[Row]) -> Any:
 
 
 def _figures(joints: Mapping[str, Sequence[Row]]) -> dict[str, list[tuple[float, str]]]:
-    """What changes in each joint: figures of the model with a trend that is sure, the largest first."""
+    """Returns, by joint, strength and text of each significant trend of the model's figures."""
     table: dict[str, dict[str, list[tuple[Row, float, float]]]] = defaultdict(lambda: defaultdict(list))
     for name, rows in joints.items():
         for row in rows:
@@ -333,7 +331,7 @@ def _first(
     kept = within_false_discoveries(np.array([each.probability for each in claims]), FALSE_DISCOVERIES)
     chosen: dict[str, Candidate] = {}
     for each, keep in zip(claims, kept.tolist(), strict=True):
-        # One line for a joint: the others are consequences, or come after the first is mended.
+        # One line for each joint: its other causes are consequences, or can wait for the first repair.
         if keep and (each.joint not in chosen or _weight(each) > _weight(chosen[each.joint])):
             chosen[each.joint] = each
     return tuple(sorted(chosen.values(), key=_urgency))
@@ -387,7 +385,7 @@ def _prevalence(
 
 
 def _odd(joints: Mapping[str, Sequence[Row]]) -> tuple[Odd, ...]:
-    """Figures outside the normal range of their gear type: the median of each joint's recordings counts."""
+    """Returns figures outside the normal range of their gear type, from each joint's median."""
     table: dict[tuple[str, str], dict[str, list[float]]] = defaultdict(lambda: defaultdict(list))
     for name, rows in joints.items():
         for row in rows:
@@ -413,7 +411,7 @@ def _odd(joints: Mapping[str, Sequence[Row]]) -> tuple[Odd, ...]:
 
 
 def _silent(rows: Sequence[Row]) -> tuple[tuple[str, str], ...]:
-    """Joints without a usable recording, or without one for long."""
+    """Returns joints without a usable recording, or without one for a long time."""
     usable: dict[str, list[datetime]] = {row["joint"]: [] for row in rows if row["joint"]}
     diagnosed = {row["joint"] for row in rows if row["reason"] is None}
     for row in rows:
