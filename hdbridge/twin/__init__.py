@@ -1,4 +1,4 @@
-"""The twin: the simulated drive learns a real axis from recordings, and says what it gets wrong.
+"""The twin: fits the simulated drive to recordings of a real axis, and reports its differences from it.
 
-Above both sides: it knows the models and the simulated drive, and neither knows it.
+It imports the models and the simulated drive; neither imports it.
 """

@@ -1,10 +1,9 @@
-"""What has changed since a twin was made: a new recording against its replay, named cause by cause.
+"""Changes since a twin was made: compares a new recording with its replay and names the causes.
 
-All parameters are fitted together, each held to where the twin has it as closely as the twin can be trusted.
-Those that are drawn from there by more than chance are set free, with all of their cause, and so are those
-that explain most when they are moved alone. Then one cause after the other has to earn its place next to the
-rest: it has to have moved by more than the new recording and the twin leave open, and by as much as matters,
-and what would make up for it has to be less likely.
+All parameters are fitted together, each held to the twin's value with the twin's uncertainty as its prior.
+Causes whose parameters are drawn away by more than chance are set free, and so are those that explain most
+when moved alone. A cause is kept only if it has moved significantly, by as much as matters in practice, and
+if the best fit without it is less likely.
 """
 
 from __future__ import annotations
@@ -37,14 +36,14 @@ from hdbridge.twin.result import Values
 # How sure a change against a twin is: by the new recording, and by what the twin's own recordings left open.
 
 Misfit = Mapping[str, Mapping[str, float]]
-"""By channel, in its unit, and kind of leg: rms of what a replay leaves of the recording."""
+"""Rms of the residuals by channel, in its unit, and kind of leg."""
 STRAY = 4.0
-"""A sample that leaves more than this times the rms of its kind counts as that: a motor that breaks away at a
-different time is no change of the axis."""
+"""Limit at which residuals are clipped, in rms of their kind of leg: a motor that breaks away at a different
+time is not a change of the axis."""
 
 
 def misfit_of(data: Data, residuals: Mapping[str, FloatArray]) -> dict[str, dict[str, float]]:
-    """What residuals leave of each recorded channel, by kind of leg."""
+    """Returns the rms of the residuals of each recorded channel, by kind of leg."""
     kinds = np.array(data.kinds)[data.leg.astype(np.intp)]
     found: dict[str, dict[str, float]] = {}
     for name, counts in counted(data).items():
@@ -59,10 +58,10 @@ def misfit_of(data: Data, residuals: Mapping[str, FloatArray]) -> dict[str, dict
 def growth(
     data: Data, residuals: Mapping[str, FloatArray], known: Misfit, noise: Mapping[str, float]
 ) -> dict[str, float]:
-    """By channel: rms of what is left over what was left of the same kinds of leg when the twin was made.
+    """Returns, by channel, the rms residual relative to that of the same kinds of leg in the twin's own fit.
 
-    A kind that the twin has not seen is held against the largest of the others; below the ``noise`` nothing
-    is left.
+    A kind that the twin has not seen is compared with the largest of the others; ``noise`` is the minimum of
+    each reference.
     """
     was, found = scales_by_kind(data, known, noise), {}
     for name, counts in counted(data).items():
@@ -75,7 +74,7 @@ def growth(
 
 
 def scales_by_kind(data: Data, known: Misfit, noise: Mapping[str, float]) -> dict[str, Any]:
-    """By channel, for each row: the misfit of its kind of leg as it was, or the noise if that is more."""
+    """Returns, by channel and row, the twin's own misfit on this kind of leg, or the noise if larger."""
     kinds = np.array(data.kinds)[data.leg.astype(np.intp)]
     found: dict[str, Any] = {}
     for name in CHANNELS:
@@ -88,22 +87,22 @@ def scales_by_kind(data: Data, known: Misfit, noise: Mapping[str, float]) -> dic
 
 @dataclass(frozen=True, eq=False)
 class Known:
-    """What a twin's file says of its own fit."""
+    """The twin's own fit, as its file describes it."""
 
     names: tuple[str, ...]
-    """Of the parameters that were fitted."""
+    """Names of the fitted parameters."""
     covariance: FloatArray
-    """Of their coordinates."""
+    """Covariance of their coordinates, shape (p, p)."""
     noise: dict[str, float]
     """Scale of each channel's residuals."""
     misfit: Misfit = field(default_factory=dict)
-    """What the twin left of its own recordings; empty in files of older versions."""
+    """Misfit to the twin's own recordings; empty in files of older versions."""
     of_axis: bool = True
-    """Whether the twin's values are the axis's."""
+    """True if the twin's values are the axis's."""
 
     @classmethod
     def of(cls, twin: Truth) -> Self:
-        """InputError where the twin was not fitted."""
+        """Reads the provenance of a twin; InputError if it was not fitted."""
         about: Any = twin.provenance.get("fit")
         if not isinstance(about, dict):
             raise InputError(
@@ -116,14 +115,14 @@ class Known:
         return cls(names, covariance, dict(about["noise"]), about.get("misfit", {}), of_axis)
 
     def root(self, parameters: Sequence[Parameter]) -> FloatArray:
-        """A root of the covariance of these parameters' coordinates, shape (p, fitted).
+        """Returns a root of the covariance of these parameters' coordinates, shape (p, fitted).
 
-        In no direction is it wider than the prior, whatever the residuals of a few legs say. A parameter that
-        the twin has not fitted has no error there.
+        It is limited to the prior's width in every direction. Parameters that the twin has not fitted have no
+        error in it.
         """
         spread = {each.name: each.spread for each in parameters}
         prior = np.array([spread.get(name, 1.0) for name in self.names])
-        # A file has some digits of it: what they leave of the smallest eigenvalues may be below zero.
+        # Rounding in the file may have made the smallest eigenvalues negative.
         worth, directions = np.linalg.eigh(self.covariance / np.outer(prior, prior))
         whole = prior[:, None] * directions * np.sqrt(np.clip(worth, 0.0, 1.0))
         root = np.zeros((len(parameters), len(self.names)))
@@ -135,10 +134,10 @@ class Known:
 
 @dataclass(frozen=True, eq=False)
 class Change:
-    """What a recording says of some coordinates, the others being the twin's."""
+    """Estimate of some coordinates from a recording, the others held to the twin."""
 
     by: FloatArray
-    """How far they are from where the slopes were taken."""
+    """Their distances from the point of linearisation."""
     covariance: FloatArray
 
 
@@ -151,11 +150,11 @@ def change_of(
     precision: FloatArray,
     off: FloatArray,
 ) -> Change:
-    """Generalised least squares of the coordinates at these places.
+    """Estimates the coordinates with these indices by generalised least squares.
 
-    ``left`` are the scaled residuals, ``slopes`` their derivatives by all coordinates, ``legs`` the number
-    of each residual's leg, ``root`` a root of the twin's covariance. The prior has this ``precision`` about
-    a point from which all coordinates are ``off`` already.
+    ``left`` are the scaled residuals, ``slopes`` their derivatives with respect to all coordinates, ``legs``
+    the leg number of each residual, ``root`` a root of the twin's covariance. ``precision`` is the prior's,
+    and ``off`` the distance of all coordinates from the prior's mean.
     """
     count = slopes.shape[1]
     gram, some = slopes.T @ slopes, list(places)
@@ -163,7 +162,7 @@ def change_of(
     variance = max(1.0, float(noise @ noise) / max(len(left) - count, 1))
     seen = gram @ root
     inner = variance * np.eye(root.shape[1]) + root.T @ seen
-    # The weights of the residuals are the slopes times this.
+    # Residual weights are the slopes times this matrix.
     weights = ((np.eye(count) - root @ np.linalg.solve(inner, seen.T)) / variance)[:, some]
     held = np.diag(precision[some])
     inverse = np.linalg.inv(weights.T @ gram[:, some] + held)
@@ -175,7 +174,7 @@ def change_of(
 
 
 def _louder(slopes: FloatArray, noise: FloatArray, legs: FloatArray, variance: float) -> FloatArray:
-    """By coordinate, how much more residuals that go together within a leg weigh than white ones."""
+    """Returns, by coordinate, the factor by which correlation within legs inflates the standard error."""
     white = variance * np.sum(np.square(slopes), axis=0)
     squares = np.sum(np.square(over_legs(slopes * noise[:, None], legs)), axis=0)
     times = np.divide(squares, white, out=np.ones_like(white), where=white > 0.0)
@@ -185,73 +184,72 @@ def _louder(slopes: FloatArray, noise: FloatArray, legs: FloatArray, variance: f
 # ----------------------------------------------------------------
 
 CHECK_S = 20.0
-"""A longer recording is checked on pieces that take about so long."""
+"""Duration of the pieces on which a longer recording is checked."""
 SIZES = (1.0, 2.5, 4.0, 6.0)
-"""Each parameter is moved by so many of the changes that matter, either way: what a spring or a load rings by
-goes out of step at a small share of a larger change already, and slopes say nothing of it."""
+"""Trial changes of each parameter, in both directions, in units of its least change. Slopes do not cover
+them: the ringing of a spring or load runs out of phase already at small changes."""
 CONTENDERS = 2
-"""So many such places a fit begins at, in addition to the twin's own."""
+"""Number of these trials at which a fit starts, in addition to the twin itself."""
 STEPS = 8
-"""Steps in each stage of a fit."""
+"""Maximum steps in each stage of a fit."""
 BLUNT = (0.1, 0.0)
-"""The stages: a replay counts as off by at least this share of the noise, in addition to the rounding of the
-readings. The second stage begins where the first ended, without the samples that are still too far off.
-Rounding is not noise: treated as noise it draws delays and feed-forwards away from their true values, because
-a smooth replay of the true axis then leaves more than the nearest wrong one (see `likelihood`). The first
-stage is blunt because the walls of a count are steep, and give no direction from far off."""
+"""Minimum error of a replay, as a share of the noise, in the two stages of a fit; rounding of the readings
+comes in addition. The second stage starts at the end of the first, without the samples that are still too far
+off. Rounding is not noise: treated as noise it biases delays and feed-forwards, because a smooth replay of
+the true axis then leaves more than the nearest wrong one (see `hdbridge.twin.noise`). The first stage is
+blunt because the likelihood of a rounded reading is steep and gives no direction from far off."""
 LOST = 0.25
-"""A channel of which a larger share of the samples has come to be beyond `SOFT` has become worse."""
+"""Clipped mean square, in units of `SOFT` squared, above which a channel that has grown is worse."""
 ROUNDS = 3
-"""So often the causes that are drawn away are set free. In the first round they are nearly always all."""
+"""Maximum rounds of setting causes free. The first round nearly always finds all of them."""
 DRAWS = 8
-"""Rounded and noisy replays about a place, within what the twin leaves open. A recording is held against
-their mean: rounding is no noise (see `likelihood`). And a sample counts by how far they are apart: how a
-motor breaks away after it has stuck hangs on a thousandth of a count, and says nothing."""
+"""Number of rounded and noisy replays about a place, drawn from the twin's posterior. The recording is
+compared with their mean, and their scatter weights each sample: the moment at which a stuck motor breaks away
+depends on a thousandth of a count and is no evidence."""
 TOLERANCE = 0.5
-"""A twin's values may be off by what its fit leaves open, and by so much of the least change that matters
-(95 %). Two values that make up for each other in its own recordings do so no longer once a third has changed:
-were they held where they are, what they leave would be told as a change of something else."""
+"""Tolerated error of a twin's values beyond their intervals (95 %), as a share of the least change. Two
+errors that cancel in the twin's own recordings no longer cancel after a third parameter has changed; without
+this tolerance their residual would be reported as another change."""
 LEAST_SUSPECT = 0.25
-"""Share of that which the slopes have to promise: they say little of what goes out of step."""
+"""Share of `TOLERATED` that the linearised fit must explain for a suspect; slopes do not cover phase loss."""
 TOLERATED = (1.0 / 3.0) ** 2
-"""Mean square that a cause has to explain of some channel, in squares of its noise: what adds less than a
-third of the noise to every channel nobody at the bench would see, and a twin may be off by as much."""
+"""Minimum mean square that a cause must explain in some channel, in squares of its noise: a twin may be off
+by a third of the noise, which nobody at the bench would see."""
 OWN = ("load friction", "temperature", "current limit", "velocity feed-forward")
-"""Looked at in addition to what a fit changes."""
+"""Parameters checked in addition to those that a fit changes."""
 KNOWN_WARMTH = "temperature"
-"""... of which this one is no unknown where both twin and recording tell the temperature."""
+"""Parameter of `OWN` that is known if both twin and recording have the temperature."""
 GROWN = 1.5
-"""Ratio of two misfits of one axis that is a change: without one they differ by their noise and by the legs
-that were recorded."""
+"""Ratio of two misfits above which an axis has changed; smaller ones come from noise and different legs."""
 EXPLAINED = 0.25
-"""Share of the growth, in squares, that a named cause may leave: a misfit changes with the axis."""
+"""Maximum share of the growth, in squares, that may remain after a cause is named by ratio."""
 MOST_NAMED = 2
-"""Causes that are named by ratios, at most."""
+"""Maximum number of causes named by ratio."""
 NOTICEABLE = 2.5
-"""Multiple of the least change that matters which a check has to be able to show."""
+"""Change that a check must be able to show, in units of a parameter's least change."""
 
 
 @dataclass(frozen=True, slots=True)
 class Check:
-    """What has changed, and what of it the twin explains."""
+    """Result of a check: the changes, and the misfit with and without them."""
 
     changes: tuple[Finding, ...]
     misfit_before: Mapping[str, float]
-    """By channel, rms of what the twin leaves, over the scale that it was made with."""
+    """Rms residual of the twin by channel, in units of the noise of its own fit."""
     misfit_after: Mapping[str, float]
     """The same with the changes."""
     unseen: tuple[str, ...] = ()
-    """Causes of which even a large change would not have shown, in this motion or against this twin."""
+    """Causes of which even a large change would not show, in this motion or with this twin."""
     growth_before: Mapping[str, float] = field(default_factory=dict)
-    """By channel, what the twin leaves of this recording over what it left of its own."""
+    """Ratio, by channel, of the twin's misfit to this recording and to its own recordings."""
     growth_after: Mapping[str, float] = field(default_factory=dict)
     """The same with the changes."""
     blind: bool = False
-    """No change of any cause would have shown."""
+    """True if no change of any cause would show."""
 
     @property
     def sentence(self) -> str:
-        """One sentence for somebody at the bench; others of what grew, and of what would not have shown."""
+        """Summary in words: the changes, channels whose misfit has grown, and causes that cannot show."""
         found = ["Nothing has changed since the twin was made"]
         if self.changes:
             found = [f"Changed since the twin was made: {'. '.join(each.text for each in self.changes)}"]
@@ -274,12 +272,12 @@ class Check:
 
     @property
     def unexplained(self) -> dict[str, float]:
-        """What is left with the changes of the channels that are beyond doubt off, as `misfit_after`."""
+        """Channels that the changes do not explain, with their values of `misfit_after`."""
         return {name: times for name, times in self.misfit_after.items() if times > SOFT}
 
     @property
     def grown(self) -> dict[str, float]:
-        """The channels of which more is left, with the changes, than when the twin was made."""
+        """Channels whose misfit has grown in spite of the changes, with their ratios."""
         return {name: times for name, times in self.growth_after.items() if times > GROWN}
 
 
@@ -328,10 +326,10 @@ def _by_ratio(
     grown: dict[str, float],
     progress: Callable[[float], None],
 ) -> Check:
-    """What has changed against a twin that does not explain its axis, by the misfit that it was made with.
+    """Checks against a twin that does not explain its axis, in units of the misfit that it was made with.
 
-    Each cause is fitted alone, in units of that misfit, then with the best one. A cause is named if it
-    explains most of the growth, and no other does as well within the scatter of the legs.
+    Each cause is fitted alone, then with the best one. A cause is named if it explains most of the growth and
+    no other cause does so equally well within the scatter of the legs.
     """
     data = replays.data
     groups: dict[str, tuple[Parameter, ...]] = {}
@@ -376,14 +374,14 @@ def _by_ratio(
 
 
 def _excess(grown: Mapping[str, float]) -> float:
-    """By how much the squares of the channels exceed what the twin was made with, in units of that."""
+    """Returns the sum of the channels' growth in squares, relative to the twin's own misfit."""
     return sum(max(each**2 - 1.0, 0.0) for each in grown.values())
 
 
 def _shows(
     replays: Replays, twin: Truth, own: Sequence[Parameter], misfit: Misfit, noise: Mapping[str, float]
 ) -> bool:
-    """Whether the misfit would grow if one of the parameters changed by a noticeable amount."""
+    """Returns True if a noticeable change of one of the parameters would make the misfit grow."""
     moved = [
         _shifted(twin, each, way * NOTICEABLE * each.least_change) for each in own for way in (-1.0, 1.0)
     ]
@@ -391,7 +389,7 @@ def _shows(
     data = replays.data
     was = scales_by_kind(data, misfit, noise)
     for found in there:
-        # What changes adds to what the twin leaves: by chance they have nothing in common.
+        # The change is uncorrelated with the twin's residuals, so squares add.
         change = {name: np.hypot(found[name] - here[name], was[name]) for name in CHANNELS}
         if max(growth(data, change, misfit, noise).values(), default=0.0) > GROWN:
             return True
@@ -399,7 +397,7 @@ def _shows(
 
 
 def _ratio(own: Sequence[Parameter], before: Truth, after: Truth) -> Finding:
-    """A change by its ratio: neither value is the axis's."""
+    """Reports a change as a ratio, because neither value is the axis's."""
     moved = []
     for each in own:
         (was,), (now,) = coordinates(before, [each]), coordinates(after, [each])
@@ -415,7 +413,7 @@ def _ratio(own: Sequence[Parameter], before: Truth, after: Truth) -> Finding:
 
 
 def _own(data: Data, twin: Truth) -> list[str]:
-    """Those of `OWN` that neither twin nor recording tells: a warmer gear is no other one."""
+    """Returns the parameters of `OWN` that are unknown; a recorded temperature is not a change."""
     path = ".".join(BY_NAME[KNOWN_WARMTH].path)
     told = path in twin.intervals and all(each.commands.start_c is not None for each in data.pieces)
     return [each for each in OWN if not (told and each == KNOWN_WARMTH)]
@@ -423,23 +421,23 @@ def _own(data: Data, twin: Truth) -> list[str]:
 
 @dataclass(frozen=True, eq=False)
 class _Place:
-    """The twin with some causes' parameters fitted, and what the recording says there of all parameters."""
+    """The twin with the parameters of some causes fitted, and the linearised residuals there."""
 
     causes: tuple[str, ...]
     truth: Truth
     off: FloatArray
-    """How far each parameter is from the twin's."""
+    """Distance of each coordinate from the twin's, shape (p,)."""
     slopes: FloatArray
-    """The scaled residuals' derivatives by all of them."""
+    """Derivatives of the scaled residuals with respect to all coordinates, shape (n, p)."""
     left: FloatArray
-    """The scaled residuals."""
+    """Scaled residuals, shape (n,)."""
     apart: FloatArray
-    """How far rounded and noisy replays are apart there, in scales; 1 at least."""
+    """Standard deviation of rounded and noisy replays there, in scales, at least 1; shape (n,)."""
 
 
 @dataclass(frozen=True, eq=False)
 class _Moved:
-    """A cause's parameters: where they are among all, how far from the twin's, and how sure that is."""
+    """Change of a cause's parameters: their indices, distances from the twin's and covariance."""
 
     places: list[int]
     off: FloatArray
@@ -447,12 +445,12 @@ class _Moved:
 
     @property
     def distance(self) -> float:
-        """In squared standard deviations."""
+        """Mahalanobis distance, squared."""
         return float(self.off @ np.linalg.solve(self.covariance, self.off))
 
 
 class _Search:
-    """The causes that may be taken in, and what each earns."""
+    """Search for the causes that explain a recording, starting from the twin."""
 
     def __init__(
         self,
@@ -480,7 +478,7 @@ class _Search:
         self._channels = np.repeat(np.arange(len(CHANNELS)), len(self._rows) // len(CHANNELS))[self._rows]
 
     def at(self, causes: tuple[str, ...], truth: Truth) -> _Place:
-        """What the recording says at a truth, to which these causes have led."""
+        """Linearises the residuals at a truth that was fitted with these causes free."""
         twin = np.array(coordinates(self._twin, self._every))
         here = solve(self._replays, truth, self._every, twin, 0, known=Scales(self._scale), everything=True)
         rng = np.random.default_rng(0)
@@ -502,15 +500,15 @@ class _Search:
 
     @cached_property
     def unchanged(self) -> _Place:
-        """The twin as it was made."""
+        """The twin without changes."""
         return self.at((), self._twin)
 
     def found(self, progress: Callable[[float], None]) -> _Place:
-        """The causes without which the recording cannot be told, and what they have come to."""
+        """Finds the causes that the recording requires, and the place with their fitted parameters."""
         unchanged = self.unchanged
         suspects = [cause for cause in self._causes if self._suspect(cause, unchanged)]
         if np.any(self._squares(unchanged.left) > SOFT**2):
-            # So far off slopes say nothing: a load that rings at another frequency is out of step.
+            # Slopes are invalid so far off: a load that rings at another frequency is out of phase.
             suspects = list(self._causes)
         if not suspects:
             return unchanged
@@ -534,14 +532,14 @@ class _Search:
         return best if best.causes else unchanged
 
     def worsens(self, place: _Place) -> bool:
-        """Whether one channel is better at the cost of another: that is none of what has changed."""
+        """Returns True if a place improves one channel at the cost of another, so it is not a change."""
         now, was = (
             self._squares(np.minimum(np.abs(each.left), SOFT)) / SOFT**2 for each in (place, self.unchanged)
         )
         return bool(np.any(now > np.maximum(was, LOST)))
 
     def _needed(self, causes: tuple[str, ...]) -> _Place:
-        """The place without the causes that others, and what the twin leaves open, make up for."""
+        """Removes causes that the other causes and the twin's uncertainty can replace."""
         best, tried = self._as(causes), set[str]()
         while rest := sorted(set(best.causes) - tried, key=lambda cause: self._moved(cause, best).distance):
             cause = rest[0]
@@ -556,7 +554,7 @@ class _Search:
         return best
 
     def _settle(self, causes: tuple[str, ...], start: Truth, near: _Place) -> None:
-        """Reach the place of some causes, all other parameters along within what the twin leaves open."""
+        """Fits some causes freely, and all other parameters within the twin's uncertainty."""
         parameters = tuple(
             replace(each, spread=float(spread))
             for each, spread in zip(self._every, self._spreads(causes), strict=True)
@@ -575,17 +573,17 @@ class _Search:
                 near=fit,
                 tempered=True,
             )
-            # Those that are still beyond `SOFT` would draw all parameters along, which none can tell.
+            # Samples that are still beyond `SOFT` cannot be explained and would bias all parameters.
             start, apart = fit.truth, np.where(np.abs(fit.vector) > SOFT, np.inf, apart)
         self._reached.append(self.at(causes, start))
 
     def _rounded(self, apart: FloatArray, blunt: float) -> Scales:
-        """What readings are rounded to, and how far off replays are beyond that, row by row."""
+        """Returns scales with the rounding of the readings, and the error of replays by row."""
         off = {name: max(self._fine[name], blunt * self._scale[name]) for name in CHANNELS}
         return Scales(self._scales_of(apart, off), self._steps)
 
     def _spreads(self, causes: tuple[str, ...]) -> FloatArray:
-        """By parameter, how far it may be from the twin's where these causes have changed."""
+        """Returns the prior standard deviation of each parameter about the twin if these causes are free."""
         open_by = np.sqrt(np.sum(np.square(self._root), axis=1))
         return np.array(
             [
@@ -595,15 +593,15 @@ class _Search:
         )
 
     def _without(self, cause: str, kept: tuple[str, ...], at: _Place) -> Truth:
-        """Where the slopes say that all others go if a cause is put back.
+        """Returns the truth with a cause reset to the twin and the others moved to their linear optimum.
 
-        Left where they are, they would make up for a change that there is no more: so far off that a fit
-        from there may never come back.
+        Without that move, the others would still compensate for the removed change, and a fit from there
+        might not converge.
         """
         own = np.array([each.cause == cause for each in self._every])
         weak = np.diag(1.0 / self._spreads(kept)[~own])
         rows = np.vstack([at.slopes[:, ~own], weak])
-        # As if from the twin's values on, so that the prior is about nothing.
+        # Relative to the twin's values, so that the prior's mean is zero.
         left = np.concatenate([at.left - at.slopes @ at.off, np.zeros(len(weak))])
         others = [each for each in self._every if each.cause != cause]
         off = -np.linalg.lstsq(rows, left, rcond=None)[0]
@@ -612,22 +610,22 @@ class _Search:
         return at_coordinates(self._put_back(cause, at.truth), others, there.tolist())
 
     def _put_back(self, cause: str, truth: Truth) -> Truth:
-        """A truth with a cause's parameters as the twin has them."""
+        """Returns a truth with a cause's parameters reset to the twin's."""
         own = [each for each in self._every if each.cause == cause]
         return at_coordinates(truth, own, coordinates(self._twin, own))
 
     def _pull(self, numbers: Sequence[int], at: _Place) -> float:
-        """How far parameters have gone along, in squared standard deviations of what the twin leaves open."""
+        """Returns the squared Mahalanobis distance of parameters from the twin, by the twin's covariance."""
         off, root = at.off[numbers], self._root[numbers]
         return float(off @ np.linalg.solve(root @ root.T, off))
 
     def _pulled(self, cause: str, best: _Place) -> bool:
-        """Whether a cause has gone along by more than chance."""
+        """Returns True if a cause that is held to the twin has moved by more than chance."""
         own = [number for number, each in enumerate(self._every) if each.cause == cause]
         return float(chdtrc(len(own), self._pull(own, best))) < FALSE_ALARM / len(self._causes)
 
     def change(self, cause: str, best: _Place, gain: tuple[float, float]) -> Finding:
-        """What is said of a cause."""
+        """Returns the finding of a cause, with intervals of its parameters."""
         moved = self._moved(cause, best)
         parameters = [self._every[place] for place in moved.places]
         now = np.array(coordinates(self._twin, parameters)) + moved.off
@@ -640,7 +638,7 @@ class _Search:
         return finding(parameters, self._twin, after, intervals, moved.distance, gain)
 
     def unseen(self, best: _Place) -> tuple[str, ...]:
-        """The causes of which no parameter's change is known to better than what was possible before."""
+        """Returns the causes whose parameters the recording does not determine better than the prior."""
         found = []
         for cause in (each for each in self._causes if each not in best.causes):
             moved = self._moved(cause, best, cause)
@@ -650,7 +648,7 @@ class _Search:
         return tuple(found)
 
     def _contenders(self, best: _Place, suspects: Sequence[str]) -> list[tuple[str, Truth]]:
-        """The suspects of which a parameter, moved alone, explains more than it costs, and where it does."""
+        """Returns suspects that explain more than they cost by one moved parameter, with these truths."""
         moves = [
             (each, way * size * each.least_change)
             for each in self._every
@@ -674,7 +672,7 @@ class _Search:
         return 0.5 * float(left @ left)
 
     def _scales_of(self, apart: FloatArray, scale: Mapping[str, float] | None = None) -> dict[str, Any]:
-        """The scale of each channel, the noise's unless it is another, row by row."""
+        """Returns the scale of each row by channel: ``scale`` (default: the noise) times ``apart``."""
         scale = self._scale if scale is None else scale
         rows = np.ones(len(self._rows))
         rows[self._rows] = apart
@@ -682,9 +680,9 @@ class _Search:
         return {name: scale[name] * each for name, each in by_channel}
 
     def _moved(self, cause: str, at: _Place, *more: str, trusted: bool = False) -> _Moved:
-        """How far a cause has moved next to the place's own, all other parameters as the twin leaves them.
+        """Estimates a cause's change with the place's causes free and the others held to the posterior.
 
-        ``trusted``: a twin is off by no more than it says.
+        ``trusted``: without the tolerance for errors of the twin beyond its covariance.
         """
         free = [number for number, each in enumerate(self._every) if each.cause in (*at.causes, *more)]
         precision = np.array([each.spread for each in self._every]) ** -2.0
@@ -697,12 +695,12 @@ class _Search:
         return _Moved(places, at.off[places] + found.by[own], found.covariance[np.ix_(own, own)])
 
     def _price(self, cause: str) -> float:
-        """What a cause costs by its number of parameters (Schwarz)."""
+        """Returns the penalty of a cause for its number of parameters (Schwarz criterion, BIC)."""
         count = sum(each.cause == cause for each in self._every)
         return count * math.log(max(len(self._replays.data.leg), 2))
 
     def _suspect(self, cause: str, best: _Place) -> bool:
-        """Whether the slopes leave it open that a cause explains what matters."""
+        """Returns True if a cause may be relevant by the linearised fit."""
         free = [number for number, each in enumerate(self._every) if each.cause in (*best.causes, cause)]
         slopes = best.slopes[:, free]
         after = best.left - slopes @ np.linalg.lstsq(slopes, best.left, rcond=None)[0]
@@ -712,7 +710,7 @@ class _Search:
         )
 
     def _matters(self, cause: str, found: _Place) -> bool:
-        """Whether a cause explains more than a twin may leave."""
+        """Returns True if a cause explains more than the tolerated error of a twin."""
         back = self._put_back(cause, found.truth)
         with_it, without = (
             told(each, Scales(self._scales_of(found.apart)), self._rows)
@@ -721,21 +719,20 @@ class _Search:
         return bool(np.any(self._squares(without) - self._squares(with_it) > TOLERATED))
 
     def _as(self, causes: tuple[str, ...]) -> _Place:
-        """The place that says most for these causes and no others, of all that have been reached.
+        """Returns the most likely of all places reached so far, evaluated with exactly these causes free.
 
-        A fit does not always come to its minimum, and where a motor sticks there is chance in what it leaves:
-        were causes judged each where its own fit has come to, that would decide. What a fit with more causes
-        has found speaks for fewer, too, if the rest of them has hardly moved there; and what went along in
-        a fit with fewer may be a cause.
+        A fit does not always reach its minimum, and the residuals of a sticking motor are partly random, so
+        judging each set of causes only at the end of its own fit would be unfair. The result of a fit with
+        more causes also supports fewer if the rest hardly moved, and a parameter that drifted in a fit with
+        fewer may be a cause.
         """
         return min((replace(each, causes=causes) for each in self._reached), key=self._evidence)
 
     def _evidence(self, at: _Place) -> float:
-        """What a place leaves, how far it is from the twin, and what its causes cost: less is better.
+        """Returns the negative log posterior of a place with the penalty of its causes; smaller is better.
 
-        Minus the log likelihood. Where replays are further apart a place foretells less, and pays for it. A
-        sample that is further off than `SOFT` says no more than one that is as far off: it comes of a motor
-        that broke away at another time, and a few of them would outweigh all others.
+        A place with scattered replays predicts less and is penalised for it. Residuals are clipped at `SOFT`:
+        larger ones come from a motor that broke away at another time, and a few would outweigh all others.
         """
         left = np.minimum(np.abs(at.left), SOFT)
         others = [number for number, each in enumerate(self._every) if each.cause not in at.causes]
@@ -744,17 +741,17 @@ class _Search:
         return 0.5 * (float(left @ left) + wide + along + sum(map(self._price, at.causes)))
 
     def _squares(self, left: FloatArray) -> FloatArray:
-        """Mean square by channel."""
+        """Returns the mean square by channel."""
         counts = np.bincount(self._channels, minlength=len(CHANNELS))
         sums = np.bincount(self._channels, np.square(left), minlength=len(CHANNELS))
         return np.asarray(sums / np.maximum(counts, 1), dtype=np.float64)
 
     def _certain(self, moved: _Moved) -> bool:
-        """Whether a cause has moved beyond what is open."""
+        """Returns True if a change is significant."""
         return float(chdtrc(len(moved.places), moved.distance)) < FALSE_ALARM / len(self._causes)
 
     def _significant(self, cause: str, at: _Place) -> bool:
-        """... and by as much as matters."""
+        """Returns True if a cause's change is significant and as large as matters in practice."""
         moved = self._moved(cause, at)
         off, spread = np.abs(moved.off), np.sqrt(np.diag(moved.covariance))
         least = np.array([self._every[place].least_change for place in moved.places])
@@ -762,7 +759,7 @@ class _Search:
 
 
 def _shifted(truth: Truth, parameter: Parameter, by: float) -> Truth:
-    """The truth with one coordinate moved, within its bounds."""
+    """Returns the truth with one coordinate moved, within its bounds."""
     low, high = parameter.bounds
     (now,) = coordinates(truth, [parameter])
     return at_coordinates(truth, [parameter], [min(max(now + by, low), high)])

@@ -1,10 +1,11 @@
-"""What a part of a recording told the drive, on the grid of its own cycle, with the approach before it.
+"""Commands of a part of a recording, on the grid of its own cycle, preceded by an approach.
 
-Before a recording nothing is known of the axis, so the replay begins on a drive that is switched on at its
-angle zero and led to the first command at the axis's limits; so does each part that does not follow another
-one. Where it begins on a drive that holds the axis, the torque that it tells is where the loops have come to;
-where it tells the temperature, the axis is as warm.
-Between parts that follow each other the drive is switched off, as the bench does, and the load rings on.
+The state before a recording is unknown, so the replay switches the drive on at its angle zero and moves to
+the first command at the axis's limits; so does each part that does not follow another one. If the recording
+begins with the drive holding the axis, its torque sets the integrals of the loops; a recorded temperature
+sets the axis's.
+Between parts that follow each other the drive is switched off, as on the bench, and the load continues to
+ring.
 """
 
 from __future__ import annotations
@@ -26,57 +27,57 @@ from hdbridge.sim.truth import Truth
 from hdbridge.twin.stretches import just_on
 
 STANDING_S = 0.3
-"""The axis stands so long between the approach and a recording that begins at rest."""
+"""Standstill between the approach and a recording that begins at rest."""
 SETTLING_S = 1.5
-"""... and so long where the recording begins on a drive that holds it: loops of 4/s have come to rest too."""
+"""The same if the recording begins with the drive on: long enough for loops with a gain of 4/s."""
 UNEVEN = 0.25
-"""Share of a cycle by which a sample's time may be off the cycle's grid."""
+"""Maximum deviation of a sample's time from the grid; cycles."""
 MOSTLY = 0.95
-"""Share of the samples that have to be so near: a master that stamps some rows late sent them in time."""
+"""Minimum share of samples within `UNEVEN`: a few late stamps do not mean late commands."""
 REST_S = 0.1
-"""The command rests this long between two legs of a recording that names none: loops answer in some ms."""
+"""Minimum rest of the command between two legs if the recording names no legs."""
 RINGS_S = 1.0
-"""A leg ends this long after its command has come to rest; a longer standstill belongs to none."""
+"""Time from the end of a leg's motion to the end of the leg; a longer standstill belongs to no leg."""
 LEAST_LEG_S = 0.4
-"""Such a leg lasts at least this long: an acceleration and the ringing of a load at 15 Hz."""
+"""Minimum length of such a leg: an acceleration and the ringing of a load at 15 Hz."""
 SIGN_SHARE = 0.2
-"""Share of the mean torque by which it has to oppose the motion, for its sign to be wrong."""
+"""Share of the mean torque that must oppose the motion for the sign to be wrong."""
 TORQUE_MARGIN = 1.5
-"""Ratio of a torque to the axis's limit beyond which it is in a different unit."""
+"""Ratio of a torque to the axis's limit above which its unit must be wrong."""
 AHEAD_CYCLES = 0.5
-"""Cycles by which a motor that leads its command shows that the command was logged late."""
+"""Lead of the motor over its command above which the command was logged late; cycles."""
 MOVING_DEG_S = 5.0
-"""Motor speed from which the direction of friction is beyond doubt."""
+"""Motor speed above which the direction of friction is certain."""
 OFF_AFTER, ON_BEFORE = 2, 1
-"""The bench switches a drive off so many cycles after the last row of a procedure, once it has come to rest,
-and on again so many before the first row of the next."""
+"""Cycles between the last row of a procedure and switching off on the bench, and between switching on and the
+first row of the next procedure."""
 
 
 @dataclass(frozen=True, eq=False)
 class Commands:
-    """What one part of a recording told the drive, cycle by cycle, with the approach before it."""
+    """Commands of one part of a recording by cycle, preceded by the approach."""
 
     counts: tuple[float, ...]
-    """Demand of the motor in counts at the end of each cycle; begins where the drive is switched on."""
+    """Motor demand at the end of each cycle, from switching on; counts."""
     lead: int
-    """How many of them are the approach."""
+    """Number of cycles of the approach."""
     row_cycles: FloatArray
-    """Where each row of the part lies, in cycles since the approach's end (fractional where uneven)."""
+    """Time of each row since the end of the approach, in cycles (fractional if uneven)."""
     time_s: FloatArray
     """Time of each row."""
     cycle_s: float
     told_nm: FloatArray | None = None
-    """The torque on the load that was told, in each of the cycles (in the approach the first); None: none."""
+    """Recorded torque on the load by cycle (during the approach its first value); None if not recorded."""
     off: tuple[slice, ...] = ()
     """Cycles in which the drive is switched off."""
     held: tuple[tuple[int, float], ...] = ()
-    """Cycles before which the loops are brought to hold the axis by a torque, and that torque in Nm."""
+    """Cycles before which the loops' integrals are set to a holding torque, and that torque in Nm."""
     start_c: float | None = None
-    """Temperature that the axis begins at; None: the truth's own."""
+    """Initial temperature of the axis; None: the truth's own."""
 
 
 def commands_of(part: Record, axis: AxisConfig, truth: Truth) -> Commands:
-    """The commands of a record in one piece, on the grid of its own cycle, with the approach before them."""
+    """Returns the commands of a part on the grid of its own cycle; InputError without usable commands."""
     target = part.motor_target_deg
     name = f"{part.source}: " if part.source else ""
     if target is None or np.isnan(target).any():
@@ -93,7 +94,7 @@ def commands_of(part: Record, axis: AxisConfig, truth: Truth) -> Commands:
     gaps = [first for first in part.starts[1:] if just_on(part, first)]
     nodes, values = cycles, target
     for first in gaps:
-        # After its last row a procedure goes on as it slowed down, no further than where the next one begins.
+        # After its last row a procedure continues to slow down, but not beyond the start of the next one.
         later = np.arange(1.0, OFF_AFTER + 1.0)
         earlier, before, last, rest = target[[max(first - 3, 0), first - 2, first - 1, first]]
         slowing = last - 2.0 * before + earlier
@@ -103,7 +104,7 @@ def commands_of(part: Record, axis: AxisConfig, truth: Truth) -> Commands:
     order = np.argsort(nodes, kind="stable")
     demand_deg = np.interp(grid, nodes[order], values[order])
     if grid[-1] > cycles[-1]:
-        # The motion goes on to the end of its cycle: the last row lies within that.
+        # Extrapolate to the end of the cycle that the last row lies in.
         speed = (target[-1] - target[-2]) / (cycles[-1] - cycles[-2])
         demand_deg[-1] = target[-1] + speed * (grid[-1] - cycles[-1])
     recorded = np.round(axis.motor_encoder.counts(1.0) * demand_deg).tolist()
@@ -132,7 +133,7 @@ def commands_of(part: Record, axis: AxisConfig, truth: Truth) -> Commands:
 
 
 def cycle_of(part: Record, axis: AxisConfig) -> float:
-    """A record's own cycle in seconds, as 60C2h can express it; the axis's own where they agree."""
+    """Returns a record's cycle in seconds, as 60C2h can express it, or the axis's if they agree."""
     own_ms = 1e3 * float(np.median(np.diff(part.time_s)))
     if not own_ms > 0.0:
         raise InputError(f"{part.source or 'the record'}: its time stands still; expected rising times")
@@ -145,7 +146,7 @@ def cycle_of(part: Record, axis: AxisConfig) -> float:
 def _approach(
     truth: Truth, axis: AxisConfig, demand_deg: FloatArray, cycle_s: float, standing_s: float
 ) -> list[int]:
-    """From where the simulated drive is switched on to the first command, and its speed, at the limits."""
+    """Plans the motion from the switch-on position to the first command and its speed, at the limits."""
     ratio, limits = axis.gear.ratio, axis.limits
     start_counts = truth.motor.encoder.zero_counts
     start_deg = axis.motor_encoder.degrees(start_counts) / ratio
@@ -176,9 +177,9 @@ def _approach(
 
 
 def counted_cycles(time_s: FloatArray, cycle_s: float) -> FloatArray:
-    """Cycle number of each row, from zero; fractional if the rows do not follow the cycle.
+    """Returns the cycle number of each row, from zero; fractional if the rows do not follow the cycle.
 
-    Rows are counted: a stamp that is late does not make its command late. Gaps count as whole cycles.
+    Rows are counted, because a late stamp does not mean a late command. Gaps count as whole cycles.
     """
     cycles: FloatArray = (time_s - time_s[0]) / cycle_s
     counted: FloatArray = np.concatenate([[0.0], np.cumsum(np.maximum(np.round(np.diff(cycles)), 1.0))])
@@ -189,14 +190,14 @@ def counted_cycles(time_s: FloatArray, cycle_s: float) -> FloatArray:
 
 
 def legs_of(recording: Recording) -> tuple[Segment, ...]:
-    """The recording's legs; if it names none, its motions from rest to rest or from turn to turn."""
+    """Returns the recording's legs; if it names none, its motions between rests and reversals."""
     if recording.segments:
         return recording.segments
     return tuple(leg for part in recording.record.parts() for leg in _legs_of_command(part))
 
 
 def _legs_of_command(part: Record) -> Iterator[Segment]:
-    """Legs of a part by its command; the part as a whole without one."""
+    """Yields the legs of a part by its command, or the whole part without one."""
     time_s, target = part.time_s, part.motor_target_deg
     cuts, moved_s = [float(time_s[0])], [float(time_s[-1])]
     if target is not None and len(part) > 2:
@@ -215,7 +216,7 @@ def _legs_of_command(part: Record) -> Iterator[Segment]:
 
 
 def doubts(recording: Recording, axis: AxisConfig) -> tuple[str, ...]:
-    """What looks wrong with torque and command of a recording, each in a sentence with what to do."""
+    """Returns suspected faults of a recording's torque and command, each in a sentence with a remedy."""
     lags, forward, backward = [], [], []
     for part in recording.record.parts():
         target, torque_nm = part.motor_target_deg, part.columns.get(Channel.MOTOR_TORQUE.value)

@@ -1,7 +1,7 @@
-"""A measured and a simulated record of the same commands, side by side: how far apart they are, and where.
+"""Comparison of a measured and a simulated record of the same commands.
 
-Every channel has its unit, and beside each difference stands the noise that the measured channel has: a
-simulation can be no nearer than that. Pure.
+Each difference is given with the noise of the measured channel, which is the best that a simulation can
+reach. Pure.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ from hdbridge.units import ARCSEC_PER_DEG
 
 SPECTRUM_SAMPLES: Final = 1024
 SHORTEST: Final = 32
-"""Samples of the shortest part that has a spectrum."""
+"""Minimum samples of a part for a spectrum."""
 
 
 @dataclass(frozen=True, eq=False)
 class Trace:
-    """A signal of both records over time, for a picture."""
+    """A signal of both records over time."""
 
     time_s: FloatArray
     measured: FloatArray
@@ -39,7 +39,7 @@ class Trace:
 
     @property
     def difference(self) -> FloatArray:
-        """Measured less simulated."""
+        """Measured minus simulated."""
         return self.measured - self.simulated
 
 
@@ -54,7 +54,7 @@ class Spectrum:
 
 
 def spectrum_of(trace: Trace, parts: Sequence[slice]) -> Spectrum | None:
-    """Welch's estimate over the parts, on an even grid; None where all are too short."""
+    """Estimates the spectrum over the parts by Welch's method; None if all parts are too short."""
     steps = np.concatenate([np.diff(trace.time_s[part]) for part in parts])
     period_s = float(np.median(steps)) if len(steps) else 0.0
     if period_s <= 0.0:
@@ -87,26 +87,25 @@ def spectrum_of(trace: Trace, parts: Sequence[slice]) -> Spectrum | None:
 
 
 # ----------------------------------------------------------------
-# When a load has settled after a stop, and by how much noise moves that. Pure.
+# Settling time of the load after a stop, and its scatter by noise. Pure.
 
 SETTLED_ARCSEC: Final = 10.0
-"""A load that swings by less than this about where it comes to rest has settled: three motor counts of 8000
-at a ratio of 50."""
+"""Amplitude about the rest position below which a load has settled: three motor counts (8000, ratio 50)."""
 SETTLED_NOISE: Final = 5.0
-"""... or by less than so many times the noise of the load's reading, where that is more."""
+"""The same in units of the load reading's noise, if that is larger."""
 OVER_S: Final = 0.04
-"""How far it swings is root two times its rms over so long: half a period of the slowest ringing, 15 Hz."""
+"""Window of the rms amplitude: half a period of the slowest ringing, 15 Hz."""
 SHORTEST_SWING: Final = 4
 DRAWS: Final = 24
 
 
 def band_arcsec(noise_arcsec: float) -> float:
-    """Within what a load of this noise has settled."""
+    """Returns the amplitude below which a load with this noise has settled."""
     return max(SETTLED_ARCSEC, SETTLED_NOISE * noise_arcsec)
 
 
 def settling_s(time_s: FloatArray, load_arcsec: FloatArray, noise_arcsec: float, band: float) -> float:
-    """Time from the first sample, where the command rests, until the load stays settled."""
+    """Returns the time from the first sample, when the command stops, until the load stays settled."""
     length = min(max(SHORTEST_SWING, round(OVER_S / float(np.median(np.diff(time_s))))), len(time_s))
     squares = np.square(load_arcsec - _rest_arcsec(load_arcsec))
     swing = 2.0 * (np.convolve(squares, np.full(length, 1.0 / length), mode="valid") - noise_arcsec**2)
@@ -117,7 +116,7 @@ def settling_s(time_s: FloatArray, load_arcsec: FloatArray, noise_arcsec: float,
 def scatter_s(
     time_s: FloatArray, load_arcsec: FloatArray, noise_arcsec: float, band: float, noises: Sequence[float]
 ) -> float:
-    """By how much two settling times of a load that moves so are apart, rms, for readings of these noises."""
+    """Returns the rms difference of two settling times of this motion that noise of these sizes causes."""
     rng = np.random.default_rng(0)
     own = settling_s(time_s, load_arcsec, noise_arcsec, band)
     squares = 0.0
@@ -129,7 +128,7 @@ def scatter_s(
 
 
 def overshoot_arcsec(load_arcsec: FloatArray, way: float) -> float:
-    """How far it goes beyond where it comes to rest; ``way`` is the sign of the motion before."""
+    """Returns the overshoot beyond the rest position; ``way`` is the sign of the motion before."""
     return max(0.0, float(np.max(way * (load_arcsec - _rest_arcsec(load_arcsec)))))
 
 
@@ -141,7 +140,7 @@ def _rest_arcsec(load_arcsec: FloatArray) -> float:
 
 Rows = NDArray[np.bool_]
 ALL: Final = "all"
-"""The kind that stands for the whole record."""
+"""Kind of leg for the whole record."""
 LOAD_ERROR, FOLLOWING_ERROR, MOTOR_TORQUE = "load_error", "following_error", "motor_torque"
 TEMPERATURE: Final = "temperature"
 SETTLING_TIME, OVERSHOOT = "settling_time", "overshoot"
@@ -157,19 +156,19 @@ TITLES: Final[Mapping[str, str]] = {
 }  # fmt: skip
 
 STAND_S: Final = 0.2
-"""The command stands so long after a motion for the stop to count."""
+"""Minimum rest of the command after a motion for a stop to count."""
 SIGHT_S: Final = 1.0
-"""How long after a stop settling is looked for, at most: servo axes of this kind settle in tenths of it."""
+"""Maximum time after a stop in which settling is evaluated; such servo axes settle in tenths of it."""
 CALM_S: Final = 0.3
-"""After so long at rest what a stop has excited is over, and what is left is noise."""
+"""Time at rest after which the ringing of a stop has ended and only noise remains."""
 MOVING_DEG_S: Final = 0.05
-"""Motor speed of the command above which it moves."""
+"""Motor speed above which the command counts as moving."""
 LEAST_SAMPLES: Final = 8
 
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """One figure of both records, of one kind of motion."""
+    """One figure of both records for one kind of motion."""
 
     channel: str
     """A signal, `settling_time`, `overshoot`, or `noise_at_rest:` and `noise_in_motion:` with a signal."""
@@ -180,26 +179,26 @@ class Row:
     """Rms of a signal (the load error's about its mean); mean of a settling time or overshoot; a noise."""
     simulated: float
     difference: float
-    """Rms of the difference, sample by sample or stop by stop; of a noise how far the two are apart."""
+    """Rms difference of samples or stops; for a noise, the absolute difference."""
     noise: float
-    """What two equal axes would differ by: the noise of the measured channel, or of the figure."""
+    """Difference expected between two equal axes: the noise of the measured channel or of the figure."""
     count: int
-    """Samples, or stops."""
+    """Number of samples or stops."""
 
     @property
     def in_noise(self) -> float:
-        """The difference in units of the noise; infinite where there is none."""
+        """Difference in units of the noise; infinite without noise."""
         return self.difference / self.noise if self.noise else math.inf if self.difference else 0.0
 
     @property
     def share(self) -> float:
-        """The difference as a share of what was measured."""
+        """Difference as a share of the measured value."""
         return self.difference / self.measured if self.measured else math.inf if self.difference else 0.0
 
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """How far two records are apart."""
+    """Figures, traces and spectra of a measured and a simulated record."""
 
     rows: tuple[Row, ...]
     traces: Mapping[str, Trace]
@@ -207,11 +206,11 @@ class Comparison:
     spectra: Mapping[str, Spectrum]
 
     def row(self, channel: str, kind: str = ALL) -> Row | None:
-        """The figure of a channel; None where the records do not have it."""
+        """Returns the figure of a channel, or None if the records do not have it."""
         return next((each for each in self.rows if (each.channel, each.kind) == (channel, kind)), None)
 
     def as_dict(self) -> dict[str, Any]:
-        """The figures for machines."""
+        """Returns the figures for JSON."""
         return {
             "figures": [
                 {
@@ -231,7 +230,7 @@ class Comparison:
 
 @dataclass(frozen=True, eq=False)
 class _Signals:
-    """One record's signals, part by part; all of one length."""
+    """Signals of one record; arrays of shape (n,)."""
 
     time_s: FloatArray
     command_deg: FloatArray
@@ -241,12 +240,12 @@ class _Signals:
 
 
 def compare(measured: Record, simulated: Record, legs: Sequence[Segment], ratio: float) -> Comparison:
-    """The figures, by kind of leg and over all, with traces and spectra.
+    """Compares two records by kind of leg and as a whole.
 
-    Both records have the same rows. What the two encoders' zeros are apart is taken off in each part of the
-    measured record, and so is by what command and motor are apart wherever it rests: zeros, too. Rows where
-    the load may still ring of what nobody knows are in no figure, nor is the torque of a motor that stands.
-    InputError where the rows do not agree, or there is no command.
+    Both records must have the same rows. Offsets between the encoders' zeros, and between command and motor
+    at rest, are removed in each part of the measured record. Rows in which the load may still ring from an
+    unknown motion are excluded, and so is the torque of a motor at standstill. InputError if the numbers of
+    rows differ or there is no command.
     """
     if len(measured) != len(simulated):
         raise InputError(
@@ -304,7 +303,7 @@ def _signals(record: Record, ratio: float, parts: Sequence[slice]) -> _Signals:
 
 
 def _groups(time_s: FloatArray, legs: Sequence[Segment], known: Rows) -> dict[str, Rows]:
-    """Which of the known rows belong to each kind of leg; the whole record first."""
+    """Returns the mask of the known rows of each kind of leg, the whole record first."""
     groups = {ALL: known}
     for leg in legs:
         inside = groups.setdefault(leg.kind, np.zeros(len(time_s), dtype=np.bool_))
@@ -313,7 +312,7 @@ def _groups(time_s: FloatArray, legs: Sequence[Segment], known: Rows) -> dict[st
 
 
 def _moving(real: _Signals, parts: Sequence[slice]) -> Rows:
-    """Whether the command moves."""
+    """Returns the mask of rows in which the command moves."""
     moves = np.zeros(len(real.time_s), dtype=np.bool_)
     for part in parts:
         if part.stop - part.start > 1:
@@ -324,7 +323,7 @@ def _moving(real: _Signals, parts: Sequence[slice]) -> Rows:
 
 
 def _since_motion_s(time_s: FloatArray, moves: Rows, parts: Sequence[slice]) -> FloatArray:
-    """How long the command has stood, in each part; endless before its first motion."""
+    """Returns the time since the command last moved, by part; infinite before its first motion."""
     since = np.full(len(time_s), np.inf)
     for part in parts:
         rows = np.where(moves[part], np.arange(part.start, part.stop), -1)
@@ -349,8 +348,8 @@ def _of_signal(
         apart = _rms(one[inside] - other[inside])
         noise = noise_of(one, inside, parts)
         if name == TEMPERATURE:
-            # A replay begins at a reading: its own rounding and that one's are a step together, at most. A
-            # reading that stays the same says nothing of how long its step is.
+            # A replay starts at a reading, so both roundings add up to one step at most. A constant reading
+            # does not show its step.
             noise *= math.sqrt(12.0)
             if not noise:
                 return
@@ -367,9 +366,9 @@ def _of_signal(
 
 
 def noise_of(values: FloatArray, which: Rows, parts: Sequence[slice]) -> float:
-    """Noise of a signal's samples, rms: what third differences leave, no less than its resolution allows.
+    """Estimates the rms noise of a signal from third differences; at least that of its resolution.
 
-    A motion that is smooth over four samples is not in it. A reading in steps of q is off by q / sqrt(12).
+    Motion that is smooth over four samples does not contribute. A resolution q makes a noise of q / sqrt(12).
     """
     squares = count = 0.0
     resolution = math.inf
@@ -386,7 +385,7 @@ def noise_of(values: FloatArray, which: Rows, parts: Sequence[slice]) -> float:
 
 
 def _stands(measured: Record, parts: Sequence[slice], count_deg: float) -> Rows:
-    """Whether the motor stands: by what torque hangs on a thousandth of a count."""
+    """Returns the mask of rows at standstill, where the torque depends on a thousandth of a count."""
     target, motor = measured.motor_target_deg, measured.motor_position_deg
     assert target is not None
     still = [
@@ -399,7 +398,7 @@ def _stands(measured: Record, parts: Sequence[slice], count_deg: float) -> Rows:
 
 
 def _least(changes: FloatArray, values: FloatArray) -> float:
-    """The least of a reading's changes, beyond what arithmetic leaves of none."""
+    """Returns the smallest change of a reading above rounding errors."""
     beyond, size = 1e-9 * float(np.max(np.abs(values), initial=1.0)), np.abs(changes)
     return float(np.min(size, where=size > beyond, initial=math.inf))
 
@@ -409,16 +408,16 @@ class _Stop:
     """One stop in both records."""
 
     moved: int
-    """A row of the motion before it."""
+    """Last row of the motion before it."""
     settled_s: tuple[float, float]
     overshoot_arcsec: tuple[float, float]
     noise_arcsec: float
     scatter_s: float
-    """By how much the two settling times are apart by noise alone."""
+    """Rms difference of the two settling times due to noise."""
 
 
 def _stops(real: _Signals, twin: _Signals, parts: Sequence[slice]) -> Iterator[_Stop]:
-    """Where the command comes to rest after a motion, and stays."""
+    """Yields the stops: places at which the command comes to rest after a motion and stays."""
     moves = _moving(real, parts)
     for part in parts:
         edges = np.flatnonzero(moves[part][:-1] & ~moves[part][1:]) + part.start + 1

@@ -1,7 +1,7 @@
-"""A plant from the axis file alone: what a twin is before anything of it has been measured.
+"""Default plant from the axis file alone: the twin before any measurement.
 
-Each value that the axis file does not say is a usual one for servo axes of this kind, in proportion to what
-it does say. They are where a fit starts, and stand in where nothing measured contradicts them.
+Each value that is not in the axis file is a usual one for servo axes of this kind, in proportion to the
+values in it. These are the start values of a fit, and remain unless a measurement contradicts them.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from hdbridge.twin.parameters import Parameter, with_load_encoder, with_values
 
 @dataclass(frozen=True, slots=True)
 class Usual:
-    """A number that is assumed, with its unit and where it comes from."""
+    """An assumed value, with its unit and source."""
 
     value: float
     unit: str
@@ -69,7 +69,7 @@ SUBSTEP_MS: Final = 0.5
 
 
 def default_truth(axis: AxisConfig) -> Truth:
-    """The simulated drive where only the axis file is known: no transmission error, usual mechanics."""
+    """Returns the simulated drive for an axis file: no transmission error, usual mechanics."""
     ratio, rated_nm = axis.gear.ratio, axis.drive.rated_torque_nm
     inertia = rated_nm / TORQUE_PER_INERTIA.value
     load_inertia = INERTIA_RATIO.value * inertia * ratio**2
@@ -121,7 +121,7 @@ def default_truth(axis: AxisConfig) -> Truth:
 
 
 def with_sections(truth: Truth, parameters: Iterable[Parameter]) -> Truth:
-    """The same simulated drive, with the sections that these parameters belong to."""
+    """Returns the truth with the sections of these parameters added, without effect where possible."""
     wanted = {section for each in parameters for section in each.path}
     if truth.motor.stribeck is None and "stribeck" in wanted:
         truth = with_values(truth, {"friction's rise at rest": 0.0, "Stribeck speed": STRIBECK_RAD_S.value})

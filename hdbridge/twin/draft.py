@@ -1,4 +1,4 @@
-"""A truth file that is being written, effect by effect."""
+"""Draft of a truth file, written effect by effect."""
 
 from __future__ import annotations
 
@@ -15,25 +15,25 @@ ARCSEC_PER_RAD = math.degrees(1.0) * ARCSEC_PER_DEG
 
 @dataclass(frozen=True, slots=True)
 class Said:
-    """What became of an effect: where it went, and what is different there."""
+    """Result of translating an effect: its place in the truth file, and notes on differences."""
 
     counterpart: str | None
     notes: tuple[str, ...] = ()
 
 
 def none(why: str) -> Said:
-    """The plant has no counterpart."""
+    """Returns the result for an effect without a counterpart in the plant."""
     return Said(None, (why,))
 
 
 @dataclass(slots=True)
 class Draft:
-    """The content of a truth file, `data`, to be changed in place."""
+    """Content of a truth file, `data`, which is changed in place."""
 
     data: dict[str, Any]
     axis: AxisConfig
     tells_servo: bool
-    """Whether the drive's feed-forward follows the load that is written (it was commissioned for it)."""
+    """True if the drive's feed-forward is set to the load that is written, as after commissioning."""
 
     @property
     def gear(self) -> dict[str, Any]:
@@ -46,7 +46,7 @@ class Draft:
         return self.part("load")
 
     def part(self, *names: str) -> dict[str, Any]:
-        """A section of a section; made where it is not there."""
+        """Returns a nested section; creates it if it is missing."""
         place = self.data
         for name in names:
             if place.get(name) is None:
@@ -56,49 +56,49 @@ class Draft:
 
     @property
     def ratio(self) -> float:
-        """N of the axis file, which the model's orders and travels are told by."""
+        """Ratio of the axis file, to which the model's orders and travels refer."""
         return self.axis.gear.ratio
 
     @property
     def stiffness_nm_per_rad(self) -> float:
-        """The spring's first stage."""
+        """Stiffness of the spring's first stage."""
         return float(self.gear["stiffness_nm_per_rad"])
 
     def set_stiffness(self, nm_per_rad: float) -> None:
-        """Another spring; the damping ratio of the load on it stays."""
+        """Sets the stiffness and keeps the damping ratio of the load."""
         self.gear["damping_nm_s_per_rad"] *= math.sqrt(nm_per_rad / self.stiffness_nm_per_rad)
         self.gear["stiffness_nm_per_rad"] = nm_per_rad
 
     @property
     def hanging_kg_m2(self) -> float:
-        """Inertia of the mass on the axis, which is not the load's own."""
+        """Inertia of the hanging mass, which is not part of the load's own."""
         mass = self.load.get("gravity")
         return float(mass["mass_kg"] * mass["arm_m"] ** 2) if mass else 0.0
 
     @property
     def inertia_kg_m2(self) -> float:
-        """The load's whole inertia."""
+        """Total inertia of the load."""
         return float(self.load["inertia_kg_m2"]) + self.hanging_kg_m2
 
     def set_inertia(self, kg_m2: float) -> None:
-        """Another whole inertia of the load; its damping ratio stays. It is more than the hanging mass's."""
+        """Sets the load's total inertia, more than the hanging mass's, and keeps the damping ratio."""
         self.gear["damping_nm_s_per_rad"] *= math.sqrt(kg_m2 / self.inertia_kg_m2)
         self.load["inertia_kg_m2"] = kg_m2 - self.hanging_kg_m2
 
     @property
     def highest_stiffness_nm_per_rad(self) -> float:
-        """The stiffest spring that the plant's shortest time step resolves, with half of that to spare."""
+        """Maximum stiffness: half of the stiffest spring that the plant's shortest time step resolves."""
         return Resonance.of({**self.data, "load": {**self.load, "presliding": ()}}).stiffest_nm_per_rad(
             math.sqrt(0.5) / (SHORTEST_MS / 1e3)
         )
 
     @property
     def spare_stiffness_nm_per_rad(self) -> float:
-        """How stiff sliders may hold the load, for its resonance to be resolved by the present time step."""
+        """Maximum stiffness of sliders at the load whose resonance the present time step resolves."""
         return Resonance.of(self.data).most_held_nm_per_rad(RESOLVED / (self.data["substep_ms"] / 1e3))
 
     def finish(self) -> None:
-        """Tell the drive of its load, and let the time step resolve the resonance."""
+        """Sets the load feed-forward, and a time step that resolves the fastest resonance."""
         servo, load = self.data["servo"], self.inertia_kg_m2
         if self.tells_servo and servo.get("load_feedforward"):
             turn = math.sqrt(self.stiffness_nm_per_rad / load)
@@ -113,6 +113,6 @@ class Draft:
 
 
 SHORTEST_MS = 0.0625
-"""The shortest step that is taken, of those that go evenly into a millisecond."""
+"""Shortest time step; a whole fraction of a millisecond."""
 RESOLVED = 0.98
-"""Radians of the fastest resonance within a step; the truth file allows one."""
+"""Maximum phase of the fastest resonance in a time step, in radians; the truth file allows one."""

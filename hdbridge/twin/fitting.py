@@ -33,24 +33,24 @@ from hdbridge.twin.regressions import start_of
 from hdbridge.twin.replays import Replays
 
 # ----------------------------------------------------------------
-# Places where a fit may have a minimum of its own, beside the one that it has come to.
+# Places at which a fit may have another minimum.
 
 FILTER, DEAD_TIME = BY_NAME["command filter"], BY_NAME["servo dead time"]
 FREQUENCIES_HZ = (11.0, 16.0, 23.0, 33.0, 48.0, 70.0, 100.0)
-"""Where a resonance of the load is looked for: a fit finds only the nearest of its minima."""
+"""Start values of the load's resonance frequency, because a fit finds only the nearest minimum."""
 FILTER_SHARES = (0.25, 0.5, 0.75, 0.9)
-"""Shares of the lag that may be the command filter's, as long as nothing else is known."""
+"""Start values of the command filter's share of the lag."""
 INERTIA_FACTORS = (0.25, 0.5, 2.0, 4.0)
-"""Factors of the motor's inertia, which shows only in the first milliseconds of each new demand."""
+"""Factors for start values of the motor's inertia, which shows only just after each new demand."""
 
 
 def elsewhere(truth: Truth, usual: Truth) -> tuple[list[Truth], ...]:
-    """The truth at other places, by what is other there; ``usual`` is where the fit began."""
+    """Returns other start values about a truth, by kind; ``usual`` is the start of the fit."""
     return springs(truth), delays(truth), feedforwards(truth, usual), inertias(truth)
 
 
 def springs(truth: Truth) -> list[Truth]:
-    """The truth with springs at which the load resonates elsewhere, as far as its time step resolves them."""
+    """Returns the truth with the load's resonance at other frequencies that its time step resolves."""
     inertia, now = truth.load_.whole_inertia_kg_m2, truth.gear.stiffness_nm_per_rad
     found = []
     for hz in FREQUENCIES_HZ:
@@ -62,16 +62,15 @@ def springs(truth: Truth) -> list[Truth]:
 
 
 def lags(truth: Truth) -> list[Truth]:
-    """The truth with other shares of command filter and dead time in the same lag."""
+    """Returns the truth with the same lag divided differently between command filter and dead time."""
     return [_with_dead_time(truth, (1.0 - share) * _lag_ms(truth)) for share in FILTER_SHARES]
 
 
 def delays(truth: Truth) -> list[Truth]:
-    """The truth with a dead time in each other one of the substeps that the lag has room for.
+    """Returns the truth with the dead time in each other substep within the lag.
 
-    The demand turns where a cycle begins, and a torque lasts a substep. A turn that comes within one is seen
-    in two halves, which is how a filter shows it too: between two whole numbers of substeps the dead time
-    has a minimum of its own.
+    The demand changes slope at the start of a cycle, and a torque lasts for a substep. A change within a
+    substep is spread over two, as by a filter, so the dead time has a minimum in every substep.
     """
     step_ms, now = truth.substep_ms, _substep(truth)
     most_ms = min(_lag_ms(truth) - 2.0 * FILTER.least, DEAD_TIME.most)
@@ -80,12 +79,12 @@ def delays(truth: Truth) -> list[Truth]:
 
 
 def neighbours(truth: Truth) -> list[Truth]:
-    """Those of `delays` whose dead time is a substep shorter or longer."""
+    """Returns those of `delays` whose dead time is one substep shorter or longer."""
     return [each for each in delays(truth) if abs(_substep(each) - _substep(truth)) == 1]
 
 
 def as_late(truth: Truth, other: Truth, free: Collection[Parameter]) -> Truth:
-    """The truth with the whole lag of another one, by whichever of filter and dead time is free."""
+    """Returns the truth with the total lag of another one, by the free one of filter and dead time."""
     lag_ms, own = _lag_ms(other), truth.servo
     if FILTER in free:
         return with_values(truth, {FILTER.name: max(0.5 * (lag_ms - own.dead_time_ms), FILTER.least)})
@@ -96,30 +95,30 @@ def as_late(truth: Truth, other: Truth, free: Collection[Parameter]) -> Truth:
 
 
 def inertias(truth: Truth) -> list[Truth]:
-    """The truth with other inertias of the motor; a spring too stiff for the time step becomes softer."""
+    """Returns the truth with other motor inertias; a spring too stiff for the time step becomes softer."""
     motor = [BY_NAME["motor inertia"]]
     (now,) = coordinates(truth, motor)
     return [at_coordinates(truth, motor, [now + math.log(factor)]) for factor in INERTIA_FACTORS]
 
 
 def _substep(truth: Truth) -> int:
-    """The number of the substep in which a delayed demand comes."""
+    """Returns the number of the substep in which a delayed demand takes effect."""
     return int(truth.servo.dead_time_ms / truth.substep_ms)
 
 
 def _lag_ms(truth: Truth) -> float:
-    """What filter and dead time are late by together, at a constant speed."""
+    """Returns the total delay of filter and dead time at constant speed; ms."""
     return 2.0 * truth.servo.command_filter_ms + truth.servo.dead_time_ms
 
 
 def _with_dead_time(truth: Truth, dead_time_ms: float) -> Truth:
-    """The truth with another share of the dead time in its lag."""
+    """Returns the truth with another dead time and the same lag."""
     filter_ms = 0.5 * (_lag_ms(truth) - dead_time_ms)
     return with_values(truth, {FILTER.name: filter_ms, DEAD_TIME.name: dead_time_ms})
 
 
 def feedforwards(truth: Truth, usual: Truth) -> list[Truth]:
-    """The truth with the load's feed-forward at other frequencies, and its usual share of both inertias'."""
+    """Returns the truth with other load feed-forward frequencies and the usual division of the inertias."""
     servo, load, there = truth.servo, truth.servo.load_feedforward, usual.servo.load_feedforward
     if load is None or there is None:
         return []
@@ -130,10 +129,10 @@ def feedforwards(truth: Truth, usual: Truth) -> list[Truth]:
 
 
 def exchanged(truth: Truth) -> Truth:
-    """The truth with position gain and the inverse of the integral time exchanged.
+    """Returns the truth with position gain and inverse integral time exchanged.
 
-    While the axis moves that is the same loop, for only their sum and their product are in its answer: each
-    of the two has a minimum of its own.
+    In motion this is the same loop, because its response depends only on their sum and product, so there are
+    two minima.
     """
     servo = truth.servo
     return with_values(
@@ -143,7 +142,7 @@ def exchanged(truth: Truth) -> Truth:
 
 
 # ----------------------------------------------------------------
-# What a fit takes in where the recording shows it, once all else is known: parameters that earn their place.
+# Optional parameters, which a fit adds at the end if the recording shows them.
 
 GROWTH: Final = "friction growth"
 LAST: Final = (
@@ -152,30 +151,29 @@ LAST: Final = (
     (GROWTH,),
     ("friction's rise at rest", "Stribeck speed"),
 )
-"""Taken in together or not at all."""
+"""Groups of optional parameters; each is added as a whole or not at all."""
 LIMIT: Final = BY_NAME["current limit"]
 EARNED = 8.0
-"""Half the drop of the scaled squares that these have to bring, and a place that is not the start's to be
-gone on from: exp(8) to one."""
+"""Minimum log likelihood ratio for adding parameters or for leaving the start's minimum: exp(8) to one."""
 SURE = 4.0
-"""... and the distance of the first one of `LAST` from where it was, in standard deviations."""
+"""Minimum change of the first parameter of a group of `LAST`; standard deviations."""
 EARNED_STEPS = 6
-"""Steps that show whether they are: how fast friction falls off is seen only once it is known to."""
+"""Steps of a trial fit with added parameters: the Stribeck speed shows only once the rise is not zero."""
 LOOP_STEPS = 10
-"""... and of a loop by each law, all else held, on a few legs."""
+"""Steps of a trial fit of each loop law on a few legs, all else held."""
 
 
 class Fitting(NamedTuple):
-    """Where a fit is to begin."""
+    """Start of a fit."""
 
     truth: Truth
     parameters: tuple[Parameter, ...]
     prior: FloatArray
-    """The coordinates that their prior is about."""
+    """Mean of the prior, shape (p,)."""
 
 
 def with_last(replays: Replays, best: Fitted, prior: FloatArray) -> tuple[Fitted, FloatArray]:
-    """A fit with those of `LAST` that earn it, not yet led to the minimum, and what its prior is about."""
+    """Adds the significant groups of `LAST`; returns the fit, not yet at its minimum, and its prior."""
     for names in LAST:
         extra = [BY_NAME[name] for name in names if BY_NAME[name] not in best.parameters]
         if not extra or (GROWTH in names and not _warms(replays.data)):
@@ -192,18 +190,18 @@ def with_last(replays: Replays, best: Fitted, prior: FloatArray) -> tuple[Fitted
 
 
 def _warms(data: Data) -> bool:
-    """Whether the pieces began at temperatures that differ by as much as matters."""
+    """Returns True if the initial temperatures of the pieces differ by a relevant amount."""
     begun = [each.commands.start_c for each in data.pieces]
     known_c = [each for each in begun if each is not None]
     return len(known_c) == len(begun) and max(known_c) - min(known_c) > BY_NAME["temperature"].least_change
 
 
 def with_loop(replays: Replays, best: Fitted, prior: FloatArray) -> Fitting | None:
-    """Where a fit with another loop of the gear begins; None where nothing speaks for one.
+    """Returns the start of a fit with another loop law of the gear, or None if none is better.
 
-    That is where the load's angle is left with no more than the true axis would leave, or no law makes that
-    better. Each law is led to what explains a few legs, all else held: another may be the nearest once all
-    else is fitted to the first, so this is asked again then.
+    There is none if the load's residuals are as small as those of the true axis, or if no law reduces them.
+    Each law is fitted to a few legs, all else held. Call again after a new fit, because another law may then
+    be the best.
     """
     noise, few = expected(replays.data), replays.rough
     if best.scales.deviation[LOAD] <= noise.deviation[LOAD]:
@@ -225,11 +223,10 @@ def with_loop(replays: Replays, best: Fitted, prior: FloatArray) -> Fitting | No
 
 
 def with_limit(replays: Replays, best: Fitted, prior: FloatArray, usual: Truth) -> Fitting:
-    """Where a fit with the drive's torque limit begins, if the recording shows it; else the usual limit's.
+    """Returns the start of a fit of the drive's torque limit if the recording shows it, else the usual limit.
 
-    The fit has gone on within the highest torque that the recording holds (`regressions`): no motion that it
-    shows needs more. That this is the drive's limit, and not as much as was needed, shows in what a replay
-    without it leaves.
+    So far the fit used the highest recorded torque as the limit (`regressions`). It is the drive's limit, and
+    not just the torque that the motion needed, if a replay without it has larger residuals.
     """
     highest, unchanged = free_value(usual, LIMIT), Fitting(best.truth, best.parameters, prior)
     if free_value(best.truth, LIMIT) >= highest or LIMIT in best.parameters:
@@ -241,7 +238,7 @@ def with_limit(replays: Replays, best: Fitted, prior: FloatArray, usual: Truth) 
 
 
 def _cost(replays: Replays, truth: Truth, best: Fitted) -> float:
-    """Half the sum of squares of what a truth leaves, by the scales of a fit."""
+    """Returns half the sum of squares of a truth's residuals, by the scales of a fit."""
     (found,) = replays([truth])
     left = told(found, best.scales, fitted_rows(replays.data))
     return 0.5 * float(left @ left)
@@ -250,44 +247,44 @@ def _cost(replays: Replays, truth: Truth, best: Fitted) -> float:
 # ----------------------------------------------------------------
 
 FIT_S = 60.0
-"""A longer recording is fitted on parts of it that take the axis about so long, of each kind of motion where
-there is time: a thousand replays of a quarter of an hour would take hours."""
+"""Duration of the pieces on which a longer recording is fitted, with all kinds of motion if possible: a
+thousand replays of a quarter of an hour would take hours."""
 FIRST_STEPS = 6
-"""From each of the starts a fit goes so many steps, as many more from the first and the best of the others,
-and as many from the better of these with its gains exchanged;"""
+"""Steps from each start; as many again from the first and the best of the others, and from the better of
+these with its gains exchanged."""
 MORE_STEPS = 10
-"""... then so many from the first, and the best of what else there is."""
+"""Further steps from the first start and the best of the others."""
 FEW_STEPS = 4
-"""From each of the places that are tried in the end, first."""
+"""First steps from each place that is tried as another minimum."""
 NEAR_STEPS = 30
-"""Steps at most over all of the recording, by the noise that is expected;"""
+"""Maximum steps over the whole recording with the expected noise."""
 STEPS = 30
-"""... and to the end."""
+"""Maximum steps of the final fit."""
 LOOPS = 6
-"""Replays with a drive's steps, and as many smooth ones, that show what these do."""
+"""Number of replays with quantised loops, and of smooth ones, that show the difference."""
 ROUNDS = 3
-"""So often at most that is looked at anew, where the fit has gone;"""
+"""Maximum number of times that the difference of the loops is estimated again at the new place."""
 SAME = 0.3
-"""... that is, by more than so many standard deviations."""
+"""Change of the coordinates below which this ends; standard deviations."""
 MORE = 1.1
-"""So many times what the true axis would leave is more: a scale of some hundred rows is known no better."""
+"""Ratio to the true axis's residuals above which a fit leaves more; a scale is not known better than that."""
 MINIMA = 8
-"""So often at most a fit goes on to a better minimum. Each is judged by what a drive's steps do there, so
-that of two minima each may look better from the other."""
+"""Maximum number of moves to a better minimum. The likelihood uses the loops' deviation at the present one,
+so each of two minima may look better from the other."""
 NEAREST = 2
-"""So many of the places of a kind are looked at more closely."""
+"""Number of places of each kind that are followed up."""
 APART = 0.1
-"""In spreads of a parameter: fits that have come closer than this are on their way to the same place."""
+"""Distance below which two fits converge to the same place; spreads of a parameter."""
 OPTIONAL = (
     "velocity feed-forward", "load friction", "temperature", "current limit", "motor encoder delay",
     "encoder coupling", "friction growth", "moving average", *LOOP,
 )  # fmt: skip
-"""Not fitted unless asked for or earned: the ordinary motion does not show them, others can take their
-place, or a calibration has told them."""
+"""Parameters fitted only on request or if significant: ordinary motion does not show them, others can replace
+them, or a calibration has determined them."""
 
 
 def free_parameters(truth: Truth, more: Sequence[str] = ()) -> tuple[Parameter, ...]:
-    """What a fit changes: every parameter that the truth has, without those that need to be asked for."""
+    """Returns the parameters to fit: all that the truth has, except `OPTIONAL` ones not in ``more``."""
     free = []
     for each in PARAMETERS:
         value = value_in(truth, each)
@@ -298,9 +295,9 @@ def free_parameters(truth: Truth, more: Sequence[str] = ()) -> tuple[Parameter, 
 
 
 def fit(replays: Replays, progress: Progress = lambda _: None, more: Sequence[str] = ()) -> Fitted | None:
-    """From the truth that the recordings were prepared with to the parameters that explain them best.
+    """Fits the parameters, starting from the truth that the recordings were prepared with.
 
-    None if its servo explains too little of them: see `hdbridge.twin.structures`.
+    Returns None if its servo explains too little of the recordings: see `hdbridge.twin.structures`.
     """
     data, roughly = replays.data, replays.rough
     start = data.base
@@ -316,8 +313,8 @@ def fit(replays: Replays, progress: Progress = lambda _: None, more: Sequence[st
     ends = []
     for number, each in enumerate(first):
         progress(0.2 + 0.4 * number / len(first))
-        # What a wrong simulation leaves is no measure of the noise: it makes light of the very channel
-        # that tells it from the right one.
+        # The residuals of a wrong simulation are no estimate of the noise: they would reduce the weight of
+        # the very channel that shows the error.
         if each.inflation < SOFT**2:
             about = loops_about(replays, each)
             near = _led(replays, parameters, prior, each.truth, NEAR_STEPS, each, about)
@@ -326,14 +323,14 @@ def fit(replays: Replays, progress: Progress = lambda _: None, more: Sequence[st
         return None
     progress(0.6)
     best = min(ends, key=lambda each: each.loss + (EARNED if each is not ends[0] else 0.0))
-    laws = len(LAWS)  # so often at most another one is taken
+    laws = len(LAWS)  # maximum number of changes
     while True:
         best = _in_best_minimum(replays, best, begun, prior, most)
         wider, prior = with_last(replays, best, prior)
         if wider is not best:
             best = _ended(replays, wider, prior, most)
             continue
-        # What a wrong spring leaves of the load's angle is no matter of the loop: that is asked last.
+        # The loop comes last, because a wrong spring also leaves residuals of the load angle.
         other = with_loop(replays, best, prior) if laws else None
         if other is None:
             break
@@ -352,23 +349,23 @@ def fit(replays: Replays, progress: Progress = lambda _: None, more: Sequence[st
         best = _ended(replays, best, prior, most)
         if np.all(np.abs(best.place - last.place) < SAME * np.sqrt(np.diag(best.covariance))):
             break
-    # So much longer differences are no guide to a minimum: next to it the loops may be unstable.
+    # Wide differences only for the covariance: near a minimum the loops may be unstable.
     loops, there = best.scales.loops, best.truth
     best = solve(replays, there, best.parameters, prior, 0, most=most, near=best, loops=loops, wide=True)
     progress(1.0)
-    # What the loops do is told by the recording's rows; those who ask further have others.
+    # The loops' deviation belongs to these rows; later callers use others.
     return replace(best, scales=replace(best.scales, loops=None))
 
 
 def _in_best_minimum(replays: Replays, best: Fitted, begun: Truth, prior: FloatArray, most: Scales) -> Fitted:
-    """The fit from the best of the minima about one, until none is better."""
+    """Moves the fit to better neighbouring minima until there are none."""
     for _ in range(MINIMA):
         last = best
         if _leaves_more(replays.data, best):
             for there in better_places(replays.rough, best, elsewhere(best.truth, begun), begun, prior):
                 best = _better(replays, best, there, prior, most)
-        # A few legs know little of what the two gains do at rest, where only they differ, and a dead time
-        # of the next substep leaves so little more that no channel shows it.
+        # Always tried: exchanged gains differ only at rest, which a few legs hardly show, and a dead time in
+        # the next substep increases the residuals too little for any channel to show it.
         for there in (exchanged(best.truth), *neighbours(best.truth)):
             best = _better(replays, best, there, prior, most)
         if best is last:
@@ -377,7 +374,7 @@ def _in_best_minimum(replays: Replays, best: Fitted, begun: Truth, prior: FloatA
 
 
 def _better(replays: Replays, best: Fitted, there: Truth, prior: FloatArray, most: Scales) -> Fitted:
-    """The fit from another place, if that is beyond doubt better."""
+    """Returns the fit from another place if it is significantly better, else ``best``."""
     loops = best.scales.loops
     other = solve(replays, there, best.parameters, prior, MORE_STEPS, most=most, loops=loops)
     if other.loss + EARNED >= best.loss:
@@ -386,13 +383,13 @@ def _better(replays: Replays, best: Fitted, there: Truth, prior: FloatArray, mos
 
 
 def _ended(replays: Replays, near: Fitted, prior: FloatArray, most: Scales) -> Fitted:
-    """The minimum next to a fit, by rows as they count there."""
+    """Continues a fit to its minimum, with the loops' deviation estimated there."""
     loops = loops_about(replays, near)
     return solve(replays, near.truth, near.parameters, prior, STEPS, most=most, near=near, loops=loops)
 
 
 def _leaves_more(data: Data, best: Fitted) -> bool:
-    """Whether a fit leaves more of any channel, beyond its rounding, than the true axis would."""
+    """Returns True if the residuals of any channel exceed those of the true axis."""
     least = least_deviation(data) | {LOAD: expected(data).deviation[LOAD]}
     return any(best.scales.deviation[name] > MORE * least[name] for name in CHANNELS)
 
@@ -400,10 +397,10 @@ def _leaves_more(data: Data, best: Fitted) -> bool:
 def better_places(
     roughly: Replays, best: Fitted, kinds: Iterable[Sequence[Truth]], begun: Truth, prior: FloatArray
 ) -> list[Truth]:
-    """Where fits of a few legs end that begin at the best places of each kind, if as good; the best first.
+    """Fits a few legs from the best places of each kind; returns competitive results, the best first.
 
-    The other parameters are known by now: where the fit began, each of these was as good as any other. A few
-    legs seldom say which of two minima is the true one: they may only rule one out.
+    This comes after the other parameters are known, because at the start of the fit these places were equally
+    good. A few legs can rule a minimum out but seldom decide between two.
     """
     (before,) = roughly([begun])
     most = scales(roughly.data, before)
@@ -426,13 +423,13 @@ def better_places(
 
 
 def _apart(one: Fitted, other: Fitted) -> bool:
-    """Whether two fits of the same parameters have come to different places."""
+    """Returns True if two fits of the same parameters have reached different places."""
     spread = np.array([each.spread for each in one.parameters])
     return bool(np.any(np.abs(one.place - other.place) > APART * spread))
 
 
 def loops_about(replays: Replays, fitted: Fitted) -> Loops:
-    """What a drive's loops do otherwise than smooth ones about a fit, within its covariance."""
+    """Estimates the deviation of quantised loops from smooth ones, by draws from the fit's covariance."""
     rng = np.random.default_rng(0)
     low, high = np.array([each.bounds for each in fitted.parameters]).T
     places = rng.multivariate_normal(fitted.place, fitted.covariance, LOOPS, method="svd")
@@ -457,7 +454,7 @@ def _led(
     near: Fitted | None = None,
     loops: Loops | None = None,
 ) -> Fitted:
-    """So many steps from a place towards the minimum, by the noise that is expected."""
+    """Fits for at most ``steps`` steps with the expected noise."""
     noise = replace(expected(replays.data), loops=loops)
     return solve(replays, start, parameters, prior, steps, known=noise, near=near, tempered=True)
 
@@ -465,10 +462,10 @@ def _led(
 def _best_of(
     replays: Replays, starts: Sequence[Truth], parameters: tuple[Parameter, ...], prior: FloatArray
 ) -> tuple[Fitted, ...]:
-    """The fit from the first place, and beside it that from another one where that is better so far.
+    """Returns the fit from the first start, and the best from another start if it is better so far.
 
-    The first is where the simulation stands: what motion does not show keeps its value, unless another place
-    is better beyond doubt in the end. Of the others those that fall behind are given up.
+    The first start is the present simulation: parameters that the motion does not show keep their values
+    unless another place is significantly better in the end. Worse starts are dropped on the way.
     """
     led = partial(_led, replays, parameters, prior)
 
@@ -483,7 +480,7 @@ def _best_of(
 
 
 def _at_best_frequency(replays: Replays, truth: Truth) -> Truth:
-    """The truth with the spring at which the load's angle comes out best."""
+    """Returns the truth with the spring that gives the smallest residuals of the load angle."""
     tried = [truth, *springs(truth)]
     off = [float(np.mean(np.abs(found[LOAD]))) for found in replays(tried)]
     return tried[int(np.argmin(off))]

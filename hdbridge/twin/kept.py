@@ -1,4 +1,4 @@
-"""The twin of an axis as a file: a truth file that says where its values come from, kept as models are.
+"""The twin of an axis as a file: a truth file with provenance, stored like a model.
 
 profiles/NAME/twin.yaml           the active twin, which `hdbridge simulate` and `--simulate` use
               pending-twin.yaml   proposed by `hdbridge twin`, not yet committed
@@ -25,13 +25,13 @@ from hdbridge.records.record import WRONG_RATIO
 from hdbridge.sim.truth import Truth
 
 # ----------------------------------------------------------------
-# What changed between two twins, parameter by parameter. Pure.
+# Difference of two twins by parameter. Pure.
 
 SECTIONS = ("motor", "servo", "gear", "load", "temperature")
 
 
 def diff(before: Truth | None, after: Truth) -> list[Difference]:
-    """All parameters of both twins that are not as usual, in the order of the file, changed or not."""
+    """Returns all non-default parameters of both twins, changed or not, in the order of the file."""
     old, new = dict(_parameters(before)) if before else {}, dict(_parameters(after))
     widths = {
         place: 0.5 * (upper - lower)
@@ -64,34 +64,34 @@ HEADER: Final = (
 
 @dataclass(frozen=True)
 class KeptTwin:
-    """A twin with the file that it was read from."""
+    """A twin and the file that it was read from."""
 
     truth: Truth
     path: Path | None = field(default=None, compare=False)
 
     @classmethod
     def load(cls, path: Path | str) -> Self:
-        """Read a twin's file; InputError with file:line:column."""
+        """Reads a twin's file; InputError with file:line:column."""
         return cls(Truth.load(path), Path(path))
 
     @property
     def provenance(self) -> Mapping[str, Any]:
-        """Axis, drive and gear that it is bound to, date, reason, recordings."""
+        """Axis, drive and gear to which it is bound, date, reason and recordings."""
         return self.truth.provenance
 
     def told(self, **provenance: Any) -> Self:
-        """The same twin, with this in its provenance."""
+        """Returns the twin with these entries added to its provenance."""
         known = {**self.truth.provenance, **provenance}
         return type(self)(self.truth.model_copy(update={"provenance": known}), self.path)
 
     def bound_to(self, axis: AxisConfig, identity: Identity | None = None) -> Self:
-        """The same twin, bound to an axis and the drive that answered there (else the axis file's)."""
+        """Returns the twin bound to an axis and the drive that answered (else the axis file's)."""
         return self.told(**binding(axis, identity))
 
     def check_ratio(self, axis: AxisConfig) -> None:
-        """Refuse (InputError) a twin of another gear ratio than the axis file's.
+        """Raises InputError if the twin has another gear ratio than the axis file.
 
-        The ratio that it was measured with; its gear's own may be off by what `ratio_error` is.
+        The ratio compared is the one of the measurement; the gear's true ratio may differ by a `ratio_error`.
         """
         bound = Provenance.model_validate(self.truth.provenance).gear
         ratio, allowed = (bound.ratio, 1e-9) if bound else (self.truth.gear.ratio, WRONG_RATIO)
@@ -102,12 +102,12 @@ class KeptTwin:
             )
 
     def check_bound_to(self, axis: AxisConfig, identity: Identity | None = None) -> None:
-        """Refuse (InputError) a twin of another drive, axis or gear."""
+        """Raises InputError if the twin belongs to another drive, axis or gear."""
         self.check_ratio(axis)
         check_binding(self.truth.provenance, axis, identity, self._name(), "twin", "make one")
 
     def dump(self) -> str:
-        """The file's text; what it says reads back exactly, and what is as usual is left out."""
+        """Returns the file's text, which reads back exactly; default values are omitted."""
         data = self.truth.model_dump(by_alias=True, mode="json", exclude_defaults=True)
         provenance = data.get("provenance", {})
         drive, about = provenance.get("drive"), provenance.get("fit")
@@ -122,7 +122,7 @@ class KeptTwin:
         return HEADER + dump_yaml(data)
 
     def save(self, path: Path | str) -> None:
-        """Write the file atomically."""
+        """Writes the file atomically."""
         write_atomically(path, self.dump())
 
     def _name(self) -> str:

@@ -1,10 +1,10 @@
-"""Least squares over replays: the plant's parameters from a start to a minimum of the misfit.
+"""Least squares over replays: fits the plant's parameters from a start to a minimum of the misfit.
 
-The residuals of following error, torque and load angle are scaled by what each channel is left with; a weak
-prior about the start holds what the motion does not show. The misfit has long, narrow and curved valleys, for
-filter, dead time and feed-forwards make up for each other: steps of several dampings are tried, each some way
-along a path that turns with the valley. The covariance allows for residuals that go together within a leg (a
-sandwich of the Jacobian and the legs' own gradients), because what a replay cannot follow is no white noise.
+The residuals of following error, torque and load angle are scaled by each channel's own deviation; a weak
+prior about the start holds parameters that the motion does not show. The misfit has long, narrow and curved
+valleys, because filter, dead time and feed-forwards compensate for each other. Steps with several dampings
+are therefore tried, at several lengths along a path that curves with the valley. The covariance allows for
+residuals correlated within a leg (sandwich estimator), because model errors are not white noise.
 """
 
 from __future__ import annotations
@@ -27,43 +27,43 @@ from hdbridge.twin.parameters import Parameter, at_coordinates, coordinates
 from hdbridge.twin.replays import Replays
 
 # ----------------------------------------------------------------
-# How sure a fit is of its coordinates: information by slopes, and a jackknife by legs.
+# Uncertainty of the coordinates: information from the slopes, and a jackknife over legs.
 
 LEAST = 1e-9
-"""Of the information of all legs, a share that none of them has alone."""
+"""Regularisation of the jackknife: share of the information that a single leg cannot have alone."""
 
 
 def information_of(slopes: FloatArray, spread: FloatArray) -> FloatArray:
-    """What residuals of unit variance and the prior say of the coordinates, shape (p, p)."""
+    """Returns the information matrix of unit-variance residuals and the prior, shape (p, p)."""
     return np.asarray(slopes.T @ slopes + np.diag(spread**-2.0), dtype=np.float64)
 
 
 def over_legs(rows: FloatArray, legs: FloatArray) -> FloatArray:
-    """Sums of rows (n, p) over each leg, shape (legs, p); their squares make up for few legs."""
+    """Sums rows (n, p) over each leg, shape (legs, p), with a correction of the squares for few legs."""
     by_leg = sums(rows, numbered(legs.astype(np.intp)))
     return np.asarray(by_leg * np.sqrt(len(by_leg) / max(len(by_leg) - 1, 1)), dtype=np.float64)
 
 
 def principal(slopes: FloatArray, spread: FloatArray) -> FloatArray:
-    """Directions of the coordinates, one a column, shape (p, p), in each of which the information is one.
+    """Returns principal directions of the coordinates as columns, shape (p, p), scaled to unit information.
 
-    A long valley is one of them. Each may be known worse by a factor of its own; were each *coordinate*, what
-    two of them have in common, which is known best of all, would be lost.
+    A long valley is one of them. The covariance may inflate each direction separately; inflating each
+    *coordinate* would lose the well-known combinations of two coordinates.
     """
     worth, directions = eigen(slopes, spread)
     return np.asarray(spread[:, None] * directions / np.sqrt(worth), dtype=np.float64)
 
 
 def sandwich(slopes: FloatArray, left: FloatArray, legs: FloatArray, spread: FloatArray) -> FloatArray:
-    """Covariance of the coordinates where residuals of one leg go together and legs are independent.
+    """Returns the covariance of the coordinates for correlated residuals within independent legs, (p, p).
 
-    By how far each leg alone has drawn the fit: without it, that would have ended elsewhere (jackknife by
-    legs; Bell and McCaffrey, Survey Methodology 28, 2002). One leg that a replay cannot follow draws a fit
-    by all that the others leave open, and has little left itself.
+    It is a jackknife over legs: the shift of the fit when one leg is left out (Bell and McCaffrey, Survey
+    Methodology 28, 2002). A leg that a replay cannot follow shifts the fit in every direction that the others
+    leave open, and has small residuals itself.
 
-    By principal directions: of a few legs no more can be said. None is better known than independent
-    residuals of the present size would have it, nor worse than before the fit. What the slopes would still
-    take of the residuals is no scatter of the legs.
+    Variances are estimated by principal direction, because a few legs do not determine more. Each is at least
+    that of independent residuals of the present size and at most the prior's. The part of the residuals that
+    the slopes can still explain is removed first, because it is not scatter of the legs.
     """
     along = principal(slopes, spread)
     rows = slopes @ along
@@ -82,87 +82,87 @@ def sandwich(slopes: FloatArray, left: FloatArray, legs: FloatArray, spread: Flo
 
 
 def eigen(slopes: FloatArray, spread: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Information and principal directions of the coordinates in units of their spreads."""
+    """Returns information and principal directions of the coordinates, in units of their spreads."""
     _, size, directions = np.linalg.svd(root_of(slopes * spread, np.eye(len(spread))))
     return size**2, np.asarray(directions.T, dtype=np.float64)
 
 
 def root_of(*tables: FloatArray) -> FloatArray:
-    """Upper triangle whose transpose times it is the sum of these tables' own."""
+    """Returns the upper triangular R with R'R equal to the sum of the tables' A'A."""
     return np.asarray(np.linalg.qr(np.concatenate(tables), mode="r"), dtype=np.float64)
 
 
 # ----------------------------------------------------------------
 
 STEP = 0.01
-"""Step of the first Jacobian's differences, in a parameter's spread."""
+"""Step of the first Jacobian's finite differences, in spreads of a parameter."""
 RESPONSE = 1.0
-"""Norm of the scaled residuals' change that the later differences are made for: a standard deviation, for no
-motion shows less."""
+"""Norm of the scaled residuals' change that sets the later difference steps: one standard deviation, the
+smallest change that a motion shows."""
 FARTHEST = 0.1
-"""The longest of these steps, in parameters' spreads: the slopes are those of a curved valley."""
+"""Longest of these steps, in spreads, because the valley is curved."""
 WIDE = 3.0
-"""So much longer, and in both senses, are the differences that intervals are made of. A motor that sticks
-breaks away elsewhere in each replay: short differences are steep by that alone, and intervals too narrow."""
+"""Factor of the difference steps for intervals, which are two-sided. A sticking motor breaks away differently
+in each replay, so short differences are too steep and intervals too narrow."""
 TOO_FAR = 1.0
-"""Change of scaled residuals (rms) beyond which a difference ends where the loops are unstable;"""
+"""Change of the scaled residuals (rms) above which the end of a difference has unstable loops."""
 NEARER = 0.1
-"""... so much shorter it is made anew."""
+"""Factor by which such a difference is shortened."""
 DAMPINGS = (0.0, 0.001, 0.01, 0.1)
 """Shares of the information's diagonal that are added to it (Marquardt)."""
 LONGEST = (4.0, 1.5, 0.6, 0.2)
-"""How long each of these steps is at most, in spreads of the parameters. Far from the minimum the linear
-reckoning would take what the motion shows least to where it shows nothing any more, and hardly comes back."""
+"""Maximum length of each of these steps, in spreads of the parameters. Far from the minimum, linear steps
+move weakly observable parameters to places without effect, from which a fit hardly returns."""
 ALONG = ((1.0,), (0.4, 0.15))
-"""How far along each of these steps to go; less far only where that brings nothing."""
+"""Lengths tried along each of these steps; the shorter ones only if the full step gains nothing."""
 PROBED = 0.1
-"""How far along each of them its second derivative is taken."""
+"""Length along each step at which the second derivative is estimated."""
 SETTLED = 3
-"""So many steps in a row that bring no more end a fit. Each time the differences are made `WIDE` times as
-long: where a motor sticks, short ones are no guide (implicit filtering; Kelley, SIAM 2011)."""
+"""Number of successive steps without a gain that ends a fit. After each, the differences become `WIDE` times
+as long, because short ones mislead if a motor sticks (implicit filtering; Kelley, SIAM 2011)."""
 WORTH = 1.0
-"""A drop of half the squares by less is no evidence of anything."""
+"""Minimum drop of half the sum of squares that counts as a gain."""
 SOFT = 4.0
-"""Residuals beyond so many scales count less: a replay that slips elsewhere is no measure of a parameter."""
+"""Residual, in scales, above which it counts less: a motor that slips elsewhere is not evidence."""
 
 Progress = Callable[[float], None]
 
 
 @dataclass(frozen=True, eq=False)
 class Fitted:
-    """The outcome of a fit over some parameters."""
+    """Result of a fit of some parameters."""
 
     truth: Truth
     parameters: tuple[Parameter, ...]
     place: FloatArray
     """Coordinates of the parameters, shape (p,)."""
     covariance: FloatArray
-    """Of the coordinates, shape (p, p)."""
+    """Covariance of the coordinates, shape (p, p)."""
     scales: Scales
-    """Of the residuals."""
+    """Scales of the residuals."""
     residuals: dict[str, FloatArray]
     rows: NDArray[np.bool_]
-    """Those that were fitted, one channel after the other."""
+    """Mask of the fitted rows, one channel after the other."""
     vector: FloatArray
-    """The scaled residuals of the fitted rows, softened."""
+    """Softened scaled residuals of the fitted rows, shape (n,)."""
     jacobian: FloatArray
-    """Of these, by coordinate."""
+    """Derivatives of `vector` with respect to the coordinates, shape (n, p)."""
 
     @property
     def cost(self) -> float:
-        """Half the sum of the squares of the scaled residuals, softened."""
+        """Half the sum of squares of the softened scaled residuals."""
         return 0.5 * float(self.vector @ self.vector)
 
     @property
     def inflation(self) -> float:
-        """Mean square of the scaled residuals, 1 at least: what one of them is worth."""
+        """Mean square of the scaled residuals, at least 1."""
         return max(1.0, float(self.vector @ self.vector) / max(len(self.vector), 1))
 
     @property
     def loss(self) -> float:
-        """Minus the log likelihood of the fitted readings, by the fit's own scales, which need to have steps.
+        """Negative log likelihood of the fitted readings by the fit's own scales, which must have steps.
 
-        Of two fits of the same readings the one with less is likelier, by the exponential of the difference.
+        The likelihood ratio of two fits of the same readings is the exponential of the difference.
         """
         half, stray = (each[self.rows] for each in self.scales.halves(len(self.rows) // len(CHANNELS)))
         size = np.abs(self.scales.scaled(self.residuals)[self.rows])
@@ -170,7 +170,7 @@ class Fitted:
         return float(np.sum(surprise(size, wide, stray) - np.log(half / wide)))
 
     def intervals(self) -> dict[str, tuple[float, float]]:
-        """95 % intervals by the parameters' names."""
+        """Returns 95 % intervals by parameter name."""
         spread = NORMAL_95 * np.sqrt(np.diag(self.covariance))
         return {
             each.name: (each.value(float(x - s)), each.value(float(x + s)))
@@ -193,14 +193,14 @@ def solve(
     tempered: bool = False,
     wide: bool = False,
 ) -> Fitted:
-    """Least squares from a truth, in so many steps at most; with none, the slopes where it stands.
+    """Fits parameters by least squares in at most ``steps`` steps; with none, only linearises at the start.
 
-    ``prior`` are the coordinates that the prior is about; ``known`` the channels' scales, by default those of
-    what each step leaves, ``most`` at most: a channel that has become worse does not count for less.
-    ``tempered``: known scales grow with what a place leaves on the way to the minimum.
-    Held-out legs count only where ``everything`` is to count. ``near`` is a fit of the same parameters whose
-    directions the first differences are made along, ``loops`` what a drive's loops do otherwise. ``wide``:
-    the last differences, of which the covariance is made, are wide ones.
+    ``prior`` is the prior's mean, shape (p,). ``known`` are the channels' scales; by default they are
+    estimated from the residuals after each step, at most ``most``, so that a worse channel does not lose
+    weight. ``tempered``: known scales grow with the residuals on the way to the minimum.
+    Held-out legs count only with ``everything``. ``near`` is a fit of the same parameters that gives the
+    directions of the first differences, ``loops`` the deviation of a drive's quantised loops from smooth
+    ones. ``wide``: the covariance uses wide differences.
     """
     data = replays.data
     rows = fitted_rows(data, everything=everything)
@@ -218,7 +218,7 @@ def solve(
         return [scale.scaled(each)[rows] for each in led(places)]
 
     def cost(place: FloatArray, found: dict[str, FloatArray]) -> float:
-        """Half the squares of the residuals as they count, and the prior's."""
+        """Returns half the sum of squares of the softened residuals and the prior."""
         left, off = told(found, scale, rows), (place - prior) / spread
         return 0.5 * float(left @ left + off @ off)
 
@@ -267,23 +267,23 @@ def solve(
 
 
 def fitted_rows(data: Data, *, everything: bool = False) -> NDArray[np.bool_]:
-    """For each row of each channel, one channel after the other, whether a fit sees it."""
+    """Returns the mask of the rows that a fit sees, one channel after the other."""
     out = 0.0 if everything else data.out
     return np.concatenate([each * (1.0 - out) > 0.0 for each in counted(data).values()])
 
 
 def legs_of_rows(data: Data, rows: NDArray[np.bool_]) -> FloatArray:
-    """The number of the leg of each of the fitted rows."""
+    """Returns the leg number of each fitted row."""
     return np.concatenate([data.leg] * len(CHANNELS))[rows]
 
 
 def told(found: dict[str, FloatArray], scale: Scales, rows: NDArray[np.bool_]) -> FloatArray:
-    """The residuals of some rows as they count: by likelihood, softened."""
+    """Returns the residuals of some rows, transformed by their likelihood and softened."""
     return counting(scale.scaled(found)[rows], scale, rows)[0]
 
 
 def counting(off: FloatArray, scale: Scales, rows: NDArray[np.bool_]) -> tuple[FloatArray, FloatArray]:
-    """Scaled residuals of some rows as they count, and the derivative of that."""
+    """Transforms scaled residuals by their likelihood and softens them; returns also the derivative."""
     half, stray = (each[rows] for each in scale.halves(len(rows) // len(CHANNELS)))
     root, slope = rooted(off, half, stray)
     return softened(root), slope * _softening(root)
@@ -296,10 +296,10 @@ def _capped(found: Scales, most: Scales | None) -> Scales:
 
 
 def _tempered(known: Scales, found: dict[str, FloatArray], rows: NDArray[np.bool_]) -> Scales:
-    """Scales that are larger by what a simulation leaves of the residuals as a whole, where that is more.
+    """Returns scales enlarged by the overall rms of the scaled residuals, if that exceeds one.
 
-    Far from the minimum no residual is worth what the noise makes it worth, and the prior would have no say.
-    One factor for all channels: the one that is furthest off still leads the way.
+    Far from the minimum, residuals are much larger than the noise, and the prior would have no weight. All
+    channels share one factor, so the worst channel still dominates.
     """
     left = told(found, known, rows)
     factor = max(1.0, float(np.sqrt(np.mean(np.square(left)))))
@@ -308,14 +308,14 @@ def _tempered(known: Scales, found: dict[str, FloatArray], rows: NDArray[np.bool
 
 @dataclass(frozen=True, eq=False)
 class _Damped:
-    """A step by the linear reckoning."""
+    """A damped Gauss-Newton step."""
 
     step: FloatArray
     root: FloatArray
-    """Of the information with its damping: that is its transpose times it."""
+    """Triangular root R of the damped information R'R."""
 
     def turn(self, bent: FloatArray) -> FloatArray:
-        """By how much a path along the step has to turn, at its end, to follow a curved valley.
+        """Returns the second-order correction of the step that follows a curved valley.
 
         ``bent`` is the slopes' product with half the second derivative of the residuals along the step
         (geodesic acceleration; Transtrum and Sethna, arXiv:1201.5885).
@@ -331,11 +331,11 @@ def _damped_steps(
     spread: FloatArray,
     bounds: tuple[FloatArray, FloatArray],
 ) -> list[_Damped]:
-    """Steps by the linear reckoning, within the bounds, the boldest first (Levenberg, Marquardt).
+    """Returns damped Gauss-Newton steps within the bounds, the longest first (Levenberg, Marquardt).
 
-    All of them are tried: where the misfit is rough, one that comes out worse says little of the others.
-    By orthogonal factors: next to where its loops are unstable a simulation changes by so much that of the
-    prior nothing would be left in a sum of squares.
+    The caller tries all of them, because on a rough misfit one bad step says little about the others. They
+    are computed by orthogonal factors: near unstable loops the slopes are so large that the prior would be
+    lost to rounding in a sum of squares.
     """
     seen = root_of(slopes, np.diag(1.0 / spread))
     gradient = slopes.T @ left + (place - prior) / spread**2
@@ -353,7 +353,7 @@ def _damped_steps(
 
 
 def _held(root: FloatArray, gradient: FloatArray, spread: FloatArray, longest: float) -> float:
-    """What is to be added to the information, in units of the prior's, for a step no longer than this."""
+    """Returns the damping, in units of the prior's information, that limits the step to this length."""
     _, size, directions = np.linalg.svd(root * spread)
     along = directions @ (gradient * spread)
 
@@ -372,10 +372,11 @@ def slopes_at(
     *,
     wide: bool,
 ) -> FloatArray:
-    """Derivatives, by coordinate, of the scaled residuals that are ``seen`` at places, ``now`` where we are.
+    """Returns finite-difference derivatives of the scaled residuals at ``place``, shape (n, p).
 
-    By differences along the moves, each in the sense in which the bounds leave more room; ``wide`` ones,
-    which intervals are made of, are `WIDE` times as long and go both ways.
+    ``seen`` evaluates residuals at places, ``now`` are those at ``place``. Differences go along the moves, in
+    the direction with more space to the bounds; ``wide`` ones, for intervals, are `WIDE` times as long and
+    two-sided.
     """
     both = [
         [np.clip(place + way * move, *bounds) for way in (1.0, -1.0)]
@@ -395,9 +396,9 @@ def slopes_at(
 
 
 def _moves(slopes: FloatArray, spread: FloatArray, times: float = 1.0) -> FloatArray:
-    """Along the principal directions of the information, as far as residuals change by `RESPONSE`.
+    """Returns difference steps along the principal directions that change the residuals by `RESPONSE`.
 
-    ``times``: so many times as far.
+    ``times`` multiplies their length.
     """
     worth, directions = eigen(slopes, spread)
     far = np.minimum(times * RESPONSE / np.sqrt(worth), FARTHEST)
@@ -406,13 +407,13 @@ def _moves(slopes: FloatArray, spread: FloatArray, times: float = 1.0) -> FloatA
 
 
 def softened(values: FloatArray) -> FloatArray:
-    """Residuals whose squares grow evenly beyond `SOFT`."""
+    """Softens residuals: their squares grow linearly beyond `SOFT` (Huber loss)."""
     size = np.abs(values) / SOFT
     bent = np.where(size > 1.0, np.sqrt(np.maximum(2.0 * size - 1.0, 1.0)), size)
     return np.sign(values) * SOFT * bent
 
 
 def _softening(values: FloatArray) -> FloatArray:
-    """Derivative of `softened`."""
+    """Returns the derivative of `softened`."""
     size = np.maximum(np.abs(values) / SOFT, 1.0)
     return np.where(size > 1.0, 1.0 / np.sqrt(2.0 * size - 1.0), 1.0)

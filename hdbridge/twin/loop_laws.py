@@ -1,7 +1,7 @@
-"""The gear's elastic loop by each law that the plant has, as nearly the same loop as that law can be.
+"""Conversion of the gear's elastic loop between the plant's hysteresis laws.
 
-A calibration's model has one law, whose shape may not be this gear's: it then has another offset than the
-gear, for half of a loop that is turned round in the middle is as much of its data as the whole one.
+A calibration's model has one law, whose shape may differ from the gear's. Its offset is then biased, because
+the data include partial loops as well as whole ones.
 """
 
 from __future__ import annotations
@@ -17,36 +17,36 @@ from hdbridge.sim.truth.hysteresis import Hysteresis, MaxwellSlip
 from hdbridge.twin.parameters import BY_NAME, Parameter, value_in
 
 LOOP: Final = ("loop offset", "loop width", "loop yield", "loop exponent")
-"""Parameters of the laws; none has all of them."""
+"""Parameters of the laws; no law has all of them."""
 LAWS: Final[tuple[dict[str, Any], ...]] = (
     {"law": "rolling_friction", "offset_arcsec": 1.0, "width_deg": 1.0, "exponent": 1.6},
     {"law": "bouc_wen", "offset_arcsec": 1.0, "yield_deg": 1.0},
     {"law": "dahl", "offset_arcsec": 1.0, "yield_deg": 1.0},
 )
-"""Loops of unit size by the laws of few parameters; the exponent of the first is a published gear's."""
+"""Unit loops by the laws with few parameters; the exponent of the first is that of a published gear."""
 LONG = 20.0
-"""Travel in widths after which each of them is as far as it gets."""
+"""Travel after which each loop has reached its limit; widths."""
 _TRUE: Final[TypeAdapter[Hysteresis]] = TypeAdapter(Hysteresis)
 
 
 def loop_parameters(truth: Truth) -> tuple[Parameter, ...]:
-    """Those that the law of this truth has."""
+    """Returns the parameters that the law of this truth has."""
     return tuple(BY_NAME[name] for name in LOOP if value_in(truth, BY_NAME[name]) is not None)
 
 
 def by_each_law(truth: Truth) -> list[Truth]:
-    """The truth, then the same with the loop of each other law; nothing where the gear has no loop."""
+    """Returns the truth, and the truth with each other law; an empty list if the gear has no loop."""
     own = truth.gear.hysteresis
     if own is None:
         return []
     if own.law == "rolling_friction":
-        # A loop that a fit makes lower may not begin above it; where one begins is long forgotten.
+        # A fit may reduce the loop below its initial state, which has no effect after some travel.
         truth = _with_loop(truth, own.model_copy(update={"start_arcsec": 0.0}))
     return [truth, *(_with_loop(truth, _like(own, each)) for each in LAWS if each["law"] != own.law)]
 
 
 def by_law_of(truth: Truth, other: Truth) -> Truth:
-    """The truth with its loop by the law that another one has."""
+    """Returns the truth with its loop converted to the law of another truth."""
     own, law = truth.gear.hysteresis, other.gear.hysteresis
     if own is None or law is None or own.law == law.law:
         return truth
@@ -54,14 +54,14 @@ def by_law_of(truth: Truth, other: Truth) -> Truth:
 
 
 def _like(own: Hysteresis, unit: dict[str, Any]) -> Hysteresis:
-    """A loop as high as this one that is crossed half after the same travel."""
+    """Returns a loop of another law with the same height and the same travel to half crossing."""
     travel_deg = _half_crossed_deg(own) / _half_crossed_deg(_TRUE.validate_python(unit))
     size = "width_deg" if "width_deg" in unit else "yield_deg"
     return _TRUE.validate_python(unit | {"offset_arcsec": _offset_arcsec(own), size: travel_deg})
 
 
 def _half_crossed_deg(loop: Hysteresis) -> float:
-    """Motor travel after a turn by which the error has come to zero."""
+    """Returns the motor travel after a reversal at which the error crosses zero; degrees."""
     far_deg = LONG * _width_deg(loop)
 
     def left(travel_deg: float) -> float:

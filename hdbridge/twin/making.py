@@ -1,4 +1,4 @@
-"""A twin from recordings: the fit, what was wrong before, what cannot be told apart, what is left."""
+"""Makes a twin from recordings: fit, causes by which the start was wrong, inseparable sets, residuals."""
 
 from __future__ import annotations
 
@@ -36,11 +36,11 @@ def fit_twin(
 ) -> Twin:
     """Fits the twin of an axis to recordings that have the commanded motor angle.
 
-    ``start`` is what is assumed of it: the translated axis file and model, or an older twin. Replays run in
+    ``start`` is the initial simulation: the translated axis file and model, or an older twin. Replays run in
     ``workers`` processes. InputError if a recording has no command or is of another gear.
 
-    Causes are named only if the values before and after are the axis's; intervals are given only if those
-    after are.
+    Causes are named only if the values before and after the fit are the axis's; intervals are given only if
+    those after it are.
     """
     whole = Recording.joined(list(recordings))
     data = coarse(prepare(whole, axis, start), FIT_S)
@@ -81,14 +81,14 @@ def fit_twin(
 
 
 def _compared(whole: Recording, axis: AxisConfig, truth: Truth) -> Comparison:
-    """A recording against one simulation, by kind of leg and for those held out."""
+    """Compares a recording with one simulation by kind of leg, and on the held-out legs."""
     held = [each.model_copy(update={"kind": HELD_OUT}) for each in held_out_legs(whole)]
     simulated = replay_directly(whole, axis, truth)
     return compare(whole.record, simulated, [*legs_of(whole), *held], axis.gear.ratio)
 
 
 def with_knowledge(fitted: Fitted, data: Data, values: Values = Values.AXIS) -> Truth:
-    """The fitted truth with its intervals and what a later check needs, as its file has it."""
+    """Returns the fitted truth with its intervals, and the data for a later check in its provenance."""
     intervals = fitted.intervals()
     about: dict[str, Any] = {
         "parameters": [each.name for each in fitted.parameters],

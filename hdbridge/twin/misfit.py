@@ -1,8 +1,7 @@
-"""What a recording shows and a replay does not, channel by channel: the residuals that a fit makes small.
+"""Residuals between a recording and its replay, by channel, which a fit minimises.
 
-The replay is smooth: encoders and torque unrounded, no noise, and loops that close on a much finer encoder,
-so that the residuals are smooth in the plant's parameters. What rounding and noise do is in the scale of each
-channel.
+The replay has no noise, unrounded encoders and torque, and loops that close on a much finer encoder, so the
+residuals are smooth in the plant's parameters. The scale of each channel accounts for rounding and noise.
 """
 
 from __future__ import annotations
@@ -36,18 +35,18 @@ from hdbridge.twin.stretches import (
 from hdbridge.units import ARCSEC_PER_DEG
 
 FINEST_STEPS_PER_TURN = 2**40
-"""Of the loops' encoder in a smooth replay. A step is a torque of some 1e-9 of the rated one: with steps that
-a drive has, the least change of a parameter shakes the torque by as much as a change that means something."""
+"""Resolution of the loops' encoder in a smooth replay. One step makes about 1e-9 of the rated torque; with a
+drive's own steps, the smallest change of a parameter would disturb the torque as much as a relevant one."""
 CHANNELS = (FOLLOWING, TORQUE, LOAD)
 UNKNOWN_DEG = 60.0
-"""Motor travel after which neither the elastic state nor the loops' integral depends on what went before the
-recording, where nothing tells them: neither a gear without such a state nor the torque that held the axis."""
+"""Motor travel after which the elastic state and the loops' integral no longer depend on the time before the
+recording, if they are not known (from a gear without such a state, or from the holding torque)."""
 LONGEST_LEG_S = 2.0
-"""A longer leg counts as several: residuals further apart than this have nothing to do with each other."""
+"""Maximum length of a leg; a longer one is split, because residuals further apart are uncorrelated."""
 COARSE_S = 15.0
-"""The first steps of a fit are made on pieces that take the axis about so long."""
+"""Duration of the pieces on which the first steps of a fit are made."""
 WITHOUT_MOTION = frozenset({"standstill", "reference", "settle"})
-"""Kinds of leg that are no reason to take a piece."""
+"""Kinds of leg that alone do not qualify a piece for a coarse fit."""
 HELD_OUT = 4
 Seed = int | Literal["loops"] | None
 
@@ -58,22 +57,22 @@ class Piece:
 
     commands: Commands
     measured: Mapping[str, FloatArray]
-    """By channel: following error in degrees of the motor, torque in Nm, load angle in arcsec."""
+    """Following error in motor degrees, torque in Nm and load angle in arcsec, by channel."""
     counts: Mapping[str, FloatArray]
-    """By channel, for each row 1 where it counts and else 0."""
+    """1 for each row that counts, else 0, by channel."""
     leg: FloatArray
-    """Number of the leg of each row, from zero."""
+    """Leg number of each row, from zero."""
     kind: tuple[str, ...]
     """Kind of each of its legs."""
     out: FloatArray
-    """For each row 1 where its leg is held out, else 0."""
+    """1 for each row of a held-out leg, else 0."""
     rest: FloatArray
-    """For each row 1 where the command has stood for a while, else 0."""
+    """1 for each row at which the command has been at rest for `RINGING_S`, else 0."""
 
 
 @dataclass(frozen=True, eq=False)
 class Data:
-    """Recordings, prepared for replays through a truth like ``base``."""
+    """Recordings prepared for replays with truths like ``base``."""
 
     axis: AxisConfig
     base: Truth
@@ -81,13 +80,13 @@ class Data:
 
     @property
     def leg(self) -> FloatArray:
-        """Number of the leg of each row, through all pieces."""
+        """Leg number of each row, continuing through all pieces."""
         firsts = np.cumsum([0, *(len(each.kind) for each in self.pieces)])[:-1]
         return np.concatenate([first + each.leg for first, each in zip(firsts, self.pieces, strict=True)])
 
     @property
     def out(self) -> FloatArray:
-        """For each row 1 where its leg is held out, else 0."""
+        """1 for each row of a held-out leg, else 0."""
         return np.concatenate([each.out for each in self.pieces])
 
     @property
@@ -97,12 +96,12 @@ class Data:
 
     @property
     def duration_s(self) -> float:
-        """How long one replay takes on the axis."""
+        """Duration of the replayed motion."""
         return sum(len(each.commands.counts) * each.commands.cycle_s for each in self.pieces)
 
 
 def held_out_legs(recording: Recording) -> tuple[Segment, ...]:
-    """The legs that a fit does not see: each `HELD_OUT`-th of its kind."""
+    """Returns the legs that a fit does not see: every `HELD_OUT`-th of its kind."""
     seen: dict[str, int] = {}
     out = []
     for leg in legs_of(recording):
@@ -113,9 +112,9 @@ def held_out_legs(recording: Recording) -> tuple[Segment, ...]:
 
 
 def prepare(recording: Recording, axis: AxisConfig, base: Truth) -> Data:
-    """The recording's parts, long ones in stretches; InputError without a command or with another ratio.
+    """Prepares a recording, long parts in stretches; InputError without a command or for another ratio.
 
-    What came before a stretch leads up to it and does not count, as far as it is known.
+    Up to `RUN_IN_S` of the recording before a stretch is replayed as its run-in and does not count.
     """
     recording.record.check_ratio(axis.gear.ratio)
     record, legs, held = recording.record, legs_of(recording), held_out_legs(recording)
@@ -143,8 +142,8 @@ def prepare(recording: Recording, axis: AxisConfig, base: Truth) -> Data:
 
 
 def coarse(data: Data, wanted_s: float = COARSE_S) -> Data:
-    """Pieces that take the axis about ``wanted_s``: as many kinds of motion as there is time for, and then
-    as different temperatures.
+    """Selects pieces of about ``wanted_s`` in total with as many kinds of motion as possible, and then with
+    different temperatures.
     """
     left = sorted(data.pieces, key=lambda each: len(each.commands.counts))
     taken: list[Piece] = []
@@ -163,7 +162,7 @@ def coarse(data: Data, wanted_s: float = COARSE_S) -> Data:
 
 
 def _by_warmth(pieces: list[Piece], taken: Sequence[Piece]) -> list[Piece]:
-    """Each next piece is as far from those before it, and from those taken, as its temperature can be."""
+    """Orders pieces so that each differs most in temperature from those before it and those taken."""
     warm_c = np.array([each.commands.start_c for each in pieces], dtype=np.float64)
     if np.isnan(warm_c).any():
         return pieces
@@ -180,10 +179,10 @@ def _by_warmth(pieces: list[Piece], taken: Sequence[Piece]) -> list[Piece]:
 
 
 def traces_of(data: Data, truth: Truth, seed: Seed = None) -> list[dict[str, FloatArray]]:
-    """What a replay shows, by piece and channel, as `Piece.measured` has it.
+    """Replays a truth; returns its traces by piece and channel, as in `Piece.measured`.
 
-    A smooth one; with a seed one that is rounded and noisy as a recording is; or one that is smooth but for
-    the steps of its loops.
+    ``seed``: None for a smooth replay, a number for a rounded and noisy one, "loops" for one that is smooth
+    except for the encoder steps of its loops.
     """
     simulated = smooth(truth) if seed is None else silent(truth) if seed == "loops" else truth
     shown = []
@@ -203,12 +202,12 @@ def traces_of(data: Data, truth: Truth, seed: Seed = None) -> list[dict[str, Flo
 
 
 def residuals(data: Data, truth: Truth, seed: Seed = None) -> dict[str, FloatArray]:
-    """Measured minus simulated, by channel, over all rows; zero where a row does not count.
+    """Returns measured minus simulated by channel over all rows, shape (n,); zero if a row does not count.
 
-    What zeros are apart is taken off in each piece: the load's angle has none in common with the motor's, and
-    a command that is off by as much wherever the axis rests, by more than a count, is told by another zero.
-    Of the load's angle what it does not share with the motor counts: a motor that is late takes the load
-    along. ``seed`` as in `traces_of`.
+    Zero offsets are removed in each piece: the load angle's zero is independent of the motor's, and a
+    constant following error of more than a count at rest means that the command has another zero. The part of
+    the load residual that follows from the motor's is removed, because a late motor makes the load late.
+    ``seed`` is as in `traces_of`.
     """
     found: dict[str, list[FloatArray]] = {name: [] for name in CHANNELS}
     step_deg = rounding(data.axis)[FOLLOWING]
@@ -225,17 +224,17 @@ def residuals(data: Data, truth: Truth, seed: Seed = None) -> dict[str, FloatArr
 
 
 def beyond(values: FloatArray, least: float) -> FloatArray:
-    """What values have beyond one that says nothing, each in its own sense."""
+    """Shrinks values towards zero by ``least`` (soft threshold)."""
     return np.asarray(np.sign(values) * np.maximum(np.abs(values) - least, 0.0), dtype=np.float64)
 
 
 def _not_taken_along(
     data: Data, following: Sequence[FloatArray], load: Sequence[FloatArray]
 ) -> list[FloatArray]:
-    """The load's residuals by piece, without what the motor's have brought about, and without their zeros.
+    """Returns the load's residuals by piece, without the part due to the motor's and without their zeros.
 
-    How large their share is the residuals themselves show: one where the loops are not as the axis's are and
-    both shafts are late. The motor encoder's rounding is not in it.
+    The share of the motor's residuals is a regression coefficient between 0 and 1; it is one if the loops are
+    wrong and both shafts are late. The motor encoder's rounding is excluded.
     """
     inside = [piece.counts[LOAD] > 0.0 for piece in data.pieces]
     rounded_deg = 0.5 * rounding(data.axis)[FOLLOWING]
@@ -256,12 +255,12 @@ def _not_taken_along(
 
 
 def counted(data: Data) -> dict[str, FloatArray]:
-    """By channel, for each row 1 where it counts and else 0."""
+    """Returns 1 for each row that counts, else 0, by channel."""
     return {name: np.concatenate([each.counts[name] for each in data.pieces]) for name in CHANNELS}
 
 
 def rounding(axis: AxisConfig) -> dict[str, float]:
-    """By channel, in its unit, the step that a recording is rounded to."""
+    """Returns the resolution of a recording by channel, in its unit."""
     return {
         FOLLOWING: 360.0 / axis.motor_encoder.counts_per_turn,
         TORQUE: 1e-3 * axis.drive.rated_torque_nm,
@@ -270,11 +269,11 @@ def rounding(axis: AxisConfig) -> dict[str, float]:
 
 
 def smooth(truth: Truth) -> Truth:
-    """The truth with loops that close on a much finer encoder, and no noise."""
+    """Returns the truth without noise, and with loops that close on a much finer encoder."""
     motor, servo = truth.motor.encoder, truth.servo
     steps = max(FINEST_STEPS_PER_TURN // motor.counts_per_turn, motor.interpolation)
     finer = steps / motor.interpolation
-    # Not as a truth file may have it: its bands are in steps of the loops' encoder.
+    # Unchecked, beyond the limits of a truth file. The bands are in steps of the loops' encoder.
     loops = servo.model_copy(
         update={
             "integral_dead_band": (servo.integral_dead_band + 0.5) * finer - 0.5,
@@ -288,7 +287,7 @@ def smooth(truth: Truth) -> Truth:
 
 
 def silent(truth: Truth) -> Truth:
-    """The truth without noise."""
+    """Returns the truth without noise."""
     return with_load_encoder(truth, noise_arcsec=0.0)
 
 
@@ -312,14 +311,14 @@ def _piece(
     stuck = part.time_s - last_moved_s > RINGING_S
     everywhere = np.where(judged, 1.0, 0.0)
     elastic = unknown | (np.cumsum(travelled) < forgets_deg)
-    # Between two parts a drive's loops may have begun anew.
+    # Between two parts the drive's loops may have been restarted.
     loops = elastic | (np.cumsum(np.where(judged, travelled, 0.0)) <= UNKNOWN_DEG)
     count_deg = 360.0 / axis.motor_encoder.counts_per_turn
     still = stands(moved > 0.0, part.motor_position_deg, STANDS_COUNTS * count_deg)
     rests = stuck & still
     torque = part.columns.get("motor_torque_nm")
     if torque is not None:
-        # What the integral came to at rest is in the torque that held the axis.
+        # The holding torque at rest is the value of the integral.
         held = held_rows(part, moved > 0.0, still)
         known = held[0] if len(held) else len(loops)
         loops[known:] = unknown[known:]
@@ -331,7 +330,7 @@ def _piece(
         TORQUE: torque if torque is not None else np.zeros(len(part)),
         LOAD: part.load_position_deg * ARCSEC_PER_DEG,
     }
-    # Where a motor came to rest within its count is one reading, not one for each row; so with the load.
+    # The rest position within a count is one reading, not one for each row; likewise for the load.
     again = np.append(rests[:-1] & rests[1:], False)
     counts = {
         FOLLOWING: np.where(unknown | rests, 0.0, everywhere),
@@ -342,7 +341,7 @@ def _piece(
 
 
 def remembers(truth: Truth) -> bool:
-    """Whether the gear's angle hangs on where its motor has been, which a replay may not know."""
+    """Returns True if the gear's angle depends on the history of the motor."""
     gear, load = truth.gear, truth.load_
     return bool(
         gear.hysteresis or gear.second_hysteresis or gear.backlash_arcsec or gear.flank or gear.wear
@@ -351,7 +350,7 @@ def remembers(truth: Truth) -> bool:
 
 
 def _legs(part: Record, legs: Sequence[tuple[str, float, float]]) -> tuple[FloatArray, tuple[str, ...]]:
-    """Number of the leg of each row, from zero, and the legs' kinds; rows between legs belong to the last."""
+    """Returns the leg number of each row, from zero, and the legs' kinds; gaps belong to the leg before."""
     starts: list[tuple[float, str]] = []
     for kind, start_s, end_s in legs:
         if end_s < part.time_s[0] or start_s > part.time_s[-1]:
@@ -366,7 +365,7 @@ def _legs(part: Record, legs: Sequence[tuple[str, float, float]]) -> tuple[Float
 
 
 def demand_deg(commands: Commands, axis: AxisConfig) -> FloatArray:
-    """The commanded motor angle at each row."""
+    """Returns the commanded motor angle at each row; degrees."""
     counts = np.asarray(commands.counts[commands.lead :], dtype=np.float64)
     encoder = axis.motor_encoder
     deg = encoder.direction * counts * 360.0 / encoder.counts_per_turn

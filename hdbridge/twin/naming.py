@@ -1,7 +1,7 @@
-"""What was wrong with the simulation: causes by the evidence that they earn, and what cannot be told apart.
+"""Names the causes by which a simulation was wrong, with their evidence, and parameters not separable.
 
-A cause is held against legs that the fit has not seen: the twin with this cause's parameters where they were,
-and then the best that can be done so (`hdbridge.twin.naming`).
+A cause is tested on held-out legs: first with its parameters reset in the twin, then with the best rival fit
+that keeps them reset.
 """
 
 from __future__ import annotations
@@ -31,20 +31,20 @@ from hdbridge.twin.replays import Replays
 from hdbridge.units import figure
 
 # ----------------------------------------------------------------
-# Whether a recording distinguishes a twin from a rival: what the rival leaves more, against its scatter.
+# Significance of a rival's larger residuals against their scatter between legs.
 
 FALSE_ALARM = 0.02
-"""Probability with which a simulation that is right has any cause named."""
+"""Probability that any cause is named in a correct simulation."""
 STEPS = 6
-"""Most steps of a rival's fit, which begins where the slopes of the twin's own fit lead. A rival that has not
-reached its minimum loses to the twin by that alone, and a cause is named that is none."""
+"""Maximum steps of a rival's fit, which starts at the linear prediction of the twin's fit. A rival that has
+not reached its minimum loses for that reason alone, and a wrong cause is named."""
 
 
 def told_apart(left: FloatArray, change: FloatArray, legs: FloatArray) -> bool:
-    """Whether a rival leaves more than chance would have it.
+    """Returns True if a rival's residuals are larger than by chance.
 
-    ``left`` is what the twin leaves, by row, in units of the noise; ``change`` what the rival leaves more;
-    ``legs`` the number of each row's leg.
+    ``left`` are the twin's residuals by row, in units of the noise; ``change`` the rival's residuals minus
+    these; ``legs`` the leg number of each row.
     """
     loss = float(change @ (change + 2.0 * left))
     within = over_legs((left * change)[:, None], legs)
@@ -54,18 +54,18 @@ def told_apart(left: FloatArray, change: FloatArray, legs: FloatArray) -> bool:
 
 
 def put_back(start: Truth, truth: Truth, own: Sequence[Parameter]) -> Truth:
-    """A truth with these parameters where they were."""
+    """Returns a truth with these parameters reset to their start."""
     return at_coordinates(truth, own, coordinates(start, own))
 
 
 def without(
     replays: Replays, start: Truth, fitted: Fitted, own: Sequence[Parameter], moved: Sequence[Parameter]
 ) -> Truth:
-    """The best rival in which these parameters are where they were: all others may make up for it.
+    """Fits the best rival that keeps these parameters at their start; all others may compensate.
 
-    It is fitted from where the slopes of the twin's fit lead, from where only the ``moved`` ones are as in
-    the twin, or from where filter or dead time makes up for the other, whichever is nearest: what makes up
-    for each other may be far from the twin, and slopes do not lead from one substep into another.
+    The fit starts at the best of three places: the linear prediction of the twin's fit, the start with only
+    the ``moved`` parameters as in the twin, or an exchange of filter and dead time. Compensating values may
+    be far from the twin, and slopes do not lead from one substep into another.
     """
     free = [number for number, each in enumerate(fitted.parameters) if each not in own]
     back = [number for number, each in enumerate(fitted.parameters) if each in own]
@@ -88,9 +88,9 @@ def without(
 
 
 def held_out(replays: Replays, found: dict[str, FloatArray], fitted: Fitted) -> tuple[FloatArray, FloatArray]:
-    """The scaled residuals on legs that the fit has not seen, softened, with the number of each one's leg.
+    """Returns the softened scaled residuals on held-out legs, and their leg numbers.
 
-    On all legs where none was held out.
+    Uses all legs if none was held out.
     """
     data = replays.data
     out = data.out if data.out.any() else np.ones(len(data.out))
@@ -101,12 +101,12 @@ def held_out(replays: Replays, found: dict[str, FloatArray], fitted: Fitted) -> 
 # ----------------------------------------------------------------
 
 ALIKE = 0.4
-"""Share of a parameter in a direction that the motion does not show, from which it belongs to the set."""
+"""Minimum component of a parameter in an unobservable direction for it to belong to the set."""
 
 
 @dataclass(frozen=True, slots=True)
 class Moved:
-    """One parameter, before and after."""
+    """Change of one parameter."""
 
     name: str
     unit: str
@@ -114,11 +114,11 @@ class Moved:
     after: float
     lower: float = math.nan
     upper: float = math.nan
-    """95 % interval of what it is after; NaN if it has none."""
+    """95 % interval of the value after; NaN if it has none."""
 
     @property
     def sentence(self) -> str:
-        """In words."""
+        """Change in words."""
         unit = f" {self.unit}" if self.unit else ""
         moved = f"{self.name} {figure(self.before, 3)} -> {figure(self.after, 3)}{unit}"
         if math.isnan(self.lower):
@@ -128,19 +128,19 @@ class Moved:
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """A cause that is named."""
+    """A named cause."""
 
     cause: str
     parameters: tuple[Moved, ...]
     shows_in: tuple[str, ...]
     evidence: float
-    """Natural logarithm of one over the probability of so large a change where there is none."""
+    """Negative natural logarithm of the probability of so large a change by chance."""
     gain: tuple[float, float]
-    """Rms of the scaled residuals on legs that the fit has not seen: without the change, and with it."""
+    """Rms of the scaled residuals on held-out legs without the change, and with it."""
     aliases: tuple[str, ...] = ()
-    """Other parameters that the motion cannot tell from these."""
+    """Other parameters that the motion does not separate from these."""
     move: str = ""
-    """The motion that would."""
+    """Motion that would separate them."""
 
     @property
     def text(self) -> str:
@@ -153,7 +153,7 @@ class Finding:
 
 @dataclass(frozen=True, slots=True)
 class Alike:
-    """Parameters that this motion cannot tell apart, and the motion that would."""
+    """Parameters that the motion does not separate, and motions that would separate them."""
 
     names: tuple[str, ...]
     moves: tuple[str, ...]
@@ -162,11 +162,11 @@ class Alike:
 def name_causes(
     replays: Replays, start: Truth, fitted: Fitted
 ) -> tuple[tuple[Finding, ...], tuple[Alike, ...]]:
-    """The causes in which the start was wrong, the most telling first, and what cannot be told apart there.
+    """Names the causes in which the start was wrong, largest gain first, and sets that are not separable.
 
-    A cause without which held-out legs come out worse, whatever else makes up for it, is named. If the twin
-    needs more than those, the others are named with what may stand in for them; if not, nothing tells what
-    they came to from the start, and that is a set. Rivals are fitted to a few of the legs.
+    A cause is named if held-out legs get worse without it, however the others compensate. If these causes do
+    not suffice, the others are named with the parameters that may replace them. If they do, the remaining
+    parameters are not separable from their start and form a set. Rivals are fitted to a few of the legs.
     """
     contest = _Contest(replays, start, fitted)
     groups: dict[str, list[Parameter]] = {}
@@ -205,7 +205,7 @@ def name_causes(
 
 
 class _Contest:
-    """A fit against its rivals, on legs that it has not seen."""
+    """Comparison of a fit with its rivals on held-out legs."""
 
     def __init__(self, replays: Replays, start: Truth, fitted: Fitted) -> None:
         self._replays, self._start, self._fitted = replays, start, fitted
@@ -213,15 +213,15 @@ class _Contest:
         self.left, self._legs = held_out(replays, shown, fitted)
 
     def left_by(self, shown: dict[str, FloatArray]) -> FloatArray:
-        """The scaled residuals of a rival."""
+        """Returns the scaled residuals of a rival."""
         return held_out(self._replays, shown, self._fitted)[0]
 
     def lost(self, shown: dict[str, FloatArray]) -> bool:
-        """Whether a rival has lost."""
+        """Returns True if a rival is significantly worse than the fit."""
         return told_apart(self.left, self.left_by(shown) - self.left, self._legs)
 
     def needed(self, rival: Truth, parameters: Sequence[Parameter]) -> list[Parameter]:
-        """Those that a rival cannot do without, each alone where it was."""
+        """Returns the parameters that a rival needs: it gets worse when one of them is reset."""
         truths = [rival, *(put_back(self._start, rival, [each]) for each in parameters)]
         left, *without = (self.left_by(shown) for shown in self._replays(truths))
         pairs = zip(parameters, without, strict=True)
@@ -237,9 +237,9 @@ def finding(
     gain: tuple[float, float],
     instead: Sequence[Parameter] = (),
 ) -> Finding:
-    """What is said of one cause's parameters; ``distance`` in squared standard deviations.
+    """Returns the finding of one cause's parameters; ``distance`` is squared, in standard deviations.
 
-    ``instead`` are those that may have changed in their place.
+    ``instead`` holds parameters that may have changed in their place.
     """
     moved = tuple(
         Moved(each.name, each.unit, free_value(before, each), free_value(after, each), *intervals[each.name])
@@ -257,15 +257,15 @@ def finding(
 
 
 def _evidence(distance: float, count: int) -> float:
-    """Natural logarithm of one over the probability of a distance by chance."""
+    """Returns the negative natural logarithm of the probability of a distance by chance."""
     chance = float(chdtrc(count, distance))
     return -math.log(chance) if chance > 0.0 else 0.5 * distance
 
 
 def alike(fitted: Fitted, legs: FloatArray) -> tuple[Alike, ...]:
-    """The sets of parameters that may move together by as much as the prior allows without being told.
+    """Returns sets of parameters that may move together by the prior's width without a significant change.
 
-    ``legs`` is the number of the leg of each fitted row.
+    ``legs`` holds the leg number of each fitted row.
     """
     spread = np.array([each.spread for each in fitted.parameters])
     scaled = fitted.jacobian * spread
@@ -285,14 +285,14 @@ def _set(members: Sequence[Parameter]) -> Alike:
 
 
 def _moved(fitted: Fitted, start: Truth, own: Sequence[Parameter]) -> float:
-    """How far some parameters have moved, in squared standard deviations."""
+    """Returns the squared Mahalanobis distance of some parameters from their start."""
     places = [number for number, each in enumerate(fitted.parameters) if each in own]
     off = fitted.place[places] - np.array(coordinates(start, own))
     return float(off @ np.linalg.solve(fitted.covariance[np.ix_(places, places)], off))
 
 
 def _further(one: Truth, other: Truth, parameters: Sequence[Parameter]) -> list[Parameter]:
-    """Those that differ by more than anybody would care about."""
+    """Returns the parameters that differ by more than their least change."""
     apart = np.subtract(coordinates(one, parameters), coordinates(other, parameters))
     return [each for each, off in zip(parameters, apart, strict=True) if abs(off) > each.least_change]
 

@@ -1,4 +1,4 @@
-"""The noise of a recording: what a twin leaves is held against it, and its load encoder has as much."""
+"""Noise of a recording: the reference for a twin's residuals, and the noise of its load encoder."""
 
 from __future__ import annotations
 
@@ -17,21 +17,21 @@ from hdbridge.twin.parameters import FOLLOWING, LOAD, TORQUE, with_load_encoder
 from hdbridge.units import ARCSEC_PER_DEG
 
 # ----------------------------------------------------------------
-# How likely a rounded reading is by a simulation that is not rounded.
+# Likelihood of a rounded reading under an unrounded simulation.
 
 FINE = 1e-3
-"""Half a step of fewer deviations is as good as none."""
+"""Half step, in standard deviations, below which rounding is negligible."""
 STRAY = 0.02
-"""Share of readings that may be anywhere: how a motor that stuck breaks away, and where it stood when the
-drive was switched on, is no measure of what a simulation is off by elsewhere, nor of a parameter."""
+"""Share of outliers among the readings: the break-away of a stuck motor and its position at switching on are
+not evidence of the simulation's error or of a parameter."""
 
 
 def rooted(off: FloatArray, half: FloatArray, stray: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Residuals of which half the squares are the loss of log likelihood, and their derivative by ``off``.
+    """Returns residuals whose half squares are the loss of log likelihood, and their derivative by ``off``.
 
-    ``off`` is how far each reading is from the simulation, ``half`` half the step that it is rounded to, both
-    in standard deviations of the simulation, shape (n,); ``stray`` the probability of a reading in spite of
-    all. Without steps they are as they came.
+    ``off`` is reading minus simulation, ``half`` half the resolution, both in standard deviations of the
+    simulation, shape (n,); ``stray`` the probability of an outlier. Without resolution, ``off`` is returned
+    unchanged.
     """
     size, plain = np.abs(off), half == 0.0
     stray = np.where(half < FINE, stray * FINE / np.where(plain, 1.0, half), stray)
@@ -48,7 +48,7 @@ def rooted(off: FloatArray, half: FloatArray, stray: FloatArray) -> tuple[FloatA
 
 
 def surprise(size: FloatArray, half: FloatArray, stray: FloatArray) -> FloatArray:
-    """Minus the logarithm of the probability of a reading so far away, ``size`` from zero on."""
+    """Returns the negative log probability of a reading at distance ``size`` >= 0."""
     outer, inner = -size - half, size - half
     near = np.log1p(-np.minimum(ndtr(outer) + ndtr(inner), 1.0 - 1e-15))
     tail = log_ndtr(-inner)
@@ -61,10 +61,9 @@ def surprise(size: FloatArray, half: FloatArray, stray: FloatArray) -> FloatArra
 def deviation(
     off: FloatArray, step: float, least: float, spread: FloatArray | None = None
 ) -> tuple[float, float]:
-    """The standard deviation of a simulation, by readings in steps: the most likely, ``least`` at least.
+    """Estimates a simulation's standard deviation from rounded readings (maximum likelihood, >= ``least``).
 
-    ``spread`` is what each reading is known to be off by in addition. With it the probability of a reading in
-    spite of all.
+    ``spread`` is the additional known deviation of each reading. Also returns the probability of an outlier.
     """
     size, known = np.abs(off), np.zeros_like(off) if spread is None else spread
     farthest = max(float(np.max(size)), least)
@@ -84,49 +83,49 @@ def deviation(
 
 
 # ----------------------------------------------------------------
-# What the residuals of a recording are measured by: how far a simulation is off, channel by channel.
+# Scales of the residuals: standard deviation of a simulation's error by channel.
 
 MAD_TO_SIGMA = 1.4826
 MOST_ANSWERED = 1.5
-"""Of a speed, the largest share that a velocity loop makes up for within a step: at two it is unstable."""
+"""Maximum share of a speed error that a velocity loop corrects within a step; it is unstable at two."""
 
 
 @dataclass(frozen=True, eq=False)
 class Loops:
-    """By channel, for each row of a recording, what loops with a drive's steps do otherwise than smooth ones.
+    """Deviation of quantised loops from smooth ones, by channel, for each row of a recording.
 
-    How a motor that has stuck breaks away hangs on where the integral came to rest, within a step.
+    The break-away of a stuck motor depends on the value of the integral within an encoder step.
     """
 
     mean: Mapping[str, FloatArray]
     spread: Mapping[str, FloatArray]
 
     def taken_off(self, found: Mapping[str, FloatArray]) -> dict[str, FloatArray]:
-        """Residuals of a smooth replay without it."""
+        """Returns the residuals of a smooth replay corrected by the mean deviation."""
         return {name: found[name] + self.mean[name] for name in CHANNELS}
 
 
 @dataclass(frozen=True, eq=False)
 class Scales:
-    """By channel: how far a simulation is off, and what readings are rounded to.
+    """Standard deviation of a simulation's error and resolution of the readings, by channel.
 
-    Without steps rounding counts as noise like any other.
+    Without resolutions, rounding counts as noise.
     """
 
     deviation: Mapping[str, float]
     step: Mapping[str, float] = field(default_factory=lambda: dict.fromkeys(CHANNELS, 0.0))
     stray: Mapping[str, float] = field(default_factory=lambda: dict.fromkeys(CHANNELS, 0.0))
-    """The probability of a reading in spite of all."""
+    """Probability of an outlier."""
     loops: Loops | None = None
 
     def scaled(self, found: Mapping[str, FloatArray]) -> FloatArray:
-        """Residuals of all channels, one after the other, in deviations."""
+        """Returns the residuals of all channels, one after the other, in standard deviations."""
         if self.loops is None:
             return np.concatenate([found[name] / self.deviation[name] for name in CHANNELS])
         return np.concatenate([self.loops.taken_off(found)[name] / self._rows(name) for name in CHANNELS])
 
     def halves(self, length: int) -> tuple[FloatArray, FloatArray]:
-        """Half the step of each of so many rows of each channel, in deviations, and its `stray`."""
+        """Returns half the resolution in standard deviations and `stray`, for ``length`` rows per channel."""
         by_channel = [np.broadcast_to(0.5 * self.step[name] / self._rows(name), length) for name in CHANNELS]
         strays = [self.stray[name] if self.step[name] else 0.0 for name in CHANNELS]
         return np.concatenate(by_channel), np.repeat(strays, length)
@@ -136,19 +135,19 @@ class Scales:
 
     @property
     def noise(self) -> dict[str, float]:
-        """Both together, as if rounding were noise."""
+        """Standard deviation with the rounding included as noise."""
         return {name: float(np.hypot(self.deviation[name], self.step[name] / 12.0**0.5)) for name in CHANNELS}
 
 
 def noise_floor(data: Data) -> dict[str, float]:
-    """Least noise of each channel: its rounding, and what its encoder's rounding makes of the torque."""
+    """Returns the minimum noise of each channel: rounding, and the torque noise from encoder rounding."""
     return Scales(least_deviation(data), rounding(data.axis)).noise
 
 
 def least_deviation(data: Data) -> dict[str, float]:
-    """By channel: what a smooth replay of the true axis is off by, beyond its readings' rounding.
+    """Returns, by channel, the error of a smooth replay of the true axis beyond the readings' rounding.
 
-    That is the steps of the encoder that the loops go by, and the load encoder's noise.
+    It comes from the resolution of the loops' encoder and the load encoder's noise.
     """
     truth = data.base
     encoder = truth.motor.encoder
@@ -163,10 +162,11 @@ def least_deviation(data: Data) -> dict[str, float]:
 
 
 def _shaken_nm(truth: Truth, off_rad: float) -> float:
-    """Torque, rms, that the velocity loop makes of readings that are off by so much, rms, each on its own.
+    """Returns the rms torque that the velocity loop makes of independent reading errors of this rms.
 
-    Speed is their difference by the step, and the motor answers within the next: from reading to torque
-    the loop is K (1 - 1/z)^2 / (dt (1 - (1 - a)/z)) with a = K dt / J, of which this is the norm.
+    Speed is the readings' difference over the step, and the motor responds within the next step. The transfer
+    function is K (1 - 1/z)^2 / (dt (1 - (1 - a)/z)) with a = K dt / J; the result is its norm times the
+    error.
     """
     gain, step_s = truth.servo.velocity_gain_nm_s_per_rad, truth.substep_s
     share = min(gain * step_s / truth.motor.inertia_kg_m2, MOST_ANSWERED)
@@ -175,9 +175,9 @@ def _shaken_nm(truth: Truth, off_rad: float) -> float:
 
 
 def scales(data: Data, found: Mapping[str, FloatArray], loops: Loops | None = None) -> Scales:
-    """Scales of the residuals in motion; no less than what a smooth replay has to be off by.
+    """Estimates the scales of the residuals in motion; at least the error of a smooth replay.
 
-    Not of those at rest: where a recording rests half of the time, they would be the scale.
+    Residuals at rest are excluded, because they would dominate a recording that rests half of the time.
     """
     least, counts, steps = least_deviation(data), counted(data), rounding(data.axis)
     found = found if loops is None else loops.taken_off(found)
@@ -188,7 +188,7 @@ def scales(data: Data, found: Mapping[str, FloatArray], loops: Loops | None = No
         rows = moving & (counts[name] > 0.0)
         inside = found[name][rows]
         if len(inside):
-            # Half of the readings in motion are no strays, however many there are.
+            # At least half of the readings in motion are not outliers.
             typical = MAD_TO_SIGMA * float(np.median(np.abs(beyond(inside, 0.5 * steps[name]))))
             spread = None if unsteady is None else unsteady[name][rows]
             given[name], stray[name] = deviation(inside, steps[name], max(least[name], typical), spread)
@@ -199,16 +199,16 @@ def scales(data: Data, found: Mapping[str, FloatArray], loops: Loops | None = No
 
 ARCSEC_PER_TURN = 360.0 * ARCSEC_PER_DEG
 THIRD_DIFFERENCE = math.sqrt(20.0)
-"""White noise is so much larger in third differences: the root of 1 + 9 + 9 + 1."""
+"""Amplification of white noise by third differences: the root of 1 + 9 + 9 + 1."""
 LEAST_ROWS = 8
 
 
 def noise_in_motion(data: Data) -> dict[str, float]:
-    """By channel, in its unit: what third differences leave of the signal, no less than its rounding.
+    """Estimates the noise in motion by channel, in its unit, from third differences; at least the rounding.
 
-    At rest an encoder says the same count again and again, and a motor that holds needs the same torque: no
-    simulation of the motion can be held against that. A motion that is smooth over four rows is not in third
-    differences, and of rows where it is not (a jerk, a reversal) a median takes no notice.
+    At rest, count and torque stay constant, which is no reference for a simulation in motion. Motion that is
+    smooth over four rows vanishes in third differences, and the median ignores rows where it is not smooth (a
+    jerk, a reversal).
     """
     floor = noise_floor(data)
     found = {}
@@ -227,18 +227,18 @@ def noise_in_motion(data: Data) -> dict[str, float]:
 
 
 def expected(data: Data) -> Scales:
-    """By channel, in its unit: what a replay of the true axis would leave.
+    """Returns the expected scales of the residuals of the true axis, by channel.
 
-    Of following error and torque that is their rounding: what third differences leave of a torque is mostly
-    motion. What the load encoder has beyond its rounding only the recording tells.
+    For following error and torque this is the rounding, because third differences of a torque are mostly
+    motion. The load encoder's noise beyond its rounding is estimated from the recording.
     """
     return Scales(noise_floor(data) | {LOAD: noise_in_motion(data)[LOAD]})
 
 
 def with_load_noise(truth: Truth, left_arcsec: FloatArray) -> Truth:
-    """The truth with the load encoder's noise: what differs from row to row and no replay has.
+    """Returns the truth with the load encoder's noise, from differences of residuals between rows.
 
-    ``left_arcsec`` are the load's residuals, zero where a row does not count. The rounding is not in it.
+    ``left_arcsec`` are the load's residuals, zero for rows that do not count. Rounding is subtracted.
     """
     encoder = truth.load_.encoder
     inside = left_arcsec != 0.0

@@ -1,7 +1,7 @@
-"""What a twin may change of the simulated drive: one row for each parameter of the plant.
+"""Parameters of the simulated drive that a fit may change.
 
-A parameter lives at a path of the truth file. Positive ones are fitted by their logarithm, so that half and
-double are equally far; a delay and what may be zero are fitted as they are.
+Each has a path in the truth file. Positive parameters are fitted by their logarithm, so that half and double
+are equally far; delays and parameters that may be zero are fitted directly.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from hdbridge.sim.truth.resonance import Resonance
 from hdbridge.twin.draft import RESOLVED
 
 FOLLOWING, TORQUE, LOAD = "following error", "motor torque", "load error"
-"""The channels that a replay is held against."""
+"""Channels in which a replay is compared with a recording."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,31 +29,31 @@ class Parameter:
     unit: str
     least: float
     most: float
-    """Values that a fit stays within."""
+    """Bounds of the value in a fit."""
     spread: float
     """Prior standard deviation about the start: of the natural logarithm, or in ``unit`` if `linear`."""
     cause: str
-    """What is said where this has changed; parameters of one cause belong together."""
+    """Cause that is reported if it has changed; several parameters may share one."""
     shows_in: tuple[str, ...]
-    """The channels that depend on it."""
+    """Channels that depend on it."""
     move: str
-    """The motion that distinguishes it from those it looks like."""
+    """Motion that separates it from parameters with similar effects."""
     least_change: float
-    """Change that matters to somebody at the bench, as `spread` is given; less is not reported."""
+    """Smallest change that matters in practice, in the unit of `spread`; smaller ones are not reported."""
     linear: bool = False
 
     def coordinate(self, value: float) -> float:
-        """Where a value lies on the axis that the fit moves along."""
+        """Returns the fit's coordinate of a value."""
         return value if self.linear else math.log(value)
 
     def value(self, coordinate: float) -> float:
-        """The value at a coordinate, kept within its bounds."""
+        """Returns the value at a coordinate, kept within its bounds."""
         value = coordinate if self.linear else math.exp(min(coordinate, 700.0))
         return min(max(value, self.least), self.most)
 
     @property
     def bounds(self) -> tuple[float, float]:
-        """Its bounds as coordinates."""
+        """Bounds as coordinates."""
         return self.coordinate(self.least), self.coordinate(self.most)
 
 
@@ -216,13 +216,13 @@ PARAMETERS: Final[tuple[Parameter, ...]] = (
         (TORQUE, LOAD), "the same motion with the temperature recorded", 3.0, linear=True,
     ),
 )  # fmt: skip
-"""In the order in which a fit has them."""
+"""All parameters, in the order of a fit."""
 
 BY_NAME: Final[Mapping[str, Parameter]] = {each.name: each for each in PARAMETERS}
 
 
 def value_in(truth: Truth, parameter: Parameter) -> float | None:
-    """What a truth file has; None where the section that it belongs to is not there, or the law has none."""
+    """Returns a parameter's value in a truth; None if its section is missing or the law does not have it."""
     place: Any = truth
     for key in parameter.path:
         place = getattr(place, "load_" if key == "load" else key, None)
@@ -232,25 +232,25 @@ def value_in(truth: Truth, parameter: Parameter) -> float | None:
 
 
 def free_value(truth: Truth, parameter: Parameter) -> float:
-    """The same of a parameter that a fit changes, which is there."""
+    """Returns the value of a parameter that is known to exist."""
     value = value_in(truth, parameter)
     assert value is not None, parameter.name
     return value
 
 
 def with_values(truth: Truth, values: Mapping[str, float]) -> Truth:
-    """The truth with other values, by the parameters' names; what cannot be is refused as in a file."""
+    """Returns the truth with other values by parameter name, validated as a file is."""
     return Truth.model_validate(_with(truth, values))
 
 
 def with_load_encoder(truth: Truth, **fields: Any) -> Truth:
-    """The truth with other fields of its load encoder, unchecked: sections that `with_values` cannot make."""
+    """Returns the truth with other fields of its load encoder, including whole sections, unchecked."""
     encoder = truth.load_.encoder.model_copy(update=fields)
     return truth.model_copy(update={"load_": truth.load_.model_copy(update={"encoder": encoder})})
 
 
 def _with(truth: Truth, values: Mapping[str, float]) -> dict[str, Any]:
-    """The content of the truth with other values."""
+    """Returns the content of the truth with other values."""
     data = truth.model_dump(by_alias=True, exclude_none=True)
     for name, value in values.items():
         *sections, key = BY_NAME[name].path
@@ -262,7 +262,7 @@ def _with(truth: Truth, values: Mapping[str, float]) -> dict[str, Any]:
 
 
 def coordinates(truth: Truth, parameters: Iterable[Parameter]) -> list[float]:
-    """Where a truth lies; a value beyond a bound counts as the bound."""
+    """Returns the coordinates of a truth; values beyond a bound count as the bound."""
     found = []
     for each in parameters:
         value = free_value(truth, each)
@@ -271,9 +271,9 @@ def coordinates(truth: Truth, parameters: Iterable[Parameter]) -> list[float]:
 
 
 def at_coordinates(truth: Truth, parameters: Sequence[Parameter], place: Sequence[float]) -> Truth:
-    """The truth at coordinates of these parameters, with a spring no stiffer than its time step resolves.
+    """Returns the truth at these coordinates, with a spring no stiffer than its time step resolves.
 
-    A fit may ask for one: at a resonance of hundreds of hertz a recording does not show how stiff it is.
+    A fit may ask for a stiffer one, because a recording hardly shows resonances of hundreds of hertz.
     """
     data = _with(truth, {each.name: each.value(float(x)) for each, x in zip(parameters, place, strict=True)})
     gear = data["gear"]

@@ -1,12 +1,11 @@
-"""Where a fit starts: what can be read off the recordings without any replay, by linear regressions.
+"""Start values of a fit: linear regressions on the recordings, without replays.
 
-The motor's torque is its own inertia times its acceleration, the load's by the ratio, Coulomb friction by the
-sign of the speed and viscous friction by the speed, whatever the spring and the loops are. The load's part is
-taken from its own encoder: near its resonance it does not do what the command says. The motor's part is
-needed, but not used: a drive takes in a new demand in each cycle, so the motor accelerates in the first
-milliseconds of a cycle, and its torque is told at the end. The following error at a constant speed is
-that speed times the age of the demand. A torque that is the highest and stays there for rows on end may be
-all that the drive has.
+For any spring and loops, the motor's torque is the sum of its inertia times its acceleration, the load's
+divided by the ratio, Coulomb friction times the sign of the speed, and viscous friction times the speed. The
+load's acceleration comes from its own encoder, because it does not follow the command near its resonance. The
+motor inertia is in the regression but not used: the motor accelerates in the first milliseconds after a new
+demand, and the torque is recorded at the end of the cycle. The following error at constant speed is the speed
+times the age of the demand. The highest torque, if held for several rows, may be the drive's limit.
 """
 
 from __future__ import annotations
@@ -23,44 +22,43 @@ from hdbridge.twin.parameters import FOLLOWING, LOAD, TORQUE, with_values
 from hdbridge.units import ARCSEC_PER_DEG
 
 SMOOTHED_S = 0.03
-"""All that is compared is averaged over so long: an angle in whole counts has no acceleration of its own."""
+"""Averaging time of all signals: without it, quantised angles give no usable acceleration."""
 MOVING_DEG_S = 5.0
-"""Motor speed above which the direction of friction is beyond doubt."""
+"""Motor speed above which the direction of friction is certain."""
 HELD_ROWS = 3
-"""A torque that only goes through its highest value is there for a row, or for two about it."""
+"""Minimum rows at the highest torque for a limit; a mere peak lasts one or two."""
 LEAST_ROWS = 50
 LEAST_SHARE = 0.15
-"""A coefficient that is known no better than this, relatively, is not used: a fifth of what the prior leaves
-open."""
+"""Maximum relative standard error of a coefficient that is used: a fifth of the prior's width."""
 
 
 @dataclass(frozen=True, slots=True)
 class Readings:
-    """What the regressions give; None where the motion does not show it."""
+    """Results of the regressions; None for values that the motion does not show."""
 
     lag_s: float | None
-    """Age of the demand: following error by speed."""
+    """Age of the demand: following error over speed."""
     load_inertia_kg_m2: float | None
     coulomb_nm: float | None
     viscous_nm_s_per_rad: float | None
     held_nm: float | None
-    """The motor's highest torque, where it stays there while the motor moves."""
+    """Highest motor torque, if it is held while the motor moves."""
 
 
 def read_off(data: Data) -> Readings:
-    """The regressions over all pieces."""
+    """Runs the regressions over all pieces."""
     return Readings(_lag_s(data), *_mechanics(data), _held_nm(data))
 
 
 def start_of(truth: Truth, data: Data) -> Truth:
-    """The truth with what the regressions give in place of what it had."""
+    """Returns the truth with the values that the regressions give."""
     found = read_off(data)
     values: dict[str, float] = {}
     load, servo = truth.load_, truth.servo
     if found.load_inertia_kg_m2 is not None:
         scale = found.load_inertia_kg_m2 / load.whole_inertia_kg_m2
         values["load inertia"] = load.inertia_kg_m2 * scale
-        # The spring with its damping keeps the frequency that the start had.
+        # Spring and damping are scaled to keep the resonance frequency of the start.
         values["gear stiffness"] = truth.gear.stiffness_nm_per_rad * scale
         values["gear damping"] = truth.gear.damping_nm_s_per_rad * scale
     if found.coulomb_nm is not None:
@@ -82,7 +80,7 @@ def start_of(truth: Truth, data: Data) -> Truth:
 
 
 def _mechanics(data: Data) -> tuple[float | None, float | None, float | None]:
-    """Load inertia, Coulomb and viscous friction."""
+    """Returns load inertia, Coulomb friction and viscous friction."""
     tables, torques = zip(*(_torques(piece, data) for piece in data.pieces), strict=True)
     table, torque = np.concatenate(tables), np.concatenate(torques)
     if not table[:, -1].any():
@@ -92,17 +90,17 @@ def _mechanics(data: Data) -> tuple[float | None, float | None, float | None]:
     columns = list(table.T)
     found = _slope(torque, columns, LEAST_SHARE)
     if found and (found[0] is None or found[0] <= 0.0):
-        # No motor inertia to be seen: the load's goes without it.
+        # The motor inertia is not visible: estimate the load's without it.
         found = [None, *(_slope(torque, columns[1:], LEAST_SHARE) or [None] * 4)]
     load, coulomb, viscous = found[1:4] if found else (None, None, None)
     return _positive(load), _positive(coulomb), _positive(viscous)
 
 
 def _torques(piece: Piece, data: Data) -> tuple[FloatArray, FloatArray]:
-    """What the motor's torque is made of, shape (n, 5), and the torque, where it counts.
+    """Returns the regressors of the motor's torque, shape (n, 5), and the torque, shape (n,).
 
-    Accelerations of motor and load, the latter as the motor feels it, direction and speed, and the weight, as
-    large everywhere, of which nothing is known where nobody tells the torque on the load.
+    The regressors are the accelerations of motor and load (the latter seen by the motor), direction, speed,
+    and a constant for the weight, which is unknown unless the torque on the load is recorded.
     """
     commands, truth = piece.commands, data.base
     cycle_s, ratio = commands.cycle_s, truth.gear.ratio
@@ -118,7 +116,7 @@ def _torques(piece: Piece, data: Data) -> tuple[FloatArray, FloatArray]:
         torque = torque + truth.load_.torque_sense * told / ratio
     speed = _smoothed(np.gradient(motor, cycle_s), 3)
     direction = np.sign(speed) * (np.abs(speed) > math.radians(MOVING_DEG_S))
-    # A linear law holds between signals that went through the same filter.
+    # A linear law holds between signals that passed the same filter.
     accelerations = [
         np.gradient(np.gradient(_smoothed(each, width), cycle_s), cycle_s) for each in (motor, load)
     ]
@@ -133,7 +131,7 @@ def _torques(piece: Piece, data: Data) -> tuple[FloatArray, FloatArray]:
 
 
 def _held_nm(data: Data) -> float | None:
-    """The highest torque where it is told in some rows on end; standing motors may be held by any."""
+    """Returns the highest torque if it is held for `HELD_ROWS`; rows at standstill do not count."""
     told = [np.abs(piece.measured[TORQUE]) * (piece.counts[TORQUE] > 0.0) for piece in data.pieces]
     highest = max(float(np.max(each)) for each in told)
     for each in told:
@@ -145,9 +143,9 @@ def _held_nm(data: Data) -> float | None:
 
 
 def _lag_s(data: Data) -> float | None:
-    """Following error by speed."""
+    """Returns the ratio of following error and speed."""
     lag_s: float | None = None
-    for _ in range(2):  # the second time the command is taken as late as the drive takes it
+    for _ in range(2):  # the second time with the command delayed by the lag
         late_s = min(max(lag_s or 0.0, 0.0), 0.1)
         rows = [_following(piece, data, late_s) for piece in data.pieces]
         speed, following = (np.concatenate(each) for each in zip(*rows, strict=True))
@@ -158,7 +156,7 @@ def _lag_s(data: Data) -> float | None:
 
 
 def _following(piece: Piece, data: Data, late_s: float) -> tuple[FloatArray, FloatArray]:
-    """Speed of the command, so late, and following error."""
+    """Returns the speed of the command, delayed by ``late_s``, and the following error."""
     commands = piece.commands
     demand = demand_deg(commands, data.axis)
     late = np.interp(commands.row_cycles - late_s / commands.cycle_s, commands.row_cycles, demand)
@@ -167,7 +165,7 @@ def _following(piece: Piece, data: Data, late_s: float) -> tuple[FloatArray, Flo
 
 
 def _width(cycle_s: float) -> int:
-    """Rows that are averaged."""
+    """Returns the number of rows to average."""
     return max(3, round(SMOOTHED_S / cycle_s))
 
 
@@ -176,7 +174,7 @@ def _positive(value: float | None) -> float | None:
 
 
 def _smoothed(column: FloatArray, width: int) -> FloatArray:
-    """Under a Hann window; the ends are held."""
+    """Smooths a column with a Hann window; the ends are held."""
     window = np.hanning(width + 2)[1:-1]
     window /= window.sum()
     left, right = (width - 1) // 2, width // 2
@@ -186,7 +184,7 @@ def _smoothed(column: FloatArray, width: int) -> FloatArray:
 def _slope(
     wanted: FloatArray, columns: list[FloatArray], least_share: float = math.inf
 ) -> list[float | None] | None:
-    """Least squares; a coefficient is None where its own standard error is more than a share of it."""
+    """Fits coefficients by least squares; None for one whose relative standard error is too large."""
     if len(wanted) <= 2 * len(columns):
         return None
     table = np.stack(columns, axis=1)

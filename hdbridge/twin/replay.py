@@ -1,11 +1,11 @@
-"""A recording's commands run once more through a simulated drive: over real frames, or without them.
+"""Replays a recording's commands through a simulated drive, over real frames or directly.
 
-Both ways give the same numbers. The frames show that a twin is what a master meets; without them a fit can
-afford the hundreds of replays that it needs. Nothing but the frames leads the drive there: what acts on the
-load from outside, and by what torque a drive held it before, no drive is told.
+Both give the same numbers. The frames show what a master sees of a twin; direct replays are fast enough for
+the hundreds that a fit needs. Over frames the drive knows nothing else: neither an external torque on the
+load nor the torque that held the axis before.
 
-What acted on the axis from outside is part of a recording as its commands are: where it tells the torque on
-the load, the simulated load is pushed by as much, in place of its own weight. So is how warm it was at first.
+External influences are part of a recording like its commands: a recorded torque on the load acts on the
+simulated load in place of its own weight, and the recorded temperature sets its initial temperature.
 """
 
 from __future__ import annotations
@@ -32,12 +32,12 @@ from hdbridge.twin.commands import OFF_AFTER, ON_BEFORE, Commands, commands_of
 from hdbridge.twin.stretches import continuous
 
 LATENCY_CYCLES = 4
-"""A command shows as demand at most so many cycles after it was given."""
+"""Maximum delay until a command appears as the demand; cycles."""
 
 
 @dataclass(frozen=True, eq=False)
 class Traces:
-    """What a replay gives at each row; unrounded where it was asked to be smooth."""
+    """Signals of a replay at each row of the recording; unrounded for a smooth replay."""
 
     motor_deg: FloatArray
     load_deg: FloatArray
@@ -48,11 +48,10 @@ class Traces:
 
 
 def replay(recording: Recording, axis: AxisConfig, truth: Truth, seed: int = 0) -> Record:
-    """The record of a simulated drive that got the recording's commands over real frames.
+    """Replays the recording's commands over real frames, and returns the simulated drive's record.
 
-    One row for each of the recording's, with its time. InputError where the recording has no command, or
-    leaves what the axis file allows. SafetyStop where the simulated drive cannot follow the commands as
-    closely as the axis file asks.
+    It has the rows and times of the recording. InputError if the recording has no command or exceeds the
+    limits of the axis file; SafetyStop if the simulated drive's following error exceeds the axis file's.
     """
     records = []
     for rows in continuous(recording.record):
@@ -75,9 +74,9 @@ def replay(recording: Recording, axis: AxisConfig, truth: Truth, seed: int = 0) 
 
 
 def replay_directly(recording: Recording, axis: AxisConfig, truth: Truth, seed: int = 0) -> Record:
-    """As `replay`, without bus and master; the load encoder's noise is another draw.
+    """Replays as `replay` does, without bus and master; the load encoder's noise is another draw.
 
-    What the drive's supervision would stop, or its limits of speed would cut, is let pass.
+    The drive's supervision and speed limits are not applied.
     """
     records = []
     for rows in continuous(recording.record):
@@ -111,7 +110,7 @@ def run(
     *,
     smooth: bool = False,
 ) -> Traces:
-    """The commands through the machine alone; a ``smooth`` one reports what it does unrounded."""
+    """Runs the commands through the machine alone; ``smooth`` returns unrounded signals."""
     truth, outer_nm = as_warm(truth, commands), np.zeros(len(commands.counts))
     if commands.told_nm is not None:
         truth, outer_nm = _weightless(truth), truth.load_.torque_sense * commands.told_nm
@@ -135,7 +134,7 @@ def run(
 
 @cache
 def _substeps(cycles: int, cycle_s: float, dt_s: float) -> tuple[int, ...]:
-    """How many substeps each cycle has: what one is short of, the next one makes up for."""
+    """Returns the number of substeps of each cycle; the remainder of one is added to the next."""
     found, owed_s = [], 0.0
     for _ in range(cycles):
         owed_s += cycle_s
@@ -145,13 +144,13 @@ def _substeps(cycles: int, cycle_s: float, dt_s: float) -> tuple[int, ...]:
 
 
 def _benched(bench: Bench, commands: Commands, axis: AxisConfig) -> list[Record]:
-    """The bench's records of the commands, one for each time that it has the drive switched on."""
+    """Runs the commands on the bench; returns one record for each period in which the drive is on."""
     load_deg = _degrees(commands.counts, axis) / axis.gear.ratio
     starts = [0, *(each.stop + ON_BEFORE for each in commands.off)]
     ends = [*(each.start for each in commands.off), len(load_deg)]
     found = []
     for start, end in zip(starts, ends, strict=True):
-        # What a drive shows in the first cycles after it was switched on was told it by nobody.
+        # In the first cycles after switching on, the drive has no commands.
         path = load_deg[start + (OFF_AFTER if start else 0) : end]
         if end == len(load_deg):
             path = np.append(path, np.full(LATENCY_CYCLES, load_deg[-1]))
@@ -168,7 +167,7 @@ def _told(
     commands: Commands,
     outer_nm: FloatArray,
 ) -> Cycles:
-    """What the machine tells of each cycle after the approach."""
+    """Runs the machine through all cycles; returns those after the approach."""
     told: list[Cycles] = []
     held_nm = np.full(len(substeps), np.nan)
     for cycle, torque_nm in commands.held:
@@ -185,7 +184,7 @@ def _told(
 
 
 def _coasted(machine: Machine, substeps: Sequence[int], outer_nm: FloatArray) -> Cycles:
-    """What the machine tells of cycles in which the drive is switched off; the brake closes at rest."""
+    """Runs the machine through cycles with the drive switched off; the brake closes at rest."""
     rows = []
     for count, outer in zip(substeps, outer_nm.tolist(), strict=True):
         at_rest = abs(machine.velocity_counts_s) * count * machine.dt_s < 1.0
@@ -195,7 +194,7 @@ def _coasted(machine: Machine, substeps: Sequence[int], outer_nm: FloatArray) ->
 
 
 def as_warm(truth: Truth, commands: Commands) -> Truth:
-    """The truth, at the beginning as warm as these commands found the axis, where they know."""
+    """Returns the truth with the initial temperature of these commands, if they have one."""
     if commands.start_c is None:
         return truth
     heat = truth.temperature.model_copy(update={"start_c": commands.start_c})
@@ -203,7 +202,7 @@ def as_warm(truth: Truth, commands: Commands) -> Truth:
 
 
 def _weightless(truth: Truth) -> Truth:
-    """The truth with the inertia of the mass on it, and without its weight."""
+    """Returns the truth with the inertia of the hanging mass but without its weight."""
     mass = truth.load_.gravity
     if mass is None:
         return truth
@@ -212,7 +211,7 @@ def _weightless(truth: Truth) -> Truth:
 
 
 def at_cycle(axis: AxisConfig, cycle_s: float) -> AxisConfig:
-    """The same axis with another SYNC period."""
+    """Returns the axis with another SYNC period."""
     if cycle_s == axis.drive.cycle_s:
         return axis
     cycle_ms = round(1e3 * cycle_s, 1)
@@ -222,18 +221,18 @@ def at_cycle(axis: AxisConfig, cycle_s: float) -> AxisConfig:
 
 
 class _Again:
-    """A procedure that gives commands, one for each cycle."""
+    """Procedure that repeats recorded commands, one for each cycle."""
 
     def __init__(self, load_deg: FloatArray, cycle_s: float) -> None:
         self._leg = _Leg(load_deg, cycle_s, "replay")
 
     def moves(self, axis: AxisView) -> Steps[None]:
-        """The commands."""
+        """Yields the commands as one leg."""
         yield self._leg
 
 
 class _Leg:
-    """Commands, one for each cycle."""
+    """Leg of recorded commands, one for each cycle."""
 
     def __init__(self, load_deg: FloatArray, cycle_s: float, kind: str) -> None:
         self.kind = kind
@@ -241,7 +240,7 @@ class _Leg:
         self._cycle_s = cycle_s
 
     def path(self, start_deg: float, limits: MotionLimits) -> Path:
-        """The commands themselves: they have been an axis's before."""
+        """Returns the recorded commands as the path, without applying the limits."""
         points, cycle_s, last = self._load_deg, self._cycle_s, len(self._load_deg) - 1
 
         def at(time_s: float) -> float:
@@ -250,12 +249,12 @@ class _Leg:
         return Path((last - 0.5) * cycle_s, at, min(points), max(points))
 
     def ended(self, samples: Sequence[Sample]) -> bool:
-        """The last command's end is the leg's end."""
+        """Returns True: the leg ends with its last command."""
         return True
 
 
 def _at_rows(measured: Record, on: slice, commands: Commands, axis: AxisConfig) -> Record:
-    """The rows of the recording that lie in some cycles, from a run that began with these."""
+    """Interpolates a bench run of some cycles at the rows of the recording in these cycles."""
     cycles = commands.row_cycles + commands.lead
     inside = (cycles >= on.start) & (cycles < on.stop)
     first = max(on.start, commands.lead)
@@ -276,7 +275,7 @@ def _at_rows(measured: Record, on: slice, commands: Commands, axis: AxisConfig) 
 
 
 def _between(column: FloatArray, cycles: FloatArray) -> FloatArray:
-    """A column by cycle, at fractional cycles."""
+    """Interpolates a column, one value for each cycle, at fractional cycles."""
     return np.interp(cycles, np.arange(len(column)), column)
 
 

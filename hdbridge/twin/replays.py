@@ -1,4 +1,4 @@
-"""Many replays side by side, in processes of their own."""
+"""Parallel replays in worker processes."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ from hdbridge.sim.truth import Truth
 from hdbridge.twin.misfit import Data, Seed, coarse, residuals
 
 WORTH_S = 2.0
-"""Replays that take the axis no longer than this are made here: a process costs as much as some of them."""
+"""Duration of the motion up to which replays run in this process, because starting workers costs more."""
 
 _data: tuple[Data, Data] | None = None
-"""A worker's own recordings, and a few of their legs."""
+"""A worker's recordings, and a few of their legs."""
 
 
 class Replays:
-    """Replays of the same recordings; a context manager, because of its processes."""
+    """Replays of the same recordings; a context manager that owns the worker processes."""
 
     rough: Replays
-    """Of a few of their legs, in the same processes."""
+    """Replays of a few of their legs, in the same processes."""
 
     def __init__(self, data: Data, workers: int | None = None) -> None:
         self.data = data
@@ -35,7 +35,7 @@ class Replays:
         self._pool: ProcessPoolExecutor | None = None
         few = coarse(data)
         if wanted > 1 and data.duration_s > WORTH_S:
-            # Not forked: this process may have threads, and locks that they hold.
+            # Not forked, because this process may have threads that hold locks.
             context = multiprocessing.get_context("spawn")
             self._pool = ProcessPoolExecutor(wanted, context, _begin, ((data, few),))
         rough = self.rough = copy(self)
@@ -51,13 +51,13 @@ class Replays:
     def __call__(
         self, truths: Iterable[Truth], seeds: Iterable[Seed] = repeat(None)
     ) -> list[dict[str, FloatArray]]:
-        """The residuals of each truth, in order, by replays as `misfit.traces_of` has them."""
+        """Returns the residuals of each truth, in order; ``seeds`` as in `misfit.traces_of`."""
         if self._pool is None or self.data.duration_s <= WORTH_S:
             return [residuals(self.data, each, seed) for each, seed in zip(truths, seeds, strict=False)]
         return list(self._pool.map(_residuals, truths, seeds, repeat(self._place)))
 
     def drawn(self, truths: Sequence[Truth]) -> list[dict[str, FloatArray]]:
-        """The residuals of each truth, in order, by replays that are rounded and noisy as a recording is."""
+        """Returns the residuals of each truth, in order, from rounded and noisy replays."""
         return self(truths, range(1, len(truths) + 1))
 
 
@@ -68,7 +68,7 @@ def _begin(data: tuple[Data, Data]) -> None:
 
 
 def _end_with_parent() -> None:
-    """Ends this process when the one that began it has been killed: it would wait for work for ever."""
+    """Ends this process when its parent has been killed; it would otherwise wait for work forever."""
     parent = multiprocessing.parent_process()
     assert parent is not None  # a worker has one
     parent.join()

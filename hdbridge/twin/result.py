@@ -1,4 +1,4 @@
-"""What `fit_twin` gives: the simulated drive's parameters, how sure they are, and what is left."""
+"""Result of `fit_twin`: the simulated drive's parameters, their intervals, and the residuals."""
 
 from __future__ import annotations
 
@@ -11,49 +11,49 @@ from hdbridge.twin.comparison import Comparison
 from hdbridge.twin.naming import Alike, Finding
 
 HELD_OUT = "held out"
-"""The kind of leg that stands for those held out in a comparison."""
+"""Kind of leg for the held-out legs in a comparison."""
 NOISE_LEVEL: Final = 1.3
-"""Rms of what is left, in units of the noise in motion, up to which nothing is left: replays of the true
-values of 608, 609 and 612 (tools/twin_random_axes.py) leave 0.3 to 1.22."""
+"""Rms residual, in units of the noise in motion, up to which a channel is explained: replays of the true
+values of axes 608, 609 and 612 (tools/twin_random_axes.py) leave 0.3 to 1.22."""
 MOST_NOISE: Final = 3.0
-"""The same, up to which a channel is explained if what is left is also a small share of its signal: 620,
-whose intervals hold 1 of 18 true values, leaves 2.9 to 28 with its true values."""
+"""Limit if the residual is also a small share of the signal: axis 620, whose intervals hold 1 of 18 true
+values, leaves 2.9 to 28 with its true values."""
 MOST_SHARE: Final = 0.05
-"""That share, rms of what is left over rms of the signal."""
+"""Maximum share for `MOST_NOISE`: rms residual over rms signal."""
 
 
 class Values(StrEnum):
-    """Where the values of a truth come from; `provenance.values` in its file."""
+    """Origin of the values of a truth; `provenance.values` in its file."""
 
     USUAL = "usual"
     """Assumed for axes of this kind."""
     AXIS = "axis"
-    """Fitted, and nothing is left beyond the noise."""
+    """Fitted, with residuals within the noise."""
     REPLAY = "replay"
-    """Fitted, but a channel is left with more: a different drive that moves alike."""
+    """Fitted, but a channel has larger residuals: a different drive with similar motion."""
 
     @classmethod
     def of(cls, truth: Truth) -> Values | None:
-        """That of a truth; None of a truth file that somebody wrote."""
+        """Returns the origin of a truth's values; None for a truth file written by hand."""
         value = truth.provenance.get("values")
         return cls(value) if value is not None else None
 
 
 @dataclass(frozen=True, slots=True)
 class Left:
-    """What a replay leaves of a channel."""
+    """Residual of a channel."""
 
     channel: str
     share: float
-    """Rms over that of the signal."""
+    """Rms residual over rms signal."""
     times_noise: float
-    """Rms over the noise in motion."""
+    """Rms residual over the noise in motion."""
     kind: str
-    """Kind of the legs in which it is largest."""
+    """Kind of the legs with the largest residual."""
 
     @property
     def explained(self) -> bool:
-        """Whether it is within the noise, or nearly so and a small share of the signal."""
+        """True if it is within the noise, or nearly so and a small share of the signal."""
         return self.times_noise <= NOISE_LEVEL or (
             self.times_noise <= MOST_NOISE and self.share <= MOST_SHARE
         )
@@ -61,40 +61,39 @@ class Left:
 
 @dataclass(frozen=True)
 class Twin:
-    """A simulated drive that has learnt an axis."""
+    """A simulated drive fitted to an axis."""
 
     truth: Truth
-    """With the intervals of what was fitted, and in its provenance what `check` needs."""
+    """Parameters with the intervals of the fitted ones; its provenance holds the data that `check` needs."""
     findings: tuple[Finding, ...]
-    """What was wrong with the simulation that the fit began with, if its values were the axis's."""
+    """Causes by which the initial simulation was wrong, if its values were the axis's."""
     alike: tuple[Alike, ...]
-    """Parameters that the recordings' motion cannot tell apart."""
+    """Sets of parameters that the recorded motion does not separate."""
     left: tuple[Left, ...]
-    """What is left of each recorded channel, on held-out legs if there are any."""
+    """Residual of each recorded channel, on held-out legs if there are any."""
     before: Comparison
-    """The recordings against the simulation that the fit began with; the kind `HELD_OUT` is of legs that the
-    fit has not seen."""
+    """Recordings against the initial simulation; the kind `HELD_OUT` covers the held-out legs."""
     after: Comparison
-    """The same against the twin."""
+    """Recordings against the twin."""
     impossible: tuple[str, ...] = ()
-    """Values that no such axis has, each in a sentence; only of a twin whose values are not the axis's."""
+    """Implausible values, each in a sentence; only for a twin whose values are not the axis's."""
 
     @property
     def values(self) -> Values:
-        """Whether its values are those of the axis."""
+        """Origin of its values: the axis, or only a replay."""
         return Values.of(self.truth) or Values.REPLAY
 
     @property
     def unexplained(self) -> tuple[Left, ...]:
-        """The channels that are left with more than their noise."""
+        """Channels with residuals above their noise."""
         return tuple(each for each in self.left if each.times_noise > NOISE_LEVEL)
 
     @property
     def intervals(self) -> dict[str, tuple[float, float]]:
-        """95 % intervals by the place in the truth file; none unless the values are the axis's."""
+        """95 % intervals by path in the truth file; empty unless the values are the axis's."""
         return self.truth.intervals
 
     @property
     def provenance(self) -> dict[str, Any]:
-        """Where the values come from."""
+        """Provenance of the truth."""
         return self.truth.provenance

@@ -1,4 +1,4 @@
-"""What a fit replays in one go: stretches of long parts, with what came before them. Pure."""
+"""Stretches: pieces of long recordings that a fit replays separately, and their unknown rows. Pure."""
 
 from __future__ import annotations
 
@@ -15,24 +15,24 @@ from hdbridge.records.recording import Segment
 # ----------------------------------------------------------------
 
 STRETCH_S = 10.0
-"""Long against what a replay does not know of the time before it: 60 degrees of the motor, the ringing."""
+"""Length of a stretch: long against its unknown beginning (60 motor degrees, ringing)."""
 LONG_S = 30.0
-"""A part no longer than this stays whole."""
+"""Maximum length of a part that is not divided."""
 GAP_S = 0.5
-"""A master that goes from task to task records nothing for some cycles; the command may stay the same."""
+"""Maximum gap between two parts that follow each other, as between two tasks of a master."""
 SAME_DEG = 1e-6
-"""Of the motor: the same count, told with as many digits."""
+"""Maximum change of the command that counts as unchanged; motor degrees."""
 STOPPED_DEG = 5.0
-"""Of the motor: as far as it goes at most from the last row of a procedure until it has stopped."""
+"""Maximum motor travel from the last row of a procedure to standstill."""
 IDLE = 0.002
-"""Share of a record's largest torque that is as good as none."""
+"""Share of a record's largest torque below which the torque counts as zero."""
 RUN_IN_S = 2.0
-"""What happened so long before a stretch is no longer to be seen in it: the ringing of a load that is hardly
-damped (15 Hz, 0.03) has come down to a three-hundredth."""
+"""Time after which earlier motion no longer matters: the ringing of a weakly damped load (15 Hz, damping
+ratio 0.03) has decayed to a three-hundredth."""
 
 
 def stretches(part: Record, legs: Sequence[Segment]) -> list[Record]:
-    """The part's rows in order; each stretch begins with a leg, or within one longer than a stretch."""
+    """Divides a part into stretches; each begins with a leg, or within a leg longer than a stretch."""
     start_s, end_s = float(part.time_s[0]), float(part.time_s[-1])
     if end_s - start_s <= LONG_S:
         return [part]
@@ -49,15 +49,15 @@ def stretches(part: Record, legs: Sequence[Segment]) -> list[Record]:
 
 
 def continuous(record: Record) -> list[slice]:
-    """The rows of parts that follow each other, in order: within `GAP_S`, the axis standing where it stood.
+    """Groups parts that follow each other within `GAP_S` with the axis in place; returns their rows.
 
-    In between the drive was switched off, as the bench does between two procedures, or it holds the command.
+    In between, the drive is switched off, as on the bench between two procedures, or holds the command.
     """
     target, motor, time_s = record.motor_target_deg, record.motor_position_deg, record.time_s
     firsts = [0]
     for first in record.starts[1:]:
         gap_s = float(time_s[first] - time_s[first - 1])
-        # Records that were put together afterwards are one row apart.
+        # Records that were joined afterwards are one row apart.
         follows = 1.5 * float(np.median(np.diff(time_s))) < gap_s <= GAP_S
         held = target is not None and abs(float(target[first] - target[first - 1])) <= SAME_DEG
         stood = abs(float(motor[first] - motor[first - 1])) <= STOPPED_DEG
@@ -67,9 +67,9 @@ def continuous(record: Record) -> list[slice]:
 
 
 def just_on(record: Record, row: int) -> bool:
-    """Whether a row is of a drive that has just been switched on: it has no torque yet.
+    """Returns True if the drive has just been switched on at a row, because it has no torque yet.
 
-    Of a record without torque that is taken for granted: power is on only while a procedure runs.
+    Returns True for a record without torque, on the assumption that power is on only during a procedure.
     """
     torque_nm = record.columns.get("motor_torque_nm")
     if torque_nm is None:
@@ -78,21 +78,21 @@ def just_on(record: Record, row: int) -> bool:
 
 
 # ----------------------------------------------------------------
-# Where an axis stands in a recording, by what torque it is held there, and where what was before is unknown.
+# Standstill in a recording, the holding torque, and rows with an unknown history.
 
 RINGING_S = 0.25
-"""So long after the command has come to rest the torque still tells of the motion; then of how it stuck."""
+"""Time after the command's stop in which the torque still shows the motion; later it depends on sticking."""
 STANDS_COUNTS = 1.5
-"""A motor that stays within so many counts of where it comes to rest stands. Its torque is what the integral
-stopped at, or creeps up while friction holds it: which of the two hangs on a thousandth of a count."""
+"""Distance from the rest position within which the motor is at standstill; counts. Its torque is then
+constant or creeps up against friction, depending on a thousandth of a count."""
 HELD_S = 0.1
-"""A motor that stands so long after the command is held by the integral alone: loops answer in some ms."""
+"""Standstill after which the integral alone holds the motor; the loops respond within a few milliseconds."""
 LARGEST_UNKNOWN = 0.25
-"""Of a recording, the largest share that is left out because of what was before it."""
+"""Maximum share of a recording that is excluded for its unknown history."""
 
 
 def stands(moved: NDArray[np.bool_], motor_deg: FloatArray, within_deg: float) -> NDArray[np.bool_]:
-    """For each row whether command and motor stand where they stand until the command moves on."""
+    """Returns the mask of rows from which command and motor stay at rest until the command moves again."""
     rest = np.cumsum(moved)
     last = np.searchsorted(rest, rest, side="right") - 1
     away = np.abs(motor_deg - motor_deg[last]) > within_deg
@@ -103,9 +103,9 @@ def stands(moved: NDArray[np.bool_], motor_deg: FloatArray, within_deg: float) -
 
 
 def held_rows(part: Record, moved: NDArray[np.bool_], still: NDArray[np.bool_]) -> NDArray[np.intp]:
-    """Rows in which a standing motor tells by what torque it is held: each `HELD_S` of a rest, and its last.
+    """Returns the rows that show the holding torque of a motor at rest: every `HELD_S`, and the last.
 
-    Not its last one alone: the integral may have moved on until the motor broke away.
+    The last one alone would not do, because the integral may have moved until the motor broke away.
     """
     rested_s = part.time_s - np.maximum.accumulate(np.where(moved, part.time_s, part.time_s[0]))
     times = np.floor(rested_s / HELD_S)
@@ -116,17 +116,17 @@ def held_rows(part: Record, moved: NDArray[np.bool_], still: NDArray[np.bool_]) 
 
 
 def begins_in_motion(part: Record) -> bool:
-    """Whether the command moves before it has stood long enough for the axis to rest."""
+    """Returns True if the command moves before it has rested for `RINGING_S`."""
     target, time_s = part.motor_target_deg, part.time_s
     assert target is not None  # commands_of has refused it
     return bool(np.any(np.diff(target[time_s - time_s[0] < RINGING_S]) != 0.0))
 
 
 def unknown_rows(record: Record, count_deg: float) -> NDArray[np.bool_]:
-    """For each row of a recording whether the load may still ring of what nobody knows.
+    """Returns the mask of rows in which the load may still ring from an unknown motion.
 
-    Where a recording begins in motion, or goes on so after a while, that is what was before. Where a
-    procedure ended in motion it is the cycles until the drive was switched off. ``count_deg`` is the motor's.
+    This is the motion before a recording that begins (or resumes) in motion, or the cycles before switching
+    off after a procedure that ended in motion. ``count_deg`` is one motor count.
     """
     target, time_s = record.motor_target_deg, record.time_s
     unknown = np.zeros(len(record), dtype=np.bool_)

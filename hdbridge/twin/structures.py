@@ -1,4 +1,4 @@
-"""Servo structures: fits for drives whose loops are not the ones that a fit assumes first.
+"""Servo structures: fits for drives with loops other than those that a fit assumes first.
 
 The simulated servo is put together from blocks (`hdbridge.sim.servo`). Each fit starts at several bandwidths,
 with and without a torque feed-forward, because a servo far from the start is a minimum of its own. Blocks are
@@ -33,25 +33,25 @@ BANDWIDTHS: Final = ((25.0, 100.0), (80.0, 300.0), (200.0, 800.0))
 """Position gain, 1/s, and velocity gain over the whole inertia, rad/s: a geared axis with a soft load, an
 ordinary one, and a stiff one."""
 INTEGRALS: Final = ("speed", "position")
-"""What the integral adds up: PI on the speed, or PIV."""
+"""Signal of the integral: speed error (PI velocity loop) or position error (PIV)."""
 INTEGRAL: Final = 3.0
 """Integral time times that bandwidth (symmetric optimum: 2 to 4)."""
 FILTER_MS: Final = 0.5
 """Speed and torque filter at the start: half to twice the period of common velocity loops."""
 SHORT_MS: Final = 0.1
-"""Command filter that is as good as none: a fifth of a substep."""
+"""Negligible command filter: a fifth of a substep."""
 VELOCITY_FEEDFORWARD: Final = 0.9
-"""At the start, between none that is seldom and the whole speed."""
+"""Start value between none (rare) and the full speed."""
 STEP: Final = 0.02
 """Step of the differences, in a parameter's spread."""
 FINE: Final = 0.01
-"""Share of a channel's signal below which less misfit is not worth a step."""
+"""Share of a channel's signal that is the minimum unit of its misfit."""
 BEST: Final = 3
-"""Starts that are followed up."""
+"""Number of starts that are followed up."""
 FEW, MORE, MOST = 5, 10, 25
-"""Evaluations of the slopes: from each start, of a structure, and over all of the recording."""
+"""Maximum function evaluations of a fit: from each start, of each structure, and over the whole recording."""
 GAIN: Final = 0.97
-"""Ratio of the misfits, with a block and without, from which it is kept: more parameters alone gain less."""
+"""Maximum ratio of the misfits with and without a block for keeping it; mere extra parameters gain less."""
 MECHANICS: Final = (
     "motor inertia", "Coulomb friction", "viscous friction", "friction's rise at rest", "Stribeck speed",
     "load inertia", "gear stiffness", "gear damping",
@@ -62,11 +62,11 @@ LOOPS: Final = (
 )  # fmt: skip
 NOTCH: Final = ("notch frequency", "notch depth", "notch width")
 PLACES: Final = (0.7, 1.0, 1.4)
-"""Notch frequencies to start at, over the resonance of motor and load."""
+"""Start values of the notch frequency, relative to the resonance of motor and load."""
 
 
 class Structure(NamedTuple):
-    """A simulated drive, and which of its parameters are fitted."""
+    """A simulated drive and its parameters to fit."""
 
     truth: Truth
     parameters: tuple[Parameter, ...]
@@ -74,21 +74,21 @@ class Structure(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Reached:
-    """Where a fit of a structure has come to."""
+    """Result of a fit of a structure."""
 
     truth: Truth
     parameters: tuple[Parameter, ...]
     residuals: dict[str, FloatArray]
     misfit: float
-    """Root mean square over the channels, each in units of its signal, on legs that the fit has not seen."""
+    """Root mean square over the channels in `units`, on held-out legs."""
 
 
 def fit_structures(
     replays: Replays, begun: Truth, progress: Callable[[float], None] = lambda _: None
 ) -> Fitted:
-    """The structure that explains the recording best, fitted to all of it.
+    """Finds the structure that explains the recording best, and fits it to the whole recording.
 
-    Each of the starts has the mechanics of ``begun``, as far as regressions give none.
+    All starts have the mechanics of the regressions, or else of ``begun``.
     """
     few = replays.rough
     cycle_ms = 1e3 * replays.data.pieces[0].commands.cycle_s
@@ -116,10 +116,10 @@ def fit_structures(
 
 
 def starts(truth: Truth, cycle_ms: float) -> Iterator[Structure]:
-    """The list of servos that a fit starts at.
+    """Yields the servos at which a fit starts.
 
-    A feed-forward of the acceleration acts on the demand behind its filter, or on differences over whole SYNC
-    cycles: that is a moving average of one cycle.
+    An acceleration feed-forward uses the filtered demand, or differences over whole SYNC cycles, which is a
+    moving average of one cycle.
     """
     lag_ms = truth.servo.dead_time_ms + 2.0 * truth.servo.command_filter_ms
     averaged_ms = min(cycle_ms, BY_NAME["moving average"].most)
@@ -155,7 +155,7 @@ def starts(truth: Truth, cycle_ms: float) -> Iterator[Structure]:
 
 
 def more_blocks(best: Reached) -> Iterator[tuple[str, Structure]]:
-    """The same servo with one more block, or another one in its place; each name begins with the block's."""
+    """Yields the servo with one more or a replaced block; the names begin with the block's."""
     truth, servo = best.truth, best.truth.servo
     if servo.notch is None:
         load = truth.load_.whole_inertia_kg_m2
@@ -177,7 +177,7 @@ def more_blocks(best: Reached) -> Iterator[tuple[str, Structure]]:
 
 
 def least_squares_fit(replays: Replays, start: Structure, evaluations: int) -> Reached:
-    """Least squares over replays (`scipy.optimize.least_squares`), each channel in units of its signal."""
+    """Fits a structure with `scipy.optimize.least_squares`, each channel in `units`."""
     data, parameters = replays.data, start.parameters
     spread = np.array([each.spread for each in parameters])
     low, high = np.array([each.bounds for each in parameters]).T
@@ -211,7 +211,7 @@ def least_squares_fit(replays: Replays, start: Structure, evaluations: int) -> R
 
 
 def units(data: Data) -> dict[str, float]:
-    """By channel, in its unit: a hundredth of its signal, or its noise if that is more."""
+    """Returns a hundredth of the signal, or the noise if larger, by channel, in its unit."""
     noise, counts, found = noise_in_motion(data), counted(data), {}
     for name, signal in signals_of(data).items():
         inside = counts[name] > 0.0
@@ -221,12 +221,12 @@ def units(data: Data) -> dict[str, float]:
 
 
 def seen(data: Data) -> dict[str, NDArray[np.bool_]]:
-    """By channel, the rows that a fit sees."""
+    """Returns the mask of the rows that a fit sees, by channel."""
     return {name: (each > 0.0) & (data.out == 0.0) for name, each in counted(data).items()}
 
 
 def misfit(data: Data, left: dict[str, FloatArray]) -> float:
-    """Root mean square over the channels in `units`, on held-out legs if there are any."""
+    """Returns the root mean square over the channels in `units`, on held-out legs if there are any."""
     scale, squares = units(data), []
     for name, counts in counted(data).items():
         held_out = (counts > 0.0) & (data.out > 0.0)

@@ -1,8 +1,9 @@
-"""The plant's thermal constants: what a recording tells of the temperature, against what warms the plant.
+"""Thermal constants of the plant, fitted to the recorded temperature.
 
-The plant is one body between its losses and its surroundings (`hdbridge.sim.heat`): a copper loss by the
-torque squared, and the work of the motor's friction. By the time that these constants are fitted all else is,
-so two replays tell the losses. The rest needs none: the temperature is linear in losses and surroundings.
+The plant is one body between its losses and its surroundings (`hdbridge.sim.heat`). The losses are a copper
+loss by the torque squared, and the work of the motor's friction. All other parameters are already fitted, so
+two replays give the losses. The fit itself needs no replays, because the temperature is linear in losses and
+ambient temperature.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ from hdbridge.twin.replay import replay_directly
 from hdbridge.twin.stretches import continuous
 
 TEMPERATURE: Final = "temperature"
-"""The channel that these constants show in."""
+"""Channel in which these constants show."""
 AMBIENT: Final = replace(BY_NAME["temperature"], name="ambient temperature")
 _WARM_UP = "a warm-up of half an hour and more, and a rest after it, with the temperature recorded"
 RESISTANCE: Final = Parameter(
@@ -43,54 +44,54 @@ TIME_CONSTANT: Final = Parameter(
     (), _WARM_UP, 0.25,
 )  # fmt: skip
 RISE_K: Final = 100.0
-"""Warming of a winding at rated torque that its insulation allows (IEC 60034-1, class F, resistance method:
-105 K): motors are rated by it. The housing warms by less."""
+"""Temperature rise of a winding at rated torque (IEC 60034-1 allows 105 K for class F by the resistance
+method, and motors are rated by it). The housing warms less."""
 MATTERS_K: Final = 5.0
-"""Of that warming: as much as anybody would look for."""
+"""Smallest change of that temperature rise that matters in practice."""
 COPPER_LOSS: Final = Parameter(
     "copper loss", ("temperature", "copper_loss_w"), "W", 0.0, 1e5, RISE_K, AMBIENT.cause, (), _WARM_UP,
     MATTERS_K, linear=True,
 )  # fmt: skip
-"""Its spread and what matters of it are those at one kelvin per watt."""
+"""Spread and least change are those at one kelvin per watt."""
 THERMAL: Final = (AMBIENT, RESISTANCE, TIME_CONSTANT, COPPER_LOSS)
 
 STEP_S: Final = 1.0
-"""Losses are taken as even over so long: a hundredth of the time constant of the smallest motor."""
+"""Time step with constant losses: a hundredth of the time constant of the smallest motor."""
 MINIMUM_STEPS: Final = 3
 LONGER: Final = 1e-4
-"""Step of the difference by the time constant's logarithm."""
+"""Step of the finite difference, in the logarithm of the time constant."""
 LARGE_S: Final = 1e6
 """Time constant of a body at one kelvin per watt that hardly warms: in an hour at 10 W by 0.04 K."""
 LEAST_ERROR: Final = 1e-4
-"""Of the friction's work, relatively: less is no error."""
+"""Minimum relative standard deviation of the friction's work."""
 START_K: Final = 1.0
-"""How far the body may be from the first reading of a part: a sensor lags behind it."""
+"""Standard deviation of the body's temperature about the first reading of a part: a sensor lags behind."""
 TOGETHER: Final = 0.25
-"""Share of the time constant over which goes together what one body does not show of a real axis."""
+"""Correlation time of the thermal model's error, as a share of the time constant."""
 PLACES: Final = (0.0, -1.4, 1.4)
-"""Logarithm of the time constants that a fit begins at, over the start's."""
+"""Start values of the time constant: logarithms of the ratio to the truth's."""
 ROUNDS: Final = 3
-"""So often the size of what is left is taken anew."""
+"""Maximum number of fits with a new estimate of the residuals' size."""
 
 
 @dataclass(frozen=True, eq=False)
 class _Part:
-    """Rows in one piece, at even times."""
+    """Rows of one continuous part, at even times."""
 
     friction_w: FloatArray
-    """Work of the friction, a mean of the step that ends at each time."""
+    """Friction power, averaged over the step that ends at each time."""
     torque_squares: FloatArray
-    """Of the torque over the rated one, a mean of the same step."""
+    """Squared torque over rated torque, averaged over the same step."""
     weather_k: FloatArray
-    """By how much the truth's surroundings are warmer than at first."""
+    """Change of the truth's ambient temperature since the start of the part."""
     reading_c: FloatArray
     rows: NDArray[np.intp]
-    """The times whose reading counts."""
+    """Indices of the times whose reading counts."""
     firsts: NDArray[np.intp]
-    """Among them the first of each run of equal readings."""
+    """Index into `rows` of the first of each run of equal readings."""
 
     def runs(self, column: FloatArray) -> FloatArray:
-        """Means over each run."""
+        """Returns the mean of a column over each run."""
         counted = column[self.rows]
         lengths = np.diff(np.append(self.firsts, len(counted)))
         return np.asarray(np.add.reduceat(counted, self.firsts) / lengths, dtype=np.float64)
@@ -98,29 +99,30 @@ class _Part:
 
 @dataclass(frozen=True, eq=False)
 class _Losses:
-    """What warms the body, added up from row to row."""
+    """Heat input to the body, accumulated by row."""
 
     friction_j: FloatArray
     torque_squares: FloatArray
-    """Of the torque over the rated one, times seconds."""
+    """Integral of the squared torque over rated torque; seconds."""
 
 
 @dataclass(frozen=True, eq=False)
 class _Fit:
-    """Coordinates of `THERMAL`, and how sure they are."""
+    """Fitted coordinates of `THERMAL` and their covariance."""
 
     place: FloatArray
     covariance: FloatArray
     left: tuple[float, float]
-    """Rms of what the readings have beyond the body's temperature, over their noise: before, and now."""
+    """Rms residual of the readings over their noise, before and after the fit."""
 
 
 def with_warmth(
     recording: Recording, axis: AxisConfig, fitted: Fitted, truth: Truth
 ) -> tuple[Truth, Finding | None]:
-    """The fitted truth with thermal constants and their intervals, and what is to be said of them.
+    """Fits the thermal constants; returns the truth with them and their intervals, and a finding.
 
-    As it was where the recording does not tell the temperature. What it does not show stays.
+    Returns the truth unchanged if the recording has no temperature. Constants that it does not show keep
+    their values.
     """
     record = recording.record
     if Channel.TEMPERATURE.value not in record.columns:
@@ -132,7 +134,7 @@ def with_warmth(
     found = _fit(parts, truth, step_k, _friction_error(recording, fitted))
     heat = dict(zip((each.path[-1] for each in THERMAL), _values(found.place), strict=True))
     if truth.temperature.friction_growth_per_k or truth.temperature.tooth_growth_per_k:
-        # The surroundings have another temperature; what has grown by it has not changed.
+        # Keep the growth of friction and tooth error unchanged by the new ambient temperature.
         heat["reference_c"] = truth.temperature.unchanged_c
     reach = NORMAL_95 * np.sqrt(np.diag(found.covariance))
     intervals = {
@@ -149,7 +151,7 @@ def with_warmth(
 
 
 def _named(before: Truth, after: Truth, found: _Fit) -> Finding | None:
-    """What is said where a constant was off by as much as matters, and by more than chance."""
+    """Returns a finding if a constant has changed significantly and by a relevant amount."""
     off = found.place - np.array(coordinates(before, THERMAL))
     spread = np.sqrt(np.diag(found.covariance))
     least = np.array([each.least_change for each in _scaled(before)])
@@ -163,9 +165,9 @@ def _named(before: Truth, after: Truth, found: _Fit) -> Finding | None:
 
 
 def _fit(parts: Sequence[_Part], truth: Truth, step_k: float, friction_error: float) -> _Fit:
-    """Least squares of the constants, of the size of the friction's work, and of where each part begins.
+    """Fits the constants, a factor of the friction's work, and the initial temperature of each part.
 
-    A reading is worth one for each run of equal ones: what rounding has left of it lasts as long.
+    Each run of equal readings counts as one, because their rounding error is common.
     """
     parameters = _scaled(truth)
     count = len(parameters)
@@ -223,14 +225,14 @@ def _values(place: FloatArray) -> list[float]:
 
 
 def _scaled(truth: Truth) -> list[Parameter]:
-    """`THERMAL`, with the copper loss's spread for as much warming per watt as the truth has."""
+    """Returns `THERMAL` with the spread of the copper loss scaled to the truth's thermal resistance."""
     k_per_w = max(truth.temperature.resistance_k_per_w, RESISTANCE.least)
     copper = replace(COPPER_LOSS, spread=RISE_K / k_per_w, least_change=MATTERS_K / k_per_w)
     return [AMBIENT, RESISTANCE, TIME_CONSTANT, copper]
 
 
 def _shown(parts: Sequence[_Part], place: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """The body's temperature, a mean for each run, and its derivatives by the coordinates."""
+    """Returns the body's mean temperature of each run, and its derivatives by the coordinates."""
     count = len(THERMAL)
     ambient_c, k_per_w, time_s, copper_w = _values(place[:count])
     friction, starts = math.exp(place[count]), place[count + 1 :]
@@ -256,14 +258,14 @@ def _shown(parts: Sequence[_Part], place: FloatArray) -> tuple[FloatArray, Float
 
 
 def _body(goal_c: FloatArray, start_c: float, time_s: float) -> FloatArray:
-    """The temperature of a body that follows another one in this time."""
+    """Returns the first-order response of a body with this time constant to ``goal_c``."""
     nearer = -math.expm1(-STEP_S / time_s)
     way_c, _ = lfilter([nearer], [1.0, nearer - 1.0], goal_c[1:], zi=[(1.0 - nearer) * start_c])
     return np.append(start_c, way_c)
 
 
 def _parts(recording: Recording, losses: _Losses, truth: Truth) -> list[_Part]:
-    """What follows in one piece, prepared; none of less than two steps, or where no reading counts."""
+    """Prepares the continuous parts; skips those that are too short or without readings that count."""
     record, heat = recording.record, truth.temperature
     counts = np.ones(len(record), dtype=np.bool_)
     for leg in held_out_legs(recording):
@@ -290,10 +292,10 @@ def _parts(recording: Recording, losses: _Losses, truth: Truth) -> list[_Part]:
 
 
 def _losses(recording: Recording, axis: AxisConfig, truth: Truth) -> _Losses:
-    """By two replays, of a body that is so large that it hardly warms: how much tells what it has taken in.
+    """Computes the losses by two replays with a body so large that it hardly warms.
 
-    The torque that a recording tells is that at the end of each cycle, and what heats is that within it. The
-    friction's work is that at the temperature that was told.
+    Replays are needed because a recording has the torque at the end of each cycle, while the torque within it
+    heats the motor. The friction's work is corrected to the recorded temperature.
     """
     told_c = recording.record.columns[Channel.TEMPERATURE.value]
     taken_j = []
@@ -317,14 +319,14 @@ def _losses(recording: Recording, axis: AxisConfig, truth: Truth) -> _Losses:
 
 
 def _grown(truth: Truth, warm_c: FloatArray) -> FloatArray:
-    """The friction at a temperature: so many times the truth file's, a twentieth at least."""
+    """Returns the friction at a temperature relative to the truth file's; at least a twentieth."""
     heat = truth.temperature
     grown = 1.0 + heat.friction_growth_per_k * (warm_c - heat.unchanged_c)
     return np.asarray(np.maximum(grown, 0.05), dtype=np.float64)
 
 
 def _friction_error(recording: Recording, fitted: Fitted) -> float:
-    """Relative standard deviation of the friction's work over a recording, by the covariance of a fit."""
+    """Returns the relative standard deviation of the friction's work, from the covariance of a fit."""
     record, motor = recording.record, fitted.truth.motor
     turned = np.abs(np.radians(np.diff(record.motor_position_deg)))
     speed = turned / np.maximum(np.diff(record.time_s), 1e-9)
@@ -341,7 +343,7 @@ def _friction_error(recording: Recording, fitted: Fitted) -> float:
 
 
 def _least_change(values: FloatArray) -> float:
-    """The step of a reading; `START_K` of one that never changes."""
+    """Returns the resolution of a reading; `START_K` if it never changes."""
     changes = np.abs(np.diff(values))
     beyond = changes > 1e-9 * float(np.max(np.abs(values), initial=1.0))
     return float(np.min(changes, where=beyond, initial=START_K))

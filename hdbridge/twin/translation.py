@@ -1,10 +1,10 @@
-"""From an axis file and a model to a truth file: each effect to the simulated plant's own physics.
+"""Translates an axis file and a model to a truth file: each effect to the simulated plant's own physics.
 
-A model says how the load errs; the plant has parts that make it err. One row per effect of the catalogue
-says which part that is (`TABLE`), and a translation says of each effect of a model what became of it: in
-full, in part, or that the plant has no counterpart. All of the transmission error comes from the model; all
-else (motor, loops, friction, load, spring where the model is silent) from the truth that is given, else from
-usual values (`hdbridge.twin.defaults`).
+A model describes the error of the load; the plant has parts that cause it. `TABLE` has one row with that part
+for each effect of the catalogue, and a translation reports for each effect of a model if it was translated in
+full, in part or not at all. The transmission error comes from the model alone; everything else (motor, loops,
+friction, load, and the spring unless the model has it) comes from the given truth, or else from usual values
+(`hdbridge.twin.defaults`).
 """
 
 from __future__ import annotations
@@ -63,20 +63,20 @@ from hdbridge.twin.draft import ARCSEC_PER_RAD, Draft, Said, none
 from hdbridge.units import ARCSEC_PER_DEG
 
 # ----------------------------------------------------------------
-# The branch of an elastic loop as parallel sliders: how a curve becomes springs that slip.
+# The branch of an elastic loop as parallel slip elements.
 
 
 def branch(exponent: float, nodes: int) -> tuple[FloatArray, FloatArray]:
-    """Points of the branch g(xi), dense where it bends: xi from 0 to 1 and g, shape (nodes + 1,) each."""
+    """Returns xi from 0 to 1 and the branch g(xi), dense in its bend, shape (nodes + 1,) each."""
     xi = np.linspace(0.0, 1.0, nodes + 1) ** (2.0 / min(max(exponent - 1.0, 0.2), 1.0))
     return xi, rise(xi, exponent)
 
 
 def elements(travel: FloatArray, height: FloatArray) -> list[tuple[float, float]]:
-    """Limit and travel to slipping of each element of a concave curve through the origin.
+    """Returns limit and travel to slipping of each element of a concave curve through the origin.
 
-    The curve is what the elements give together from a state of rest; its points are in order, the first is
-    (0, 0), beyond the last it is flat.
+    The curve is the sum of the elements from rest. Its points are in order, from (0, 0); it is flat beyond
+    the last.
     """
     slopes = [(h1 - h0) / (t1 - t0) for (t0, h0), (t1, h1) in pairwise(zip(travel, height, strict=True))]
     return [
@@ -87,38 +87,38 @@ def elements(travel: FloatArray, height: FloatArray) -> list[tuple[float, float]
 
 
 # ----------------------------------------------------------------
-# Effects of teeth and ratio, as the plant's gear has them; see `hdbridge.twin.translation`.
+# Effects of teeth and ratio.
 
 HIGHEST_ORDER: Final = 512
 FLANK_TRAVEL_DEG: Final = 0.5
-"""Motor travel from flank to flank: a fraction of a motor degree, the size of the play between teeth."""
+"""Motor travel from flank to flank: a fraction of a degree, like the play between teeth."""
 MOST_YIELD: Final = 0.9
-"""Share of the spring's own softness that teeth may have; at one the plant is not stable."""
+"""Maximum compliance of the teeth, as a share of the spring's; at one the plant is unstable."""
 
 
 def ratio_error(effect: RatioError, draft: Draft) -> Said:
-    """The ratio that the gear really has."""
+    """Sets the true ratio of the gear."""
     draft.gear["ratio"] = effect.true_ratio(draft.ratio)
     return Said("gear.ratio")
 
 
 def motor_orders(effect: Synchronous | MotorOrders, draft: Draft) -> Said:
-    """Tooth error by motor angle; an order that stands in two effects is their sum."""
+    """Sets the tooth error by motor angle; orders in two effects are added."""
     return _orders(effect.orders, draft, "motor_orders")
 
 
 def flexspline_orders(effect: FlexsplineOrders, draft: Draft) -> Said:
-    """Tooth error by the angle between wave generator and flexspline."""
+    """Sets the tooth error by the angle between wave generator and flexspline."""
     return _orders(effect.orders, draft, "flexspline_orders")
 
 
 def gear_load_orders(orders: Iterable[MotorOrder], draft: Draft) -> Said:
-    """Tooth error by load angle."""
+    """Sets the tooth error by load angle."""
     return _orders(orders, draft, "load_orders")
 
 
 def direction_phase(effect: DirectionPhase, draft: Draft) -> Said:
-    """Two flanks; the model's orders are the mean of both, the plant's those of either."""
+    """Sets two flanks; the model's orders are the mean of both, the plant's those of each."""
     held = []
     orders: list[dict[str, Any]] = []
     for each in draft.gear.get("motor_orders", ()):
@@ -137,7 +137,7 @@ def direction_phase(effect: DirectionPhase, draft: Draft) -> Said:
 
 
 def torque_modulation(effect: TorqueModulation, draft: Draft) -> Said:
-    """Growth with the size of the torque that the teeth carry."""
+    """Sets the growth of the tooth error with the magnitude of the torque."""
     if effect.signed:
         return none("the plant's teeth grow with the size of the torque, not with its sign")
     per_nm = 0.01 * effect.growth_percent_per_nm
@@ -161,7 +161,7 @@ def torque_modulation(effect: TorqueModulation, draft: Draft) -> Said:
 
 
 def local_defect(effect: LocalDefect, draft: Draft) -> Said:
-    """A damaged tooth: the same raised cosine."""
+    """Sets a damaged tooth with the same raised cosine."""
     width = min(180.0, 2.0 * effect.half_width_deg)
     bump = {"at_deg": effect.centre_deg, "width_deg": width, "height_arcsec": effect.height_arcsec}
     draft.gear["damage"] = [*draft.gear.get("damage", ()), bump]
@@ -194,13 +194,13 @@ def _orders(orders: Iterable[MotorOrder], draft: Draft, key: str) -> Said:
 
 
 # ----------------------------------------------------------------
-# Effects that are errors of an encoder, as the plant has them; see `hdbridge.twin.translation`.
+# Encoder errors.
 
 RADIUS_MM: Final = 20.0
-"""Of a disc's graduation, where nobody says: only the eccentricity's ratio to it is seen."""
+"""Assumed radius of a disc's graduation: only the ratio of the eccentricity to it has an effect."""
 LATEST_MS: Final = 100.0
 SMALL_ARCSEC: Final = 0.05
-"""What is lost in a translation and smaller than this is not worth a note: a tenth of a usual count."""
+"""Maximum loss in a translation that is not noted: a tenth of a usual count."""
 _LIMITS: Final = {
     "sine_offset": 0.5, "cosine_offset": 0.5, "gain_mismatch": 0.5, "phase_mismatch_deg": 45.0,
     "third_harmonic": 0.3,
@@ -208,9 +208,9 @@ _LIMITS: Final = {
 
 
 def motor_eccentricity(effect: MotorEncoderEccentricity, draft: Draft) -> Said:
-    """The disc of the motor encoder; the drive holds its reading, so the load runs by the opposite.
+    """Sets the disc of the motor encoder. The drive controls its reading, so the load has the opposite error.
 
-    A disc reads (e / r) sin(a - a0) too much, so the load is that much behind, divided by the ratio.
+    A disc reads (e / r) sin(a - a0) too much, so the load lags by this divided by the ratio.
     """
     # -sin(a - a0) = cos(a + 90 deg - a0), and the same for twice the angle.
     disc = _disc(effect.orders, draft.ratio, lambda phase_deg: 90.0 - phase_deg)
@@ -219,7 +219,7 @@ def motor_eccentricity(effect: MotorEncoderEccentricity, draft: Draft) -> Said:
 
 
 def load_orders(effect: LoadOrders, draft: Draft) -> Said:
-    """The load encoder's disc where it is known to be that, else a pitch error of the spline."""
+    """Sets the load encoder's disc if it is the known origin, else a pitch error of the spline."""
     if effect.origin != "load_encoder":
         said = gear_load_orders(effect.orders, draft)
         unknown = ("origin unknown: taken for the gear's",) if effect.origin == "unknown" else ()
@@ -248,7 +248,7 @@ def _disc(orders: Iterable[MotorOrder], ratio: float, at_deg: Any) -> dict[str, 
 
 
 def channel_skew(effect: ChannelSkew, draft: Draft) -> Said:
-    """The other encoder's reading is old: where the load is read later, the motor's reading is."""
+    """Sets the delay of the other encoder: a load that is read later has an older motor reading."""
     delay_ms = effect.delay_ms
     late = "motor" if delay_ms > 0.0 else "load"
     draft.part(late, "encoder")["late_ms"] = min(abs(delay_ms), LATEST_MS)
@@ -265,7 +265,7 @@ def channel_skew(effect: ChannelSkew, draft: Draft) -> Said:
 
 
 def subdivisional_error(effect: SubdivisionalError, draft: Draft) -> Said:
-    """Offsets, gain, phase and third harmonic of the signals, to first order.
+    """Sets offsets, gain, phase and third harmonic of the signals, to first order.
 
     The angle read from (1 + g) sin p - t sin 3p + s and cos(p + d) + t cos 3p + c is off by
     s cos p - c sin p + g/2 sin 2p - d/2 cos 2p - t sin 4p, in radians of a line.
@@ -295,7 +295,7 @@ def subdivisional_error(effect: SubdivisionalError, draft: Draft) -> Said:
 
 
 def count_loss(effect: CountLoss, draft: Draft) -> Said:
-    """Counts of the load encoder, lost at the same times after it is switched on."""
+    """Sets count losses of the load encoder at the same times after switching on."""
     counts_per_arcsec = draft.axis.load_encoder.counts(1.0) / 3600.0
     losses = [
         {"time_s": each.time_s, "counts": round(each.size_arcsec * counts_per_arcsec)}
@@ -311,14 +311,14 @@ def count_loss(effect: CountLoss, draft: Draft) -> Said:
 
 
 # ----------------------------------------------------------------
-# Effects of warmth, travel and time, as the plant has them; see `hdbridge.twin.translation`.
+# Effects of temperature, travel and time.
 
 LINEAR_BUILD_UP: Final = 0.5
-"""Below this the plant's element, which has one time for strain and release, differs."""
+"""Build-up ratio below which the plant's element, with equal times of strain and release, differs."""
 
 
 def zero_drift(effect: ZeroDrift, draft: Draft) -> Said:
-    """A shift with the temperature, delayed as the model has it; from the ambient temperature on."""
+    """Sets a shift with the temperature, delayed as in the model and zero at the ambient temperature."""
     heat = draft.part("temperature")
     heat["zero_drift_arcsec_per_k"] = effect.drift_arcsec_per_k
     if effect.driven_by == "time":
@@ -328,7 +328,7 @@ def zero_drift(effect: ZeroDrift, draft: Draft) -> Said:
 
 
 def amplitude_drift(effect: AmplitudeDrift, draft: Draft) -> Said:
-    """Growth of tooth error and of friction with the temperature."""
+    """Sets the growth of tooth error and friction with the temperature."""
     heat = draft.part("temperature")
     heat["tooth_growth_per_k"] = _share(effect.ripple_percent_per_k)
     heat["friction_growth_per_k"] = _share(effect.friction_percent_per_k)
@@ -345,7 +345,7 @@ def amplitude_drift(effect: AmplitudeDrift, draft: Draft) -> Said:
 
 
 def wear(effect: Wear, draft: Draft) -> Said:
-    """A gap between the teeth that grows with the travel; the plant's is told one way, the model's both."""
+    """Sets a gap between the teeth that grows with the travel; the model's loop may also widen."""
     if effect.growth_arcsec_per_kiloturn > 0.0:
         return none("the loop widens in the sense of the elastic one: the plant's teeth wear to a gap only")
     draft.gear["wear"] = {
@@ -359,7 +359,7 @@ def wear(effect: Wear, draft: Draft) -> Said:
 
 
 def creep(effect: Creep, draft: Draft) -> Said:
-    """Kelvin-Voigt elements. The model's strain is ahead in motion, the plant's yields to the drag."""
+    """Sets Kelvin-Voigt elements. The model's strain leads in motion, the plant's yields to the drag."""
     parts = [
         {"time_constant_s": each.tau_s, "amplitude_arcsec": -each.amplitude_arcsec} for each in effect.parts
     ]
@@ -374,7 +374,7 @@ def creep(effect: Creep, draft: Draft) -> Said:
 
 
 def _warms_up(effect: Warmed, draft: Draft) -> str:
-    """Start the plant as much colder than its surroundings as the model warms up by."""
+    """Sets the plant's initial temperature below ambient by the model's warm-up; returns a note."""
     heat = draft.part("temperature")
     ambient_c = heat.get("ambient_c", 22.0)
     heat["start_c"] = max(-60.0, ambient_c - effect.warm_up_k)
@@ -387,25 +387,25 @@ def _share(percent_per_k: float) -> float:
 
 
 # ----------------------------------------------------------------
-# Effects of spring, friction, play and loop, as the plant has them; see `hdbridge.twin.translation`.
+# Effects of spring, friction, play and loop.
 
 NODES: Final = 24
-"""Of a branch; straight between them it is off by less than a hundredth of the offset."""
+"""Nodes of a branch; linear interpolation is then accurate to a hundredth of the offset."""
 SLIDERS: Final = 16
-"""As many as a truth file may have at the load."""
+"""Maximum number of sliders at the load in a truth file."""
 DRY_TIME_S: Final = 0.01
-"""Within which a drag by the direction alone comes and goes: within two or three control cycles."""
+"""Time constant of a drag that depends only on direction: two or three control cycles."""
 HIGHEST_SHAKE_HZ: Final = 500.0
 HOLDS: Final = 1.5
-"""Friction over the load's inertia at the axis's highest acceleration, to hold it in a dead zone."""
+"""Friction that holds the load in a dead zone, over its inertial torque at the highest acceleration."""
 MOST_HELD: Final = 0.3
-"""Of half a gap, the most that this friction may wind up the spring by."""
+"""Maximum wind-up of the spring by this friction, as a share of half the gap."""
 
 
 def compliance(effect: Compliance, draft: Draft) -> Said:
-    """The spring in up to three stages, as far as the effect's torque goes.
+    """Sets the spring in up to three stages, within the torque range of the effect.
 
-    A torque at the motor is one at the load divided by the ratio.
+    Motor torque is load torque divided by the ratio.
     """
     times = draft.ratio if effect.torque == "motor_torque_nm" else 1.0
     notes = []
@@ -442,7 +442,7 @@ def compliance(effect: Compliance, draft: Draft) -> Said:
 
 
 def inertial_windup(effect: InertialWindup, draft: Draft) -> Said:
-    """J / K of the load on its spring, less what the load encoder's coupling winds up by itself."""
+    """Sets J / K of the load on its spring, minus the wind-up of the load encoder's coupling."""
     seconds2 = effect.inertia_over_stiffness_s2
     coupling = draft.part("load", "encoder").get("coupling")
     if coupling:
@@ -466,9 +466,9 @@ def inertial_windup(effect: InertialWindup, draft: Draft) -> Said:
 
 
 def velocity_windup(effect: VelocityWindup, draft: Draft) -> Said:
-    """Viscous friction at the load that thins; the dry part as an element that yields at once to motion.
+    """Sets shear-thinning viscous friction at the load, and the dry part as a fast creep element.
 
-    Coulomb friction at the load would leave its wind-up at rest, where the model has none.
+    Coulomb friction at the load would keep its wind-up at rest, which the model does not.
     """
     places = []
     if effect.viscous_arcsec_s_per_deg:
@@ -486,17 +486,17 @@ def velocity_windup(effect: VelocityWindup, draft: Draft) -> Said:
 
 
 def hysteresis(effect: Hysteresis, draft: Draft) -> Said:
-    """The same law where the load leads; friction at the load where it lags."""
+    """Sets the same law if the load leads, or friction at the load if it lags."""
     return _loop(effect, draft, memory=False)
 
 
 def hysteresis_memory(effect: HysteresisMemory, draft: Draft) -> Said:
-    """Parallel sliders, which have return-point memory."""
+    """Sets parallel sliders, which have return-point memory."""
     return _loop(effect, draft, memory=True)
 
 
 def hysteresis_parameters(effect: HysteresisParameters, draft: Draft) -> Said:
-    """The loop as it is now, in the place of the model's."""
+    """Replaces the model's loop by the changed one."""
     draft.gear.pop("hysteresis", None)
     draft.load.pop("presliding", None)
     return _loop(effect.changed().law(), draft, memory=effect.base.memory)
@@ -507,7 +507,7 @@ def _loop(effect: Hysteresis | HysteresisMemory, draft: Draft, *, memory: bool) 
         return _lagging(effect, draft, memory=memory)
     if memory:
         xi, height = branch(effect.exponent, NODES)
-        # The virgin curve, of which a branch is twice: offset g(2 x / width).
+        # The virgin curve, half the size of a branch: offset g(2 x / width).
         parts = elements(0.5 * effect.width_deg * xi, effect.offset_arcsec * height)
         slips = [{"limit_arcsec": limit, "yield_deg": travel} for limit, travel in parts]
         if slips:
@@ -523,10 +523,10 @@ def _loop(effect: Hysteresis | HysteresisMemory, draft: Draft, *, memory: bool) 
 
 
 def _lagging(effect: Hysteresis | HysteresisMemory, draft: Draft, *, memory: bool) -> Said:
-    """Friction at the load that yields before it slips: it winds up the gear's spring, so the load lags.
+    """Sets presliding friction at the load, which winds up the gear's spring, so that the load lags.
 
-    Over a branch the motor goes by x and the load lags by 2 offset g(x / width) more; what is left of x is
-    the load's own travel, over which the friction has grown. Where nothing is left the load stands still.
+    Over a branch the motor moves by x and the load's lag grows by 2 offset g(x / width). The rest of x is the
+    load's travel, over which the friction grows. If nothing remains, the load stands still.
     """
     offset, stiffness = -effect.offset_arcsec, draft.stiffness_nm_per_rad / ARCSEC_PER_RAD
     xi, height = branch(effect.exponent, 4 * NODES)
@@ -557,7 +557,7 @@ def _lagging(effect: Hysteresis | HysteresisMemory, draft: Draft, *, memory: boo
 
 
 def backlash(effect: Backlash, draft: Draft) -> Said:
-    """A dead zone between spring and load, with friction that holds the load in it and winds up a little."""
+    """Sets a dead zone between spring and load, with friction that holds the load in it."""
     half, per_nm = 0.5 * effect.gap_arcsec, ARCSEC_PER_RAD / draft.stiffness_nm_per_rad
     acceleration = math.radians(draft.axis.limits.acceleration_deg_s2)
     already_nm = float(draft.load.get("coulomb_nm") or 0.0)
@@ -575,7 +575,7 @@ def backlash(effect: Backlash, draft: Draft) -> Said:
 
 
 def rate_dependence(effect: RateDependence, draft: Draft) -> Said:
-    """Growth of the loop with speed."""
+    """Sets the growth of the loop with speed."""
     if draft.gear.get("hysteresis") is None:
         return none("there is no leading loop that could grow")
     draft.gear["rate_dependence"] = {
@@ -586,7 +586,7 @@ def rate_dependence(effect: RateDependence, draft: Draft) -> Said:
 
 
 def vibration(effect: Vibration, draft: Draft) -> Said:
-    """A torque on the load that shakes it by as much, the motor held."""
+    """Sets a torque that shakes the load by the same amplitude with the motor held."""
     if effect.frequency_hz > HIGHEST_SHAKE_HZ:
         return none(f"the plant is shaken by up to {HIGHEST_SHAKE_HZ:g} Hz")
     turn = math.tau * effect.frequency_hz
@@ -618,7 +618,7 @@ OF_GEAR: Final = (
     "torque_growth_per_nm", "backlash_arcsec", "rate_dependence", "wear", "ageing", "creep", "damage",
     "roller", "seat",
 )  # fmt: skip
-"""What the section `gear` says of transmission error: with a model, the model says it."""
+"""Keys of the section `gear` for transmission error, which a model replaces."""
 OF_ENCODERS: Final = ("disc", "late_ms", "losses", "signals", "cable", "sensor_warming")
 OF_TEMPERATURE: Final = (
     "zero_drift_arcsec_per_k", "zero_time_constant_s", "reference_c", "tooth_growth_per_k",
@@ -628,36 +628,36 @@ OF_TEMPERATURE: Final = (
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """What became of one effect."""
+    """Result of the translation of one effect."""
 
     effect: str
     counterpart: str | None
-    """Places in the truth file, dotted; None where the plant has no counterpart."""
+    """Dotted paths in the truth file; None if the plant has no counterpart."""
     note: str
-    """What is different there, or why there is none; empty where nothing is lost."""
+    """Differences, or the reason why there is no counterpart; empty for an exact translation."""
 
 
 @dataclass(frozen=True, slots=True)
 class Translation:
-    """A truth file and how it came about."""
+    """A translated truth, with the result for each effect."""
 
     truth: Truth
     rows: tuple[Row, ...]
-    """One per effect of the model, in the order of the catalogue; last what the catalogue does not have."""
+    """One row per effect of the model, in the order of the catalogue; effects outside it come last."""
 
 
 class Entry(NamedTuple):
-    """One row of the table."""
+    """One row of `TABLE`."""
 
     counterpart: str
-    """Places in the truth file."""
+    """Dotted paths in the truth file."""
     write: Callable[[Any, Draft], Said]
-    """Puts an effect of this kind into a draft, and says what is different there."""
+    """Writes an effect of this kind to a draft, and returns the place and differences."""
 
 
 TABLE: Final[Mapping[str, Entry]] = MappingProxyType(
     {
-        # In the order in which they are put in: the spring first, because torques are told by it.
+        # In the order of writing: the spring comes first, because torques are derived from it.
         "ratio_error": Entry("gear.ratio", ratio_error),
         "compliance": Entry("gear.stiffness_nm_per_rad, gear.stiffening", compliance),
         "inertial_windup": Entry("gear.stiffness_nm_per_rad or load.inertia_kg_m2", inertial_windup),
@@ -689,17 +689,17 @@ TABLE: Final[Mapping[str, Entry]] = MappingProxyType(
 )
 """One row per effect of the catalogue."""
 UNKNOWN: Final = none("the simulated drive has no part for an effect that is not of hdbridge's own catalogue")
-"""Of an effect that somebody has registered."""
+"""Result for an effect that was registered by an extension."""
 
 
 def translate(
     axis: AxisConfig, model: TransmissionModel | None = None, base: Truth | None = None
 ) -> Translation:
-    """The simulated drive that errs as the model says, on the axis of the axis file.
+    """Returns the simulated drive with the model's errors, on the axis of the axis file.
 
-    ``base`` says what the model does not speak of; without it usual values do. Without a model its
-    transmission error stays as it is. InputError where the model is of another gear ratio, or where the
-    plant cannot have what it says.
+    ``base`` (default: usual values) provides everything that the model does not describe. Without a model it
+    keeps its transmission error. InputError if the model has another gear ratio, or a value that the plant
+    cannot have.
     """
     truth = _of_axis(axis, base) if base is not None else default_truth(axis)
     if model is None:
@@ -735,7 +735,7 @@ def _validated(data: dict[str, Any]) -> Truth:
 
 
 def _of_axis(axis: AxisConfig, base: Truth) -> Truth:
-    """The same plant with encoders and rated torque of the axis file; of its origin ``values`` is left."""
+    """Returns the plant with encoders and rated torque of the axis file; its provenance keeps ``values``."""
     data = base.model_dump(by_alias=True)
     data["name"] = axis.name
     data["motor"]["rated_torque_nm"] = axis.drive.rated_torque_nm
@@ -748,7 +748,7 @@ def _of_axis(axis: AxisConfig, base: Truth) -> Truth:
 
 
 def _without_error(truth: Truth, axis: AxisConfig) -> dict[str, Any]:
-    """The truth file's content without any transmission error that a model speaks of."""
+    """Returns the truth file's content without the transmission errors that a model describes."""
     data = truth.model_dump(by_alias=True)
     data["gear"]["ratio"] = axis.gear.ratio
     parts = (

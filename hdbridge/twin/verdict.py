@@ -1,8 +1,8 @@
-"""What a twin may be used for: by what it leaves of each channel on held-out legs. Pure.
+"""Verdict on a twin, from its residuals in each channel on held-out legs. Pure.
 
-A fit assumes that the simulated drive can do what the axis does. What is left shows if that is so. Only a
-twin that explains every channel has the values of the axis. Any other twin replays the motion, and its values
-are those of a different drive that happens to move alike.
+A fit assumes that the simulated drive can behave like the axis. The residuals show if that is so. Only a twin
+that explains every channel has the values of the axis. Any other twin replays the motion, and its values are
+those of a different drive with similar motion.
 """
 
 from __future__ import annotations
@@ -34,20 +34,20 @@ from hdbridge.units import ARCSEC_PER_DEG, figure
 
 SIGNALS: Final = (LOAD_ERROR, FOLLOWING_ERROR, MOTOR_TORQUE, TEMPERATURE)
 LEAST_GAIN: Final = 0.01
-"""Share by which the mean ratio of the differences has to fall: a smaller one changes with the noise."""
+"""Minimum reduction of the mean ratio of the differences; smaller ones are due to noise."""
 WORSE: Final = 1.1
-"""Ratio of the differences after and before from which a signal is worse, if it exceeds its noise."""
+"""Ratio of the differences after and before above which a signal is worse, if it exceeds its noise."""
 DECADE: Final = 10.0
-"""Largest ratio of a motor's inertia to the one usual for its rated torque, and of both inertias seen by the
-motor. Servo motors of one torque differ by a factor of three to five (catalogues, low and high inertia)."""
+"""Maximum ratio of a motor's inertia to the usual one for its rated torque, and of load and motor inertia
+seen by the motor. Servo motors of equal torque differ by a factor of three to five (catalogues)."""
 MOST_DEAD_CYCLES: Final = 2.0
-"""SYNC cycles of dead time: one until the demand is taken over, one until it is carried out (CiA 402)."""
+"""Maximum dead time in SYNC cycles: one to take over the demand, one to execute it (CiA 402)."""
 
 
 def what_is_left(
     data: Data, residuals: Mapping[str, FloatArray], noise: Mapping[str, float]
 ) -> tuple[Left, ...]:
-    """What a replay leaves of each recorded channel, on held-out legs if there are any.
+    """Returns the residual of each recorded channel, on held-out legs if there are any.
 
     ``residuals`` by channel over all rows of the data, ``noise`` by channel in its unit (`noise_in_motion`).
     """
@@ -67,7 +67,7 @@ def what_is_left(
 
 
 def signals_of(data: Data) -> dict[str, FloatArray]:
-    """By channel, in its unit: what was measured. Of the load angle, the error without its zero."""
+    """Returns the measured signals by channel, in its unit; for the load, its error without the zero."""
     per_motor_deg = ARCSEC_PER_DEG / data.axis.gear.ratio
     found = {name: list[FloatArray]() for name in CHANNELS}
     for piece in data.pieces:
@@ -81,12 +81,12 @@ def signals_of(data: Data) -> dict[str, FloatArray]:
 
 
 def values_of(left: Sequence[Left]) -> Values:
-    """Whether values that leave this much are those of the axis."""
+    """Returns the origin of fitted values: the axis if all channels are explained, else a replay."""
     return Values.AXIS if all(each.explained for each in left) else Values.REPLAY
 
 
 def impossible(truth: Truth, axis: AxisConfig, cycle_s: float) -> tuple[str, ...]:
-    """The values of a truth that no axis with this axis file has, each in a sentence."""
+    """Returns values of a truth that are impossible for this axis file, each in a sentence."""
     motor, servo = truth.motor, truth.servo
     usual = default_truth(axis).motor.inertia_kg_m2
     load = truth.load_.whole_inertia_kg_m2 / axis.gear.ratio**2
@@ -115,15 +115,15 @@ def impossible(truth: Truth, axis: AxisConfig, cycle_s: float) -> tuple[str, ...
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """What becomes of a twin."""
+    """Decision to keep a twin or not, with its reason."""
 
     kept: bool
     text: str
-    """In a sentence or two; what the values are worth comes first."""
+    """Reason in a sentence or two, beginning with the validity of the values."""
 
 
 def judge(twin: Twin) -> Verdict:
-    """Whether a twin is kept, and what its values are worth."""
+    """Decides if a twin is kept, and states the validity of its values."""
     gain = better(twin.before, twin.after)
     if twin.impossible:
         return Verdict(False, f"the twin is not kept: no axis has these values: {'; '.join(twin.impossible)}")
@@ -134,7 +134,7 @@ def judge(twin: Twin) -> Verdict:
 
 
 def replays_only(left: Sequence[Left]) -> str:
-    """The headline of a twin whose values are not the axis's."""
+    """Returns the headline of a twin whose values are not the axis's."""
     shown = [f"{each.channel} to {_percent(each.share)}" for each in left]
     lost = [
         f"{each.channel} is left with {figure(each.times_noise, 3)} times its noise"
@@ -155,7 +155,7 @@ def _rms(values: FloatArray) -> float:
 
 @dataclass(frozen=True, slots=True)
 class Gain:
-    """What the fit has gained."""
+    """Improvement by a fit."""
 
     better: bool
     text: str
@@ -173,7 +173,7 @@ def better(before: Comparison, after: Comparison) -> Gain:
         for name in SIGNALS
         if (was := before.row(name, kind)) is not None and (now := after.row(name, kind)) is not None
     }
-    # A replay begins at a reading, and may be off by a step from there on: within it none is nearer.
+    # A replay starts at a reading and may be off by a step from there on; smaller differences are equal.
     step_k = max((each.noise for each in pairs.get(TEMPERATURE, ())), default=0.0)
     if max((each.difference for each in pairs.get(TEMPERATURE, ())), default=0.0) <= step_k:
         pairs.pop(TEMPERATURE, None)
@@ -182,7 +182,7 @@ def better(before: Comparison, after: Comparison) -> Gain:
         for name, (was, now) in pairs.items()
         if now.difference > WORSE * was.difference and now.difference > max(now.noise, 1e-12)
     ]
-    # What is noise is in both differences. What they are less than is none: rounding, a jerk.
+    # Noise is in both differences. Differences below these limits are rounding errors.
     least = {name: step_k if name == TEMPERATURE else 1e-12 for name in pairs}
     ratios = [
         math.log(max(now.difference, least[name]) / max(was.difference, least[name]))
