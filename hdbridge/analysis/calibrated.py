@@ -28,7 +28,7 @@ EXACT: Final = 1e-3
 
 @dataclass(frozen=True, slots=True)
 class CalibratedPart:
-    """Parameters of one effect that change together, as calibrated."""
+    """Parameters of one effect that change together, with their calibrated values."""
 
     place: int
     """Place of the effect in the model."""

@@ -33,11 +33,12 @@ NOISY = frozenset({Channel.LOAD_TORQUE, Channel.MOTOR_TORQUE})
 SMOOTH = 15
 """Window of the parabolas that smooth such a channel, samples."""
 WHITE = 1.17
-"""Ratio of the channel noise to its part removed by smoothing, which is five sixths; less 3 %."""
+"""Noise variance of a channel relative to the part that smoothing removes: 6/5, less 3 %, as accurately
+as it is known."""
 MOST_TURNS = 100
 """Maximum number of turning points with an error of their own. With more, the mean is known well enough."""
 SHORT = 10_000
-"""Number of samples below which the rare share grows in proportion."""
+"""Record length, samples, below which the number of rare samples shrinks in proportion."""
 STOPS_DEG = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0)
 """Widths of the stop operators of the free-form hysteresis."""
 
@@ -52,15 +53,15 @@ class Hypothesis:
     """Further columns at the usable points, in addition to the zeros; compared by identity."""
 
     def plus(self, effect: Effect) -> Hypothesis:
-        """With one more effect."""
+        """Returns the hypothesis with one more effect."""
         return replace(self, effects=(*self.effects, effect))
 
     def without(self, place: int) -> Hypothesis:
-        """With one effect less."""
+        """Returns the hypothesis without one effect."""
         return replace(self, effects=self.effects[:place] + self.effects[place + 1 :])
 
     def instead(self, place: int, effect: Effect) -> Hypothesis:
-        """With one effect replaced."""
+        """Returns the hypothesis with one effect replaced."""
         return replace(self, effects=(*self.effects[:place], effect, *self.effects[place + 1 :]))
 
 

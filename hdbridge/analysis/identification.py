@@ -127,7 +127,7 @@ class Traces:
     motor_deg: FloatArray
     load_deg: FloatArray
     direction: FloatArray
-    """1, -1, or 0 at rest."""
+    """Direction of motion: 1, -1, or 0 at rest."""
     kind: tuple[str, ...]
     """Names of the leg kinds, indexed by ``kind_index``."""
     kind_index: np.ndarray[Any, np.dtype[np.intp]]

@@ -48,7 +48,7 @@ def confounded(estimator: Estimator, fitted: Fitted, place: int) -> Iterator[Con
     for other, columns, noise in _alike(estimator, fitted, place):
         theirs = [at for at, each in enumerate(effects) if each.name == other.name]
         if known & set(theirs):
-            continue  # its calibration distinguishes the two
+            continue  # its calibration separates the two
         own = np.array([i for i, each in enumerate(fitted.parameters) if each.effect not in theirs])
         fit = fitted.linearised.of(own)
         shift = fit.taken_over(columns)
@@ -216,7 +216,7 @@ def named_parameters(effect: Effect, columns: Sequence[Column], spread: FloatArr
         low, high = value - half, value + half
         is_size = path in names and not name.endswith("phase_deg")
         shape = shapes.get(name)
-        if shape is not None and shape.logarithmic:  # no further than it may be
+        if shape is not None and shape.logarithmic:  # limited to its range
             factor = math.exp(min(half / value, math.log(shape.upper / shape.lower)))
             low = min(value, max(value / factor, shape.lower))
             high = max(value, min(value * factor, shape.upper))

@@ -36,8 +36,8 @@ class Regressors:
             # These columns are the same in every fit.
             pieces = [self._of_piece(unit(each), starts) for each in effect.pieces()]
             return pieces[0] if len(pieces) == 1 else side_by_side(pieces, self._rows)
-        # Columns do not depend on the coefficients; effects carried by another (its loop, its orders) do
-        # depend on those, and these are fields of them.
+        # Columns do not depend on an effect's own coefficients, but on the loop and orders that it carries
+        # as fields.
         key = (unit(effect), starts)
         if key in self._recent:
             self._recent.move_to_end(key)

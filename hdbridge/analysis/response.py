@@ -39,7 +39,7 @@ MAX_UNCERTAINTY = 0.5
 """95 % half width, as a share of the gain, above which a frequency counts as unknown: the correction might
 leave more than half of the order."""
 BIN_HZ = 0.5
-"""Points that are closer are merged, or closer than `BIN_SHARE` of their frequency."""
+"""Points closer than this, or closer than `BIN_SHARE` of their frequency, are merged."""
 BIN_SHARE = 0.01
 MAX_GAP = 0.12
 """Largest gap between two points of a known range, as a share of the SYNC rate."""
@@ -224,7 +224,7 @@ def _found(
             hertz = order_hz(orders, before.speed_deg_s, ratio)
             applied = np.ones(len(orders)) if trial.filter is None else gain(trial.filter, hertz, cycle_s)
             error, effect = before.amplitudes, before.amplitudes - after.amplitudes
-            if before.speed_deg_s < 0.0:  # the angle runs against the time
+            if before.speed_deg_s < 0.0:  # the angle decreases with time
                 error, effect = error.conj(), effect.conj()
             clear = abs(error) > MIN_Z_SCORE * before.deviations
             clear &= (hertz < STOP / cycle_s) & (abs(applied) > MIN_APPLIED)

@@ -164,7 +164,7 @@ def step(estimator: Estimator, fitted: Fitted) -> Iterator[tuple[float]]:
     gain = np.where(usable, after**2 / np.maximum(left, 1e-300), 0.0)
     place = int(np.argmax(gain))
     data = estimator.data
-    first = data.runs[estimator.index[place]]  # of the samples of the point at which it is seen
+    first = data.runs[estimator.index[place]]  # first sample of the point that shows it
     yield (float(data.full.time_s[first]),)
 
 

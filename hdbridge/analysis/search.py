@@ -105,7 +105,7 @@ class Search:
         rival = 0.0 if found is None else fitted.chi_square - found.chi_square
         return loose if gain > max(rival, 0.0) else None
 
-    # --- another look
+    # --- revision
 
     def _swapped(self, fitted: Fitted) -> Fitted:
         """Replaces each finding in turn by the best alternative if that lowers the cost.
@@ -373,7 +373,7 @@ def _key(score: Score) -> object:
     return (effect.name, tuple(each.name for each in effect.named_coefficients()), score.freedom)
 
 
-# Second looks at a name whose look-alike is the better one: what follows a measured channel, and what
+# Exchange of a finding for a look-alike that describes it better.
 
 
 def with_measured(search: Search, fitted: Fitted) -> Fitted:

@@ -126,8 +126,8 @@ DAMPING = 1e-4
 TRIES = 6
 """Maximum number of times that an unsuccessful step is shortened."""
 EXCHANGES = 3
-"""Maximum number of times that data carried by one effect for another are updated although chi square
-rises at first."""
+"""Maximum number of updates of the copies that effects carry of each other although chi square rises at
+first."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -252,7 +252,7 @@ class Separable:
                 step, _ = self._step(here, where, system, damping)
             gained = here.chi_square - there.chi_square
             if not better:
-                # Only the carried data have changed; updating them may help at the second step.
+                # Only the carried copies have changed; updating them may help at the second step.
                 exchanged += 1
                 if not small or exchanged > EXCHANGES:
                     break
@@ -417,7 +417,7 @@ class Separable:
         return step, float(slope @ step)
 
     def _stands(self, here: _Point, effects: Sequence[Effect]) -> bool:
-        """Returns True if the data that effects carry of each other are those of the fit."""
+        """Returns True if the copies that effects carry of each other are those of the fit."""
         return all(unit(one) == unit(other) for one, other in zip(here.given, effects, strict=True))
 
     def _solution(self, here: _Point) -> Solution:

@@ -188,7 +188,7 @@ def beyond_noise(estimator: Estimator, residual: FloatArray, rows: BoolArray | s
 def _peak(estimator: Estimator, residual: FloatArray) -> float:
     """Returns half the span of the block means, less the share of white noise, arcsec."""
     mean, white = _blocks(estimator, residual, slice(None))
-    mean, white = (each[white <= np.median(white)] for each in (mean, white))  # whole ones
+    mean, white = (each[white <= np.median(white)] for each in (mean, white))  # complete blocks
     noise = NormalDist().inv_cdf(1.0 - estimator.rare) ** 2 * float(np.mean(white))
     return float(np.sqrt(max(estimator.half_span(mean) ** 2 - noise, 0.0)))
 
