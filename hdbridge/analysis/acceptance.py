@@ -1,8 +1,8 @@
-"""Gates that a finding has to pass before it is named: block-robust evidence, where it has to show.
+"""Acceptance tests of a finding: block-robust evidence in the parts of the record where it must show.
 
-Chi square takes neighbouring samples for independent, and noise that wanders takes it in. So a finding's
-score is summed over blocks of time, and its variance is taken from those sums: whatever is correlated
-within a block no longer counts as many.
+Chi square treats neighbouring samples as independent, which correlated noise violates. A finding's
+score is therefore summed over blocks of time, and its variance is estimated from these sums, so that
+correlation within a block does no harm.
 """
 
 from __future__ import annotations
@@ -16,22 +16,23 @@ from hdbridge.analysis.linear import Linearised, of_length, sandwich, side_by_si
 from hdbridge.effects import BoolArray, Effect, FloatArray
 
 BLOCKS_S = (1.0, 5.0, 20.0)
-"""Noise that wanders, or warms up, is correlated over less than one of them."""
+"""Block lengths; wandering noise and warming are correlated over less than one of them."""
 LEAST_BLOCKS = 30
-"""A short record is cut into so many, whatever their length: fewer tell no variance."""
+"""Minimum number of blocks; in a short record they become shorter, because fewer give no reliable
+variance."""
 LEAST_POINTS = 20
-"""Fewer tell nothing."""
+"""Minimum number of points."""
 
 
 @dataclass(frozen=True, slots=True)
 class Gate:
-    """How a finding fared."""
+    """Result of the acceptance tests of a finding."""
 
     robust: float
     """Smallest block-robust chi square over the block lengths."""
     needed: float
     reason: str = ""
-    """Why it is not named, in words; empty where it passed."""
+    """Reason for rejection; empty if it passed."""
 
 
 def robust_chi_square(
@@ -43,12 +44,11 @@ def robust_chi_square(
     only: int | None = None,
     laws: FloatArray | None = None,
 ) -> float:
-    """Of one effect of a hypothesis: its coefficients against zero, but for those that are incidental, by
-    their sandwich over blocks of time.
+    """Returns the block-robust chi square of an effect's coefficients against zero.
 
-    Everything else is refitted, and the columns ``nuisances`` (weighted) are in addition to it; only ``rows``
-    count, where given, and of the coefficients the one with the number ``only``. ``laws`` are weighted
-    columns by a standard deviation of which other laws may be wrong.
+    Incidental coefficients are left out, all other parameters are refitted. ``nuisances`` are further
+    weighted columns; ``rows`` restricts the points, ``only`` the coefficients to one number. ``laws`` are
+    weighted columns of one standard deviation each of the errors of other laws.
     """
     own = [i for i in fitted.places(place) if not fitted.parameters[i].shape]
     effect = fitted.hypothesis.effects[place]
@@ -69,14 +69,14 @@ def block_robust(
     rows: BoolArray | slice = slice(None),
     laws: FloatArray | None = None,
 ) -> float:
-    """The same of the columns ``own`` of any fit to some rows, which stands at these ``coefficients``."""
+    """Returns the block-robust chi square of columns ``own`` of any fit with these ``coefficients``."""
     time_s = estimator.time_s[rows]
     if len(time_s) < LEAST_POINTS:
         return 0.0
     inverse = fit.directions @ fit.directions[own].T
     coefficients = coefficients + fit.directions[own] @ fit.slack
     influence = (fit.columns @ inverse) * (fit.residual - fit.basis @ fit.slack)[:, np.newaxis]
-    # The noise itself is a floor: a residual may be quieter than it by luck.
+    # The noise is a floor, because a residual may be smaller than it by chance.
     least = 0.25 * inverse[own] + inverse.T @ (np.maximum(fit.known[:, :1], 0.0) * inverse)
     longest_s = estimator.data.period_s * len(estimator.data.full) / LEAST_BLOCKS
     if laws is not None:
@@ -87,7 +87,7 @@ def block_robust(
 
 
 def gate(estimator: Estimator, fitted: Fitted, place: int) -> Gate:
-    """Judge one finding."""
+    """Tests one finding."""
     effect = fitted.hypothesis.effects[place]
     needed = estimator.scales.robust + estimator.scales.robust_more * (len(evident(effect)) - 1)
     laws = law_discrepancies(estimator, fitted.hypothesis.without(place))
@@ -119,7 +119,7 @@ def gate(estimator: Estimator, fitted: Fitted, place: int) -> Gate:
 
 
 def gate_of_change(estimator: Estimator, fitted: Fitted, without: Fitted) -> Gate:
-    """Judge a change of the model's own loop; ``without`` is the fit that has the loop as it was."""
+    """Tests a change of the model's own loop; ``without`` is the fit with the given loop."""
     change = without.residual - fitted.residual
     columns = np.column_stack([without.tangent, change])
     known = np.vstack([without.linearised.known, np.zeros(2)])
@@ -132,19 +132,19 @@ def gate_of_change(estimator: Estimator, fitted: Fitted, without: Fitted) -> Gat
 
 
 def evident(effect: Effect) -> list[int]:
-    """The numbers of the coefficients that are evidence of an effect."""
+    """Returns the numbers of the coefficients that count as evidence of an effect."""
     named = effect.named_coefficients()
     return [column for each in named if each.name not in effect.incidental for column in each.columns]
 
 
 def law_discrepancies(estimator: Estimator, hypothesis: Hypothesis) -> FloatArray:
-    """What the laws of all effects of a hypothesis may be wrong by, weighted columns (m, k)."""
+    """Returns the uncertainties of the laws of all effects of a hypothesis, weighted columns (m, k)."""
     forms = [estimator.law_discrepancy(each, hypothesis.start) for each in hypothesis.effects]
     return side_by_side(forms, len(estimator.index))
 
 
 def all_pieces_seen(estimator: Estimator, fitted: Fitted, place: int) -> bool:
-    """Whether each piece of a finding is seen, and none is what a larger one gets wrong."""
+    """Returns True if each piece of a finding is significant and exceeds the error of a larger one's law."""
     effect = fitted.hypothesis.effects[place]
     pieces = range(len(effect.coefficients()))
     if not effect.inexact or len(pieces) != len(effect.pieces()):
@@ -154,7 +154,7 @@ def all_pieces_seen(estimator: Estimator, fitted: Fitted, place: int) -> bool:
 
 
 def _changes(estimator: Estimator, fitted: Fitted, place: int) -> bool:
-    """Whether what has to be the same everywhere is another one along the way; see `Effect.changing`."""
+    """Returns True if a parameter that must be constant changes along the record; see `Effect.changing`."""
     effect, own = fitted.hypothesis.effects[place], fitted.places(place)
     for number, piece in enumerate(effect.pieces()):
         changing = piece.changing(estimator.motion)

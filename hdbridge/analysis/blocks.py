@@ -1,8 +1,8 @@
-"""Samples averaged over short stretches: a million rows become some ten thousand, exactly.
+"""Averaging of samples over short blocks, which reduces a million rows to some ten thousand.
 
 Columns are averaged like the observations, so a linear model of the samples is the same linear model of the
-blocks; what is lost is only what varies inside a block. Blocks are short just after a reversal, where the
-hysteresis is steep, and never reach across a turn, a gap, or samples that cannot be used.
+blocks. Only the variation within a block is lost. Blocks are short just after a reversal, where the
+hysteresis is steep, and never cross a turning point, a gap or unusable samples.
 """
 
 from __future__ import annotations
@@ -24,26 +24,26 @@ from hdbridge.units import ARCSEC_PER_DEG
 TARGET_BLOCKS = 30_000
 LONGEST_S = 0.25
 FINE_DEG = 0.4
-"""Just after a reversal blocks are a twentieth of this angle plus of the angle since the reversal."""
+"""Scale of the block length after a reversal: a twentieth of this angle plus the angle since the reversal."""
 REST_DEG_S = 0.05
-"""Motor speed below which an axis stands."""
+"""Motor speed below which an axis counts as resting."""
 AVERAGED_COUNTS_S = 200.0
-"""Faster than this a servo passes several counts before it answers, and rounding averages out."""
+"""Count rate above which rounding averages out, because a servo passes several counts before it responds."""
 LOCKED_COUNTS = 0.15
-"""Standard deviation of what rounding leaves over a leg: sampled in step with the counts that it passes, an
-encoder is read at the same few places within a count over all the travel to the next turn."""
+"""Standard deviation of the mean rounding error of a leg. Sampling in step with the counts reads an
+encoder at the same few places within a count up to the next turning point."""
 LEAST_LOCKED_COUNTS = 0.03
-"""At least so much there may be at any speed."""
+"""Lower limit of that deviation at any speed."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Blocks:
-    """Blocks of samples; arrays of shape (b,) but for those named otherwise."""
+    """Blocks of samples; arrays of shape (b,) unless stated otherwise."""
 
     index: IntArray
     """Usable samples, shape (u,)."""
     first: IntArray
-    """Where each block begins in ``index``."""
+    """Position in ``index`` at which each block begins."""
     weight: FloatArray
     """Weight of each usable sample, shape (u,): 1, or 0 for an outlier."""
     count: FloatArray
@@ -58,19 +58,19 @@ class Blocks:
     speed_deg_s: FloatArray
     moving: BoolArray
     heading: FloatArray
-    """1 or -1: the direction of motion, at rest the last one; 0 before the first."""
+    """Direction of motion, 1 or -1; at rest the last one; 0 before the first motion."""
     kind: IntArray
     zero: IntArray
     chain: IntArray
     middle: IntArray
-    """The sample in the middle of each block."""
+    """Index of the middle sample of each block."""
     error_arcsec: FloatArray
     leg: IntArray
-    """Number of the travel from turn to turn that a block lies on."""
+    """Number of the leg, from turning point to turning point, that contains the block."""
     locked_arcsec: FloatArray
-    """Standard deviation of an error that is the same over a leg, from reading the motor in whole counts."""
+    """Standard deviation of the rounding error of the motor angle that is constant over a leg."""
     blur: FloatArray
-    """Variance of each block, arcsec squared, because turns of the driving angle are known so well only."""
+    """Variance of each block due to uncertain turning points of the driving angle, arcsec squared."""
 
     def __len__(self) -> int:
         """Number of blocks."""
@@ -78,18 +78,18 @@ class Blocks:
 
     @property
     def sizes(self) -> IntArray:
-        """Usable samples in each block, outliers too."""
+        """Number of usable samples in each block, including outliers."""
         return np.diff(np.append(self.first, len(self.index)))
 
     def mean(self, values: FloatArray) -> FloatArray:
-        """Average of a per-sample quantity (n,) or (n, p) over each block: (b,) or (b, p)."""
+        """Averages a per-sample quantity (n,) or (n, p) over each block: (b,) or (b, p)."""
         picked = values[self.index]
         spread = (slice(None), np.newaxis)[: picked.ndim]
         total = np.add.reduceat(picked * self.weight[spread], self.first, axis=0)
         return np.asarray(total / np.maximum(self.count, 1e-300)[spread])
 
     def picked(self, index: IntArray | BoolArray) -> Blocks:
-        """Some of the blocks, each stood for by its middle sample."""
+        """Selects blocks, each represented by its middle sample."""
         own = {"index", "first", "weight"}
         kept = {each.name: getattr(self, each.name)[index] for each in fields(self) if each.name not in own}
         middle = self.middle[index]
@@ -97,7 +97,7 @@ class Blocks:
 
 
 def make_blocks(samples: Samples, weight: FloatArray | None = None) -> Blocks:
-    """Cut the usable samples into blocks; ``weight`` (one per sample, 0 or 1) leaves outliers out."""
+    """Cuts the usable samples into blocks; ``weight`` (one per sample, 0 or 1) excludes outliers."""
     index = np.flatnonzero(samples.usable)
     motor, time = samples.motor_deg, samples.time_s
     parts = [motor[each.rows] for each in samples.chains]
@@ -154,7 +154,7 @@ def make_blocks(samples: Samples, weight: FloatArray | None = None) -> Blocks:
 
 
 def locked_counts(speed_deg_s: FloatArray, count_deg: float) -> FloatArray:
-    """What rounding leaves over a leg at a motor speed, counts (standard deviation)."""
+    """Returns the rounding error that is constant over a leg, counts (standard deviation), by motor speed."""
     rate = np.abs(speed_deg_s) / max(count_deg, 1e-12)
     share = np.minimum(1.0, AVERAGED_COUNTS_S / np.maximum(rate, 1.0))
     return np.maximum(LOCKED_COUNTS * share, LEAST_LOCKED_COUNTS)
@@ -171,9 +171,9 @@ def _heading(motor_deg: FloatArray) -> FloatArray:
 
 
 def _cells(motor_deg: FloatArray, turning: Sequence[int], coarsest_deg: float) -> IntArray:
-    """A number per sample that changes from cell to cell of the travel since the last turn."""
+    """Numbers the samples by cells of the travel since the last turning point."""
     cells = np.zeros(len(motor_deg), dtype=np.int64)
-    edge = 20.0 * coarsest_deg - FINE_DEG  # where the fine part has grown to the coarsest
+    edge = 20.0 * coarsest_deg - FINE_DEG  # from here on all cells have the coarsest size
     base = 0
     for first, last in pairwise(turning):
         since = np.abs(motor_deg[first + 1 : last + 1] - motor_deg[first])
@@ -184,7 +184,7 @@ def _cells(motor_deg: FloatArray, turning: Sequence[int], coarsest_deg: float) -
     return cells
 
 
-# Calibration's observations: samples, their blocks, and the elastic state in which each chain begins.
+# Design of a calibration fit.
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -198,28 +198,29 @@ class Design:
 
     @classmethod
     def of(cls, samples: Samples, blocks: Blocks, starts: Sequence[Start]) -> Design:
-        """Prepare columns for these blocks."""
+        """Prepares the regressors for these blocks."""
         motions = [samples.along(each) for each in samples.chains]
         return cls(samples, blocks, tuple(starts), Regressors(motions, blocks.mean, len(blocks)))
 
     def beginning(self, starts: Sequence[Start]) -> Design:
-        """The same with other states at the start."""
+        """Returns the design with other elastic states at the start of the chains."""
         return replace(self, starts=tuple(starts))
 
     def columns(self, effect: Effect) -> FloatArray:
-        """Regressors of an effect, block averages, shape (b, p)."""
+        """Returns the regressors of an effect, block averages, shape (b, p)."""
         return self.regressors.columns(effect, self.starts)
 
     def told(self, effects: Sequence[Effect]) -> FloatArray:
-        """What effects say together, shape (b,)."""
+        """Returns the sum of the effects, arcsec, shape (b,)."""
         return self.regressors.told(effects, self.starts)
 
     def turn_effects(self, effects: Sequence[Effect]) -> tuple[FloatArray, FloatArray, IntArray]:
-        """What a reach further at the turn before would change, arcsec (b,), what share of that reach may lie
-        between two samples (b,), and which turn it is (b,).
+        """Returns the influence of each block's last turning point.
 
-        The reach is within what a turn is known: the count, and twice what may lie between two samples.
-        Every turn is moved outwards at once; what is seen on a branch is put down to the turn that began it.
+        These are the change if it lay further out by its reach, arcsec (b,), the share of the reach that is
+        due to sampling (b,), and the number of the turning point (b,). The reach is the uncertainty of a
+        turning point: one count plus twice the overshoot between samples. All turning points are moved
+        outwards at once; a change on a branch is attributed to the one that began it.
         """
         change, missed = np.zeros((2, len(self.blocks)))
         turn = np.zeros(len(self.blocks), dtype=np.intp)
@@ -247,16 +248,16 @@ class Design:
         return 2.0 * change, missed, turn
 
     def blurred(self, effects: Sequence[Effect]) -> Design:
-        """The same, each block's variance raised by what rounding of the driving angle does to the effects.
+        """Returns the design with the variance that rounding of the driving angle adds to each block.
 
-        Just after a turn a hysteresis may rise without bound: what is measured there says little, and should
-        not say much.
+        Just after a turning point a hysteresis may be arbitrarily steep, so measurements there get little
+        weight.
         """
         change, _, _ = self.turn_effects(effects)
         return replace(self, blocks=replace(self.blocks, blur=change**2 / 12.0))
 
     def residual(self, effects: Sequence[Effect], rest: FloatArray) -> FloatArray:
-        """Observation minus effects per sample, minus ``rest`` per block; NaN where not usable."""
+        """Returns observation minus effects per sample, minus ``rest`` per block; NaN if not usable."""
         left = self.samples.error_arcsec - self.regressors.predicted(effects, self.starts)
         result = np.full(len(left), np.nan)
         index = self.blocks.index
@@ -265,9 +266,9 @@ class Design:
 
 
 def harmonics(design: Design, orders: Sequence[float]) -> FloatArray:
-    """Cosine and sine of each order of the motor angle, block averages, shape (blocks, 2 * orders).
+    """Returns cosine and sine of each order of the motor angle, block averages, (blocks, 2 * orders).
 
-    Orders need not be whole numbers: 1 / N is once per load turn, k (1 + 1/N) the flexspline's.
+    Orders need not be integers: 1 / N is the load turn, k (1 + 1/N) the flexspline.
     """
     angles = (np.deg2rad(each) * design.samples.motor_deg for each in orders)
     parts = [design.blocks.mean(np.stack([np.cos(each), np.sin(each)], axis=1)) for each in angles]
@@ -275,7 +276,7 @@ def harmonics(design: Design, orders: Sequence[float]) -> FloatArray:
 
 
 def clusters(blocks: Blocks, number: int) -> IntArray:
-    """Blocks in about so many stretches of measured time, each of one chain; a number per block."""
+    """Numbers the blocks by about ``number`` stretches of measured time, each within one chain."""
     gone = np.concatenate([[0.0], np.cumsum(np.clip(np.diff(blocks.time_s), 0.0, 1.0))])
     span_s = max(float(gone[-1]) / number, 1e-9)
     cut = (np.diff(np.floor(gone / span_s)) != 0) | (np.diff(blocks.chain) != 0)
@@ -283,10 +284,10 @@ def clusters(blocks: Blocks, number: int) -> IntArray:
 
 
 def missed_deg(motor_deg: FloatArray, turns: IntArray) -> FloatArray:
-    """How much further than at the sample of each turn the motor may have been, shape of ``turns``.
+    """Returns how far the motor may have moved beyond the sample of each turning point, shape of ``turns``.
 
-    Between two samples at one speed each way the lines before and after meet so far outside. A motor that
-    rests where it turns was read there.
+    With constant speed before and after, the two lines meet outside by this much. It is 0 for a motor that
+    rests at the turning point.
     """
 
     def step(way: int) -> FloatArray:

@@ -1,10 +1,10 @@
-"""What a model knows of an axis, as a prior of a fit: each part of it is as calibrated, or has changed.
+"""Priors of a fit from the calibration of a model: each part is either as calibrated or has changed.
 
-A part is what changes together: a loop, one order, a spring. As calibrated, its parameters are normally
-distributed about those of the model file, as wide as the 95 % intervals there, or where it has none by
-`Scales.calibrated`. A part that the data pull further away than a change costs has changed and is free. So
-what the data cannot distinguish from a new cause stays with the model, and a loop that is another one is
-still found.
+A part is a group of parameters that change together: a loop, one order, a spring. As calibrated, its
+parameters are normally distributed about those of the model file, with the 95 % intervals given there or,
+without any, by `Scales.calibrated`. A part becomes free if the data pull it further away than a change
+costs. Thus the model keeps what the data cannot separate from a new cause, and a changed loop is still
+found.
 """
 
 from __future__ import annotations
@@ -23,38 +23,38 @@ from hdbridge.analysis.separable import on_scale, shape_value
 from hdbridge.effects import Effect, FloatArray
 
 EXACT: Final = 1e-3
-"""Share of such a deviation that no record distinguishes from none."""
+"""Share of such a deviation that is practically zero."""
 
 
 @dataclass(frozen=True, slots=True)
 class CalibratedPart:
-    """Parameters of one effect that change together, as calibrated."""
+    """Parameters of one effect that change together, with their calibrated values."""
 
     place: int
-    """Of the effect among the model's."""
+    """Place of the effect in the model."""
     parameters: Mapping[str, tuple[float, float]]
-    """Mean and standard deviation, by number of the coefficient or name of the shape; of the logarithm of a
-    logarithmic shape.
-    """
+    """Mean and standard deviation by number of the coefficient or name of the shape (its logarithm if
+    logarithmic)."""
     scales: Scales
     fixed: bool = False
-    """Whether it cannot have changed."""
+    """True if it cannot have changed."""
 
     @property
     def change_cost(self) -> float:
-        """Chi square that the part's change costs."""
+        """Penalty in chi square for a change of the part."""
         if self.fixed:
             return math.inf
         return self.scales.enter + self.scales.penalty * len(self.parameters)
 
     def as_given(self) -> CalibratedPart:
-        """The part where it is taken for exactly what the model file says."""
+        """Returns the part fixed exactly at the values of the model file."""
         exact = {name: (mean, EXACT * deviation) for name, (mean, deviation) in self.parameters.items()}
         return replace(self, parameters=exact, fixed=True)
 
     def strain(self, effects: Sequence[Effect], spread: FloatArray | None = None) -> float:
-        """Chi square by which the part is away from its calibration; ``spread`` (p, p) is the covariance of
-        the ``effects``' own parameters, where they are known no better.
+        """Returns the chi square of the part's deviation from its calibration.
+
+        ``spread`` (p, p) is the covariance of the parameters of ``effects``, if they are uncertain too.
         """
         effect = effects[self.place]
         coefficients = effect.coefficients()
@@ -69,7 +69,7 @@ class CalibratedPart:
         return float(off @ np.linalg.solve(np.diag(variance) + spread, off))
 
     def times(self, share: float) -> CalibratedPart:
-        """The part where so much of it is seen."""
+        """Returns the part with only a ``share`` of it visible."""
         seen = {name: (share * mean, deviation) for name, (mean, deviation) in self.parameters.items()}
         return replace(self, parameters=seen)
 
@@ -80,7 +80,10 @@ def calibrated(
     columns: Callable[[Effect], FloatArray],
     scales: Scales,
 ) -> tuple[CalibratedPart, ...]:
-    """The parts of a model with its 95 % half widths; ``columns``: an effect's in the record, (m, p)."""
+    """Returns the parts of a model with its 95 % half widths.
+
+    ``columns`` returns the columns of an effect in the record, (m, p).
+    """
     return tuple(
         CalibratedPart(place, parameters, scales)
         for place, effect in enumerate(effects)
@@ -89,13 +92,13 @@ def calibrated(
 
 
 def variances(parts: Sequence[CalibratedPart], place: int, columns: Iterable[int]) -> FloatArray:
-    """Of some coefficients of an effect of the model, as calibrated, shape (n,); 0 where nothing is known."""
+    """Returns the calibrated variances of some coefficients, shape (n,); 0 without a calibration."""
     own = {name: each for part in parts if part.place == place for name, each in part.parameters.items()}
     return np.array([own.get(str(each), (0.0, 0.0))[1] ** 2 for each in columns])
 
 
 def priors(parts: Sequence[CalibratedPart]) -> dict[tuple[int, str], Prior]:
-    """What is known of the parameters of some parts."""
+    """Returns the priors of the parameters of some parts."""
     return {
         (part.place, name): Prior(mean, deviation**-2)
         for part in parts
@@ -107,7 +110,7 @@ def _parts(
     effect: Effect, halves: Mapping[str, Any], columns: FloatArray, scales: Scales
 ) -> Iterator[dict[str, tuple[float, float]]]:
     peaks = np.max(np.abs(columns), axis=0, initial=0.0)
-    # What the record does not see stays as it is.
+    # Parameters that the record does not show stay unchanged.
     least = np.where(peaks > 0.0, scales.calibrated_arcsec / np.maximum(peaks, 1e-12), 0.0)
     values = effect.coefficients()
     named = effect.named_coefficients()
@@ -142,7 +145,7 @@ def _width(half: object, otherwise: float) -> float:
 
 
 def _of_order(amplitude_arcsec: float, halves: Mapping[str, Any] | None, share: float) -> float:
-    """Of cosine and sine alike, from the half widths of amplitude and phase."""
+    """Returns the standard deviation of cosine and sine from the half widths of amplitude and phase."""
     if halves is None:
         return share * amplitude_arcsec
     turn = math.radians(float(halves.get("phase_deg", 0.0))) * amplitude_arcsec

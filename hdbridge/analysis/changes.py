@@ -1,6 +1,6 @@
-"""Findings within the model's own parts: the elastic law, its parameters, the orders of the motor, a spring.
+"""Changes of the model's own parts: hysteresis law and parameters, motor orders, springs.
 
-Calibrations are a few per cent off as a rule, and that is no finding: the change has to be larger than that.
+Calibrations are usually off by a few per cent. A finding must exceed that.
 """
 
 from __future__ import annotations
@@ -28,9 +28,12 @@ from hdbridge.model import TransmissionModel
 def findings(
     search: Search, model: TransmissionModel, fitted: Fitted, precise: Fitted, spread: FloatArray
 ) -> list[Finding]:
-    """What has changed within the baseline, as the fit for parameters has it, with their covariance."""
+    """Returns the findings within the baseline.
+
+    ``spread`` is the covariance of ``precise``, the fit for parameters.
+    """
     estimator = search.estimator
-    # Whatever the file's intervals are: some kelvin and weeks later a calibration is as far off as any.
+    # Independent of the file's intervals: temperature and time put every calibration off by as much.
     parts = calibrated(
         model.effects, {}, lambda effect: estimator.columns(effect, Start.VIRGIN), estimator.scales
     )
@@ -52,7 +55,7 @@ def findings(
 def _another_law(
     search: Search, fitted: Fitted, precise: Fitted, place: int, given: Effect, spread: FloatArray
 ) -> Finding | None:
-    """Where another elastic law does better than the ``given`` one."""
+    """Returns a finding if another hysteresis law fits better than the ``given`` one."""
     estimator, now = search.estimator, precise.hypothesis.effects[place]
     scales = estimator.scales
     causes = causes_of(given, now)
@@ -79,7 +82,7 @@ def _loop(
     given: Effect,
     spread: FloatArray,
 ) -> Finding | None:
-    """Where the loop has other parameters, or a form that neither law has."""
+    """Returns a finding if the loop's parameters have changed, or its shape matches neither law."""
     estimator, place = search.estimator, usual.place
     scales = estimator.scales
     change = _change(estimator, precise, place, given)
@@ -92,7 +95,7 @@ def _loop(
     if reason := gate_of_change(estimator, fitted, search.with_given(fitted, place, given)).reason:
         search.refusals[causes[0].name] = reason
         return None
-    # A loop that obeys no law may follow another one in part.
+    # A loop that follows neither law exactly may follow the other one in part.
     laws = [kind.name for kind in CATALOGUE.values() if kind.part is Part.LOOP and kind.changes is Part.LOOP]
     residual, near = fitted.residual / estimator.weight, near_reversals(estimator, fitted)
     taken = float(np.mean(((residual + change - np.mean(change)) ** 2 - residual**2)[near]))
@@ -104,13 +107,13 @@ def _loop(
 
 
 def _apart_arcsec(estimator: Estimator, one: Fitted, other: Fitted) -> float:
-    """How far apart two fits are at their peak, but for what is rare."""
+    """Returns the largest difference of two fits, arcsec, without rare extremes."""
     apart = np.abs(one.residual - other.residual) / estimator.weight
     return float(np.quantile(apart, 1.0 - estimator.rare))
 
 
 def _lawless_arcsec(estimator: Estimator, fitted: Fitted) -> float:
-    """What a loop of free form does in addition to the law, peak; 0 where the law does as well."""
+    """Returns the peak that a free-form loop adds to the law; 0 if the law fits as well."""
     scales, free = estimator.scales, fitted.hypothesis.nuisances
     if free is None:
         return 0.0
@@ -123,7 +126,7 @@ def _lawless_arcsec(estimator: Estimator, fitted: Fitted) -> float:
 def _orders(
     estimator: Estimator, fitted: Fitted, usual: Sequence[CalibratedPart], given: Effect, spread: FloatArray
 ) -> Finding | None:
-    """Those of the orders of the motor that have changed."""
+    """Returns a finding of the motor orders that have changed."""
     place, scales = usual[0].place, estimator.scales
     now = fitted.hypothesis.effects[place]
     columns = fitted.places(place)
@@ -132,7 +135,7 @@ def _orders(
     known: list[FloatArray] = []
     for old, new, named in zip(given.pieces(), now.pieces(), now.named_coefficients(), strict=True):
         before, after = old.coefficients(), new.coefficients()
-        # What is odd in the direction takes some of an order away from the mean of both directions.
+        # Effects that are odd in the direction reduce an order's mean over both directions.
         number = round(new.waves()[0][0]) if new.waves() else 0
         share = math.prod(each.left_in_mean(number) for each in fitted.hypothesis.effects)
         part = next(each for each in usual if str(named.columns[0]) in each.parameters).times(share)
@@ -149,8 +152,8 @@ def _orders(
     difference = is_now.fitted(is_now.coefficients() - was.coefficients())
     causes = causes_of(was, is_now)
     if not causes or difference.largest_piece_arcsec() > scales.extrapolated * seen:
-        return None  # on an arc of their turn orders take any size
-    # What it has changed from was itself known to its calibration only.
+        return None  # on an arc of their turn, orders can take any amplitude
+    # The old value has the uncertainty of its calibration.
     apart = spread[np.ix_(own, own)] + np.diag(np.concatenate(known))
     parameters = named_parameters(difference, [Column(0, str(i)) for i in range(len(own))], apart)
     return _finding(
@@ -164,7 +167,10 @@ def _orders(
 def _freed(
     search: Search, fitted: Fitted, precise: Fitted, place: int, given: Effect, spread: FloatArray
 ) -> Finding | None:
-    """Any other part that the data have pulled out of its calibration (`hdbridge.analysis.calibrated`)."""
+    """Returns a finding for another part that the data pull out of its calibration.
+
+    See `hdbridge.analysis.calibrated`.
+    """
     estimator, own = search.estimator, precise.places(place)
     if not len(own) or np.all(precise.information[own] != 0.0):
         return None
@@ -194,7 +200,7 @@ def _finding(
     aliases: tuple[str, ...],
     **more: Any,
 ) -> Finding:
-    """That the columns ``own`` of a fit have changed by ``change_arcsec``, (m,)."""
+    """Returns the finding that the columns ``own`` of a fit have changed by ``change_arcsec``, (m,)."""
     weighted = estimator.weight * (change_arcsec - np.mean(change_arcsec))
     return Finding(
         effect.name, UNWEIGHED, aliases, parameters, held_out_change(estimator, fitted, own, change_arcsec),
@@ -204,14 +210,14 @@ def _finding(
 
 
 def _change(estimator: Estimator, fitted: Fitted, place: int, given: Effect) -> FloatArray:
-    """What a part of the model does otherwise than as it was ``given``, arcsec, (m,)."""
+    """Returns the change of a part's contribution from the ``given`` one, arcsec, (m,)."""
     start, now = fitted.hypothesis.start, fitted.hypothesis.effects[place]
     after = estimator.columns(now, start) @ now.coefficients()
     return np.asarray(after - estimator.columns(given, start) @ given.coefficients())
 
 
 def strain(fitted: Fitted, part: CalibratedPart, spread: FloatArray) -> float:
-    """Chi square by which a part of a fit is away from its calibration, both with their errors."""
+    """Returns the chi square of a part's deviation from its calibration, with the errors of both."""
     own = {fitted.parameters[i].name: i for i in fitted.places(part.place)}
     seen = replace(part, parameters={name: each for name, each in part.parameters.items() if name in own})
     at = [own[name] for name in seen.parameters]
@@ -219,6 +225,6 @@ def strain(fitted: Fitted, part: CalibratedPart, spread: FloatArray) -> float:
 
 
 def causes_of(given: Effect, now: Effect) -> list[Effect]:
-    """The causes that can have made one of the other, those that say more of it first."""
+    """Returns the causes that can explain the change, the more specific first."""
     found = [each for kind in CATALOGUE.values() if (each := kind.of_change(given, now)) is not None]
     return sorted(found, key=lambda each: each.changes is None)

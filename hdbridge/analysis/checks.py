@@ -1,4 +1,4 @@
-"""Refuses records that no axis can have made, and says how to read them right."""
+"""Plausibility checks of records: rejects impossible ones and says how to read them correctly."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ from hdbridge.records.wraps import Wraps, count_of, find_wraps, period_in, unwra
 from hdbridge.units import DEG_PER_TURN
 
 LEAST_WHOLE = 10.0
-"""Travel beyond which whole numbers are not a chance."""
+"""Minimum travel for which whole numbers only cannot be a coincidence."""
 SLOWEST_DEG_S = 6.0
-"""A motor that is recorded reaches one turn per minute."""
+"""Minimum peak motor speed of a plausible record: one turn per minute."""
 MOST_COUNTS = 2**32
-"""Counts of the largest counter that wraps within a record."""
+"""Largest plausible counter that wraps within a record, counts."""
 TURNS_SEEN = 4.0
-"""Minimum motor turns in which an error is seen to repeat."""
+"""Minimum motor turns for a test of repetition."""
 PLACES = 8
-"""Places within a motor turn that are counted as different."""
+"""Number of sectors of a motor turn that count as different places."""
 REPEATS_SHARE = 0.5
 """Minimum share of the error's variance that repeats with each turn of the motor."""
 FOLLOWS_SHARE = 0.1
@@ -33,10 +33,10 @@ FOLLOWS_SHARE = 0.1
 
 
 def check_records(records: Mapping[Path, Record], ratio: float) -> None:
-    """Refuse (InputError) records that no axis of this ratio can have made, or that say nothing of one.
+    """Raises InputError for records that no axis of this ratio can have produced, or without motion.
 
-    Time has to pass, angles have to be multi-turn, units and ratio have to be right, and in one of the
-    records the motor has to move. Each record is named by its path.
+    Time must advance, angles must be multi-turn, units and ratio must be right, and the motor must move in at
+    least one record. Keys are the paths for the messages.
     """
     for path, record in records.items():
         if len(record) > 1 and float(np.ptp(record.time_s)) == 0.0:
@@ -58,10 +58,10 @@ def check_records(records: Mapping[Path, Record], ratio: float) -> None:
 
 
 def zeros_apart_arcsec(records: Sequence[Record], ratio: float) -> float | None:
-    """How far apart the zeros of records are that went the same way; None where that is no more than their
-    own errors, or there is nothing to compare.
+    """Returns the spread of the zeros of records with the same direction of motion.
 
-    Half the height of a loop lies between two directions, so only records of one direction are compared.
+    None if it does not exceed their own variation, or there is nothing to compare. Directions are compared
+    separately, because they differ by half the height of a loop.
     """
     apart: list[float] = []
     for sign in (-1.0, 1.0):
@@ -80,7 +80,7 @@ def zeros_apart_arcsec(records: Sequence[Record], ratio: float) -> float | None:
 
 
 def check_once(paths: Sequence[Path], records: Sequence[Record]) -> None:
-    """Refuse (InputError) a measurement that is named twice: what it says would count twice."""
+    """Raises InputError if a measurement is given twice, because it would count twice."""
     for number, (path, record) in enumerate(zip(paths, records, strict=True)):
         for other, before in zip(paths[:number], records[:number], strict=True):
             if len(record) == len(before) and all(
@@ -95,7 +95,7 @@ def _moves(record: Record) -> bool:
 
 
 def _check_whole(path: Path, record: Record) -> None:
-    """Refuse a load angle in whole numbers: no encoder reads whole degrees."""
+    """Raises InputError for a load angle in whole numbers: no encoder reads whole degrees."""
     load, origin = record.load_position_deg, record.origin
     if origin is not None and "load" in origin.stated:
         return
@@ -115,7 +115,7 @@ def _check_whole(path: Path, record: Record) -> None:
 
 
 def _check_wrapped(path: Path, record: Record) -> None:
-    """Refuse an angle that jumps by a constant, as a counter that wraps, while the other does not."""
+    """Raises InputError for an angle that jumps by a constant (a wrapping counter), unlike the other one."""
     motor, load, target = record.motor_position_deg, record.load_position_deg, record.motor_target_deg
     found: dict[str, Wraps] = {}
     for channel, angle, other in (("load", load, motor), ("motor", motor, load)):
@@ -149,12 +149,12 @@ def _check_wrapped(path: Path, record: Record) -> None:
 
 
 def _shown(value: float) -> str:
-    """A count in full, any other value with six digits."""
+    """Formats a count in full, any other value with six digits."""
     return f"{value:.12g}" if value == round(value) else f"{value:.6g}"
 
 
 def _counter(period: float, unit: Unit, angle: FloatArray) -> str:
-    """Name of a counter or an angle with this period."""
+    """Describes a counter or an angle with this period."""
     if abs(period * abs(unit.factor) - DEG_PER_TURN) < 1e-6 * DEG_PER_TURN:
         return "an angle that wraps after a turn"
     counts = period if unit.name == "counts" else period / (count_of(angle / unit.factor) or period)
@@ -163,7 +163,7 @@ def _counter(period: float, unit: Unit, angle: FloatArray) -> str:
 
 
 def _unwrapping(record: Record, channel: str, found: Mapping[str, Wraps]) -> str:
-    """How to unwrap what was found."""
+    """Says how to unwrap the angles found."""
     origin = record.origin
     if origin is None:
         return f"unwrap it by {found[channel].period_deg:.10g} deg"
@@ -180,7 +180,7 @@ def _unwrapping(record: Record, channel: str, found: Mapping[str, Wraps]) -> str
 
 
 def _check_speed(path: Path, record: Record) -> None:
-    """Refuse milliseconds and radians in columns that are taken for seconds and degrees, unless stated."""
+    """Raises InputError for unstated milliseconds or radians taken for seconds or degrees."""
     origin = record.origin
     if origin is None or "time" in origin.stated or not _moves(record):
         return
@@ -210,7 +210,7 @@ def _check_speed(path: Path, record: Record) -> None:
 
 
 def _check_turn(path: Path, record: Record, ratio: float) -> None:
-    """Refuse angles in radians: the error repeats with each turn of the motor, which is 2 pi then."""
+    """Raises InputError for angles in radians: the error repeats every 2 pi of the motor angle."""
     origin, motor = record.origin, record.motor_position_deg
     if origin is None or "motor" in origin.stated:
         return

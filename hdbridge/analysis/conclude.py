@@ -1,10 +1,10 @@
-"""The covariance of what was fitted, from the noise as it is, not as one would like it.
+"""Covariance, residual tests, held-out test and result of an identification.
 
-The covariance of a fit under the noise model is the inverse information. Where the noise model is wrong the
-scores of longer stretches of the record vary more than it says: a sandwich over stretches (Liang and Zeger
-1986) finds out, and wherever it is wider it is believed. What reading in counts leaves in a wave is the same
-all along a sweep, and other in the next: for waves the stretches are whole legs as well, and since there are
-few of these, all waves are taken together.
+The covariance of a fit under the noise model is the inverse information. If the noise model is wrong, the
+scores of longer stretches vary more than it predicts. A sandwich estimate over stretches (Liang and Zeger
+1986) shows this, and replaces the model's variance wherever it is larger. The rounding error in a wave is
+constant along a sweep and differs in the next. For waves, whole legs therefore serve as stretches too;
+because there are few legs, all waves are pooled.
 """
 
 from __future__ import annotations
@@ -49,14 +49,14 @@ from hdbridge.model import TransmissionModel
 from hdbridge.units import ARCSEC_PER_DEG, DEG_PER_TURN
 
 CLUSTERS = 100
-"""The record is cut into about so many stretches for the sandwich."""
+"""Approximate number of stretches for the sandwich estimate."""
 
 
 def covariance(solution: Solution, precision: Precision, blocks: Blocks) -> FloatArray:
-    """Covariance of the solution's columns, shape (p, p)."""
+    """Returns the covariance of the solution's columns, shape (p, p)."""
     model = inverse_symmetric(solution.information)
     number = clusters(blocks, CLUSTERS)
-    # Turns are noise (each has one stretch to itself), not parameters: they have no scores of their own.
+    # Turning points are noise (each has a single stretch), not parameters, and have no scores.
     main = [at for at, column in enumerate(solution.columns) if not is_turn(column.name)]
     if int(number[-1]) + 1 < 2 * len(main):
         return model
@@ -74,16 +74,17 @@ def covariance(solution: Solution, precision: Precision, blocks: Blocks) -> Floa
 
 
 def of_effect(solution: Solution, index: int, cov: FloatArray) -> list[Interval]:
-    """Intervals of one effect's parameters by the covariance of a solution's columns."""
+    """Returns the intervals of one effect's parameters, from the covariance of the solution's columns."""
     mine = [at for at, column in enumerate(solution.columns) if column.effect == index]
     columns = [solution.columns[at] for at in mine]
     return intervals_of(solution.effects[index], columns, cov[np.ix_(mine, mine)])
 
 
 def _between_legs(waves: FloatArray, precision: Precision, residual: FloatArray, blocks: Blocks) -> float:
-    """By how much the variance of waves, taken from leg to leg, is more than the noise model's; at least 1.
+    """Returns the variance of waves between legs relative to the noise model's; at least 1.
 
-    Waves (b, p) of one kind have nearly the same information and hardly share any, so that each tells of all.
+    Waves (b, p) of one kind have nearly equal information and share little, so each is an independent
+    estimate of the ratio.
     """
     scores = sums(waves * precision.apply(residual)[:, np.newaxis], blocks.leg)
     own = sums(waves * precision.apply(waves), blocks.leg)
@@ -93,15 +94,15 @@ def _between_legs(waves: FloatArray, precision: Precision, residual: FloatArray,
     return max(float(np.mean(ratio)), 1.0)
 
 
-# What is left, questioned: does it hang on the motor angle, the load angle, the direction, the time?
+# Residual tests: does the residual depend on motor angle, load angle, direction or time?
 
 
 SURE = 3.0
-"""Standard errors that a difference must have."""
+"""Minimum significance of a difference, standard errors."""
 WORTH_ARCSEC = 0.3
-"""What is smaller than this is not reported as a failure, however sure it is."""
+"""Smallest deviation that fails a test, however significant."""
 LEAST_TOLD_ARCSEC = 0.005
-"""What would be told as 0.00 is left out."""
+"""Smallest deviation mentioned in the text; less would be printed as 0.00."""
 
 
 def residual_tests(
@@ -111,7 +112,7 @@ def residual_tests(
     left: Sequence[Line],
     figures: NoiseFigures,
 ) -> tuple[ResidualTest, ...]:
-    """All tests; ``left`` are the orders that are not in the fit."""
+    """Runs all residual tests; ``left`` holds the orders that are not in the fit."""
     return (
         _orders("motor_angle", [each for each in left if each.order.family is not Family.LOAD]),
         _orders("load_angle", [each for each in left if each.order.family is Family.LOAD]),
@@ -133,7 +134,7 @@ def _orders(name: str, left: Sequence[Line]) -> ResidualTest:
 def _contrast(
     name: str, column: FloatArray, residual: FloatArray, precision: Precision, scale: float
 ) -> ResidualTest:
-    """Generalised least squares of the residual on one column and the mean; size: ``scale`` columns."""
+    """Fits the residual with one column and a mean by generalised least squares; size: ``scale`` columns."""
     columns = np.stack([np.ones(len(column)), column], axis=1)
     weighted = precision.apply(columns)
     information = columns.T @ weighted
@@ -174,25 +175,26 @@ def _level(figures: NoiseFigures) -> ResidualTest:
     return ResidualTest("noise_level", size < max(rest, 1.0), size, text)
 
 
-# Quality on data that the fit has not seen: parts are left out, fitted without, and predicted.
+# Held-out test: parts of the record are left out, the model is fitted to the rest and predicts them.
 
 
 FOLDS = 4
 STRETCHES = 40
-"""Of time, of which a fold takes every fourth."""
+"""Number of stretches of time; each fold takes every fourth."""
 RECORDINGS = "recordings"
 CELL_DEG = 30.0
 SAME_WAY = 0.8
-"""A recording went where others did when so much of it lies in cells of the motor angle that they saw."""
+"""Minimum share of a recording in cells of the motor angle that other recordings also cover, for it to
+count as the same travel."""
 
 
 def held_out(
     state: State, solution: Solution, measured_arcsec: FloatArray, inside_variance: float
 ) -> HeldOut:
-    """Leave out one fold at a time, and compare with the active model, or none.
+    """Cross-validates the model by folds, and compares it with the active model (or none).
 
-    ``measured_arcsec`` (b,) is what was measured, before any delay was put right; ``inside_variance`` is what
-    samples vary inside their blocks, which no model of this kind changes.
+    ``measured_arcsec`` (b,) is the measured error before delay correction. ``inside_variance`` is the
+    variance of samples within their blocks, which no model of this kind changes.
     """
     design, blocks, active = state.design, state.design.blocks, state.options.active
     fold, over = folds(design)
@@ -201,7 +203,7 @@ def held_out(
     kept = shift + [at for at, each in enumerate(solution.columns) if each.effect in written]
     rest_arcsec = blocks.error_arcsec - solution.jacobian[:, shift] @ solution.nuisances[shift]
     added, alone = (np.zeros((2, len(blocks))) for _ in range(2))
-    # The active model has no nuisances of its own: it is given those that suit it best.
+    # The active model has no nuisances of its own, so the best-fitting ones are used.
     own = active.effects if active else ()
     new = [solution.effects[place] for place in sorted(written)]
     for row, (effects, of) in enumerate(((own, shift), (new, kept))):
@@ -210,7 +212,7 @@ def held_out(
         steps = steps_without(fit, fold, lambda rows: Precision(state.noise, blocks.picked(rows)))
         for number, step in enumerate(steps):
             out = fold == number
-            # About the zeros that the rest of the data have; about its own where one is in this fold alone.
+            # About the zeros of the other data, or about its own if a zero occurs only in this fold.
             lost = ~np.isin(blocks.zero, blocks.zero[~out])
             left = fit.residual - columns @ step
             added[row, out] = about_zeros(left, blocks.zero, blocks.count * lost)[out]
@@ -239,12 +241,12 @@ def held_out(
 
 
 def folds(design: Design) -> tuple[IntArray, str]:
-    """Which fold each block is in, and what is left out in words.
+    """Assigns each block to a fold; returns the folds (b,) and a description of what is left out.
 
-    Sweeps by whole motor turns, every fourth one in both directions; what stays in one place (sines,
-    reversals) by stretches of time, so that no fold takes all there is to know about a reversal. Of several
-    short recordings of the same travel whole ones: what is left in one of them goes on from one
-    stretch to the next, and would be foretold by its neighbours.
+    Sweeps are divided by motor turns, every fourth one in both directions. Local motions (sines, reversals)
+    are divided by stretches of time, so that no fold holds all reversals. Several short recordings of the
+    same travel are left out whole: their residual is correlated from one stretch to the next, and neighbours
+    would predict it.
     """
     blocks = design.blocks
     lowest = float(np.min(blocks.motor_deg))
@@ -259,7 +261,7 @@ def folds(design: Design) -> tuple[IntArray, str]:
 
 
 def _alike(design: Design) -> bool:
-    """Whether there are recordings of which nothing is known but that each went where others did."""
+    """Returns True for recordings of unknown motion that each cover the same travel as the others."""
     blocks = design.blocks
     if np.any(design.samples.among(blocks.kind, KNOWN)) or int(blocks.chain[-1]) == 0:
         return False
@@ -271,24 +273,24 @@ def _alike(design: Design) -> bool:
     return True
 
 
-# Everything that is derived from the final solution, put together.
+# Result.
 
 
 MOST_NAMED = 4
-"""Orders that are named one by one."""
+"""Maximum number of orders that are listed individually."""
 
 
 def conclude(
     state: State, solution: Solution, cov: FloatArray, system: System, warnings: list[str]
 ) -> FitResult:
-    """The result of an identification; ``system`` is the state's, with the final noise."""
+    """Assembles the result of an identification; ``system`` is the state's, with the final noise."""
     design, blocks, samples = state.design, state.design.blocks, state.design.samples
     precision, chosen = state.precision(), state.selection.chosen
     intervals = [each for index in range(len(solution.effects)) for each in of_effect(solution, index, cov)]
     effects = tuple(each for each in solution.effects if not each.violations())
     uncertainty = {each.name: nested_half_widths(each, intervals) for each in effects}
     inside = _inside_variance(design, solution, state.columns().columns @ solution.nuisances)
-    # Samples were put right by the delay, which no model holds.
+    # Samples were corrected by the delay, which is not part of any model.
     measured = blocks.error_arcsec + state.delay_ms * delay_column(design)[:, 0]
     written = about_zeros(measured - design.told(effects), blocks.zero, blocks.count)
 
@@ -315,7 +317,7 @@ def conclude(
     waves = design.told([each for each in solution.effects if each.part is Part.ORDERS])
     lines = spectrum(state.candidates, chosen, system, state.options.family_wise)
     _describe_limits(state, lines, warnings)
-    used = blocks.count > 0  # a block all of whose samples were given no weight has no mean to be drawn
+    used = blocks.count > 0  # a block without any weight has no mean to plot
     return FitResult(
         model=TransmissionModel(samples.ratio, effects, uncertainty),
         intervals=tuple(intervals),
@@ -350,7 +352,7 @@ def conclude(
 
 
 def _inside_variance(design: Design, solution: Solution, nuisances: FloatArray) -> float:
-    """Variance of the residual of samples about the mean of their block."""
+    """Returns the variance of the residual of samples about their block means."""
     blocks = design.blocks
     residual = design.residual(solution.effects, nuisances)
     off = residual[blocks.index] - np.repeat(blocks.mean(residual), blocks.sizes)
@@ -358,7 +360,7 @@ def _inside_variance(design: Design, solution: Solution, nuisances: FloatArray) 
 
 
 def _nuisances(state: State, further: Mapping[str, tuple[float, float]]) -> tuple[Nuisance, ...]:
-    """What of all that was fitted in addition (``further``: value and half width) has a meaning."""
+    """Returns the physically meaningful nuisances; ``further`` maps names to value and half width."""
     found = []
     for name in state.nuisances:
         if name in TEXTS and name in further:
@@ -378,7 +380,7 @@ def _not_the_motors(state: State) -> list[Order]:
 
 
 def _describe_limits(state: State, lines: Sequence[Line], warnings: list[str]) -> None:
-    """Warnings about what the record's angles cannot tell apart, and about samples left out."""
+    """Appends warnings about orders that are not separable, short travel and outliers."""
     samples, outliers = state.design.samples, state.outliers
     for alike in _families(lines):
         warnings.append(f"{_named(alike)} cannot be distinguished at the angles of this record")
@@ -404,7 +406,7 @@ def _describe_limits(state: State, lines: Sequence[Line], warnings: list[str]) -
 
 
 def _families(lines: Sequence[Line]) -> list[list[Order]]:
-    """Orders that hang together as aliases of each other."""
+    """Returns groups of orders that are aliases of each other."""
     alike = [[other.order in each.aliases for other in lines] for each in lines]
     number = connected_components(np.array(alike).reshape(len(lines), -1))[1].tolist() if lines else []
     families = [
@@ -415,7 +417,7 @@ def _families(lines: Sequence[Line]) -> list[list[Order]]:
 
 
 def _named(orders: Sequence[Order]) -> str:
-    """Their names; of many only the first and the last."""
+    """Lists orders by name; a long list is shortened to its first and last."""
     if len(orders) > MOST_NAMED:
         return f"{orders[0]} to {orders[-1]} ({len(orders)} orders)"
     return " and ".join(map(str, orders))

@@ -1,7 +1,7 @@
-"""Where a record is no record of one motion: cuts between what was put together, readings that are none.
+"""Splits a concatenated record at its joins and drops invalid readings.
 
-A motor cannot be somewhere else in the next sample. Where a record says so it was put together from several,
-and nothing is known of the axis in between; or, where the next sample or two are back, they were misread.
+A motor cannot be elsewhere in the next sample. A jump means that the record was joined from several, with
+unknown motion in between, or, if the next sample or two return, that they were misread.
 """
 
 from __future__ import annotations
@@ -22,33 +22,36 @@ IntArray = NDArray[np.intp]
 BoolArray = NDArray[np.bool_]
 
 FASTEST_DEG_S2 = 1e6
-"""Acceleration of a small servo motor on its peak torque (17,000 rad/s^2); with a wave generator on its shaft
-it has less."""
+"""Upper limit of motor acceleration: a small servo motor at peak torque (17,000 rad/s^2). With a wave
+generator on its shaft it reaches less."""
 JUMP_DEG = 30.0
-"""Motor angle that is no noise, no count and no lost count."""
+"""Minimum jump of the motor angle that is not noise, a count or a lost count."""
 SPIKE_ARCSEC = 900.0
-"""No gear's error goes there and back from one sample to the next."""
+"""Change of the error to a single sample and back that no gear can make."""
 SLOWEST_S = 1.0
-"""A record needs a few samples per motor turn; nobody samples a bench once in so long."""
+"""Implausibly long sample period: a record needs a few samples per motor turn."""
 MISREAD_ROWS = 2
-"""A reading that is none lasts no longer than so many samples."""
+"""Maximum duration of a misreading, samples."""
 MISREAD_SHARE = 0.01
-"""Of more samples than this something else is wrong."""
+"""Maximum share of misread samples; with more, the problem is another one."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Observed:
-    """A record without readings that are none, taken apart where it is cut."""
+    """A record without invalid readings, split at its cuts."""
 
     record: Record
     remarks: tuple[str, ...]
-    """What was left out and where it was cut, in words."""
+    """Samples left out and cuts, in words."""
     cuts: tuple[int, ...] = ()
-    """The rows before which nothing is known of the axis; some of ``record.starts``."""
+    """Rows before which the motion is unknown; some of ``record.starts``."""
 
 
 def observed(record: Record, ratio: float) -> Observed:
-    """What a record says was observed; the same record where nothing is wrong with it."""
+    """Cleans a record: spreads coarse times, drops misread samples and cuts at jumps.
+
+    Returns the same record if nothing is wrong.
+    """
     remarks = []
     if repeated := sum(coarse(part.time_s, part.motor_position_deg) for part in record.parts()):
         remarks.append(
@@ -104,7 +107,7 @@ def _picked(record: Record, kept: BoolArray) -> Record:
 
 
 def jumps(motor_deg: FloatArray, time_s: FloatArray) -> IntArray:
-    """The steps from one sample to the next that no motor can make from the speed before or after."""
+    """Returns the steps between samples that no motor can make from the speed before or after."""
     step, time = np.diff(motor_deg), np.maximum(np.diff(time_s), 1e-6)
     if not len(step):
         return np.empty(0, dtype=np.intp)
@@ -116,7 +119,7 @@ def jumps(motor_deg: FloatArray, time_s: FloatArray) -> IntArray:
 
 
 def _misread(record: Record, ratio: float) -> BoolArray:
-    """Samples at which one of the angles, or both, are elsewhere, and back at once."""
+    """Returns a mask of samples at which an angle jumps away and back."""
     window = 2 * MISREAD_ROWS + 1
     found = np.zeros(len(record), dtype=np.bool_)
     if len(record) <= 2 * window:

@@ -1,4 +1,4 @@
-"""From a measurement and a model to a diagnosis: the steps in their order."""
+"""Diagnosis of a measurement against a model: all steps in order."""
 
 from __future__ import annotations
 
@@ -68,12 +68,11 @@ def diagnose(
     progress: Callable[[str], None] = lambda _: None,
     scales: Scales | None = None,
 ) -> Diagnosis:
-    """Say how the model differs from one or several recordings, and why; ``.as_dict()`` is the document.
+    """Diagnoses how a model differs from one or several recordings, and why; ``.as_dict()`` is the document.
 
-    ``independent_zeros`` says that the encoders' zeros were lost between them. ``progress`` receives what is
-    being done, in words. ``scales`` are the numbers that
-    decide, where they shall be others. InputError where a
-    recording is too short, was made by no axis of the model's ratio, or lacks a channel that the model needs.
+    ``independent_zeros`` states that the encoders' zeros were lost between recordings. ``progress`` receives
+    a description of each step. ``scales`` overrides the decision thresholds. InputError if a recording is
+    too short, does not match the model's ratio, or lacks a channel that the model needs.
     """
     recordings = by_name(recording)
     agreed_ratio(recordings, [(str(model.path or "the model"), model.ratio)])
@@ -112,7 +111,7 @@ def diagnose(
 
 
 def _of_zeros(parts: Sequence[Record], ratio: float) -> tuple[str, ...]:
-    """A remark where the zeros of the recordings do not agree."""
+    """Returns a remark if the zeros of the recordings disagree."""
     apart = zeros_apart_arcsec(parts, ratio)
     if apart is None:
         return ()
@@ -125,7 +124,7 @@ def _of_zeros(parts: Sequence[Record], ratio: float) -> tuple[str, ...]:
 @dataclass(frozen=True, slots=True, eq=False)
 class _Judged:
     fitted: Fitted
-    """Without a loop of free form."""
+    """Fit without a free-form loop."""
     findings: list[Finding]
     left: Rest
 
@@ -135,16 +134,16 @@ class _Judge:
     search: Search
     model: TransmissionModel
     unfitted: bool
-    """Whether the model lacks most of what the axis has."""
+    """True if the model lacks a loop that makes up most of its residual."""
     considered: list[str] = field(default_factory=list)
-    """What is not named, with the reason."""
+    """Causes that were considered but not reported, with the reason."""
 
     @property
     def estimator(self) -> Estimator:
         return self.search.estimator
 
     def of(self, fitted: Fitted) -> Diagnosis:
-        """The diagnosis, from where the search has ended."""
+        """Turns the result of the search into a diagnosis."""
         estimator, given = self.estimator, self.model.effects
         base = len(given)
         fitted = self.search.eliminated(fitted, self._stopped, self.considered)
@@ -167,7 +166,7 @@ class _Judge:
         chosen = [place for place in range(base, len(sound)) if sound[place].name in named]
         reason = "diagnosis: " + (", ".join(each.cause for each in findings) or "nothing found, refitted")
         extended = extended_model(self.model, fitted, chosen, spread, reason, base)
-        # Of the model as it was given with the start that suits it best.
+        # Residual of the given model from the best-fitting elastic start.
         each_start = (self._left_by(given, start) for start in Start)
         before = min(each_start, key=lambda error: float(error @ error))
         after = self._left_by(extended.effects, fitted.hypothesis.start)
@@ -197,7 +196,7 @@ class _Judge:
         )
 
     def _stopped(self, fitted: Fitted) -> tuple[int, str] | None:
-        """Of what a gate stops the weakest; without any, what cannot be as it has come out."""
+        """Returns the weakest cause that fails its gate, else an implausible or unidentifiable one."""
         places = range(len(self.model.effects), len(fitted.hypothesis.effects))
         gates = {place: gate(self.estimator, fitted, place) for place in places}
         stopped = [place for place, each in gates.items() if each.reason]
@@ -212,17 +211,15 @@ class _Judge:
         return None
 
     def _shadow(self, fitted: Fitted) -> tuple[int, str] | None:
-        """Of names that do less than what is left unexplained in addition, and may be a shadow of that, the
-        one that does least.
-        """
+        """Returns the cause with the least effect relative to the residual, if it may be an artefact."""
         estimator, base = self.estimator, len(self.model.effects)
-        left = replace(rest(estimator, fitted), fast_arcsec=0.0)  # what is fast casts no shadow
+        left = replace(rest(estimator, fitted), fast_arcsec=0.0)  # fast residuals cause no artefacts
         if len(fitted.hypothesis.effects) == base or not is_unexplained(estimator, left):
             return None
         share = {
             place: does_more(estimator, fitted, place)
             for place, effect in enumerate(fitted.hypothesis.effects[base:], base)
-            # What is left has no such line, and casts no shadow there; or any axis has it.
+            # Exempt: spectral lines, which the residual does not resemble, and effects of any normal axis.
             if not (effect.sought is not None and effect.sought.is_line) and not effect.ordinary_arcsec
         }
         place = min(share, key=lambda each: share[each], default=-1)
@@ -231,8 +228,9 @@ class _Judge:
         return place, LESS
 
     def _likely_only(self, fitted: Fitted) -> _Judged:
-        """The findings, without those that are not likely enough to be named, which leave the fit too, and
-        without those that any axis has.
+        """Judges the findings and removes those that are improbable or normal for any axis.
+
+        Improbable ones are removed from the fit as well.
         """
         base = len(self.model.effects)
         while True:
@@ -249,14 +247,14 @@ class _Judge:
                 if i < base or id(each) not in effects
             ]
             if len(kept) == len(fitted.hypothesis.effects):
-                break  # what is left of them are changes of the baseline, which it keeps
+                break  # the others are changes of the baseline, which stay in it
             fitted = self.estimator.fit(replace(fitted.hypothesis, effects=tuple(kept)))
         usual = {each.cause for each in likely if _ordinary(each)}
         self.considered.extend([*words, *(f"{cause}: no more than usual" for cause in sorted(usual))])
         return replace(judged, findings=[each for each in likely if each.cause not in usual])
 
     def _judged(self, fitted: Fitted) -> tuple[_Judged, list[str]]:
-        """What a hypothesis finds, how sure that is, and in words what of it is not named."""
+        """Judges the findings of a hypothesis; also returns the causes not reported, with reasons."""
         estimator, base = self.estimator, len(self.model.effects)
         precise = precisely(estimator, fitted)
         spread = covariance(estimator, precise)
@@ -267,17 +265,17 @@ class _Judge:
         findings += changes.findings(self.search, self.model, fitted, precise, spread)
         findings.sort(key=lambda each: -each.robust)
         excess = fitted.chi_square / max(len(fitted.residual) - fitted.count(), 1)
-        # A model cannot hold a free-form loop: figures are without it.
+        # A model cannot contain a free-form loop, so the figures exclude it.
         fitted = estimator.fit(replace(fitted.hypothesis, nuisances=None))
         left = rest(estimator, fitted)
         unknown = is_unexplained(estimator, left) or many_of_one(findings, estimator.scales) is not None
         doubtful = doubtful_loops(estimator, findings, left) if unknown else []
-        if doubtful:  # what they do is left, too
+        if doubtful:  # their contribution counts as residual too
             findings = [each for each in findings if each not in doubtful]
             left = rest(estimator, self._with_given_loop(fitted))
         words = [f"{each.cause}: {LESS}" for each in doubtful]
         findings = weighed(findings, Context(left.arcsec, excess, unknown), estimator.scales)
-        if estimator.data.reversals < 2:  # speed, torque, place and time go together: useful, but no proof
+        if estimator.data.reversals < 2:  # speed, torque, place and time are correlated
             most = estimator.scales.one_way
             findings = [replace(each, probability=min(each.probability, most)) for each in findings]
         return _Judged(fitted, findings, left), words
@@ -308,7 +306,7 @@ class _Judge:
         )
 
     def _aliases(self, fitted: Fitted, without: Fitted, place: int) -> tuple[str, ...]:
-        """Other causes that do nearly as well in its place."""
+        """Returns other causes that explain the data nearly as well as this one."""
         effect, available = fitted.hypothesis.effects[place], self.estimator.motion.available()
         alike = lookalikes(effect, self.estimator.data.ratio)
         names = [
@@ -345,7 +343,7 @@ class _Judge:
         )
         loops = [each for each in findings if each.effect is not None and each.effect.changes is Part.LOOP]
         if many is None and loops and of_the_loop(self.estimator, left):
-            # The law that is nearest to the truth is not the truth: one finding, with what it leaves.
+            # The best law is only an approximation: one finding, with its residual in the note.
             note = f"the loop has another shape than either law: {left.arcsec:.2g} arcsec rms are left"
             told = replace(loops[0], note=note, lives_in=lives)
             return [told if each is loops[0] else each for each in findings]
@@ -353,7 +351,7 @@ class _Judge:
         return [*findings, unknown] if largest > size else [unknown, *findings]
 
     def _left_by(self, effects: Sequence[Effect], start: Start) -> FloatArray:
-        """What a prediction for the usable points leaves of them, about the zeros that suit it best."""
+        """Returns observed minus predicted at the usable points, about the best-fitting zeros."""
         estimator = self.estimator
         left = estimator.observed - estimator.told(effects, start)
         return about_zeros(left, estimator.zero, estimator.weight**2)
@@ -362,7 +360,7 @@ class _Judge:
         estimator = self.estimator
         points, direction = estimator.data.points, direction_of(estimator.motion)[estimator.index]
         masks = {name: points.of_kind(name)[estimator.index] for name in points.kinds}
-        if len(masks) == 1:  # without legs by whether it stands, is slow or fast
+        if len(masks) == 1:  # without legs: divided into standing, slow and fast
             speed = np.abs(points.speed_deg_s)
             slow = speed <= np.median(speed[speed > 0.0]) if np.any(speed) else speed <= 1.0
             either = {"standing": speed == 0.0, "slow": (speed > 0.0) & slow, "fast": ~slow}
@@ -376,7 +374,7 @@ class _Judge:
 
 
 def _ordinary(finding: Finding) -> bool:
-    """Whether any axis has as much of it."""
+    """Returns True if the finding is no larger than on any normal axis."""
     return finding.effect is not None and finding.peak_arcsec < finding.effect.ordinary_arcsec
 
 

@@ -1,4 +1,7 @@
-"""Where a motor reverses: a turn counts only when it comes back by more than chatter."""
+"""Driving angle of the effects, with speed and acceleration; reversals free of chatter.
+
+A reversal counts only if the motor comes back by more than the chatter.
+"""
 
 from __future__ import annotations
 
@@ -16,16 +19,18 @@ from hdbridge.analysis.readings import Reading, quantum_deg, reading_of, third_d
 from hdbridge.effects import FloatArray
 
 REVERSAL_DEG = 0.3
-"""Travel that a reversal has on either side of it, motor degrees: less than the narrowest loop that is looked
-for (0.5, `effects.elastic_loop`), and several times what a motor settles by (0.07 in measured records)."""
+"""Minimum travel on either side of a reversal, motor degrees: less than the narrowest loop considered
+(0.5, `effects.elastic_loop`), and several times the settling motion of a motor (0.07 in measured
+records)."""
 JITTER_SIGMAS = 8.0
-"""... and at least so many standard deviations of the reading's own error."""
+"""Lower limit of that travel, in standard deviations of the reading error."""
 
 
 def steadied(path_deg: FloatArray, measured_deg: FloatArray, band_deg: float) -> FloatArray:
-    """A path without reversals smaller than ``band_deg`` of what was measured: monotone from turn to turn.
+    """Removes reversals smaller than ``band_deg`` of the measured angle: monotone between turning points.
 
-    At each turn it reaches what was measured and no more: the largest of many noisy angles lies too far out.
+    At each turning point the path is limited to the measured angle: the largest of many noisy angles lies too
+    far out.
     """
     changes = np.flatnonzero(np.diff(measured_deg, prepend=np.nan) != 0.0)
     until = np.append(changes[1:], len(measured_deg)) - 1
@@ -55,7 +60,7 @@ def steadied(path_deg: FloatArray, measured_deg: FloatArray, band_deg: float) ->
 
 
 def reversals(driving_deg: FloatArray, jitter_deg: float) -> int:
-    """How often one record reverses with travel on both sides (`REVERSAL_DEG`)."""
+    """Counts the reversals of one record that have travel on both sides (`REVERSAL_DEG`)."""
     if len(driving_deg) < 3:
         return 0
     band = max(REVERSAL_DEG, JITTER_SIGMAS * jitter_deg)
@@ -63,49 +68,47 @@ def reversals(driving_deg: FloatArray, jitter_deg: float) -> int:
     return int(np.count_nonzero(np.diff(steps[steps != 0.0])))
 
 
-# The angle that drives the effects, its speed and its acceleration, of one record.
+# Driving angle, speed and acceleration of one record.
 
 
 BoolArray = NDArray[np.bool_]
 
 CHATTER_COUNTS = 2.6
-"""A measured angle counts as reversed when it has come back by more than this many counts: noise of a third
-of one flickers over two."""
+"""Minimum return for a reversal of a measured angle, counts: noise of a third of a count flickers over
+two."""
 WINDOW_S = 0.03
-"""Speed and acceleration are means over so long."""
+"""Averaging window of speed and acceleration."""
 LONGEST_S = 0.05
-"""... of the acceleration no longer than this: moves speed up in a tenth of a second."""
+"""Longest window of the acceleration: moves accelerate within a tenth of a second."""
 SETTLE_S = 0.1
-"""After a fast move the load is left this much time to come to rest: two periods of a load that swings at
-20 Hz."""
+"""Time for the load to settle after a fast move: two periods of an oscillation at 20 Hz."""
 
 
 class Driven(NamedTuple):
-    """What drove the axis in one record, arrays of shape (n,)."""
+    """Motion that drove the axis in one record, arrays of shape (n,)."""
 
     motor_deg: FloatArray
     speed_deg_s: FloatArray
     acceleration_deg_s2: FloatArray
     rested_deg: FloatArray
-    """The angle if at rest the motor stood in the middle of the counts that it was read in, and not as near
-    to where it was told to be as they allow; the same without a command.
-    """
+    """Angle under the assumption that the resting motor stood in the middle of its counts, and not as
+    close to the command as they allow; the same angle without a command."""
 
 
 def reading_of_all(angle_deg: FloatArray, parts: Sequence[slice]) -> Reading:
-    """How finely the motor's angle was read: one encoder for all parts, so the one that saw it best tells."""
+    """Returns the resolution of the motor encoder, determined from the longest part."""
     largest = max(parts, key=lambda rows: rows.stop - rows.start)
     return replace(reading_of(angle_deg[largest]), count_deg=quantum_deg(angle_deg))
 
 
 def settling(fast: BoolArray, time_s: FloatArray) -> BoolArray:
-    """The samples of fast moves, and those within `SETTLE_S` after."""
+    """Returns a mask of the samples of fast moves and of the `SETTLE_S` after them."""
     last = np.maximum.accumulate(np.where(fast, time_s, -np.inf))
     return np.asarray(fast | ((time_s - last < SETTLE_S) & (time_s >= last)))
 
 
 def kinematics(position: FloatArray, target: FloatArray | None, time: FloatArray, reading: Reading) -> Driven:
-    """What drove the axis in one record."""
+    """Derives the driving angle, speed and acceleration of one record."""
     steps = np.diff(time)
     period_s = float(np.median(steps[steps > 0.0])) if np.any(steps > 0.0) else 1.0
     window = max(1, round(WINDOW_S / period_s)) | 1
@@ -117,7 +120,7 @@ def kinematics(position: FloatArray, target: FloatArray | None, time: FloatArray
     speed, acceleration = _rates(_smooth(driving, window), driving, time, window, bent, exact=True)
     resting = _resting(driving if target is None else target, window)
     if count and target is None:
-        # Counts that come and go are no motion: less than half a count over eight windows is rest.
+        # Flickering counts are not motion: less than half a count over the span is rest.
         span = 4 * window + 1
         resting |= np.abs(_slope(driving, time, span)) * span * np.median(np.diff(time)) < 0.5 * count
     speed[resting] = acceleration[resting] = 0.0
@@ -138,14 +141,15 @@ def _rested(
 def _driving(
     position: FloatArray, target: FloatArray | None, time: FloatArray, window: int, reading: Reading
 ) -> FloatArray:
-    """The command and a smooth line for the lag behind it, within the cell that the encoder was read in;
-    without a command the angle freed of chatter.
+    """Returns the command plus a smooth estimate of the lag, within the cell that the encoder read.
+
+    Without a command, the angle without chatter.
     """
     if target is None:
         return steadied(position, position, CHATTER_COUNTS * reading.unaided_deg)
     count = reading.count_deg
     lag = position - target
-    # How large the acceleration is does not matter here: its part of the lag is fitted.
+    # The scale of the acceleration does not matter here, because its share of the lag is fitted.
     speed, acceleration = _rates(target, target, time, window, window, exact=False)
     speed[_resting(target, window)] = 0.0
     columns = np.column_stack([np.ones(len(lag)), speed, acceleration])
@@ -156,16 +160,16 @@ def _driving(
     noise = _noise(lag, count)
     if noise >= 0.5 * count and float(np.std(rest)) > 0.45 * count + 1e-6:
         line = line + uniform_filter1d(rest, 2 * window + 1, mode="nearest")
-    # A motor that sticks where it reverses, or overshoots where it stops, is where its encoder says.
+    # A motor that sticks at a reversal or overshoots a stop is where its encoder says.
     cell = max(0.5 * count, 3.0 * noise)
     line = np.clip(line, lag - cell, lag + cell)
-    # Without a reversal the path may change sides of its cell, and the cell moves with a noisy reading.
+    # The path may cross its cell without reversing, and the cell moves with a noisy reading.
     band = max(CHATTER_COUNTS * reading.resolution_deg, 4.0 * cell)
     return steadied(target + line, target + line, band)
 
 
 def _noise(lag: FloatArray, count: float) -> float:
-    """Noise of the motor's reading in addition to that of its counts, degrees."""
+    """Returns the noise of the motor reading in addition to quantisation, degrees."""
     if len(lag) < 4:
         return 0.0
     return math.sqrt(max(third_deviation(np.diff(lag, 3)) ** 2 - count**2 / 12.0, 0.0))
@@ -184,10 +188,10 @@ def _resting(angle: FloatArray, window: int) -> BoolArray:
 def _rates(
     smooth: FloatArray, angle: FloatArray, time: FloatArray, window: int, bent: int, *, exact: bool
 ) -> tuple[FloatArray, FloatArray]:
-    """Speed of ``smooth`` over one window, and acceleration of ``angle`` over the other.
+    """Returns the speed of ``smooth`` and the acceleration of ``angle``, each over its window.
 
-    A record that begins or ends in motion has no window on its far side: there the acceleration goes on as it
-    was, and the speed with it.
+    At an end of a record in motion the window is incomplete: the acceleration is extrapolated as a constant,
+    the speed linearly.
     """
     speed, acceleration = _slope(smooth, time, window), _curvature(_smooth(angle, bent), time, bent)
     reach = 2 * max(1, window // 2)
@@ -201,13 +205,13 @@ def _rates(
 
 
 def _unsmoothed(means: FloatArray, window: int) -> FloatArray:
-    """Accelerations without what the second moment of their weights has made of them, by second differences.
+    """Corrects accelerations for the second moment of their averaging weights, by second differences.
 
-    An effect comes out larger by as much as the means leave out: a twentieth, where a move speeds up and
-    slows down in a third of a second and is seen fifty times in one.
+    The means underestimate by a twentieth for a move that accelerates and decelerates in a third of a second,
+    sampled fifty times per second, and effects would come out larger by as much.
     """
     result = means.copy()
-    # In samples: that of the differences, a triangle, and that of the smoothing, a rectangle.
+    # Second moments in samples: differences (triangle) plus smoothing (rectangle).
     moment = max(1, window // 2) ** 2 / 6.0 + (window**2 - 1) / 12.0
     bend = means[2 * window :] - 2.0 * means[window:-window] + means[: -2 * window]
     result[window:-window] -= 0.5 * moment / window**2 * bend
@@ -215,7 +219,7 @@ def _unsmoothed(means: FloatArray, window: int) -> FloatArray:
 
 
 def _slope(values: FloatArray, time: FloatArray, window: int) -> FloatArray:
-    """Central differences."""
+    """Returns central differences over a window."""
     half = max(1, window // 2)
     count = len(values)
     ahead = np.minimum(np.arange(count) + half, count - 1)
@@ -227,7 +231,7 @@ def _slope(values: FloatArray, time: FloatArray, window: int) -> FloatArray:
 
 
 def _curvature(values: FloatArray, time: FloatArray, window: int) -> FloatArray:
-    """Second differences, as near to the sample as the window allows."""
+    """Returns second differences, as close to the sample as the window allows."""
     half = max(1, window // 2)
     count = len(values)
     result = np.zeros(count)

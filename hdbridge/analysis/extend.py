@@ -1,4 +1,4 @@
-"""The extended model: the refitted baseline and what was found, with uncertainty and provenance."""
+"""Extended model: refitted baseline and findings, with uncertainty and provenance."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from hdbridge.model import TransmissionModel
 
 
 def as_named(estimator: Estimator, fitted: Fitted, given: Sequence[Effect], named: Container[str]) -> Fitted:
-    """The fit with the ``given`` law of the loop, where another one does better but was not named."""
+    """Returns the fit with the ``given`` hysteresis law, if another one fits better but was not reported."""
     for place, (old, new) in enumerate(zip(given, fitted.hypothesis.effects, strict=False)):
         if type(old) is not type(new) and new.changes is not None and new.name not in named:
             return estimator.fit(fitted.hypothesis.instead(place, *in_place(new, [type(old)])))
@@ -25,10 +25,10 @@ def as_named(estimator: Estimator, fitted: Fitted, given: Sequence[Effect], name
 def supported(
     estimator: Estimator, fitted: Fitted, given: Sequence[Effect], alone: Container[str] = ()
 ) -> tuple[Effect, ...]:
-    """The hypothesis's effects, but those of the baseline as ``given`` where the record cannot tell them.
+    """Returns the effects, with those of the baseline as ``given`` if the record does not determine them.
 
-    A loop without a reversal, and orders on a short arc of their turn, take any value that suits this record;
-    a change of those to be left ``alone`` may be another cause's doing.
+    A loop without a reversal, and orders on a short arc of their turn, take any value that suits this record.
+    A change of an effect in ``alone`` may be due to another cause.
     """
     start = fitted.hypothesis.start
     one_way = estimator.data.reversals < 2
@@ -52,9 +52,9 @@ def extended_model(
     reason: str,
     base: int,
 ) -> TransmissionModel:
-    """``model`` with the fitted baseline (`supported`) and the findings at ``places`` of the hypothesis.
+    """Returns ``model`` with the fitted baseline (`supported`) and the findings at ``places``.
 
-    What else the hypothesis holds was fitted in addition to them and is not written: it was not named.
+    Other effects of the hypothesis were not reported and are not included.
     """
     ratio = model.ratio
     effects: tuple[Effect, ...] = tuple(each.tidied(ratio) for each in fitted.hypothesis.effects[:base])

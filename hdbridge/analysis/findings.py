@@ -1,7 +1,7 @@
-"""The next experiment in words: what would separate what the data leave open.
+"""Findings and diagnosis as plain values, and the next experiment in words.
 
-As the causes have it, also what only a person can do (move a mass, re-clock an encoder). What the axis can do
-by itself: `hdbridge.improvement.experiments`.
+Experiments come from the causes' descriptions and include those that need a person (move a mass, re-clock
+an encoder). Automatic ones: `hdbridge.improvement.experiments`.
 """
 
 from __future__ import annotations
@@ -28,12 +28,13 @@ _UNEXPLAINED: Final = {
     "torque": "the same sweep with the load's mass at two places",
     "time": "an hour of returns to one reference pose, with the temperature recorded",
 }
-"""By what it depends on."""
+"""Experiments for an unexplained residual, by the variable that it depends on."""
 
 
 def next_experiment(cause: str, aliases: tuple[str, ...]) -> str:
-    """The shortest experiment that distinguishes the cause from its aliases; without aliases, the one that
-    confirms it.
+    """Returns the shortest experiment that separates the cause from its aliases.
+
+    Without aliases, the one that confirms the cause.
     """
     either = [pair for each in aliases for pair in ((cause, each), (each, cause))]
     known = [
@@ -47,12 +48,12 @@ def next_experiment(cause: str, aliases: tuple[str, ...]) -> str:
 
 
 def for_unexplained(lives_in: str) -> str:
-    """How to look closer at something unexplained."""
+    """Returns the experiment for an unexplained residual that depends on this coordinate."""
     return _UNEXPLAINED[depends_on(lives_in)]
 
 
 def depends_on(lives_in: str) -> str:
-    """Which of load angle, motor angle, reversal, speed, torque and time a coordinate is one of."""
+    """Classifies a coordinate as load angle, motor angle, reversal, speed, torque or time."""
     if "load angle" in lives_in or "position" in lives_in:
         return "load angle"
     if "reversal" in lives_in or lives_in == "direction":
@@ -64,23 +65,23 @@ def depends_on(lives_in: str) -> str:
     return "torque" if "torque" in lives_in else "time"
 
 
-# What a diagnosis says, as plain values; `Diagnosis.as_dict` is the document for machines.
+# Diagnosis as plain values; `Diagnosis.as_dict` is the JSON document.
 
 
 SCHEMA = "hdbridge.diagnosis/1"
 UNWEIGHED = math.nan
-"""The probability of a finding that is not weighed against the others yet."""
+"""Probability of a finding before the findings are weighed."""
 
 
 @dataclass(frozen=True, slots=True)
 class Figures:
-    """How far measurement and model are apart."""
+    """Differences between measurement and model."""
 
     rms_arcsec: float
     three_sigma_arcsec: float
 
     def as_dict(self) -> dict[str, float]:
-        """For machines."""
+        """Returns the JSON object."""
         return {name: _round(each) for name, each in asdict(self).items()}
 
 
@@ -93,50 +94,51 @@ class Parameter:
     low: float
     high: float
     is_size: bool = False
-    """Whether it says how large something is: at zero nothing would be there."""
+    """True for a size: at zero the effect would vanish."""
 
     def as_dict(self) -> dict[str, Any]:
-        """For machines."""
+        """Returns the JSON object."""
         return {"value": self.value, "unit": self.unit, "ci95": [self.low, self.high]}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Finding:
-    """One thing that the model gets wrong."""
+    """One error of the model."""
 
     cause: str
-    """A name of the catalogue, or ``unexplained``."""
+    """Name from the catalogue, or ``unexplained``."""
     probability: float
-    """That this cause, or one of its aliases, is there."""
+    """Probability that this cause, or one of its aliases, is present."""
     aliases: tuple[str, ...]
-    """Other causes that these data cannot distinguish from it."""
+    """Other causes that these data cannot separate from it."""
     parameters: Mapping[str, Parameter]
     gain: Gain | None
-    """On held-out data, everything else refitted; None where nothing was held out."""
+    """Gain on held-out data with everything else refitted; None without held-out data."""
     experiment: str
-    """What to measure next, in words."""
+    """Next measurement, in words."""
     peak_arcsec: float
-    """Half the span of what it does in this record."""
+    """Half the span of its contribution in this record."""
     robust: float = 0.0
-    """Chi square that it takes away; of a change within the model that of the change itself."""
+    """Fall in chi square due to it; for a change within the model, due to the change."""
     left_arcsec: float = 0.0
-    """Of something unexplained: root mean square that is left beyond the noise."""
+    """Root mean square beyond the noise, for an unexplained residual."""
     taken_arcsec: float = 0.0
-    """Of a changed loop: root mean square that it takes away in the fit itself, near the reversals."""
+    """Root mean square that a changed loop explains near the reversals, in the fit."""
     left_alone: bool = False
-    """Whether it may be a change of a part of the model or another cause: the model keeps its own."""
+    """True if either a part of the model has changed or another cause is present: the model keeps its
+    part."""
     lives_in: str = ""
-    """Of something unexplained: the coordinate over which it shows."""
+    """Coordinate on which an unexplained residual depends."""
     note: str = ""
     effect: Effect | None = field(default=None, repr=False)
-    """As it goes into the model."""
+    """Effect to add to the model."""
     gate: Gate | None = field(default=None, repr=False)
-    """What speaks for it; of a change within the model none."""
+    """Evidence for it; None for a change within the model."""
     terms: Mapping[str, float] = field(default_factory=dict, repr=False)
-    """The terms of the formula of its probability."""
+    """Terms of the probability formula."""
 
     def as_dict(self) -> dict[str, Any]:
-        """For machines."""
+        """Returns the JSON object."""
         gain = self.gain
         words = {"lives_in": self.lives_in, "note": self.note, "not_offered": self.refusal()}
         return {
@@ -154,11 +156,11 @@ class Finding:
 
     @property
     def within(self) -> bool:
-        """Whether it is a change of a part that the model has already."""
+        """True for a change of a part of the model."""
         return self.gate is None and self.cause != "unexplained"
 
     def refusal(self) -> str:
-        """Why it is not offered as an improvement of the model, in words; empty where nothing is against."""
+        """Returns the reason not to offer it as an improvement of the model; empty if there is none."""
         if self.cause == "unexplained":
             return "there is no law that could be held out or compensated"
         if self.left_alone:
@@ -178,19 +180,19 @@ class Finding:
 
 @dataclass(frozen=True, slots=True)
 class Identifiability:
-    """What this record could say about a cause."""
+    """Ability of a record to show a cause."""
 
     detectable: bool
     detection_limit_arcsec: float | None
-    """Smallest peak that would be named; None where nothing of it can be seen."""
+    """Smallest peak that would be reported; None if the cause is invisible."""
     aliases: tuple[str, ...]
-    """Causes that it could not be distinguished from in this record."""
+    """Causes that this record could not separate from it."""
     share_left: float
-    """Share of its square that the baseline does not take over."""
+    """Share of its square that the baseline cannot absorb."""
     reason: str = ""
 
     def as_dict(self) -> dict[str, Any]:
-        """For machines."""
+        """Returns the JSON object."""
         limit = self.detection_limit_arcsec
         data: dict[str, Any] = {
             **asdict(self),
@@ -203,65 +205,65 @@ class Identifiability:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Traces:
-    """Arrays for pictures, one length: model next to measurement on the same trajectory."""
+    """Arrays of equal length for plots of model and measurement on the same trajectory."""
 
     measured_arcsec: FloatArray
-    """About the zero of the fit."""
+    """Measured error about the zero of the fit."""
     model_arcsec: FloatArray
-    """The model as it was given."""
+    """Prediction of the given model."""
     extended_arcsec: FloatArray
     motion: Motion
-    """What drove the whole record; an elastic state passes through all of it."""
+    """Motion of the whole record, through all of which the elastic state is carried."""
     rows: IntArray
-    """Which points of ``motion`` these arrays are of."""
+    """Points of ``motion`` that the arrays belong to."""
     start: Start
     """Elastic state at the first point of ``motion``, as fitted."""
     samples: Motion
-    """The same at every sample."""
+    """Motion at every sample."""
     runs: IntArray
     """First sample of each point of ``motion``."""
 
     @property
     def time_s(self) -> FloatArray:
-        """Of the record's clock."""
+        """Time on the record's clock."""
         assert self.motion.time_s is not None
         return self.motion.time_s[self.rows]
 
     @property
     def direction(self) -> FloatArray:
-        """Of the motor, -1 or 1, held at rest."""
+        """Direction of the motor, -1 or 1; held at rest."""
         return direction_of(self.motion)[self.rows]
 
     def told(self, effect: Effect) -> FloatArray:
-        """What an effect does at these points, arcsec, shape (m,)."""
+        """Returns an effect's contribution at these points, arcsec, shape (m,)."""
         return means(effect.predict(self.samples, self.start), self.runs)[self.rows]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Diagnosis:
-    """How a model differs from a measurement, and why."""
+    """Difference between a model and a measurement, with its causes."""
 
     baseline: Figures
-    """Of the model as it was given."""
+    """Differences of the given model."""
     refitted: Figures
-    """Of the model with its own parameters fitted anew, but no new cause."""
+    """Differences of the model with its own parameters refitted, without new causes."""
     extended: Figures
     noise_floor_arcsec: float
     findings: tuple[Finding, ...]
     identifiability: Mapping[str, Identifiability]
     by_kind: Mapping[str, tuple[Figures, Figures]]
-    """Per kind of motion and per direction: as given, and extended."""
+    """By kind of motion and by direction: given and extended model."""
     remarks: tuple[str, ...]
     model: TransmissionModel = field(repr=False)
-    """The extended model; the refitted one where nothing was found."""
+    """Extended model; the refitted one if nothing was found."""
     traces: Traces = field(repr=False)
     considered: tuple[str, ...] = ()
-    """What was taken into account and not named, with the reason."""
+    """Causes considered but not reported, with the reason."""
     scales: Scales = field(default_factory=Scales, repr=False)
-    """The numbers that decided."""
+    """Thresholds that were used."""
 
     def as_dict(self) -> dict[str, Any]:
-        """The document for machines, schema hdbridge.diagnosis/1."""
+        """Returns the JSON document, schema hdbridge.diagnosis/1."""
         return {
             "schema": SCHEMA,
             "baseline": self.baseline.as_dict(),
@@ -284,7 +286,7 @@ class Diagnosis:
         }
 
     def views(self) -> ResidualViews:
-        """Its residuals, and what they can be looked at over."""
+        """Returns its residuals and the coordinates to view them over."""
         traces = self.traces
         return ResidualViews(
             traces.measured_arcsec - traces.model_arcsec,
@@ -295,7 +297,7 @@ class Diagnosis:
         )
 
     def verdict(self) -> str:
-        """One sentence."""
+        """Returns a summary in one sentence."""
         if not self.findings:
             return (
                 "Nothing found: the model differs from the measurement by no more than noise and calibration."

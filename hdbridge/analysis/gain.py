@@ -1,4 +1,4 @@
-"""What a model gains on data that its fit has not seen."""
+"""Gain of a model on held-out data."""
 
 from __future__ import annotations
 
@@ -13,52 +13,53 @@ from hdbridge.analysis.noise import White
 from hdbridge.effects import FloatArray, IntArray
 
 SURE = 2.0
-"""Standard errors by which the fall must be more than nothing."""
+"""Minimum significance of a gain, standard errors."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Gain:
-    """Squares that stretches of a record leave, each left out of the fit that is judged on it.
+    """Squared errors of stretches of a record, each predicted by a fit without it.
 
-    Only a hold-out knows them: two root mean squares of one fit make no gain. Arrays of shape (stretches,).
+    Only a held-out test gives them: two root mean squares of one fit are not a gain. Arrays of shape
+    (stretches,).
     """
 
     over: str
-    """What was left out at a time, in words: motor turns, stretches of time, recordings."""
+    """Unit that was left out, in words: motor turns, stretches of time, recordings."""
     folds: int
-    """So many fits were made, each without a part of the record."""
+    """Number of fits, each without a part of the record."""
     samples: FloatArray
     """Weight of each stretch."""
     before_arcsec2: FloatArray
-    """Sum of squares without what is judged, or with what it is compared with."""
+    """Sum of squares without the tested part, or with the model that it is compared with."""
     after_arcsec2: FloatArray
-    """... and with it."""
+    """Sum of squares with the tested part."""
 
     @property
     def before_arcsec(self) -> float:
-        """Root mean square without it."""
+        """Root mean square without the tested part."""
         return math.sqrt(float(np.sum(self.before_arcsec2)) / float(np.sum(self.samples)))
 
     @property
     def after_arcsec(self) -> float:
-        """Root mean square with it."""
+        """Root mean square with the tested part."""
         return math.sqrt(float(np.sum(self.after_arcsec2)) / float(np.sum(self.samples)))
 
     @property
     def recovered(self) -> float:
-        """Share of the mean square that it takes away; negative where it makes things worse."""
+        """Share of the mean square that it removes; negative if it increases the error."""
         return 1.0 - (self.after_arcsec / max(self.before_arcsec, 1e-12)) ** 2
 
     @property
     def sure(self) -> bool:
-        """Whether the squares fall by more than chance from one stretch to another."""
+        """True if the squares fall significantly, by their scatter between stretches."""
         fall = self.before_arcsec2 - self.after_arcsec2
         if len(fall) < 2:
             return False
         return float(np.mean(fall)) > SURE * float(np.std(fall, ddof=1)) / math.sqrt(len(fall))
 
     def as_dict(self) -> dict[str, float | str]:
-        """For the provenance of a model file."""
+        """Returns the entries for the provenance of a model file."""
         return {
             "over": self.over,
             "before_arcsec": self.before_arcsec,
@@ -66,7 +67,7 @@ class Gain:
         }
 
 
-# What a finding gains on data that its fit has not seen: whole stretches of time left out in turn.
+# Gain of a finding: whole stretches of time are left out in turn.
 
 
 FOLDS = 8
@@ -75,9 +76,9 @@ OVER = "stretches of time"
 
 
 def held_out(estimator: Estimator, fitted: Fitted, without: Fitted) -> Gain | None:
-    """Leave stretches out in turn; ``without`` is the fit that lacks the effect in question.
+    """Leaves out stretches in turn; ``without`` is the fit without the effect in question.
 
-    None where the record is too short to leave anything out.
+    None if the record is too short.
     """
     return _gain(estimator, without.linearised, fitted.linearised)
 
@@ -85,10 +86,10 @@ def held_out(estimator: Estimator, fitted: Fitted, without: Fitted) -> Gain | No
 def held_out_change(
     estimator: Estimator, fitted: Fitted, columns: IntArray, change_arcsec: FloatArray
 ) -> Gain | None:
-    """The same for a change within what the model has.
+    """Tests a change within the model's own parts by leaving out stretches in turn.
 
-    Without it these ``columns`` of the tangent stand as they were given, everything else is refitted;
-    ``change_arcsec`` (m,) is what they have changed by.
+    In the comparison these ``columns`` of the tangent keep their given values, and everything else is
+    refitted; ``change_arcsec`` (m,) is the change.
     """
     after = fitted.linearised
     kept = np.setdiff1d(np.arange(fitted.count()), columns)
@@ -97,7 +98,7 @@ def held_out_change(
 
 
 def _gain(estimator: Estimator, before: Linearised, after: Linearised) -> Gain | None:
-    """From weighted columns and residuals."""
+    """Computes the gain from two linearised fits."""
     stretch = counted(of_number(estimator.time_s, STRETCHES))
     fold = stretch % FOLDS
     samples = np.bincount(stretch).astype(np.float64)

@@ -1,6 +1,6 @@
-"""A hypothesis: effects and zeros, fitted together with everything that is free (`separable`).
+"""Hypotheses (effects and zeros) and their joint fit with all free parameters (`separable`).
 
-The baseline is refitted with every candidate, so what the baseline can take over is never called a finding.
+The baseline is refitted with every candidate, so nothing that the baseline can absorb becomes a finding.
 """
 
 from __future__ import annotations
@@ -27,42 +27,41 @@ from hdbridge.effects.play import stop
 from hdbridge.units import ARCSEC_PER_DEG
 
 ENOUGH = Effort(steps=8, converged=0.5, roughly=2e-5)
-"""A search compares hypotheses whose chi squares are tens and more apart."""
+"""Accuracy of fits in a search, which compares chi squares that differ by tens or more."""
 NOISY = frozenset({Channel.LOAD_TORQUE, Channel.MOTOR_TORQUE})
-"""Measured channels of which each reading has its own noise that goes into a column as it is."""
+"""Measured channels whose reading noise enters a column directly."""
 SMOOTH = 15
-"""Samples about whose parabola a reading of such a channel is noise,"""
+"""Window of the parabolas that smooth such a channel, samples."""
 WHITE = 1.17
-"""... of which that shows five sixths; less 3 %, as well as it is known."""
+"""Noise variance of a channel relative to the part that smoothing removes: 6/5, less 3 %, as accurately
+as it is known."""
 MOST_TURNS = 100
-"""Maximum number of turning points with an error of their own; of more, the mean is known well enough."""
+"""Maximum number of turning points with an error of their own. With more, the mean is known well enough."""
 SHORT = 10_000
-"""Samples: what is rare in a shorter record is rarer in proportion."""
+"""Record length, samples, below which the number of rare samples shrinks in proportion."""
 STOPS_DEG = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0)
 """Widths of the stop operators of the free-form hysteresis."""
 
 
 @dataclass(frozen=True, slots=True)
 class Hypothesis:
-    """Effects (the baseline's first), the elastic state at the first sample, and what may be fitted in
-    addition to them.
-    """
+    """Effects (the baseline's first), elastic state at the first sample, and optional nuisances."""
 
     effects: tuple[Effect, ...]
     start: Start = Start.VIRGIN
     nuisances: Nuisances | None = None
-    """In addition to the zeros, rows of the usable points; the same only where it is the same object."""
+    """Further columns at the usable points, in addition to the zeros; compared by identity."""
 
     def plus(self, effect: Effect) -> Hypothesis:
-        """With one more effect."""
+        """Returns the hypothesis with one more effect."""
         return replace(self, effects=(*self.effects, effect))
 
     def without(self, place: int) -> Hypothesis:
-        """With one effect less."""
+        """Returns the hypothesis without one effect."""
         return replace(self, effects=self.effects[:place] + self.effects[place + 1 :])
 
     def instead(self, place: int, effect: Effect) -> Hypothesis:
-        """With one effect exchanged."""
+        """Returns the hypothesis with one effect replaced."""
         return replace(self, effects=(*self.effects[:place], effect, *self.effects[place + 1 :]))
 
 
@@ -75,14 +74,14 @@ class Fitted:
     residual: FloatArray
     """Weighted residual of the usable points, shape (m,)."""
     parameters: tuple[Column, ...]
-    """What the columns of the tangent matrix stand for."""
+    """Parameters that the columns of the tangent matrix belong to."""
     chi_square: float
     _solution: Solution = field(repr=False)
     _weight: FloatArray = field(repr=False)
 
     @cached_property
     def linearised(self) -> Linearised:
-        """In units of the noise."""
+        """Fit linearised at its minimum, in units of the noise."""
         weighted = self._solution.jacobian * self._weight[:, np.newaxis]
         return Linearised(weighted, self.residual, self._solution.known)
 
@@ -93,30 +92,30 @@ class Fitted:
 
     @property
     def information(self) -> FloatArray:
-        """What was known of each column beforehand: one over its variance, shape (p,)."""
+        """Prior information of each column: one over its variance, shape (p,)."""
         return self.linearised.known[:, 0]
 
     def count(self) -> int:
-        """Columns of the tangent matrix."""
+        """Returns the number of columns of the tangent matrix."""
         return len(self.parameters)
 
     def free(self) -> int:
-        """Parameters that do anything in this record."""
+        """Returns the number of parameters that affect this record."""
         return self._solution.free()
 
     def places(self, effect: int) -> IntArray:
-        """Columns of one effect."""
+        """Returns the columns of one effect."""
         return np.array([i for i, each in enumerate(self.parameters) if each.effect == effect], dtype=np.intp)
 
 
 class Estimator:
-    """Fits theories to one body of evidence; keeps columns that are asked for again and again."""
+    """Fits hypotheses to one record; caches design-matrix columns."""
 
     def __init__(self, data: Observed, scales: Scales | None = None) -> None:
         points = data.points
         self.data = data
         self.scales = scales or Scales()
-        """The numbers that decide what is named."""
+        """Thresholds of the decisions."""
         self.index: IntArray = np.flatnonzero(points.usable)
         self.weight: FloatArray = 1.0 / points.sigma_arcsec[self.index]
         self.observed: FloatArray = points.error_arcsec[self.index]
@@ -125,58 +124,59 @@ class Estimator:
         self._regressors = Regressors([data.full.motion], self.at_points, len(self.index))
         self._noise: dict[object, FloatArray] = {}
         self._free_loops: dict[Start, Nuisances] = {}
-        # About the level that they have in common: an encoder's zero is no part of the physics.
+        # The common level is subtracted: an encoder's zero is arbitrary.
         self.level = float(np.median(self.observed))
         self.loop_sign = 1.0
-        """Of the loop's offset: -1 where the load lags."""
+        """Sign of the loop's offset; -1 if the load lags."""
         self.calibrated: tuple[CalibratedPart, ...] = ()
-        """What is known of the first effects of each hypothesis beforehand."""
+        """Priors from the calibration for the first effects of each hypothesis."""
 
     @property
     def motion(self) -> Motion:
-        """What drove the axis, point by point (all points, the elastic state passes through each)."""
+        """Motion at all points, usable or not, because the elastic state passes through each."""
         return self.data.points.motion
 
     @property
     def rare(self) -> float:
-        """Share of the record in which a quantity may be larger, and in which smaller, than it is said to
-        be.
-        """
+        """Tail share of the record that is excluded at either end when a span is measured."""
         return self.scales.rare / max(len(self.data.full), SHORT)
 
     def half_span(self, values: FloatArray) -> float:
-        """Half the span of values, but for what is rare at either end."""
+        """Returns half the span of values without the rare extremes."""
         low, high = np.quantile(values, [self.rare, 1.0 - self.rare])
         return 0.5 * float(high - low)
 
     def columns(self, effect: Effect, start: Start) -> FloatArray:
-        """Regressors of an effect at the usable points, arcsec, shape (m, p): means over their samples."""
+        """Returns regressors of an effect at the usable points (means over samples), arcsec, shape (m, p)."""
         return self._regressors.columns(effect, (start,))
 
     def at_points(self, values: FloatArray) -> FloatArray:
-        """Of every sample to the usable points, as the observations are averaged."""
+        """Averages a quantity of every sample to the usable points, as for the observations."""
         means = self.data.mean(values)
         return means if len(means) == len(self.index) else np.asarray(means[self.index])
 
     def does(self, effect: Effect, start: Start) -> FloatArray:
-        """What an effect does in the usable samples, arcsec; in means a fast one would seem smaller."""
+        """Returns an effect's contribution at every usable sample, arcsec.
+
+        Averaging to points would make fast effects seem smaller.
+        """
         full = self.data.full
         if len(full) == len(self.data.points):
             return np.asarray(self.columns(effect, start) @ effect.coefficients())
         return effect.predict(full.motion, start)[full.usable]
 
     def weighted(self, columns: FloatArray) -> FloatArray:
-        """Columns in units of the noise."""
+        """Scales columns to units of the noise."""
         return np.asarray(columns * self.weight[:, np.newaxis])
 
     def law_discrepancy(self, effect: Effect, start: Start) -> FloatArray:
-        """What an effect's law may be wrong by, a weighted column per standard deviation, shape (m, k)."""
+        """Returns the uncertainty of an effect's law, one weighted column per standard deviation, (m, k)."""
         return self.weighted(self.at_points(effect.law_discrepancy(self.data.full.motion, start)))
 
     def angle_discrepancy(self, effects: Sequence[Effect], start: Start) -> FloatArray:
-        """What the driving angle may be wrong by within its counts, a weighted column, shape (m, 1).
+        """Returns the influence of the driving angle's uncertainty within its counts, weighted, shape (m, 1).
 
-        The error is against that angle, and a loop is steepest where the motor stops.
+        The error refers to that angle, and a loop is steepest where the motor stops.
         """
         full = self.data.full
         other = replace(full.motion, motor_deg=full.rested_deg)
@@ -187,10 +187,10 @@ class Estimator:
         return self.weighted(self.at_points(change)[:, np.newaxis])
 
     def turn_discrepancy(self, effects: Sequence[Effect], start: Start) -> FloatArray:
-        """Errors of turning points within their counts, a weighted column per standard deviation, (m, k).
+        """Returns errors of turning points within counts, a weighted column per standard deviation, (m, k).
 
-        A motor with friction stops short of all turns alike, and of each by its own amount. One column is for
-        all turns, and unless there are more than `MOST_TURNS`, one for each.
+        A motor with friction stops short of all turning points alike, and of each by its own amount. One
+        column is common to all; up to `MOST_TURNS` of them also have one each.
         """
         full, loops = self.data.full, [each for each in effects if each.tracker().memory_deg > 0.0]
         turning, signs = branches(full.motor_deg, start)
@@ -209,9 +209,7 @@ class Estimator:
         return self.weighted(np.column_stack(columns))
 
     def free_loop(self, start: Start) -> Nuisances:
-        """A free-form hysteresis: stop operators of `STOPS_DEG`, which make a loop of any shape with
-        memory.
-        """
+        """Returns a free-form hysteresis: stop operators of `STOPS_DEG`, which form any loop shape."""
         if start not in self._free_loops:
             angle = self.data.full.motion.motor_deg
             stops = {f"stop of {each:g} deg": self.at_points(stop(angle, each, start)) for each in STOPS_DEG}
@@ -219,9 +217,10 @@ class Estimator:
         return self._free_loops[start]
 
     def fit(self, hypothesis: Hypothesis, moves: frozenset[Moves] = LOCAL, effort: Effort = ENOUGH) -> Fitted:
-        """The minimum near where the hypothesis stands, and never worse; shapes move as ``moves`` says.
+        """Fits a hypothesis from its present parameters; the result is never worse than these.
 
-        Every part is as calibrated at first; those that cost less as changed ones become free one by one.
+        ``moves`` selects the shapes to fit. All parts start at their calibration. Those for which a change
+        costs less than the strain become free, one by one.
         """
         parts, costs = list(self.calibrated), 0.0
         while True:
@@ -237,7 +236,7 @@ class Estimator:
     def _prior(
         self, hypothesis: Hypothesis, parts: Sequence[CalibratedPart]
     ) -> tuple[dict[tuple[int, str], Prior], float]:
-        """With what the noise of measured channels claims taken back, and what that adds to chi square."""
+        """Returns priors without the information due to channel noise, and the chi-square offset."""
         known, offset = priors(parts), 0.0
         for place in {each.place for each in parts}:
             claimed = self.channel_noise(hypothesis.effects[place], hypothesis.start)
@@ -249,11 +248,11 @@ class Estimator:
         return known, offset
 
     def channel_noise(self, effect: Effect, start: Start) -> FloatArray:
-        """Squares that the noise of measured channels puts into an effect's columns, weighted, shape (p,).
+        """Returns the squared contribution of channel noise to an effect's columns, weighted, shape (p,).
 
-        Errors in variables: a fit looks better the smaller the coefficient is that multiplies such noise.
-        What a coefficient of one gains by it is taken back (Fuller 1987, 2.2) where its calibration holds it:
-        without one, what only noise distinguishes would have any size.
+        Errors in variables: a fit seems better the smaller the coefficient of a noisy column is. The
+        correction (Fuller 1987, 2.2) applies to coefficients that their calibration holds; without one, a
+        coefficient distinguished only by noise could take any size.
         """
         motion = self.data.full.motion
         channels = sorted(effect.needs() & NOISY & motion.measured.keys(), key=lambda each: each.value)
@@ -275,7 +274,7 @@ class Estimator:
         moves: frozenset[Moves],
         effort: Effort,
     ) -> Fitted:
-        """The minimum where these ``parts`` are as calibrated, and changes of others have their ``costs``."""
+        """Fits with ``parts`` held by their calibration; adds the ``costs`` of changes of the others."""
         start = hypothesis.start
         prior, offset = self._prior(hypothesis, parts)
         costs += offset
@@ -300,27 +299,27 @@ class Estimator:
         )
 
     def _nuisances(self, hypothesis: Hypothesis) -> Nuisances:
-        """A zero for each absolute zero, and what the hypothesis has in addition."""
+        """Returns the columns of the zeros and of the hypothesis's own nuisances."""
         own = zeros(self.zero, self.data.full.zeros)
         return own if hypothesis.nuisances is None else own.and_also(hypothesis.nuisances)
 
     def _sign(self, effect: Effect) -> float:
-        """The sign that an effect's coefficients have; 0 where they may have either."""
+        """Returns the sign that an effect's coefficients must have; 0 if either."""
         if effect.part is Part.LOOP:
             return self.loop_sign
         return 1.0 if effect.nonnegative else 0.0
 
     def predicted(self, fitted: Fitted) -> FloatArray:
-        """What the hypothesis says for each sample, zeros included, arcsec, shape (n,)."""
+        """Returns the prediction for each sample, zeros included, arcsec, shape (n,)."""
         effects, start = fitted.hypothesis.effects, fitted.hypothesis.start
         return fitted.zeros[self.data.full.zero] + self.level + self._regressors.predicted(effects, (start,))
 
     def told(self, effects: Sequence[Effect], start: Start) -> FloatArray:
-        """What effects say together at the usable points, arcsec, shape (m,)."""
+        """Returns the sum of the effects at the usable points, arcsec, shape (m,)."""
         return self._regressors.told(effects, (start,))
 
     def with_load_angle(self, load_deg: FloatArray) -> None:
-        """Make a predicted load angle (n,) what effects of the load encoder's lines count on."""
+        """Sets the load angle (n,) on which effects of the load encoder's lines depend."""
         data = self.data
         full = replace(data.full, motion=replace(data.full.motion, load_deg=load_deg))
         points = replace(data.points, motion=replace(data.points.motion, load_deg=data.mean(load_deg)))
@@ -329,9 +328,9 @@ class Estimator:
 
 
 def _smooth(values: FloatArray) -> FloatArray:
-    """A channel without the noise of its readings, of which parabolas through `SMOOTH` keep a sixth.
+    """Smooths a channel by parabolas over `SMOOTH` samples, which keep a sixth of the noise variance.
 
-    Savitzky and Golay's filter; scipy.signal has it, and takes a second to load.
+    This is the Savitzky-Golay filter. scipy.signal has it too, but takes a second to import.
     """
     if len(values) <= SMOOTH:
         return values

@@ -1,4 +1,4 @@
-"""What a record, measured or only planned, could say about each cause: detection limits and look-alikes."""
+"""Detection limits and look-alikes of each cause in a record, measured or planned."""
 
 from __future__ import annotations
 
@@ -24,27 +24,26 @@ from hdbridge.records.record import Record
 from hdbridge.records.recording import Segment
 from hdbridge.units import ARCSEC_PER_DEG
 
-# What a record could show: these numbers decide what is said of that, and no name.
+# Thresholds of identifiability; they do not affect findings.
 ENOUGH = 8_000
-"""Points that are enough to distinguish shapes."""
+"""Maximum number of points used to compare shapes."""
 NOT_APART = 0.95
-"""Canonical correlation from which on two causes cannot be distinguished."""
+"""Canonical correlation above which two causes are not separable."""
 SHARE_LEFT = 1e-4
-"""Share of a column's squares below which nothing is left of it."""
+"""Share of a column's squares below which nothing of it remains."""
 WORST_ARCSEC = 30.0
-"""A cause whose limit is higher than this counts as not detectable."""
+"""Detection limit above which a cause counts as not detectable."""
 INFLATION = 2.5
-"""By how much correlated noise and unknown shapes raise a limit above that of white noise and a known
-shape."""
+"""Factor on the limit of white noise and a known shape, for correlated noise and unknown shapes."""
 
 
 def identifiability(
     estimator: Estimator, fitted: Fitted, base: Sequence[Effect]
 ) -> dict[str, Identifiability]:
-    """For each cause of the catalogue."""
+    """Returns detection limit and look-alikes of each cause of the catalogue."""
     best: dict[str, tuple[float, float, FloatArray, Effect]] = {}
     stride = -(-len(estimator.index) // ENOUGH)
-    # Leaving points out changes what a basis spans over them: made orthonormal anew.
+    # A basis is no longer orthonormal when points are left out.
     basis = orthonormal(fitted.linearised.basis[::stride])
     weight = estimator.weight[::stride, np.newaxis]
     for candidate in candidates(estimator.data, base, screened=False):
@@ -83,7 +82,7 @@ def identifiability(
         ]
         result[cause] = Identifiability(limit <= WORST_ARCSEC, limit, tuple(alike), share)
     for candidate in candidates(estimator.data, ()):
-        # What is not measured may look like what is.
+        # An effect of a missing channel may look like a measured one.
         each = result[candidate.name]
         for kind, _ in lookalikes(candidate, estimator.data.ratio):
             if kind.channels - estimator.motion.available() and kind.name not in each.aliases:
@@ -99,25 +98,23 @@ def _missing(estimator: Estimator, cause: str) -> str:
 
 
 def _correlation(one: FloatArray, other: FloatArray) -> float:
-    """Smallest canonical correlation of the smaller space with the larger: all of it has to look alike."""
+    """Returns the smallest canonical correlation of the smaller space with the larger."""
     values = np.linalg.svd(one.T @ other, compute_uv=False)
     return float(np.min(values)) if len(values) else 0.0
 
 
-# Before anything is measured: what a plan's procedures could detect, and what they could not tell apart.
+# Planned records: detectable causes, and those that are not separable.
 
 
 PERIOD_S: Final = 0.04
 NOISE_ARCSEC: Final = 0.5
-"""White noise that is assumed of a planned record, of one sample every `PERIOD_S`."""
+"""Assumed white noise of a planned record, for one sample every `PERIOD_S`."""
 LIMITS: Final = MotionLimits(-400.0, 400.0, 20.0, 200.0, 4000.0)
-"""Limits of the load that are assumed where no axis says."""
+"""Assumed limits of the load without an axis."""
 
 
 def plan_report(plan: Plan, model: TransmissionModel, limits: MotionLimits = LIMITS) -> dict[str, Any]:
-    """Per cause what the plan could say; the part ``identifiability`` of a diagnosis, and how long it
-    takes.
-    """
+    """Returns what a plan could show of each cause (as in a diagnosis), and its duration."""
     view = AxisView(model.ratio, limits)
     tasks = plan.tasks(view)
     places: list[float] = []

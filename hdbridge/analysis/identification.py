@@ -1,4 +1,4 @@
-"""What an identification says."""
+"""Results, options, sample selection and intermediate state of an identification."""
 
 from __future__ import annotations
 
@@ -28,36 +28,35 @@ from hdbridge.model import TransmissionModel
 from hdbridge.units import ARCSEC_PER_DEG, DEG_PER_TURN
 
 WORTH = 0.01
-"""Share of its rms by which what a model leaves on held-out data must fall at least.
+"""Minimum relative fall of the held-out rms.
 
-A model that is better by less changes no stepping test, and noise alone offers it: a second calibration of
-the unchanged demo axis leaves 0.8 % less.
-"""
+A smaller improvement changes no stepping test and can arise from noise alone: a second calibration of
+the unchanged demo axis improves the rms by 0.8 %."""
 
 
 @dataclass(frozen=True, slots=True)
 class NoiseFigures:
-    """How noisy the record is, and how far the model's residual is above that."""
+    """Noise of the record, and the residual of the model in comparison."""
 
     standing_arcsec: float | None
     """Rms about the mean of each rest; None where the axis never stood for long enough."""
     laps_arcsec: float | None
-    """What two passes over the same angles in one direction differ by, over the root of two."""
+    """Rms difference between passes over the same angles in one direction, divided by the root of two."""
     model: NoiseModel
-    """White noise and wanders as the intervals use them, from the residual."""
+    """Noise model of the residual, white and correlated, on which the intervals are based."""
     residual_arcsec: float
-    """Rms that the model, as it is written, leaves of a sample, about its zero."""
+    """Rms residual of the samples with the stored model, about each zero."""
     fitted_arcsec: float
-    """The same with all that was fitted in addition and is not written: delay, rounding, other orders."""
+    """Rms residual with the nuisances as well: delay, rounding, other orders."""
     samples: int
-    """Used by the fit."""
+    """Number of samples in the fit."""
     effective_samples: float
-    """Independent samples of the residual's size that would fix the zero as well as these do."""
+    """Number of independent samples with this rms that would determine the zero equally well."""
 
 
 @dataclass(frozen=True, slots=True)
 class Outliers:
-    """Samples that stand out alone and were given no weight."""
+    """Isolated outliers, which have zero weight."""
 
     samples: int
     longest_run: int
@@ -65,36 +64,35 @@ class Outliers:
 
 @dataclass(frozen=True, slots=True)
 class ResidualTest:
-    """One question to the residual."""
+    """Result of one test of the residual."""
 
     name: str
-    """motor_angle, load_angle, direction, time, whiteness, noise_level."""
+    """One of motor_angle, load_angle, direction, time, whiteness, noise_level."""
     passed: bool
     size_arcsec: float
-    """How large what was found is."""
+    """Size of the deviation found."""
     text: str
 
 
 @dataclass(frozen=True, slots=True)
 class HeldOut:
-    """How well a model fitted to the rest of a record tells the part that was left out."""
+    """Prediction error on parts of the record that were left out of the fit."""
 
     gain: Gain | None
-    """Of the model alone against the active one, or none, each about its zero; None where nothing was held
-    out.
-    """
+    """Gain of the model alone over the active model (or none), each about its zero; None without held-
+    out data."""
     in_addition: Gain | None
-    """The same with all that is fitted in addition to the model (delay, load orders) taken off of both."""
+    """Gain after the nuisances (delay, load orders) have been subtracted from both."""
     fitted_arcsec: float
-    """Rms that the fit leaves of the same data, with all that is fitted in addition to the model."""
+    """Rms residual of the fit with nuisances on the same data."""
     text: str
 
     @property
     def improves(self) -> bool:
-        """Whether the model is worth having.
+        """True if the model is a real improvement.
 
-        With the nuisances taken off, what it leaves falls by more than chance and by at least `WORTH` of its
-        rms; alone it is not worse.
+        Without the nuisances the rms must fall significantly and by at least `WORTH`; with them the model
+        must not be worse.
         """
         gain = self.in_addition
         return (
@@ -106,13 +104,13 @@ class HeldOut:
 
     @property
     def worse(self) -> bool:
-        """Whether the model leaves more of what was left out than the active one, or none, does."""
+        """True if the model predicts the held-out data less well than the active model (or none)."""
         return self.gain is not None and self.gain.recovered < 0.0
 
 
 @dataclass(frozen=True, slots=True)
 class Nuisance:
-    """Something that was fitted in addition to the model so that it does not bend it."""
+    """Parameter that is fitted so that it does not bias the model, but is not part of it."""
 
     name: str
     text: str
@@ -129,71 +127,71 @@ class Traces:
     motor_deg: FloatArray
     load_deg: FloatArray
     direction: FloatArray
-    """1, -1, or 0 at rest."""
+    """Direction of motion: 1, -1, or 0 at rest."""
     kind: tuple[str, ...]
-    """Names that ``kind_index`` points into."""
+    """Names of the leg kinds, indexed by ``kind_index``."""
     kind_index: np.ndarray[Any, np.dtype[np.intp]]
     error_arcsec: FloatArray
-    """Observed, zero taken off."""
+    """Observed error minus its zero."""
     predicted_arcsec: FloatArray
-    """The model's effects."""
+    """Sum of the model's effects."""
     residual_arcsec: FloatArray
-    """Observed minus model, about the zeros that suit it."""
+    """Observed error minus model, about the best-fitting zeros."""
     orders_arcsec: FloatArray
-    """Observed without hysteresis, zero and nuisances."""
+    """Observed error minus hysteresis, zero and nuisances."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FitResult:
-    """The model that a record shows, and how far it can be trusted."""
+    """Fitted model with its uncertainty, tests and plot data."""
 
     model: TransmissionModel
-    """With ``uncertainty``: 95 % half widths, nested like the parameters."""
+    """Includes ``uncertainty``: 95 % half widths, nested like the parameters."""
     intervals: tuple[Interval, ...]
     zeros_arcsec: tuple[float, ...]
-    """Offset of each absolute zero against the median of its record's error."""
+    """Offset of each absolute zero from the median of its record's error."""
     nuisances: tuple[Nuisance, ...]
     noise: NoiseFigures
     outliers: Outliers
     orders: tuple[Line, ...]
-    """Of the motor, in the model."""
+    """Motor orders in the model."""
     spectrum: tuple[Line, ...]
-    """All orders that were looked for."""
+    """All candidate orders."""
     residual_tests: tuple[ResidualTest, ...]
     held_out: HeldOut
     traces: Traces
     warnings: tuple[str, ...]
-    """What the data cannot say, in words."""
+    """Limits of the data, in words."""
 
     def interval(self, effect: str, parameter: str) -> Interval:
-        """The interval of one parameter; KeyError where it was not fitted."""
+        """Returns the interval of one parameter; KeyError if it was not fitted."""
         for each in self.intervals:
             if (each.effect, each.parameter) == (effect, parameter):
                 return each
         raise KeyError(f"{effect}: {parameter}")
 
 
-# Noise as the axis itself shows it, without any model: at rest, and between one lap and the next.
+# Noise measured without a model: at rest, and between repeated passes.
 
 
 SHORTEST_REST_S = 1.0
 LONGEST_GAP_S = 0.5
 LAP_BIN_DEG = 30.0
 WINDOW = 51
-"""Samples whose median an outlier is compared with."""
+"""Window of the median that an outlier is compared with, samples."""
 OUTLYING = 6.0
-"""Robust standard deviations."""
+"""Outlier threshold, robust standard deviations."""
 
 
 def standing_arcsec(samples: Samples) -> float | None:
-    """Noise of the load encoder at rest: rms about the mean of each rest.
+    """Returns the rms of the load encoder about the mean of each rest, arcsec; None without a long rest.
 
-    A motor that rests between two counts of its encoder flickers, which is no noise of the load; a sine or
-    sweep that creeps within a count seems to rest, while the load goes on.
+    A motor that rests between two counts flickers, which is not noise of the load. Sines and sweeps are
+    excluded: within one count they seem to rest while the load moves.
     """
     still = samples.usable & (np.abs(samples.speed_deg_s) < REST_DEG_S)
     still &= ~samples.of_kind(*SLOW)
-    # What was not recorded may have been a motion.
+    # The axis may have moved in a gap of the record.
     pause = np.diff(samples.time_s, prepend=samples.time_s[0]) > LONGEST_GAP_S
     rest = np.where(still, np.cumsum(pause) + 1, 0)
     edges = np.flatnonzero(np.diff(rest, prepend=-1, append=-1))
@@ -211,7 +209,10 @@ def standing_arcsec(samples: Samples) -> float | None:
 
 
 def laps_arcsec(samples: Samples) -> float | None:
-    """Rms by which passes in the same direction differ, over the root of two; means over `LAP_BIN_DEG`."""
+    """Returns the rms difference of passes in one direction, divided by the root of two; None if too few.
+
+    Errors are averaged over bins of `LAP_BIN_DEG`.
+    """
     passes: dict[int, list[dict[int, float]]] = {1: [], -1: []}
     sweep = samples.usable & samples.of_kind("sweep")
     for chain in samples.chains:
@@ -222,7 +223,7 @@ def laps_arcsec(samples: Samples) -> float | None:
             if len(rows) >= 20:
                 cells, inverse = np.unique(samples.motor_deg[rows] // LAP_BIN_DEG, return_inverse=True)
                 means = np.bincount(inverse, samples.error_arcsec[rows]) / np.bincount(inverse)
-                # The first cells of a pass are on the travel across the hysteresis.
+                # In its first cells a pass still crosses the hysteresis.
                 keep = slice(5, None) if sign > 0 else slice(None, -5)
                 passes[sign].append(dict(zip(cells[keep].tolist(), means[keep].tolist(), strict=True)))
     differences = [
@@ -235,11 +236,11 @@ def laps_arcsec(samples: Samples) -> float | None:
 
 
 def outlying(residual: FloatArray, count_arcsec: float = 0.0) -> tuple[FloatArray, Outliers]:
-    """Weights (n,), 0 for samples far from the median of their neighbours; NaN residuals keep 1.
+    """Returns weights (n,): 0 for samples far from the median of their neighbours, else 1 (also for NaN).
 
-    Compared with neighbours and not with the model, so that what the model lacks is not thrown away, and a
-    step that stays (lost counts) is left in for all to see. ``count_arcsec`` is the motor encoder's count at
-    the load: a motor between two counts reads now the one and now the other, and only their mean is right.
+    Comparison with neighbours, not with the model, keeps effects that the model lacks and lasting steps
+    (lost counts). ``count_arcsec`` is the motor encoder's count at the load: a motor between two counts
+    alternates between them, and only the mean is right.
     """
     weight = np.ones(len(residual))
     index = np.flatnonzero(np.isfinite(residual))
@@ -255,28 +256,28 @@ def outlying(residual: FloatArray, count_arcsec: float = 0.0) -> tuple[FloatArra
     return weight, Outliers(int(np.count_nonzero(out)), int(np.max(runs, initial=0)))
 
 
-# Which samples of a calibration are near enough to standing to be used, by what the axis was doing.
+# Selection of the quasi-static samples of a calibration.
 
 
 MINIMUM_SAMPLES = 8
 SETTLE_SHARE = 0.2
-"""After a turn, where the hysteresis rises too steeply for a load on a spring to follow, no more than this
-share of the travel to the next one is left out."""
+"""Maximum share of the travel to the next turning point that is dropped after a turning point. There the
+hysteresis changes too steeply for a load on a spring to follow."""
 STANDING_DEG_S = 1e-3
-"""Load speed below which an axis stands."""
+"""Load speed below which an axis counts as standing."""
 GENTLE_DEG_S2 = 40.0
-"""Load acceleration that a motion of which nothing is known may have."""
+"""Maximum load acceleration of a usable motion of unknown kind."""
 RESTING = ("reference", "standstill")
 SLOW = ("sweep", "sine", "reversal")
-"""Legs whose own speed is what is meant by slow."""
+"""Leg kinds that define slow speed."""
 KNOWN = (*RESTING, *ON_THE_WAY, *SLOW)
 
 
 def usable_samples(measured: Measured, ratio: float, slow_deg_s: float | None = None) -> Samples:
-    """Samples, errors about the median of each zero. InputError where there is too little, or the ratio is
-    not this gear's.
+    """Prepares the samples of a calibration: errors about the median of each zero, usable samples marked.
 
-    ``slow_deg_s`` is the load speed up to which samples are used; by default the one of the slow legs.
+    ``slow_deg_s`` is the maximum load speed of usable samples, by default that of the slow legs. InputError
+    if there are too few samples or the ratio does not match the record.
     """
     count = len(measured.record)
     if count < MINIMUM_SAMPLES:
@@ -292,10 +293,11 @@ def usable_samples(measured: Measured, ratio: float, slow_deg_s: float | None = 
 
 
 def _slow(samples: Samples, slow_deg_s: float | None) -> BoolArray:
-    """Samples at rest and in slow motions, not within `SETTLE_S` after fast ones.
+    """Selects samples at rest and in slow motions, but not within `SETTLE_S` after fast ones.
 
-    A motion counts as a whole, from rest or turn to the next: the start of a fast move is no slow motion. Of
-    moves and steps only the rests are used. Where nothing is known of a record, what accelerates is left out.
+    A motion is judged as a whole, from rest or turning point to the next, so the start of a fast move is
+    not slow. Of moves and steps only the rests are used. In motions of unknown kind, samples with high
+    acceleration are dropped.
     """
     speed, acceleration = samples.speed_deg_s / samples.ratio, samples.motion.motor_acceleration_deg_s2
     assert acceleration is not None
@@ -306,7 +308,7 @@ def _slow(samples: Samples, slow_deg_s: float | None) -> BoolArray:
     under_way = moving > STANDING_DEG_S
     fast = under_way & samples.of_kind(*ON_THE_WAY)
     fast |= ~samples.of_kind(*KNOWN) & (np.abs(acceleration / samples.ratio) > GENTLE_DEG_S2)
-    # Motions that follow one another without a rest are distinguished by their kind and direction.
+    # Consecutive motions without a rest between them differ in kind or direction.
     changes = [np.diff(each) != 0 for each in (under_way, samples.kind, np.sign(speed))]
     first = np.append(0, np.flatnonzero(np.any(changes, axis=0)) + 1)
     fastest = np.repeat(np.maximum.reduceat(moving, first), np.diff(np.append(first, len(samples))))
@@ -315,7 +317,7 @@ def _slow(samples: Samples, slow_deg_s: float | None) -> BoolArray:
 
 
 def _has_turned(time: FloatArray, motor_deg: FloatArray) -> BoolArray:
-    """Samples within `SETTLE_S` after a turn."""
+    """Selects samples within `SETTLE_S` after a turning point."""
     turned = np.zeros(len(time), dtype=bool)
     turning, _ = branches(motor_deg)
     for first, last in pairwise(turning[1:]):
@@ -324,35 +326,36 @@ def _has_turned(time: FloatArray, motor_deg: FloatArray) -> BoolArray:
     return turned
 
 
-# What an identification may be told.
+# Options.
 
 
 @dataclass(frozen=True, slots=True)
 class FitOptions:
-    """All have defaults that suit the bench's own recordings."""
+    """Options of an identification; the defaults suit the bench's recordings."""
 
     effects: tuple[Effect, ...] = (USUAL_LOOP,)
-    """Fitted in addition to the ripple. Where data cannot say, their shapes stay as given here."""
+    """Effects to fit in addition to the ripple. Shapes that the data cannot determine stay as given here."""
     highest_order: int = 24
-    """Motor orders up to this are looked for."""
+    """Highest candidate motor order."""
     load_orders: int = 4
-    """Orders of the load turn and of the flexspline that are fitted in addition to the model if they show."""
+    """Highest order of the load and of the flexspline that is fitted in addition to the model if
+    significant."""
     family_wise: float = 0.01
-    """Chance that noise alone puts any order in."""
+    """Probability that noise alone selects any order."""
     smallest_arcsec: float = 0.1
-    """Orders below this are left out however certain they are."""
+    """Minimum amplitude of an order, however significant."""
     start: Start | None = None
-    """Elastic state at the first sample: `Start.FORWARD` after the bench's pre-conditioning; None: by fit."""
+    """Elastic state at the first sample: `Start.FORWARD` after the bench's preconditioning; None: fitted."""
     active: TransmissionModel | None = None
-    """The model that the new one has to beat, and whose shapes it falls back on."""
+    """Model to compare with, and source of shapes that the data cannot determine."""
 
     def prototype(self, effect: Effect) -> Effect:
-        """The active model's effect of the same name, else the effect."""
+        """Returns the active model's effect of the same name, else the effect itself."""
         active = self.active.effects if self.active else ()
         return next((each for each in active if each.name == effect.name), effect)
 
 
-# Where to begin: the best point of a grid over all shapes.
+# Start of the fit: the best point of a grid over all shapes.
 
 
 GRID_LOGARITHMIC: Final = 12
@@ -361,7 +364,7 @@ LINEAR_ONLY: Final = Effort(steps=1)
 
 
 def searched(fit: Separable, effects: tuple[Effect, ...]) -> Solution:
-    """The minimum that the best point of a grid over each effect's shapes leads to."""
+    """Fits from the best point of a grid over the shapes of each effect."""
     for index, effect in enumerate(effects):
         axes = [each.grid(GRID_LOGARITHMIC if each.logarithmic else GRID_LINEAR) for each in effect.shape]
         names = [each.name for each in effect.shape]
@@ -374,41 +377,41 @@ def searched(fit: Separable, effects: tuple[Effect, ...]) -> Solution:
     return fit.fit(effects)
 
 
-# What the steps of an identification hand on, and the fits that are made of it.
+# State between the steps of an identification, and its fits.
 
 
 PARTS = ("cosine", "sine")
 WHOLE_TURN = 0.95
-"""Turns that count as one."""
+"""Minimum travel that counts as one whole turn, turns."""
 COVERED_DEG = 30.0
-"""A motor angle was seen when some angle within the same cell of this size was."""
+"""Cell size of the coverage of motor angles."""
 
 
 class State(NamedTuple):
-    """Where an identification stands."""
+    """Intermediate state of an identification: data, noise model, selected orders and effects."""
 
     options: FitOptions
     design: Design
     candidates: tuple[Order, ...]
     waves: FloatArray
-    """Columns of the candidates, (b, 2 candidates)."""
+    """Cosine and sine columns of the candidates, shape (b, 2 candidates)."""
     nuisances: tuple[str, ...]
     effects: tuple[Effect, ...]
-    """All but the ripple."""
+    """All effects except the ripple."""
     noise: NoiseModel = NoiseModel(1.0, 1.0)
     selection: Selection = Selection((), ())
     ripple: Effect | None = None
-    """As last fitted."""
+    """Ripple of the last fit."""
     outliers: Outliers = Outliers(0, 0)
     delay_ms: float = 0.0
-    """By which the samples have been put right already."""
+    """Delay by which the samples have already been corrected."""
 
     def precision(self) -> Precision:
-        """Of the present noise model."""
+        """Returns the precision matrix of the current noise model."""
         return Precision(self.noise, self.design.blocks)
 
     def in_addition(self) -> Nuisances:
-        """Zeros and nuisances."""
+        """Returns columns of zeros and nuisances."""
         waves = []
         for order, amplitude_arcsec, phase_deg in self.ripple.waves() if self.ripple else ():
             at = 2 * self.candidates.index(Order.motor(round(order)))
@@ -418,11 +421,11 @@ class State(NamedTuple):
         return nuisances_of(self.design, self.nuisances, self.effects, waves)
 
     def candidate_waves(self) -> Nuisances:
-        """All candidates."""
+        """Returns columns of all candidate orders, with unknown amplitudes."""
         return unknown(self.waves, [f"{each} {part}" for each in self.candidates for part in PARTS])
 
     def columns(self) -> Nuisances:
-        """Zeros and nuisances, and the chosen orders that are not the motor's."""
+        """Returns columns of zeros, nuisances and the selected orders of load and flexspline."""
         others = [
             (f"{order} {part}", 2 * at + number)
             for at, order in enumerate(self.candidates)
@@ -433,22 +436,22 @@ class State(NamedTuple):
         return self.in_addition().and_also(unknown(picked, [name for name, _ in others]))
 
     def model(self) -> tuple[Effect, ...]:
-        """The chosen motor orders as the ripple, and the other effects."""
+        """Returns the selected motor orders as the ripple, followed by the other effects."""
         motor = [each.number for each in self.selection.chosen if each.family is Family.MOTOR]
         return ((ripple(motor),) if motor else ()) + self.effects
 
     def under(self, weighting: Weighting, columns: Nuisances) -> Separable:
-        """Fits of effects."""
+        """Returns a solver for effects with this weighting and these further columns."""
         return Separable(Terms(self.design.blocks.error_arcsec, self.design.columns, weighting, columns))
 
     def fitted(self) -> Solution:
-        """The minimum near where the model stands."""
+        """Fits the current model."""
         return self.under(self.precision(), self.columns()).fit(self.model())
 
     def information(self) -> System:
-        """J' K^-1 J and J' K^-1 y of [candidates | zeros and nuisances | effects and their tangents].
+        """Returns J' K^-1 J and J' K^-1 y of [candidates | zeros and nuisances | effects and their tangents].
 
-        With the tangents in, shapes are refitted with every order that is tried.
+        The tangents allow the shapes to be refitted with every candidate order.
         """
         precision, nuisances = self.precision(), self.candidate_waves().and_also(self.in_addition())
         found = self.under(precision, nuisances).fit(self.effects, LINEAR_ONLY)
@@ -458,7 +461,7 @@ class State(NamedTuple):
         return found.information, right
 
     def selected(self, system: System | None = None) -> State:
-        """With the orders that this noise lets one see; ``system`` is `information`, where it is at hand."""
+        """Selects the orders significant at the current noise; ``system`` is `information`, if known."""
         options = self.options
         found = select(
             self.candidates, system or self.information(), options.family_wise, options.smallest_arcsec
@@ -466,24 +469,23 @@ class State(NamedTuple):
         return self._replace(selection=found)
 
     def after(self, solution: Solution) -> State:
-        """With a solution's effects, and the blur that they bring."""
+        """Takes over the effects of a solution, and their blur within blocks."""
         effects = tuple(each for each in solution.effects if not is_ripple(each) and not each.violations())
         own = next(filter(is_ripple, solution.effects), None)
         return self._replace(effects=effects, design=self.design.blurred(effects), ripple=own)
 
     def remade(self, samples: Samples, weight: FloatArray, delay_ms: float) -> State:
-        """With corrected samples and without outliers."""
+        """Rebuilds the blocks from delay-corrected samples, without outliers."""
         design = Design.of(samples, make_blocks(samples, weight), self.design.starts).blurred(self.effects)
         waves = harmonics(design, [each.per_motor_turn for each in self.candidates])
         return self._replace(design=design, waves=waves, delay_ms=delay_ms)
 
 
 def candidate_orders(design: Design, options: FitOptions) -> tuple[Order, ...]:
-    """Orders to look for: what the travel resolves.
+    """Returns the candidate orders that the travel can resolve.
 
-    Neighbouring orders are apart from each other, and from all else that varies along the travel, from a
-    whole turn on (Rayleigh): orders of the motor need a motor turn, those of load and flexspline enough of a
-    load turn.
+    Neighbouring orders are separable over at least one whole turn (Rayleigh criterion): motor orders need
+    a motor turn, orders of load and flexspline enough of a load turn.
     """
     ratio = design.samples.ratio
     if turns_covered(design) < WHOLE_TURN:
@@ -503,7 +505,7 @@ def candidate_orders(design: Design, options: FitOptions) -> tuple[Order, ...]:
 
 
 def turns_covered(design: Design) -> float:
-    """Motor turns of different angles that were seen about one zero."""
+    """Returns the distinct motor angles covered about one zero, in turns; the largest over the zeros."""
     blocks = design.blocks
     cell = np.floor(blocks.motor_deg / COVERED_DEG).astype(np.intp)
     seen = (len(np.unique(cell[blocks.zero == zero])) for zero in range(design.samples.zeros))

@@ -1,4 +1,4 @@
-"""From records to a model: the steps of an identification, in their order."""
+"""Identification of a model from a measurement: all steps in order."""
 
 from __future__ import annotations
 
@@ -41,18 +41,19 @@ from hdbridge.units import ARCSEC_PER_DEG
 
 MINIMUM_USABLE = 50
 LEAST_TRAVEL_DEG = 10.0
-"""Motor angle that a record has to cover: less is rest and the beginning of a move, and half of a loop."""
+"""Minimum motor travel. Less is a rest and the beginning of a move, and half of a loop."""
 NO_DEGREES = "where the axis went further, both angles are in radians or turns: convert them to degrees"
-"""Both angles in one other unit give the right ratio: only how little the axis went can show it."""
+"""Hint about units. If both angles are in another unit, the ratio is right and only the short travel
+shows it."""
 EFFECT_SHARE = 1e-3
-"""An effect of whose columns less than this is left by the zeros and orders is not in the record."""
+"""Share of an effect's columns not explained by zeros and orders, below which it is not in the record."""
 ROUNDS = 3
 
 
 def fit(measured: Measured, ratio: float, options: FitOptions | None = None) -> FitResult:
-    """Identify an axis of gear ratio ``ratio`` from a measurement.
+    """Identifies an axis of gear ratio ``ratio`` from a measurement.
 
-    InputError where the record cannot be used at all; what it cannot say stands in the result's ``warnings``.
+    InputError if the record cannot be used at all. The result's ``warnings`` list what it cannot determine.
     """
     options = options or FitOptions()
     warnings: list[str] = []
@@ -89,7 +90,7 @@ def fit(measured: Measured, ratio: float, options: FitOptions | None = None) -> 
 
 
 def _prepare(samples: Samples, options: FitOptions, warnings: list[str]) -> State:
-    """Blocks, columns, and which effects and nuisances the record can show at all."""
+    """Prepares blocks and columns, and selects the effects and nuisances that the record can show."""
     starts = [each.start or Start.FORWARD for each in samples.chains]
     design = Design.of(samples, make_blocks(samples), starts)
     candidates = candidate_orders(design, options)
@@ -137,7 +138,7 @@ def _prepare(samples: Samples, options: FitOptions, warnings: list[str]) -> Stat
 
 
 def _search(state: State, warnings: list[str]) -> State:
-    """Shapes from a grid, the elastic state at the start where it is not known, and a first noise model."""
+    """Finds shapes on a grid, unknown elastic states at the start, and a first noise model."""
     simple = state._replace(nuisances=tuple(each for each in state.nuisances if each != TURNS))
     columns = simple.in_addition().and_also(state.candidate_waves())
 
@@ -165,7 +166,7 @@ def _search(state: State, warnings: list[str]) -> State:
 
 
 def _settle(state: State) -> tuple[State, Solution, System]:
-    """Orders, outliers, delay and noise in turn until they agree; everything refitted together each time."""
+    """Iterates orders, outliers, delay and noise until they agree, refitting everything each time."""
     state = state.selected()
     solution = state.fitted()
     samples = state.design.samples
@@ -188,20 +189,20 @@ def _settle(state: State) -> tuple[State, Solution, System]:
             break
     solution = state.fitted()
     if _value(solution, SWING) < 0.0:
-        # No load is held back below its natural frequency: something else differs from speed to speed.
+        # Below resonance a load amplifies the error. A negative swing has another, speed-dependent cause.
         state = state._replace(nuisances=tuple(each for each in state.nuisances if each != SWING))
         solution = state.fitted()
         system = state.information()
     state = state.after(solution)
     if len(state.columns().names) != len(solution.nuisances):
-        # The first orders came in last, and what swings with them, or turns that now matter.
+        # Swing columns of newly selected orders, or newly relevant turning points, were added.
         solution = state.fitted()
         system = state.information()
     return state, solution, system
 
 
 def _value(solution: Solution, nuisance: str) -> float:
-    """Of a nuisance; 0 where it is not fitted."""
+    """Returns the value of a nuisance; 0 if it is not fitted."""
     names = [each.name for each in solution.columns[: len(solution.nuisances)]]
     return float(solution.nuisances[names.index(nuisance)]) if nuisance in names else 0.0
 
@@ -209,7 +210,7 @@ def _value(solution: Solution, nuisance: str) -> float:
 def _hold_what_is_unknown(
     state: State, solution: Solution, warnings: list[str]
 ) -> tuple[Solution, FloatArray]:
-    """Where the data cannot say what shape an effect has, it keeps the one that it came with."""
+    """Resets shapes that the data cannot determine to their initial values, and refits the rest."""
     options, blocks = state.options, state.design.blocks
     cov = covariance(solution, state.precision(), blocks)
     effects = list(solution.effects)

@@ -23,11 +23,11 @@ class Interval:
 
     effect: str
     parameter: str
-    """As the model file nests it: ``offset_arcsec``, ``orders[2].amplitude_arcsec`` (2 is the order)."""
+    """Path in the model file: ``offset_arcsec``, ``orders[2].amplitude_arcsec`` (2 is the order)."""
     value: float
     half_width: float
     identifiable: bool = True
-    """False where the data cannot say: the interval is then the whole range of the parameter."""
+    """False if the data do not determine it; the interval is then the whole range of the parameter."""
 
     @property
     def low(self) -> float:
@@ -41,7 +41,7 @@ class Interval:
 
 
 def intervals_of(effect: Effect, columns: Sequence[Column], cov: FloatArray) -> list[Interval]:
-    """Of one effect's parameters; ``cov`` (c, c) is the covariance of its ``columns`` of the fit."""
+    """Returns the intervals of one effect's parameters; ``cov`` (c, c): covariance of its ``columns``."""
     shapes = {each.name: each for each in effect.shape}
     base = dict(leaves(effect.parameters()))
     result = []
@@ -57,7 +57,7 @@ def intervals_of(effect: Effect, columns: Sequence[Column], cov: FloatArray) -> 
 
 
 def half_widths(effect: Effect, columns: Sequence[Column], cov: FloatArray) -> dict[str, float]:
-    """`NORMAL_95` standard deviations of each parameter, by the slopes at its value."""
+    """Returns `NORMAL_95` standard deviations of each parameter, by its derivatives."""
     steps = 0.05 * np.sqrt(np.maximum(np.diag(cov), 1e-24))
     return {
         name: NORMAL_95 * math.sqrt(max(float(slope @ cov @ slope), 0.0))
@@ -66,8 +66,9 @@ def half_widths(effect: Effect, columns: Sequence[Column], cov: FloatArray) -> d
 
 
 def slopes(effect: Effect, columns: Sequence[Column], steps: FloatArray) -> dict[str, FloatArray]:
-    """Derivatives of an effect's parameters by the columns of a fit, (c,) each, from ``steps`` (c,) to
-    either side; only of those that depend on any.
+    """Returns the derivatives of an effect's parameters by the columns of a fit, (c,) each.
+
+    They are central differences with ``steps`` (c,), only for parameters that depend on a column.
     """
     coefficients = effect.coefficients()
     result: dict[str, FloatArray] = {}
@@ -90,7 +91,7 @@ def slopes(effect: Effect, columns: Sequence[Column], steps: FloatArray) -> dict
 
 
 def nested_half_widths(effect: Effect, intervals: list[Interval]) -> dict[str, Any]:
-    """Half widths nested like the effect's parameters; whole numbers (orders) stand as they are."""
+    """Nests half widths like the effect's parameters; integers (orders) are copied."""
     half = {each.parameter: each.half_width for each in intervals if each.effect == effect.name}
 
     def nest(value: Any, path: str) -> Any:
@@ -106,7 +107,7 @@ def nested_half_widths(effect: Effect, intervals: list[Interval]) -> dict[str, A
 
 
 def leaves(parameters: Any, path: str = "") -> Iterator[tuple[str, float]]:
-    """Every floating-point parameter with its path; list items are labelled by their ``order`` if any."""
+    """Yields every floating-point parameter with its path; list items are labelled by ``order`` if any."""
     if isinstance(parameters, dict):
         for key, part in parameters.items():
             yield from leaves(part, joined(path, key))
@@ -122,12 +123,12 @@ def _label(part: Any, number: int) -> int:
 
 
 def joined(path: str, key: str) -> str:
-    """A path (`leaves`) with one step more."""
+    """Extends a path (`leaves`) by one key."""
     return f"{path}.{key}" if path and key else path or key
 
 
 def labelled(parameters: Any, path: Iterable[str | int]) -> str:
-    """The path (`leaves`) of where keys and numbers lead."""
+    """Returns the path (`leaves`) to which keys and numbers lead."""
     said = ""
     for key in path:
         parameters = parameters[key]
@@ -136,14 +137,14 @@ def labelled(parameters: Any, path: Iterable[str | int]) -> str:
 
 
 def difference(name: str, low: float, high: float) -> float:
-    """Of two values of a parameter with this path (`leaves`); phases the short way round."""
+    """Returns the difference of two values of a parameter with this path (`leaves`); phases are wrapped."""
     if re.search(r"phase_deg$", name):
         return (high - low + 180.0) % 360.0 - 180.0
     return high - low
 
 
 def _free_move(effect: Effect, name: str, step: float) -> Effect:
-    """Move one shape parameter without regard to its range (only to differentiate)."""
+    """Moves one shape parameter without regard to its range (only for differentiation)."""
     shape = next(each for each in effect.shape if each.name == name)
     here = shape_value(effect, name)
     there = here * float(np.exp(step)) if shape.logarithmic else here + step

@@ -1,4 +1,7 @@
-"""Symmetric systems that may be singular: columns that a record cannot tell apart share what they explain."""
+"""Linear algebra of fits: possibly singular symmetric systems, sandwich covariance, priors, held-out steps.
+
+Columns that a record cannot separate share what they explain.
+"""
 
 from __future__ import annotations
 
@@ -15,19 +18,19 @@ from hdbridge.effects import BoolArray, Effect, FloatArray, IntArray
 from hdbridge.effects.described import Moves
 
 NOTHING = 1e-20
-"""Information below this is none."""
+"""Information below which a column counts as unseen."""
 SEEN = 1e-9
-"""Share of the largest eigenvalue of scaled columns below which a direction is not in the data."""
+"""Share of the largest eigenvalue of scaled columns below which the data do not determine a direction."""
 SUSPECT = 1e-6
-"""Square of a Cholesky factor's diagonal below which the smallest eigenvalue is looked at."""
+"""Square of a Cholesky factor's diagonal below which the eigenvalues are computed."""
 
 
 def solve_symmetric(matrix: FloatArray, right: FloatArray) -> FloatArray:
-    """Solution of a positive semi-definite system, columns scaled to one; what is not seen stays at zero."""
+    """Solves a positive semi-definite system with scaled columns; undetermined directions stay at zero."""
     if not len(matrix):
         return np.zeros_like(right)
     seen = np.diag(matrix) > 0.0
-    if not np.all(seen):  # rounding on the scale of nothing could be anything
+    if not np.all(seen):  # unseen columns contain only rounding errors
         result = np.zeros_like(right)
         result[seen] = solve_symmetric(matrix[np.ix_(seen, seen)], right[seen])
         return result
@@ -42,7 +45,7 @@ def solve_symmetric(matrix: FloatArray, right: FloatArray) -> FloatArray:
 
 
 def inverse_symmetric(matrix: FloatArray) -> FloatArray:
-    """Inverse of a positive semi-definite matrix by its scaled eigenvalues; huge where it has none."""
+    """Inverts a positive semi-definite matrix by its scaled eigenvalues; huge where it is singular."""
     scale = np.sqrt(np.maximum(np.diag(matrix), NOTHING))
     values, vectors = np.linalg.eigh(matrix / np.outer(scale, scale))
     inverse = vectors @ ((1.0 / np.maximum(values, 1e-12 * values[-1]))[:, np.newaxis] * vectors.T)
@@ -50,9 +53,10 @@ def inverse_symmetric(matrix: FloatArray) -> FloatArray:
 
 
 def seen_directions(gram: FloatArray) -> FloatArray:
-    """Factor R, shape (p, r), with R' gram R = 1 over the directions that the data see.
+    """Returns a factor R, shape (p, r), with R' gram R = 1 over the directions that the data determine.
 
-    R R' is the pseudo-inverse of columns scaled to one, and ``columns @ R`` an orthonormal basis of theirs.
+    R R' is the pseudo-inverse of the scaled matrix, and ``columns @ R`` is an orthonormal basis of the
+    columns.
     """
     if not len(gram):
         return np.empty((0, 0))
@@ -64,9 +68,9 @@ def seen_directions(gram: FloatArray) -> FloatArray:
 
 
 def side_by_side(parts: Sequence[FloatArray | BoolArray], rows: int) -> FloatArray:
-    """Columns of some parts in one matrix, shape (rows, p), each column in one piece of memory.
+    """Concatenates columns into one matrix, shape (rows, p), each column contiguous in memory.
 
-    A long column that is spread over all rows takes as long to write, and to read, as the whole matrix.
+    Reading or writing one column of a row-major matrix takes as long as the whole matrix.
     """
     result = np.empty((sum(each.shape[1] for each in parts), rows)).T
     at = 0
@@ -77,55 +81,56 @@ def side_by_side(parts: Sequence[FloatArray | BoolArray], rows: int) -> FloatArr
 
 
 def orthonormal(columns: FloatArray) -> FloatArray:
-    """An orthonormal basis of what the columns span, shape (m, r)."""
+    """Returns an orthonormal basis of the columns' span, shape (m, r)."""
     return np.asarray(columns @ seen_directions(columns.T @ columns))
 
 
-# Stretches of a record, numbered point by point, and what is summed over them.
+# Stretches of a record, numbered point by point, and sums over them.
 
 
 def of_length(time_s: FloatArray, length_s: float) -> IntArray:
-    """A number per point that changes after every so many seconds; empty stretches are not counted."""
+    """Numbers the points by stretches of equal length; empty stretches are skipped."""
     return counted(np.floor((time_s - time_s[0]) / length_s).astype(np.intp))
 
 
 def of_number(time_s: FloatArray, number: int) -> IntArray:
-    """In which of so many equally long stretches of time each point lies, shape (n,)."""
+    """Numbers the points by ``number`` stretches of time of equal length, shape (n,)."""
     span = max(float(time_s[-1] - time_s[0]), 1e-9)
     return np.asarray(np.minimum((time_s - time_s[0]) / span * number, number - 1), dtype=np.intp)
 
 
 def counted(number: IntArray) -> IntArray:
-    """The same stretches, numbered without gaps."""
+    """Renumbers stretches without gaps."""
     return np.asarray(np.unique(number, return_inverse=True)[1])
 
 
 def sums(rows: FloatArray, number: IntArray) -> FloatArray:
-    """Sums of rows (n, p) by their number, shape (numbers, p)."""
+    """Sums rows (n, p) by their number, shape (numbers, p)."""
     return np.stack([np.bincount(number, each) for each in rows.T], axis=1)
 
 
 def sandwich(influence: FloatArray, number: IntArray) -> FloatArray:
-    """Covariance (p, p) of what is the sum of the influences of all points, (n, p), where those of one number
-    may hang together (Liang and Zeger 1986).
+    """Returns the covariance (p, p) of the sum of the influences of all points, (n, p).
+
+    Influences of one number may be correlated (Liang and Zeger 1986).
     """
     summed, count = sums(influence, number), int(number[-1]) + 1
     return np.asarray(summed.T @ summed * (count / max(count - 1, 1)))
 
 
 def about_zeros(left_arcsec: FloatArray, zero: IntArray, weight: FloatArray) -> FloatArray:
-    """What is left (n,) about the weighted mean of each absolute zero; as it is where that weighs nothing."""
+    """Subtracts the weighted mean of each absolute zero from a residual (n,); unchanged without weight."""
     total, weights = np.bincount(zero, weight * left_arcsec), np.bincount(zero, weight)
     return np.asarray(left_arcsec - (total / np.maximum(weights, 1e-300))[zero])
 
 
-# What a fit is given: observations, columns, their weighting, what is known beforehand, its effort.
+# Inputs of a fit: observations, columns, weighting, priors, effort.
 
 
 LOCAL = frozenset({Moves.ANYWHERE})
-"""Shapes that a local step improves from anywhere."""
+"""Shapes that local steps can improve from any start."""
 FOUND = LOCAL | {Moves.NEARBY}
-"""... and those that a search has brought next to their best value."""
+"""The same, and shapes that a search has brought close to their best value."""
 
 Columns = Callable[[Effect], FloatArray]
 
@@ -139,55 +144,55 @@ class Weighting(Protocol):
 
 
 class Prior(NamedTuple):
-    """What is known of a coefficient or shape beforehand (of a logarithmic shape: of its logarithm)."""
+    """Prior of a coefficient or shape (of a logarithmic shape: of its logarithm)."""
 
     mean: float
     information: float
-    """One over the variance; less than nothing takes back what columns that are noisy themselves claim."""
+    """One over the variance. A negative value compensates for information that noisy columns seem to add."""
 
 
 FREE = Prior(0.0, 0.0)
-"""Nothing is known."""
+"""Prior without information."""
 
 
 class Column(NamedTuple):
-    """What a column of the fit stands for."""
+    """Parameter that a column of the fit belongs to."""
 
     effect: int
-    """Place of the effect, or -1 for a column that is no effect's."""
+    """Place of the effect, or -1 for a nuisance."""
     name: str
-    """Number of the coefficient, name of the shape parameter, or of the other column."""
+    """Number of the coefficient, name of the shape, or name of the nuisance."""
     shape: bool = False
     logarithmic: bool = False
 
 
 @dataclass(frozen=True, slots=True)
 class Effort:
-    """How far a fit goes."""
+    """Limits of the iterations of a fit."""
 
     steps: int = 25
     converged: float = 1e-4
-    """A step that promises, or gains, less than this in chi square is the last."""
+    """Predicted or actual fall in chi square below which the fit ends."""
     roughly: float = 0.0
-    """... or less than this share of chi square: where much is left, exactness is of no use."""
+    """The same as a share of chi square: with a large residual, accuracy is of no use."""
 
     def enough(self, chi_square: float) -> float:
-        """Gain in chi square below which the fit stands."""
+        """Returns the fall in chi square below which the fit ends."""
         return max(self.converged, self.roughly * chi_square)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Nuisances:
-    """Columns that are no effect's."""
+    """Columns that belong to no effect."""
 
     columns: FloatArray
     """Shape (b, q)."""
     names: tuple[str, ...]
     prior: tuple[Prior, ...]
-    """What is known of each coefficient beforehand."""
+    """Prior of each coefficient."""
 
     def and_also(self, other: Nuisances) -> Nuisances:
-        """With further columns."""
+        """Returns these and further columns."""
         return Nuisances(
             side_by_side([self.columns, other.columns], len(self.columns)),
             (*self.names, *other.names),
@@ -195,7 +200,7 @@ class Nuisances:
         )
 
     def without(self, left_out: Callable[[str], bool]) -> Nuisances:
-        """Without the columns whose names answer."""
+        """Returns the columns for whose names ``left_out`` is False."""
         keep = np.array([not left_out(each) for each in self.names])
         return Nuisances(
             self.columns[:, keep], tuple(compress(self.names, keep)), tuple(compress(self.prior, keep))
@@ -203,84 +208,84 @@ class Nuisances:
 
 
 def unknown(columns: FloatArray | BoolArray, names: Sequence[str]) -> Nuisances:
-    """Columns of which nothing is known."""
+    """Returns columns without prior information."""
     return Nuisances(np.asarray(columns, dtype=np.float64), tuple(names), (FREE,) * len(names))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Terms:
-    """What is fitted to what; arrays of m rows."""
+    """Inputs of a fit; arrays of m rows."""
 
     observed: FloatArray
-    """Arcsec, shape (m,)."""
+    """Observations, arcsec, shape (m,)."""
     columns: Columns
-    """Of an effect, (m, p): whatever its coefficients are."""
+    """Columns of an effect, (m, p), independent of its coefficients."""
     weighting: Weighting
     nuisances: Nuisances
     prior: Mapping[tuple[int, str], Prior] = field(default_factory=dict)
-    """By place of the effect, and number of the coefficient or name of the shape."""
+    """Priors by place of the effect, and number of the coefficient or name of the shape."""
     sign: Callable[[Effect], float] = lambda _: 0.0
-    """The sign that an effect's coefficients have; 0 where they may have either."""
+    """Sign that an effect's coefficients must have; 0 if either."""
     moves: frozenset[Moves] = LOCAL
-    """Shapes that are moved; the others stay as they are."""
+    """Kinds of shapes that are fitted; the others stay fixed."""
 
     def known(self, columns: Sequence[Column]) -> FloatArray:
-        """Mean and information beforehand of columns that begin with the nuisances', shape (p, 2)."""
+        """Returns prior mean and information of columns that begin with the nuisances, shape (p, 2)."""
         others = columns[len(self.nuisances.prior) :]
         own = [self.prior.get((each.effect, each.name), FREE) for each in others]
         return np.array([*self.nuisances.prior, *own], dtype=np.float64).reshape(-1, 2)
 
 
-# A fit near its minimum, where it is linear: in coefficients and, by their tangents, in shapes.
+# Fit linearised near its minimum, in coefficients and (by tangents) in shapes.
 
 
 @dataclass(frozen=True, eq=False)
 class Linearised:
-    """A fit at its minimum, or near it; rows in units of the noise, but for `steps_without`."""
+    """Fit linearised at or near its minimum; rows in units of the noise, except for `steps_without`."""
 
     columns: FloatArray
     """Derivatives, shape (m, p)."""
     residual: FloatArray
-    """Shape (m,)."""
+    """Residual, shape (m,)."""
     known: FloatArray
-    """Per column the information beforehand, and that times how far its mean is off, shape (p, 2)."""
+    """Prior information of each column, and that times (prior mean - value), shape (p, 2)."""
 
     @cached_property
     def directions(self) -> FloatArray:
-        """R, shape (p, r), with R' (columns' columns + information) R = 1 over what the data see."""
+        """R, shape (p, r), with R' (columns' columns + information) R = 1 over the determined directions."""
         return seen_directions(self.columns.T @ self.columns + np.diag(self.known[:, 0]))
 
     @cached_property
     def basis(self) -> FloatArray:
-        """B, shape (m, r): of a column c the fit leaves c'c - (B'c)'(B'c); orthonormal without a prior."""
+        """B, shape (m, r): the fit leaves c'c - (B'c)'(B'c) of a column c; orthonormal without priors."""
         return np.asarray(self.columns @ self.directions)
 
     @cached_property
     def slack(self) -> FloatArray:
-        """s, shape (r,): of a column's moment c'r the fit leaves c'r - (B'c)'s; none at its minimum."""
+        """s, shape (r,): the fit leaves c'r - (B'c)'s of a column's moment c'r; zero at the minimum."""
         return np.asarray(self.directions.T @ (self.columns.T @ self.residual + self.known[:, 1]))
 
     def of(self, places: IntArray) -> Linearised:
-        """With some of its columns only."""
+        """Returns the fit restricted to some of its columns."""
         return Linearised(self.columns[:, places], self.residual, self.known[places])
 
     def left(self, columns: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """What the fit leaves of the Gram matrix (k, k) and of the moment (k,) of other columns (m, k)."""
+        """Returns the remaining Gram matrix (k, k) and moment (k,) of other columns (m, k) after the fit."""
         shadow = self.basis.T @ columns
         return columns.T @ columns - shadow.T @ shadow, columns.T @ self.residual - shadow.T @ self.slack
 
     def taken_over(self, columns: FloatArray) -> FloatArray:
-        """Coefficients with which the fit would take over other columns (m, k), shape (p, k)."""
+        """Returns the coefficients with which the fit would absorb other columns (m, k), shape (p, k)."""
         return np.asarray(self.directions @ (self.basis.T @ columns))
 
 
 def steps_without(
     fit: Linearised, fold: IntArray, weighting: Callable[[BoolArray], Weighting]
 ) -> list[FloatArray]:
-    """For each fold the step, (p,), to the fit without it; ``weighting`` is that of some of the rows.
+    """Returns, for each fold, the step (p,) to the fit without it; ``weighting`` weights some of the rows.
 
-    A fold is weighted by itself, so that none knows of another by the noise that they have in common. What
-    only the fold itself shows stays where it is.
+    Each fold is weighted separately, so that correlated noise carries nothing between folds. Parameters that
+    only the fold itself determines stay unchanged.
     """
     grams, moments = [], []
     for number in range(int(np.max(fold)) + 1):

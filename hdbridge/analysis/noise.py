@@ -1,10 +1,10 @@
-"""Noise that is not white, and least squares that know it.
+"""Coloured noise, and least squares weighted by it.
 
-Four parts: white noise (its size may differ between standing and moving), a slow wander in time, a wander
-over the motor's *travel*: an axis rests anywhere within a count of its encoder, the same way as long as it
-stands and another way at the next stop; and what rounding to counts leaves over a whole leg, of a size that
-the count gives. The wanders are first-order Markov processes, so the inverse of their covariance is banded,
-and a fit costs no more than one with white noise (Rybicki and Press 1995).
+The noise has four parts: white noise (which may differ between standing and moving); a drift in time;
+a drift over the motor's *travel*, because an axis rests anywhere within a count of its encoder, constant
+during a stop and different at the next one; and the rounding error that is constant over a leg, whose size
+follows from the count. The drifts are first-order Markov processes, so the inverse of their covariance is
+banded, and a fit costs no more than one with white noise (Rybicki and Press 1995).
 """
 
 from __future__ import annotations
@@ -24,38 +24,38 @@ PIECES = 16
 PIECE_BLOCKS = 250
 SMALLEST_ARCSEC = 1e-3
 DIFFERENCE = 1e-4
-"""Step of the likelihood's slopes, in logarithms: the rounding of a smaller one stops the fit on its way."""
+"""Step of the likelihood's derivatives, in logarithms. With a smaller one, rounding stops the fit early."""
 COLUMNS_AT_ONCE = 8
 CHAINS_KEPT = 8
-"""A slope of the likelihood needs two at each length and one at a step from it."""
+"""Size of the cache of chains: a derivative needs two at each length and one at a step from it."""
 SAME_LEG = 1e-8
-"""A block's step along a wander that stays the same over a leg: as good as none."""
+"""Step between blocks of a leg, over which that error is constant: practically zero."""
 
 
 @dataclass(frozen=True, slots=True)
 class NoiseModel:
-    """Standard deviations and correlation lengths."""
+    """Standard deviations and correlation lengths of the noise."""
 
     standing_arcsec: float
-    """White, of one sample, at rest."""
+    """White noise of one sample at rest."""
     moving_arcsec: float
-    """White, of one sample, in motion."""
+    """White noise of one sample in motion."""
     slow_arcsec: float = 0.0
     slow_s: float = 10.0
-    """Wander in time: its size, and the time in which it forgets."""
+    """Drift in time: standard deviation and correlation time."""
     place_arcsec: float = 0.0
     place_deg: float = 0.1
-    """Wander over the motor's travel: its size, and the travel over which it forgets."""
+    """Drift over the motor's travel: standard deviation and correlation length."""
 
     def white_variance(self, blocks: Blocks) -> FloatArray:
-        """Of each block's mean; infinite for blocks without samples."""
+        """Returns the white variance of each block's mean; infinite for blocks without samples."""
         sample = np.where(blocks.moving, self.moving_arcsec, self.standing_arcsec) ** 2
         mean = np.divide(sample, blocks.count, out=np.full(len(blocks), np.inf), where=blocks.count > 0)
         return np.asarray(mean + blocks.blur)
 
 
 BEGIN = NoiseModel(1.0, 1.0, 1.0, 10.0, 1.0, 0.3)
-"""Where a fit of it begins; it ends where it would from any other."""
+"""Initial values of a noise fit; the result does not depend on them."""
 
 
 class White:
@@ -73,7 +73,7 @@ class White:
 
 
 class _Chain(NamedTuple):
-    """A wander of unit size along some blocks: its inverse covariance, and what a block's mean has of it."""
+    """A drift of unit size along some blocks: its inverse covariance, and its share in each block's mean."""
 
     diagonal: FloatArray
     off_diagonal: FloatArray
@@ -82,7 +82,7 @@ class _Chain(NamedTuple):
 
 
 class _Wanders:
-    """The chains of some blocks. A search for a noise model asks for the same length again and again."""
+    """Cache of the chains of some blocks; a fit of the noise model requests the same lengths repeatedly."""
 
     def __init__(self, blocks: Blocks) -> None:
         self._blocks = blocks
@@ -90,19 +90,19 @@ class _Wanders:
         self._kept: dict[object, _Chain] = {}
 
     def in_time(self, length_s: float) -> _Chain:
-        """The slow wander."""
+        """Returns the drift in time."""
         blocks = self._blocks
         return self._once(("time", length_s), lambda: self._along(blocks.time_s, blocks.duration_s, length_s))
 
     def in_place(self, length_deg: float) -> _Chain:
-        """The wander over the motor's travel."""
+        """Returns the drift over the motor's travel."""
         blocks = self._blocks
         return self._once(
             ("place", length_deg), lambda: self._along(blocks.travel_deg, blocks.extent_deg, length_deg)
         )
 
     def over_legs(self) -> _Chain:
-        """What stays the same over a leg, of the size that the blocks say."""
+        """Returns the error that is constant over a leg, with the size given in the blocks."""
         blocks = self._blocks
         return self._once(
             "leg",
@@ -122,7 +122,7 @@ class _Wanders:
 
 
 def _chain(step: FloatArray, load: FloatArray) -> _Chain:
-    """By the steps from block to block in correlation lengths; infinite where nothing is left."""
+    """Builds a chain from steps between blocks, in correlation lengths (infinite: independent)."""
     spread = -np.expm1(-2.0 * step)
     decay = np.exp(-step)
     diagonal = np.ones(len(load))
@@ -132,9 +132,9 @@ def _chain(step: FloatArray, load: FloatArray) -> _Chain:
 
 
 class Precision:
-    """The inverse covariance of the noise of some blocks, applied without ever being written out.
+    """Inverse covariance of the noise of some blocks, applied without forming the matrix.
 
-    K = W + H S H', W white, S of the wanders. By Woodbury, with P = S^-1 (tridiagonal for each wander),
+    K = W + H S H', with W white and S of the drifts. By Woodbury, with P = S^-1 (tridiagonal for each drift),
     K^-1 = w - w H (P + H' w H)^-1 H' w, and the bracket is banded.
     """
 
@@ -145,7 +145,7 @@ class Precision:
         left_out: BoolArray | None = None,
         wanders: _Wanders | None = None,
     ) -> None:
-        """Blocks in ``left_out`` count as not observed; ``wanders`` are those of the blocks, where known."""
+        """Blocks in ``left_out`` count as not observed; ``wanders`` is the cache of the blocks, if any."""
         weight = 1.0 / noise.white_variance(blocks)
         if left_out is not None:
             weight = np.where(left_out, 0.0, weight)
@@ -168,7 +168,7 @@ class Precision:
         self._factor = self._factored(chains) if chains else None
 
     def _factored(self, chains: list[_Chain]) -> FloatArray:
-        """Cholesky factor of the bracket, wanders interleaved."""
+        """Returns the Cholesky factor of the bracket, with the drifts interleaved."""
         width, count = len(chains), len(self.weight)
         band = np.zeros((width + 1, width * count))
         for number, chain in enumerate(chains):
@@ -186,14 +186,14 @@ class Precision:
         if columns.ndim == 1:
             return np.asarray(self._applied(columns[np.newaxis])[0])
         result = np.empty(columns.shape)
-        # a few columns at a time, each in one piece of memory, as the solver wants them: four times as fast
+        # a few contiguous columns at a time suit the solver: four times as fast
         for first in range(0, columns.shape[1], COLUMNS_AT_ONCE):
             part = slice(first, first + COLUMNS_AT_ONCE)
             result[:, part] = self._applied(columns[:, part].T).T
         return result
 
     def _applied(self, rows: FloatArray) -> FloatArray:
-        """K^-1 times columns that are given as rows, (p, b)."""
+        """Returns K^-1 times columns that are given as rows, (p, b)."""
         weighted = self.weight * rows
         if self._factor is None:
             return weighted
@@ -207,21 +207,21 @@ class Precision:
         return np.asarray(weighted - self.weight * back)
 
     def log_likelihood(self, residual: FloatArray) -> float:
-        """Of Gaussian noise, up to a constant; only blocks that were observed count."""
+        """Returns the Gaussian log likelihood up to a constant; only observed blocks count."""
         return 0.5 * (self._log_determinant - float(residual @ self.apply(residual)))
 
 
 def _averaged(extent: FloatArray) -> FloatArray:
-    """Variance of a wander's mean over a block, by that of the wander itself; extent in its own lengths."""
+    """Returns the variance of a drift's block mean relative to its own; extent in correlation lengths."""
     x = np.maximum(extent, 1e-6)
     return np.where(x < 1e-3, 1.0 - x / 3.0, 2.0 * (x - 1.0 + np.exp(-x)) / x**2)
 
 
 def fit_noise(residual: FloatArray, blocks: Blocks, parameters: int, begin: NoiseModel = BEGIN) -> NoiseModel:
-    """The noise model that makes a residual (b,) most likely.
+    """Fits the noise model to a residual (b,) by maximum likelihood.
 
-    Pieces of the record, spread over all of it, are enough: a likelihood of ten thousand blocks. The
-    ``parameters`` that were fitted have taken their share of the white noise out.
+    It uses at most `PIECES` pieces of the record, spread evenly. The white noise is corrected for the
+    ``parameters`` that were fitted.
     """
     pieces = _pieces(blocks)
     part = blocks.picked(pieces)
@@ -256,7 +256,7 @@ def fit_noise(residual: FloatArray, blocks: Blocks, parameters: int, begin: Nois
 
 
 def _pieces(blocks: Blocks) -> IntArray:
-    """Blocks of some pieces spread evenly over the record."""
+    """Selects blocks of some pieces spread evenly over the record."""
     count = len(blocks)
     if count <= PIECES * PIECE_BLOCKS:
         return np.arange(count)

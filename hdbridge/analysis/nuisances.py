@@ -1,13 +1,13 @@
-"""What is fitted in addition to the model so that it does not bend it: zeros, and faults of the measurement.
+"""Nuisance columns, fitted so that measurement errors do not bias the model: zeros and encoder faults.
 
-A load encoder that is read later than the motor's looks like hysteresis at one speed. An encoder of whole
-counts reads a motor that creeps from count to count, or rests just short of one, wrong by a fraction of a
-count *in the direction of motion*: that looks like hysteresis too, and the fraction changes with speed.
-Each turn is known to within a count and the way between two samples only (its reach), and a hysteresis that
-is narrow or steep cannot be known better than its turns. Each has a column; a fraction of its reach it cannot
-exceed. With fine encoders that are read often these columns vanish by themselves. The load on the gear's
-spring swings beyond the error that shakes it, the more the faster. Two speeds distinguish that from the
-orders' amplitudes; at one speed they are less well known.
+A load encoder that is read later than the motor encoder looks like hysteresis at one speed. An encoder of
+whole counts reads a motor that creeps from count to count, or rests just short of one, wrong by a fraction
+of a count *in the direction of motion*. That looks like hysteresis too, and depends on speed. Each turning
+point is known only to within a count and the travel between two samples (its reach), and a narrow or steep
+hysteresis is known no better than its turning points. Each has a column whose coefficient is a bounded
+share of its reach. With fine encoders and fast sampling these columns vanish. The load on the gear's spring
+amplifies the error that excites it, more at higher speed. Two speeds separate this swing from
+the amplitudes of the orders; at one speed these are less certain.
 """
 
 from __future__ import annotations
@@ -35,44 +35,47 @@ TEXTS = {
 }
 UNITS = {DELAY: "ms", ROUNDING: "counts", SWING: "ms\N{SUPERSCRIPT TWO}"}
 SWING_MS2 = 25.0
-"""Standard deviation beforehand: 1 / (2 pi f)^2 of a load that swings at f = 32 Hz."""
+"""Prior standard deviation of the swing: 1 / (2 pi f)^2 of a load with natural frequency f = 32 Hz."""
 SWING_MS3 = 50.0
-"""The same for a damping ratio z of the swing: 2 z / (2 pi f)^3."""
+"""Prior standard deviation of its damping part, for a damping ratio z: 2 z / (2 pi f)^3."""
 SWING_COUNT_ARCSEC = 2.0
-"""With a coarser motor encoder its sawtooth, which differs from speed to speed too, poses as swing."""
+"""Largest motor count for which swing is fitted. The sawtooth of a coarser encoder also depends on speed
+and looks like swing."""
 MOST_TURNS = 80
 SMALLEST_TURN = 1e-3
 COUNTS = 0.29
-"""Standard deviation that an unknown place within a count, or within the reach of a turn, has."""
+"""Standard deviation of a uniformly distributed position within a count, or within the reach of a
+turning point."""
 SPEEDS_COUNTS_S = (
     0, 25, *range(50, 800, 50), *range(800, 1600, 100), *range(1600, 3200, 200),
     3200, 4800, 6400, 12800, np.inf,
 )  # fmt: skip
-"""Edges of the classes of speed that round alike; at rest is a class of its own. A drive that is told whole
-counts in every cycle, and read in the same cycles, lags by the same fraction of a count as long as its speed
-is the same: simulated servos were read wrong by 0.08 to 0.22 counts (rms over speeds) from 300 to 12,000
-counts per second. With a lag of 5 ms that goes round with every 200 counts per second; a class is a quarter.
-"""
+"""Edges of the speed classes with equal rounding, counts per second; rest is a class of its own. A drive
+that receives whole counts in every cycle, and is read in the same cycles, lags by the same fraction
+of a count at constant speed. Simulated servos were read wrong by 0.08 to 0.22 counts (rms over
+speeds) from 300 to 12,000 counts per second. With a lag of 5 ms the error repeats every 200 counts
+per second; a class is a quarter."""
 SHARE = 0.1
-"""A nuisance of whose column less than this is left by what else is fitted stays out."""
+"""Minimum share of a nuisance column that other columns do not explain; below it, the nuisance is left
+out."""
 
 
 def zeros(zero: IntArray, number: int) -> Nuisances:
-    """A column for each of so many absolute zeros; ``zero`` (b,) says which."""
+    """Returns a column for each of ``number`` absolute zeros; ``zero`` (b,) assigns the blocks."""
     return unknown(zero[:, np.newaxis] == np.arange(number), [f"zero {each}" for each in range(number)])
 
 
 def delay_column(design: Design) -> FloatArray:
-    """What a load encoder read with a delay of one millisecond would show, shape (b, 1), arcsec."""
+    """Returns the error due to a load encoder delay of one millisecond, shape (b, 1), arcsec."""
     blocks, samples = design.blocks, design.samples
     column = -blocks.speed_deg_s * blocks.moving / samples.ratio * ARCSEC_PER_DEG / 1000.0
     return np.asarray(column)[:, np.newaxis]
 
 
 def rounding_columns(design: Design) -> tuple[FloatArray, FloatArray]:
-    """A count in the direction of motion, arcsec: at rest, per class of speed, and in all of them together.
+    """Returns columns of one count in the direction of motion, arcsec, with the prior standard deviations.
 
-    Columns (b, classes + 2), and how many counts there may be of each (standard deviations).
+    Columns, shape (b, classes + 2): at rest, all together, each speed class. Deviations in counts.
     """
     blocks, samples = design.blocks, design.samples
     count_arcsec = samples.count_deg / samples.ratio * ARCSEC_PER_DEG
@@ -90,10 +93,10 @@ def rounding_columns(design: Design) -> tuple[FloatArray, FloatArray]:
 
 
 def turn_columns(design: Design, effects: Sequence[Effect]) -> tuple[FloatArray, list[Prior]]:
-    """A column for each turn that matters, shape (b, turns): what its reach further out would change.
+    """Returns a column for each relevant turning point, shape (b, turns): the change if it lay further out.
 
-    The turn is anywhere within its count, and from where the sample lies to where straight lines meet: it is
-    to be expected halfway out.
+    A turning point lies anywhere within its count, and between its sample and the intersection of straight
+    lines; its expected place is halfway.
     """
     change, missed, turn = design.turn_effects(effects)
     weight = np.bincount(turn, design.blocks.count * change**2)
@@ -107,7 +110,7 @@ def turn_columns(design: Design, effects: Sequence[Effect]) -> tuple[FloatArray,
 
 
 def is_turn(name: str) -> bool:
-    """Whether a column of this name is one turn's."""
+    """Returns True for the column of a turning point."""
     return name.startswith("turn ")
 
 
@@ -116,12 +119,12 @@ def swing(
     waves: Iterable[tuple[float, FloatArray, FloatArray]],
     mean: Callable[[FloatArray], FloatArray] = lambda columns: columns,
 ) -> Nuisances:
-    """What the load shows beyond waves of the motor angle, arcsec per square and cube of a millisecond.
+    """Returns the swing of the load beyond the waves that excite it, arcsec per ms squared and per ms cubed.
 
-    ``rate`` (n,) is the motor's, radians per second. ``waves`` are orders, what they contribute, (n,), and
-    the same a quarter of a wave later; ``mean`` averages columns (n, 2) as the observations are.
-    Driven by a cos(w t) well below its natural frequency f a load on a spring with damping ratio z answers
-    with (1 + (w / 2 pi f)^2) a cos(w t) + 2 z (w / 2 pi f)^3 a sin(w t): more, and later both ways.
+    ``rate`` (n,) is the motor speed, radians per second. ``waves`` are orders, their contribution, (n,), and
+    the same a quarter of a wave later. ``mean`` averages columns (n, 2) like the observations. Driven by a
+    cos(w t) well below its natural frequency f, a load on a spring with damping ratio z responds with (1 +
+    (w / 2 pi f)^2) a cos(w t) + 2 z (w / 2 pi f)^3 a sin(w t): larger, and later in both directions.
     """
     columns = np.zeros((len(rate), 2))
     for order, wave, later in waves:
@@ -132,9 +135,9 @@ def swing(
 
 
 def speeds_differ(speed_deg_s: FloatArray, count: FloatArray) -> bool:
-    """Whether more than `SHARE` of the squared speed is left by its mean; ``count`` (n,) samples have each.
+    """Returns True if the speeds differ enough to separate swing from the orders that excite it.
 
-    At one speed a swing of the load cannot be distinguished from the orders that shake it.
+    The mean must leave more than `SHARE` of the squared speed; ``count`` (n,) weights the speeds.
     """
     squared = speed_deg_s**2
     fourth = float(count @ squared**2)
@@ -147,7 +150,7 @@ def nuisances_of(
     effects: Sequence[Effect],
     waves: Sequence[tuple[float, FloatArray, FloatArray]] = (),
 ) -> Nuisances:
-    """Zeros and the nuisances named; ``waves`` as for `swing`."""
+    """Returns the columns of zeros and the named nuisances; ``waves`` as for `swing`."""
     parts = [zeros(design.blocks.zero, design.samples.zeros)]
     if DELAY in nuisances:
         parts.append(unknown(delay_column(design), [DELAY]))
@@ -166,7 +169,7 @@ def nuisances_of(
 
 
 def share_left(columns: FloatArray, others: FloatArray, weight: FloatArray) -> float:
-    """Smallest share of any column's weighted squares that the others do not explain."""
+    """Returns the smallest share of a column's weighted squares that the others do not explain."""
     both = np.concatenate([others, columns], axis=1)
     gram = both.T @ (weight[:, np.newaxis] * both)
     split = others.shape[1]

@@ -1,8 +1,8 @@
-"""Which orders a record shows, by least squares at the true angles.
+"""Selection of the orders in a record, by least squares at the true angles.
 
-Samples are never even in angle, and a stepping test of 43.56 degrees samples a motor turn 8.26 times: a
-Fourier transform by sample number would put order 6 at 2.26 and order 8 at 0.26. Fitted at the true angles
-each order stands where it is, or is reported as one that the record cannot tell from another.
+Samples are never evenly spaced in angle, and a stepping test of 43.56 degrees samples a motor turn 8.26
+times: a Fourier transform by sample number would put order 6 at 2.26 and order 8 at 0.26. Fitted at the
+true angles, each order appears at its own number, or is reported as not separable from another.
 """
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ from hdbridge.analysis.linear import seen_directions, solve_symmetric
 from hdbridge.effects import FloatArray
 
 NOT_APART = 0.95
-"""Correlation above which two orders cannot be distinguished in a record."""
+"""Correlation above which two orders are not separable in a record."""
 
 System = tuple[FloatArray, FloatArray]
-"""J' K^-1 J and J' K^-1 y of [candidates' cosine and sine pairs | all that is in the fit anyway]."""
+"""J' K^-1 J and J' K^-1 y of [cosine and sine pairs of the candidates | all other columns of the fit]."""
 
 
 class Family(Enum):
-    """What an order belongs to."""
+    """Source of an order."""
 
     MOTOR = "motor"
     """k: the wave generator, the motor encoder."""
@@ -47,76 +47,79 @@ class Order:
 
     @classmethod
     def motor(cls, number: int) -> Order:
-        """Periods per motor turn."""
+        """Returns an order by its periods per motor turn."""
         return cls(Family.MOTOR, number, float(number))
 
     @classmethod
     def load(cls, number: int, ratio: float) -> Order:
-        """Periods per load turn."""
+        """Returns an order by its periods per load turn."""
         return cls(Family.LOAD, number, number / ratio)
 
     @classmethod
     def flexspline(cls, number: int, ratio: float) -> Order:
-        """Periods per turn of the wave generator against the flexspline."""
+        """Returns an order by its periods per turn of the wave generator against the flexspline."""
         return cls(Family.FLEXSPLINE, number, number * (1.0 + 1.0 / ratio))
 
     def __str__(self) -> str:
-        """For people."""
+        """Returns its name."""
         return f"{self.family.value} order {self.number}"
 
 
 @dataclass(frozen=True, slots=True)
 class Selection:
-    """What the selection found."""
+    """Result of the selection."""
 
     chosen: tuple[Order, ...]
     unresolved: tuple[Order, ...]
-    """Candidates that this record cannot distinguish from the zero, the hysteresis or an order already in."""
+    """Candidates not separable from the zero, the hysteresis or a selected order in this record."""
 
 
 @dataclass(frozen=True, slots=True)
 class Line:
-    """One order, all else in the fit allowed for: what it is, or would add."""
+    """Estimate of one order with everything else in the fit: its value, or what it would add."""
 
     order: Order
     amplitude_arcsec: float
     phase_deg: float
-    """Of amplitude * cos(order * motor angle + phase)."""
+    """Phase in amplitude * cos(order * motor angle + phase)."""
     standard_error_arcsec: float
-    """Of the cosine and of the sine coefficient (the larger)."""
+    """Standard error of the cosine or sine coefficient, the larger."""
     threshold_arcsec: float
-    """An amplitude that noise alone reaches at any of the orders in one record of a hundred."""
+    """Amplitude that noise alone reaches at any of the orders in one record of a hundred."""
     aliases: tuple[Order, ...] = ()
-    """Orders that this record cannot tell from it."""
+    """Orders that are not separable from it in this record."""
 
     @property
     def significant(self) -> bool:
-        """Whether it is more than noise."""
+        """True if it exceeds noise and has no aliases."""
         return self.amplitude_arcsec > self.threshold_arcsec and not self.aliases
 
     @property
     def fall_in_chi_square(self) -> float:
-        """What the fit loses without it."""
+        """Rise in chi square without it."""
         return (self.amplitude_arcsec / max(self.standard_error_arcsec, 1e-12)) ** 2
 
     @property
     def threshold(self) -> float:
-        """The fall that `threshold_arcsec` would be."""
+        """Fall in chi square that corresponds to `threshold_arcsec`."""
         return (self.threshold_arcsec / max(self.standard_error_arcsec, 1e-12)) ** 2
 
 
 def threshold(candidates: int, family_wise: float) -> float:
-    """Fall in chi square (two coefficients) that the best of so many reaches by chance this often."""
+    """Returns the fall in chi square (two coefficients) that the best candidate exceeds by chance.
+
+    ``family_wise`` is the probability of that.
+    """
     return -2.0 * math.log(family_wise / max(candidates, 1))
 
 
 class _Left(NamedTuple):
-    """What the others in a fit leave of one order."""
+    """Part of one order that the others in a fit leave."""
 
     share: float
-    """Of its information."""
+    """Remaining share of its information."""
     fall: float
-    """In chi square."""
+    """Fall in chi square."""
     cosine: float
     sine: float
     error: float
@@ -132,7 +135,7 @@ class _Left(NamedTuple):
 
 
 class _Candidates:
-    """Orders that may be in a fit; what is in it anyway is eliminated once."""
+    """Candidate orders, with all other columns of the fit eliminated once."""
 
     def __init__(self, number: int, system: System) -> None:
         information, right = system
@@ -144,7 +147,7 @@ class _Candidates:
         self.number = number
 
     def left(self, index: int, inside: Collection[int]) -> _Left:
-        """What is left of a candidate by the others that are ``inside``."""
+        """Returns the part of a candidate that the others ``inside`` leave."""
         own = [2 * index, 2 * index + 1]
         others = [2 * each + part for each in inside if each != index for part in (0, 1)]
         cross = self._information[np.ix_(others, own)]
@@ -161,11 +164,11 @@ class _Candidates:
 def select(
     candidates: Sequence[Order], system: System, family_wise: float = 0.01, smallest_arcsec: float = 0.1
 ) -> Selection:
-    """Forward selection with look-back.
+    """Selects orders by forward selection with removal.
 
-    An order enters when it lowers chi square by more than `threshold`, which all candidates together pass by
-    chance 1 in 100, and its amplitude is at least ``smallest_arcsec``; it leaves again when later ones take
-    its place.
+    An order enters if it lowers chi square by more than `threshold` (which all candidates together exceed by
+    chance with probability ``family_wise``) and its amplitude is at least ``smallest_arcsec``. It is removed
+    when later ones replace it.
     """
     waves = _Candidates(len(candidates), system)
     needed = threshold(len(candidates), family_wise)
@@ -196,7 +199,7 @@ def select(
 def spectrum(
     orders: Sequence[Order], chosen: Collection[Order], system: System, family_wise: float = 0.01
 ) -> tuple[Line, ...]:
-    """Each order's line; of the orders those ``chosen`` are in the fit."""
+    """Returns the line of each order; those ``chosen`` are in the fit."""
     waves = _Candidates(len(orders), system)
     root = math.sqrt(threshold(len(orders), family_wise))
     inside = [at for at, each in enumerate(orders) if each in chosen]
@@ -212,7 +215,7 @@ def spectrum(
 
 
 def _aliases(orders: Sequence[Order], information: FloatArray) -> dict[Order, list[Order]]:
-    """For each order those whose largest canonical correlation with it is above `NOT_APART`."""
+    """Returns, for each order, those whose largest canonical correlation with it exceeds `NOT_APART`."""
     pairs = {order: [2 * at, 2 * at + 1] for at, order in enumerate(orders)}
     roots = {order: seen_directions(information[np.ix_(own, own)]) for order, own in pairs.items()}
     result: dict[Order, list[Order]] = {order: [] for order in orders}

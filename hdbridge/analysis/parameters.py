@@ -1,9 +1,9 @@
-"""Systematic errors of parameters: what moves them and leaves nothing in the residual.
+"""Parameters of findings with 95 % intervals, including systematic errors that leave no residual.
 
-No sandwich over blocks sees them, for they are the same in the whole record. Each is a column with a
-standard deviation of its own, and moves the parameters as the fit takes it over: the form of a law, as its
-effect says it may differ, and what only a measured channel's noise distinguishes from a finding (a mass off
-centre winds the gear up once per turn, as a run-out of the load encoder goes once per turn).
+A sandwich over blocks misses these errors, because they are constant over the whole record. Each is a
+column with a standard deviation, and shifts the parameters as the fit absorbs it. They are the
+uncertainty of an effect's law, and causes separated from a finding only by the noise of a measured channel
+(an eccentric mass winds the gear up once per turn, like run-out of the load encoder).
 """
 
 from __future__ import annotations
@@ -31,15 +31,15 @@ from hdbridge.units import unit_of
 
 
 class Confounded(NamedTuple):
-    """Another cause that may have taken a part of a finding, or added to it, unseen."""
+    """Cause that may have biased a finding without being noticed."""
 
     name: str
     shift: FloatArray
-    """Of the fit's parameters by one standard deviation of what is left of it unseen, shape (p, k)."""
+    """Shift of the fit's parameters per standard deviation of the undetected part, shape (p, k)."""
 
 
 def confounded(estimator: Estimator, fitted: Fitted, place: int) -> Iterator[Confounded]:
-    """Causes of which one of typical size beside the effect at ``place`` would not be seen."""
+    """Yields causes that would go unnoticed at typical size in addition to the effect at ``place``."""
     effects, scales = fitted.hypothesis.effects, estimator.scales
     held = zip(fitted.parameters, fitted.information.tolist(), strict=True)
     known = {each.effect for each, information in held if information}  # as calibrated, not changed
@@ -48,7 +48,7 @@ def confounded(estimator: Estimator, fitted: Fitted, place: int) -> Iterator[Con
     for other, columns, noise in _alike(estimator, fitted, place):
         theirs = [at for at, each in enumerate(effects) if each.name == other.name]
         if known & set(theirs):
-            continue  # its calibration distinguishes the two
+            continue  # its calibration separates the two
         own = np.array([i for i, each in enumerate(fitted.parameters) if each.effect not in theirs])
         fit = fitted.linearised.of(own)
         shift = fit.taken_over(columns)
@@ -62,7 +62,7 @@ def confounded(estimator: Estimator, fitted: Fitted, place: int) -> Iterator[Con
 
 
 def systematic(estimator: Estimator, fitted: Fitted) -> FloatArray:
-    """What systematic errors add to the covariance of all parameters, shape (p, p)."""
+    """Returns the covariance of all parameters due to systematic errors, shape (p, p)."""
     added = np.zeros((fitted.count(), fitted.count()))
     for place, effect in enumerate(fitted.hypothesis.effects):
         shift = fitted.linearised.taken_over(estimator.law_discrepancy(effect, fitted.hypothesis.start))
@@ -74,8 +74,9 @@ def systematic(estimator: Estimator, fitted: Fitted) -> FloatArray:
 
 
 def _alike(estimator: Estimator, fitted: Fitted, place: int) -> Iterator[tuple[Effect, FloatArray, float]]:
-    """Look-alikes by a measured channel: one of them, its weighted columns of typical size, and the share of
-    the channel's noise in their squares.
+    """Yields causes that resemble the effect except for a measured channel.
+
+    With each: its weighted columns at typical size, and the share of channel noise in their squares.
     """
     effect, ratio = fitted.hypothesis.effects[place], estimator.data.ratio
     start = fitted.hypothesis.start
@@ -98,13 +99,13 @@ def _alike(estimator: Estimator, fitted: Fitted, place: int) -> Iterator[tuple[E
         yield other, estimator.weighted(columns * typical), noise
 
 
-# The fit that parameters are taken from: what else moves the load is allowed for.
+# Final fit for the parameters, including the swing of the load.
 
 
 def precisely(estimator: Estimator, fitted: Fitted) -> Fitted:
-    """The same hypothesis fitted together with what its waves shake, with the tangents of all shapes.
+    """Refits a hypothesis with the swing that its waves excite, and with the tangents of all shapes.
 
-    What its waves shake is left out where the record has one speed only: it is part of the orders there.
+    At a single speed the swing is left out, because it is part of the orders.
     """
     plain = estimator.fit(replace(fitted.hypothesis, nuisances=_shaken(estimator, fitted)))
     found = estimator.fit(plain.hypothesis, moves=FOUND)
@@ -114,8 +115,9 @@ def precisely(estimator: Estimator, fitted: Fitted) -> Fitted:
 
 
 def _shaken(estimator: Estimator, fitted: Fitted) -> Nuisances | None:
-    """In phase by the square of frequency, and lagging by its cube; the second is odd in the direction, as a
-    lag is. None without orders, and at one speed.
+    """Returns columns of the load's swing: in phase by frequency squared, lagging by frequency cubed.
+
+    The second is odd in the direction. None without orders, or at a single speed.
     """
     motion = estimator.data.full.motion
     speed = motion.motor_speed_deg_s
@@ -130,25 +132,24 @@ def _shaken(estimator: Estimator, fitted: Fitted) -> Nuisances | None:
     return swing(RAD_PER_DEG * speed, both, estimator.at_points)
 
 
-# Parameters of a fitted effect with 95 % intervals that allow for noise which is not white.
+# Parameters of a fitted effect with 95 % intervals, valid for coloured noise.
 
 
 WAVE: Final = ("amplitude_arcsec", "phase_deg")
 PARTS: Final = (6, 12)
-"""Numbers of equal parts of a record that count as one observation each."""
+"""Numbers of equal parts of a record, each part treated as one observation."""
 STEP_95: Final = 11.03
-"""95 % point of where a Brownian motion with the drift -|t| / 2 to either side is largest."""
+"""95 % point of the location of the maximum of a Brownian motion with drift -|t| / 2 on either side."""
 
 
 def covariance(estimator: Estimator, fitted: Fitted) -> FloatArray:
-    """Of all parameters, shape (p, p), so that `NORMAL_95` standard deviations are a 95 % interval.
+    """Returns the covariance of all parameters, (p, p), scaled for 95 % intervals by `NORMAL_95`.
 
-    The sandwich over blocks of time, and of all lengths of blocks the most careful: seconds for noise that
-    wanders, and `PARTS` of the whole record for what the hypothesis gets wrong from one part of a bench to
-    the next. Few parts tell a variance badly, so Student's quantile stands for the normal one, with as many
-    degrees of freedom as parts carry the parameter, less one (Bester, Conley and Hansen 2011; effective
-    number of clusters as Carter, Schnepel and Steigerwald 2017). What no residual shows is added
-    (`systematic`).
+    It is the largest of the sandwiches over blocks of seconds, for wandering noise, and over `PARTS` of the
+    record, for errors of the hypothesis that differ between them. Few parts estimate a variance poorly.
+    Student's quantile then replaces the normal one, with one degree of freedom less than the parts that
+    carry the parameter (Bester, Conley and Hansen 2011; effective number of clusters as in Carter, Schnepel
+    and Steigerwald 2017). Errors without residual are added (`systematic`).
     """
     tangent, residual = fitted.tangent, fitted.residual
     directions, known = fitted.linearised.directions, fitted.linearised.known
@@ -181,7 +182,7 @@ def covariance(estimator: Estimator, fitted: Fitted) -> FloatArray:
 def parameters_of(
     estimator: Estimator, fitted: Fitted, place: int, spread: FloatArray
 ) -> dict[str, Parameter]:
-    """Those of one effect, by the names of the model file where it has them."""
+    """Returns the parameters of one effect, by the names of the model file if it has them."""
     effect, own = fitted.hypothesis.effects[place], fitted.places(place)
     result = named_parameters(effect, [fitted.parameters[i] for i in own], spread[np.ix_(own, own)])
     for shape in effect.shape:
@@ -198,8 +199,9 @@ def parameters_of(
 
 
 def named_parameters(effect: Effect, columns: Sequence[Column], spread: FloatArray) -> dict[str, Parameter]:
-    """An effect's parameters by the covariance (c, c) of its ``columns``; without what nothing in the record
-    depends on.
+    """Returns an effect's parameters, with intervals from the covariance (c, c) of its ``columns``.
+
+    Parameters that nothing in the record depends on are left out.
     """
     names: dict[str, str] = {}
     for each in effect.named_coefficients():
@@ -214,14 +216,14 @@ def named_parameters(effect: Effect, columns: Sequence[Column], spread: FloatArr
         low, high = value - half, value + half
         is_size = path in names and not name.endswith("phase_deg")
         shape = shapes.get(name)
-        if shape is not None and shape.logarithmic:  # no further than it may be
+        if shape is not None and shape.logarithmic:  # limited to its range
             factor = math.exp(min(half / value, math.log(shape.upper / shape.lower)))
             low = min(value, max(value / factor, shape.lower))
             high = max(value, min(value * factor, shape.upper))
         amplitude = result.get(name.replace("phase_deg", "amplitude_arcsec"))
-        if amplitude is not None and amplitude.low <= 0.0:  # what may be nothing has any phase
+        if amplitude is not None and amplitude.low <= 0.0:  # no phase without an amplitude
             low, high = value - 180.0, value + 180.0
-        if half > 0.0 and name not in result:  # a shape that several parts share is told once
+        if half > 0.0 and name not in result:  # a shape shared by several parts is reported once
             result[name] = Parameter(value, unit_of(name), low, high, is_size)
     return result
 
@@ -229,11 +231,11 @@ def named_parameters(effect: Effect, columns: Sequence[Column], spread: FloatArr
 def _stepwise(
     estimator: Estimator, fitted: Fitted, effect: Effect, sizes: Mapping[str, Parameter]
 ) -> dict[str, Parameter]:
-    """Sizes and times of steps.
+    """Returns sizes and times of steps.
 
-    A step seen first at one sample happened since the one before. How many samples further off noise may
-    have put it is the place of the largest likelihood of a step in white noise, within
-    `STEP_95` (sigma / size)^2 samples (Yao 1987).
+    A step first seen at one sample happened after the previous one. Noise may shift it by up to
+    `STEP_95` (sigma / size)^2 samples, the 95 % range of the most likely place of a step in white noise
+    (Yao 1987).
     """
     result: dict[str, Parameter] = {}
     time_s = estimator.time_s

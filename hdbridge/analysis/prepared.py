@@ -1,10 +1,11 @@
-"""How large the white noise is, from the spectrum of the error itself: never from the residual of a fit.
+"""Preparation of records: white noise, driving angle, observed error, averaging.
 
-A noise model fitted to a residual takes an effect for noise. Third differences see nothing that is slow, so a
-slow effect of any size leaves them alone; but they take what is fast (a vibration, an encoder's
-interpolation error) for noise, and so are an upper bound. What is fast is a few lines of the spectrum: the
-level between the lines is the noise's own. Both are taken apart for standing and moving, and quantisation is
-a floor. What is slow (wander, drift) is met later by statistics over blocks of seconds.
+White noise is estimated from the spectrum of the error, never from the residual of a fit, because a noise
+model fitted to a residual absorbs effects. Third differences suppress slow effects of any size. They
+include fast ones (vibration, interpolation error of an encoder), so they give an upper bound. Fast effects
+are a few lines of the spectrum, and the level between the lines is the noise. Standing and moving samples
+are treated separately, with quantisation as a floor. Slow noise (wander, drift) is handled later by
+statistics over blocks of seconds.
 """
 
 from __future__ import annotations
@@ -26,14 +27,16 @@ from hdbridge.records.recording import Segment
 from hdbridge.units import ARCSEC_PER_DEG
 
 SEGMENTS = (128, 64, 32)
-"""Samples that are transformed together: the longer, the narrower a line; as many as there are enough of."""
+"""Segment lengths of the spectrum, samples. The longest with enough segments is used, because its lines
+are narrowest."""
 ORDINATES = 150
-"""So many of the spectrum's ordinates know the level to a tenth."""
+"""Number of ordinates that determine the level to 10 %."""
 LOWEST = 0.125
-"""Share of the sampling rate below which a spectrum may be that of something slow."""
+"""Share of the sampling rate below which the spectrum may contain slow effects."""
 QUARTILE = 0.25
-"""White noise has less than 0.29 of its mean power at so many frequencies. Lines have more, and where they
-fill a third of the spectrum the deviation is found a quarter too large."""
+"""Quantile of the spectrum taken as the noise level. White noise has less than 0.29 of its mean power at
+this share of frequencies. If lines fill a third of the spectrum, the deviation comes out a quarter
+too large."""
 
 
 def noise_arcsec(
@@ -44,8 +47,9 @@ def noise_arcsec(
     commanded: bool,
     starts: Sequence[int] = (0,),
 ) -> FloatArray:
-    """Standard deviation of the white noise of each sample, shape (n,); ``starts`` are the first samples of
-    records that were put together.
+    """Returns the standard deviation of the white noise of each sample, shape (n,).
+
+    ``starts`` are the first samples of concatenated records.
     """
     floor = load_count_arcsec / np.sqrt(12.0)
     if not commanded:
@@ -56,16 +60,16 @@ def noise_arcsec(
     for rows, part in ((still, third[inner]), (~still, third[~inner])):
         size = third_deviation(part) if len(part) >= 20 else 0.0
         result[rows] = max(min(size, between_lines(error_arcsec, rows, starts)), floor, 0.02)
-    if np.any(still) and np.any(~still):  # in motion nothing is quieter than at rest
+    if np.any(still) and np.any(~still):  # noise in motion is at least half of that at rest
         result[~still] = max(float(result[~still][0]), 0.5 * float(result[still][0]))
     return result
 
 
 def between_lines(values: FloatArray, rows: BoolArray, starts: Sequence[int] = (0,)) -> float:
-    """Standard deviation of the white noise of ``values`` in some rows, by the level between the lines of
-    their spectra; infinite where too few rows are together.
+    """Returns the white noise of ``values`` in some rows, as a standard deviation.
 
-    Third differences take away what is slow; their spectrum is divided by that of white noise.
+    It is the level between the lines of the spectra; infinite if too few rows are consecutive. Third
+    differences remove slow effects, and their spectrum is divided by that of white noise.
     """
     edge = np.zeros(len(rows) + 1, dtype=bool)
     edge[1:-1] = np.diff(rows)
@@ -77,34 +81,34 @@ def between_lines(values: FloatArray, rows: BoolArray, starts: Sequence[int] = (
             continue
         window = np.hanning(size - 1)[1:-1]
         power = np.abs(np.fft.rfft(np.diff(np.stack(segments), 3, axis=1) * window)) ** 2
-        # What one sample of size one puts into each frequency, summed over the samples.
+        # Power that one unit sample contributes to each frequency, summed over the samples.
         power /= np.sum(np.abs(np.fft.rfft(np.diff(np.eye(size), 3, axis=1) * window)) ** 2, axis=0)
         level = float(np.quantile(power[:, round(LOWEST * size) :], QUARTILE))
         return float(np.sqrt(level / -np.log1p(-QUARTILE)))
     return float("inf")
 
 
-# What was observed, sample by sample, and what drove it: one table, for calibration and diagnosis alike.
+# Samples: observed error and motion, shared by calibration and diagnosis.
 
 
 ON_THE_WAY = ("move", "precondition", "step", "settle")
-"""Legs whose motion serves only to get somewhere: it carries the elastic state, and only rests are used."""
+"""Legs that only move the axis to a place. They carry the elastic state, but only their rests are used."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Measured:
-    """A record, and what is known of its samples; arrays of shape (n,)."""
+    """A record and the known properties of its samples; arrays of shape (n,)."""
 
     record: Record
-    """Nothing is known of the axis between what lies before one of its ``starts`` and what begins there."""
+    """The measured record. The motion of the axis before each of its ``starts`` is unknown."""
     kinds: tuple[str, ...]
-    """What the axis may have been doing, by the names of a recording's legs."""
+    """Kinds of motion, by the names of a recording's legs."""
     kind: IntArray
     """Index into ``kinds``."""
     zero: IntArray
     """Number of the absolute zero, 0 .. zeros - 1."""
     states: Mapping[int, Start] = field(default_factory=dict)
-    """The elastic state at a start where it is known."""
+    """Known elastic states, by first sample."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -113,7 +117,7 @@ class Chain:
 
     rows: slice
     start: Start | None
-    """None where it has to be found by fit."""
+    """Elastic state at the first sample; None if fitted."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -124,13 +128,13 @@ class Samples:
     motion: Motion
     """Driving angle, time, speed, acceleration and the channels that were recorded."""
     rested_deg: FloatArray
-    """Another driving angle that was read alike (`hdbridge.analysis.driving.Driven`)."""
+    """Driving angle under another assumption about rests (`hdbridge.analysis.driving.Driven`)."""
     load_deg: FloatArray
     """Measured load angle."""
     error_arcsec: FloatArray
     """Observed transmission error, about an arbitrary zero."""
     sigma_arcsec: FloatArray
-    """White noise of each."""
+    """White noise of each sample, standard deviation."""
     usable: BoolArray
     kinds: tuple[str, ...]
     kind: IntArray
@@ -138,11 +142,11 @@ class Samples:
     zero: IntArray
     """Number of the absolute zero, 0 .. zeros - 1."""
     chains: tuple[Chain, ...]
-    """Of single samples."""
+    """Chains, by indices of single samples."""
     reading: Reading
-    """How finely the motor's angle was read."""
+    """Resolution of the motor encoder."""
     commanded: bool
-    """Whether the record has the command."""
+    """True if the record has the command."""
 
     def __len__(self) -> int:
         """Number of samples."""
@@ -155,12 +159,12 @@ class Samples:
 
     @property
     def count_deg(self) -> float:
-        """Motor angle of one count of the encoder, 0 where none is seen."""
+        """Motor angle of one count of the encoder; 0 if no quantisation is visible."""
         return self.reading.count_deg
 
     @property
     def motor_deg(self) -> FloatArray:
-        """The driving angle."""
+        """Angle that drives the effects."""
         return self.motion.motor_deg
 
     @property
@@ -176,19 +180,19 @@ class Samples:
         return self.motion.motor_speed_deg_s
 
     def of_kind(self, *names: str) -> BoolArray:
-        """The samples of legs of some names."""
+        """Returns a mask of the samples in legs of these names."""
         return self.among(self.kind, names)
 
     def among(self, kind: IntArray, names: Collection[str]) -> BoolArray:
-        """Which indices into ``kinds`` are those of some names."""
+        """Returns a mask of the entries of ``kind`` that have one of these names."""
         return np.isin(kind, [at for at, each in enumerate(self.kinds) if each in names])
 
     def along(self, chain: Chain) -> Motion:
-        """What drove one of the chains."""
+        """Returns the motion of one chain."""
         return motion_at(self.motion, chain.rows)
 
     def delayed(self, delay_s: float) -> Samples:
-        """The same if the load was read so much later than the motor: with the motor as it was then."""
+        """Returns the samples with the motor angle ``delay_s`` earlier, for a load that was read late."""
         motor = self.motor_deg.copy()
         for chain in self.chains:
             time, angle = self.time_s[chain.rows], self.motor_deg[chain.rows]
@@ -199,12 +203,12 @@ class Samples:
 
 
 def motion_at(motion: Motion, rows: slice | IntArray) -> Motion:
-    """A motion at some of its samples."""
+    """Returns a motion at some of its samples."""
     return of_each(motion, lambda values: values[rows])
 
 
 def of_each(motion: Motion, change: Callable[[FloatArray], FloatArray]) -> Motion:
-    """A motion with each of its arrays changed."""
+    """Applies a function to each array of a motion."""
     given: dict[str, Any] = {each.name: getattr(motion, each.name) for each in fields(motion)}
     changed = {name: change(each) for name, each in given.items() if isinstance(each, np.ndarray)}
     measured = {channel: change(values) for channel, values in motion.measured.items()}
@@ -218,11 +222,11 @@ def observe(
     against_command: bool,
     expected: Callable[[Motion], FloatArray] | None = None,
 ) -> Samples:
-    """Drive, error and noise of all samples, all of them usable.
+    """Derives driving angle, error and noise of all samples, all marked usable.
 
-    ``against_command`` says that the error is that against the driving angle where there is a command, else
-    against the encoder's counts; ``expected`` is what a model predicts, taken off before the noise is looked
-    at. InputError where the record holds what cannot be computed with, or the ratio is not this gear's.
+    With ``against_command`` the error refers to the driving angle if there is a command, else to the
+    encoder's counts. ``expected`` is a model's prediction, subtracted before the noise is estimated.
+    InputError if the record holds unusable values or the ratio does not match it.
     """
     record = measured.record
     name = f"{record.source}: " if record.source else ""
@@ -246,14 +250,14 @@ def observe(
         part.check_ratio(ratio)
     reading = reading_of_all(position, rows_of)
     if target is not None and np.ptp(target) <= 0.0 and np.ptp(position) > 4.0 * reading.count_deg:
-        target = None  # a command that never moves while the motor does is no command
+        target = None  # a constant command with a moving motor is not a command
     pieces = [
         kinematics(position[rows], None if target is None else target[rows], time[rows], reading)
         for rows in rows_of
     ]
     driving, speed, acceleration, rested = (np.concatenate(each) for each in zip(*pieces, strict=True))
     for angle in (driving, rested):
-        angle.setflags(write=False)  # so that where it reverses is worked out once
+        angle.setflags(write=False)  # allows its reversals to be cached
     motion = Motion(driving, time, record.measured, speed, acceleration, load_deg=driving / ratio)
     against = driving if against_command and target is not None else position
     error = (record.load_position_deg - against / ratio) * ARCSEC_PER_DEG
@@ -280,52 +284,52 @@ def observe(
     )
 
 
-# What a diagnosis looks at: the observed error and what drove it, on at most `MOST_POINTS` points.
+# Data of a diagnosis: observed error and motion on at most `MOST_POINTS` points.
 
 
 MOST_POINTS = 100_000
-"""A record of more samples is averaged,"""
+"""Largest number of samples that are used without averaging."""
 AVERAGED_POINTS = 50_000
-"""to at most about so many points: time and memory go with them, and what is slow needs no more."""
+"""Approximate number of points after averaging. It bounds time and memory, and suffices for slow effects."""
 SHORT = 0.77
-"""Share of the mean length of a run that every other one has: the rest have 1.6 times as much."""
+"""Length of every other run as a share of the mean run length; the others have 1.6 times as many samples."""
 LEAST_SAMPLES = 60
 LEAST_SETTLED = 0.2
-"""Of a record with less of it that is not in a fast move, all is used."""
+"""Minimum share of samples outside fast moves; below it, fast moves are used as well."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Observed:
-    """A measurement, prepared."""
+    """A measurement prepared for diagnosis: samples and the points to fit."""
 
     ratio: float
     points: Samples
-    """What is fitted."""
+    """Points to fit: samples, or means over runs of them."""
     full: Samples
     """Every sample."""
     runs: IntArray
     """First sample of each point's run, shape (points,)."""
     motor_count_arcsec: float
-    """One count of the motor encoder at the load; where none is seen, the one that would jitter as much."""
+    """One count of the motor encoder at the load; if none is visible, the count with equal jitter."""
     period_s: float
     """Median time between samples."""
     standstill: bool
     reversals: int
-    """Turns of the driving angle with travel on both sides, each within one record."""
+    """Number of reversals of the driving angle with travel on both sides, within single records."""
     remarks: tuple[str, ...]
-    """What the record lacks, in words."""
+    """Shortcomings of the record, in words."""
 
     def over(self, runs: IntArray) -> Observed:
-        """The same samples averaged over other runs, given by their first samples."""
+        """Returns the same samples averaged over other runs, given by their first samples."""
         return replace(self, points=_averaged(self.full, runs), runs=runs)
 
     @property
     def motion(self) -> Motion:
-        """What drove the axis, point by point."""
+        """Motion that drove the axis, by points."""
         return self.points.motion
 
     def mean(self, values: FloatArray) -> FloatArray:
-        """Means of a quantity of every sample, (n,) or (n, p), over the points: (points,) or (points, p)."""
+        """Averages a quantity of every sample, (n,) or (n, p), over the points: (points,) or (points, p)."""
         return means(values, self.runs)
 
 
@@ -336,8 +340,10 @@ def gather(
     independent_zeros: bool = False,
     expected: Callable[[Motion], FloatArray] | None = None,
 ) -> Observed:
-    """Prepare a record; ``expected`` is what a model predicts, taken off before the noise is looked at.
-    InputError where there is too little of it, or the ratio is not this gear's.
+    """Prepares a record for diagnosis.
+
+    ``expected`` is a model's prediction, subtracted before the noise is estimated. InputError if the record
+    is too short or the ratio does not match it.
     """
     if len(record) < LEAST_SAMPLES:
         raise InputError(
@@ -380,7 +386,7 @@ def gather(
 
 
 def _kinds(time: FloatArray, legs: Sequence[Segment]) -> tuple[tuple[str, ...], IntArray]:
-    """Kind of the leg of each sample."""
+    """Returns the kinds of legs, and the kind of each sample."""
     names = tuple(dict.fromkeys(["other", *(each.kind for each in legs)]))
     kind = np.zeros(len(time), dtype=np.intp)
     for each in legs:
@@ -390,9 +396,9 @@ def _kinds(time: FloatArray, legs: Sequence[Segment]) -> tuple[tuple[str, ...], 
 
 
 def _runs(count: int, starts: Sequence[int]) -> IntArray:
-    """Where runs of consecutive samples begin; none reaches over a start.
+    """Returns the first samples of runs to average; no run crosses a start.
 
-    Their lengths alternate, so that no period is averaged out in all of them.
+    Run lengths alternate, so that no period is averaged out in all runs.
     """
     if count <= MOST_POINTS:
         return np.arange(count, dtype=np.intp)
@@ -405,7 +411,7 @@ def _runs(count: int, starts: Sequence[int]) -> IntArray:
 
 
 def means(values: FloatArray, runs: IntArray) -> FloatArray:
-    """Means of a quantity of every sample, (n,) or (n, p), over runs of samples given by their first ones."""
+    """Averages a quantity of every sample, (n,) or (n, p), over runs, given by their first samples."""
     if len(runs) == len(values):
         return values
     size = np.diff(np.append(runs, len(values)))
@@ -414,9 +420,7 @@ def means(values: FloatArray, runs: IntArray) -> FloatArray:
 
 
 def _averaged(full: Samples, runs: IntArray) -> Samples:
-    """Means over runs of consecutive samples; what is not usable is left out of the means, not of the
-    path.
-    """
+    """Averages samples over runs; a run with unusable samples becomes an unusable point of the path."""
     if len(runs) == len(full):
         return full
     size = np.diff(np.append(runs, len(full)))

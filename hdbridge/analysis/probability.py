@@ -1,8 +1,8 @@
-"""How sure a name is: a logistic formula of what speaks for it and against it.
+"""Probability of a finding: a logistic formula of the evidence for and against it.
 
-Its coefficients stand in `Scales`. They are fitted, with a ridge and each with the sign that it must have, by
-tools/fit_probabilities.py on the findings of two blind suites and of records from formulas, whose causes are
-known; what came of it in cross-validation stands in docs/diagnosis.md.
+`Scales` holds its coefficients. tools/fit_probabilities.py fits them, with a ridge and with fixed signs, on
+the findings of two blind suites and of records from formulas, whose causes are known. docs/diagnosis.md
+reports the cross-validation.
 """
 
 from __future__ import annotations
@@ -18,17 +18,17 @@ from hdbridge.analysis.scales import Scales
 
 @dataclass(frozen=True, slots=True)
 class Context:
-    """What speaks against all findings of a record."""
+    """Evidence against all findings of a record."""
 
     left_arcsec: float
-    """Root mean square that is left beyond the noise."""
+    """Root mean square of the residual beyond the noise."""
     excess: float
     """Chi square per point of the whole fit."""
     unexplained: bool
 
 
 def coefficients(scales: Scales) -> dict[str, float]:
-    """Log odds per unit of each term, by the terms' names."""
+    """Returns the log odds per unit of each term, by name."""
     return {
         "constant": scales.odds,
         "strength": scales.odds_strength,
@@ -40,7 +40,7 @@ def coefficients(scales: Scales) -> dict[str, float]:
 
 
 def features(finding: Finding, largest: float, context: Context, scales: Scales) -> dict[str, float]:
-    """The terms of the formula, by their names; ``largest`` is the chi square of the largest finding."""
+    """Returns the terms of the formula by name; ``largest`` is the chi square of the largest finding."""
     gate = finding.gate or Gate(finding.robust, scales.robust)
     return {
         "constant": 1.0,
@@ -53,7 +53,7 @@ def features(finding: Finding, largest: float, context: Context, scales: Scales)
 
 
 def weighed(findings: Sequence[Finding], context: Context, scales: Scales) -> list[Finding]:
-    """The findings with the probability that each (or one of its aliases) is there."""
+    """Returns the findings with the probability that each (or one of its aliases) is present."""
     largest = max((each.robust for each in findings), default=0.0)
     terms = [features(each, largest, context, scales) for each in findings]
     return [
@@ -63,6 +63,6 @@ def weighed(findings: Sequence[Finding], context: Context, scales: Scales) -> li
 
 
 def probability(terms: Mapping[str, float], scales: Scales) -> float:
-    """By the terms of the formula."""
+    """Returns the probability from the terms of the formula."""
     score = sum(each * terms[name] for name, each in coefficients(scales).items())
     return min(1.0 / (1.0 + math.exp(-score)), scales.surest)

@@ -1,8 +1,7 @@
-"""How finely an angle was read: the counts of its encoder, the digits of its file, its own jitter.
+"""Resolution of an angle: counts of its encoder, digits of its file, and jitter.
 
-An encoder's counts are seen in the record unless the file has kept too few digits, or noise is larger than
-they are. What jitters without the axis having moved is known in either case, from third differences while it
-moves: they see nothing that is slow.
+Counts are visible in the record unless the file has too few digits or the noise is larger. The jitter
+is always known from third differences during motion, which suppress slow changes.
 """
 
 from __future__ import annotations
@@ -15,15 +14,15 @@ from hdbridge.effects import FloatArray
 
 SMALLEST_COUNT_DEG = 1e-5
 ROUNDED_DEG = 1e-6
-"""Changes are whole counts to within this: floats round."""
+"""Tolerance for changes in whole counts, because of floating-point rounding."""
 WHOLE_SHARE = 0.99
-"""So many of the changes have to be whole counts."""
+"""Minimum share of the changes that are whole counts."""
 DIGITS = 9
-"""A file of fewer decimals has its last digit looked for."""
+"""Number of decimals from which a file counts as unrounded."""
 FINEST_COUNT_DEG = 360.0 / 2**20 - ROUNDED_DEG
-"""What is finer is a digit of the file, or a count that its encoder's noise hides."""
+"""Smallest plausible count. Smaller steps are a digit of the file, or a count hidden by noise."""
 COUNTS_PER_DIGIT = 6.0
-"""A count that is to be seen through the rounding of a file is at least so many units of its last digit."""
+"""Smallest count that can be recognised in a rounded file, in units of its last digit."""
 _THIRD = np.sqrt(20.0)
 _MAD = 1.4826
 _UNIFORM = np.sqrt(12.0)
@@ -31,42 +30,43 @@ _UNIFORM = np.sqrt(12.0)
 
 @dataclass(frozen=True, slots=True)
 class Reading:
-    """How finely an angle was read, degrees."""
+    """Resolution of an angle, degrees."""
 
     count_deg: float
-    """One count of the encoder; 0 where none is seen."""
+    """One count of the encoder; 0 if none is visible."""
     jitter_deg: float
-    """Standard deviation of what a reading is off by, that of rounding to counts included."""
+    """Standard deviation of a reading's error, including quantisation."""
 
     @property
     def resolution_deg(self) -> float:
-        """The count; where none is seen, the one that would jitter as much."""
+        """The count; if none is visible, the count with equal jitter."""
         if self.count_deg >= FINEST_COUNT_DEG:
             return self.count_deg
         return max(self.count_deg, self._alike_deg)
 
     @property
     def unaided_deg(self) -> float:
-        """The same where no command distinguishes a motor that is shaken from a reading that is noisy: noise
-        that is larger than the counts bounds it, too.
+        """The resolution without a command, when motor vibration and reading noise are not separable.
+
+        Noise larger than the counts then limits it too.
         """
         return self._alike_deg if self._alike_deg > 2.0 * self.count_deg else self.resolution_deg
 
     @property
     def _alike_deg(self) -> float:
-        """The count that would jitter as much."""
+        """The count with equal jitter."""
         return float(_UNIFORM * self.jitter_deg)
 
 
 def reading_of(angle_deg: FloatArray) -> Reading:
-    """How finely an angle was read, shape (n,)."""
+    """Returns the resolution of an angle, shape (n,)."""
     return Reading(quantum_deg(angle_deg), jitter_deg(angle_deg))
 
 
 def jitter_deg(angle_deg: FloatArray) -> float:
-    """Standard deviation of a reading's own error, degrees; 0 where it is too short or never moves.
+    """Returns the standard deviation of the reading error, degrees; 0 if too short or without motion.
 
-    From third differences while it moves, without the largest of them: those are motion that begins or ends.
+    It uses third differences during motion, without the largest, which are the start or end of a motion.
     """
     if len(angle_deg) < 8:
         return 0.0
@@ -83,37 +83,37 @@ def jitter_deg(angle_deg: FloatArray) -> float:
 
 
 def median_deviation(off: FloatArray) -> float:
-    """Standard deviation of Gaussian values about zero by the median of their sizes: a few wild ones do not
-    matter.
+    """Returns the standard deviation of Gaussian values about zero from the median of their sizes.
+
+    Robust against a few outliers.
     """
     return float(_MAD * np.median(np.abs(off)))
 
 
 def third_deviation(third: FloatArray) -> float:
-    """Standard deviation of white noise from its third differences."""
+    """Returns the standard deviation of white noise from its third differences."""
     return float(median_deviation(third) / _THIRD)
 
 
 def quantum_deg(angle_deg: FloatArray) -> float:
-    """The count in which an angle was read, degrees; 0 where it moves in no counts that can be seen.
+    """Returns the count of an angle, degrees; 0 if no counts are visible.
 
-    Changes of a counted angle, and the differences between them, are whole multiples of the count; the
-    smallest of them is the count itself if nearly all changes are multiples of it. Where a file has rounded
-    its numbers they are so to within the last digit.
+    Changes of a counted angle, and their differences, are multiples of the count. The smallest difference is
+    the count if nearly all changes are multiples of it, within the last digit of a rounded file.
     """
     exact = _exact(angle_deg)
     digit = last_digit(angle_deg)
     if exact > 1.5 * digit or not digit:
         return exact
-    # What is seen exactly is the last digit of the file, or nothing.
+    # Exact steps are those of the last digit of the file, or there are none.
     return _through_rounding(angle_deg, digit)
 
 
 def last_digit(angle_deg: FloatArray) -> float:
-    """The unit of the last digit that a file has kept of its largest values; 0 where it kept them all.
+    """Returns the unit of the last digit of a file's largest values; 0 if unrounded.
 
-    Programs write so many significant digits or so many decimals; either way the largest values are the
-    coarsest.
+    Programs write a fixed number of significant digits or of decimals; in both cases the largest values are
+    the coarsest.
     """
     size = np.abs(angle_deg)
     largest = float(np.max(size, initial=0.0))
@@ -142,7 +142,7 @@ def _exact(angle_deg: FloatArray) -> float:
 
 
 def _through_rounding(angle_deg: FloatArray, digit_deg: float) -> float:
-    """The count where each reading was rounded to ``digit_deg``: changes lie in clusters, a count apart."""
+    """Returns the count of readings rounded to ``digit_deg``: changes form clusters one count apart."""
     steps = np.sort(np.abs(np.diff(angle_deg)))
     if len(steps) < 2:
         return 0.0
@@ -154,7 +154,7 @@ def _through_rounding(angle_deg: FloatArray, digit_deg: float) -> float:
     count = float(np.median(apart[apart < 1.5 * np.min(apart)]))
     if count < COUNTS_PER_DIGIT * digit_deg:
         return 0.0
-    # From the smallest change up: each tells the count better, as long as its own number is certain.
+    # From the smallest change up, each improves the count, as long as its multiple is certain.
     products = squares = 0.0
     for size in sizes[sizes > 0.5 * count]:
         whole = round(size / count)
@@ -168,18 +168,18 @@ def _through_rounding(angle_deg: FloatArray, digit_deg: float) -> float:
     return count if len(near) and np.mean(off < 1.5 * digit_deg) > WHOLE_SHARE else 0.0
 
 
-# A clock that is coarser than the sampling: several samples have one time, though the axis has moved on.
+# Clocks coarser than the sampling, so that several samples have the same time during motion.
 
 
 def coarse(time_s: FloatArray, motor_deg: FloatArray) -> int:
-    """How many samples have the time of the one before and another motor angle: which no axis can do."""
+    """Counts the samples with the time of the previous one and another motor angle, which is impossible."""
     return int(np.count_nonzero((np.diff(time_s) == 0.0) & (np.diff(motor_deg) != 0.0)))
 
 
 def spread(time_s: FloatArray) -> FloatArray:
-    """The times of samples that came evenly from one tick of their clock to the next, shape (n,).
+    """Returns the times of samples spread evenly between the ticks of their clock, shape (n,).
 
-    The first sample of each tick keeps its time; what follows the last tick goes on as what came before it.
+    The first sample of each tick keeps its time; after the last tick the previous spacing continues.
     """
     ticks = np.flatnonzero(np.diff(time_s, prepend=-np.inf) > 0.0)
     if len(ticks) < 2:

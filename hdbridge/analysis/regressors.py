@@ -1,4 +1,4 @@
-"""Columns of effects over all samples of a record, averaged as its observations are."""
+"""Columns of effects over all samples of a record, averaged like its observations."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from hdbridge.analysis.separable import unit
 from hdbridge.effects import Channel, Effect, FloatArray, Motion, Start
 
 KEPT = 64
-"""What is asked for again and again is kept; so many, for they are large."""
+"""Size of the cache of columns, which are large."""
 
 Starts = tuple[Start, ...]
-"""The elastic state in which each motion begins."""
+"""Elastic state at the start of each motion."""
 
 
 class Regressors:
-    """Regressors of any effect along motions that follow one another; rows are means over samples."""
+    """Regressors of effects along consecutive motions; rows are means over samples."""
 
     def __init__(
         self, motions: Sequence[Motion], mean: Callable[[FloatArray], FloatArray], rows: int
@@ -31,13 +31,13 @@ class Regressors:
         self._recent: OrderedDict[tuple[Effect, Starts], FloatArray] = OrderedDict()
 
     def columns(self, effect: Effect, starts: Starts) -> FloatArray:
-        """Regressors of an effect, arcsec, shape (rows, p); not to be written to."""
+        """Returns the regressors of an effect, arcsec, shape (rows, p); read-only."""
         if not (effect.shape or effect.carries or effect.curved) and not _counts(effect):
-            # The same in every fit.
+            # These columns are the same in every fit.
             pieces = [self._of_piece(unit(each), starts) for each in effect.pieces()]
             return pieces[0] if len(pieces) == 1 else side_by_side(pieces, self._rows)
-        # Columns do not depend on the coefficients; effects carried by another (its loop, its orders) do
-        # depend on those, and these are fields of them.
+        # Columns do not depend on an effect's own coefficients, but on the loop and orders that it carries
+        # as fields.
         key = (unit(effect), starts)
         if key in self._recent:
             self._recent.move_to_end(key)
@@ -48,19 +48,19 @@ class Regressors:
         return columns
 
     def told(self, effects: Sequence[Effect], starts: Starts) -> FloatArray:
-        """What effects say together, arcsec, shape (rows,)."""
+        """Returns the sum of the effects, arcsec, shape (rows,)."""
         parts = (self.columns(each, starts) @ each.coefficients() for each in effects)
         return np.asarray(sum(parts, start=np.zeros(self._rows)))
 
     def predicted(self, effects: Sequence[Effect], starts: Starts) -> FloatArray:
-        """The same for every sample, shape (n,)."""
+        """Returns the sum of the effects at every sample, shape (n,)."""
         along = zip(self.motions, starts, strict=True)
         return np.concatenate(
             [sum((each.predict(*one) for each in effects), start=np.zeros(len(one[0]))) for one in along]
         )
 
     def along(self, motions: Sequence[Motion]) -> None:
-        """Go on with motions that differ from the present ones in the predicted load angle only."""
+        """Switches to motions that differ from the present ones only in the predicted load angle."""
         self.motions = tuple(motions)
         for each in [each for each in self._recent if _counts(each[0])]:
             del self._recent[each]
@@ -77,5 +77,5 @@ class Regressors:
 
 
 def _counts(effect: Effect) -> bool:
-    """Whether it depends on the predicted load angle, which a fit exchanges."""
+    """Returns True if the effect depends on the predicted load angle, which a fit updates."""
     return Channel.LOAD_ANGLE in effect.channels

@@ -1,9 +1,9 @@
-"""Response of the load to its correction, from runs at constant speed, and the filter that makes up for it.
+"""Response of the load to its correction, from runs at constant speed, and the compensating filter.
 
-A correction u of the load target moves the load by G u. The transmission error moves it by E, whether or not
-it is corrected. With a correction c, what remains is E - G F c, with F the filter (1 without). From runs
-without and with correction, per order and speed, ``W = F E / (E - rest)`` is the filter that leaves nothing.
-The amplitudes of the model cancel. W is a function of the frequency alone, so that one filter along the path
+A correction u of the load target moves the load by G u. The transmission error moves it by E, with or
+without correction. With a correction c and the filter F (1 without one), the rest is E - G F c. From runs
+without and with correction, per order and speed, ``W = F E / (E - rest)`` is the filter that cancels the
+error. The model's amplitudes drop out. W depends only on frequency, so one filter along the path
 has the right gain and phase at every speed.
 """
 
@@ -34,12 +34,12 @@ MIN_Z_SCORE = 4.0
 MIN_DEVIATION = 0.01
 """Smallest deviation of a point, as a share: the response is not exactly linear."""
 MIN_APPLIED = 0.05
-"""Gain of a filter below which its trial says nothing."""
+"""Minimum gain of a filter for its trial to be used."""
 MAX_UNCERTAINTY = 0.5
 """95 % half width, as a share of the gain, above which a frequency counts as unknown: the correction might
 leave more than half of the order."""
 BIN_HZ = 0.5
-"""Points that are closer are merged, or closer than `BIN_SHARE` of their frequency."""
+"""Points closer than this, or closer than `BIN_SHARE` of their frequency, are merged."""
 BIN_SHARE = 0.01
 MAX_GAP = 0.12
 """Largest gap between two points of a known range, as a share of the SYNC rate."""
@@ -53,9 +53,10 @@ REFINEMENTS = 5
 FADE = 0.12
 """Width over which the filter falls to zero beyond the last point, as a share of the SYNC rate."""
 UNKNOWN = 0.5
-"""Response that is expected where none is known, per transmission error."""
+"""Assumed response, relative to the transmission error, at frequencies without data."""
 DIFFERENT = 0.1
-"""Smallest rms share by which two responses count as different. The correction leaves that much more."""
+"""Smallest relative rms difference at which two responses count as different. The correction leaves that
+much more error."""
 DIFFERENT_LAG = 0.15
 """Smallest share by which two following lags count as different."""
 LAG_NOISE_MS = 0.5
@@ -75,19 +76,20 @@ class Limits(NamedTuple):
     acceleration_deg_s2: float
 
     def amplitude_arcsec(self, frequency_hz: float) -> float:
-        """Amplitude of the largest order that reaches this frequency."""
+        """Returns the amplitude of the largest order that reaches this frequency."""
         return max((each for top_hz, each in self.orders if top_hz >= frequency_hz), default=0.0)
 
     def excess(self, gain: float, frequency_hz: float) -> float:
-        """Factor by which the largest order takes more than half of the permitted size or slew; 1 if not."""
+        """Returns the factor by which the largest order exceeds half of the permitted size or slew, or 1."""
         reach_arcsec = gain * self.amplitude_arcsec(frequency_hz)
         slew_arcsec_s = math.tau * frequency_hz * reach_arcsec
         return max(1.0, 2.0 * reach_arcsec / self.maximum_arcsec, 2.0 * slew_arcsec_s / self.slew_arcsec_s)
 
     def full_speed_deg_s(self, reach_arcsec: float) -> float:
-        """Speed from which a filter works in full that makes a correction this large.
+        """Returns the load speed from which a filter with this largest correction works in full, deg/s.
 
-        While it fades out in the slowest part of a stop, it takes `FADE_SHARE` of the load's speed at most.
+        While the correction fades out at the end of a stop, it takes at most `FADE_SHARE` of the load's
+        speed.
         """
         return math.sqrt(2.0 * self.acceleration_deg_s2 * reach_arcsec / ARCSEC_PER_DEG / FADE_SHARE)
 
@@ -107,12 +109,15 @@ class Harmonics(NamedTuple):
 
 
 def order_hz(order: ArrayLike, speed_deg_s: float, ratio: float) -> FloatArray:
-    """Frequency of a motor order at a load speed, Hz, shape of ``order``."""
+    """Returns the frequency of a motor order at a load speed, Hz, shape of ``order``."""
     return np.asarray(order) * (abs(speed_deg_s) * ratio / DEG_PER_TURN)
 
 
 def harmonics(run: EvenRun, orders: Sequence[int], ratio: float) -> Harmonics:
-    """Orders of the load error over the uncompensated motor target; InputError if the run is too short."""
+    """Fits orders to the load error over the uncompensated motor target.
+
+    InputError if the run is too short.
+    """
     if len(run.samples) < 4 * (2 * len(orders) + 2):
         raise InputError(
             f"a run at {run.speed_deg_s:g} deg/s has only {len(run.samples)} samples at constant speed: "
@@ -147,7 +152,7 @@ class Trial:
 
 
 def following_lag_s(runs: Iterable[Harmonics]) -> float:
-    """Lag of the load behind its target; the hysteresis's offset per direction is fitted as well."""
+    """Fits the lag of the load behind its target, with the hysteresis offset of each direction."""
     given = list(runs)
     speed = np.array([each.speed_deg_s for each in given])
     mean = np.array([each.mean_arcsec for each in given]) / ARCSEC_PER_DEG
@@ -179,10 +184,10 @@ def response_of(
     highest_hz: float = math.inf,
     explore: bool = False,
 ) -> Response | None:
-    """Response and filter from runs without and with correction; None if no frequency is known.
+    """Computes response and filter from runs without and with correction; None if no frequency is known.
 
-    Nothing beyond ``highest_hz`` is corrected in full. With ``explore`` the filter continues beyond the known
-    range with its last gain: a run with it shows the response there.
+    Above ``highest_hz`` nothing is corrected in full. With ``explore`` the filter continues beyond the known
+    range with its last gain, so that a run with it shows the response there.
     """
     lag_s = following_lag_s(none)
     points = _merged(_found(none, trials, orders, ratio, cycle_s, lag_s))
@@ -212,14 +217,14 @@ def _found(
     cycle_s: float,
     lag_s: float,
 ) -> list[_Found]:
-    """Response per order and speed, from every trial that shows it."""
+    """Returns the response per order and speed from every trial that shows it, sorted by frequency."""
     found: list[_Found] = []
     for trial in trials:
         for before, after in zip(none, trial.runs, strict=True):
             hertz = order_hz(orders, before.speed_deg_s, ratio)
             applied = np.ones(len(orders)) if trial.filter is None else gain(trial.filter, hertz, cycle_s)
             error, effect = before.amplitudes, before.amplitudes - after.amplitudes
-            if before.speed_deg_s < 0.0:  # the angle runs against the time
+            if before.speed_deg_s < 0.0:  # the angle decreases with time
                 error, effect = error.conj(), effect.conj()
             clear = abs(error) > MIN_Z_SCORE * before.deviations
             clear &= (hertz < STOP / cycle_s) & (abs(applied) > MIN_APPLIED)
@@ -233,7 +238,7 @@ def _found(
 
 
 def _merged(found: Sequence[_Found]) -> list[_Found]:
-    """Neighbours in one; what scatters more than its noise is known less well."""
+    """Merges neighbouring points; scatter beyond the noise increases their deviation."""
     groups: list[list[_Found]] = []
     for each in found:
         first_hz = groups[-1][0].frequency_hz if groups else -math.inf
@@ -254,9 +259,10 @@ def _mean(group: Sequence[_Found]) -> _Found:
 
 
 def _known(points: Sequence[_Found], highest_hz: float, max_gap_hz: float, limits: Limits) -> list[_Found]:
-    """The points from zero up to the first gap or doubt; the last one may lie above ``highest_hz``.
+    """Returns the points from zero up to the first gap; the last one may lie above ``highest_hz``.
 
-    A response is raised if its inverse would exceed the limits: such an order is corrected in part.
+    Uncertain points are skipped. If the inverse of a response would exceed the limits, the response is
+    raised, so that the order is corrected in part.
     """
     kept: list[_Found] = []
     before_hz = 0.0
@@ -272,7 +278,7 @@ def _known(points: Sequence[_Found], highest_hz: float, max_gap_hz: float, limit
 
 
 def difference(one: Response, other: Response) -> float:
-    """Rms relative difference of two responses over their known range, in excess of their noise."""
+    """Returns the rms relative difference of two responses over their range, less their noise."""
     hertz = np.array([each for each in other.frequency_hz if each <= min(one.known_to_hz, other.known_to_hz)])
     if not hertz.size:
         return 0.0
@@ -292,7 +298,7 @@ def agree(one: Response, other: Response) -> bool:
 
 
 def _at(response: Response, hertz: FloatArray) -> tuple[ComplexArray, FloatArray]:
-    """Response and uncertainty at some frequencies, the following lag included; linear between the points."""
+    """Interpolates response (with the following lag) and uncertainty linearly at some frequencies."""
     known = np.array(response.frequency_hz)
     late = np.exp(-2j * math.pi * response.following_lag_ms / 1000.0 * known)
     values = np.array(response.gain) * np.exp(1j * np.radians(response.phase_deg)) * late
@@ -301,7 +307,7 @@ def _at(response: Response, hertz: FloatArray) -> tuple[ComplexArray, FloatArray
 
 
 def gain(lead: LeadFilter, frequency_hz: FloatArray, cycle_s: float) -> ComplexArray:
-    """Complex gain of a filter, shape of ``frequency_hz``."""
+    """Returns the complex gain of a filter, shape of ``frequency_hz``."""
     hertz = np.asarray(frequency_hz, dtype=float)
     ahead_s = (lead.lead_cycles - np.arange(len(lead.weights)) / lead.per_cycle) * cycle_s
     total: ComplexArray = _turned(hertz, ahead_s) @ np.array(lead.weights)
@@ -321,10 +327,10 @@ def _denominator(hertz: FloatArray, feedback: FloatArray, cycle_s: float) -> Com
 def _filter(
     kept: Sequence[_Found], edge_hz: float, lag_s: float, cycle_s: float, fastest_hz: float, limits: Limits
 ) -> LeadFilter:
-    """Least squares on the relative error: what the inverse response makes 1 up to ``edge_hz``, 0 beyond.
+    """Fits the filter by least squares on the relative error: the inverse response to ``edge_hz``, 0 beyond.
 
-    Between the points the inverse response without its poles is interpolated: it has no peak that is
-    narrower than their distance.
+    Between the points the inverse response without its poles is interpolated, because it has no peak narrower
+    than their distance.
     """
     per_cycle = min(max(2, math.ceil((fastest_hz + edge_hz) * cycle_s)), 4)
     lag_cycles = math.ceil(max(0.0, lag_s) / cycle_s) + LAG_CYCLES
@@ -336,13 +342,13 @@ def _filter(
     hertz, beyond = np.linspace(0.0, edge_hz, 160), np.linspace(edge_hz, 0.5 * per_cycle / cycle_s, 200)[1:]
     weight = 1.0 / (1.0 + 3.0 * np.interp(hertz, points_hz, trust))
     known = np.array([0.0, *points_hz])
-    # Beyond the edge the axis is not known: the filter falls to zero, steeply and then for good.
+    # Beyond the edge the response is unknown: the filter falls steeply to zero and stays there.
     fade = np.clip((beyond - edge_hz) / (FADE / cycle_s), 0.0, 1.0)
     inside, outside = _turned(hertz, ahead_s), _turned(beyond, ahead_s)
     late = _turned(hertz, -cycle_s * np.arange(1, POLES + 1))
     feedback = np.zeros(POLES)
     for refined in range(REFINEMENTS + 1):
-        # The poles are found in plain lines between the points; then they are taken out of the lines.
+        # The poles are fitted to a plain interpolation, then removed before the final interpolation.
         smooth = feedback if refined == REFINEMENTS else np.zeros(POLES)
         flat, rest = inverse * _denominator(points_hz, smooth, cycle_s), 1.0 + float(smooth.sum())
         size = np.interp(hertz, known, np.log([rest, *abs(flat)]))
@@ -376,8 +382,9 @@ def _filter(
 
 
 def _least_squares(within: ComplexArray, without: ComplexArray, goal: ComplexArray) -> FloatArray:
-    """Real coefficients with which ``within`` is ``goal`` and ``without`` is zero; both have a row per
-    frequency.
+    """Returns real coefficients c with ``within @ c`` near ``goal`` and ``without @ c`` near zero.
+
+    Both matrices have one row per frequency.
     """
     count = within.shape[1]
     rows = np.vstack([within.real, within.imag, without.real, without.imag, REGULARISATION * np.eye(count)])
@@ -387,9 +394,9 @@ def _least_squares(within: ComplexArray, without: ComplexArray, goal: ComplexArr
 
 
 def _stable(feedback: FloatArray, points_hz: FloatArray, cycle_s: float) -> FloatArray:
-    """The feedback with stable poles whose peaks are no narrower than the distance of the points there.
+    """Returns the feedback with stable poles, whose peaks are no narrower than the local point distance.
 
-    A pole outside of the unit circle is mirrored. There is none beyond the last point.
+    A pole outside the unit circle is mirrored. Beyond the last point there are no poles.
     """
     poles = np.roots(np.array([1.0, *feedback]))
     hertz = np.abs(np.angle(poles)) / (2.0 * math.pi * cycle_s)

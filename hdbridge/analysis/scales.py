@@ -1,8 +1,8 @@
-"""The numbers that decide what a diagnosis names, in one table, each with its unit and where it comes from.
+"""Thresholds of the diagnosis in one table, each with its unit and source.
 
-A fit has no opinion: these have. They are handed to a diagnosis and stand in its JSON, so that an answer
-says by which numbers it was reached. At its ``neutral`` value a number decides nothing; tools/ablation.py
-sets each to it in turn and counts what that costs.
+They are passed to a diagnosis and included in its JSON, so that a result documents its criteria. At its
+``neutral`` value a threshold has no effect; tools/ablation.py sets each to it in turn and measures the
+loss.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ def _scale(value: float, unit: str, neutral: float, source: str) -> Any:
 
 @dataclass(frozen=True, kw_only=True)
 class Scales:
-    """The deciding numbers of a diagnosis; `described` gives their units and sources."""
+    """Thresholds of a diagnosis; `described` gives their units and sources."""
 
-    # What a cause has to earn.
+    # Required gain of a cause.
     penalty: float = _scale(
         11.5, "chi square per parameter", 0.0, "Schwarz 1978: the logarithm of 100,000 points"
     )
@@ -43,7 +43,7 @@ class Scales:
         6.0, "chi square of block sums per further parameter", 0.0, "95 % of chi square of two"
     )
 
-    # Looking again.
+    # Termination and revision of the search.
     few: float = _scale(3.0, "causes", math.inf, "more mean something that is none of them")
     large: float = _scale(4.0, "chi square per point", 1.0, "twice the noise")
     slow: float = _scale(
@@ -77,7 +77,7 @@ class Scales:
         4.0, "standard deviations of calibration and fit", 0.0, "6 in 100,000 by chance"
     )
 
-    # Names that look alike.
+    # Look-alikes.
     in_step: float = _scale(
         0.85, "share of a wave's squares", 2.0, "waves a fifth of a period apart explain 0.87 of each other"
     )
@@ -89,7 +89,7 @@ class Scales:
         "k lines off, a wave switched on has 1 / (pi k) of its amplitude: of 78 arcsec the floor",
     )
 
-    # What is left.
+    # Unexplained residual.
     plain_arcsec: float = _scale(1.0, "arcsec", math.inf, "twice the floor, for what has no name")
     shadow: float = _scale(2.0, "times the square of what is left", 0.0, "a name does more than it misses")
     episodes: float = _scale(
@@ -103,7 +103,7 @@ class Scales:
         "sidebands of a full modulation are a half each, the third partial of a sawtooth is a third",
     )
 
-    # How sure a name is (`hdbridge.analysis.probability`): 128 names, 115 of them right.
+    # Probability of a finding (`hdbridge.analysis.probability`): fitted to 128 findings, 115 of them right.
     odds: float = _scale(-2.80, "log odds", 0.0, FITTED)
     odds_strength: float = _scale(1.88, "log odds per log of robust evidence over the needed", 0.0, FITTED)
     odds_rank: float = _scale(0.42, "log odds per decade of the largest one's chi square", 0.0, FITTED)
@@ -120,7 +120,7 @@ class Scales:
     )
 
     def described(self) -> dict[str, dict[str, float | str]]:
-        """Name, value, unit and source of each, for machines."""
+        """Returns value, unit and source of each threshold by name, for JSON."""
         return {
             each.name: {
                 "value": getattr(self, each.name),

@@ -1,9 +1,9 @@
-"""Screening: every candidate's score on the residual, with the whole present hypothesis projected out.
+"""Screening: scores of all candidates on the residual, with the present hypothesis projected out.
 
-One matrix product for all columns: with Q an orthonormal basis of the hypothesis's tangent and C a
-candidate's columns, C'C - (Q'C)'(Q'C) is what is left of it, and its score is the chi square that it would
-gain. So a grid of hundreds of shapes costs no more than one fit. A column of which less than `SHARE_LEFT` is
-left is not in the record.
+One matrix product serves all columns. With Q an orthonormal basis of the hypothesis's tangent and C a
+candidate's columns, C'C - (Q'C)'(Q'C) is the remaining Gram matrix, and the score is the predicted fall in
+chi square. A grid of hundreds of shapes thus costs no more than one fit. A direction with a remaining
+share below `SHARE_LEFT` is not visible in the record.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ SHARE_LEFT = 1e-4
 
 
 def candidates(observations: Observations, base: Sequence[Effect], screened: bool = True) -> list[Effect]:
-    """What the catalogue proposes for a record and the model ``base``, over grids of shapes; all whose
-    channels are there. Their coefficients are of no account.
+    """Returns the catalogue's candidates for a record and the model ``base``, over grids of shapes.
 
-    To be ``screened`` are those that would be an addition to the model, and that a grid covers; else all.
+    Only those whose channels were recorded; their coefficients have no meaning. With ``screened``, only
+    additions to the model that a grid covers.
     """
     kinds = [CATALOGUE[each] for each in causes()]
     if screened:
@@ -36,26 +36,26 @@ def candidates(observations: Observations, base: Sequence[Effect], screened: boo
 
 
 def proposed(kind: type[Effect], observations: Observations, base: Sequence[Effect] = ()) -> list[Effect]:
-    """What a kind proposes for a record and the model ``base``, where its channels are there."""
+    """Returns a kind's proposals for a record and the model ``base``, if its channels were recorded."""
     available = observations.motion.available()
     return [each for each in kind.proposals(observations, base) if not unmet([each], available)]
 
 
 @dataclass(frozen=True, slots=True)
 class Score:
-    """What a candidate promises."""
+    """Predicted gain of a candidate."""
 
     effect: Effect
     gain: float
-    """Chi square that it would take away, linearised."""
+    """Predicted fall in chi square, linearised."""
     freedom: int
-    """Directions of it that the hypothesis leaves."""
+    """Number of directions that the hypothesis does not span."""
     share: float
-    """Largest share of a column's square that the hypothesis leaves."""
+    """Largest share of a column's square outside the hypothesis."""
 
 
 class Screen:
-    """The weighted columns of all candidates, made once."""
+    """Weighted columns of all candidates, computed once."""
 
     def __init__(self, estimator: Estimator, candidates: Sequence[Effect], start: Start) -> None:
         self._candidates = tuple(candidates)
@@ -69,7 +69,7 @@ class Screen:
         self._grams = [block.T @ block for block in blocks]
 
     def scores(self, fitted: Fitted) -> list[Score]:
-        """Each candidate's, in their order."""
+        """Returns the score of each candidate, in their order."""
         fit, matrix = fitted.linearised, self._matrix
         shadow = fit.basis.T @ matrix
         moment = matrix.T @ fit.residual - shadow.T @ fit.slack
@@ -80,12 +80,12 @@ class Screen:
 
 
 def score_of(effect: Effect, columns: FloatArray, fitted: Fitted) -> Score:
-    """The score of one candidate from its weighted columns."""
+    """Scores one candidate by its weighted columns."""
     return _score(effect, np.sum(columns**2, axis=0), *fitted.linearised.left(columns))
 
 
 def _score(effect: Effect, size: FloatArray, gram: FloatArray, moment: FloatArray) -> Score:
-    """From the squares of its columns, and what a hypothesis leaves of their Gram matrix and moment."""
+    """Scores from the squares of the columns, and the remaining Gram matrix and moment."""
     seen = size > 0.0
     if not np.any(seen):
         return Score(effect, 0.0, 0, 0.0)
@@ -100,27 +100,26 @@ def _score(effect: Effect, size: FloatArray, gram: FloatArray, moment: FloatArra
     return Score(effect, float(np.sum(inner**2 / values[kept])), int(np.count_nonzero(kept)), share)
 
 
-# Matched filters: forms whose place no grid covers, each found over all places at once (`Sought`).
+# Matched filters for shapes whose place no grid covers, evaluated at all places at once (`Sought`).
 
 
 BINS = 1 << 17
 DEFECT_BINS = 3600
 HALF_WIDTHS_DEG = (0.5, 1.2, 2.5, 4.0, 6.5, 10.0)
-"""Grids on which places are looked for; a fit moves what was found. None of the numbers here decides a name:
-what is found has to earn its place as any cause does (`Scales`).
-"""
+"""Grids of the searches by place. A fit refines the result, and `Scales` decides whether it is reported."""
 LEAST_LINES = 256
-"""Periods per turn of the coarsest encoder that is interpolated."""
+"""Smallest number of periods per turn of an encoder with interpolation."""
 LINE_OVER_MEAN = 12.0
-"""Power of a line that is worth a fit: it gains twice that in chi square, half of what a cause must earn."""
+"""Minimum power of a line, relative to the mean, for a fit. It gains twice that in chi square, half of the
+required gain."""
 LOWEST_HZ = 0.3
-"""Below it a line is a motion's own."""
+"""Lowest frequency of a tone; slower lines belong to the motion itself."""
 PEAKS = 3
-"""So many of the highest lines are fitted."""
+"""Number of highest lines to fit."""
 
 
 def filtered(estimator: Estimator, fitted: Fitted) -> list[Effect]:
-    """Of each kind that is sought, those that promise most on what a fit leaves."""
+    """Returns the most promising candidates of the kinds that are found by matched filters."""
     residual, load_deg = fast_residual(estimator, fitted)
     estimator.with_load_angle(load_deg)
     present = fitted.hypothesis.effects
@@ -150,7 +149,7 @@ def filtered(estimator: Estimator, fitted: Fitted) -> list[Effect]:
 
 
 def step(estimator: Estimator, fitted: Fitted) -> Iterator[tuple[float]]:
-    """The time (s) of the best single step, at any sample; exact, with the hypothesis projected out."""
+    """Yields the time (s) of the best single step, exactly, with the hypothesis projected out."""
     weight, basis = estimator.weight, fitted.linearised.basis
     after = np.cumsum((weight * fitted.residual)[::-1])[::-1]
     square = np.cumsum((weight**2)[::-1])[::-1]
@@ -165,12 +164,12 @@ def step(estimator: Estimator, fitted: Fitted) -> Iterator[tuple[float]]:
     gain = np.where(usable, after**2 / np.maximum(left, 1e-300), 0.0)
     place = int(np.argmax(gain))
     data = estimator.data
-    first = data.runs[estimator.index[place]]  # of the samples of the point at which it is seen
+    first = data.runs[estimator.index[place]]  # first sample of the point that shows it
     yield (float(data.full.time_s[first]),)
 
 
 def bump(estimator: Estimator, fitted: Fitted) -> Iterator[tuple[float, float]]:
-    """Centre and half width (degrees of the load) of the best bump; it may not cover most of the travel."""
+    """Yields centre and half width (load degrees) of the best bump; it must not cover most of the travel."""
     ratio = estimator.data.ratio
     load = estimator.motion.motor_deg[estimator.index] / ratio
     place = np.floor(np.mod(load, DEG_PER_TURN) * (DEFECT_BINS / DEG_PER_TURN)).astype(np.intp) % DEFECT_BINS
@@ -208,11 +207,11 @@ def _bump(half_deg: float) -> FloatArray:
 
 
 def fast_residual(estimator: Estimator, fitted: Fitted) -> tuple[FloatArray, FloatArray]:
-    """Residual of every sample, and the predicted load angle there; zero where it is not usable."""
+    """Returns the residual of every sample (0 if not usable), clipped, and the predicted load angle."""
     full = estimator.data.full
     predicted = estimator.predicted(fitted)
     residual = np.where(full.usable, full.error_arcsec - predicted, 0.0)
-    # What is slow is none of the business of those who ask for this, and would leak into their peaks.
+    # The scale of the clipping comes from fast variations only.
     window = 9
     smooth = np.convolve(residual, np.ones(window) / window, mode="same")
     spread = 6.0 * median_deviation(residual - smooth) + 1e-9
@@ -223,9 +222,9 @@ def fast_residual(estimator: Estimator, fitted: Fitted) -> tuple[FloatArray, Flo
 def tones(
     estimator: Estimator, residual: FloatArray, present: Sequence[Effect] = ()
 ) -> Iterator[tuple[float]]:
-    """Frequencies (Hz) of the highest lines over absolute time, apart from the feet of those ``present``.
+    """Yields the frequencies (Hz) of the highest lines in time, outside the sidelobes of those ``present``.
 
-    A line that swells and fades, as the axis stands or moves, has feet, and is one source all the same.
+    A line whose amplitude varies between rest and motion has sidelobes, but is a single source.
     """
     data = estimator.data
     time_s = data.full.time_s
@@ -237,8 +236,8 @@ def tones(
     grid = np.bincount(slot, residual, length)
     power = np.abs(np.fft.rfft(grid, size)) ** 2
     frequency = np.arange(len(power)) / (size * data.period_s)
-    # Less than two periods of it are a bend, not a frequency. Moves that are alike bend alike: only what lies
-    # about one zero counts together.
+    # Fewer than two periods are a bend, not a frequency. Similar moves bend alike, so the length of data
+    # about one zero counts.
     unbroken = min(length, int(np.max(np.bincount(data.full.zero))))
     power[frequency < max(LOWEST_HZ, 2.0 / (unbroken * data.period_s))] = 0.0
     lobe = max(4, size // length * 4)
@@ -250,7 +249,7 @@ def tones(
 
 
 def _highest(power: FloatArray, lobe: int, least: float) -> Iterator[int]:
-    """Places of the highest peaks above ``least``, highest first, none within a ``lobe`` of another."""
+    """Yields the indices of the highest peaks above ``least``, highest first, at least a ``lobe`` apart."""
     left = power.copy()
     for _ in range(PEAKS):
         at = int(np.argmax(left))
@@ -261,9 +260,7 @@ def _highest(power: FloatArray, lobe: int, least: float) -> Iterator[int]:
 
 
 def _off_centre(height: FloatArray, at: int) -> float:
-    """Where the top of a peak lies next to its highest sample, in samples: that of the parabola through
-    three.
-    """
+    """Returns the offset of a peak from its highest sample, in samples, by a parabola through three."""
     if not 0 < at < len(height) - 1:
         return 0.0
     left, middle, right = (float(each) for each in height[at - 1 : at + 2])
@@ -272,7 +269,7 @@ def _off_centre(height: FloatArray, at: int) -> float:
 
 
 def load_lines(estimator: Estimator, residual: FloatArray, load_deg: FloatArray) -> Iterator[int]:
-    """Periods per turn of the highest lines over one load turn, beyond the orders of the mesh."""
+    """Yields the periods per load turn of the highest lines beyond the orders of the mesh."""
     place = np.floor(np.mod(load_deg, DEG_PER_TURN) * (BINS / DEG_PER_TURN)).astype(np.intp) % BINS
     power = np.abs(np.fft.rfft(np.bincount(place, residual, BINS))) ** 2
     ratio = estimator.data.ratio

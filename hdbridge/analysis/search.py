@@ -1,7 +1,7 @@
-"""The search for causes: screen everything, fit the best few with everything, take the best, look again.
+"""Greedy search for causes: screen all candidates, fit the best few in full, add the best one, repeat.
 
-What a cause has to earn stands in `Scales`; the elastic law is chosen again after each of
-the first picks. What was picked and no longer earns its keep among the others goes.
+`Scales` holds the gain that a cause must bring. The hysteresis law is chosen again after each of the
+first additions. At the end, causes that no longer bring that gain are removed.
 """
 
 from __future__ import annotations
@@ -21,29 +21,30 @@ from hdbridge.effects import CATALOGUE, Channel, Effect, Part, Start, aliases_of
 
 MOST = 6
 BEST = 3
-"""So many causes are looked for, and so many of the best candidates are fitted: what a search may cost."""
+"""Maximum number of additions (`MOST`) and of causes fitted in full at each (`BEST`); both bound the run
+time."""
 ANEW = 3
-"""So often the law of the loop is chosen anew after a pick."""
+"""Number of additions after which the hysteresis law is chosen again."""
 
 
 class Search:
-    """One search on one estimator."""
+    """Search for causes on one estimator, starting from the effects of a given model."""
 
     def __init__(self, estimator: Estimator, base: Sequence[Effect]) -> None:
         self.estimator = estimator
         self.scales = estimator.scales
         self.base = len(base)
-        """How many effects of each hypothesis are the baseline's."""
+        """Number of baseline effects, which come first in every hypothesis."""
         self._base = tuple(base)
         self._screens: dict[object, Screen] = {}
         self.refusals: dict[str, str] = {}
-        """Causes that were refused though the evidence spoke for them, with the reason in words."""
+        """Reason for each cause that was rejected although it improved the fit."""
         law = next((each for each in self._base if each.part is Part.LOOP), None)
         if law is not None:
             estimator.loop_sign = -1.0 if law.coefficients()[0] < 0.0 else 1.0
 
     def run(self) -> Fitted:
-        """Find causes, best first, and keep those that earn their keep among the others."""
+        """Adds causes, best first, then removes those that no longer improve the fit enough."""
         fitted = self._with_best_law(self._with_best_sign(self._begin()))
         for number in range(MOST):
             found = self._best_addition(fitted)
@@ -58,7 +59,7 @@ class Search:
             slow = left > self.scales.slow * fitted.chi_square
             fitted = found
             if number >= self.scales.few - 1 and slow and left > self.scales.large * len(found.residual):
-                break  # piece by piece at something that is none of them
+                break  # many small pieces approximate something that is not in the catalogue
             if number < ANEW:
                 fitted = self._with_best_law(fitted)
         if len(fitted.hypothesis.effects) - self.base <= self.scales.few:
@@ -70,12 +71,14 @@ class Search:
         return min(fits, key=lambda each: each.chi_square)
 
     def _with_best_sign(self, known: Fitted) -> Fitted:
-        """Let the load lag where the model has it lead, or the other way round, where that explains more than
-        a loop of the model's sign with the best cause added to it (play lags, too).
+        """Chooses the sign of the hysteresis loop.
+
+        The sign is reversed if that explains more than the model's sign together with the best cause (play
+        also makes the load lag).
         """
         loops = [each for each in known.hypothesis.effects if each.part is Part.LOOP]
         if self.estimator.data.reversals < 2 or not loops or any(each.coefficients()[0] for each in loops):
-            return known  # not held at zero: it has the model's sign
+            return known  # a coefficient that is not held at zero confirms the model's sign
         self.estimator.loop_sign *= -1.0
         other = self._begin()
         self.estimator.loop_sign *= -1.0
@@ -85,7 +88,7 @@ class Search:
         return self._begin()
 
     def _with_best_law(self, fitted: Fitted) -> Fitted:
-        """The model's law of the loop or one that can stand in its place, whichever fits better."""
+        """Exchanges the hysteresis law for an equivalent one if that fits better."""
         for place, effect in enumerate(fitted.hypothesis.effects[: self.base]):
             laws = in_place(effect, CATALOGUE.values()) if effect.part is Part.LOOP else ()
             if laws:
@@ -94,7 +97,7 @@ class Search:
         return fitted
 
     def _with_free_loop(self, fitted: Fitted, found: Fitted | None) -> Fitted | None:
-        """With a hysteresis of any shape added to the law, where that does more than the best cause."""
+        """Adds a free-form hysteresis, or returns None if the best cause explains more."""
         free = self.estimator.free_loop(fitted.hypothesis.start)
         loose = self.estimator.fit(replace(fitted.hypothesis, nuisances=free))
         added = loose.free() - fitted.free()
@@ -102,17 +105,17 @@ class Search:
         rival = 0.0 if found is None else fitted.chi_square - found.chi_square
         return loose if gain > max(rival, 0.0) else None
 
-    # --- another look
+    # --- revision
 
     def _swapped(self, fitted: Fitted) -> Fitted:
-        """With the best one in the place of each finding that is taken out, and the law chosen anew.
+        """Replaces each finding in turn by the best alternative if that lowers the cost.
 
-        What a finding has gained with further pieces cost an entry for each when they were added, and does so
-        here: what takes its place has entered only once.
+        Each piece that was added to a finding paid the entry penalty. The comparison charges these penalties
+        again, because the replacement has paid only one.
         """
         for place in range(self.base, len(fitted.hypothesis.effects)):
             if place >= len(fitted.hypothesis.effects):
-                break  # what took another's place has become part of one that was there
+                break  # the replacement was merged into an existing finding
             further = self._additions(fitted.hypothesis.effects[place]) - 1
             most = self.cost(fitted) + self.scales.enter * further
             without = self._with_best_law(self.estimator.fit(fitted.hypothesis.without(place)))
@@ -122,17 +125,19 @@ class Search:
         return fitted
 
     def _additions(self, effect: Effect) -> int:
-        """How often a search has added to a finding: orders come one by one, or those of a cause together."""
+        """Returns how many additions a finding took.
+
+        Orders are added singly or in the groups that a cause proposes.
+        """
         offered = next(iter(type(effect).proposals(self.estimator.data, ())), effect)
         return max(1, len(effect.pieces()) // max(1, len(offered.pieces())))
 
     def eliminated(
         self, fitted: Fitted, worst: Callable[[Fitted], tuple[int, str] | None], told: list[str]
     ) -> Fitted:
-        """Without the cause that is ``worst`` (its place, and why it goes), one after the other; the others
-        fitted again.
+        """Removes causes and refits until ``worst`` returns None.
 
-        What went is appended to ``told`` in words.
+        ``worst`` returns the place of the cause to remove and the reason, which is appended to ``told``.
         """
         while len(fitted.hypothesis.effects) > self.base and (found := worst(fitted)) is not None:
             place, why = found
@@ -141,7 +146,7 @@ class Search:
         return fitted
 
     def _least(self, fitted: Fitted) -> tuple[int, str] | None:
-        """What no longer earns its keep among the others."""
+        """Returns the weakest cause if its gain is below the required one or its peak is below the floor."""
         effects = fitted.hypothesis.effects
         gains = {
             place: self._lacking(fitted, place).chi_square - fitted.chi_square
@@ -150,14 +155,14 @@ class Search:
         toll = {each: self.scales.penalty * len(fitted.places(each)) + self.scales.enter for each in gains}
         place = min(gains, key=lambda each: gains[each] - toll[each])
         small = self.peak(fitted, place) < self.scales.floor_arcsec
-        # What the law of a large one gets wrong looks like a small one of its kind.
+        # The error of a large effect's law resembles a small effect of the same kind.
         alike = [each for each in gains if each != place and effects[each].name == effects[place].name]
         share = effects[place].inexact * max((gains[each] for each in alike), default=0.0)
         needed = max(toll[place], self.scales.leftover * max(gains.values()), share)
         return None if gains[place] > needed and not small else (place, "")
 
     def _lacking(self, fitted: Fitted, place: int) -> Fitted:
-        """A fit that lacks an effect, but for what is incidental to it and may be there without it."""
+        """Fits without an effect, but keeps its incidental columns, which may be present without it."""
         effect, hypothesis = fitted.hypothesis.effects[place], fitted.hypothesis.without(place)
         columns = sorted(set(range(len(effect.coefficients()))) - set(evident(effect)))
         if columns:
@@ -170,9 +175,9 @@ class Search:
     # --- one more cause
 
     def _best_addition(self, fitted: Fitted) -> Fitted | None:
-        """With the best cause more, refitted; None where none earns its keep.
+        """Adds the best acceptable cause and refits; returns None if no cause improves the fit enough.
 
-        What is refused may be another beside what is found next, so nothing is refused for good.
+        A rejected cause may be acceptable next to a later one, so no rejection is final.
         """
         scores, refused = self._scores(fitted), set[object]()
         while shortlist := self._shortlist(fitted, [each for each in scores if _key(each) not in refused]):
@@ -195,20 +200,20 @@ class Search:
         return None
 
     def _gain(self, fitted: Fitted, trial: Fitted, cause: str) -> float:
-        """By how much what was added to a fit as the last of its name has lowered chi square."""
+        """Returns the fall in chi square due to the last effect of this name."""
         place = _last(trial, cause)
         incidental = trial.hypothesis.effects[place].incidental
         lacking = self._lacking(trial, place).chi_square if incidental else math.inf
         return min(lacking, fitted.chi_square) - trial.chi_square
 
     def _too_small(self, trial: Fitted, cause: str) -> bool:
-        """Whether what was added is of no use to an axis."""
+        """Returns True if the last effect of this name is below the floor of practical relevance."""
         return self.peak(trial, _last(trial, cause)) < self.scales.floor_arcsec
 
     def _refusal(self, trial: Fitted, cause: str, as_alias: bool = False) -> str:
-        """Why what was added to a fit as the last of its name is not named, in words.
+        """Returns the reason to reject the last effect of this name, or an empty string.
 
-        It has to be physical and really seen; an alias need not be identifiable.
+        The effect must be physically possible and visible in the record. An alias need not be identifiable.
         """
         place = _last(trial, cause)
         effect = trial.hypothesis.effects[place]
@@ -219,23 +224,28 @@ class Search:
         elif (
             not reason and Channel.TIME in effect.needs() and effect.shows(self.estimator.motion) is not None
         ):
-            # What happens in time may be placed anywhere: where it is not seen as it has to be, it is
-            # another cause's, which would not be found with it in the fit.
+            # An effect in time can be placed anywhere. If it does not pass the gate, it stands for
+            # another cause, which would not be found with this one in the fit.
             reason = gate(self.estimator, trial, place).reason
             if not reason and not all_pieces_seen(self.estimator, trial, place):
                 reason = "a part of it may be what a larger one gets wrong"
         return reason
 
     def refusal(self, effect: Effect, as_alias: bool = False) -> str:
-        """Why an effect as it has come out is not named, in words; of an alias only why it cannot be."""
+        """Returns the reason to reject an effect with its fitted parameters, or an empty string.
+
+        An alias is rejected only if it is impossible, not if it is unidentifiable.
+        """
         if violations := effect.violations():
             return f"parameters that it cannot have ({violations[0]})"
         data = self.estimator.data
         return effect.implausible(data) or ("" if as_alias else effect.unidentifiable(data))
 
     def told_refusals(self, fitted: Fitted) -> list[str]:
-        """The refusals that matter: of what may stand for a cause that was named, and of what would still
-        earn its keep beside the ``fitted`` hypothesis by its evidence alone, linearised.
+        """Returns the rejections to report.
+
+        These concern aliases of the causes found, and causes that by the linearised gain would still improve
+        the ``fitted`` hypothesis enough.
         """
         if not self.refusals:
             return []
@@ -250,14 +260,14 @@ class Search:
         return [f"{cause}: {why}" for cause, why in self.refusals.items() if cause in told]
 
     def peak(self, fitted: Fitted, place: int) -> float:
-        """Half the span of what an effect does in this record, arcsec, but for what is rare at either end."""
+        """Returns half the span of an effect's contribution in this record, arcsec, without rare extremes."""
         hypothesis = fitted.hypothesis
         return self.estimator.half_span(self.estimator.does(hypothesis.effects[place], hypothesis.start))
 
     def _shortlist(self, fitted: Fitted, scores: Sequence[Score], left_out: str = "") -> list[Score]:
-        """The best candidate of each of the best causes, and of each number of parameters that it may have.
+        """Returns, for each of the best causes, the best candidate of each number of parameters.
 
-        One of more parameters gains more only once its shapes are fitted.
+        A candidate with more parameters may gain more only after its shapes are fitted.
         """
         passed = {each.name for each in fitted.hypothesis.effects if each.usual == 1} | {left_out}
         scores = [
@@ -292,24 +302,22 @@ class Search:
         return self._screens[key]
 
     def cost(self, fitted: Fitted) -> float:
-        """Chi square and what the parameters have to earn."""
+        """Returns chi square plus the penalty for the free parameters."""
         return fitted.chi_square + self.scales.penalty * fitted.free()
 
     def instead_of_change(self, fitted: Fitted, place: int, given: Effect) -> list[str]:
-        """Other causes that explain as well what a changed part of the model explains, with that part as
-        ``given``.
-        """
+        """Returns causes that explain the data as well as a change of the part at ``place``."""
         with self.held({place}):
             return self.as_well(fitted, self.with_given(fitted, place, given), given.name)
 
     def with_given(self, fitted: Fitted, place: int, given: Effect) -> Fitted:
-        """The fit with the model's part at ``place`` exactly as ``given``."""
+        """Fits with the model's part at ``place`` fixed exactly as ``given``."""
         with self.held({place}):
             return self.estimator.fit(fitted.hypothesis.instead(place, given))
 
     @contextmanager
     def held(self, places: Set[int]) -> Iterator[None]:
-        """Some parts of the model as they were given, whatever the data say of them."""
+        """Context in which some parts of the model are fixed at their given values."""
         known = self.estimator.calibrated
         self.estimator.calibrated = tuple(each.as_given() if each.place in places else each for each in known)
         try:
@@ -318,10 +326,11 @@ class Search:
             self.estimator.calibrated = known
 
     def as_well(self, fitted: Fitted, without: Fitted, cause: str) -> list[str]:
-        """Other causes that do nearly as well in the place of one, best first; ``without`` is the fit that
-        lacks it.
+        """Returns causes that fit nearly as well in place of ``cause``, best first.
+
+        ``without`` is the fit without that cause.
         """
-        # Where more is left than noise, neither is the whole truth, and a margin counts for less.
+        # A residual above the noise means that neither is complete, so the margin is wider.
         excess = max(fitted.chi_square / max(len(fitted.residual) - fitted.free(), 1), 1.0)
         margin = self.scales.enter * excess + self.scales.alias * (without.chi_square - fitted.chi_square)
         most = self.cost(fitted) + margin
@@ -338,12 +347,11 @@ class Search:
         return sorted(best, key=lambda each: best[each].chi_square)
 
     def _with(self, fitted: Fitted, score: Score) -> Fitted:
-        """With one of the candidates more."""
         return self.estimator.fit(joined(fitted.hypothesis, score.effect, self.base))
 
 
 def joined(hypothesis: Hypothesis, effect: Effect, base: int) -> Hypothesis:
-    """A hypothesis with one more effect, as part of a finding where the two are of one."""
+    """Adds an effect to a hypothesis, merged into an existing finding if the two can be joined."""
     for place in range(base, len(hypothesis.effects)):
         both = hypothesis.effects[place].joined(effect)
         if both is not None:
@@ -352,28 +360,28 @@ def joined(hypothesis: Hypothesis, effect: Effect, base: int) -> Hypothesis:
 
 
 def _last(fitted: Fitted, cause: str) -> int:
-    """Place of the last effect of a name."""
+    """Returns the place of the last effect of this name."""
     effects = fitted.hypothesis.effects
     return next(i for i in range(len(effects) - 1, -1, -1) if effects[i].name == cause)
 
 
 def _key(score: Score) -> object:
-    """What distinguishes one candidate from another: its kind, its coefficients, its degrees of freedom."""
+    """Returns a key of a candidate: kind, coefficient names and degrees of freedom."""
     effect = score.effect
     if effect.sought is not None:
         return effect.name
     return (effect.name, tuple(each.name for each in effect.named_coefficients()), score.freedom)
 
 
-# Second looks at a name whose look-alike is the better one: what follows a measured channel, and what
+# Exchange of a finding for a look-alike that describes it better.
 
 
 def with_measured(search: Search, fitted: Fitted) -> Fitted:
-    """What looks like a measured channel's effect, and follows the channel, is that effect.
+    """Replaces a wave that resembles the effect of a measured channel by that effect if it fits as well.
 
-    A wave takes any phase, a wind-up only that of the torque: where it does as well but for what the noise of
-    the channel takes from it, the wave would be a coincidence. Together the wave makes up for that noise, and
-    takes most of what is the other's.
+    A wave can take any phase, a wind-up only the phase of the torque. If the wind-up fits as well, apart
+    from the loss due to the channel's noise, the wave is a coincidence. Fitted together, the wave would
+    compensate for that noise and absorb most of the wind-up.
     """
     estimator, scales, base = search.estimator, search.scales, search.base
     hypothesis = fitted.hypothesis
@@ -383,7 +391,7 @@ def with_measured(search: Search, fitted: Fitted) -> Fitted:
             without = hypothesis.instead(place, together(others)) if others else hypothesis.without(place)
             tried = [without]
             if not any(type(each) is kind for each in without.effects[base:]):
-                # Each of its shapes: a spring that bends is not what a straight one leaves.
+                # Every shape that it proposes: a non-linear spring differs from a linear one.
                 own = proposed(kind, estimator.data, hypothesis.effects[:base])
                 tried = [without.plus(each) for each in own]
             for trial in sorted((estimator.fit(each) for each in tried), key=search.cost):
@@ -399,7 +407,7 @@ def with_measured(search: Search, fitted: Fitted) -> Fitted:
 
 
 def together(pieces: Sequence[Effect]) -> Effect:
-    """One effect of several pieces of it."""
+    """Joins several pieces into one effect."""
     whole = pieces[0]
     for each in pieces[1:]:
         both = whole.joined(each)
@@ -409,7 +417,7 @@ def together(pieces: Sequence[Effect]) -> Effect:
 
 
 def lookalikes(effect: Effect, ratio: float) -> list[tuple[type[Effect], Effect]]:
-    """Kinds that look like a piece of an effect where their channel was not measured, and the piece."""
+    """Returns kinds that would resemble a piece of the effect without their channel, each with that piece."""
     result = []
     for name in aliases_of(effect.name):
         look = CATALOGUE[name].unmeasured(ratio) if name in CATALOGUE else None
@@ -421,10 +429,10 @@ def lookalikes(effect: Effect, ratio: float) -> list[tuple[type[Effect], Effect]
 
 
 def waves_alike(estimator: Estimator, effects: Sequence[Effect], start: Start) -> Iterator[str]:
-    """Other kinds of waves that have hardly parted from any of some effects of one kind, in all the record.
+    """Yields other kinds of waves that this record cannot separate from one of the effects, all of one kind.
 
-    Over the same angle it is enough that both may have the orders. On an arc of a turn different orders
-    cancel each other, so what counts there is how large they are, not what they do.
+    Kinds over the same angle count as similar if both can have the orders concerned. On an arc of a turn
+    different orders cancel, so the comparison uses their amplitudes, not their sum.
     """
     data, most = estimator.data, estimator.scales.in_step
     effects = [each for each in effects if each.waves()]
@@ -452,7 +460,7 @@ def waves_alike(estimator: Estimator, effects: Sequence[Effect], start: Start) -
 
 
 def _share_in(effect: Effect, orders: Container[float]) -> float:
-    """Of its waves, the share of the squares that is in some orders."""
+    """Returns the share of an effect's squared amplitudes that lies in the given orders."""
     squares = {turns: amplitude**2 for turns, amplitude, _ in effect.waves()}
     return sum(each for turns, each in squares.items() if turns in orders) / max(
         sum(squares.values()), 1e-300
@@ -460,9 +468,9 @@ def _share_in(effect: Effect, orders: Container[float]) -> float:
 
 
 def as_calibrated(estimator: Estimator, fitted: Fitted, given: tuple[Effect, ...]) -> Fitted:
-    """What can be told by several conventions, by the one that leaves the ``given`` model as it was.
+    """Chooses, among equivalent parametrisations, the one that leaves the ``given`` model unchanged.
 
-    As it was, where there is none; see `Effect.retold`.
+    Returns ``fitted`` if there is none; see `Effect.retold`.
     """
     effects = fitted.hypothesis.effects
     for place in range(len(given), len(effects)):

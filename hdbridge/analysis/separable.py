@@ -1,4 +1,7 @@
-"""Shapes, the parameters that an effect is not linear in: their values, their steps, their derivatives."""
+"""Separable non-linear least squares (variable projection), and the shape parameters of effects.
+
+Shapes are the parameters in which an effect is not linear.
+"""
 
 from __future__ import annotations
 
@@ -17,20 +20,20 @@ from hdbridge.effects.described import Moves
 
 LOGARITHM = 0.7
 RANGE = 0.15
-"""A step goes no further than this: in the logarithm of a shape, or in shares of its range."""
+"""Largest step: in the logarithm of a shape (`LOGARITHM`), else as a share of its range (`RANGE`)."""
 DIFFERENCE = 1e-3
-"""Step of a derivative: of the logarithm of a shape, or of its range."""
+"""Step of numerical differentiation, in the logarithm of a shape or as a share of its range."""
 LINEAR = 0.3
-"""A step that changes more than this share of what the effect does is too long to differentiate with."""
+"""Largest relative change of an effect within a differentiation step."""
 
 
 def unit(effect: Effect) -> Effect:
-    """What the columns of an effect depend on: all but its coefficients, where it is linear in them."""
+    """Returns the effect with unit coefficients if it is linear in them: the key to its columns."""
     return effect.fitted(np.ones(len(effect.coefficients()))) if not effect.curved else effect
 
 
 def tangent(columns: Columns, effect: Effect, shape: Shape, central: bool = False) -> FloatArray:
-    """Derivative of what an effect does by one of its shapes, shape (m,); one-sided at a bound."""
+    """Returns the derivative of an effect by one of its shapes, shape (m,); one-sided at a bound."""
     coefficients = effect.coefficients()
     here = shape_value(effect, shape.name)
     told = _told(columns(effect), coefficients)
@@ -63,14 +66,17 @@ def tangent(columns: Columns, effect: Effect, shape: Shape, central: bool = Fals
 
 
 def _told(columns: FloatArray, coefficients: FloatArray) -> FloatArray:
-    """Their product; of one column by a product of numbers, ten times faster than one of matrices."""
+    """Returns columns times coefficients; a scalar product for one column is ten times as fast."""
     return columns[:, 0] * coefficients[0] if columns.shape[1] == 1 else columns @ coefficients
 
 
 def moved(
     effects: Sequence[Effect], where: Sequence[tuple[int, Shape]], step: FloatArray
 ) -> tuple[Effect, ...]:
-    """The effects with their shapes moved (in the logarithm where it is one), kept in their ranges."""
+    """Returns the effects after a step of their shapes, clipped to the ranges.
+
+    Logarithmic shapes are stepped in their logarithm.
+    """
     result = list(effects)
     for (place, shape), move in zip(where, step.tolist(), strict=True):
         here = shape_value(result[place], shape.name)
@@ -85,7 +91,7 @@ def moved(
 
 
 def free_shapes(effect: Effect, moves: frozenset[Moves]) -> list[Shape]:
-    """The shapes that may be moved; one that stands outside its range is of no account, and stays."""
+    """Returns the shapes to fit; one outside its range has no influence and stays fixed."""
     return [
         each
         for each in effect.shape
@@ -94,7 +100,7 @@ def free_shapes(effect: Effect, moves: frozenset[Moves]) -> list[Shape]:
 
 
 def shape_value(effect: Effect, name: str) -> float:
-    """A shape parameter; where it is not a field, that of the first of its parts."""
+    """Returns the value of a shape; if it is not a field, that of the first part."""
     if name in type(effect).model_fields:
         return float(getattr(effect, name))
     parts = next(each for each in effect.parameters().values() if isinstance(each, list) and name in each[0])
@@ -102,13 +108,13 @@ def shape_value(effect: Effect, name: str) -> float:
 
 
 def on_scale(effect: Effect, shape: Shape | Column) -> float:
-    """A shape parameter as it is stepped and known beforehand: its logarithm where it has one."""
+    """Returns the value of a shape on the scale of steps and priors: its logarithm if logarithmic."""
     value = shape_value(effect, shape.name)
     return math.log(value) if shape.logarithmic else value
 
 
 def leaves(effect: Effect, shape: Shape, move: float) -> bool:
-    """Whether a shape stands on the edge of its range and the step points outwards."""
+    """Returns True if a shape is at its bound and the step points outwards."""
     here = shape_value(effect, shape.name)
     return bool((here <= shape.lower and move < 0) or (here >= shape.upper and move > 0))
 
@@ -118,14 +124,15 @@ def leaves(effect: Effect, shape: Shape, move: float) -> bool:
 
 DAMPING = 1e-4
 TRIES = 6
-"""So often a step that does not help is shortened."""
+"""Maximum number of times that an unsuccessful step is shortened."""
 EXCHANGES = 3
-"""So often what effects carry of each other is exchanged though that makes the fit worse at first."""
+"""Maximum number of updates of the copies that effects carry of each other although chi square rises at
+first."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Fixed:
-    """Columns that stay while shapes move: the nuisances, then those of the effects in ``places``."""
+    """Columns that do not change with the shapes: nuisances, then the effects in ``places``."""
 
     places: tuple[int, ...]
     units: tuple[Effect, ...]
@@ -137,45 +144,45 @@ class _Fixed:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Point:
-    """Coefficients at some shapes."""
+    """Best coefficients at given shapes."""
 
     given: tuple[Effect, ...]
-    """What the columns are those of."""
+    """Effects from which the columns were computed."""
     effects: tuple[Effect, ...]
-    """With the coefficients that were found."""
+    """Same effects with the fitted coefficients."""
     fixed: _Fixed
     moving: tuple[int, ...]
-    """Places of the effects whose columns are in ``matrix``, in their order."""
+    """Places of the effects whose columns form ``matrix``, in order."""
     matrix: FloatArray
     gram: FloatArray
-    """Of all linear columns, those in ``fixed`` first, and what is known beforehand."""
+    """Gram matrix of all linear columns, those in ``fixed`` first, plus the prior information."""
     coefficients: FloatArray
     inside: BoolArray
-    """False for coefficients that are held at zero."""
+    """False for coefficients that are held at zero by their sign."""
     chi_square: float
 
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """The minimum, and what intervals and tests need of it."""
+    """Minimum of a fit, with the data for intervals and tests."""
 
     effects: tuple[Effect, ...]
     nuisances: FloatArray
-    """Coefficients of the columns that are no effect's, shape (q,)."""
+    """Coefficients of the nuisance columns, shape (q,)."""
     chi_square: float
-    """With what was known beforehand."""
+    """Chi square, including priors."""
     columns: tuple[Column, ...]
-    """The nuisances', the effects' coefficients (first of those without free shape), then shapes."""
+    """Nuisances, then coefficients of the effects (those without free shapes first), then shapes."""
     residual: FloatArray
-    """Shape (m,)."""
+    """Observed minus fitted, shape (m,)."""
     at_bound: tuple[tuple[int, str], ...]
-    """Shapes that ended on the edge of their range: effect, name."""
+    """Shapes that ended at a bound: effect, name."""
     _fit: Separable
     _point: _Point
 
     @cached_property
     def jacobian(self) -> FloatArray:
-        """Derivatives by all columns, shape (m, p)."""
+        """Derivatives by all parameters, shape (m, p)."""
         linear = side_by_side([self._point.fixed.matrix, self._point.matrix], len(self.residual))
         linear[:, ~self._point.inside] = 0.0
         if linear.shape[1] == len(self.columns):
@@ -184,7 +191,7 @@ class Solution:
 
     @cached_property
     def information(self) -> FloatArray:
-        """Jacobian' K^-1 Jacobian and what was known beforehand, shape (p, p)."""
+        """Jacobian' K^-1 Jacobian plus the prior information, shape (p, p)."""
         kept = self._point.inside
         size = len(kept)
         cross = self.jacobian.T @ self._fit.terms.weighting.apply(self.jacobian[:, size:])
@@ -194,17 +201,17 @@ class Solution:
 
     @cached_property
     def known(self) -> FloatArray:
-        """Per column the information beforehand, and that times how far its mean is off, shape (p, 2)."""
+        """Prior information of each column, and that times (prior mean - value), shape (p, 2)."""
         mean, information = self._fit.terms.known(self.columns).T
         shapes = [on_scale(self.effects[each.effect], each) for each in self.columns if each.shape]
         value = np.concatenate([self._point.coefficients, shapes])
         return np.stack([information, information * (mean - value)], axis=1)
 
     def free(self) -> int:
-        """Parameters that do anything in the data."""
+        """Returns the number of parameters that affect the data."""
         linear = self._point.inside & (np.diag(self._point.gram) > 0.0)
         idle = {place for place, each in enumerate(self.effects) if not np.any(each.coefficients())}
-        # Of a spring that the record does not load far enough, neither a zone nor where it begins is seen.
+        # A spring that is not loaded far enough shows neither its outer zone nor the beginning of that zone.
         partly = {each.effect for each, seen in zip(self.columns, linear, strict=False) if not seen}
         shapes = [
             each.effect not in partly or bool(np.any(self.jacobian[:, at]))
@@ -215,7 +222,7 @@ class Solution:
 
 
 class Separable:
-    """Fits of effects to the same data; what does not depend on shapes is kept from one to the next."""
+    """Fits of effects to the same data; caches everything that does not depend on shapes."""
 
     def __init__(self, terms: Terms) -> None:
         self.terms = terms
@@ -224,7 +231,7 @@ class Separable:
         self._fixed: _Fixed | None = None
 
     def fit(self, effects: Sequence[Effect], effort: Effort | None = None) -> Solution:
-        """The minimum near where the effects stand; never worse than there."""
+        """Fits effects from their present parameters; the result is never worse than the start."""
         effort = effort or Effort()
         here = best = self._at(refreshed(effects))
         damping, exchanged = DAMPING, 0
@@ -245,7 +252,7 @@ class Separable:
                 step, _ = self._step(here, where, system, damping)
             gained = here.chi_square - there.chi_square
             if not better:
-                # Only what is carried has changed: to exchange it may lead downhill at the second step.
+                # Only the carried copies have changed; updating them may help at the second step.
                 exchanged += 1
                 if not small or exchanged > EXCHANGES:
                     break
@@ -262,10 +269,7 @@ class Separable:
     def tangents(
         self, effects: Sequence[Effect], central: bool = False
     ) -> tuple[list[tuple[int, Shape]], FloatArray]:
-        """Derivatives of the effects by their free shapes: which, and columns (m, s).
-
-        Logarithmic shapes are differentiated by their logarithm.
-        """
+        """Returns the free shapes (place, shape) and the derivatives of the effects by them, (m, s)."""
         where = [
             (place, each)
             for place, effect in enumerate(effects)
@@ -277,7 +281,7 @@ class Separable:
         return where, result
 
     def _at(self, effects: Sequence[Effect]) -> _Point:
-        """Coefficients for given shapes."""
+        """Finds the best coefficients at given shapes."""
         terms = self.terms
         fixed = self._fixed_of(effects)
         moving = tuple(place for place in range(len(effects)) if place not in fixed.places)
@@ -304,7 +308,7 @@ class Separable:
             if not np.any(below):
                 break
             inside &= ~below
-        # Not by the normal equations, which a ridge satisfies only nearly.
+        # Computed in full, because a ridge solution satisfies the normal equations only approximately.
         chi_square = self._total + float(information @ mean**2)
         chi_square += float(coefficients @ (gram @ coefficients) - 2.0 * (right @ coefficients))
         chi_square += self._of_shapes(effects)
@@ -319,7 +323,7 @@ class Separable:
         )
 
     def _fixed_of(self, effects: Sequence[Effect]) -> _Fixed:
-        """Columns that can stay: of effects without free shape, as long as they are what they were."""
+        """Returns the columns of effects without free shapes, from the cache if they have not changed."""
         units = {
             place: unit(effect)
             for place, effect in enumerate(effects)
@@ -333,7 +337,7 @@ class Separable:
             )
             if same:
                 return old
-            # What was exchanged once is exchanged again at the next step.
+            # An effect whose columns changed once will change again at the next step.
             known = set(old.units)
             places = tuple(place for place, each in units.items() if each in known) or tuple(units)
         else:
@@ -352,14 +356,14 @@ class Separable:
         return self._fixed
 
     def _linear(self, effects: Sequence[Effect], *places: tuple[int, ...]) -> list[Column]:
-        """The linear columns, the nuisances' first."""
+        """Lists the linear columns, nuisances first."""
         columns = [Column(-1, name) for name in self.terms.nuisances.names]
         for place in chain(*places):
             columns += [Column(place, str(number)) for number in range(len(effects[place].coefficients()))]
         return columns
 
     def _of_shapes(self, effects: Sequence[Effect]) -> float:
-        """What the shapes cost for being other than was known beforehand."""
+        """Returns the contribution of the shapes' priors to chi square."""
         total = 0.0
         for (place, name), known in self.terms.prior.items():
             shape = next((each for each in effects[place].shape if each.name == name), None)
@@ -370,7 +374,7 @@ class Separable:
     def _system(
         self, here: _Point, where: list[tuple[int, Shape]], tangents: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        """Matrix and slope of the shapes, with everything linear eliminated."""
+        """Returns the normal matrix and gradient of the shapes, with all linear parameters eliminated."""
         if not where:
             return np.empty((0, 0)), np.empty(0)
         weighted = self.terms.weighting.apply(tangents)
@@ -391,7 +395,7 @@ class Separable:
         system: tuple[FloatArray, FloatArray],
         damping: float,
     ) -> tuple[FloatArray, float]:
-        """Step of the shapes, none of which leaves its range, and the fall in chi square that it promises."""
+        """Returns the damped step of the shapes within their ranges, and the predicted fall in chi square."""
         inner, slope = system
         free = np.ones(len(where), dtype=np.bool_)
         step = np.zeros(len(where))
@@ -413,7 +417,7 @@ class Separable:
         return step, float(slope @ step)
 
     def _stands(self, here: _Point, effects: Sequence[Effect]) -> bool:
-        """Whether what effects carry of each other is what they were fitted with."""
+        """Returns True if the copies that effects carry of each other are those of the fit."""
         return all(unit(one) == unit(other) for one, other in zip(here.given, effects, strict=True))
 
     def _solution(self, here: _Point) -> Solution:

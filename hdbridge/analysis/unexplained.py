@@ -1,9 +1,9 @@
-"""What is left when no cause fits: how much, and what it depends on.
+"""Residual that no cause explains: its size and the variable it depends on.
 
-Non-parametric rivals that know nothing of causes (bins over all that a residual can be looked at over, see
-`residual_views`) are judged on stretches of time that they were not fitted to, by what causes are judged by.
-Where one of them is seen, or more moves than noise does, there something is that the catalogue does not have.
-What is left near the reversals only may be the loop's, whose law nobody knows exactly.
+Non-parametric models (bins over every coordinate of `residual_views`) are tested on stretches of time that
+they were not fitted to, by the criteria for causes. If one of them is significant, or the residual exceeds
+the noise, something is missing from the catalogue. A residual near the reversals only may belong to the
+loop, whose law is not known exactly.
 """
 
 from __future__ import annotations
@@ -27,52 +27,52 @@ from hdbridge.effects.coordinate import since_reversal
 from hdbridge.effects.kinematics import direction_of
 
 BINS = {"load angle": (72, 360, 1800), "position": (72, 360, 1800), "time": (25,)}
-"""Of angles as many as a wide bump, a narrow one or a wave of the motor's orders asks for; of time no more
-than have several stretches each."""
+"""Number of bins per coordinate. Those of angles suit a wide bump, a narrow one and waves of the motor
+orders; bins of time are so long that each has several stretches."""
 BLOCK_S = 0.2
 FEW = 50
-"""Points that tell nothing of a record."""
+"""Minimum number of points for a statement about a record."""
 TAIL = 3.0
-"""Times the width of a loop after which one that forgets by and by has forgotten, too."""
+"""Travel after a reversal, in widths of a loop, after which even a gradual memory has faded."""
 LESS = "does less than what is left unexplained"
 EPISODES = 30
-"""Stretches that a record is cut into, to see whether what is left is left everywhere."""
+"""Number of stretches in which the residual is compared, to see if it is present everywhere."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Rest:
-    """What is left."""
+    """Unexplained residual."""
 
     arcsec: float
     """Root mean square beyond the noise, over short blocks."""
     near_arcsec: float
-    """The same where a loop may remember the last reversal."""
+    """Root mean square near reversals, within the memory of a loop."""
     apart_arcsec: float
-    """The same where the axis moves and none does."""
+    """Root mean square in motion beyond the memory of a loop."""
     peak_arcsec: float
-    """Half the span of what is left beyond the noise, but for what is rare."""
+    """Half the span of the residual beyond the noise, without rare extremes."""
     fast_arcsec: float
-    """Root mean square over all points: what is too fast for short blocks as well."""
+    """Root mean square over all points beyond the noise; includes parts too fast for the blocks."""
     standing_arcsec: float
-    """What moves at rest only; 0 where it never rests."""
+    """Drift at rest; 0 if the axis never rests."""
     lives_in: str
-    """Where most of it is; time where nothing in particular."""
+    """Coordinate on which it depends most; time if none."""
     seen: bool
-    """Whether it is seen there as a cause has to be, apart from the reversals."""
+    """True if that dependence passes the criteria for a cause, apart from the reversals."""
 
 
 class _View(NamedTuple):
     """A residual over one coordinate."""
 
     gain: float
-    """Chi square that ``predicted_arcsec`` takes away."""
+    """Fall in chi square due to ``predicted_arcsec``."""
     name: str
     predicted_arcsec: FloatArray
-    """What all other stretches of time say of each, shape (m,)."""
+    """Prediction of each stretch of time from all others, shape (m,)."""
 
 
 def rest(estimator: Estimator, fitted: Fitted) -> Rest:
-    """Look at a residual."""
+    """Measures the unexplained residual of a fit."""
     residual = fitted.residual / estimator.weight
     near = near_reversals(estimator, fitted)
     apart = ~near & (estimator.data.points.speed_deg_s != 0.0)[estimator.index]
@@ -94,14 +94,13 @@ def rest(estimator: Estimator, fitted: Fitted) -> Rest:
 
 
 def is_unexplained(estimator: Estimator, left: Rest) -> bool:
-    """Whether more is left than nobody need explain."""
+    """Returns True if the residual exceeds what an ordinary axis leaves."""
     if not of_the_loop(estimator, left):
         return True
     data, scales = estimator.data, estimator.scales
-    # An axis rests anywhere within a count of its motor encoder, and noise wanders; nobody can explain
-    # that.
+    # An axis rests anywhere within a count of its motor encoder, and noise wanders; neither has a cause.
     counts = data.motor_count_arcsec / np.sqrt(12.0)
-    # Where command and standstill distinguish noise and following error from the gear, fast things count.
+    # If command and standstill separate noise and following error from the gear, fast residuals count.
     if data.full.commanded and data.standstill:
         floor = float(np.sqrt(np.mean(1.0 / estimator.weight**2)))
         if left.fast_arcsec > np.hypot(max(scales.plain_arcsec, floor), left.standing_arcsec):
@@ -110,7 +109,10 @@ def is_unexplained(estimator: Estimator, left: Rest) -> bool:
 
 
 def many_of_one(findings: Sequence[Finding], scales: Scales) -> list[Finding] | None:
-    """Several near-equal picks of one kind, more than usual: sidebands of something that is none of them."""
+    """Returns near-equal findings of one kind that exceed its usual number, else None.
+
+    They are sidebands of a cause outside the catalogue.
+    """
     for family in {each.cause for each in findings}:
         same = [each for each in findings if each.cause == family]
         kinds = [each.effect for each in same if each.effect is not None and not each.within]
@@ -123,8 +125,9 @@ def many_of_one(findings: Sequence[Finding], scales: Scales) -> list[Finding] | 
 
 
 def of_the_loop(estimator: Estimator, left: Rest) -> bool:
-    """Whether all that is left may be the loop's: no more than nobody need explain where the axis moves
-    beyond the memory of any loop.
+    """Returns True if the whole residual may belong to the loop.
+
+    It must be below the threshold where the axis moves beyond the memory of any loop.
     """
     counts = _angle_step_arcsec(estimator) / np.sqrt(12.0)
     most = np.linalg.norm((estimator.scales.floor_arcsec, counts, left.standing_arcsec))
@@ -132,8 +135,10 @@ def of_the_loop(estimator: Estimator, left: Rest) -> bool:
 
 
 def doubtful_loops(estimator: Estimator, findings: Sequence[Finding], left: Rest) -> list[Finding]:
-    """Changes of the loop's parameters that do less near the reversals than what is left there, unless that
-    is the loop's too. What follows the direction alone looks like a changed loop everywhere else.
+    """Returns changes of the loop's parameters that explain less near the reversals than remains there.
+
+    Returns none if the residual is the loop's too. Elsewhere, an effect of direction alone looks like a
+    changed loop.
     """
     if of_the_loop(estimator, left):
         return []
@@ -149,11 +154,12 @@ def doubtful_loops(estimator: Estimator, findings: Sequence[Finding], left: Rest
 
 
 def does_more(estimator: Estimator, fitted: Fitted, place: int) -> float:
-    """Squares that an effect takes away where it acts, in those of what is left there.
+    """Returns the squares that an effect explains where it acts, relative to those of the residual there.
 
-    It acts where it is a good part of what it can be. The tenth of the record in which most is left does not
-    count: what is left in one episode, say in small swings of a motor that sticks where it turns, casts no
-    shadow on what is seen everywhere else. Without reversals an episode is a place, and all points count.
+    It acts where it exceeds a share of its maximum. The tenth of the record with the largest residual is
+    ignored, because a residual in one episode (say, small swings of a motor that sticks at reversals) does
+    not cast doubt on an effect seen everywhere else. Without reversals an episode is a place, and all points
+    count.
     """
     effect, weight, scales = fitted.hypothesis.effects[place], estimator.weight, estimator.scales
     residual = fitted.residual / weight
@@ -174,15 +180,15 @@ def does_more(estimator: Estimator, fitted: Fitted, place: int) -> float:
 
 
 def beyond_noise(estimator: Estimator, residual: FloatArray, rows: BoolArray | slice = slice(None)) -> float:
-    """Root mean square over blocks of `BLOCK_S`, less what white noise leaves there, arcsec."""
+    """Returns the root mean square over blocks of `BLOCK_S`, less the share of white noise, arcsec."""
     mean, white = _blocks(estimator, residual, rows)
     return float(np.sqrt(max(float(np.mean(mean**2 - white)), 0.0)))
 
 
 def _peak(estimator: Estimator, residual: FloatArray) -> float:
-    """Half the span of the means over such blocks, less what white noise puts there, arcsec."""
+    """Returns half the span of the block means, less the share of white noise, arcsec."""
     mean, white = _blocks(estimator, residual, slice(None))
-    mean, white = (each[white <= np.median(white)] for each in (mean, white))  # whole ones
+    mean, white = (each[white <= np.median(white)] for each in (mean, white))  # complete blocks
     noise = NormalDist().inv_cdf(1.0 - estimator.rare) ** 2 * float(np.mean(white))
     return float(np.sqrt(max(estimator.half_span(mean) ** 2 - noise, 0.0)))
 
@@ -190,7 +196,7 @@ def _peak(estimator: Estimator, residual: FloatArray) -> float:
 def _blocks(
     estimator: Estimator, residual: FloatArray, rows: BoolArray | slice
 ) -> tuple[FloatArray, FloatArray]:
-    """Means of some rows over blocks of `BLOCK_S`, and the variances that white noise gives them."""
+    """Returns means of some rows over blocks of `BLOCK_S`, and their variances due to white noise."""
     number = of_length(estimator.time_s[rows], BLOCK_S)
     count = np.bincount(number)
     variance = np.bincount(number, 1.0 / estimator.weight[rows] ** 2) / count**2
@@ -198,19 +204,19 @@ def _blocks(
 
 
 def _angle_step_arcsec(estimator: Estimator) -> float:
-    """A step of the angle that drives the effects in motion: a count of the motor's, or none."""
+    """Returns the step of the driving angle at the load: one motor count, or 0 with a command."""
     return 0.0 if estimator.data.full.commanded else estimator.data.motor_count_arcsec
 
 
 def near_reversals(estimator: Estimator, fitted: Fitted) -> BoolArray:
-    """The points at which a loop may still remember the last reversal, shape (m,); all without any."""
+    """Returns a mask (m,) of points within a loop's memory of the last reversal; all if there are none."""
     memory_deg = max((each.tracker().memory_deg for each in fitted.hypothesis.effects), default=0.0)
     near = (since_reversal(estimator.motion).values <= TAIL * memory_deg)[estimator.index]
     return np.asarray(near if np.any(near) else np.ones_like(near))
 
 
 def _views(estimator: Estimator, residual: FloatArray, rows: BoolArray) -> Iterator[_View]:
-    """Some rows of a residual over everything that they can be looked at over."""
+    """Yields the views of some rows of a residual over all coordinates."""
     motion, index = estimator.motion, estimator.index[rows]
     values, weight = residual[rows], estimator.weight[rows]
     fold, direction = folds(estimator.time_s[rows]), direction_of(motion)[index]
@@ -223,14 +229,12 @@ def _views(estimator: Estimator, residual: FloatArray, rows: BoolArray) -> Itera
 
 
 def _seen(estimator: Estimator, fitted: Fitted, rows: BoolArray, views: Iterable[_View]) -> list[_View]:
-    """Those views of some rows that are held to be there by what a cause is held to be there by, and are so
-    large that they need no name.
-    """
+    """Returns the views that pass the criteria for a cause and are large enough to be reported."""
     scales, start = estimator.scales, fitted.hypothesis.start
     weight, step_arcsec = estimator.weight[rows], 0.5 * _angle_step_arcsec(estimator)
     gain, peak = scales.enter + scales.penalty, float(np.hypot(scales.plain_arcsec, step_arcsec))
     laws = [each for each in fitted.hypothesis.effects if each.part is None]
-    for law in laws:  # the more it does, the more a real one differs from its formula
+    for law in laws:  # the larger its contribution, the larger the error of its formula
         does = estimator.columns(law, start)[rows] @ law.coefficients()
         gain = max(gain, scales.alias * len(does) * float(np.var(weight * does)))
         peak = max(peak, scales.plain_arcsec + math.sqrt(scales.alias) * estimator.half_span(does))
@@ -252,9 +256,7 @@ def _seen(estimator: Estimator, fitted: Fitted, rows: BoolArray, views: Iterable
 
 
 def _standing(estimator: Estimator, residual: FloatArray) -> float:
-    """What moves from one short block to the next while the axis rests: no physics, but noise that
-    wanders.
-    """
+    """Returns the drift between neighbouring blocks at rest, which is wandering noise, not physics."""
     speed = estimator.motion.motor_speed_deg_s
     if speed is None:
         return 0.0
@@ -268,18 +270,17 @@ def _standing(estimator: Estimator, residual: FloatArray) -> float:
     return float(np.median(np.abs(step))) * 1.05 if len(step) else 0.0
 
 
-# Is this a model of the axis at all? One without a loop, for an axis that has one, was never fitted.
+# Check for a model that was never fitted: it has no loop although the axis has one.
 
 
 MOST = 0.5
-"""Share of the squares that the model leaves; a loop that makes up more is most of what is wrong. It decides
-a remark, no name."""
+"""Share of the model's squared residual above which a loop is its main error. It decides on a remark only."""
 
 
 def unfitted(estimator: Estimator, effects: tuple[Effect, ...]) -> str:
-    """In words, where the model lacks a loop and one makes up most of what it leaves; else empty.
+    """Returns a remark if the model lacks a loop that would explain most of its residual; else empty.
 
-    What else is wrong shows only with the loop in the fit, so nothing that is named without it means much.
+    Other errors show only with the loop in the fit, so findings without it mean little.
     """
     if estimator.data.reversals < 2 or any(each.part is Part.LOOP for each in effects):
         return ""

@@ -1,8 +1,8 @@
-"""What a model gets wrong, over every coordinate that a cause may depend on.
+"""Residuals of a model as functions of every variable that a cause may depend on.
 
-A residual is looked at over motor angle, load angle, direction, speed, acceleration, torque, temperature,
-time and what has passed since the last reversal: means over bins, and how much of the residual they foretell
-on stretches of time that had no part in them.
+The variables are motor angle, load angle, direction, speed, acceleration, torque, temperature, time, and
+travel and time since the last reversal. Residuals are averaged over bins, and the bin means are tested as
+predictions of stretches of time that were not used for them.
 """
 
 from __future__ import annotations
@@ -21,28 +21,28 @@ from hdbridge.effects.coordinate import Coordinate
 from hdbridge.effects.kinematics import direction_of
 
 COARSE: Final = 16
-"""Bins of time: wide enough that each has several stretches."""
+"""Number of time bins, few enough that each has several stretches."""
 SHRUNK: Final = 2.0
-"""Points with a mean of zero that each bin has in addition: a mean of few points foretells nothing."""
+"""Number of zero-valued points added to each bin: a mean of few points has no predictive value."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ResidualViews:
-    """Two residuals and what they are looked at over; arrays of shape (m,)."""
+    """Two residuals and the coordinates to view them over; arrays of shape (m,)."""
 
     given_arcsec: FloatArray
-    """Measurement less the model as it was given, about zero."""
+    """Measurement minus the given model, about zero."""
     left_arcsec: FloatArray
-    """Measurement less the extended model."""
+    """Measurement minus the extended model."""
     direction: FloatArray
     time_s: FloatArray
     coordinates: Mapping[str, Coordinate]
-    """By name."""
+    """Coordinates by name."""
 
     def shares(self) -> dict[str, tuple[float, float]]:
-        """Per coordinate the share of the mean square that bin means foretell, of both residuals, 0 to 1.
+        """Returns, per coordinate, the share of the mean square that bin means predict, 0 to 1.
 
-        Noise has a share of zero.
+        The pair is that of the given and of the extended model. Noise has a share of zero.
         """
         fold = folds(self.time_s)
 
@@ -58,7 +58,7 @@ class ResidualViews:
 
 
 def coordinates(motion: Motion, rows: IntArray, ratio: float) -> dict[str, Coordinate]:
-    """What a record can be looked at over at some of its points; only what was recorded, and what varies."""
+    """Returns the coordinates at some points of a record; only those that were recorded and vary."""
     found = (
         over.motor_angle(motion),
         over.load_angle(motion, ratio),
@@ -77,14 +77,14 @@ def coordinates(motion: Motion, rows: IntArray, ratio: float) -> dict[str, Coord
 
 
 def folds(time_s: FloatArray) -> IntArray:
-    """Which of `FOLDS` parts of the record each point is in, shape (m,): every so many-th stretch of time."""
+    """Assigns each point to one of `FOLDS` folds, shape (m,): every `FOLDS`-th stretch of time."""
     return np.asarray(of_number(time_s, STRETCHES) % FOLDS)
 
 
 def predicted(
     coordinate: Coordinate, values: FloatArray, direction: FloatArray, fold: IntArray
 ) -> FloatArray:
-    """What the bin means of all other folds say of the points of each, shape (m,)."""
+    """Predicts the points of each fold by the bin means of all others, shape (m,)."""
     number = coordinate.numbers()
     if coordinate.both_ways:
         number = 2 * number + (direction < 0.0)
