@@ -11,6 +11,7 @@ from hdbridge.cli.interrupt import deferred_interrupt
 from hdbridge.cli.options import (
     JsonOption,
     console,
+    need_extra,
     notes,
     print_table,
     progress_bar,
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
     from hdbridge.fleet.summary import Summary
 
 PAGE_NAME = "fleet.html"
+_EXTRA = ("distributed", "pyarrow", "fsspec")
 
 OutArgument = Annotated[Path, typer.Argument(metavar="OUT", help="The --out folder of a run.")]
 LimitOption = Annotated[
@@ -106,7 +108,7 @@ def run(
     from hdbridge.fleet.sources import find_sources
     from hdbridge.model import TransmissionModel
 
-    _need_extra()
+    need_extra("a fleet needs", _EXTRA, "fleet")
     if out is None:
         raise InputError("--out is missing; name a new folder, or one of an earlier run")
     if not sources and manifest is None:
@@ -172,7 +174,7 @@ def report(
     """Write the page of a run again, and print which joints to look at first."""
     from hdbridge.fleet.dataset import Dataset
 
-    _need_extra()
+    need_extra("a fleet needs", _EXTRA, "fleet")
     dataset = Dataset(out)
     dataset.check()
     _summarise(dataset, limit_arcsec, html_file or out / PAGE_NAME, json_file)
@@ -239,14 +241,6 @@ def _check_memory(text: str) -> None:
         raise InputError(
             f"--memory: found '{text}'; expected at least 200MB: the libraries alone need so much"
         )
-
-
-def _need_extra() -> None:
-    from importlib.util import find_spec
-
-    lacking = [name for name in ("distributed", "pyarrow", "fsspec") if find_spec(name) is None]
-    if lacking:
-        raise InputError(f"a fleet needs {', '.join(lacking)}: python -m pip install 'hdbridge[fleet]'")
 
 
 def _say(line: str) -> None:

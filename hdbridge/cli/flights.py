@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from datetime import UTC, datetime
-from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from hdbridge.cli.options import need_extra
 from hdbridge.errors import InputError
 
 if TYPE_CHECKING:
@@ -55,7 +55,7 @@ def read_flights(
     ``paths`` are MCAP files and folders of them, ``begin`` and ``end`` times as the options take them. Raises
     `InputError` if the axis or the time is not in the recordings.
     """
-    need_extra()
+    need_reader()
     from hdbridge.daemon.recorder.export import axis_of, exported, last_model
     from hdbridge.daemon.recorder.reading import each_flight, overview, read
 
@@ -90,26 +90,15 @@ def remarks(recording: Recording) -> Iterator[str]:
         )
 
 
-def need_extra() -> None:
+def need_reader() -> None:
     """Raises `InputError` if a package that reads flight recordings is not installed."""
-    lacking = [name for name in _EXTRA if not _found(name)]
-    if lacking:
-        raise InputError(
-            f"flight recordings need {', '.join(lacking)}: python -m pip install 'hdbridge[daemon]'"
-        )
+    need_extra("flight recordings need", _EXTRA, "daemon")
 
 
 def _outside(about: Overview, begin_ns: int | None, end_ns: int | None) -> bool:
     return (begin_ns is not None and about.last_ns < begin_ns) or (
         end_ns is not None and about.first_ns > end_ns
     )
-
-
-def _found(name: str) -> bool:
-    try:
-        return find_spec(name) is not None
-    except ModuleNotFoundError:
-        return False
 
 
 def _time_ns(text: str | None, option: str) -> int | None:

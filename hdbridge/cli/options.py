@@ -6,6 +6,7 @@ import json
 import os
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -118,6 +119,19 @@ HtmlOption = Annotated[
     typer.Option("--html", metavar="FILE", help="Write a page that opens without a network."),
     Kind.PAGE,
 ]
+
+
+def need_extra(subject: str, packages: Sequence[str], extra: str) -> None:
+    """Raises `InputError` with the command that installs ``extra`` if one of its ``packages`` is missing."""
+    if lacking := [name for name in packages if not _installed(name)]:
+        raise InputError(f"{subject} {', '.join(lacking)}: python -m pip install 'hdbridge[{extra}]'")
+
+
+def _installed(package: str) -> bool:
+    try:
+        return find_spec(package) is not None
+    except ModuleNotFoundError:  # of a package above it
+        return False
 
 
 def load_recordings(

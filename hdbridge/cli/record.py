@@ -10,7 +10,7 @@ import typer
 from rich.markup import escape
 from rich.table import Table
 
-from hdbridge.cli.flights import AxisOption, FromOption, ToOption, need_extra, read_flights, remarks
+from hdbridge.cli.flights import AxisOption, FromOption, ToOption, need_reader, read_flights, remarks
 from hdbridge.cli.options import JsonOption, console, notes, print_table, write_json, write_result
 from hdbridge.errors import InputError
 from hdbridge.files.atomic import check_writable
@@ -57,7 +57,7 @@ def register(app: typer.Typer) -> None:
 
 def overviews(flights: FlightsArgument, json_file: JsonOption = None) -> None:
     """List recordings: from when to when, how large, and what stopped an axis in them."""
-    need_extra()
+    need_reader()
     from hdbridge.daemon.recorder.reading import each_flight, overview
 
     found = list(each_flight(flights, overview))
@@ -81,7 +81,7 @@ def info(
     json_file: JsonOption = None,
 ) -> None:
     """Report the content of a recording: machine, axes, models, missing cycles, events."""
-    need_extra()
+    need_reader()
     import numpy as np
 
     from hdbridge.daemon.recorder.reading import read
@@ -133,7 +133,7 @@ def mend(flights: FlightsArgument) -> None:
 
     The daemon does this itself when it starts. One that is being written is refused.
     """
-    need_extra()
+    need_reader()
     from hdbridge.daemon.recorder import mend as mending
     from hdbridge.daemon.recorder.reading import each_flight, overview
 

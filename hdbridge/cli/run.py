@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -16,6 +15,7 @@ from hdbridge.cli.options import (
     MachineArgument,
     SeedOption,
     check_bus_options,
+    need_extra,
     simulated_by,
 )
 from hdbridge.errors import InputError
@@ -71,8 +71,7 @@ def run(
     daemon: it is reported to clients, and latched.
     """
     check_bus_options(interface, channel, simulate=simulate)
-    if lacking := [name for name in _EXTRA if find_spec(name) is None]:
-        raise InputError(f"the daemon needs {', '.join(lacking)}: python -m pip install 'hdbridge[daemon]'")
+    need_extra("the daemon needs", _EXTRA, "daemon")
     from hdbridge.daemon.hold import hold
     from hdbridge.daemon.logs import LogSettings
     from hdbridge.daemon.machine import Machine
