@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Final
 from hdbridge.clock import Clock
 
 if TYPE_CHECKING:
-    from hdbridge.drive.link import Link
+    pass
 
 _EXACT_BITS: Final = 6
 _EXACT: Final = 1 << _EXACT_BITS
@@ -247,19 +247,6 @@ def wake_ups(
         skipped += behind
         deadline += period_s * (1 + behind)
     return Measurement(period_s, histogram, skipped)
-
-
-def bus_exchange(link: Link, can_id: int) -> Callable[[], object]:
-    """Returns work for `measure`: sends one frame and reads one if there is one.
-
-    Choose an identifier that nothing on the bus listens to, or the master's own heartbeat.
-    """
-
-    def exchange() -> None:
-        link.send(can_id, b"\x05")
-        link.recv(link.now())
-
-    return exchange
 
 
 def measure(

@@ -36,8 +36,6 @@ Outcome = TypeVar("Outcome")
 POLL_S: Final = 0.01
 """Interval between checks for new samples."""
 STREAM_TIMEOUT_S: Final = 10.0
-BRAKE_S: Final = 30.0
-"""Time in which an axis that was told to stop is at rest with its power off."""
 _HALVINGS: Final = 5
 """Maximum number of times that a period between two knots is halved."""
 _VELOCITY_SHARE: Final = 1.0 + 3e-7
