@@ -12,8 +12,9 @@ import numpy as np
 from hdbridge.analysis.findings import Identifiability
 from hdbridge.analysis.hypothesis import Estimator, Fitted, Hypothesis
 from hdbridge.analysis.linear import Effort, orthonormal
+from hdbridge.analysis.orders import NOT_APART
 from hdbridge.analysis.prepared import gather
-from hdbridge.analysis.screening import candidates
+from hdbridge.analysis.screening import SHARE_LEFT, candidates
 from hdbridge.analysis.search import lookalikes, waves_alike
 from hdbridge.effects import CATALOGUE, Effect, FloatArray, Motion, Start, causes
 from hdbridge.model import TransmissionModel
@@ -27,10 +28,6 @@ from hdbridge.units import ARCSEC_PER_DEG
 # Thresholds of identifiability; they do not affect findings.
 ENOUGH = 8_000
 """Maximum number of points used to compare shapes."""
-NOT_APART = 0.95
-"""Canonical correlation above which two causes are not separable."""
-SHARE_LEFT = 1e-4
-"""Share of a column's squares below which nothing of it remains."""
 WORST_ARCSEC = 30.0
 """Detection limit above which a cause counts as not detectable."""
 INFLATION = 2.5

@@ -20,7 +20,7 @@ from hdbridge.analysis.linear import seen_directions, solve_symmetric
 from hdbridge.effects import FloatArray
 
 NOT_APART = 0.95
-"""Correlation above which two orders are not separable in a record."""
+"""Canonical correlation above which two orders, or two causes, are not separable in a record."""
 
 System = tuple[FloatArray, FloatArray]
 """J' K^-1 J and J' K^-1 y of [cosine and sine pairs of the candidates | all other columns of the fit]."""

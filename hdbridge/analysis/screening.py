@@ -21,6 +21,7 @@ from hdbridge.effects.orders import HIGHEST_MOTOR_ORDER
 from hdbridge.units import DEG_PER_TURN
 
 SHARE_LEFT = 1e-4
+"""Share of a column's squares below which nothing of it remains."""
 
 
 def candidates(observations: Observations, base: Sequence[Effect], screened: bool = True) -> list[Effect]:

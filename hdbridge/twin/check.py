@@ -231,13 +231,11 @@ NOTICEABLE = 2.5
 
 @dataclass(frozen=True, slots=True)
 class Check:
-    """Result of a check: the changes, and the misfit with and without them."""
+    """Result of a check: the changes, and the misfit that they leave."""
 
     changes: tuple[Finding, ...]
-    misfit_before: Mapping[str, float]
-    """Rms residual of the twin by channel, in units of the noise of its own fit."""
     misfit_after: Mapping[str, float]
-    """The same with the changes."""
+    """Rms residual of the twin with the changes, by channel, in units of the noise of its own fit."""
     unseen: tuple[str, ...] = ()
     """Causes of which even a large change would not show, in this motion or with this twin."""
     growth_before: Mapping[str, float] = field(default_factory=dict)
@@ -309,12 +307,12 @@ def check(
         (after,) = replays([best.truth])
         if search.worsens(best):
             best, after = search.unchanged, before
-        was, now = _in_scales(before, scale), _in_scales(after, scale)
+        now = _in_scales(after, scale)
     progress(1.0)
     gain = (_rms(before, scale), _rms(after, scale))
     changes = tuple(search.change(cause, best, gain) for cause in best.causes)
     left = growth(data, after, known.misfit, scale)
-    return Check(changes, was, now, search.unseen(best), grown, left)
+    return Check(changes, now, search.unseen(best), grown, left)
 
 
 def _by_ratio(
@@ -338,7 +336,7 @@ def _by_ratio(
     unseen = tuple(cause for cause, own in groups.items() if not _shows(replays, twin, own, misfit, noise))
     blind = len(unseen) == len(groups)
     if max(grown.values(), default=0.0) <= GROWN:
-        return Check((), {}, {}, unseen, grown, grown, blind)
+        return Check((), {}, unseen, grown, grown, blind)
     scale, legs = (
         Scales(scales_by_kind(data, misfit, noise)),
         legs_of_rows(data, fitted_rows(data, everything=True)),
@@ -370,7 +368,7 @@ def _by_ratio(
             break
     progress(1.0)
     changes = tuple(_ratio(groups[cause], twin, best.truth) for cause in named) if best else ()
-    return Check(changes, {}, {}, unseen, grown, now)
+    return Check(changes, {}, unseen, grown, now)
 
 
 def _excess(grown: Mapping[str, float]) -> float:

@@ -269,7 +269,7 @@ def compare(measured: Record, simulated: Record, legs: Sequence[Segment], ratio:
             apart = real.by_name[FOLLOWING_ERROR][part] - twin.by_name[FOLLOWING_ERROR][part]
             twin.by_name[FOLLOWING_ERROR][part] += np.median(apart[calm[part]])
     motor = measured.motor_position_deg
-    count_deg = _least(np.concatenate([np.diff(motor[part]) for part in parts]), motor)
+    count_deg = least_change(np.concatenate([np.diff(motor[part]) for part in parts]), motor)
     groups = _groups(measured.time_s, legs, ~unknown_rows(measured, count_deg))
     goes = ~_stands(measured, parts, count_deg)
     rows = [
@@ -345,7 +345,7 @@ def _of_signal(
     one, other = real.by_name[name], twin.by_name[name]
     unit = UNITS[name]
     if count := int(np.count_nonzero(inside)):
-        apart = _rms(one[inside] - other[inside])
+        apart = rms(one[inside] - other[inside])
         noise = noise_of(one, inside, parts)
         if name == TEMPERATURE:
             # A replay starts at a reading, so both roundings add up to one step at most. A constant reading
@@ -353,7 +353,7 @@ def _of_signal(
             noise *= math.sqrt(12.0)
             if not noise:
                 return
-        yield Row(name, kind, unit, _rms(one[inside]), _rms(other[inside]), apart, noise, count)
+        yield Row(name, kind, unit, rms(one[inside]), rms(other[inside]), apart, noise, count)
     for channel, which in zip((NOISE_AT_REST, NOISE_IN_MOTION), rest_and_motion, strict=True):
         count = int(np.count_nonzero(which))
         if count < LEAST_SAMPLES or name == TEMPERATURE:
@@ -376,7 +376,7 @@ def noise_of(values: FloatArray, which: Rows, parts: Sequence[slice]) -> float:
         third = np.diff(values[part], 3)
         inside = which[part]
         changes = np.diff(values[part])[inside[1:] & inside[:-1]]
-        resolution = min(resolution, _least(changes, values))
+        resolution = min(resolution, least_change(changes, values))
         whole = inside[3:] & inside[2:-1] & inside[1:-2] & inside[:-3]
         squares += float(np.sum(third[whole] ** 2))
         count += float(np.count_nonzero(whole))
@@ -397,7 +397,7 @@ def _stands(measured: Record, parts: Sequence[slice], count_deg: float) -> Rows:
     return np.concatenate(still)
 
 
-def _least(changes: FloatArray, values: FloatArray) -> float:
+def least_change(changes: FloatArray, values: FloatArray) -> float:
     """Returns the smallest change of a reading above rounding errors."""
     beyond, size = 1e-9 * float(np.max(np.abs(values), initial=1.0)), np.abs(changes)
     return float(np.min(size, where=size > beyond, initial=math.inf))
@@ -447,8 +447,8 @@ def _of_stops(kind: str, stops: Sequence[_Stop], time_s: FloatArray) -> Iterator
     if not stops:
         return
     sample_s = float(np.median(np.diff(time_s)))
-    noise = _rms(np.array([each.noise_arcsec for each in stops]))
-    scatter = _rms(np.array([each.scatter_s for each in stops]))
+    noise = rms(np.array([each.noise_arcsec for each in stops]))
+    scatter = rms(np.array([each.scatter_s for each in stops]))
     for channel, pairs, own in (
         (SETTLING_TIME, [each.settled_s for each in stops], max(sample_s, scatter)),
         (OVERSHOOT, [each.overshoot_arcsec for each in stops], noise),
@@ -456,9 +456,10 @@ def _of_stops(kind: str, stops: Sequence[_Stop], time_s: FloatArray) -> Iterator
         values = np.array(pairs)
         one, other = (float(each) for each in np.mean(values, axis=0))
         yield Row(
-            channel, kind, UNITS[channel], one, other, _rms(values[:, 0] - values[:, 1]), own, len(pairs)
+            channel, kind, UNITS[channel], one, other, rms(values[:, 0] - values[:, 1]), own, len(pairs)
         )
 
 
-def _rms(values: FloatArray) -> float:
+def rms(values: FloatArray) -> float:
+    """Returns the root of the mean square; 0 for no values."""
     return float(np.sqrt(np.mean(values**2))) if len(values) else 0.0

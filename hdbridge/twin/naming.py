@@ -15,6 +15,7 @@ from scipy.special import chdtrc, ndtri
 
 from hdbridge.effects import FloatArray
 from hdbridge.sim.truth import Truth
+from hdbridge.twin.comparison import rms
 from hdbridge.twin.fitting import as_late
 from hdbridge.twin.least_squares import (
     Fitted,
@@ -199,7 +200,7 @@ def name_causes(
         if (instead or cause in needed) and not any(
             each.name in other.aliases for each in own for other in found
         ):
-            gain = (_rms(contest.left_by(shown[cause])), _rms(contest.left))
+            gain = (rms(contest.left_by(shown[cause])), rms(contest.left))
             found.append(finding(own, start, fitted.truth, intervals, distances[cause], gain, instead))
     return tuple(sorted(found, key=lambda each: -each.gain[0])), tuple(dict.fromkeys(sets))
 
@@ -295,7 +296,3 @@ def _further(one: Truth, other: Truth, parameters: Sequence[Parameter]) -> list[
     """Returns the parameters that differ by more than their least change."""
     apart = np.subtract(coordinates(one, parameters), coordinates(other, parameters))
     return [each for each, off in zip(parameters, apart, strict=True) if abs(off) > each.least_change]
-
-
-def _rms(values: FloatArray) -> float:
-    return math.sqrt(float(np.mean(np.square(values))))

@@ -17,14 +17,13 @@ import numpy as np
 
 from hdbridge.effects import FloatArray
 from hdbridge.sim.truth import Truth
+from hdbridge.twin.commands import MOVING_DEG_S
 from hdbridge.twin.misfit import Data, Piece, demand_deg, rounding
 from hdbridge.twin.parameters import FOLLOWING, LOAD, TORQUE, with_values
 from hdbridge.units import ARCSEC_PER_DEG
 
 SMOOTHED_S = 0.03
 """Averaging time of all signals: without it, quantised angles give no usable acceleration."""
-MOVING_DEG_S = 5.0
-"""Motor speed above which the direction of friction is certain."""
 HELD_ROWS = 3
 """Minimum rows at the highest torque for a limit; a mere peak lasts one or two."""
 LEAST_ROWS = 50

@@ -24,6 +24,7 @@ from hdbridge.axis import AxisConfig
 from hdbridge.effects import Channel, FloatArray
 from hdbridge.records.recording import Recording
 from hdbridge.sim.truth import Truth
+from hdbridge.twin.comparison import least_change
 from hdbridge.twin.least_squares import Fitted, sandwich
 from hdbridge.twin.misfit import held_out_legs
 from hdbridge.twin.naming import FALSE_ALARM, Finding, finding
@@ -130,7 +131,8 @@ def with_warmth(
     parts = _parts(recording, _losses(recording, axis, truth), truth)
     if not parts:
         return truth, None
-    step_k = _least_change(record.columns[Channel.TEMPERATURE.value])
+    readings = record.columns[Channel.TEMPERATURE.value]
+    step_k = min(least_change(np.diff(readings), readings), START_K)
     found = _fit(parts, truth, step_k, _friction_error(recording, fitted))
     heat = dict(zip((each.path[-1] for each in THERMAL), _values(found.place), strict=True))
     if truth.temperature.friction_growth_per_k or truth.temperature.tooth_growth_per_k:
@@ -340,10 +342,3 @@ def _friction_error(recording: Recording, fitted: Fitted) -> float:
     works["friction growth"] = float(np.sum(force_nm * turned * (warm_c - heat.unchanged_c)))
     share = np.array([works.get(each.name, 0.0) / whole if whole else 0.0 for each in fitted.parameters])
     return max(math.sqrt(float(share @ fitted.covariance @ share)), LEAST_ERROR)
-
-
-def _least_change(values: FloatArray) -> float:
-    """Returns the resolution of a reading; `START_K` if it never changes."""
-    changes = np.abs(np.diff(values))
-    beyond = changes > 1e-9 * float(np.max(np.abs(values), initial=1.0))
-    return float(np.min(changes, where=beyond, initial=START_K))

@@ -25,6 +25,7 @@ from hdbridge.twin.comparison import (
     TEMPERATURE,
     TITLES,
     Comparison,
+    rms,
 )
 from hdbridge.twin.defaults import default_truth
 from hdbridge.twin.misfit import CHANNELS, Data, counted, demand_deg
@@ -58,11 +59,11 @@ def what_is_left(
         inside = held_out if held_out.any() else counts > 0.0
         if not inside.any():
             continue
-        squares, signal = np.square(residuals[name][inside]), _rms(signals[name][inside])
+        squares, signal = np.square(residuals[name][inside]), rms(signals[name][inside])
         by_kind = {str(kind): float(squares[kinds[inside] == kind].mean()) for kind in set(kinds[inside])}
-        rms = math.sqrt(float(squares.mean()))
-        share = rms / signal if signal else math.inf
-        found.append(Left(name, share, rms / noise[name], max(by_kind, key=lambda kind: by_kind[kind])))
+        left = math.sqrt(float(squares.mean()))
+        share = left / signal if signal else math.inf
+        found.append(Left(name, share, left / noise[name], max(by_kind, key=lambda kind: by_kind[kind])))
     return tuple(found)
 
 
@@ -147,10 +148,6 @@ def replays_only(left: Sequence[Left]) -> str:
 
 def _percent(share: float) -> str:
     return f"{figure(100.0 * share, 2)} %" if math.isfinite(share) else "no share"
-
-
-def _rms(values: FloatArray) -> float:
-    return math.sqrt(float(np.mean(np.square(values))))
 
 
 @dataclass(frozen=True, slots=True)

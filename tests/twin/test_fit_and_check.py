@@ -242,7 +242,7 @@ def test_a_twin_that_leaves_all_of_a_signal_shows_no_change() -> None:
 
 def test_what_no_cause_explains_is_no_nothing() -> None:
     before = {"following error": 1.1, "motor torque": 21.0, "load error": 242.0}
-    told = Check((), before, before, ("warmth",))
+    told = Check((), before, ("warmth",))
     assert told.sentence == (
         "Something has changed since the twin was made that no change of a cause explains. "
         "Unexplained: motor torque, 21 times what the twin was off by when it was made. "
