@@ -210,9 +210,9 @@ class Design:
         """Returns the regressors of an effect, block averages, shape (b, p)."""
         return self.regressors.columns(effect, self.starts)
 
-    def told(self, effects: Sequence[Effect]) -> FloatArray:
+    def predict(self, effects: Sequence[Effect]) -> FloatArray:
         """Returns the sum of the effects, arcsec, shape (b,)."""
-        return self.regressors.told(effects, self.starts)
+        return self.regressors.predict(effects, self.starts)
 
     def turn_effects(self, effects: Sequence[Effect]) -> tuple[FloatArray, FloatArray, IntArray]:
         """Returns the influence of each block's last turning point.

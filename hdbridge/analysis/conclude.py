@@ -207,7 +207,7 @@ def held_out(
     own = active.effects if active else ()
     new = [solution.effects[place] for place in sorted(written)]
     for row, (effects, of) in enumerate(((own, shift), (new, kept))):
-        told, columns = design.told(effects), solution.jacobian[:, of]
+        told, columns = design.predict(effects), solution.jacobian[:, of]
         fit = Linearised(columns, rest_arcsec - told, solution.known[of])
         steps = steps_without(fit, fold, lambda rows: Precision(state.noise, blocks.picked(rows)))
         for number, step in enumerate(steps):
@@ -292,7 +292,7 @@ def conclude(
     inside = _inside_variance(design, solution, state.columns().columns @ solution.nuisances)
     # Samples were corrected by the delay, which is not part of any model.
     measured = blocks.error_arcsec + state.delay_ms * delay_column(design)[:, 0]
-    written = about_zeros(measured - design.told(effects), blocks.zero, blocks.count)
+    written = about_zeros(measured - design.predict(effects), blocks.zero, blocks.count)
 
     def rms(left_arcsec: FloatArray) -> float:
         return math.sqrt(float(blocks.count @ left_arcsec**2) / float(np.sum(blocks.count)) + inside)
@@ -314,7 +314,7 @@ def conclude(
         )
     }
     zeros = tuple(value for name, (value, _) in further.items() if name.startswith("zero"))
-    waves = design.told([each for each in solution.effects if each.part is Part.ORDERS])
+    waves = design.predict([each for each in solution.effects if each.part is Part.ORDERS])
     lines = spectrum(state.candidates, chosen, system, state.options.family_wise)
     _describe_limits(state, lines, warnings)
     used = blocks.count > 0  # a block without any weight has no mean to plot
@@ -343,7 +343,7 @@ def conclude(
             kind=samples.kinds,
             kind_index=blocks.kind[used],
             error_arcsec=(blocks.error_arcsec - np.array(zeros)[blocks.zero])[used],
-            predicted_arcsec=design.told(solution.effects)[used],
+            predicted_arcsec=design.predict(solution.effects)[used],
             residual_arcsec=written[used],
             orders_arcsec=(solution.residual + waves)[used],
         ),

@@ -353,7 +353,7 @@ class _Judge:
     def _left_by(self, effects: Sequence[Effect], start: Start) -> FloatArray:
         """Returns observed minus predicted at the usable points, about the best-fitting zeros."""
         estimator = self.estimator
-        left = estimator.observed - estimator.told(effects, start)
+        left = estimator.observed - estimator.predict(effects, start)
         return about_zeros(left, estimator.zero, estimator.weight**2)
 
     def _by_kind(self, given: FloatArray, after: FloatArray) -> dict[str, tuple[Figures, Figures]]:

@@ -234,7 +234,7 @@ class Traces:
         """Direction of the motor, -1 or 1; held at rest."""
         return direction_of(self.motion)[self.rows]
 
-    def told(self, effect: Effect) -> FloatArray:
+    def predict(self, effect: Effect) -> FloatArray:
         """Returns an effect's contribution at these points, arcsec, shape (m,)."""
         return means(effect.predict(self.samples, self.start), self.runs)[self.rows]
 

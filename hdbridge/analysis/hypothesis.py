@@ -314,9 +314,9 @@ class Estimator:
         effects, start = fitted.hypothesis.effects, fitted.hypothesis.start
         return fitted.zeros[self.data.full.zero] + self.level + self._regressors.predicted(effects, (start,))
 
-    def told(self, effects: Sequence[Effect], start: Start) -> FloatArray:
+    def predict(self, effects: Sequence[Effect], start: Start) -> FloatArray:
         """Returns the sum of the effects at the usable points, arcsec, shape (m,)."""
-        return self._regressors.told(effects, (start,))
+        return self._regressors.predict(effects, (start,))
 
     def with_load_angle(self, load_deg: FloatArray) -> None:
         """Sets the load angle (n,) on which effects of the load encoder's lines depend."""

@@ -47,7 +47,7 @@ class Regressors:
             self._recent.popitem(last=False)
         return columns
 
-    def told(self, effects: Sequence[Effect], starts: Starts) -> FloatArray:
+    def predict(self, effects: Sequence[Effect], starts: Starts) -> FloatArray:
         """Returns the sum of the effects, arcsec, shape (rows,)."""
         parts = (self.columns(each, starts) @ each.coefficients() for each in effects)
         return np.asarray(sum(parts, start=np.zeros(self._rows)))

@@ -145,7 +145,7 @@ def _learned(
         twin = fit_twin([recording], axis, begun.truth, lambda share: bar.update(task, completed=share))
         verdict = judge(twin)
         if verdict.kept:
-            kept = KeptTwin(twin.truth).told(recordings=[str(each) for each in paths])
+            kept = KeptTwin(twin.truth).with_provenance(recordings=[str(each) for each in paths])
             reason = f"learned from {', '.join(each.name for each in paths)}"
             TWINS.propose(files.folder, kept, reason, datetime.now().astimezone(), recording.drive)
     commit = Command(f"hdbridge model commit {files.folder} --twin", "makes it what --simulate uses")

@@ -68,7 +68,7 @@ class Kept(Protocol):
 
     @property
     def provenance(self) -> Mapping[str, Any]: ...
-    def told(self, **provenance: Any) -> Self:
+    def with_provenance(self, **provenance: Any) -> Self:
         """Returns the same content with these entries added to its provenance."""
         ...
 
@@ -176,7 +176,7 @@ class Store(Generic[K]):
         axis = AxisConfig.load(profile)
         content.check_ratio(axis)
         with _locked(profile):
-            told = content.told(date=_iso(date), reason=reason)
+            told = content.with_provenance(date=_iso(date), reason=reason)
             told.bound_to(axis, identity).save(profile / self.pending)
         return profile / self.pending
 

@@ -91,7 +91,7 @@ class TransmissionModel:
         """Writes the model file atomically."""
         write_atomically(path, self.dump())
 
-    def told(self, **provenance: Any) -> Self:
+    def with_provenance(self, **provenance: Any) -> Self:
         """Returns the model with these entries added to its provenance."""
         return replace(self, provenance={**self.provenance, **provenance})
 

@@ -80,9 +80,9 @@ def _in_model(finding: Finding, model: TransmissionModel) -> Effect | None:
 
 def _does(effect: Effect, traces: Traces) -> FloatArray:
     """Returns the contribution of an effect at the points of the traces, arcsec, shape (m,)."""
-    does = traces.told(effect)
+    does = traces.predict(effect)
     if effect.replaces in CATALOGUE:  # it replaces another effect
-        does = does - traces.told(CATALOGUE[effect.replaces].model_validate(effect.parameters()))
+        does = does - traces.predict(CATALOGUE[effect.replaces].model_validate(effect.parameters()))
     return does
 
 
@@ -105,7 +105,7 @@ def _strength(
     scaled = None if effect is None else effect.scales()
     if scaled is None or own is None:
         return None
-    part = traces.told(scaled[1])
+    part = traces.predict(scaled[1])
     coarse = replace(home, bins=SEEN_BINS)
     number = coarse.numbers()
     square = np.bincount(number, part**2)

@@ -79,14 +79,14 @@ class KeptTwin:
         """Axis, drive and gear to which it is bound, date, reason and recordings."""
         return self.truth.provenance
 
-    def told(self, **provenance: Any) -> Self:
+    def with_provenance(self, **provenance: Any) -> Self:
         """Returns the twin with these entries added to its provenance."""
         known = {**self.truth.provenance, **provenance}
         return type(self)(self.truth.model_copy(update={"provenance": known}), self.path)
 
     def bound_to(self, axis: AxisConfig, identity: Identity | None = None) -> Self:
         """Returns the twin bound to an axis and the drive that answered (else the axis file's)."""
-        return self.told(**binding(axis, identity))
+        return self.with_provenance(**binding(axis, identity))
 
     def check_ratio(self, axis: AxisConfig) -> None:
         """Raises InputError if the twin has another gear ratio than the axis file.
