@@ -57,7 +57,7 @@ def command(
     """Measure an axis by a plan, fit its model, test it on the axis, and keep it as pending.
 
     The axis moves within the limits of its axis file, without compensation. Everything measured is kept;
-    Ctrl-C stops the axis, and --resume goes on. The model is pending until `hdbridge model commit PROFILE`.
+    Ctrl-C stops the axis, and --resume continues. The model is pending until `hdbridge model commit PROFILE`.
     A model that does not improve on held-out data is not offered.
     """
     from hdbridge.calibration import calibrate

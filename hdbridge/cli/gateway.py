@@ -45,7 +45,8 @@ def simulate(
     machine: MachineArgument,
     axis: AxisOption = None,
     duration_s: Annotated[
-        float | None, typer.Option("--duration", min=0.0, help="Stop after so many seconds; else at Ctrl-C.")
+        float | None,
+        typer.Option("--duration", min=0.0, help="Stop after this many seconds; without it at Ctrl-C."),
     ] = None,
 ) -> None:
     """Run an ideal drive in place of the gateway, in real time, until Ctrl-C.

@@ -53,7 +53,7 @@ def command(
     """Move an axis by a plan and keep the recording, for diagnose, twin and fit.
 
     The axis moves as in a calibration, within the limits of its axis file and without compensation. No model
-    is fitted or changed. Ctrl-C stops the axis, and --resume goes on.
+    is fitted or changed. Ctrl-C stops the axis, and --resume continues.
     """
     from hdbridge.calibration import measure
     from hdbridge.cli.measuring import Measurement, phases

@@ -68,7 +68,7 @@ class Measurement:
             default = Path("recordings") / f"{axis.name}-{date:%Y%m%d-%H%M%S}"
             return cls(axis, loaded, make_folder(out) if out else new_folder(default), date, None)
         if out is not None:
-            raise InputError("--resume goes on in its own folder: leave out --out")
+            raise InputError("--resume continues in its own folder: leave out --out")
         journal = Journal.open(resume)
         journal.check_is_of(axis)
         return cls(axis, journal.plan, resume, date, journal)

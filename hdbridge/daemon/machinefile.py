@@ -138,7 +138,7 @@ class MachineFile(_Part):
         description="the flight recorder: folder, size and age of recordings",
     )
     gateway: GatewaySettings | None = Field(
-        None, description="axes as drives of another master; without the key there is none"
+        None, description="axes as drives of another master; without this key there is no gateway"
     )
     adaptation: AdaptationSettings = Field(
         default_factory=AdaptationSettings, description="adaptation of model parameters to the load encoder"

@@ -156,7 +156,7 @@ def _not_read(axis: AxisConfig, od: ObjectDictionary) -> Iterator[Left]:
     """Yields the objects that the control cycle and the boot-up would read but the drive cannot provide."""
     absent = layouts(axis, od).absent
     for address, consequence in (
-        (objects.POSITION_DEMAND, "the last target sent stands in for it"),
+        (objects.POSITION_DEMAND, "the last target sent is used instead"),
         (objects.TORQUE_ACTUAL, "torque is neither recorded nor checked"),
         (objects.SUPPORTED_MODES, "only the drive itself shows if it has the mode"),
         (objects.ERROR_CODE, "only emergency messages explain a fault"),

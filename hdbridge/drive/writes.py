@@ -167,7 +167,7 @@ def _pdos(axis: AxisConfig, od: ObjectDictionary | None, pdos: Layouts) -> Itera
         yield timer
         yield last
     for base, kind, without in (
-        (objects.TPDO_COMMUNICATION, "TPDO", "it goes on sending"),
+        (objects.TPDO_COMMUNICATION, "TPDO", "it keeps sending"),
         (objects.RPDO_COMMUNICATION, "RPDO", "it stays, and nobody sends it"),
     ):
         for index in range(base, base + PDOS_PER_KIND):

@@ -16,7 +16,7 @@ SOURCE = "source: {index: 0x60E4, subindex: 1, type: int32, via: tpdo}"
     ("eds", "lines"),
     [
         (without(OWN, 0x605D), [r"left to the drive  605Dh:00, which drive\.eds lacks: how a halt brakes \(.*axis\.yaml:\d+:3: drive\.halt_option\)"]),
-        (without(OWN, 0x6062), [r"left to the drive  6062h:00, which drive\.eds lacks: the last target sent stands in for it$"]),
+        (without(OWN, 0x6062), [r"left to the drive  6062h:00, which drive\.eds lacks: the last target sent is used instead$"]),
         (without(OWN, 0x6066), [r"left to the drive  6066h:00, .*: time after which a following error counts"]),
         (without(OWN, 0x6077), [r"left to the drive  6077h:00, .*: torque is neither recorded nor checked"]),
         (without(OWN, 0x1017), [r"left to the drive  1017h:00, .*: only missing TPDOs show that the drive is gone"]),
