@@ -11,6 +11,7 @@ import re
 import sys
 from collections.abc import Iterator, Mapping
 from enum import Enum
+from functools import cache
 from pathlib import Path
 from typing import Any, get_args
 
@@ -69,9 +70,9 @@ ENTRIES: tuple[type[BaseModel], ...] = (
 
 
 def key_table(model: type[BaseModel]) -> str:
-    """Returns every key of a file with its expected values, default and meaning."""
-    lines = ["| key | expected | default | meaning |", "|---|---|---|---|"]
-    lines += (f"| `{key}` | {what} | {default} | {about} |" for key, what, default, about in _rows(model))
+    """Returns every key of a file with its expected value and its meaning."""
+    lines = ["| key | value | meaning |", "|---|---|---|"]
+    lines += (f"| {key} | {what} | {about} |" for key, what, about in _rows(model))
     return "\n".join(lines) + "\n"
 
 
@@ -85,14 +86,11 @@ def column_table() -> str:
 
 def procedure_table() -> str:
     """Returns the procedures of a plan, with the keys of each."""
-    lines = ["| procedure | key | expected | default | meaning |", "|---|---|---|---|---|"]
+    lines = ["| procedure | key | value | meaning |", "|---|---|---|---|"]
     for entry in ENTRIES:
         _, *keys = _rows(entry)
         procedure = entry.model_fields["procedure"].annotation
-        lines += (
-            f"| `{get_args(procedure)[0]}` | `{key}` | {what} | {default} | {about} |"
-            for key, what, default, about in keys
-        )
+        lines += (f"| `{get_args(procedure)[0]}` | {key} | {what} | {about} |" for key, what, about in keys)
     return "\n".join(lines) + "\n"
 
 
@@ -154,16 +152,54 @@ def updated(page: str) -> str:
     return _BLOCK.sub(lambda match: match[1] + BLOCKS[match["name"]]() + match[3], page)
 
 
-def _rows(model: type[BaseModel], prefix: str = "") -> Iterator[tuple[str, str, str, str]]:
+_SHORTER = (
+    (r"\ban? (mapping)(, not empty)?", ""),
+    (r"\ban? (integer|number|list)\b", r"\1"),
+    (r"\bfrom (\S+ to)", r"\1"),
+    (r"\b(of at least|at least)\b", "from"),
+    (r", at most\b", " to"),
+    (r"\bat most\b", "to"),
+    (r"integer 0 to 4294967295", "32-bit integer"),
+    (r" or '", ", '"),
+    (r"'([^']*)'", r"`\1`"),
+)
+"""Words of an error message in the style of a table."""
+
+
+def _rows(
+    model: type[BaseModel], prefix: str = "", shown: dict[type[BaseModel], str] | None = None
+) -> Iterator[tuple[str, str, str]]:
+    """Yields key (bold if required), expected value (default) and meaning.
+
+    A mapping that was ``shown`` before is a reference to it.
+    """
+    shown = ({} if model is AxisConfig else dict(_of_the_axis_file())) if shown is None else shown
     for name, info in model.model_fields.items():
         key = key_of(name, info)
         place = field_at(model, (key,))
         assert place is not None
         inner, many = _inner(place)
-        what = type_words(place).replace("|", "\\|")
-        yield prefix + key, what, _default(key, info), place.description.replace("|", "\\|")
-        if inner is not None:
-            yield from _rows(inner, f"{prefix}{key}{'[]' if many else ''}.")
+        what = type_words(place)
+        for pattern, shorter in _SHORTER:
+            what = re.sub(pattern, shorter, what)
+        same = f"as {shown[inner]}" if inner in shown else ""
+        value = " ".join(each for each in (what, same, _default(key, info)) if each)
+        yield (
+            f"**`{prefix}{key}`**" if info.is_required() else f"`{prefix}{key}`",
+            value.replace("|", "\\|"),
+            place.description.replace("|", "\\|"),
+        )
+        if inner is not None and inner not in shown:
+            shown[inner] = f"`{prefix}{key}`"
+            yield from _rows(inner, f"{prefix}{key}{'[]' if many else ''}.", shown)
+
+
+@cache
+def _of_the_axis_file() -> dict[type[BaseModel], str]:
+    """Returns the mappings within an axis file, with their keys."""
+    shown: dict[type[BaseModel], str] = {}
+    list(_rows(AxisConfig, shown=shown))
+    return {model: f"{key} of an axis file" for model, key in shown.items()}
 
 
 def _inner(place: Field) -> tuple[type[BaseModel] | None, bool]:
@@ -179,19 +215,19 @@ def _inner(place: Field) -> tuple[type[BaseModel] | None, bool]:
 
 def _default(key: str, info: FieldInfo) -> str:
     if info.is_required():
-        return "required"
+        return ""
     value = info.get_default(call_default_factory=True, validated_data={})
     if value is None or value is PydanticUndefined or value in ((), {}, "") or isinstance(value, BaseModel):
         return ""
     if isinstance(value, Enum):
         value = value.value
     if key == "index":
-        return f"`{value:#x}`"
+        return f"(`{value:#x}`)"
     if isinstance(value, bool):
-        return f"`{value}`".lower()
+        return f"(`{value}`)".lower()
     if isinstance(value, tuple):
-        return f"`{[*value]}`".replace(".0", "")
-    return f"`{value:g}`" if isinstance(value, float) else f"`{value}`"
+        return f"(`{[*value]}`)".replace(".0", "")
+    return f"(`{value:g}`)" if isinstance(value, float) else f"(`{value}`)"
 
 
 def main(arguments: list[str]) -> int:
