@@ -1,5 +1,5 @@
 """Writes the tables of docs/files.md and of plans (docs/calibration.md) from the models that read the files,
-that of faults (docs/daemon.md) from the fault table, and that of docs/twin.md from the translation.
+that of faults (docs/reliability.md) from the fault table, and that of docs/twin.md from the translation.
 
 python tools/file_reference.py           rewrite the tables
 python tools/file_reference.py --check   report if they are up to date (exit status 1 if not)
@@ -22,7 +22,7 @@ from pydantic_core import PydanticUndefined
 from hdbridge.axis import AxisConfig
 from hdbridge.daemon.machinefile import MachineFile
 from hdbridge.device.behaviour import Behaviour
-from hdbridge.drive.supervision import TABLE, Reaction
+from hdbridge.drive.supervision import TABLE, Fault, Reaction
 from hdbridge.effects import CATALOGUE
 from hdbridge.files.expectation import Field, field_at, key_of, type_words
 from hdbridge.fleet.dataset import COLUMNS as FLEET_COLUMNS
@@ -46,7 +46,7 @@ DOCS = Path(__file__).resolve().parent.parent / "docs"
 PAGES = (
     DOCS / "files.md",
     DOCS / "calibration.md",
-    DOCS / "daemon.md",
+    DOCS / "reliability.md",
     DOCS / "fleet.md",
     DOCS / "twin.md",
     DOCS / "truth-file.md",
@@ -55,7 +55,7 @@ _BLOCK = re.compile(r"(<!-- generated: (?P<name>[a-z-]+) -->\n).*?(<!-- end -->)
 
 
 REACTION_WORDS = {
-    Reaction.GO: "go on, count",
+    Reaction.GO: "count",
     Reaction.FREEZE: "freeze",
     Reaction.QUICK_STOP: "quick stop",
     Reaction.LATCH: "latch",
@@ -94,12 +94,40 @@ def procedure_table() -> str:
     return "\n".join(lines) + "\n"
 
 
+SEEN_BY: Mapping[Fault, str] = {
+    Fault.LOST_TPDO: "not all TPDOs within the window: lost, remote, 29-bit, cable pulled",
+    Fault.OVERRUN: "more than half a period late; whole periods are skipped",
+    Fault.HANG: "no cycle for heartbeat_ms or four cycles with power on; before the next SYNC",
+    Fault.DUPLICATE_TPDO: "drained before SYNC, or twice in the window",
+    Fault.WRONG_LENGTH: "the PDO's length",
+    Fault.DISCARDED_FRAME: "remote, 29-bit, FD or error frame",
+    Fault.FLOOD: "more than 256 frames before SYNC",
+    Fault.EMERGENCY: "EMCY; the statusword decides. The newest 64 are kept",
+    Fault.MASTER_LOST: "EMCY 8130h or 8250h while enabled; before the next SYNC",
+    Fault.DRIVE_FAULT: "statusword, also for one between two SYNCs",
+    Fault.DROPPED_OUT: "statusword, also for one between two SYNCs",
+    Fault.BOOT_UP: "boot-up message of a node of the cycle",
+    Fault.NMT_CHANGE: "heartbeat of a node of the cycle",
+    Fault.HEARTBEAT_LOST: "heartbeat older than twice heartbeat_ms",
+    Fault.OWN_ID_ELSEWHERE: "RPDO, heartbeat of the master, NMT or SDO request from elsewhere",
+    Fault.FOREIGN_SYNC: "SYNC from elsewhere",
+    Fault.ENCODER_JUMP: "more than 1.5 x velocity limit x time + 180 arcsec at the load, while enabled",
+    Fault.FOLLOWING_ERROR: "6062h minus 6064h above following_error_deg, while enabled",
+    Fault.BAD_TARGET: "NaN, infinite, not an integer or outside the limits, before it is sent",
+    Fault.BUS_DOWN: "any failing call, or the error frame: down, deleted, bus-off",
+    Fault.TRANSMIT_FULL: "ENOBUFS; the frame is dropped, never sent again",
+    Fault.CHANNEL_HELD: "its PDO, and the range in the axis file; the last reading is held",
+    Fault.CHANNEL_LOST: "no reading for hold_ms; its part of the correction fades out",
+}
+
+
 def fault_table() -> str:
     """Returns the reactions to each fault, and the advice."""
-    lines = ["| fault | at once | again in the next cycles | what to do |", "|---|---|---|---|"]
+    lines = ["| fault | at once | in the next cycle | seen by | what to do |", "|---|---|---|---|---|"]
     for row in TABLE:
         later = REACTION_WORDS[row.then] if row.then is not row.first else ""
-        lines.append(f"| {row.fault.value} | {REACTION_WORDS[row.first]} | {later} | {row.hint} |")
+        first = REACTION_WORDS[row.first]
+        lines.append(f"| {row.fault.value} | {first} | {later} | {SEEN_BY[row.fault]} | {row.hint} |")
     return "\n".join(lines) + "\n"
 
 
