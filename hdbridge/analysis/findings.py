@@ -231,7 +231,7 @@ class Diagnosis:
     capability: Capability
     """Causes that the record can show."""
     by_kind: Mapping[str, tuple[Figures, Figures]]
-    """By kind of motion and by direction: given and extended model."""
+    """Figures of the given and the extended model, by kind of motion and by direction."""
     remarks: tuple[str, ...]
     model: TransmissionModel = field(repr=False)
     """Extended model; the refitted one if nothing was found."""

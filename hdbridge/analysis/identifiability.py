@@ -117,7 +117,7 @@ def _before(estimator: Estimator, candidate: Effect, base: Sequence[Effect], sta
 
 
 class _Background:
-    """All that explains a record without a cause: the model, the motion before, errors of turning points."""
+    """Explanations of a record without a cause: the model, the motion before, errors of turning points."""
 
     def __init__(self, estimator: Estimator, fitted: Fitted, base: Sequence[Effect], stride: int) -> None:
         start = fitted.hypothesis.start

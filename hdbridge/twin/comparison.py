@@ -202,7 +202,7 @@ class Comparison:
 
     rows: tuple[Row, ...]
     traces: Mapping[str, Trace]
-    """By signal."""
+    """Figures by signal."""
     spectra: Mapping[str, Spectrum]
 
     def row(self, channel: str, kind: str = ALL) -> Row | None:

@@ -30,7 +30,7 @@ def bring(master, state: str) -> None:
 
 
 def demanded(state: str, word: int) -> str:
-    """Where CiA 402 says that ``word`` leads from ``state`` (axis at rest, 605Ah = 6).
+    """Returns the state that CiA 402 gives after ``word`` in ``state`` (axis at rest, 605Ah = 6).
 
     The commands of the profile's table, bits 7 3 2 1 0, with x for any.
     """
