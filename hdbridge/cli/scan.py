@@ -17,16 +17,14 @@ from hdbridge.cli.options import (
     SeedOption,
     SimulateOption,
     TruthOption,
-    connected,
     console,
-    load_axis,
     notes,
     progress_bar,
     write_json,
 )
+from hdbridge.cli.session import Session
 from hdbridge.clock import Clock, MonotonicClock
 from hdbridge.errors import DriveError, InputError
-from hdbridge.files.profile import Profile
 
 if TYPE_CHECKING:
     import can
@@ -82,9 +80,8 @@ def scan(
 
     axis = None
     if profile is not None:
-        files = Profile.find(profile)
-        axis = load_axis(files, interface, channel, simulate=simulate)
-        opened = connected(axis, files, simulate=simulate, truth=truth, seed=seed, force=force)
+        session = Session(profile, simulate, truth, seed, interface, channel, force)
+        axis, opened = session.axis, session.connected()
     elif simulate or interface is None or channel is None:
         raise InputError("scan needs a bus: give a PROFILE, or --interface and --channel (socketcan, can0)")
     else:
