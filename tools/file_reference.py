@@ -49,7 +49,7 @@ PAGES = (
     DOCS / "reliability.md",
     DOCS / "fleet.md",
     DOCS / "twin.md",
-    DOCS / "truth-file.md",
+    DOCS / "ci.md",
 )
 _BLOCK = re.compile(r"(<!-- generated: (?P<name>[a-z-]+) -->\n).*?(<!-- end -->)", re.DOTALL)
 
