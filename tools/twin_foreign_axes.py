@@ -34,15 +34,12 @@ from hdbridge.errors import HdbridgeError
 from hdbridge.procedures.plan import Plan
 from hdbridge.records.recording import Recording
 from hdbridge.sim.truth import Truth
-from hdbridge.twin.comparison import compare
-from hdbridge.twin.defaults import default_truth
-from hdbridge.twin.fitting import FIT_S
-from hdbridge.twin.making import fit_twin
-from hdbridge.twin.misfit import coarse, prepare
+from hdbridge.twin.compare import compare
+from hdbridge.twin.fit import FIT_S, in_best_structure, start_of
+from hdbridge.twin.misfit import Replays, coarse, prepare
+from hdbridge.twin.parameters import default_truth
 from hdbridge.twin.replay import replay_directly
-from hdbridge.twin.replays import Replays
-from hdbridge.twin.structures import fit_structures
-from hdbridge.twin.verdict import judge
+from hdbridge.twin.twin import fit_twin, judge
 
 
 def bench(foreign: Foreign, plan: Plan) -> Recording:
@@ -85,7 +82,7 @@ def start(axis: AxisConfig, foreign: Foreign) -> Truth:
 def servo_only(recording: Recording, axis: AxisConfig, begun: Truth, workers: int) -> Truth:
     """Fits servo structures alone, without the usual servo first."""
     with Replays(coarse(prepare(recording, axis, begun), FIT_S), workers) as replays:
-        return fit_structures(replays, begun).truth
+        return in_best_structure(replays, start_of(begun, replays.data)).truth
 
 
 def shares(other: Recording, axis: AxisConfig, truth: Truth, seed: int) -> str:

@@ -12,7 +12,7 @@ import pytest
 import real_records
 
 from hdbridge.records.recording import Recording
-from hdbridge.twin.translation import translate
+from hdbridge.twin.translate import translate
 
 BESIDE = Path(__file__).parents[3] / "shared" / "data"
 

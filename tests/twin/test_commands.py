@@ -15,7 +15,7 @@ from hdbridge.records.record import Record
 from hdbridge.records.recording import Recording
 from hdbridge.sim.exercise import Exercise
 from hdbridge.sim.truth import Truth
-from hdbridge.twin.commands import counted_cycles, doubts, legs_of
+from hdbridge.twin.replay import counted_cycles, doubts, legs_of
 
 DEMO = Path(__file__).parents[2] / "profiles" / "demo"
 AXIS = AxisConfig.load(DEMO)

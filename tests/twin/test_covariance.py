@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from hdbridge.twin.least_squares import principal, sandwich
+from hdbridge.twin.fit import principal, sandwich
 
 
 def test_what_slopes_would_still_take_is_no_scatter_of_the_legs() -> None:

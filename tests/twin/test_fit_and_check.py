@@ -21,15 +21,21 @@ from hdbridge.records.recording import Recording
 from hdbridge.sim.lockstep import simulated_bench
 from hdbridge.sim.truth import Truth
 from hdbridge.twin.check import Check, check
-from hdbridge.twin.least_squares import solve
-from hdbridge.twin.making import with_knowledge
-from hdbridge.twin.misfit import CHANNELS, counted, prepare, residuals
-from hdbridge.twin.noise import noise_floor, noise_in_motion
+from hdbridge.twin.fit import read_off, solve
+from hdbridge.twin.misfit import (
+    CHANNELS,
+    Replays,
+    Values,
+    counted,
+    noise_floor,
+    noise_in_motion,
+    prepare,
+    residuals,
+    values_of,
+    what_is_left,
+)
 from hdbridge.twin.parameters import BY_NAME, coordinates, value_in, with_values
-from hdbridge.twin.regressions import read_off
-from hdbridge.twin.replays import Replays
-from hdbridge.twin.result import Values
-from hdbridge.twin.verdict import values_of, what_is_left
+from hdbridge.twin.twin import with_knowledge
 
 DEMO = Path(__file__).parents[2] / "profiles" / "demo"
 AXIS = AxisConfig.load(DEMO)
@@ -191,7 +197,7 @@ def test_a_load_that_rings_out_of_step_has_changed() -> None:
 @cache
 def replay_only() -> Truth:
     """A twin with wrong loops: it leaves several times the noise, so its values are not the axis's."""
-    wrong = with_values(TRUTH, {"position gain": 120.0, "integral time": 40.0, "motor inertia": 6e-5})
+    wrong = with_values(TRUTH, {"position gain": 80.0, "integral time": 40.0, "motor inertia": 6e-5})
     parameters = tuple(BY_NAME[name] for name in NAMES)
     with Replays(prepare(recorded(), AXIS, wrong), 1) as replays:
         prior = np.array(coordinates(wrong, parameters))

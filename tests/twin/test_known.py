@@ -9,7 +9,7 @@ import pytest
 
 from hdbridge.sim.truth import Truth
 from hdbridge.twin.check import Known
-from hdbridge.twin.fitting import free_parameters
+from hdbridge.twin.fit import free_parameters
 
 TRUTH = Truth.load(Path(__file__).parents[2] / "profiles" / "demo")
 PARAMETERS = free_parameters(TRUTH)

@@ -14,7 +14,7 @@ from hdbridge.axis import AxisConfig
 from hdbridge.records.recording import Recording, Segment
 from hdbridge.sim.exercise import Exercise
 from hdbridge.sim.truth import Truth
-from hdbridge.twin.fitting import (
+from hdbridge.twin.fit import (
     as_late,
     better_places,
     delays,
@@ -23,12 +23,11 @@ from hdbridge.twin.fitting import (
     inertias,
     lags,
     neighbours,
+    solve,
     springs,
 )
-from hdbridge.twin.least_squares import solve
-from hdbridge.twin.misfit import Data, prepare
+from hdbridge.twin.misfit import Data, Replays, prepare
 from hdbridge.twin.parameters import BY_NAME, FOLLOWING, coordinates, free_value, with_values
-from hdbridge.twin.replays import Replays
 
 DEMO = Path(__file__).parents[2] / "profiles" / "demo"
 AXIS = AxisConfig.load(DEMO)

@@ -11,9 +11,9 @@ import numpy as np
 
 from hdbridge.effects import FloatArray
 from hdbridge.sim.truth import Truth
-from hdbridge.twin.least_squares import fitted_rows, legs_of_rows, solve
+from hdbridge.twin.fit import fitted_rows, legs_of_rows, solve
+from hdbridge.twin.misfit import Scales
 from hdbridge.twin.naming import Alike, Finding, alike, name_causes
-from hdbridge.twin.noise import Scales
 from hdbridge.twin.parameters import BY_NAME, FOLLOWING, LOAD, TORQUE, coordinates, with_values
 
 TRUTH = Truth.load(Path(__file__).parents[2] / "profiles" / "demo")

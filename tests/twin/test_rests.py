@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from hdbridge.records.record import Record, concatenate
-from hdbridge.twin.stretches import HELD_S, LARGEST_UNKNOWN, held_rows, stands, unknown_rows
+from hdbridge.twin.replay import HELD_S, LARGEST_UNKNOWN, held_rows, stands, unknown_rows
 
 CYCLE_S = 0.01
 COUNT_DEG = 0.045

@@ -55,8 +55,8 @@ from hdbridge.sim import fast
 from hdbridge.sim.exercise import Exercise
 from hdbridge.sim.machine import Machine
 from hdbridge.sim.truth import Truth
-from hdbridge.twin.defaults import default_truth
-from hdbridge.twin.translation import TABLE, translate
+from hdbridge.twin.parameters import default_truth
+from hdbridge.twin.translate import TABLE, translate
 
 PROFILE = Path(__file__).parents[2] / "profiles" / "demo"
 N = 50.0

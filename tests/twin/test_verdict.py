@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from hdbridge.twin.comparison import ALL, Comparison, Row
-from hdbridge.twin.result import HELD_OUT
-from hdbridge.twin.verdict import better
+from hdbridge.twin.compare import ALL, Comparison, Row
+from hdbridge.twin.twin import HELD_OUT, better
 
 UNITS = {"load_error": "arcsec", "following_error": "motor deg", "motor_torque": "Nm", "temperature": "K"}
 

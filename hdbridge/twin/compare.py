@@ -18,7 +18,7 @@ from hdbridge.effects import Channel, FloatArray
 from hdbridge.errors import InputError
 from hdbridge.records.record import Record
 from hdbridge.records.recording import Segment
-from hdbridge.twin.stretches import STANDS_COUNTS, stands, unknown_rows
+from hdbridge.twin.replay import STANDS_COUNTS, stands, unknown_rows
 from hdbridge.units import ARCSEC_PER_DEG
 
 # ----------------------------------------------------------------
