@@ -24,7 +24,7 @@ from hdbridge.device.emergency import Emergency, ErrorCode
 from hdbridge.device.faults import Faults, Outgoing
 from hdbridge.device.firmware import Firmware
 from hdbridge.device.motion import Machine
-from hdbridge.device.nameplate import Nameplate
+from hdbridge.device.nameplate import MOTOR_POSITION, Nameplate
 from hdbridge.device.nmt import Nmt, NmtCommand
 from hdbridge.device.parameters import StoredParameters
 from hdbridge.device.pdo import ReceivePdo, TransmitPdo
@@ -93,7 +93,7 @@ class DriveNode:
         self._parameters.restore()
         self.emergency = Emergency(self.dictionary, self._send_unless_stopped)
         self.firmware = Firmware(self.dictionary, machine, self.emergency, self.faults, self.behaviour, stage)
-        if nameplate.load_object in self.dictionary:
+        if nameplate.load_object in self.dictionary and nameplate.load_object != MOTOR_POSITION:
             self.dictionary[nameplate.load_object].bind(self.firmware.motion.load_position)
         self._sdo = SdoServer(self.dictionary)
         self._tpdos = [TransmitPdo(self.dictionary, number, self._route) for number in self._pdos(0x1800)]
