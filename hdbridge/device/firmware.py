@@ -9,7 +9,7 @@ from __future__ import annotations
 from typing import Final
 
 from hdbridge.device.behaviour import Behaviour, Controlword
-from hdbridge.device.dictionary import Abort, Dictionary, SdoAbortError
+from hdbridge.device.dictionary import Abort, Dictionary, SdoAbortError, only
 from hdbridge.device.emergency import Emergency, ErrorCode
 from hdbridge.device.faults import Faults
 from hdbridge.device.modes import (
@@ -137,6 +137,7 @@ class Firmware:
         entry[0x60E5, 1].bind(lambda: round(motion.load_velocity_counts_s))
         entry[0x6040, 0].follower = self.control
         entry[0x6072, 0].follower = self._limit_torque
+        entry[0x6086, 0].guard = only(0)  # trapezoidal profiles
         entry[0x6060, 0].guard = self._check_mode
         entry[0x6060, 0].follower = self._change_mode
         for index, sub in ((0x60C2, 1), (0x60C2, 2), (0x607E, 0)):
