@@ -13,6 +13,7 @@ from __future__ import annotations
 import math
 import multiprocessing
 import os
+import signal
 import threading
 from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
@@ -444,6 +445,8 @@ class Replays:
 def _begin(data: tuple[Data, Data]) -> None:
     global _data  # noqa: PLW0603 - a process's own, set once where it begins
     _data = data
+    # Ctrl-C in a terminal reaches every process; the one that waits for this one decides what to keep.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with_parent, daemon=True).start()
 
 
@@ -739,10 +742,8 @@ SHARE: Final = 0.01
 def units(data: Data) -> dict[str, float]:
     """Returns a hundredth of the signal, or the noise if larger, by channel, in its unit."""
     noise, counts, found = noise_in_motion(data), counted(data), {}
-    for name, signal in signals_of(data).items():
-        inside = counts[name] > 0.0
-        rms = math.sqrt(float(np.mean(np.square(signal[inside])))) if inside.any() else 0.0
-        found[name] = max(noise[name], SHARE * rms)
+    for name, measured in signals_of(data).items():
+        found[name] = max(noise[name], SHARE * rms(measured[counts[name] > 0.0]))
     return found
 
 
