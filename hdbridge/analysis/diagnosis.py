@@ -10,6 +10,7 @@ import numpy as np
 from hdbridge.analysis import changes
 from hdbridge.analysis.acceptance import gate
 from hdbridge.analysis.calibrated import calibrated
+from hdbridge.analysis.capability import capability
 from hdbridge.analysis.checks import check_once, check_records, zeros_apart_arcsec
 from hdbridge.analysis.cuts import observed
 from hdbridge.analysis.extend import as_named, extended_model, supported
@@ -171,13 +172,15 @@ class _Judge:
         before = min(each_start, key=lambda error: float(error @ error))
         after = self._left_by(extended.effects, fitted.hypothesis.start)
         measured = estimator.observed - estimator.level - fitted.zeros[estimator.zero]
+        visible = identifiability(estimator, refitted, given)
         return Diagnosis(
             baseline=_figures(before),
             refitted=_figures(refitted.residual / estimator.weight),
             extended=_figures(after),
             noise_floor_arcsec=float(np.sqrt(np.mean(estimator.weight**-2.0))),
             findings=tuple(findings),
-            identifiability=identifiability(estimator, fitted, given),
+            identifiability=visible,
+            capability=capability(estimator.data, given, visible, estimator.scales),
             by_kind=self._by_kind(before, after),
             remarks=estimator.data.remarks,
             model=extended,

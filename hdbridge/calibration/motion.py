@@ -258,13 +258,7 @@ def _ripple_test(runner: _Runner, model: TransmissionModel, measure: bool) -> Mo
     none = runner.run("without correction", model.only(()))
     static_model = replace(model, response=None)
     static = runner.run("correction of rest", static_model)
-    speed = axis.limits.velocity_deg_s
-    limits = Limits(
-        tuple((float(order_hz(at, speed, model.ratio)), each) for at, each in runner.amplitudes.items()),
-        axis.compensation.maximum_arcsec,
-        axis.compensation.slew_arcsec_s,
-        axis.limits.acceleration_deg_s2,
-    )
+    limits = limits_of(axis, model)
     if not measure:
         return _tested(runner, model, none, static, limits)
     trials = [Trial(static)]
@@ -331,13 +325,12 @@ class _Runner:
         interrupted: Callable[[], bool],
     ) -> None:
         axis = self.axis = drive.axis
-        self.amplitudes = {each.order: each.amplitude_arcsec for each in motor_orders(model)}
-        if not self.amplitudes:
+        self.orders = tuple(each.order for each in motor_orders(model))
+        if not self.orders:
             raise InputError(
                 f"the model has no motor order of {LEAST_ARCSEC:g} arcsec or more: there is no ripple to "
                 "measure the response by; calibrate the axis first"
             )
-        self.orders = tuple(self.amplitudes)
         self.procedure = EvenSpeed.spread(axis_view(axis))
         self.ratio, self.cycle_s = model.ratio, axis.drive.cycle_s
         self._drive = drive
@@ -365,6 +358,21 @@ def motor_orders(model: TransmissionModel) -> list[MotorOrder]:
     ]
     found = {order.order: order for each in series for order in each.orders}
     return [found[number] for number in sorted(found) if found[number].amplitude_arcsec >= LEAST_ARCSEC]
+
+
+def limits_of(axis: AxisConfig, model: TransmissionModel) -> Limits:
+    """Returns the limits of the axis file on a correction of the model's motor orders."""
+    speed = axis.limits.velocity_deg_s
+    tops = (
+        (float(order_hz(each.order, speed, model.ratio)), each.amplitude_arcsec)
+        for each in motor_orders(model)
+    )
+    return Limits(
+        tuple(tops),
+        axis.compensation.maximum_arcsec,
+        axis.compensation.slew_arcsec_s,
+        axis.limits.acceleration_deg_s2,
+    )
 
 
 def _ripples(

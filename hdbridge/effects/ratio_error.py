@@ -32,6 +32,7 @@ class RatioError(Linear):
     name: ClassVar[str] = "ratio_error"
     about: ClassVar[Cause] = Cause(
         title="wrong gear ratio or encoder scale",
+        subject="ratio errors",
         equation="ramp theta_M, ramp = 3600 (1 / N_true - 1 / N), theta_M limited to +- limit",
         signature="a ramp over the motor angle, the same in both directions, undone on the return",
         consequence="the load is off in proportion to its distance from zero",

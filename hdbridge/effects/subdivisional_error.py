@@ -57,6 +57,7 @@ class SubdivisionalError(Effect):
     channels: ClassVar[frozenset[Channel]] = frozenset({Channel.LOAD_ANGLE})
     about: ClassVar[Cause] = Cause(
         title="interpolation error of the load encoder",
+        subject="interpolation errors",
         equation="sum over k of A_k cos(k lines theta_L + phi_k), k = 1 (offset), 2 (gain, phase), 4 "
         "(distortion)",
         signature="very many periods per load turn: as many as the encoder has lines, or twice, or four "
