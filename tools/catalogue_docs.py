@@ -25,16 +25,16 @@ of the model file's `effects`. The error is how far the load is ahead of motor a
 load.
 
 - **Separate it**: the measurement that distinguishes a cause from its look-alikes.
-- **Compensated**: an error of the measurement is not, because that would move the load away from its target;
-  neither is what cannot be predicted.
+- **Compensated**: yes, unless stated otherwise. An error of the measurement is not, because that would move
+  the load away from its target; neither is what cannot be predicted.
 - **Needs**: columns of the record in addition to `motor_position_deg`. Speed, acceleration and direction are
   derived from the commanded motor angle by backward differences; the direction is held at rest. `load_deg`
   is the predicted load angle.
 - Parameters: the name ends in the unit. In brackets: the permitted range; *sought* is the range of the
   search for a parameter that enters non-linearly; = is the default. `orders` are a list of `{order,
   amplitude_arcsec, phase_deg}`. A `loop` (or `base`) is a copy of the model's loop: `{offset_arcsec,
-  width_deg, exponent, memory}`. `ratio` is N of the model. Beyond a *limit* an effect is held, so that a
-  faulty sensor cannot move the axis far.
+  width_deg, exponent, memory}`. `ratio` is N of the model. Beyond a `limit_*` of its input an effect is
+  held, so that a faulty sensor cannot move the axis far.
 """
 
 
@@ -65,9 +65,13 @@ def _section(kind: type[Effect]) -> Iterator[str]:
     yield f"- **Separate it**: {about.experiment}."
     if aliases_of(kind.name):
         yield f"- **Taken for**: {', '.join(f'[`{each}`](#{each})' for each in aliases_of(kind.name))}."
-    possible = "yes" if kind.compensable.possible else "no"
     why = kind.compensable.why.removeprefix("no, ")
-    yield f"- **Compensated**: {possible}; {why}."
+    if not kind.compensable.possible:
+        yield f"- **Not compensated**: {why}."
+    elif not why.startswith("the load really"):
+        yield f"- **Compensated**: {why}."
+    elif condition := why.partition(", where ")[2]:
+        yield f"- **Compensated** where {condition}."
     if kind.replaces:
         yield f"- In a model it replaces [`{kind.replaces}`](#{kind.replaces})."
     if needs := _needs(kind):
@@ -118,7 +122,8 @@ def _parameters(kind: type[Effect], model: type[BaseModel], within: str = "") ->
                 default = field.default
                 bounds.append(f"= {f'{default:g}' if isinstance(default, float) else str(default).lower()}")
             limits = ", ".join(each for each in bounds if each)
-            yield f"`{within}{name}` ({limits}): {field.description or ''}"
+            about = "" if name.startswith("limit_") else f": {field.description or ''}"
+            yield f"`{within}{name}` ({limits}){about}"
 
 
 def _model(annotation: Any) -> type[BaseModel] | None:

@@ -71,8 +71,12 @@ ENTRIES: tuple[type[BaseModel], ...] = (
 
 def key_table(model: type[BaseModel]) -> str:
     """Returns every key of a file with its expected value and its meaning."""
-    lines = ["| key | value | meaning |", "|---|---|---|"]
-    lines += (f"| {key} | {what} | {about} |" for key, what, about in _rows(model))
+    lines = ["| key: value | meaning |", "|---|---|"]
+    lines += (
+        f"| {key}{what and ': '}{what} | {about} |"
+        for key, what, about in _rows(model)
+        if key != "**`schema`**"
+    )
     return "\n".join(lines) + "\n"
 
 
@@ -184,6 +188,7 @@ _SHORTER = (
     (r"\ban? (mapping)(, not empty)?", ""),
     (r"\ban? (integer|number|list)\b", r"\1"),
     (r"\bfrom (\S+ to)", r"\1"),
+    (r"\bnumber (above|from|-?\d)", r"\1"),
     (r"\b(of at least|at least)\b", "from"),
     (r", at most\b", " to"),
     (r"\bat most\b", "to"),
