@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -16,20 +15,15 @@ from hdbridge.cli.options import (
     SeedOption,
     SimulateOption,
     TruthOption,
-    connected,
-    load_axis,
     notes,
     print_table,
     progress_bar,
     write_json,
 )
-from hdbridge.clock import Clock, MonotonicClock
+from hdbridge.cli.session import Session, bare_bus
 from hdbridge.errors import DriveError, InputError
-from hdbridge.files.profile import Profile
 
 if TYPE_CHECKING:
-    import can
-
     from hdbridge.conformance import Check, Result
 
 
@@ -121,16 +115,15 @@ def conform(
         )
         _print_list(wanted)
         return
-    axis, files = None, None
+    axis = None
     if profile is not None:
-        files = Profile.find(profile)
-        axis = load_axis(files, interface, channel, simulate=simulate)
+        session = Session(profile, simulate, truth, seed, interface, channel, force)
+        axis, opened = session.axis, session.connected()
         node_id, eds = node_id or axis.drive.node_id, eds or axis.eds_path
-        opened = connected(axis, files, simulate=simulate, truth=truth, seed=seed, force=force)
     elif simulate or channel is None or node_id is None:
         raise InputError("conform needs a node: give a PROFILE, or --channel (can0) and --node")
     else:
-        opened = _opened(interface or "socketcan", channel, bitrate_bps, force)
+        opened = bare_bus(interface or "socketcan", channel, bitrate_bps, force=force)
     assert node_id is not None
     od = None if eds is None else read_eds(eds, node_id).dictionary
     with deferred_interrupt() as interrupted, opened as (bus, clock), progress_bar() as bar:
@@ -173,20 +166,6 @@ def _chosen(allowed: Sequence[Check], every: Sequence[Check], only: Sequence[str
         if not any(each.id.startswith(prefix) for each in allowed):
             raise InputError(f"--only {prefix}: these checks need --motion or --store")
     return [each for each in allowed if each.id.startswith(tuple(only))]
-
-
-@contextmanager
-def _opened(
-    interface: str, channel: str, bitrate_bps: int | None, force: bool
-) -> Iterator[tuple[can.BusABC, Clock]]:
-    from hdbridge.axis import BusConfig
-    from hdbridge.drive.link import check_interface, open_bus
-
-    check_interface(interface, "--interface")
-    with open_bus(
-        BusConfig(interface=interface, channel=channel, bitrate_bps=bitrate_bps), shared=force
-    ) as bus:
-        yield bus, MonotonicClock()
 
 
 def _described(check: Check) -> dict[str, Any]:

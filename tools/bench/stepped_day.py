@@ -35,16 +35,16 @@ from accounts import Accounts
 sys.path.append(str(Path(__file__).resolve().parents[2] / "tests"))
 from support.service import Service, stepped_service
 
-from hdbridge.daemon.adaptation.settings import AdaptationSettings
 from hdbridge.daemon.api.metrics import Metrics
+from hdbridge.daemon.following.settings import AdaptationSettings
 from hdbridge.daemon.memory import Event, EventKind, SampleArray
 from hdbridge.daemon.recorder.about import About, AxisAbout
 from hdbridge.daemon.recorder.flightlog import Batch, FlightLog
 from hdbridge.daemon.recorder.settings import RecorderSettings
 from hdbridge.daemon.recorder.store import Store
-from hdbridge.daemon.service.adapting import Adapting
 from hdbridge.daemon.service.bridge import ServiceBridge
 from hdbridge.daemon.service.eventlog import ANSWERS_KEPT, KEPT
+from hdbridge.daemon.service.following import Following
 from hdbridge.daemon.service.interface import StreamPoint, WayPoint
 from hdbridge.daemon.service.journal import Journal
 from hdbridge.errors import HdbridgeError
@@ -317,16 +317,15 @@ async def day(
     rows: list[dict[str, float]] = []
     began_s = time.monotonic()
     with ExitStack() as stack:
-        writer = stack.enter_context(ThreadPoolExecutor(1))
+        worker = stack.enter_context(ThreadPoolExecutor(1))
         async with service.ready() as bridge:
-            adapting = [
-                Adapting(
-                    place, port, AdaptationSettings(mode="observe"), service.folder / f"adapt{place}", writer
-                )
-                for place, port in enumerate(bridge.axes.values())
+            observe = AdaptationSettings(mode="observe")
+            following = [
+                Following(index, axis, observe, service.folder / f"adapt{index}", worker)
+                for index, axis in enumerate(bridge.axes.values())
             ]
             recorder = Recorder(service)
-            for sink in (told, Journal([*bridge.axes]), Metrics(), recorder, *adapting):
+            for sink in (told, Journal([*bridge.axes]), Metrics(), recorder, *following):
                 bridge.core.observer.add(sink)
             bridge.subscribe()  # a client that never reads
             reading = asyncio.create_task(_read(bridge.subscribe()))
@@ -338,8 +337,8 @@ async def day(
             while daemon.clock.now() < end_s and time.monotonic() < began_s + at_most_s:
                 await story.step()
                 accounts.take(*reader.read())
-                for each in adapting:
-                    await each.follow()
+                for each in following:
+                    await each.apply()
                 if daemon.clock.now() >= due_s:
                     due_s += every_s
                     rows.append(look(daemon.clock.now() - begin_s, began_s))
@@ -347,7 +346,7 @@ async def day(
             reading.cancel()
             bridge.core.observer.poll()
             accounts.take(*reader.read())
-            for each in adapting:
+            for each in following:
                 each.close()
             recorded = recorder.close()
     cycle = daemon.controller.cycle

@@ -12,11 +12,11 @@ from __future__ import annotations
 import asyncio
 import logging
 import time
-from collections.abc import Callable, Coroutine, Mapping, Sequence
+from collections.abc import Callable, Coroutine, Mapping
 from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Protocol, Self
+from typing import TYPE_CHECKING, Any, Final, Self
 
 from hdbridge.client import messages
 from hdbridge.daemon.memory import Cell, CommandKind, EventKind
@@ -37,6 +37,7 @@ from hdbridge.errors import HdbridgeError, InputError
 if TYPE_CHECKING:
     from hdbridge.daemon.machine import Machine
     from hdbridge.daemon.memory import Memory
+    from hdbridge.daemon.service.following import Following
     from hdbridge.daemon.service.lease import Lease
 
 VERIFY_AGAIN_S: Final = (0.0, 1.0, 2.0, 5.0, 10.0)
@@ -45,14 +46,6 @@ SETTLE_AGAIN_S: Final = 0.5
 """Pause before a compensation that was not acknowledged is sent again."""
 EVENTS_TOLD: Final = 1000
 _log = logging.getLogger(__name__)
-
-
-class Adaptation(Protocol):
-    """Adaptation of one axis, as the bridge uses it."""
-
-    def state(self) -> messages.AdaptationState: ...
-    async def set_mode(self, mode: messages.AdaptationMode) -> None: ...
-    async def back(self) -> None: ...
 
 
 class ServiceBridge:
@@ -76,10 +69,8 @@ class ServiceBridge:
             axis.name: ServiceAxis(index, axis, self.core, self.book.begin, self.axis_state)
             for index, axis in enumerate(machine.axes)
         }
-        self.adaptations: dict[str, Adaptation] = {}
-        """Adaptations by axis name."""
-        self.advice: Callable[[str], Sequence[str]] = lambda _: ()
-        """Returns the watch's advice about an axis."""
+        self.following: dict[str, Following] = {}
+        """Watch and adaptation by axis name."""
         self.recorder: Callable[[], messages.RecorderState] = lambda: messages.RecorderState(on=False)
         self.marks: list[Callable[[str], None]] = []
         """Receivers of remarks, such as the recorder."""
@@ -270,14 +261,14 @@ class ServiceBridge:
     def axis_state(self, name: str) -> messages.AxisState:
         """Returns the state of one axis in the newest cycle."""
         self._look()
-        adaptation = self.adaptations.get(name)
+        following = self.following.get(name)
         return reports.axis_state(
             self._axis(name),
             self._stopped.get(name),
             self._loop_doubts.get(name, "the reason is in the log of an earlier service"),
             self.book.of_axis(name),
-            adaptation.state() if adaptation is not None else messages.AdaptationState(),
-            self.advice(name),
+            following.state if following is not None else messages.AdaptationState(),
+            following.advice if following is not None else (),
             self._outer(name),
         )
 
@@ -362,12 +353,12 @@ class ServiceBridge:
     async def adapt(self, holder: str, axis: str, mode: messages.AdaptationMode) -> None:
         """Sets the adaptation mode of an axis."""
         self.core.lease.check(holder)
-        await self._adaptation(axis).set_mode(mode)
+        await self._following(axis).set_mode(mode)
 
     async def adaptation_back(self, holder: str, axis: str) -> None:
         """Discards the adapted parameters of an axis."""
         self.core.lease.check(holder)
-        await self._adaptation(axis).back()
+        await self._following(axis).revert()
 
     def _axis(self, name: str) -> ServiceAxis:
         axis = self.axes.get(name)
@@ -375,14 +366,14 @@ class ServiceBridge:
             raise InputError(f"there is no axis '{name}'; expected one of: {', '.join(self.axes)}")
         return axis
 
-    def _adaptation(self, name: str) -> Adaptation:
+    def _following(self, name: str) -> Following:
         self._axis(name)
-        adaptation = self.adaptations.get(name)
-        if adaptation is None:
+        following = self.following.get(name)
+        if following is None:
             raise InputError(
                 f"{name}: nothing adapts on this axis; give it an adaptation in the machine file"
             )
-        return adaptation
+        return following
 
     def _start(self, coroutine: Coroutine[Any, Any, None]) -> None:
         task = asyncio.get_running_loop().create_task(coroutine)

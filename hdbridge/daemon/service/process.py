@@ -20,17 +20,18 @@ from hdbridge.daemon.api.metrics import Metrics
 from hdbridge.daemon.api.policy import Policy
 from hdbridge.daemon.api.server import ApiServer, Listener
 from hdbridge.daemon.api.sockets import file_of, unix_socket
+from hdbridge.daemon.following.autodiagnosis import AutoDiagnosis
 from hdbridge.daemon.logs import begin_log
 from hdbridge.daemon.machine import Machine
 from hdbridge.daemon.memory import Cell, Memory
+from hdbridge.daemon.recorder.recorder import FlightRecorder
 from hdbridge.daemon.runtime import runtime_folder
-from hdbridge.daemon.service.adapting import Adapting
 from hdbridge.daemon.service.bridge import ServiceBridge
+from hdbridge.daemon.service.following import Following
 from hdbridge.daemon.service.journal import Journal
 from hdbridge.daemon.service.observer import Sink
 from hdbridge.daemon.service.recording import Recording
 from hdbridge.daemon.service.timing import RealTiming, SimulatedClock
-from hdbridge.daemon.service.watching import Watching
 from hdbridge.daemon.start import Start, begin_child
 from hdbridge.errors import HdbridgeError
 
@@ -76,10 +77,8 @@ async def serve(start: Start, memory: Memory) -> None:
         metrics = Metrics()
         recording = Recording(machine, bridge)
         stack.callback(recording.close)
-        watching = Watching(machine, bridge, recording.recorder)
-        stack.callback(watching.close)
-        adapting = _adaptations(machine, bridge, stack)
-        sinks: list[Sink] = [Journal([*bridge.axes]), metrics, recording, watching, *adapting]
+        following = follow(machine, bridge, recording.recorder, stack)
+        sinks: list[Sink] = [Journal([*bridge.axes]), metrics, recording, *following]
         for sink in sinks:
             bridge.core.observer.add(sink)
         await stack.enter_async_context(bridge)
@@ -88,7 +87,7 @@ async def serve(start: Start, memory: Memory) -> None:
             group.create_task(server.run())
             group.create_task(_say_when_served(server, memory))
             beside = [
-                group.create_task(_follow(adapting)),
+                group.create_task(_apply(following)),
                 group.create_task(_keep_socket(start, server, bridge.core.log.note)),
             ]
             await told.wait()
@@ -98,26 +97,28 @@ async def serve(start: Start, memory: Memory) -> None:
             server.stop()
 
 
-def _adaptations(machine: Machine, bridge: ServiceBridge, stack: AsyncExitStack) -> list[Adapting]:
-    """Creates the adaptations and registers them with the bridge; one thread writes their files."""
-    writer = ThreadPoolExecutor(1, thread_name_prefix="adaptation")
-    stack.callback(writer.shutdown)
-    made = []
-    for place, (axis, port) in enumerate(zip(machine.axes, bridge.axes.values(), strict=True)):
+def follow(
+    machine: Machine, bridge: ServiceBridge, recorder: FlightRecorder | None, stack: AsyncExitStack
+) -> list[Following]:
+    """Follows all axes, each in a thread of its own; with a recorder, bad verdicts are diagnosed."""
+    diagnosis = AutoDiagnosis(recorder.folder) if recorder is not None else None
+    if diagnosis is not None:
+        stack.callback(diagnosis.close)
+    for index, (axis, port) in enumerate(zip(machine.axes, bridge.axes.values(), strict=True)):
         given = axis.adaptation.folder
         folder = machine.beside(given) if given is not None else machine.axis_folder(axis, "adaptation")
-        adapting = Adapting(place, port, axis.adaptation, folder, writer)
-        bridge.adaptations[axis.name] = adapting
-        stack.callback(adapting.close)
-        made.append(adapting)
-    return made
+        worker = stack.enter_context(ThreadPoolExecutor(1, thread_name_prefix=f"following-{axis.name}"))
+        made = Following(index, port, axis.adaptation, folder, worker, recorder, diagnosis)
+        bridge.following[axis.name] = made
+        stack.callback(made.close)
+    return list(bridge.following.values())
 
 
-async def _follow(adapting: Sequence[Adapting]) -> None:
+async def _apply(following: Sequence[Following]) -> None:
     """Applies adapted models to the control process."""
     while True:
-        for each in adapting:
-            await each.follow()
+        for each in following:
+            await each.apply()
         await asyncio.sleep(FOLLOW_S)
 
 

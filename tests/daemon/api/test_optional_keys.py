@@ -23,7 +23,7 @@ from hdbridge.daemon.api.policy import Policy
 from hdbridge.daemon.api.server import ApiServer, Listener
 from hdbridge.daemon.api.sockets import unix_socket
 from hdbridge.daemon.machine import Machine
-from hdbridge.daemon.service.process import _adaptations
+from hdbridge.daemon.service.process import follow
 from hdbridge.errors import DaemonError, HdbridgeError, InputError
 from hdbridge.files.yamlfile import document_from_text
 
@@ -164,7 +164,7 @@ def call_everything(machine: Machine, folder: Path) -> list[str]:
         path = folder / "cell.sock"
         async with AsyncExitStack() as stack:
             bridge = await stack.enter_async_context(service.ready(simulated=True))
-            for each in _adaptations(machine, bridge, stack):
+            for each in follow(machine, bridge, None, stack):
                 bridge.core.observer.add(each)
             metrics = Metrics()
             bridge.core.observer.add(metrics)

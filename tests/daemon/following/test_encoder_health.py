@@ -8,7 +8,8 @@ import pytest
 from support.axis_samples import SampleMaker, moves_and_rests
 
 from hdbridge.axis import AxisConfig
-from hdbridge.daemon.watch.encoder_health import EncoderFault, EncoderHealth
+from hdbridge.daemon.following.follower import Follower
+from hdbridge.daemon.following.health import EncoderFault, EncoderHealth
 from hdbridge.effects import Hysteresis, MotorOrder, Synchronous
 from hdbridge.model import TransmissionModel
 
@@ -33,13 +34,13 @@ MODEL = model_of()
 
 
 def judged(samples, health=None, batch=50):
-    """The judgements over the samples: when each first came, and what it said."""
+    """The states of the encoder over the samples, each when it first came."""
     health = health or EncoderHealth(AXIS, MODEL)
     seen = []
     for first in range(0, len(samples), batch):
-        judgement = health.take(samples[first : first + batch])
-        if not seen or judgement.fault is not seen[-1][1].fault:
-            seen.append((first * PERIOD_S, judgement))
+        status = health.take(samples[first : first + batch])
+        if not seen or status.fault is not seen[-1][1].fault:
+            seen.append((first * PERIOD_S, status))
     return seen
 
 
@@ -85,22 +86,21 @@ def faulty(change, **options):
 def test_a_fault_is_named_with_figures_and_not_before_it_is_there(fault, change, within_s):
     seen = judged(faulty(change)[: FAULT + int((within_s + 1.0) / PERIOD_S)])
     assert [each.fault for _, each in seen][:2] == [None, fault]
-    at_s, judgement = seen[1]
+    at_s, status = seen[1]
     assert FAULT_S - 0.2 <= at_s <= FAULT_S + within_s
-    assert not judgement.believed
-    assert judgement.why.startswith(f"load encoder {fault.value}: ")
-    assert "arcsec" in judgement.why
+    assert status.reason.startswith(f"load encoder {fault.value}: ")
+    assert "arcsec" in status.reason
 
 
 @pytest.mark.parametrize("seed", range(2))
 @pytest.mark.parametrize("speed_deg_s", [2.0, 20.0])
 def test_a_healthy_encoder_stays_believed(seed, speed_deg_s):
-    assert [each.believed for _, each in judged(working(seed=seed, speed_deg_s=speed_deg_s))] == [True]
+    assert [each.fault for _, each in judged(working(seed=seed, speed_deg_s=speed_deg_s))] == [None]
 
 
 @pytest.mark.parametrize("truth", [model_of(offset=38.0), model_of(second=17.0), model_of(phase=150.0)])
 def test_a_gear_that_has_changed_is_no_fault_of_the_encoder(truth):
-    assert [each.believed for _, each in judged(working(truth))] == [True]
+    assert [each.fault for _, each in judged(working(truth))] == [None]
 
 
 def test_wear_in_the_course_of_time_is_no_fault_of_the_encoder():
@@ -112,13 +112,13 @@ def test_wear_in_the_course_of_time_is_no_fault_of_the_encoder():
     share = np.clip(np.linspace(-0.3, 1.3, len(path)), 0.0, 1.0)
     load = before["axes"]["load_position_deg"][:, 0]
     load += share * (after["axes"]["load_position_deg"][:, 0] - load)
-    assert [each.believed for _, each in judged(before)] == [True]
+    assert [each.fault for _, each in judged(before)] == [None]
 
 
 def test_one_misread_sample_is_no_fault():
     samples = working(duration_s=60.0)
     samples["axes"]["load_position_deg"][3000] += 0.5
-    assert [each.believed for _, each in judged(samples)] == [True]
+    assert [each.fault for _, each in judged(samples)] == [None]
 
 
 def test_an_encoder_that_follows_again_is_believed_again():
@@ -134,11 +134,11 @@ def test_a_jump_stays_until_the_drive_was_verified_again():
     samples = faulty(lambda load, _: load + 100.0 / 3600.0)
     health = EncoderHealth(AXIS, MODEL)
     judged(samples, health)
-    assert not health.judgement.believed
+    assert health.status.fault is EncoderFault.JUMPED
     again = working(duration_s=60.0, seed=9)
     again["cycle"] += samples["cycle"][-1]
     again["axes"]["state"][:10] = 0  # unverified
-    assert judged(again, health)[-1][1].believed
+    assert judged(again, health)[-1][1].fault is None
 
 
 def test_it_does_not_depend_on_how_the_samples_come():
@@ -146,11 +146,15 @@ def test_it_does_not_depend_on_how_the_samples_come():
     before, after = samples[: FAULT - 500], samples[FAULT - 500 :]
     at_s = []
     for batch in (2, 5, 100):
-        health = EncoderHealth(AXIS, MODEL)
-        assert judged(before, health)[-1][1].believed
-        seen = judged(after, health, batch)
-        assert [each.fault for _, each in seen] == [None, EncoderFault.JUMPED]
-        at_s.append(seen[1][0])
+        follower = Follower(AXIS, MODEL)
+        for part in (before, after):
+            assert follower.health.status.fault is None
+            for first in range(0, len(part), batch):
+                follower.take(part[first : first + batch])
+                if follower.health.status.fault is not None:
+                    break
+        assert follower.health.status.fault is EncoderFault.JUMPED
+        at_s.append(first * PERIOD_S)
     assert max(at_s) - min(at_s) <= 1.1
 
 
@@ -158,7 +162,7 @@ def test_while_the_memory_is_not_known_the_model_blames_nobody():
     samples = working()
     samples["axes"]["flags"] &= ~np.uint16(8)
     samples["axes"]["predicted_arcsec"] += np.where(samples["cycle"] % 1000 < 500, 40.0, 0.0)[:, None]
-    assert [each.believed for _, each in judged(samples)] == [True]
+    assert [each.fault for _, each in judged(samples)] == [None]
 
 
 def test_an_axis_that_is_not_calibrated_yet_is_not_blamed_for_its_gear():
@@ -167,6 +171,6 @@ def test_an_axis_that_is_not_calibrated_yet_is_not_blamed_for_its_gear():
     maker = SampleMaker(AXIS, nothing, model_of(offset=160.0, second=30.0), 3, compensated=False)
     samples = maker.make(moves_and_rests(120.0, PERIOD_S, 3, 60.0))
     assert EncoderHealth(AXIS, MODEL).take(samples).fault is EncoderFault.JUMPED  # what it would be called
-    assert [each.believed for _, each in judged(samples, EncoderHealth(AXIS, nothing))] == [True]
+    assert [each.fault for _, each in judged(samples, EncoderHealth(AXIS, nothing))] == [None]
     samples["axes"]["load_position_deg"][len(samples) // 2 :] = samples["axes"]["load_position_deg"][0]
     assert EncoderHealth(AXIS, nothing).take(samples).fault is EncoderFault.FROZEN

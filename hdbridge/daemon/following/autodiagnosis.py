@@ -12,13 +12,13 @@ results are stored next to the recordings:
 from __future__ import annotations
 
 import json
-import logging
 import os
 import subprocess
 import sys
 import threading
 import time
 from collections.abc import Callable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
@@ -32,47 +32,43 @@ RECORD: Final = "record"
 RESULT: Final = "diagnosis.json"
 LONGEST_S: Final = 1800.0
 """Time-out of a diagnosis."""
-APART_S: Final = 3600.0
+INTERVAL_S: Final = 3600.0
 """Minimum time between two diagnoses of one axis."""
 _NS: Final = 10**9
-_log = logging.getLogger(__name__)
 
 
 class AutoDiagnosis:
     """Runs one diagnosis at a time, in a thread that waits for its process."""
 
-    def __init__(
-        self,
-        folder: Path,
-        tell: Callable[[str, str], None],
-        *,
-        wall_ns: Callable[[], int] = time.time_ns,
-        apart_s: float = APART_S,
-    ) -> None:
-        """The flight recorder's ``folder``; another thread calls ``tell`` with axis and result."""
+    def __init__(self, folder: Path, wall_ns: Callable[[], int] = time.time_ns) -> None:
+        """``folder`` is the flight recorder's."""
         self._folder = folder
-        self._tell = tell
         self._wall_ns = wall_ns
-        self._apart_s = apart_s
         self._last_ns: dict[str, int] = {}
-        self._lock = threading.Lock()
         self._ended = threading.Event()
         self._process: subprocess.Popen[bytes] | None = None
-        self._threads: list[threading.Thread] = []
+        self._worker = ThreadPoolExecutor(1, thread_name_prefix="diagnosis")
 
-    def ask(self, axis: str, model_text: str, minutes: float, reason: str) -> bool:
-        """Starts a diagnosis of the last minutes; False if this axis was diagnosed within ``apart_s``."""
-        now_ns = self._wall_ns()
-        last_ns = self._last_ns.get(axis)
-        if self._ended.is_set() or (last_ns is not None and now_ns - last_ns < self._apart_s * _NS):
-            return False
+    def start(
+        self, axis: str, model_text: str, minutes: float, reason: str, report: Callable[[str], None]
+    ) -> Future[None] | None:
+        """Diagnoses the last minutes, and calls ``report`` with the result in another thread.
+
+        Returns None if this axis was diagnosed within `INTERVAL_S`.
+        """
+        now_ns, last_ns = self._wall_ns(), self._last_ns.get(axis)
+        if self._ended.is_set() or (last_ns is not None and now_ns - last_ns < INTERVAL_S * _NS):
+            return None
         self._last_ns[axis] = now_ns
-        thread = threading.Thread(
-            target=self._run, args=(axis, model_text, minutes, reason, now_ns), name="diagnosis", daemon=True
-        )
-        self._threads = [each for each in self._threads if each.is_alive()] + [thread]
-        thread.start()
-        return True
+
+        def run() -> None:
+            try:
+                report(self._diagnosed(axis, model_text, minutes, reason, now_ns))
+            except (HdbridgeError, OSError, subprocess.SubprocessError) as problem:
+                if not self._ended.is_set():
+                    report(f"the diagnosis was not made: {problem}")
+
+        return self._worker.submit(run)
 
     def close(self) -> None:
         """Ends a running diagnosis."""
@@ -81,23 +77,7 @@ class AutoDiagnosis:
         if process is not None:
             with suppress(ProcessLookupError):
                 process.kill()
-        for each in self._threads:
-            each.join()
-
-    def wait(self) -> None:
-        """Waits until no diagnosis runs."""
-        for each in self._threads:
-            each.join()
-
-    def _run(self, axis: str, model_text: str, minutes: float, reason: str, now_ns: int) -> None:
-        with self._lock:
-            try:
-                self._tell(axis, self._diagnosed(axis, model_text, minutes, reason, now_ns))
-            except (HdbridgeError, OSError, subprocess.SubprocessError) as problem:
-                if not self._ended.is_set():
-                    self._tell(axis, f"the diagnosis was not made: {problem}")
-            except Exception:
-                _log.exception("an automatic diagnosis failed")
+        self._worker.shutdown(cancel_futures=True)
 
     def _diagnosed(self, axis: str, model_text: str, minutes: float, reason: str, now_ns: int) -> str:
         date = datetime.fromtimestamp(now_ns / _NS, UTC)
@@ -128,7 +108,10 @@ class AutoDiagnosis:
             )
             self._process = process
             try:
-                _yield_to_all(process.pid)
+                with suppress(OSError):
+                    os.setpriority(os.PRIO_PROCESS, process.pid, 19)
+                with suppress(OSError):
+                    os.sched_setscheduler(process.pid, os.SCHED_IDLE, os.sched_param(0))
                 if self._ended.is_set():
                     process.kill()
                 status = process.wait(LONGEST_S)
@@ -139,8 +122,8 @@ class AutoDiagnosis:
             finally:
                 self._process = None
         if status:
-            said = (folder / "log.txt").read_text(encoding="utf-8", errors="replace").strip().splitlines()
-            raise HdbridgeError(said[-1] if said else f"'hdbridge {arguments[0]}' ended with {status}")
+            lines = (folder / "log.txt").read_text(encoding="utf-8", errors="replace").strip().splitlines()
+            raise HdbridgeError(lines[-1] if lines else f"'hdbridge {arguments[0]}' ended with {status}")
 
 
 def summary(found: dict[str, Any]) -> str:
@@ -155,11 +138,3 @@ def summary(found: dict[str, Any]) -> str:
         f"diagnosis: {named or 'nothing that it could name'}; the model is {baseline:.2f} arcsec rms off, "
         f"the noise is {floor:.2f}"
     )
-
-
-def _yield_to_all(pid: int) -> None:
-    """Gives a process only processor time that no other process needs."""
-    with suppress(OSError):
-        os.setpriority(os.PRIO_PROCESS, pid, 19)
-    with suppress(OSError):
-        os.sched_setscheduler(pid, os.SCHED_IDLE, os.sched_param(0))

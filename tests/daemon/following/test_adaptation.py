@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from support.adapting import AXIS, MODEL, PERIOD_S, wandering, work, worn
+from support.adapting import AXIS, MODEL, PERIOD_S, History, packed, wandering, work, worn
 
-from hdbridge.daemon.adaptation.adaptation import Adaptation
-from hdbridge.daemon.adaptation.settings import AdaptationSettings, Standing
-from hdbridge.daemon.adaptation.sink import reading_of
+from hdbridge.daemon.following.follower import Follower
+from hdbridge.daemon.following.health import EncoderFault, EncoderStatus
+from hdbridge.daemon.following.settings import AdaptationSettings
 from hdbridge.daemon.loop.states import AxisState
 from hdbridge.daemon.memory import SampleFlag
 
@@ -22,34 +22,48 @@ OFFSET, SECOND = 12, 2
 class Axis:
     """An adaptation and the work that it has seen."""
 
-    def __init__(self, **changes: Any) -> None:
-        self.history: list[Any] = []
+    def __init__(self, files: History | None = None, **changes: Any) -> None:
+        self.files = files or History()
         self.settings = QUICK.model_copy(update=changes)
-        self.adaptation = Adaptation(MODEL, self.settings, reading_of(AXIS), self.history.append)
+        self.follower = Follower(AXIS, MODEL, settings=self.settings)
+        self.follower.adapt(self.settings.mode, self.files)
+        self.adaptation = self.follower.adaptation
         self.time_s = 0.0
         self.proposals: list[Any] = []
         self.used: list[tuple[float, np.ndarray]] = []
         self.path = [0.0]
 
-    def works(self, truth=MODEL, stands: int = 60, seed: int = 0, disbelieved: str = "", **more: Any) -> None:
-        self.takes(*self.measures(truth, wandering(stands, seed), seed=seed, **more), disbelieved)
+    def works(self, truth=MODEL, stands: int = 60, seed: int = 0, fault: str = "", **more: Any) -> None:
+        self.takes(*self.measures(truth, wandering(stands, seed), seed=seed, **more), fault)
 
     def measures(self, truth, targets: list[float], **more: Any) -> tuple[np.ndarray, np.ndarray]:
         found = work(truth, targets, begun_s=self.time_s, before_deg=self.path[-8:], **more)
         self.path += targets
         return found
 
-    def takes(self, times: np.ndarray, samples: np.ndarray, disbelieved: str = "") -> None:
+    def takes(self, times: np.ndarray, samples: np.ndarray, fault: str = "") -> None:
+        status = EncoderStatus(EncoderFault.NOISY, fault) if fault else EncoderStatus()
         for part in np.array_split(np.arange(len(times)), max(len(times) // 50, 1)):
-            proposal = self.adaptation.take(times[part], samples[part], disbelieved)
+            proposal = self.follower.advance(packed(times[part], samples[part]), status).proposal
             self.used.append((float(times[part][-1]), self.adaptation.used_arcsec))
             if proposal is not None:
                 self.proposals.append(proposal)
         self.time_s = float(times[-1]) + PERIOD_S
 
     @property
-    def standing(self) -> Standing:
-        return self.adaptation.report().standing
+    def frozen(self) -> str:
+        """Reason of the freeze; empty without one."""
+        return self.adaptation.freeze_reason.reason if self.adaptation.freeze_reason else ""
+
+    @property
+    def waiting(self) -> str | None:
+        """What clients read."""
+        return self.follower.state().frozen
+
+    @property
+    def history(self) -> list[Any]:
+        self.follower.save()
+        return self.files.entries
 
     def events(self) -> list[str]:
         return [each["event"] for each in self.history if "change" not in each["event"]]
@@ -68,7 +82,7 @@ def test_a_gear_that_has_changed_is_followed():
     axis = Axis()
     for seed in range(6):
         axis.works(worn(4.0, -2.0), seed=seed)
-    assert axis.standing is Standing.FOLLOWING
+    assert axis.waiting is None
     assert axis.adaptation.estimate_arcsec[OFFSET] == pytest.approx(4.0, abs=0.15)
     assert axis.adaptation.estimate_arcsec[SECOND] == pytest.approx(-2.0, abs=0.15)
     model = axis.proposals[-1].model
@@ -86,7 +100,7 @@ def test_a_gear_that_has_not_changed_is_left_alone():
     for seed in range(5):
         axis.works(seed=seed)
     assert np.max(np.abs(axis.adaptation.used_arcsec)) < 0.25
-    assert axis.standing is Standing.FOLLOWING
+    assert axis.waiting is None
 
 
 def test_observing_changes_nothing_and_says_what_it_would():
@@ -97,9 +111,9 @@ def test_observing_changes_nothing_and_says_what_it_would():
     assert not any(each.apply for each in axis.proposals)
     assert axis.adaptation.model == MODEL
     assert {each["event"] for each in axis.history} == {"would change"}
-    assert axis.adaptation.report().estimated.effects[1].offset_arcsec == pytest.approx(44.0, abs=0.3)
+    assert axis.follower.state().parameters["hysteresis.offset_arcsec"] == pytest.approx(4.0, abs=0.3)
     # Turned on, it begins from the committed model: nothing that was only observed is applied at once.
-    axis.adaptation.adapt("on")
+    axis.follower.adapt("on")
     begun_s = axis.time_s
     axis.works(worn(4.0), seed=9)
     first = next(each for each in axis.proposals if each.apply)
@@ -111,12 +125,12 @@ def test_at_rest_nothing_moves():
     axis = Axis()
     axis.works(worn(2.0), stands=80)
     before = state_of(axis)
-    windows = axis.adaptation.report().windows
+    windows = axis.adaptation.windows
     _, samples = axis.measures(MODEL, axis.path[-1:])
     standing = np.repeat(samples[-1:], 30_000)
     standing["load_position_deg"] += np.linspace(0.0, 0.02, 30_000)  # whatever the load encoder says
     axis.takes(axis.time_s + PERIOD_S * np.arange(30_000), standing)
-    assert axis.adaptation.report().windows <= windows + 1
+    assert axis.adaptation.windows <= windows + 1
     assert state_of(axis) == before
 
 
@@ -126,9 +140,9 @@ def test_without_reversals_the_loop_is_neither_learnt_nor_forgotten():
     one_way = axis.path[-1] + 97.0 * np.arange(1, 241)
     axis.takes(*axis.measures(MODEL, one_way[:40].tolist()))
     before = axis.adaptation.estimate_arcsec, axis.adaptation.covariance
-    windows = axis.adaptation.report().windows
+    windows = axis.adaptation.windows
     axis.takes(*axis.measures(worn(3.0), one_way[40:].tolist()))  # the loop and the zero look alike
-    assert axis.adaptation.report().windows > windows
+    assert axis.adaptation.windows > windows
     assert axis.adaptation.estimate_arcsec[OFFSET] == before[0][OFFSET]
     assert axis.adaptation.covariance[OFFSET, OFFSET] == pytest.approx(before[1][OFFSET, OFFSET], rel=1e-9)
 
@@ -142,8 +156,8 @@ def test_a_zero_that_moves_is_told_and_changes_nothing_else():
     drift = 0.01 * (times - times[0])  # 36 arcsec an hour: as a gear warms up
     samples["load_position_deg"] += drift / 3600.0
     axis.takes(times, samples)
-    assert axis.standing is Standing.FOLLOWING
-    assert axis.adaptation.report().zero_arcsec == pytest.approx(drift[-1], abs=0.3)
+    assert axis.waiting is None
+    assert axis.adaptation.zero_moved_arcsec == pytest.approx(drift[-1], abs=0.3)
     assert axis.adaptation.used_arcsec == pytest.approx(quiet, abs=0.3)
 
 
@@ -154,7 +168,7 @@ def test_an_eccentric_disc_of_the_load_encoder_is_not_learnt():
         turned = np.radians(samples["motor_target_deg"] / AXIS.gear.ratio)
         samples["load_position_deg"] += (8.0 * np.cos(turned) + 3.0 * np.sin(2.0 * turned)) / 3600.0
         axis.takes(times, samples)
-    assert axis.standing is Standing.FOLLOWING
+    assert axis.waiting is None
     assert np.max(np.abs(axis.adaptation.used_arcsec)) < 0.4
 
 
@@ -163,14 +177,14 @@ def test_a_load_that_is_off_all_at_once_freezes_until_the_zero_is_taken_again():
     axis.works(stands=100)
     before = state_of(axis)
     axis.works(worn(0.0), stands=100, zero_arcsec=40.0)
-    assert axis.standing is Standing.FROZEN
-    assert "slipped" in axis.adaptation.report().reason
+    assert axis.frozen
+    assert "slipped" in axis.frozen
     assert axis.adaptation.used_arcsec.tolist() == before[2]
     times, samples = axis.measures(MODEL, axis.path[-1:])
     samples["state"] = AxisState.LENT  # it is homed
     axis.takes(times, samples)
     axis.works(stands=100, zero_arcsec=40.0)
-    assert axis.standing is Standing.FOLLOWING
+    assert axis.waiting is None
     assert axis.events() == ["frozen", "thawed"]
 
 
@@ -180,32 +194,32 @@ def test_a_zero_that_has_moved_too_far_is_a_fault():
     times, samples = axis.measures(MODEL, wandering(700, 7))
     samples["load_position_deg"] += 0.012 * (times - times[0]) / 3600.0
     axis.takes(times, samples)
-    assert axis.standing is Standing.FROZEN
-    assert "at most 1" in axis.adaptation.report().reason
+    assert axis.frozen
+    assert "at most 1" in axis.frozen
 
 
 def test_a_command_ends_a_doubt_that_lasts():
     axis = Axis()
     axis.works(stands=100)
     axis.works(stands=100, zero_arcsec=40.0)
-    assert axis.standing is Standing.FROZEN
-    axis.adaptation.adapt("on")
+    assert axis.frozen
+    axis.follower.adapt("on")
     axis.works(stands=100, zero_arcsec=40.0)
-    assert axis.standing is Standing.FOLLOWING
+    assert axis.waiting is None
     assert np.max(np.abs(axis.adaptation.used_arcsec)) < 0.6
 
 
 def test_a_doubt_that_passes_thaws_after_some_plausible_windows():
     axis = Axis()
     axis.works(stands=60)
-    axis.works(stands=20, disbelieved="load encoder noisy: it says so")
-    assert axis.standing is Standing.FROZEN
-    assert axis.adaptation.report().reason == "load encoder noisy: it says so"
+    axis.works(stands=20, fault="load encoder noisy: it says so")
+    assert axis.frozen
+    assert axis.frozen == "load encoder noisy: it says so"
     before = state_of(axis)
     axis.works(stands=20)
     assert state_of(axis) == before
     axis.works(stands=120, seed=1)
-    assert axis.standing is Standing.FOLLOWING
+    assert axis.waiting is None
     assert axis.events() == ["frozen", "thawed"]
 
 
@@ -217,7 +231,7 @@ def test_what_the_windows_before_a_fault_taught_is_forgotten():
         axis.works(worn(3.0), stands=12, seed=seed)
         learnt.append(axis.adaptation.estimate_arcsec)
     assert abs(learnt[-1][OFFSET]) > 0.3
-    axis.works(stands=3, disbelieved="a fault")
+    axis.works(stands=3, fault="a fault")
     assert abs(axis.adaptation.estimate_arcsec[OFFSET]) < abs(learnt[-1][OFFSET])
 
 
@@ -227,7 +241,7 @@ def test_samples_that_are_not_sure_are_not_used(flag):
     times, samples = work(worn(5.0), wandering(100))
     samples["flags"] &= ~np.uint16(flag)
     axis.takes(times, samples)
-    assert axis.adaptation.report().windows == 0
+    assert axis.adaptation.windows == 0
 
 
 def test_a_stopped_axis_freezes():
@@ -236,7 +250,7 @@ def test_a_stopped_axis_freezes():
     times, samples = axis.measures(worn(5.0), wandering(60))
     samples["fault"] = 9
     axis.takes(times, samples)
-    assert axis.standing is Standing.FROZEN
+    assert axis.frozen
 
 
 def test_after_power_was_off_the_path_has_to_be_known_again():
@@ -245,9 +259,9 @@ def test_after_power_was_off_the_path_has_to_be_known_again():
     times, samples = axis.measures(MODEL, axis.path[-1:])
     samples["state"] = AxisState.DISABLED
     axis.takes(times, samples)
-    assert axis.standing is Standing.WAITING
+    assert "turned past its loop" in axis.waiting
     axis.works(stands=60)
-    assert axis.standing is Standing.FOLLOWING
+    assert axis.waiting is None
 
 
 def test_back_is_back_to_the_committed_model_and_stays_there():
@@ -255,7 +269,7 @@ def test_back_is_back_to_the_committed_model_and_stays_there():
     for seed in range(3):
         axis.works(worn(4.0), seed=seed)
     assert axis.adaptation.model != MODEL
-    proposal = axis.adaptation.back()
+    proposal = axis.follower.revert()
     assert proposal.apply
     assert proposal.model == axis.adaptation.model == MODEL
     axis.proposals.clear()
@@ -268,11 +282,11 @@ def test_it_goes_on_after_a_restart():
     axis = Axis()
     for seed in range(3):
         axis.works(worn(4.0), seed=seed)
-    again = Adaptation(MODEL, axis.settings, reading_of(AXIS), memory=axis.adaptation.memory())
+    axis.follower.save()
+    again = Axis(History(axis.adaptation.learned())).adaptation
     assert again.model.effects == axis.adaptation.model.effects
     assert again.estimate_arcsec.tolist() == axis.adaptation.estimate_arcsec.tolist()
-    observing = axis.settings.model_copy(update={"mode": "observe"})
-    assert Adaptation(MODEL, observing, reading_of(AXIS), memory=axis.adaptation.memory()).model == MODEL
+    assert Axis(History(axis.adaptation.learned()), mode="observe").adaptation.model == MODEL
 
 
 @settings(max_examples=12)

@@ -8,7 +8,8 @@ import pytest
 from support.axis_samples import SampleMaker, moves_and_rests
 
 from hdbridge.axis import AxisConfig
-from hdbridge.daemon.watch.watch import Verdict, Watch, WatchSettings, _Steady
+from hdbridge.daemon.following.follower import Follower
+from hdbridge.daemon.following.judging import Debounced, Verdict, WatchLimits
 from hdbridge.effects import CATALOGUE
 from hdbridge.model import TransmissionModel
 
@@ -45,17 +46,19 @@ def with_order(number, amplitude_arcsec):
     return replace(MODEL, effects=(*MODEL.effects, CATALOGUE["motor_order"](orders=(order,))))
 
 
-def watched(truth, duration_s=900.0, seed=0, change=None, watch=None, batch=250, path=None):
+def watched(truth, duration_s=900.0, seed=0, change=None, model=MODEL, batch=250, path=None):
     """Returns the remarks of a watch over an axis at work."""
     path = moves_and_rests(duration_s, PERIOD_S, seed) if path is None else path
     samples = SampleMaker(AXIS, MODEL, truth, seed).make(path)
     if change is not None:
         change(samples)
-    watch = watch or Watch(AXIS, MODEL)
-    raised = [
-        each for first in range(0, len(samples), batch) for each in watch.take(samples[first : first + batch])
-    ]
-    return watch, raised
+    follower = Follower(AXIS, model)
+    return follower.watch, raised_over(follower, samples, batch)
+
+
+def raised_over(follower, samples, batch):
+    batches = (samples[first : first + batch] for first in range(0, len(samples), batch))
+    return [each for batch in batches for each in follower.take(batch).raised]
 
 
 def test_at_work_nothing_is_raised():
@@ -74,7 +77,7 @@ def quiet(seed, duration_s):
     truth = model_of(31.6 + sign * HALF_WIDTH_OFFSET_ARCSEC, second(sign * HALF_WIDTH_ARCSEC))
     watch, raised = watched(truth, duration_s=duration_s, seed=seed)
     assert raised == []
-    assert watch.evidence.clearly_holds
+    assert watch.evidence.verdict(Verdict.RECALIBRATE) is Verdict.HOLDS
     assert watch.verdict is Verdict.HOLDS
 
 
@@ -88,9 +91,9 @@ def quiet(seed, duration_s):
 def test_wear_asks_for_a_calibration_and_says_what_has_moved(truth, named):
     watch, raised = watched(truth)
     assert [each.verdict for each in raised] == [Verdict.RECALIBRATE]
-    assert named in raised[0].text
-    assert raised[0].words.startswith("recalibrate: ")
-    assert "arcsec rms off the model" in raised[0].text
+    assert named in raised[0].evidence
+    assert raised[0].text.startswith("recalibrate: ")
+    assert "arcsec rms off the model" in raised[0].evidence
     assert watch.evidence.rms_arcsec > 1.0 > watch.evidence.left_arcsec - 0.5
 
 
@@ -107,7 +110,7 @@ def test_a_zero_that_moves_asks_for_a_calibration():
 
     _, raised = watched(MODEL, 1500.0, change=warm)
     assert [each.verdict for each in raised] == [Verdict.RECALIBRATE]
-    assert "zero: by +" in raised[0].text
+    assert "zero: by +" in raised[0].evidence
 
 
 def test_a_load_encoder_that_is_not_believed_is_all_that_is_said():
@@ -116,7 +119,7 @@ def test_a_load_encoder_that_is_not_believed_is_all_that_is_said():
 
     watch, raised = watched(MODEL, change=jump)
     assert [each.verdict for each in raised] == [Verdict.ENCODER]
-    assert "load encoder jumped: by +" in raised[0].text
+    assert "load encoder jumped: by +" in raised[0].evidence
     assert watch.verdict is Verdict.ENCODER
 
 
@@ -130,23 +133,15 @@ def test_one_bad_minute_raises_nothing():
     assert raised == []
 
 
-def test_another_model_begins_anew():
-    watch, _ = watched(model_of(offset=38.0))
-    assert watch.verdict is Verdict.RECALIBRATE
-    watch.use(MODEL)
-    assert watch.verdict is Verdict.HOLDS
-    assert watch.evidence is None
-
-
 def test_an_axis_without_a_model_has_not_changed():
-    watch, raised = watched(MODEL, watch=Watch(AXIS, TransmissionModel(50.0)))
+    watch, raised = watched(MODEL, model=TransmissionModel(50.0))
     assert raised == []
     assert watch.verdict is Verdict.HOLDS
 
 
 def test_a_model_without_intervals_is_taken_for_a_usual_calibration():
     bare = replace(MODEL, uncertainty={})
-    _, raised = watched(model_of(offset=31.6 * 1.3), watch=Watch(AXIS, bare))
+    _, raised = watched(model_of(offset=31.6 * 1.3), model=bare)
     assert [each.verdict for each in raised] == [Verdict.RECALIBRATE]
 
 
@@ -159,17 +154,17 @@ def test_an_axis_that_rests_says_nothing():
 def test_lost_cycles_leave_the_path_unknown_until_it_is_known_again():
     path = moves_and_rests(900.0, PERIOD_S, 4)
     samples = SampleMaker(AXIS, MODEL, MODEL, 4).make(path)
-    watch = Watch(AXIS, MODEL)
+    follower = Follower(AXIS, MODEL)
     kept = np.ones(len(samples), dtype=bool)
     for first in range(5_000, 45_000, 5_000):
         kept[first : first + 300] = False
     samples = samples[kept]
-    assert [r for at in range(0, len(samples), 50) for r in watch.take(samples[at : at + 50])] == []
-    assert watch.evidence is not None
+    assert raised_over(follower, samples, 50) == []
+    assert follower.watch.evidence is not None
 
 
 def test_a_verdict_lasts_before_it_is_raised_and_longer_before_it_is_withdrawn():
-    steady = _Steady(WatchSettings(raise_s=60.0, withdraw_s=300.0))
+    steady = Debounced(WatchLimits(raise_s=60.0, withdraw_s=300.0))
     assert not any(steady.take(Verdict.RECALIBRATE, 10.0) for _ in range(5))
     assert not steady.take(Verdict.HOLDS, 10.0)
     assert [steady.take(Verdict.RECALIBRATE, 10.0) for _ in range(7)] == [False] * 5 + [True, False]

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hdbridge.analysis.linear import solve_symmetric
-from hdbridge.daemon.adaptation.estimator import Estimator
+from hdbridge.daemon.following.estimator import Estimator
 
 SIGMA = 0.9
 seeds = st.integers(0, 10_000)
@@ -48,7 +48,7 @@ def test_what_is_not_shown_is_not_forgotten_nor_learnt_but_by_what_was_known(see
     before = estimator.covariance.copy()
     rows, observed = data(6, 30, seed)
     rows[:, hidden] = 0.0
-    estimator.update(rows, observed, SIGMA, keep=keep)
+    estimator.update(rows, observed, SIGMA, retention=keep)
     gained = np.linalg.eigvalsh(estimator.covariance[hidden, hidden] - before[hidden, hidden])
     assert np.all(gained <= 1e-9 * before[0, 0])
     if not correlated:
@@ -60,7 +60,7 @@ def test_what_is_not_shown_is_not_forgotten_nor_learnt_but_by_what_was_known(see
 def test_nothing_shown_changes_nothing(seed, keep):
     estimator = fresh(4, seed)
     estimate, covariance = estimator.estimate.copy(), estimator.covariance.copy()
-    assert estimator.update(np.zeros((8, 4)), np.ones(8), SIGMA, keep=keep) == 0
+    assert estimator.update(np.zeros((8, 4)), np.ones(8), SIGMA, retention=keep) == 0
     assert np.array_equal(estimator.estimate, estimate)
     assert np.array_equal(estimator.covariance, covariance)
 
@@ -71,7 +71,7 @@ def test_what_is_held_keeps_its_value_and_its_variance(seed, keep):
     before = estimator.covariance.copy()
     columns, observed = data(5, 30, seed)
     held = np.array([True, False, True, False, False])
-    estimator.update(columns, observed, SIGMA, keep=keep, held=held)
+    estimator.update(columns, observed, SIGMA, retention=keep, held=held)
     assert np.array_equal(estimator.estimate[held], np.zeros(2))
     assert estimator.covariance[np.ix_(held, held)] == pytest.approx(before[np.ix_(held, held)], rel=1e-9)
     assert np.all(estimator.estimate[~held] != 0.0)
@@ -86,7 +86,7 @@ def test_forgetting_for_ever_winds_no_variance_up(seed, keep, shown):
     kept = rng.normal(size=(shown, 5))
     for _ in range(200):
         rows = rng.normal(size=(6, shown)) @ kept
-        estimator.update(rows, rng.normal(size=6), SIGMA, keep=keep)
+        estimator.update(rows, rng.normal(size=6), SIGMA, retention=keep)
         values = np.linalg.eigvalsh(estimator.covariance)
         assert values[0] > 0.0
     # In units of the scale: no direction is less sure than the prior or the scale.
@@ -103,5 +103,5 @@ def test_forgetting_follows_what_changes():
     for step in range(400):
         truth[0] = 0.05 * step
         rows = rng.normal(size=(10, 3))
-        estimator.update(rows, rows @ truth + rng.normal(0.0, 0.1, 10), SIGMA, keep=0.8)
+        estimator.update(rows, rows @ truth + rng.normal(0.0, 0.1, 10), SIGMA, retention=0.8)
     assert estimator.estimate == pytest.approx(truth, abs=0.5)

@@ -10,10 +10,9 @@ from hdbridge.analysis.linear import solve_symmetric
 from hdbridge.axis import AxisConfig
 from hdbridge.calibration.identification import measured_of
 from hdbridge.control.bench import Bench
-from hdbridge.daemon.adaptation.estimator import Estimator
-from hdbridge.daemon.adaptation.measuring import Measuring
-from hdbridge.daemon.adaptation.regressors import Regressors
-from hdbridge.daemon.adaptation.sink import reading_of
+from hdbridge.daemon.following.estimator import Estimator
+from hdbridge.daemon.following.follower import observation_sigma_arcsec
+from hdbridge.daemon.following.measuring import DriftModel, Measuring
 from hdbridge.drive import Drive
 from hdbridge.effects import Start
 from hdbridge.procedures.moves import Settle
@@ -34,24 +33,24 @@ def run():
 
 
 def test_recursion_equals_the_least_squares_of_the_identification(run):
-    regressors = Regressors(MODEL)
+    drift = DriftModel(MODEL)
     samples = Sampler(AXIS, MODEL).samples(run.record)
-    measuring = Measuring(regressors, 0.5)
+    measuring = Measuring(drift, 0.5)
     times, axis = 1e-9 * samples["time_ns"].astype(float), samples["axes"][:, 0]
     found = measuring.take(times, axis, np.ones(len(times), dtype=bool))
     assert len(found) == pytest.approx(80, abs=3)
     rows, observed = np.array([each.row for each in found]), np.array([each.error_arcsec for each in found])
 
-    wide = np.full(regressors.count, 100.0)
-    sigma = reading_of(AXIS).sigma_arcsec
-    estimator = Estimator(np.zeros(regressors.count), np.diag(wide**2), wide)
+    wide = np.full(drift.count, 100.0)
+    sigma = observation_sigma_arcsec(AXIS)
+    estimator = Estimator(np.zeros(drift.count), np.diag(wide**2), wide)
     for part in np.array_split(np.arange(len(found)), 13):
         estimator.update(rows[part], observed[part], sigma)
     information = rows.T @ rows / sigma**2 + np.diag(1.0 / wide**2)
     batch = solve_symmetric(information, rows.T @ observed / sigma**2)
     assert estimator.estimate == pytest.approx(batch, abs=1e-4)  # which adds a ridge
 
-    model = regressors.changed(estimator.estimate[: regressors.followed])
+    model = drift.changed(estimator.estimate[: drift.zero])
     options = FitOptions(start=Start.FORWARD, highest_order=8, load_orders=0, active=MODEL)
     identified = fit(measured_of([run]), AXIS.gear.ratio, options)
     offset = identified.interval("hysteresis", "offset_arcsec")
@@ -64,7 +63,4 @@ def test_recursion_equals_the_least_squares_of_the_identification(run):
 
 
 def test_the_axis_says_how_finely_it_is_measured():
-    reading = reading_of(AxisConfig.load(AXIS.path))
-    assert reading.motor_count_arcsec == pytest.approx(3.24)
-    assert reading.load_count_arcsec == pytest.approx(0.45)
-    assert reading.sigma_arcsec == pytest.approx(0.944, abs=0.001)
+    assert observation_sigma_arcsec(AxisConfig.load(AXIS.path)) == pytest.approx(0.944, abs=0.001)

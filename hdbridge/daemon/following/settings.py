@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from enum import StrEnum
 from typing import Annotated, Literal
 
 from pydantic import Field
@@ -11,17 +10,6 @@ from hdbridge.strictness import Strict
 
 Mode = Literal["off", "observe", "on"]
 Parameter = Annotated[str, Field(pattern=r"^[a-z_]+\.[a-z_]+$")]
-
-
-class Standing(StrEnum):
-    """State of an axis's adaptation."""
-
-    OFF = "off"
-    WAITING = "waiting"
-    """Nothing to learn from: at rest, too fast, without power, or too little motion yet."""
-    FOLLOWING = "following"
-    FROZEN = "frozen"
-    """A doubt stops learning; the reason is reported. It ends when its cause does, or by `resume`."""
 
 
 class Excitation(Strict):
