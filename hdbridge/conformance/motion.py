@@ -695,9 +695,9 @@ class _Stream:
                     self.target = self.position
         self.cycle(5)
 
-    def move(self) -> float:
-        """Moves by one test distance in 0.5 s; returns the step per cycle."""
-        step = _direction(self.t, 2) * self.t.travel * _CYCLE_S / 0.5
+    def move(self, side: int = 0) -> float:
+        """Moves by one test distance in 0.5 s, by default to where there is room; returns the step."""
+        step = (side or _direction(self.t, 2)) * self.t.travel * _CYCLE_S / 0.5
         self.cycle(50, step)
         return step
 
@@ -743,8 +743,11 @@ def _(t: NodeTester) -> None:
     stream.enable()
     step = stream.move()
     stream.word = 0x10F
+    stream.cycle(20, step)
+    before = stream.position
     stream.cycle(30, step)
-    _stands(t)
+    moved = abs(stream.position - before)
+    t.true(moved <= 0.1 * t.travel + 2, f"the axis moved by {moved}", "standstill")
 
 
 @check("402.csp.limit", "A target beyond 607Dh leads at most to the limit", _CSP)
@@ -757,7 +760,7 @@ def _(t: NodeTester) -> None:
     t.write(0x607D, 1, low, 4)
     t.write(0x607D, 2, high, 4)
     stream.enable()
-    stream.move()
+    stream.move(side)
     stream.cycle(30)
     beyond = side * (stream.position - edge)
     t.true(beyond <= _window(t), f"{beyond} units beyond the limit", "the limit")

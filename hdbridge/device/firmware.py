@@ -354,8 +354,12 @@ class Firmware:
 
     def power_cut(self) -> None:
         """Switches the power stage off without an error, as a hardware enable input does when it opens."""
-        if self.state is not State.FAULT:
-            self._power_off(State.SWITCH_ON_DISABLED)
+        self._cut()
+
+    def _cut(self) -> None:
+        """Switches the power stage off; a fault remains one."""
+        in_fault = self.state in (State.FAULT, State.FAULT_REACTION_ACTIVE)
+        self._power_off(State.FAULT if in_fault else State.SWITCH_ON_DISABLED)
 
     def connection_lost(self, code: int) -> None:
         """Reacts to the loss of the master as 6007h says; ``code`` is the EMCY code of the loss."""
@@ -363,7 +367,7 @@ class Firmware:
         if option == 1 and self.state in POWERED:
             self.fault(code)
         elif option == 2 and self.state in POWERED:
-            self._power_off(State.SWITCH_ON_DISABLED)
+            self._cut()
         elif option == 3 and self.state is State.OPERATION_ENABLED:
             self._stopped_itself = True
             self._quick_stop()
