@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from hdbridge.fleet.summary import Summary
 
 PAGE_NAME = "fleet.html"
+PRIOR_NAME = "fleet.parquet"
 _EXTRA = ("distributed", "pyarrow", "fsspec")
 
 OutArgument = Annotated[Path, typer.Argument(metavar="OUT", help="The --out folder of a run.")]
@@ -299,11 +300,14 @@ def simulate(
 def _summarise(dataset: Dataset, limit_arcsec: float, page: Path, json_file: Path | None = None) -> None:
     from rich.table import Table
 
+    from hdbridge.fleet.prior import write_prior
     from hdbridge.fleet.report import fleet_page, hours_words
     from hdbridge.fleet.summary import summarise
     from hdbridge.report.page import render
 
-    summary: Summary = summarise(dataset.recordings(), limit_arcsec)
+    rows = dataset.recordings()
+    summary: Summary = summarise(rows, limit_arcsec)
+    write_prior(dataset.folder / PRIOR_NAME, rows)
     write_json(json_file, summary.as_dict())
     table = Table("joint", "cause", "probability", "peak, arcsec", "hours to the limit")
     for each in summary.first:
