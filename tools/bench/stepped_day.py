@@ -45,8 +45,9 @@ from hdbridge.daemon.recorder.store import Store
 from hdbridge.daemon.service.bridge import ServiceBridge
 from hdbridge.daemon.service.eventlog import ANSWERS_KEPT, KEPT
 from hdbridge.daemon.service.following import Following
-from hdbridge.daemon.service.interface import StreamPoint, WayPoint
 from hdbridge.daemon.service.journal import Journal
+from hdbridge.daemon.service.moves import WayPoint
+from hdbridge.daemon.service.streams import StreamPoint
 from hdbridge.errors import HdbridgeError
 from hdbridge.evaluation.stepping import Scheme
 

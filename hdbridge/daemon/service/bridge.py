@@ -5,6 +5,16 @@
 
 All of it runs in one event loop. An axis holds its position without this process: if the process dies, the
 axes complete the commands they have, and the next service process takes them over as they are.
+
+Angles are load angles in degrees, speeds in deg/s. ``holder`` is the lease token. All coroutines of machine
+and axes raise an `HdbridgeError` whose text is one line with the cause and the remedy:
+
+    InputError      a value is invalid: outside the limits, not finite, no such model or object
+    RefusedError    not possible in this state: not enabled, in motion, a job runs, a fault is latched
+    LeaseError      ``holder`` is not the token of the present lease
+    DriveError      the drive refuses the request or does not answer
+    SafetyStop      the supervision stopped the axis during the call
+    BusError        the CAN interface is gone
 """
 
 from __future__ import annotations
@@ -49,7 +59,7 @@ _log = logging.getLogger(__name__)
 
 
 class ServiceBridge:
-    """The machine; `interface.Bridge` documents each method."""
+    """The machine, for the API."""
 
     def __init__(
         self,
@@ -306,7 +316,7 @@ class ServiceBridge:
         )
 
     def subscribe(self, most: int = 512) -> Subscription:
-        """Subscribes to samples and events."""
+        """Subscribes to samples and events; at most the newest ``most`` samples wait to be fetched."""
         return Subscription(self.core.observer, self._messages_since, most)
 
     def _messages_since(self, number: int) -> tuple[list[messages.Event], int]:
@@ -321,7 +331,7 @@ class ServiceBridge:
     # ---------------------------------------------------------------- requests
 
     async def quick_stop(self) -> None:
-        """Quick-stops all axes."""
+        """Quick-stops all axes. Requires no lease."""
         for axis in self.axes.values():
             axis.give_up("it was stopped by a quick stop")
         await self.core.dispatch.do(CommandKind.QUICK_STOP)
@@ -329,7 +339,7 @@ class ServiceBridge:
     async def coordinated(
         self, holder: str, moves: Mapping[str, float], speed: float = 1.0, wait: bool = True
     ) -> None:
-        """Moves several axes so that all begin and end together."""
+        """Moves several axes so that all begin and end together; ``speed`` is a share of the limits."""
         if not moves:
             raise InputError("a coordinated move of no axis; expected a target for at least one")
         axes = [self._axis(name) for name in moves]
@@ -347,7 +357,7 @@ class ServiceBridge:
             hear(text)
 
     async def load_loop(self, holder: str, axis: str, on: bool) -> None:
-        """Switches an axis's load loop on or off."""
+        """Switches an axis's load loop on or off; raises InputError if it has none."""
         await self._axis(axis).switch_load_loop(holder, on=on)
 
     async def adapt(self, holder: str, axis: str, mode: messages.AdaptationMode) -> None:
@@ -356,7 +366,7 @@ class ServiceBridge:
         await self._following(axis).set_mode(mode)
 
     async def adaptation_back(self, holder: str, axis: str) -> None:
-        """Discards the adapted parameters of an axis."""
+        """Discards the adapted parameters of an axis and restores its model as it was activated."""
         self.core.lease.check(holder)
         await self._following(axis).revert()
 

@@ -23,7 +23,7 @@ from hdbridge.daemon.api.policy import Policy
 from hdbridge.daemon.api.server import ApiServer, Listener
 from hdbridge.daemon.api.sockets import unix_socket
 from hdbridge.daemon.machine import Machine
-from hdbridge.daemon.service.process import follow
+from hdbridge.daemon.serve import follow
 from hdbridge.errors import DaemonError, HdbridgeError, InputError
 from hdbridge.files.yamlfile import document_from_text
 

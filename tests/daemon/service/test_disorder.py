@@ -16,7 +16,8 @@ from support.service import stepped_service, until
 
 from hdbridge.client.messages import JobKind
 from hdbridge.daemon.loop.states import AxisState
-from hdbridge.daemon.service.interface import StreamPoint, WayPoint
+from hdbridge.daemon.service.moves import WayPoint
+from hdbridge.daemon.service.streams import StreamPoint
 from hdbridge.errors import HdbridgeError, LeaseError
 
 LEASE_S = 2.0

@@ -21,9 +21,9 @@ from hdbridge.daemon.following.follower import Follower
 from hdbridge.daemon.following.settings import AdaptationSettings
 from hdbridge.daemon.following.statefile import AdaptationFiles
 from hdbridge.daemon.memory import EventKind
+from hdbridge.daemon.serve import follow
 from hdbridge.daemon.service.bridge import ServiceBridge
 from hdbridge.daemon.service.following import Following
-from hdbridge.daemon.service.process import follow
 from hdbridge.effects import Hysteresis
 from hdbridge.evaluation.stepping import Scheme
 from hdbridge.model import TransmissionModel

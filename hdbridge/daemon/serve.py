@@ -1,4 +1,4 @@
-"""The service process: ``python -m hdbridge.daemon.service.process FD``, started by the keeper.
+"""The service process: ``python -m hdbridge.daemon.serve FD``, started by the keeper.
 
 It assembles bridge, API, recorder, watch, adaptation and log, and ends them in order. It has one event loop;
 blocking work runs in threads. If it dies, the axes complete the commands they have.
