@@ -10,6 +10,7 @@ import typer
 from rich.table import Table
 
 from hdbridge.cli.options import (
+    BorrowOption,
     ForceOption,
     JsonOption,
     SeedOption,
@@ -89,6 +90,7 @@ def conform(
     truth: TruthOption = None,
     seed: SeedOption = 0,
     force: ForceOption = False,
+    borrow: BorrowOption = False,
     json_file: JsonOption = None,
 ) -> None:
     """Check a node against CiA 301 and CiA 402: NMT, SDO, PDO, SYNC, EMCY, its EDS, the drive profile.
@@ -117,7 +119,7 @@ def conform(
         return
     axis = None
     if profile is not None:
-        session = Session(profile, simulate, truth, seed, interface, channel, force)
+        session = Session(profile, simulate, truth, seed, interface, channel, force, borrow)
         axis, opened = session.axis, session.connected()
         node_id, eds = node_id or axis.drive.node_id, eds or axis.eds_path
     elif simulate or channel is None or node_id is None:

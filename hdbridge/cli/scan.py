@@ -8,6 +8,7 @@ import typer
 
 from hdbridge.bringup import ASK_TIMEOUT_S, LISTEN_S
 from hdbridge.cli.options import (
+    BorrowOption,
     ChannelOption,
     ForceOption,
     InterfaceOption,
@@ -44,6 +45,7 @@ def scan(
     interface: InterfaceOption = None,
     channel: ChannelOption = None,
     force: ForceOption = False,
+    borrow: BorrowOption = False,
     bitrate_bps: Annotated[
         int | None,
         typer.Option("--bitrate", min=10_000, max=1_000_000, help="Bit rate, where the interface sets it."),
@@ -74,7 +76,7 @@ def scan(
 
     axis = None
     if profile is not None:
-        session = Session(profile, simulate, truth, seed, interface, channel, force)
+        session = Session(profile, simulate, truth, seed, interface, channel, force, borrow)
         axis, opened = session.axis, session.connected()
     elif simulate or interface is None or channel is None:
         raise InputError("scan needs a bus: give a PROFILE, or --interface and --channel (socketcan, can0)")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import cached_property, wraps
 from pathlib import Path
@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, Concatenate, ParamSpec, get_type_hints
 
 from hdbridge.cli.interrupt import deferred_interrupt
 from hdbridge.cli.options import (
+    BorrowOption,
     ChannelOption,
     ForceOption,
     InterfaceOption,
@@ -22,13 +23,13 @@ from hdbridge.cli.options import (
     notes,
 )
 from hdbridge.clock import Clock, MonotonicClock
-from hdbridge.errors import InputError
+from hdbridge.errors import DaemonError, InputError
 from hdbridge.files.profile import Profile
 
 if TYPE_CHECKING:
     import can
 
-    from hdbridge.axis import AxisConfig
+    from hdbridge.axis import AxisConfig, BusConfig
     from hdbridge.drive.drive import Drive
 
 P = ParamSpec("P")
@@ -48,9 +49,12 @@ class Session:
     interface: InterfaceOption = None
     channel: ChannelOption = None
     force: ForceOption = False
+    borrow: BorrowOption = False
 
     def __post_init__(self) -> None:
         check_bus_options(self.interface, self.channel, simulate=self.simulate)
+        if self.borrow and (self.simulate or self.force):
+            raise InputError("--borrow takes the bus from a daemon: leave out --simulate and --force")
 
     @cached_property
     def files(self) -> Profile:
@@ -92,6 +96,8 @@ class Session:
                 "expected the interface of the bus (socketcan), or give --simulate, which puts a simulated "
                 "drive there"
             )
+        if self.borrow:
+            _borrow(axis.bus)
         wanted, bus_of = axis.realtime, open_bus(axis.bus, shared=self.force)
         with prepare_realtime(wanted.priority, wanted.cpus) as conditions, bus_of as bus:
             notes.print(f"this process: {conditions}")
@@ -167,6 +173,35 @@ def load_axis(
         name: value for name, value in (("interface", interface), ("channel", channel)) if value is not None
     }
     return axis.on_bus(**changes) if changes else axis
+
+
+def _borrow(bus: BusConfig) -> None:
+    """Makes the daemon that holds a bus release it; does nothing if no program holds the bus.
+
+    Raises `BusInUseError` if the holder is not a daemon that this user may ask.
+    """
+    from hdbridge.client import Client
+    from hdbridge.client.address import running
+    from hdbridge.drive.interfacelock import InterfaceLock
+
+    if not InterfaceLock(bus.interface, bus.channel).holder:
+        return
+    for address in running():
+        with suppress(DaemonError), Client(address.socket, name="hdbridge --borrow") as client:
+            machine = client.state()
+            if (machine.bus.interface, machine.bus.channel) == (bus.interface, str(bus.channel)):
+                break
+    else:
+        return  # opening the bus names its holder
+    names = ", ".join(each.name for each in machine.axes)
+    with Client(address.socket, name="hdbridge --borrow") as client:
+        client.lend_bus()
+    notes.print(
+        f"the daemon of machine '{machine.name}' has stopped its axes ({names}) and lends the bus to this "
+        "command; they come back disabled",
+        markup=False,
+        soft_wrap=True,
+    )
 
 
 def simulated_by(files: Profile, truth: Path | None) -> Path:

@@ -16,7 +16,7 @@ from hdbridge.daemon.memory import Memory
 from hdbridge.daemon.notify import Notifier
 from hdbridge.daemon.runtime import runtime_folder, socket_path
 from hdbridge.daemon.start import Simulation, Start
-from hdbridge.drive.interfacelock import interface_lock
+from hdbridge.drive.interfacelock import InterfaceLock
 
 
 def hold(
@@ -38,8 +38,9 @@ def hold(
     begin_log(log)
     folder = runtime_folder()
     with ExitStack() as stack:
+        lock = None
         if simulation is None and not force:
-            stack.enter_context(interface_lock(machine.bus.interface, machine.bus.channel))
+            lock = stack.enter_context(InterfaceLock(machine.bus.interface, machine.bus.channel))
         given = machine.api.socket
         path = socket_path(machine.name, folder, machine.beside(given) if given is not None else None)
         listeners = [stack.enter_context(unix_socket(path, machine.api.group))]
@@ -58,7 +59,7 @@ def hold(
             socket_file=file_of(path), page_token=token, log=log,
         )  # fmt: skip
         times = Times() if simulation is None else SIMULATED
-        return Keeper(start, memory, listeners, Notifier.of_environment(), times=times).run()
+        return Keeper(start, memory, listeners, Notifier.of_environment(), times=times, lock=lock).run()
 
 
 def _tell_page(listener: socket.socket, token: str | None) -> None:

@@ -11,6 +11,11 @@ It holds what must outlive a child: the shared memory, the listening sockets, th
     service, hung     kills it after `Times.service_hung_s`
     gateway           as the service; its axes brake and lose power because their set-points end
 
+The bus can be lent to another program of this computer. On the service's request the control process stops
+its axes and ends, and the keeper releases the lock of the interface. The program that acquires the lock has
+the bus. When the lock is free again, the keeper acquires it and starts a control process, whose axes come up
+disabled.
+
 If a child cannot start (the bus cannot be opened, a folder cannot be written), the daemon ends with that
 child's exit status.
 """
@@ -34,7 +39,8 @@ from hdbridge.daemon.memory import Cell, Memory
 from hdbridge.daemon.notify import Notifier
 from hdbridge.daemon.patience import BackOff, Budget, Pulse
 from hdbridge.daemon.start import Start
-from hdbridge.errors import HdbridgeError
+from hdbridge.drive.interfacelock import InterfaceLock
+from hdbridge.errors import BusInUseError, HdbridgeError
 
 _log = logging.getLogger(__name__)
 TICK_S: Final = 0.25
@@ -94,6 +100,38 @@ class _Helper:
     back_off: BackOff = field(default_factory=lambda: BackOff(0.5, 30.0, 60.0))
 
 
+class Loan:
+    """A loan of the bus to another program: asked for, then begun, and over when the lock is free again."""
+
+    COLLECTED_S: Final = 10.0
+    """Time for the borrower to acquire the lock."""
+
+    def __init__(self, lock: InterfaceLock) -> None:
+        self._lock = lock
+        self.asked_s: float | None = None
+        self._begun_s = 0.0
+        self._collected = False
+
+    def begin(self, now_s: float) -> None:
+        """Releases the lock."""
+        self._begun_s, self._collected = now_s, False
+        self._lock.release()
+
+    def is_over(self, now_s: float) -> bool:
+        """Acquires the lock if the borrower is done, or has not come; returns True if it is acquired."""
+        if self._lock.holder:
+            self._collected = True
+            return False
+        if not self._collected and now_s - self._begun_s < self.COLLECTED_S:
+            return False
+        try:
+            self._lock.acquire()
+        except BusInUseError:
+            return False
+        self.asked_s = None
+        return True
+
+
 class Keeper:
     """Keeper of the processes of one machine."""
 
@@ -105,12 +143,15 @@ class Keeper:
         notifier: Notifier,
         programs: Programs = Programs(),
         times: Times = Times(),
+        lock: InterfaceLock | None = None,
     ) -> None:
+        """``lock`` is the lock of the interface, which is held; None for a bus that cannot be lent."""
         self._start, self._memory, self._listeners = start, memory, listeners
         self._notifier, self._programs, self._times = notifier, programs, times
         self._budget = Budget(start.machine.limits.restarts_per_minute, 60.0)
         self._turns = Pulse()
         self._control: Child | None = None
+        self._loan = Loan(lock) if lock is not None else None
         api = tuple(each.fileno() for each in listeners)
         self._helpers = [
             _Helper(
@@ -168,6 +209,8 @@ class Keeper:
         if self._stopping_since_s is not None:
             self._go_on_stopping(now_s)
             return
+        if self._loan is not None:
+            self._lend(self._loan, now_s)
         for helper in self._helpers:
             if helper.due_s is not None and now_s >= helper.due_s:
                 self._start_helper(helper, now_s)
@@ -207,6 +250,11 @@ class Keeper:
         if self._stopping_since_s is not None:
             self._status = self._status or max(status, 0)
             return
+        if self._loan is not None and self._loan.asked_s is not None:
+            self._loan.begin(now_s)
+            self._memory.status.set(Cell.BUS_LENT, 1)
+            _log.info("the bus is lent", {"how": how})
+            return
         _log.error("control process died", {"how": how, "lived_s": round(now_s - child.started_s, 1)})
         known = status if status in _ERRORS else HdbridgeError.exit_status
         if status in _ERRORS and not self._memory.status.loop_count:
@@ -233,6 +281,23 @@ class Keeper:
         else:
             helper.due_s = now_s + helper.back_off.delay_s(lived_s)
 
+    def _lend(self, loan: Loan, now_s: float) -> None:
+        """Ends the control process if the bus is wanted; starts another one when the bus is free again."""
+        status = self._memory.status
+        if loan.asked_s is None:
+            if status.get(Cell.BUS_WANTED) and self._control is not None:
+                loan.asked_s = now_s
+                status.set(Cell.STOP_ASKED, 1)
+        elif self._control is not None:
+            if now_s - loan.asked_s > self._times.stop_s:
+                _log.error("the axes do not come to rest", {"after_s": self._times.stop_s})
+                self._control.send(signal.SIGKILL)
+        elif loan.is_over(now_s):
+            _log.info("the bus is taken back")
+            for cell in (Cell.BUS_LENT, Cell.STOP_ASKED):
+                status.set(cell, 0)
+            self._start_control(now_s)
+
     def _look_after(self, now_s: float) -> None:
         """Kills hung children; reports readiness, sign of life and status to the service manager."""
         status = self._memory.status
@@ -247,7 +312,10 @@ class Keeper:
             self._ready = True
             self._notifier.ready()
             _log.info("ready", self._facts())
-        if running and now_s - self._fed_s >= (self._notifier.watchdog_s or 0.0) / 4.0:
+        running |= bool(status.get(Cell.BUS_LENT))
+        if running and now_s - self._fed_s >= (
+            self._notifier.watchdog_s or 0.0
+        ) / 4.0:
             self._fed_s = now_s
             self._notifier.alive()
         restarts = ", ".join(f"{name} restarted {n} times" for name, n in self._restarts.items() if n)

@@ -71,7 +71,7 @@ async def serve(start: Start, memory: Memory) -> None:
         timing = RealTiming(THREADS_PER_AXIS * len(machine.axes) + SPARE_THREADS, clock)
         stack.callback(timing.close)
         bridge = ServiceBridge(
-            machine, memory, timing, simulated=simulated,
+            machine, memory, timing, simulated=simulated, forced=start.force,
             recordings=lambda port: machine.axis_folder(port.axis, "recordings"),
         )  # fmt: skip
         metrics = Metrics()

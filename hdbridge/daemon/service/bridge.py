@@ -36,13 +36,14 @@ from hdbridge.daemon.service.core import Core
 from hdbridge.daemon.service.dispatch import ANSWER_S
 from hdbridge.daemon.service.eventlog import Entry
 from hdbridge.daemon.service.jobs import JobBook, Runner, in_own_process
+from hdbridge.daemon.service.lending import Lending
 from hdbridge.daemon.service.observer import PERIOD_S, Subscription
 from hdbridge.daemon.service.outermaster import OuterMaster
 from hdbridge.daemon.service.ports import ServiceAxis
 from hdbridge.daemon.service.power import UNKNOWN
 from hdbridge.daemon.service.reports import LATCHED
 from hdbridge.daemon.service.timing import Timing
-from hdbridge.errors import HdbridgeError, InputError
+from hdbridge.errors import HdbridgeError, InputError, RefusedError
 
 if TYPE_CHECKING:
     from hdbridge.daemon.machine import Machine
@@ -70,10 +71,18 @@ class ServiceBridge:
         recordings: Callable[[ServiceAxis], Path] = lambda axis: axis.axis.profile.folder / "recordings",
         runner: Runner = in_own_process,
         simulated: bool = False,
+        forced: bool = False,
     ) -> None:
-        """``recordings`` returns the folder for recordings of an axis's jobs; ``runner`` runs a job."""
+        """``recordings`` returns the folder for recordings of an axis's jobs; ``runner`` runs a job.
+
+        ``forced`` says that the daemon does not hold the lock of its interface.
+        """
         self.machine = machine
         self.core = Core.of(memory, timing, machine.lease_s)
+        against = "the daemon was started with --force and does not hold the interface" if forced else ""
+        if simulated:
+            against = "its axes are simulated; a command has a simulated axis of its own with --simulate"
+        self.lending = Lending(self.core, machine.bus, against)
         self.book = JobBook(self.core, recordings, runner)
         self.axes: dict[str, ServiceAxis] = {
             axis.name: ServiceAxis(index, axis, self.core, self.book.begin, self.axis_state)
@@ -251,6 +260,7 @@ class ServiceBridge:
                 interface=self.machine.bus.interface,
                 channel=str(self.machine.bus.channel),
                 up=self._bus_up,
+                lent_to=self.lending.borrower,
                 load=float(head["bus_load"]) if head is not None else None,
             ),
             cycle=messages.CycleState(
@@ -293,7 +303,9 @@ class ServiceBridge:
     def _warnings(self) -> list[str]:
         core = self.core
         warnings = []
-        if not core.observer.alive:
+        if (borrower := self.lending.borrower) is not None:
+            warnings.append(f"the bus is lent to {borrower}; the axes come back disabled when it ends")
+        elif not core.observer.alive:
             warnings.append(
                 "the control process does not turn: it hangs or is gone, and is started again by itself"
             )
@@ -335,6 +347,15 @@ class ServiceBridge:
         for axis in self.axes.values():
             axis.give_up("it was stopped by a quick stop")
         await self.core.dispatch.do(CommandKind.QUICK_STOP)
+
+    async def lend_bus(self, holder: str) -> None:
+        """Stops the axes, switches them off and releases the bus to another program of this computer."""
+        self.core.lease.check(holder)
+        if running := [each.id for each in self.book.all() if each.state is messages.JobState.RUNNING]:
+            raise RefusedError(
+                f"the bus cannot be lent: {', '.join(running)} has not ended; wait, or cancel it"
+            )
+        await self.lending.lend()
 
     async def coordinated(
         self, holder: str, moves: Mapping[str, float], speed: float = 1.0, wait: bool = True

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import TypedDict, Unpack
 
 from hdbridge.daemon.memory import CommandKind, Event, EventKind, Memory
@@ -34,6 +35,8 @@ class Dispatcher:
         self._memory = memory
         self._timing = timing
         self.log = log
+        self.refuse: Callable[[CommandKind], None] = lambda _: None
+        """Raises RefusedError if the control process cannot take a command, because the bus is lent."""
 
     async def do(
         self, kind: CommandKind, axis: int = -1, within_s: float = ANSWER_S, **arguments: Unpack[Arguments]
@@ -43,6 +46,7 @@ class Dispatcher:
         Raises RefusedError with the control process's reason if nothing was done, and DaemonError if it
         does not answer within ``within_s``.
         """
+        self.refuse(kind)
         loop_pid = self._memory.status.loop_pid
         command_id = self._memory.commands.post(kind, axis, **arguments)
         deadline_s = self._timing.clock.now() + within_s
@@ -55,6 +59,7 @@ class Dispatcher:
         self, kind: CommandKind, axis: int = -1, within_s: float = ANSWER_S, **arguments: Unpack[Arguments]
     ) -> Event:
         """Does the same as `do`, for blocking code."""
+        self.refuse(kind)
         clock = self._timing.clock
         loop_pid = self._memory.status.loop_pid
         command_id = self._memory.commands.post(kind, axis, **arguments)
