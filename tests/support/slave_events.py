@@ -126,7 +126,8 @@ class Story:
         self.rng, self.bus, self.clock, self.node = rng, bus, clock, node
         self.stage, self.motor, self.laws = stage, motor, laws
         self.target = 0
-        self.statusword = 0
+        self.errors: set[int] = set()
+        """Codes that were reported and not ended by 'error reset'."""
 
     def send(self, can_id: int, data: bytes, **kind: Any) -> None:
         self.bus.send(can.Message(arbitration_id=can_id, data=data, **{"is_extended_id": False, **kind}))
@@ -136,7 +137,9 @@ class Story:
         """An EMCY or a boot-up message is a loss, unless the master has chosen to ignore it (6007h = 0)."""
         while (message := self.bus.recv(0)) is not None:
             code = struct.unpack_from("<H", message.data)[0] if message.arbitration_id == 0x081 else 0
-            emergency = code not in (0x0000, 0x8210, 0x8220)  # an RPDO of another length loses nothing
+            known = code in (0x0000, 0x8210, 0x8220, *self.errors)  # an RPDO of another length loses nothing
+            emergency = message.arbitration_id == 0x081 and not known
+            self.errors = set() if message.arbitration_id == 0x081 and not code else self.errors | {code}
             ignored = code >> 8 in (0x81, 0x87) and self.node.dictionary.value(0x6007) == 0
             if (emergency and not ignored) or (message.arbitration_id == 0x701 and message.data[0] == 0):
                 self.laws.interrupted()
@@ -232,7 +235,9 @@ class Story:
             data = bytes(rng.randint(0, 255) for _ in range(rng.randint(0, 8)))
             can_id = rng.choice((0x080, 0x201, 0x301, 0x601, 0x000, 0x181))
             if can_id == 0x201 and len(data) >= 6:
-                self.laws.asked(data[0] | data[1] << 8)
+                if (word := data[0] | data[1] << 8) & 0x8F == 0x0F:  # any other one is not obeyed before SYNC
+                    self.laws.asked(word)
+                self.laws.set_points |= bool(word & 0x10)
                 self.laws.targets = True
             if can_id == 0x601 and len(data) == 8 and data[1:4] in (b"\x7d\x60\x01", b"\x7d\x60\x02"):
                 return
