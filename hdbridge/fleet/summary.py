@@ -67,8 +67,6 @@ class Candidate:
     path: str
     """Path of its last recording."""
     gear: str
-    model: str
-    """Model file; `models/...` is in the folder of the data set."""
 
 
 @dataclass(frozen=True)
@@ -338,7 +336,6 @@ def _first(
                     remarks=tuple(rows[-1]["remarks"] or ()),
                     path=rows[-1]["path"],
                     gear=rows[-1]["gear"],
-                    model=rows[-1]["model"] or "MODEL.yaml",
                 )
             )
     kept = within_false_discoveries(np.array([each.probability for each in claims]), FALSE_DISCOVERIES)
