@@ -15,6 +15,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from hdbridge.analysis.intervals import NORMAL_95
 from hdbridge.fleet.statistics import (
     Interval,
     Series,
@@ -273,7 +274,7 @@ def _figures(joints: Mapping[str, Sequence[Row]]) -> dict[str, list[tuple[float,
                     and each["half_width"] > 0.0
                     and not each["name"].endswith("phase_deg")
                 ):
-                    table[each["name"]][name].append((row, each["value"], each["half_width"] / 1.96))
+                    table[each["name"]][name].append((row, each["value"], each["half_width"] / NORMAL_95))
     result: dict[str, list[tuple[float, str]]] = defaultdict(list)
     for figure, of_joint in table.items():
         if figure.split(".")[0] not in {"synchronous", "hysteresis"}:
