@@ -40,7 +40,7 @@ from hdbridge.procedures.plan import (
 )
 from hdbridge.records.record import OPTIONAL, REQUIRED
 from hdbridge.records.recording import RecordingFile
-from hdbridge.twin.translation import TABLE as TRANSLATED
+from hdbridge.twin.translate import TABLE as TRANSLATED
 
 DOCS = Path(__file__).resolve().parent.parent / "docs"
 PAGES = (

@@ -29,7 +29,7 @@ from hdbridge.analysis.identifiability import identifiability
 from hdbridge.analysis.linear import about_zeros
 from hdbridge.analysis.parameters import confounded, covariance, parameters_of, precisely
 from hdbridge.analysis.prepared import gather
-from hdbridge.analysis.probability import Context, weighed
+from hdbridge.analysis.probability import Context, Prior, weighed
 from hdbridge.analysis.scales import Scales
 from hdbridge.analysis.search import (
     Search,
@@ -68,12 +68,14 @@ def diagnose(
     independent_zeros: bool = False,
     progress: Callable[[str], None] = lambda _: None,
     scales: Scales | None = None,
+    prior: Prior | None = None,
 ) -> Diagnosis:
     """Diagnoses how a model differs from one or several recordings, and why; ``.as_dict()`` is the document.
 
     ``independent_zeros`` states that the encoders' zeros were lost between recordings. ``progress`` receives
-    a description of each step. ``scales`` overrides the decision thresholds. InputError if a recording is
-    too short, does not match the model's ratio, or lacks a channel that the model needs.
+    a description of each step. ``scales`` overrides the decision thresholds; ``prior`` holds
+    what a fleet says of the causes. InputError if a recording is too short, does not match the model's ratio,
+    or lacks a channel that the model needs.
     """
     recordings = by_name(recording)
     agreed_ratio(recordings, [(str(model.path or "the model"), model.ratio)])
@@ -107,7 +109,7 @@ def diagnose(
     progress("searching for causes")
     found = search.run()
     progress("judging what was found")
-    diagnosis = _Judge(search, model, bool(first)).of(found)
+    diagnosis = _Judge(search, model, bool(first), prior).of(found)
     return replace(diagnosis, remarks=(*remarks, *diagnosis.remarks))
 
 
@@ -136,6 +138,7 @@ class _Judge:
     model: TransmissionModel
     unfitted: bool
     """True if the model lacks a loop that makes up most of its residual."""
+    prior: Prior | None = None
     considered: list[str] = field(default_factory=list)
     """Causes that were considered but not reported, with the reason."""
 
@@ -242,7 +245,10 @@ class _Judge:
                 each for each in judged.findings if each.probability >= self.estimator.scales.named_from
             ]
             doubted = [each for each in judged.findings if each not in likely]
-            self.considered.extend(f"{each.cause}: more likely something else" for each in doubted)
+            self.considered.extend(
+                f"{each.cause}: more likely something else" + f" (prior: {each.prior})" * bool(each.prior)
+                for each in doubted
+            )
             effects = {id(each.effect) for each in doubted}
             kept = [
                 each
@@ -277,7 +283,7 @@ class _Judge:
             findings = [each for each in findings if each not in doubtful]
             left = rest(estimator, self._with_given_loop(fitted))
         words = [f"{each.cause}: {LESS}" for each in doubtful]
-        findings = weighed(findings, Context(left.arcsec, excess, unknown), estimator.scales)
+        findings = weighed(findings, Context(left.arcsec, excess, unknown), estimator.scales, self.prior)
         if estimator.data.reversals < 2:  # speed, torque, place and time are correlated
             most = estimator.scales.one_way
             findings = [replace(each, probability=min(each.probability, most)) for each in findings]

@@ -8,12 +8,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
-from typing import Any, Final
+from dataclasses import asdict, dataclass, field, replace
+from typing import Any, Final, Self
 
 from hdbridge.analysis.acceptance import Gate
 from hdbridge.analysis.capability import Capability, Identifiability, certainty
 from hdbridge.analysis.gain import Gain
+from hdbridge.analysis.intervals import NORMAL_95
 from hdbridge.analysis.prepared import means
 from hdbridge.analysis.scales import Scales
 from hdbridge.analysis.views import ResidualViews, coordinates
@@ -98,6 +99,15 @@ class Parameter:
     is_size: bool = False
     """True for a size: at zero the effect would vanish."""
 
+    def combined(self, middle: float, deviation: float) -> Self:
+        """Combines it with a normal prior; unchanged if they are three standard deviations apart."""
+        own = (self.high - self.low) / (2.0 * NORMAL_95)
+        if not 0.0 < own < math.inf or abs(self.value - middle) > 3.0 * math.hypot(own, deviation):
+            return self
+        share = deviation**2 / (own**2 + deviation**2)
+        value, half = middle + share * (self.value - middle), NORMAL_95 * own * math.sqrt(share)
+        return replace(self, value=value, low=value - half, high=value + half)
+
     def as_dict(self) -> dict[str, Any]:
         """Returns the JSON object."""
         return {"value": self.value, "unit": self.unit, "ci95": [self.low, self.high]}
@@ -132,6 +142,8 @@ class Finding:
     lives_in: str = ""
     """Coordinate on which an unexplained residual depends."""
     note: str = ""
+    prior: str = ""
+    """What other joints say of it, if a fleet was given."""
     effect: Effect | None = field(default=None, repr=False)
     """Effect to add to the model."""
     gate: Gate | None = field(default=None, repr=False)
@@ -142,7 +154,8 @@ class Finding:
     def as_dict(self) -> dict[str, Any]:
         """Returns the JSON object."""
         gain = self.gain
-        words = {"lives_in": self.lives_in, "note": self.note, "not_offered": self.refusal()}
+        words = {"lives_in": self.lives_in, "note": self.note, "prior": self.prior}
+        words["not_offered"] = self.refusal()
         return {
             "cause": self.cause,
             "probability": round(self.probability, 3),
@@ -231,7 +244,7 @@ class Diagnosis:
     capability: Capability
     """Causes that the record can show."""
     by_kind: Mapping[str, tuple[Figures, Figures]]
-    """By kind of motion and by direction: given and extended model."""
+    """Figures of the given and the extended model, by kind of motion and by direction."""
     remarks: tuple[str, ...]
     model: TransmissionModel = field(repr=False)
     """Extended model; the refitted one if nothing was found."""

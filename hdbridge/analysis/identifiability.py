@@ -16,7 +16,7 @@ from hdbridge.analysis.orders import NOT_APART
 from hdbridge.analysis.prepared import gather
 from hdbridge.analysis.screening import SHARE_LEFT, candidates
 from hdbridge.analysis.search import lookalikes, waves_alike
-from hdbridge.effects import CATALOGUE, Effect, FloatArray, Motion, Part, Start, causes
+from hdbridge.effects import CATALOGUE, Effect, FloatArray, Motion, Part, Sought, Start, causes
 from hdbridge.model import TransmissionModel
 from hdbridge.procedures.moves import AxisView, MotionLimits
 from hdbridge.procedures.plan import Plan
@@ -85,6 +85,11 @@ def identifiability(
             if name != cause and (name in waves or _correlation(spans[cause], spans[name]) > NOT_APART)
         ]
         result[cause] = Identifiability(limit <= WORST_ARCSEC, limit, tuple(alike), share)
+    for cause, each in result.items():
+        # A tone looks like a wave over an angle only at its frequency, which is that of no example.
+        tones = [name for name in each.aliases if CATALOGUE[name].sought is Sought.TONE]
+        for tone in tones:
+            result[tone] = replace(result[tone], aliases=tuple(dict.fromkeys((*result[tone].aliases, cause))))
     for candidate in candidates(estimator.data, ()):
         # An effect of a missing channel may look like a measured one.
         each = result[candidate.name]
@@ -117,7 +122,7 @@ def _before(estimator: Estimator, candidate: Effect, base: Sequence[Effect], sta
 
 
 class _Background:
-    """All that explains a record without a cause: the model, the motion before, errors of turning points."""
+    """Explanations of a record without a cause: the model, the motion before, errors of turning points."""
 
     def __init__(self, estimator: Estimator, fitted: Fitted, base: Sequence[Effect], stride: int) -> None:
         start = fitted.hypothesis.start

@@ -396,6 +396,14 @@ class AxisConfig(OtherChannels):
         line, column = self._document.position(tuple(key.split(".")))
         return f"{self.path}:{line}:{column}: {key}"
 
+    def require_load_encoder(self) -> None:
+        """Raises `InputError` if the axis has no encoder at its load."""
+        if self.load_encoder.is_motor_encoder:
+            raise InputError(
+                f"{self.where('load_encoder.source')}: found the motor encoder (6064h); expected an encoder "
+                "at the load, which this measurement needs"
+            )
+
     @property
     def is_from_file(self) -> bool:
         """True if the axis was read from a file, so that its EDS file is known."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated, ClassVar, Literal, Self
+from typing import Annotated, ClassVar, Final, Literal, Self
 
 from pydantic import Field, model_validator
 
@@ -102,7 +102,16 @@ class Source(Strict):
         return self.range_counts or self.WRAPS[self.type]
 
 
+POSITION_ACTUAL: Final = (0x6064, 0)
+"""Position actual value of the motor (CiA 402-2)."""
+
+
 class LoadEncoder(Encoder):
     """The encoder at the load, which measures the positioning error."""
 
     source: Source = Field(default_factory=Source, description="source of its reading")
+
+    @property
+    def is_motor_encoder(self) -> bool:
+        """True if the reading is that of the motor encoder: the axis has no encoder at its load."""
+        return self.source.node is None and self.source.address == POSITION_ACTUAL

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -22,9 +24,13 @@ from hdbridge.errors import InputError
 from hdbridge.files.outputs import Kind
 
 if TYPE_CHECKING:
+    from hdbridge.fleet.dataset import Dataset
+    from hdbridge.fleet.engine import Cluster
+    from hdbridge.fleet.sources import Source, Stored
     from hdbridge.fleet.summary import Summary
 
 PAGE_NAME = "fleet.html"
+PRIOR_NAME = "fleet.parquet"
 _EXTRA = ("distributed", "pyarrow", "fsspec")
 
 OutArgument = Annotated[Path, typer.Argument(metavar="OUT", help="The --out folder of a run.")]
@@ -81,6 +87,7 @@ def register(app: typer.Typer) -> None:
         rich_markup_mode="markdown",
     )
     group.command()(run)
+    group.command()(watch)
     group.command()(report)
     group.command()(simulate)
     app.add_typer(group, name="fleet")
@@ -102,63 +109,152 @@ def run(
     A joint without a model gets one fitted to its earliest recording. A recording that cannot be used is a
     row with the reason. Ctrl-C keeps what is done; the same command continues.
     """
-    from hdbridge.fleet.dataset import Dataset
-    from hdbridge.fleet.engine import Cluster, Progress
-    from hdbridge.fleet.engine import run as run_fleet
     from hdbridge.fleet.sources import find_sources
-    from hdbridge.model import TransmissionModel
 
-    need_extra("a fleet needs", _EXTRA, "fleet")
-    if out is None:
-        raise InputError("--out is missing; name a new folder, or one of an earlier run")
-    if not sources and manifest is None:
-        raise InputError(
-            "no source; name folders, globs or URLs of recordings, or a manifest with --manifest"
-        )
-    if scheduler is not None and workers is not None:
-        raise InputError(
-            "--workers: a cluster that exists has its own workers; leave out --workers or --scheduler"
-        )
-    _check_memory(memory)
-    if scheduler == "":
-        raise InputError("--scheduler: found no address; expected one such as tcp://HOST:8786")
-    if "" in (sources or []):
-        raise InputError("SOURCE: found an empty name; expected a folder, a glob or a URL")
-    if model is not None:
-        TransmissionModel.load(model)
-    if models is not None and not models.is_dir():
-        raise InputError(f"--models: '{models}' is not a folder; expected one with JOINT.yaml for each joint")
-    found = find_sources(sources or [], manifest)
-    dataset = Dataset(out)
-    dataset.create()
-    notes.print(f"{len(found)} sources, {len({each.joint for each in found})} joints")
-    with deferred_interrupt() as interrupted, progress_bar() as bar:
-        task = bar.add_task("diagnosing", total=len(found))
+    fleet = _Fleet.checked(sources, out, manifest, model, models, scheduler, workers, memory)
+    found = find_sources(sources or [], manifest, fleet.dataset.stored())
+    with deferred_interrupt() as interrupted:
+        try:
+            fleet.diagnose(found, interrupted)
+        except KeyboardInterrupt:
+            fleet.say_interrupted()
+            raise
+    _summarise(fleet.dataset, limit_arcsec, fleet.dataset.folder / PAGE_NAME)
 
-        def tell(now: Progress) -> None:
-            words = f"{now.done} of {now.total}" + f", {now.failed} failed" * bool(now.failed)
-            bar.update(task, completed=now.done, total=max(now.total, 1), description=words)
+
+def watch(
+    sources: JoinsOption = None,
+    out: OutOption = None,
+    manifest: ManifestOption = None,
+    model: ModelOption = None,
+    models: ModelsOption = None,
+    scheduler: SchedulerOption = None,
+    workers: WorkersOption = None,
+    memory: MemoryOption = "2GB",
+    limit_arcsec: LimitOption = 10.0,
+    interval_s: Annotated[
+        float,
+        typer.Option(
+            "--interval", metavar="SECONDS", min=0.1, max=86_400.0, help="Time between two listings."
+        ),
+    ] = 60.0,
+    once: Annotated[
+        bool, typer.Option("--once", help="End after one round, for a timer such as cron.")
+    ] = False,
+) -> None:
+    """Diagnose new recordings as they arrive, and update Parquet and page in FOLDER.
+
+    A recording is ready when its size and time are the same in two listings; one that is still being written
+    waits for the next round. Ctrl-C ends it and keeps what is done (exit status 0).
+    """
+    from hdbridge.fleet.engine import watch as watch_fleet
+    from hdbridge.fleet.sources import find_sources
+
+    fleet = _Fleet.checked(sources, out, manifest, model, models, scheduler, workers, memory)
+
+    def find(stored: Stored) -> Sequence[Source]:
+        return find_sources(sources or [], manifest, stored, may_be_empty=True)
+
+    with deferred_interrupt() as interrupted:
+
+        def diagnose(found: Sequence[Source], retried: Collection[str]) -> None:
+            fleet.diagnose(found, interrupted, retried)
+            _summarise(fleet.dataset, limit_arcsec, fleet.dataset.folder / PAGE_NAME)
 
         try:
-            end = run_fleet(
-                found,
-                dataset,
-                Cluster(scheduler, workers, memory),
-                model=model,
-                models=models,
-                progress=tell,
-                interrupted=interrupted,
+            watch_fleet(
+                find, fleet.dataset, interval_s, diagnose, once=once, report=_note, interrupted=interrupted
             )
         except KeyboardInterrupt:
-            notes.print(
-                f"interrupted; {out} keeps what is done, and the same command continues", soft_wrap=True
+            fleet.say_interrupted()
+
+
+@dataclass(frozen=True)
+class _Fleet:
+    """Checked options of a run."""
+
+    dataset: Dataset
+    cluster: Cluster
+    model: Path | None
+    models: Path | None
+
+    @classmethod
+    def checked(
+        cls,
+        sources: list[str] | None,
+        out: Path | None,
+        manifest: Path | None,
+        model: Path | None,
+        models: Path | None,
+        scheduler: str | None,
+        workers: int | None,
+        memory: str,
+    ) -> _Fleet:
+        """Checks the options; InputError names the wrong one."""
+        from hdbridge.fleet.dataset import Dataset
+        from hdbridge.fleet.engine import Cluster
+        from hdbridge.model import TransmissionModel
+
+        need_extra("a fleet needs", _EXTRA, "fleet")
+        if out is None:
+            raise InputError("--out is missing; name a new folder, or one of an earlier run")
+        if not sources and manifest is None:
+            raise InputError(
+                "no source; name folders, globs or URLs of recordings, or a manifest with --manifest"
             )
-            raise
-    _say(
-        f"{out}: {end.done} recordings, {end.known} of them known already, {end.failed} newly failed; "
-        f"largest memory of a worker {end.memory_mb:.0f} MB"
-    )
-    _summarise(dataset, limit_arcsec, out / PAGE_NAME)
+        if scheduler is not None and workers is not None:
+            raise InputError(
+                "--workers: a cluster that exists has its own workers; leave out --workers or --scheduler"
+            )
+        _check_memory(memory)
+        if scheduler == "":
+            raise InputError("--scheduler: found no address; expected one such as tcp://HOST:8786")
+        if "" in (sources or []):
+            raise InputError("SOURCE: found an empty name; expected a folder, a glob or a URL")
+        if model is not None:
+            TransmissionModel.load(model)
+        if models is not None and not models.is_dir():
+            raise InputError(
+                f"--models: '{models}' is not a folder; expected one with JOINT.yaml for each joint"
+            )
+        return cls(Dataset(out), Cluster(scheduler, workers, memory), model, models)
+
+    def diagnose(
+        self,
+        found: Sequence[Source],
+        interrupted: Callable[[], bool],
+        retried: Collection[str] | None = None,
+    ) -> None:
+        """Runs over the recordings with a progress bar."""
+        from hdbridge.fleet.engine import RETRIED, Progress
+        from hdbridge.fleet.engine import run as run_fleet
+
+        _note(f"{len(found)} sources, {len({each.joint for each in found})} joints")
+        with progress_bar() as bar:
+            task = bar.add_task("diagnosing", total=len(found))
+
+            def tell(now: Progress) -> None:
+                words = f"{now.done} of {now.total}" + f", {now.failed} failed" * bool(now.failed)
+                bar.update(task, completed=now.done, total=max(now.total, 1), description=words)
+
+            end = run_fleet(
+                found,
+                self.dataset,
+                self.cluster,
+                model=self.model,
+                models=self.models,
+                progress=tell,
+                interrupted=interrupted,
+                retried=RETRIED if retried is None else retried,
+            )
+        _say(
+            f"{self.dataset.folder}: {end.done} recordings, {end.known} of them known already, "
+            f"{end.failed} newly failed; largest memory of a worker {end.memory_mb:.0f} MB"
+        )
+
+    def say_interrupted(self) -> None:
+        """Reports that the finished part is kept."""
+        _note(f"interrupted; {self.dataset.folder} keeps what is done, and the same command continues")
 
 
 def report(
@@ -201,16 +297,17 @@ def simulate(
     _say(f"{folder}: {joints} joints with {recordings} recordings each")
 
 
-def _summarise(dataset: object, limit_arcsec: float, page: Path, json_file: Path | None = None) -> None:
+def _summarise(dataset: Dataset, limit_arcsec: float, page: Path, json_file: Path | None = None) -> None:
     from rich.table import Table
 
-    from hdbridge.fleet.dataset import Dataset
+    from hdbridge.fleet.prior import write_prior
     from hdbridge.fleet.report import fleet_page, hours_words
     from hdbridge.fleet.summary import summarise
     from hdbridge.report.page import render
 
-    assert isinstance(dataset, Dataset)
-    summary: Summary = summarise(dataset.recordings(), limit_arcsec)
+    rows = dataset.recordings()
+    summary: Summary = summarise(rows, limit_arcsec)
+    write_prior(dataset.folder / PRIOR_NAME, rows)
     write_json(json_file, summary.as_dict())
     table = Table("joint", "cause", "probability", "peak, arcsec", "hours to the limit")
     for each in summary.first:
@@ -241,6 +338,10 @@ def _check_memory(text: str) -> None:
         raise InputError(
             f"--memory: found '{text}'; expected at least 200MB: the libraries alone need so much"
         )
+
+
+def _note(line: str) -> None:
+    notes.print(line, markup=False, soft_wrap=True)
 
 
 def _say(line: str) -> None:

@@ -175,3 +175,20 @@ def simulated_by(files: Profile, truth: Path | None) -> Path:
     if plant == files.twin:
         notes.print(f"simulated by the axis's twin, {plant}", markup=False, soft_wrap=True)
     return plant
+
+
+@contextmanager
+def bare_bus(
+    interface: str, channel: str, bitrate_bps: int | None, *, force: bool
+) -> Iterator[tuple[can.BusABC, Clock]]:
+    """Yields a bus without an axis file, and the monotonic clock.
+
+    With ``force``, the bus is opened even if another process on this computer masters it.
+    """
+    from hdbridge.axis import BusConfig
+    from hdbridge.drive.link import check_interface, open_bus
+
+    check_interface(interface, "--interface")
+    settings = BusConfig(interface=interface, channel=channel, bitrate_bps=bitrate_bps)
+    with open_bus(settings, shared=force) as bus:
+        yield bus, MonotonicClock()

@@ -22,6 +22,8 @@ from hdbridge.effects import FloatArray, IntArray
 Complexes = NDArray[np.complex128]
 MAD: Final = 1.4826
 """Standard deviation of a normal distribution per median absolute deviation."""
+OUTLIERS_FROM: Final = 8
+"""Minimum number of values for a range: below it, the median absolute deviation is uncertain by half."""
 DRAWS: Final = 4001
 GOLDEN: Final = 0.6180339887498949
 INTERVAL: Final = (0.05, 0.95)
@@ -160,7 +162,7 @@ def outliers(values: FloatArray, rate: float = 0.05) -> NDArray[np.bool_]:
     There are none among fewer than eight values, or if more than half of the values are equal.
     """
     scale = MAD * float(np.median(np.abs(values - np.median(values)))) if len(values) else 0.0
-    if len(values) < 8 or scale == 0.0:
+    if len(values) < OUTLIERS_FROM or scale == 0.0:
         return np.zeros(len(values), dtype=bool)
     chance = 2.0 * ndtr(-np.abs(values - np.median(values)) / scale)
     order = np.argsort(chance)
@@ -366,7 +368,7 @@ def identities(orders: Complexes, joint: Sequence[int], time: Sequence[Any]) -> 
     with NaN have none. Each recording is compared with the first one of its joint.
     """
     numbers = np.asarray(joint)
-    known = np.all(np.isfinite(orders), axis=1) if len(orders) else np.zeros(0, dtype=bool)
+    known = np.all(np.isfinite(orders), axis=1) & (orders.shape[1] > 0)
     first: dict[int, int] = {}
     for place in sorted(range(len(numbers)), key=lambda each: time[each]):
         if known[place]:

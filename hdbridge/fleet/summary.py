@@ -139,13 +139,7 @@ _KINDS: Final = {
 
 def summarise(rows: Sequence[Row], limit_arcsec: float) -> Summary:
     """Summarises the recordings of a data set (`Dataset.recordings`)."""
-    good = [row for row in rows if row["reason"] is None and row["duplicate_of"] is None]
-    good.sort(key=_when)
-    mistaken, foreign = _mistaken(good)
-    joints: dict[str, list[Row]] = defaultdict(list)
-    for row in good:
-        if (row["key"], row["path"]) not in foreign:
-            joints[row["joint"]].append(row)
+    joints, mistaken = own_recordings(rows)
     has, rates, sizes = _causes(joints)
     changed = _figures(joints)
     first = _first(joints, has, sizes, changed, limit_arcsec)
@@ -168,6 +162,18 @@ def summarise(rows: Sequence[Row], limit_arcsec: float) -> Summary:
     )
 
 
+def own_recordings(rows: Sequence[Row]) -> tuple[dict[str, list[Row]], tuple[Mistaken, ...]]:
+    """Returns the diagnosed recordings of each joint in time, without copies and mistaken ones; and these."""
+    good = [row for row in rows if row["reason"] is None and row["duplicate_of"] is None]
+    good.sort(key=_when)
+    mistaken, foreign = _mistaken(good)
+    joints: dict[str, list[Row]] = defaultdict(list)
+    for row in good:
+        if (row["key"], row["path"]) not in foreign:
+            joints[row["joint"]].append(row)
+    return joints, mistaken
+
+
 def _when(row: Row) -> tuple[float, str, str]:
     return (row["hours"] if row["hours"] is not None else -1.0, row["date"] or "", row["path"])
 
@@ -181,12 +187,13 @@ def _mistaken(good: Sequence[Row]) -> tuple[tuple[Mistaken, ...], set[tuple[str,
         gears[f"{row['gear']}"].append(row)
     for rows in gears.values():
         names = sorted({row["joint"] for row in rows})
+        numbers = {name: number for number, name in enumerate(names)}
         count = max((len(row["orders"] or ()) for row in rows), default=0)
         orders = np.full((len(rows), count), np.nan + 0j)
         for place, row in enumerate(rows):
             if count and len(row["orders"] or ()) == count:
                 orders[place] = [complex(each["cos_arcsec"], -each["sin_arcsec"]) for each in row["orders"]]
-        found = identities(orders, [names.index(row["joint"]) for row in rows], [_when(row) for row in rows])
+        found = identities(orders, [numbers[row["joint"]] for row in rows], [_when(row) for row in rows])
         for row, each in zip(rows, found, strict=True):
             if each is None:
                 continue
@@ -222,8 +229,14 @@ def _causes(
     return has, rates, sizes
 
 
+def named_by(row: Row, cause: str) -> Mapping[str, Any] | None:
+    """Returns the finding of a recording that names a cause, or None."""
+    return next((each for each in row["findings"] if each["cause"] == cause), None)
+
+
 def _peak(row: Row, cause: str) -> float | None:
-    return next((each["peak_arcsec"] for each in row["findings"] if each["cause"] == cause), None)
+    found = named_by(row, cause)
+    return found["peak_arcsec"] if found else None
 
 
 def _size(rows: Sequence[Row], cause: str) -> Series:

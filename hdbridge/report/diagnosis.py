@@ -236,6 +236,8 @@ def _about(finding: Finding) -> Iterator[tuple[str, str]]:
         yield "name in files", finding.cause
     if finding.note:
         yield "note", sentence(finding.note)
+    if finding.prior:
+        yield "prior", sentence(finding.prior)
 
 
 def _sure(finding: Finding) -> str:

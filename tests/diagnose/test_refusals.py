@@ -1,4 +1,4 @@
-"""What the evidence speaks for and a rule refuses is told, and may still be an alias of what is named."""
+"""A cause with evidence that a rule refuses is reported, and may still be an alias of a named cause."""
 
 from __future__ import annotations
 

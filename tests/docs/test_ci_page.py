@@ -98,7 +98,7 @@ def test_the_workflow_takes_vcan_where_it_is(tmp_path: Path, has_vcan: bool, bus
 
 
 def test_the_program_knows_nothing_of_hdbridge(tmp_path):
-    """It runs where there is none."""
+    """The workflow runs on a runner without a CAN interface."""
     ci_page.write(tmp_path)
     loaded = "sorted(each for each in sys.modules if each.partition('.')[0] in ('hdbridge', 'canopen'))"
     done = subprocess.run(

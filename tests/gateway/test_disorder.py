@@ -41,7 +41,7 @@ HARMLESS = {"word", "walk", "target", "mode", "wait", "frame"}
 
 
 class Laws:
-    """Of one axis."""
+    """Requests to one axis."""
 
     def __init__(self, bench: GatewayBench) -> None:
         self.bench = bench

@@ -1,4 +1,4 @@
-"""What four rows of scatter and mean say of the runs behind them, tried on runs that are known."""
+"""Inference from four rows of scatter and mean to the runs behind them, tried on known runs."""
 
 from __future__ import annotations
 

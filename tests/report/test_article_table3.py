@@ -1,4 +1,4 @@
-"""What the page about the article's Table 3 says is what its script computes."""
+"""The page about the article's Table 3 has the figures that its script computes."""
 
 import re
 from pathlib import Path

@@ -314,7 +314,7 @@ def no_watchdogs(drive, program):
 
 
 def slow_brakes(drive, program):
-    """It takes the time that this deceleration needs: 10,000 counts/s at 20,000 counts/s2."""
+    """The stop takes the time of this deceleration: 10,000 counts/s at 20,000 counts/s2."""
     drive.fault("slow_brakes", counts_per_s2=20_000.0)
     drive.fault("drive_fault")
     drive.sleep(0.4)
