@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -21,13 +21,14 @@ from hdbridge.cli.options import (
     write_result,
 )
 from hdbridge.errors import InputError
+from hdbridge.files.expectation import nearest
 from hdbridge.files.outputs import Kind
 
 if TYPE_CHECKING:
     from hdbridge.fleet.dataset import Dataset
     from hdbridge.fleet.engine import Cluster
     from hdbridge.fleet.sources import Source, Stored
-    from hdbridge.fleet.summary import Summary
+    from hdbridge.fleet.summary import Row, Summary
 
 PAGE_NAME = "fleet.html"
 PRIOR_NAME = "fleet.parquet"
@@ -76,6 +77,10 @@ WorkersOption = Annotated[
     int | None,
     typer.Option("--workers", min=1, max=1000, help="Processes on this computer; else one per core."),
 ]
+PagesOption = Annotated[
+    bool,
+    typer.Option("--pages", help="Write the page of each joint in the list too, into OUT/pages."),
+]
 MemoryOption = Annotated[str, typer.Option("--memory", metavar="SIZE", help="Memory limit of each of them.")]
 
 
@@ -103,6 +108,7 @@ def run(
     workers: WorkersOption = None,
     memory: MemoryOption = "2GB",
     limit_arcsec: LimitOption = 10.0,
+    pages: PagesOption = False,
 ) -> None:
     """Diagnose every recording that is not in FOLDER yet, and write Parquet and a page there.
 
@@ -119,7 +125,7 @@ def run(
         except KeyboardInterrupt:
             fleet.say_interrupted()
             raise
-    _summarise(fleet.dataset, limit_arcsec, fleet.dataset.folder / PAGE_NAME)
+    _summarise(fleet.dataset, limit_arcsec, pages=pages)
 
 
 def watch(
@@ -132,6 +138,7 @@ def watch(
     workers: WorkersOption = None,
     memory: MemoryOption = "2GB",
     limit_arcsec: LimitOption = 10.0,
+    pages: PagesOption = False,
     interval_s: Annotated[
         float,
         typer.Option(
@@ -159,7 +166,7 @@ def watch(
 
         def diagnose(found: Sequence[Source], retried: Collection[str]) -> None:
             fleet.diagnose(found, interrupted, retried)
-            _summarise(fleet.dataset, limit_arcsec, fleet.dataset.folder / PAGE_NAME)
+            _summarise(fleet.dataset, limit_arcsec, pages=pages)
 
         try:
             watch_fleet(
@@ -266,6 +273,11 @@ def report(
     ] = None,
     json_file: JsonOption = None,
     limit_arcsec: LimitOption = 10.0,
+    pages: PagesOption = False,
+    joints: Annotated[
+        list[str] | None,
+        typer.Option("--joint", metavar="NAME", help="Write the page of this joint too."),
+    ] = None,
 ) -> None:
     """Write the page of a run again, and print which joints to look at first."""
     from hdbridge.fleet.dataset import Dataset
@@ -273,7 +285,7 @@ def report(
     need_extra("a fleet needs", _EXTRA, "fleet")
     dataset = Dataset(out)
     dataset.check()
-    _summarise(dataset, limit_arcsec, html_file or out / PAGE_NAME, json_file)
+    _summarise(dataset, limit_arcsec, html_file, json_file, pages=pages, joints=joints or ())
 
 
 def simulate(
@@ -297,18 +309,37 @@ def simulate(
     _say(f"{folder}: {joints} joints with {recordings} recordings each")
 
 
-def _summarise(dataset: Dataset, limit_arcsec: float, page: Path, json_file: Path | None = None) -> None:
+def _summarise(
+    dataset: Dataset,
+    limit_arcsec: float,
+    page: Path | None = None,
+    json_file: Path | None = None,
+    *,
+    pages: bool = False,
+    joints: Sequence[str] = (),
+) -> None:
+    """Prints and writes what the data set says; also the pages of these joints, and of all of the list."""
     from rich.table import Table
 
     from hdbridge.fleet.prior import write_prior
-    from hdbridge.fleet.report import fleet_page, hours_words
-    from hdbridge.fleet.summary import summarise
+    from hdbridge.fleet.report import ROWS, fleet_page, hours_words
+    from hdbridge.fleet.summary import own_recordings, summarise
     from hdbridge.report.page import render
 
     rows = dataset.recordings()
+    latest = {joint: own[-1] for joint, own in own_recordings(rows)[0].items()}
+    for joint in joints:
+        if joint not in latest:
+            close = nearest(joint, [*latest])
+            raise InputError(
+                f"--joint: no diagnosis of '{joint}' in {dataset.folder}"
+                + (f" (did you mean {close}?)" if close else "")
+            )
     summary: Summary = summarise(rows, limit_arcsec)
-    write_prior(dataset.folder / PRIOR_NAME, rows)
     write_json(json_file, summary.as_dict())
+    write_prior(dataset.folder / PRIOR_NAME, rows)
+    listed = [each.joint for each in summary.first[:ROWS]] if pages else []
+    found = _with_pages(dataset.folder, latest, dict.fromkeys([*joints, *listed]))
     table = Table("joint", "cause", "probability", "peak, arcsec", "hours to the limit")
     for each in summary.first:
         table.add_row(
@@ -324,7 +355,28 @@ def _summarise(dataset: Dataset, limit_arcsec: float, page: Path, json_file: Pat
         _say("No joint stands out.")
     for line in summary.lines():
         _say(line)
-    write_result(page, render(fleet_page(summary, dataset.folder)))
+    target = page or dataset.folder / PAGE_NAME
+    beside = target.resolve().parent == dataset.folder.resolve()
+    if not beside:  # pages are in OUT
+        found = {joint: (dataset.folder.resolve() / each).as_uri() for joint, each in found.items()}
+    write_result(target, render(fleet_page(summary, dataset.folder, found)))
+
+
+def _with_pages(folder: Path, latest: Mapping[str, Row], wanted: Collection[str]) -> dict[str, str]:
+    """Writes the wanted pages of joints that are missing; returns the addresses of all that are there."""
+    from hdbridge.fleet.pages import links, write_page
+
+    there = links(folder, latest)
+    missing = [each for each in wanted if each not in there]
+    if missing:
+        with progress_bar() as bar:
+            for each in bar.track(missing, description="pages of joints"):
+                try:
+                    write_page(folder, latest[each])
+                except InputError as problem:  # such as a recording that was removed
+                    _note(f"no page of {each}: {problem}")
+        there = links(folder, latest)
+    return there
 
 
 def _check_memory(text: str) -> None:

@@ -364,6 +364,8 @@ class Firmware:
     def connection_lost(self, code: int) -> None:
         """Reacts to the loss of the master as 6007h says; ``code`` is the EMCY code of the loss."""
         option = self._dictionary.value(0x6007)
+        if option and self._awaits_power:
+            self._power_off(self.state)  # the request came from the master that is lost
         if option == 1 and self.state in POWERED:
             self.fault(code)
         elif option == 2 and self.state in POWERED:
@@ -374,8 +376,9 @@ class Firmware:
 
     @property
     def follows_the_bus(self) -> bool:
-        """True if the axis needs cyclic set-points: enabled in a cyclic mode."""
-        return self.state is State.OPERATION_ENABLED and isinstance(self._mode, CyclicSynchronousPosition)
+        """True if the axis needs cyclic set-points: enabled, or about to be, in a cyclic mode."""
+        enabled = self.state is State.OPERATION_ENABLED or self._awaits_power
+        return enabled and isinstance(self._mode, CyclicSynchronousPosition)
 
     def _judge_stage(self) -> None:
         """Reacts to a failure of the power stage, without a ramp, or to the end of a pending request."""

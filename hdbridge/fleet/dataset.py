@@ -84,6 +84,9 @@ COLUMNS: Final[Mapping[str, Mapping[str, tuple[str, str]]]] = {
             "null if it could not be fetched",
         ),
         "axes": ("integer", "number of axes in a flight recording"),
+        "columns": ("text", "from the manifest"),
+        "units": ("text", "from the manifest"),
+        "unwrap": ("text", "from the manifest"),
     },
     FINDINGS: {
         "key": ("text", "of the recording"),

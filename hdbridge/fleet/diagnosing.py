@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -156,11 +156,7 @@ def lost(source: Source, reason: str) -> Row:
 
 def _described(source: Source) -> Row:
     """Returns the columns that are known before a recording is read."""
-    same = ("path", "axis", "gear", "batch", "cell", "lubricant", "hours", "date", "stamp", "axes")
-    return {name: getattr(source, name) for name in same} | {
-        "joint": source.joint or "",
-        "version": __version__,
-    }
+    return asdict(source) | {"joint": source.joint or "", "version": __version__}
 
 
 def _reason(problem: Exception) -> str:

@@ -15,6 +15,7 @@ from typing import Any, Final
 import numpy as np
 from scipy.special import expit, logit
 
+from hdbridge.analysis.intervals import NORMAL_95
 from hdbridge.analysis.probability import Prior
 from hdbridge.effects import CATALOGUE
 from hdbridge.errors import InputError
@@ -72,7 +73,7 @@ def _ranges(cause: str, joints: Mapping[str, Sequence[Row]]) -> list[dict[str, A
     result = []
     for name, each in values.items():
         normal = normal_range(np.array(each))
-        deviation = (normal.high - normal.value) / 1.96
+        deviation = (normal.high - normal.value) / NORMAL_95
         if len(each) >= OUTLIERS_FROM and deviation > 0.0:
             result.append({"name": name, "middle": normal.value, "deviation": deviation})
     return result

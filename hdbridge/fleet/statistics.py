@@ -17,11 +17,11 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.special import betaln, chdtri, expit, logsumexp, ndtr, ndtri
 
+from hdbridge.analysis.intervals import NORMAL_95
+from hdbridge.analysis.readings import median_deviation
 from hdbridge.effects import FloatArray, IntArray
 
 Complexes = NDArray[np.complex128]
-MAD: Final = 1.4826
-"""Standard deviation of a normal distribution per median absolute deviation."""
 OUTLIERS_FROM: Final = 8
 """Minimum number of values for a range: below it, the median absolute deviation is uncertain by half."""
 DRAWS: Final = 4001
@@ -152,7 +152,7 @@ def within_false_discoveries(probability: FloatArray, rate: float) -> FloatArray
 def normal_range(values: FloatArray) -> Interval:
     """Returns the median and the range of 95 % of normal values, by the median absolute deviation."""
     middle = float(np.median(values))
-    half = 1.96 * MAD * float(np.median(np.abs(values - middle)))
+    half = NORMAL_95 * median_deviation(values - middle)
     return Interval(middle - half, middle, middle + half)
 
 
@@ -161,7 +161,7 @@ def outliers(values: FloatArray, rate: float = 0.05) -> NDArray[np.bool_]:
 
     There are none among fewer than eight values, or if more than half of the values are equal.
     """
-    scale = MAD * float(np.median(np.abs(values - np.median(values)))) if len(values) else 0.0
+    scale = median_deviation(values - np.median(values)) if len(values) else 0.0
     if len(values) < OUTLIERS_FROM or scale == 0.0:
         return np.zeros(len(values), dtype=bool)
     chance = 2.0 * ndtr(-np.abs(values - np.median(values)) / scale)

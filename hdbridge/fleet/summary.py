@@ -15,6 +15,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from hdbridge.analysis.intervals import NORMAL_95
 from hdbridge.fleet.statistics import (
     Interval,
     Series,
@@ -67,8 +68,6 @@ class Candidate:
     path: str
     """Path of its last recording."""
     gear: str
-    model: str
-    """Model file; `models/...` is in the folder of the data set."""
 
 
 @dataclass(frozen=True)
@@ -275,7 +274,7 @@ def _figures(joints: Mapping[str, Sequence[Row]]) -> dict[str, list[tuple[float,
                     and each["half_width"] > 0.0
                     and not each["name"].endswith("phase_deg")
                 ):
-                    table[each["name"]][name].append((row, each["value"], each["half_width"] / 1.96))
+                    table[each["name"]][name].append((row, each["value"], each["half_width"] / NORMAL_95))
     result: dict[str, list[tuple[float, str]]] = defaultdict(list)
     for figure, of_joint in table.items():
         if figure.split(".")[0] not in {"synchronous", "hysteresis"}:
@@ -338,7 +337,6 @@ def _first(
                     remarks=tuple(rows[-1]["remarks"] or ()),
                     path=rows[-1]["path"],
                     gear=rows[-1]["gear"],
-                    model=rows[-1]["model"] or "MODEL.yaml",
                 )
             )
     kept = within_false_discoveries(np.array([each.probability for each in claims]), FALSE_DISCOVERIES)

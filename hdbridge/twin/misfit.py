@@ -28,6 +28,7 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 from scipy.special import log_ndtr, ndtr
 
+from hdbridge.analysis.readings import median_deviation, third_deviation
 from hdbridge.axis import AxisConfig
 from hdbridge.effects import FloatArray
 from hdbridge.records.record import Record
@@ -535,7 +536,6 @@ def deviation(
 # ----------------------------------------------------------------
 # Scales of the residuals: standard deviation of a simulation's error by channel.
 
-MAD_TO_SIGMA = 1.4826
 MOST_ANSWERED = 1.5
 """Maximum share of a speed error that a velocity loop corrects within a step; it is unstable at two."""
 
@@ -639,7 +639,7 @@ def scales(data: Data, found: Mapping[str, FloatArray], loops: Loops | None = No
         inside = found[name][rows]
         if len(inside):
             # At least half of the readings in motion are not outliers.
-            typical = MAD_TO_SIGMA * float(np.median(np.abs(beyond(inside, 0.5 * steps[name]))))
+            typical = median_deviation(beyond(inside, 0.5 * steps[name]))
             spread = None if unsteady is None else unsteady[name][rows]
             given[name], stray[name] = deviation(inside, steps[name], max(least[name], typical), spread)
     return Scales(given, steps, stray, loops)
@@ -648,8 +648,6 @@ def scales(data: Data, found: Mapping[str, FloatArray], loops: Loops | None = No
 # ----------------------------------------------------------------
 
 ARCSEC_PER_TURN = 360.0 * ARCSEC_PER_DEG
-THIRD_DIFFERENCE = math.sqrt(20.0)
-"""Amplification of white noise by third differences: the root of 1 + 9 + 9 + 1."""
 LEAST_ROWS = 8
 
 
@@ -668,11 +666,8 @@ def noise_in_motion(data: Data) -> dict[str, float]:
             moving = piece.rest == 0.0
             whole = moving[3:] & moving[2:-1] & moving[1:-2] & moving[:-3]
             rows.append(np.diff(piece.measured[name], 3)[whole])
-        third = np.abs(np.concatenate(rows))
-        spread = (
-            MAD_TO_SIGMA * float(np.median(third)) / THIRD_DIFFERENCE if len(third) >= LEAST_ROWS else 0.0
-        )
-        found[name] = max(floor[name], spread)
+        third = np.concatenate(rows)
+        found[name] = max(floor[name], third_deviation(third) if len(third) >= LEAST_ROWS else 0.0)
     return found
 
 
@@ -695,7 +690,7 @@ def with_load_noise(truth: Truth, left_arcsec: FloatArray) -> Truth:
     steps = np.diff(left_arcsec)[inside[1:] & inside[:-1]]
     if not len(steps):
         return truth
-    spread = MAD_TO_SIGMA * float(np.median(np.abs(steps))) / math.sqrt(2.0)
+    spread = median_deviation(steps) / math.sqrt(2.0)
     rounding = ARCSEC_PER_TURN / encoder.counts_per_turn / math.sqrt(12.0)
     noise_arcsec = round(math.sqrt(max(spread**2 - rounding**2, 0.0)), 4)
     return with_load_encoder(truth, noise_arcsec=noise_arcsec)

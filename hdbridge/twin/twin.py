@@ -64,6 +64,7 @@ from hdbridge.twin.misfit import (
 from hdbridge.twin.naming import Alike, Finding, alike, name_causes
 from hdbridge.twin.parameters import LOAD, default_truth, with_sections
 from hdbridge.twin.replay import legs_of, replay_directly
+from hdbridge.twin.response import with_response
 from hdbridge.twin.thermal import with_warmth
 from hdbridge.units import figure
 
@@ -173,22 +174,26 @@ def judge(twin: Twin) -> Verdict:
         return Verdict(False, f"the twin is not kept: no axis has these values: {'; '.join(twin.impossible)}")
     if not gain.better:
         return Verdict(False, f"the twin is not kept: {gain.text}")
-    kept = f"the twin is kept as pending: {gain.text}"
+    text = f"the twin is kept as pending: {gain.text}"
+    if twin.values is not Values.AXIS:
+        text = f"{replays_only(twin)}; {text}"
     if twin.provenance.get("interrupted"):
-        kept = f"the fit was interrupted, so this is the best place so far; {kept}"
-    return Verdict(True, kept if twin.values is Values.AXIS else f"{replays_only(twin.left)}; {kept}")
+        text = f"the fit was interrupted, so this is the best place so far; {text}"
+    return Verdict(True, text)
 
 
-def replays_only(left: Sequence[Left]) -> str:
+def replays_only(twin: Twin) -> str:
     """Returns the headline of a twin whose values are not the axis's."""
-    shown = [f"{each.channel} to {_percent(each.share)}" for each in left]
+    shown = ", ".join(f"{each.channel} to {_percent(each.share)}" for each in twin.left)
     lost = [
         f"{each.channel} is left with {figure(each.times_noise, 3)} times its noise"
-        for each in left
+        for each in twin.left
         if not each.explained
     ]
-    replayed = f"the twin replays this drive ({', '.join(shown)})"
-    return f"{replayed}, but its values are not the axis's: {'; '.join(lost)}"
+    if twin.truth.servo.response is not None:
+        lost.append("a measured response stands for what its loops do not do")
+    why = f": {'; '.join(lost)}" if lost else ""
+    return f"the twin replays this drive ({shown}), but its values are not the axis's{why}"
 
 
 def _percent(share: float) -> str:
@@ -375,15 +380,19 @@ def fit_twin(
     ``workers`` processes. InputError if a recording has no command or is of another gear.
 
     Causes are named only if the values before and after the fit are the axis's; intervals are given only if
-    those after it are.
+    those after it are. Otherwise a measured response is added, if held-out legs confirm it.
     """
     whole = Recording.joined(list(recordings))
-    data = coarse(prepare(whole, axis, start), FIT_S)
+    plain = start.model_copy(update={"servo": start.servo.model_copy(update={"response": None})})
+    data = coarse(prepare(whole, axis, plain), FIT_S)
     with Replays(data, workers) as replays:
         noise = noise_in_motion(data)
         fitted = fit(replays, lambda share: progress(0.9 * share))
         left = what_is_left(data, fitted.residuals, noise)
         values = Values.REPLAY if fitted.interrupted else values_of(left)
+        if values is Values.REPLAY and not fitted.interrupted:
+            fitted = with_response(replays, fitted)
+            left = what_is_left(data, fitted.residuals, noise)
         findings: tuple[Finding, ...] = ()
         sets: dict[Alike, None] = {}
         if values is Values.AXIS:
