@@ -84,8 +84,8 @@ BorrowOption = Annotated[
     bool,
     typer.Option(
         "--borrow",
-        help="Borrow the bus from the daemon that holds it. All its axes are stopped and switched off; it takes "
-        "the bus back when this command ends.",
+        help="Borrow the bus from the daemon that holds it. All its axes are stopped and switched off, and it "
+        "takes the bus back when this command ends.",
     ),
 ]
 ColumnsOption = Annotated[

@@ -313,9 +313,7 @@ class Keeper:
             self._notifier.ready()
             _log.info("ready", self._facts())
         running |= bool(status.get(Cell.BUS_LENT))
-        if running and now_s - self._fed_s >= (
-            self._notifier.watchdog_s or 0.0
-        ) / 4.0:
+        if running and now_s - self._fed_s >= (self._notifier.watchdog_s or 0.0) / 4.0:
             self._fed_s = now_s
             self._notifier.alive()
         restarts = ", ".join(f"{name} restarted {n} times" for name, n in self._restarts.items() if n)

@@ -154,9 +154,7 @@ with InterfaceLock("socketcan", "can0", Path(sys.argv[1])):
 """
 
 
-def test_a_lent_bus_comes_back_however_its_borrower_ends(
-    keeper: Callable[..., Kept], tmp_path: Path
-) -> None:
+def test_a_lent_bus_comes_back_however_its_borrower_ends(keeper: Callable[..., Kept], tmp_path: Path) -> None:
     """The borrower is killed; the service is killed meanwhile, too. Nothing runs on the bus beside it."""
     kept = keeper()
     kept.until_told("READY=1")
@@ -183,7 +181,10 @@ def test_a_lent_bus_that_nobody_opens_comes_back(keeper: Callable[..., Kept]) ->
     kept.until_told("READY=1")
     os.kill(kept.until_begun("service"), signal.SIGUSR1)
     kept.until_begun("control", times=2)
-    assert [name for name in kept.names() if "bus" in str(name)] == ["the bus is lent", "the bus is taken back"]
+    assert [name for name in kept.names() if "bus" in str(name)] == [
+        "the bus is lent",
+        "the bus is taken back",
+    ]
 
 
 def test_a_daemon_ends_while_its_bus_is_lent(keeper: Callable[..., Kept]) -> None:

