@@ -12,6 +12,7 @@ from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Final, Self
 
 from hdbridge.analysis.acceptance import Gate
+from hdbridge.analysis.capability import Capability, Identifiability, certainty
 from hdbridge.analysis.gain import Gain
 from hdbridge.analysis.intervals import NORMAL_95
 from hdbridge.analysis.prepared import means
@@ -70,6 +71,7 @@ def depends_on(lives_in: str) -> str:
 
 
 SCHEMA = "hdbridge.diagnosis/1"
+UNEXPLAINED: Final = "unexplained"
 UNWEIGHED = math.nan
 """Probability of a finding before the findings are weighed."""
 
@@ -191,31 +193,6 @@ class Finding:
         return ""
 
 
-@dataclass(frozen=True, slots=True)
-class Identifiability:
-    """Ability of a record to show a cause."""
-
-    detectable: bool
-    detection_limit_arcsec: float | None
-    """Smallest peak that would be reported; None if the cause is invisible."""
-    aliases: tuple[str, ...]
-    """Causes that this record could not separate from it."""
-    share_left: float
-    """Share of its square that the baseline cannot absorb."""
-    reason: str = ""
-
-    def as_dict(self) -> dict[str, Any]:
-        """Returns the JSON object."""
-        limit = self.detection_limit_arcsec
-        data: dict[str, Any] = {
-            **asdict(self),
-            "detection_limit_arcsec": None if limit is None else _round(limit),
-            "aliases": list(self.aliases),
-            "share_left": float(f"{self.share_left:.3g}"),
-        }
-        return {name: each for name, each in data.items() if name != "reason" or each}
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class Traces:
     """Arrays of equal length for plots of model and measurement on the same trajectory."""
@@ -264,8 +241,10 @@ class Diagnosis:
     noise_floor_arcsec: float
     findings: tuple[Finding, ...]
     identifiability: Mapping[str, Identifiability]
+    capability: Capability
+    """Causes that the record can show."""
     by_kind: Mapping[str, tuple[Figures, Figures]]
-    """By kind of motion and by direction: given and extended model."""
+    """Figures of the given and the extended model, by kind of motion and by direction."""
     remarks: tuple[str, ...]
     model: TransmissionModel = field(repr=False)
     """Extended model; the refitted one if nothing was found."""
@@ -279,6 +258,7 @@ class Diagnosis:
         """Returns the JSON document, schema hdbridge.diagnosis/1."""
         return {
             "schema": SCHEMA,
+            "record": self.capability.as_dict(),
             "baseline": self.baseline.as_dict(),
             "refitted": self.refitted.as_dict(),
             "noise_floor_arcsec": _round(self.noise_floor_arcsec),
@@ -310,7 +290,10 @@ class Diagnosis:
         )
 
     def verdict(self) -> str:
-        """Returns a summary in one sentence."""
+        """Returns two sentences: the causes that the record can show, and those that were found."""
+        return f"{self.capability.sentence()} {self._found()}"
+
+    def _found(self) -> str:
         if not self.findings:
             return (
                 "Nothing found: the model differs from the measurement by no more than noise and calibration."
@@ -318,8 +301,10 @@ class Diagnosis:
         words = []
         for each in self.findings:
             others = f" (or {', '.join(each.aliases)})" if each.aliases else ""
-            where = f" that depends on the {each.lives_in or 'time'}" if each.cause == "unexplained" else ""
-            words.append(f"{each.cause}{others}{where}, {each.peak_arcsec:.2g} arcsec")
+            name = f"{certainty(each.probability)}{each.cause}{others}"
+            if each.cause == UNEXPLAINED:
+                name = f"{UNEXPLAINED} that depends on the {each.lives_in or 'time'}"
+            words.append(f"{name}, {each.peak_arcsec:.2g} arcsec")
         return (
             f"The model is off by {self.baseline.rms_arcsec:.3g} arcsec rms: {'; '.join(words)}; "
             f"extended it is off by {self.extended.rms_arcsec:.3g}."

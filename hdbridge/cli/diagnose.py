@@ -293,6 +293,7 @@ def _provenance(recording: Recording, records: Sequence[Path], model: Path) -> l
 
 
 def _print_plan(report: dict[str, Any]) -> None:
+    _say(report["record"]["sentence"].replace("record", "plan", 1))
     table = Table("cause", "detected from", "not distinguished from")
     for name, each in report["identifiability"].items():
         limit = each["detection_limit_arcsec"]

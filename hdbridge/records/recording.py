@@ -42,12 +42,10 @@ HEADER = "# What was recorded next to this file, by hdbridge. docs/files.md desc
 class Segment(Strict):
     """One leg of the motion."""
 
-    kind: str = Field(
-        min_length=1, description="what the leg was for: precondition, standstill, sweep, sine, step, ..."
-    )
+    kind: str = Field(min_length=1, description="purpose: precondition, standstill, sweep, sine, step, ...")
     start_s: float = Field(description="time of its first sample")
     end_s: float = Field(description="time of its last sample")
-    notes: dict[str, Any] = Field(default_factory=dict, description="more about it, as one likes")
+    notes: dict[str, Any] = Field(default_factory=dict, description="free notes")
 
     @model_validator(mode="after")
     def _forwards(self) -> Self:
@@ -79,7 +77,7 @@ class RecordingFile(Strict):
     files: tuple[RecordedFile, ...] = Field(
         min_length=1, description="the CSV files, in the order of their time"
     )
-    segments: tuple[Segment, ...] = Field((), description="what moved how, in the order of time")
+    segments: tuple[Segment, ...] = Field((), description="legs of the motion, in the order of time")
 
 
 @dataclass(frozen=True)

@@ -33,7 +33,7 @@ def check_fleet_at(url):
 
 @pytest.fixture(autouse=True)
 def collected():
-    """What clients leave open is closed within the test that opened it."""
+    """Closes the files that clients leave open within the test that opened them."""
     yield
     for protocol in ("s3", "sftp"):
         with suppress(ImportError):

@@ -1,4 +1,4 @@
-"""What the statistics of a fleet promise, on fleets whose truth is known."""
+"""Promises of the statistics of a fleet, on fleets of known truth."""
 
 import numpy as np
 import pytest
