@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
@@ -16,6 +16,7 @@ from hdbridge.analysis.response import (
     Trial,
     agree,
     difference,
+    following_lag_s,
     gain,
     harmonics,
     order_hz,
@@ -23,12 +24,12 @@ from hdbridge.analysis.response import (
 )
 from hdbridge.axis import AxisConfig
 from hdbridge.calibration.measure import Pace
-from hdbridge.calibration.path import PathError, path_errors
+from hdbridge.calibration.path import PathError, inertia_over_stiffness, path_errors
 from hdbridge.control.bench import axis_view, compensation_for
 from hdbridge.control.rig import Rig, bench_on
 from hdbridge.drive.drive import Drive
 from hdbridge.drive.gains import changed_gains, read_gains
-from hdbridge.effects import Motion, Synchronous
+from hdbridge.effects import InertialWindup, Motion, Synchronous
 from hdbridge.effects.orders import MotorOrder, OrderSeries
 from hdbridge.errors import InputError
 from hdbridge.model import TransmissionModel
@@ -71,12 +72,15 @@ class OrderRipple:
 
 @dataclass(frozen=True, slots=True)
 class PathResult:
-    """Error on one path without correction, with the static one, and with the filtered one."""
+    """Error on one path without correction, with the static one, with the filtered one, and with the
+    wind-up compensated as well.
+    """
 
     name: str
     none: PathError
     static: PathError
     filtered: PathError | None = None
+    wind_up: PathError | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,6 +125,13 @@ class MotionTest:
     """Response with the filter of the correction; None if no filter helps."""
     remarks: tuple[str, ...] = ()
     paths: tuple[PathResult, ...] = ()
+    wind_up: InertialWindup | None = None
+    """Wind-up of the load in acceleration, if compensating for it makes the path error smaller."""
+
+    def applied(self, model: TransmissionModel) -> TransmissionModel:
+        """Returns a model with the response and the wind-up of this test."""
+        effects = model.effects if self.wind_up is None else (*model.effects, self.wind_up)
+        return replace(model, effects=effects, response=self.response)
 
     @property
     def helps_to_deg_s(self) -> float | None:
@@ -159,6 +170,13 @@ class MotionTest:
         )
 
     @property
+    def gains_by_wind_up(self) -> bool:
+        """True if the error with wind-up, on all paths together, is smaller once that is compensated."""
+        pairs = [(each.filtered, each.wind_up) for each in self.paths]
+        before, after = ([one.delayed_arcsec for one in each if one] for each in zip(*pairs, strict=True))
+        return bool(after) and CHANCE * _rms(after) < _rms(before)
+
+    @property
     def remaining(self) -> float:
         """Mean share of the ripple that the filtered correction leaves; 1 without one."""
         shares = [
@@ -187,6 +205,7 @@ class MotionTest:
             ],
             "paths": [asdict(each) for each in self.paths],
             "response": self.response.model_dump(mode="json") if self.response else None,
+            "wind_up": self.wind_up.parameters() if self.wind_up else None,
             "remarks": list(self.remarks),
         }
 
@@ -209,19 +228,20 @@ class MotionTest:
                 each["name"],
                 PathError(**each["none"]),
                 PathError(**each["static"]),
-                PathError(**each["filtered"]) if each["filtered"] else None,
+                *(PathError(**each[name]) if each[name] else None for name in ("filtered", "wind_up")),
             )
             for each in data.get("paths", ())
         )
         response = Response.model_validate(data["response"]) if data["response"] else None
-        return cls(ripples, response, tuple(map(str, data["remarks"])), paths)
+        wind_up = InertialWindup.model_validate(data["wind_up"]) if data["wind_up"] else None
+        return cls(ripples, response, tuple(map(str, data["remarks"])), paths, wind_up)
 
 
 def motion_test_s(axis: AxisConfig, runs: int = 2 + TRIALS) -> float:
     """Returns the longest duration of the test on an ideal axis."""
     view = axis_view(axis)
     middle = 0.5 * (axis.limits.position_min_deg + axis.limits.position_max_deg)
-    paths_s = 3.0 * rehearse(PathTest(), view, middle).duration_s
+    paths_s = 4.0 * rehearse(PathTest(), view, middle).duration_s
     return paths_s + runs * rehearse(EvenSpeed.spread(view), view, middle).duration_s
 
 
@@ -250,21 +270,29 @@ def motion_test(
         found = replace(found, remarks=(*found.remarks, *changed))
     if drive.axis.load_encoder.is_motor_encoder:
         return replace(found, remarks=(*found.remarks, NO_LOAD_ENCODER))
-    used = [model.only(()), replace(model, response=None)]
+    used = [replace(model.only(()), response=None), replace(model, response=None)]
     if found.response is not None:
         used.append(replace(model, response=found.response))
-    errors = path_errors([runner.run_paths(each) for each in used], model.ratio)
+    runs = [runner.run_paths(each) for each in used]
+    errors = path_errors(runs, model.ratio, runner.lag_s)
+    if measure and found.response is not None and (wind_up := runner.wind_up(runs[-1])) is not None:
+        found = replace(found, wind_up=wind_up)
+        corrected = runner.run_paths(found.applied(model))
+        errors.append(path_errors([runs[0], corrected], model.ratio, runner.lag_s)[1])
     found = replace(found, paths=tuple(PathResult(each[0].name, *each) for each in zip(*errors, strict=True)))
+    if found.wind_up is not None and not found.gains_by_wind_up:
+        found = replace(found, wind_up=None)
     if measure and found.harms_paths:
         remark = "no filter is kept: with it the path error is larger than without correction"
-        return replace(found, response=None, remarks=(*found.remarks, remark))
+        return replace(found, response=None, wind_up=None, remarks=(*found.remarks, remark))
     return found
 
 
 def _ripple_test(runner: _Runner, model: TransmissionModel, measure: bool) -> MotionTest:
     """Runs the constant-speed part of the test."""
     axis = runner.axis
-    none = runner.run("without correction", model.only(()))
+    none = runner.run("without correction", replace(model.only(()), response=None))
+    runner.lag_s = following_lag_s(none)
     static_model = replace(model, response=None)
     static = runner.run("correction of rest", static_model)
     limits = limits_of(axis, model)
@@ -340,6 +368,9 @@ class _Runner:
                 f"the model has no motor order of {LEAST_ARCSEC:g} arcsec or more: there is no ripple to "
                 "measure the response by; calibrate the axis first"
             )
+        self.lag_s = 0.0
+        """Following lag, from the runs without correction."""
+        self._model = model
         self.procedure = EvenSpeed.spread(axis_view(axis))
         self._orders_only = TransmissionModel(model.ratio, (Synchronous(orders=tuple(motor_orders(model))),))
         self.ratio, self.cycle_s = model.ratio, axis.drive.cycle_s
@@ -355,11 +386,29 @@ class _Runner:
             runs = tuple(predicted_run(each, self._orders_only) for each in runs)
         return tuple(harmonics(each, self.orders, self.ratio) for each in runs)
 
+    def wind_up(self, runs: Sequence[PathRun]) -> InertialWindup | None:
+        """Returns the wind-up in compensated runs; None if it is not significant or the model has it."""
+        if wind_up_of(self._model) is not None:
+            return None
+        moves = [each for each in runs if not each.skipped]
+        found_s2, spread_s2 = inertia_over_stiffness(moves, self._orders_only, self.lag_s)
+        if found_s2 < 2.0 * spread_s2:
+            return None
+        limit_deg_s2 = self.axis.limits.acceleration_deg_s2 * self.ratio
+        return InertialWindup(
+            ratio=self.ratio, inertia_over_stiffness_s2=float(f"{found_s2:.3g}"), limit_deg_s2=limit_deg_s2
+        )
+
     def run_paths(self, model: TransmissionModel) -> tuple[PathRun, ...]:
         """Runs the paths with this model."""
         self._pace.begin("path error")
         compensation = compensation_for(self.axis, model)
         return bench_on(self._drive, compensation, interrupted=self._pace.interrupted).run(PathTest()).outcome
+
+
+def wind_up_of(model: TransmissionModel) -> InertialWindup | None:
+    """Returns the wind-up of the load in acceleration that a model has."""
+    return next((each for each in model.effects if isinstance(each, InertialWindup)), None)
 
 
 def motor_orders(model: TransmissionModel) -> list[MotorOrder]:

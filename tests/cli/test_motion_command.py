@@ -27,6 +27,10 @@ def test_it_measures_the_response_proposes_it_and_the_committed_model_uses_it(hd
         none, static, filtered = (each[name]["path_arcsec"] for name in ("none", "static", "filtered"))
         assert filtered < 0.8 * static < 0.8 * none, each
         assert abs(each["filtered"]["rest_arcsec"]) < abs(each["static"]["rest_arcsec"]) + 0.5
+        assert each["wind_up"]["delayed_arcsec"] < 0.6 * each["filtered"]["delayed_arcsec"], each
+        assert abs(each["wind_up"]["rest_arcsec"]) < abs(each["static"]["rest_arcsec"]) + 0.5
+    # The article's load on its spring: 0.225 kg m2 on 16,000 Nm/rad.
+    assert result["wind_up"]["inertia_over_stiffness_s2"] == pytest.approx(0.225 / 16000.0, rel=0.1)
     assert "Path error" in (tmp_path / "out.html").read_text()
     assert "Gain" in (tmp_path / "out.html").read_text()
     done = hdbridge("model", "commit", "fast")
