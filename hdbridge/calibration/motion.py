@@ -34,7 +34,7 @@ from hdbridge.effects.orders import MotorOrder, OrderSeries
 from hdbridge.errors import InputError
 from hdbridge.model import TransmissionModel
 from hdbridge.model.response import Response
-from hdbridge.procedures.even_speed import EvenRun, EvenSpeed
+from hdbridge.procedures.even_speed import SHARES, EvenRun, EvenSpeed
 from hdbridge.procedures.path_test import PathRun, PathTest
 from hdbridge.procedures.rehearsal import rehearse
 from hdbridge.units import ARCSEC_PER_DEG
@@ -50,6 +50,8 @@ RETUNED = (
     "{:.1f} ms now; the response differs by {:.0f} %): it was retuned, or the load changed; measure the "
     "response again"
 )
+CHECKED = (0.64, 0.38, 0.18)
+"""Speeds of a check of the stored response, as shares of the limit."""
 NO_LOAD_ENCODER = (
     "load_encoder.source is the motor encoder: the ripple is that of the load angle predicted from motor "
     "encoder and model; path errors are not measured"
@@ -343,12 +345,61 @@ def _tested(
     if stored is None:
         return MotionTest(_ripples(runner, none, static), None)
     filtered = runner.run("filtered correction", model)
-    found = response_of(none, [Trial(static)], runner.orders, model.ratio, runner.cycle_s, limits)
-    remarks: tuple[str, ...] = ()
-    if found is not None and not agree(stored, found):
-        apart = 100.0 * difference(stored, found)
-        remarks = (RETUNED.format(stored.following_lag_ms, found.following_lag_ms, apart),)
+    trials = [Trial(static), Trial(filtered, stored.filter)]
+    found = response_of(none, trials, runner.orders, model.ratio, runner.cycle_s, limits)
+    remark = None if found is None else ServoCheck.of(stored, found).remark
+    remarks = () if remark is None else (remark,)
     return MotionTest(_ripples(runner, none, static, filtered, stored), stored, remarks)
+
+
+@dataclass(frozen=True, slots=True)
+class ServoCheck:
+    """Comparison of the stored response with a new measurement."""
+
+    stored_lag_ms: float
+    lag_ms: float
+    difference: float
+    """Rms relative difference of the responses over the frequencies that both have, less its noise."""
+    agrees: bool
+
+    @classmethod
+    def of(cls, stored: Response, found: Response) -> ServoCheck:
+        """Compares two responses."""
+        apart = difference(stored, found)
+        return cls(stored.following_lag_ms, found.following_lag_ms, apart, agree(stored, found))
+
+    @property
+    def remark(self) -> str | None:
+        """Reason why the stored response is not valid any more; None if it is."""
+        if self.agrees:
+            return None
+        return RETUNED.format(self.stored_lag_ms, self.lag_ms, 100.0 * self.difference)
+
+
+def servo_check(
+    drive: Drive, model: TransmissionModel, interrupted: Callable[[], bool] = lambda: False
+) -> ServoCheck:
+    """Measures a few frequencies of a booted drive's response, and compares them with the model's response.
+
+    InputError if the model has no response or no motor order, or if the ripple is too small.
+    """
+    stored = model.response
+    if stored is None:
+        raise InputError(f"{model.path}: has no response in motion; measure it: hdbridge motion --propose")
+    runner = _Runner(drive, model, lambda *_: None, interrupted, CHECKED)
+    none = runner.run("without correction", replace(model.only(()), response=None))
+    filtered = runner.run("filtered correction", model)
+    found = response_of(
+        none,
+        [Trial(filtered, stored.filter)],
+        runner.orders,
+        model.ratio,
+        runner.cycle_s,
+        limits_of(drive.axis, model),
+    )
+    if found is None:
+        raise InputError("the response cannot be measured: the ripple is too small")
+    return ServoCheck.of(stored, found)
 
 
 class _Runner:
@@ -360,6 +411,7 @@ class _Runner:
         model: TransmissionModel,
         progress: Callable[[str, float, float], None],
         interrupted: Callable[[], bool],
+        shares: Sequence[float] = SHARES,
     ) -> None:
         axis = self.axis = drive.axis
         self.orders = tuple(each.order for each in motor_orders(model))
@@ -371,7 +423,7 @@ class _Runner:
         self.lag_s = 0.0
         """Following lag, from the runs without correction."""
         self._model = model
-        self.procedure = EvenSpeed.spread(axis_view(axis))
+        self.procedure = EvenSpeed.spread(axis_view(axis), shares)
         self._orders_only = TransmissionModel(model.ratio, (Synchronous(orders=tuple(motor_orders(model))),))
         self.ratio, self.cycle_s = model.ratio, axis.drive.cycle_s
         self._drive = drive
