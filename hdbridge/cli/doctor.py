@@ -10,23 +10,13 @@ from hdbridge.bringup import TORQUE_PERCENT
 from hdbridge.bringup.checks import Outcome
 from hdbridge.cli.interrupt import deferred_interrupt
 from hdbridge.cli.options import (
-    ChannelOption,
-    ForceOption,
-    InterfaceOption,
     JsonOption,
-    ProfileArgument,
-    SeedOption,
-    SimulateOption,
-    TruthOption,
-    check_bus_options,
-    connected,
     console,
-    load_axis,
     notes,
     write_json,
 )
+from hdbridge.cli.session import Session, on_axis
 from hdbridge.errors import DriveError
-from hdbridge.files.profile import Profile
 
 if TYPE_CHECKING:
     from hdbridge.bringup.checks import Row
@@ -52,17 +42,11 @@ LEFT_OUT = "left out by --no-motion"
 
 def register(app: typer.Typer) -> None:
     """Adds the command."""
-    app.command("doctor")(doctor)
+    app.command("doctor")(on_axis(doctor))
 
 
 def doctor(
-    profile: ProfileArgument,
-    simulate: SimulateOption = False,
-    truth: TruthOption = None,
-    seed: SeedOption = 0,
-    interface: InterfaceOption = None,
-    channel: ChannelOption = None,
-    force: ForceOption = False,
+    session: Session,
     torque_percent: Annotated[
         float,
         typer.Option(
@@ -99,23 +83,22 @@ def doctor(
     from hdbridge.bringup.doctor import CHECKS
     from hdbridge.cli.servo import SERVO
 
-    check_bus_options(interface, channel, simulate=simulate)
-    files = Profile.find(profile)
+    files = session.files
     refused: list[str] = []
 
     def permitted() -> str | None:
         if not motion:
             return LEFT_OUT
-        if simulate or yes or _confirm(torque_percent, servo):
+        if session.simulate or yes or _confirm(torque_percent, servo):
             return None
         refused.append(DECLINED)
         return DECLINED
 
     with BringUpContext(
-        lambda: load_axis(files, interface, channel),
-        lambda axis: connected(axis, files, simulate=simulate, truth=truth, seed=seed, force=force),
+        lambda: session.axis,
+        lambda _axis: session.connected(),
         torque_percent=torque_percent,
-        force=force,
+        force=session.force,
         interruptible=deferred_interrupt,
     ) as context:
         checks = (*CHECKS, SERVO) if servo else CHECKS
@@ -126,7 +109,7 @@ def doctor(
         {
             "schema": "hdbridge.doctor/1",
             "axis_file": str(files.axis),
-            "simulated": simulate,
+            "simulated": session.simulate,
             "passed": not failures and not refused,
             "checks": [row.as_dict() for row in rows],
         },

@@ -19,7 +19,7 @@ import can
 from hdbridge.canframe import DataFrame
 from hdbridge.clock import Clock
 from hdbridge.device.behaviour import Behaviour, HeartbeatConsumer
-from hdbridge.device.dictionary import Abort, Dictionary, SdoAbortError
+from hdbridge.device.dictionary import Abort, Dictionary, SdoAbortError, only
 from hdbridge.device.emergency import Emergency, ErrorCode
 from hdbridge.device.faults import Faults, Outgoing
 from hdbridge.device.firmware import Firmware
@@ -102,6 +102,7 @@ class DriveNode:
         entry = self.dictionary
         entry[0x1005, 0].guard = _check_sync_id
         entry[0x1005, 0].follower = lambda _: self._route()
+        entry[0x1019, 0].guard = only(0, *range(2, 241))
         entry[0x1016, 1].guard = _check_consumer
         entry[0x1016, 1].follower = lambda _: self._change_watch()
         entry[0x1017, 0].follower = lambda _: self._start_heartbeat()
