@@ -84,7 +84,7 @@ BorrowOption = Annotated[
     bool,
     typer.Option(
         "--borrow",
-        help="Borrow the bus from the daemon that holds it. All its axes are stopped and switched off, and it "
+        help="Borrow the bus from the daemon that holds it. Its axes are stopped and switched off, and it "
         "takes the bus back when this command ends.",
     ),
 ]

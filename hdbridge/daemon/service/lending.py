@@ -37,7 +37,7 @@ class Lending:
         self._lock = InterfaceLock(bus.interface, bus.channel)
         self._signalled_s = 0.0
         self._status.set(Cell.BUS_WANTED, 0)
-        core.dispatch.refuse = self.refuse
+        core.refuse = self.refuse
 
     @property
     def borrower(self) -> str | None:

@@ -20,7 +20,6 @@ from hdbridge.drive.interfacelock import InterfaceLock
 from hdbridge.files.bundled import bundled_profile
 from tests.support.patience import until
 
-
 LISTENING = ("scan", "--listen", 600, "--borrow")
 """A command that has the bus for ten minutes and needs no real time."""
 
@@ -54,8 +53,18 @@ def daemon(tmp_path: Path) -> Iterator[Daemon]:
     path.write_text(yaml.safe_dump(axis))
     with started(tmp_path, "simulate", tmp_path), running(tmp_path, tmp_path, name="article") as daemon:
         daemon.until_told("READY=1")
-        daemon.until_axis("disabled")
+        until_off(daemon)
         yield daemon
+
+
+def until_off(daemon: Daemon) -> None:
+    """Waits until the loop turns without power. A busy machine may have stopped the axis for lost frames."""
+    off = {"unverified", "disabled", "quick-stopped", "latched"}
+    daemon.until(
+        lambda: (found := daemon.state())
+        and found["cycle"]["alive"] and found["bus"]["lent_to"] is None and found["axes"][0]["state"] in off,
+        "the axis is off",
+    )  # fmt: skip
 
 
 def until_borrowed(daemon: Daemon, pid: int) -> None:
@@ -75,7 +84,7 @@ def test_a_command_borrows_the_bus_and_the_axis_comes_back_disabled(daemon: Daem
         assert json.loads(output)["value"] == 0x20192
         assert "lends the bus to this command" in error
     daemon.until(lambda: len(daemon.pids("control")) == 2, "the bus is taken back")
-    daemon.until_axis("disabled")
+    until_off(daemon)
     assert (daemon.state() or {})["bus"]["lent_to"] is None
 
 
@@ -94,7 +103,7 @@ def test_others_see_who_has_the_bus_and_can_stop_it(daemon: Daemon) -> None:
         assert "it was asked to stop its axis and to end" in stop.text
         assert borrower.wait() != 0
     daemon.until(lambda: len(daemon.pids("control")) == 2, "the bus is taken back")
-    daemon.until_axis("disabled")
+    until_off(daemon)
 
 
 def test_a_killed_borrower_leaves_a_disabled_axis(daemon: Daemon) -> None:
@@ -104,5 +113,4 @@ def test_a_killed_borrower_leaves_a_disabled_axis(daemon: Daemon) -> None:
         borrower.send_signal(signal.SIGKILL)
         borrower.wait()
         daemon.until(lambda: len(daemon.pids("control")) == 2, "the bus is taken back")
-        axis = daemon.axis()
-        assert axis["power"] != "operation enabled"
+        until_off(daemon)
