@@ -183,7 +183,7 @@ def _leave_one_out(records: list[Record]) -> None:
 
 
 def left_out(records: Sequence[Record]) -> list[float]:
-    """Returns the error of each record about its mean, predicted by a diagnosis of the others; rms, arcsec."""
+    """Returns the error of each record that a diagnosis of the others leaves, about its mean; rms, arcsec."""
     left = []
     for out in records:
         others = concatenate([each for each in records if each is not out])
@@ -194,7 +194,7 @@ def left_out(records: Sequence[Record]) -> list[float]:
 
 
 def regressed(records: Sequence[Record]) -> list[float]:
-    """Returns the same by least squares: orders 1 and 2 of the motor, its speed, and the torque at the load."""
+    """Returns the same by least squares: orders 1 and 2 of the motor, its speed, and the load torque."""
     columns, errors = [], []
     for record in records:
         motor = record.motor_position_deg
