@@ -30,6 +30,7 @@ from hdbridge.files.profile import Profile
 if TYPE_CHECKING:
     import can
 
+    from hdbridge.axis import BusConfig
     from hdbridge.conformance import Check, Result
 
 
@@ -42,7 +43,9 @@ def conform(
     profile: Annotated[
         str | None,
         typer.Argument(
-            metavar="PROFILE", help="Axis whose drive is checked. Without it: --channel, --node and --eds."
+            metavar="PROFILE",
+            help="Axis whose drive is checked, or machine whose gateway is. Without it: --channel, --node "
+            "and --eds.",
         ),
     ] = None,
     interface: Annotated[
@@ -64,6 +67,9 @@ def conform(
         typer.Option(
             "--eds", metavar="FILE", help="EDS of the node, which is compared with it; else the axis file's."
         ),
+    ] = None,
+    axis: Annotated[
+        str | None, typer.Option("--axis", help="Which axis, if the gateway has several.", show_default=False)
     ] = None,
     motion: Annotated[
         bool,
@@ -107,10 +113,13 @@ def conform(
 
     Exit status 4 when a check failed, or when the node does not answer or is not without power.
     """  # fmt: skip
+    from hdbridge.axis import BusConfig
+    from hdbridge.cli.gateway import eds_of, gateway_axis
     from hdbridge.cli.interrupt import deferred_interrupt
     from hdbridge.conformance import NodeTester, checks, run
     from hdbridge.conformance.tester import StoppedError, Timing
-    from hdbridge.drive.link import Link
+    from hdbridge.daemon.machine import machine_file
+    from hdbridge.drive.link import Link, check_interface
     from hdbridge.drive.manners import Ear, listening_s
     from hdbridge.files.edsfile import read_eds
 
@@ -121,18 +130,24 @@ def conform(
         )
         _print_list(wanted)
         return
-    axis, files = None, None
-    if profile is not None:
+    od = None
+    if profile is not None and machine_file(profile) is not None:
+        config, settings = gateway_axis(profile, axis)
+        opened, node_id = _opened(settings.bus, force), settings.nodes[config.name]
+        od = eds_of(config, settings) if eds is None else None
+    elif profile is not None:
         files = Profile.find(profile)
-        axis = load_axis(files, interface, channel, simulate=simulate)
-        node_id, eds = node_id or axis.drive.node_id, eds or axis.eds_path
-        opened = connected(axis, files, simulate=simulate, truth=truth, seed=seed, force=force)
+        config = load_axis(files, interface, channel, simulate=simulate)
+        node_id, eds = node_id or config.drive.node_id, eds or config.eds_path
+        opened = connected(config, files, simulate=simulate, truth=truth, seed=seed, force=force)
     elif simulate or channel is None or node_id is None:
         raise InputError("conform needs a node: give a PROFILE, or --channel (can0) and --node")
     else:
-        opened = _opened(interface or "socketcan", channel, bitrate_bps, force)
+        check_interface(interface or "socketcan", "--interface")
+        bus_of = BusConfig(interface=interface or "socketcan", channel=channel, bitrate_bps=bitrate_bps)
+        opened = _opened(bus_of, force)
     assert node_id is not None
-    od = None if eds is None else read_eds(eds, node_id).dictionary
+    od = od if eds is None else read_eds(eds, node_id).dictionary
     with deferred_interrupt() as interrupted, opened as (bus, clock), progress_bar() as bar:
         link = Link(bus, clock)
         task = bar.add_task(f"{len(wanted)} checks", total=len(wanted))
@@ -176,16 +191,10 @@ def _chosen(allowed: Sequence[Check], every: Sequence[Check], only: Sequence[str
 
 
 @contextmanager
-def _opened(
-    interface: str, channel: str, bitrate_bps: int | None, force: bool
-) -> Iterator[tuple[can.BusABC, Clock]]:
-    from hdbridge.axis import BusConfig
-    from hdbridge.drive.link import check_interface, open_bus
+def _opened(settings: BusConfig, force: bool) -> Iterator[tuple[can.BusABC, Clock]]:
+    from hdbridge.drive.link import open_bus
 
-    check_interface(interface, "--interface")
-    with open_bus(
-        BusConfig(interface=interface, channel=channel, bitrate_bps=bitrate_bps), shared=force
-    ) as bus:
+    with open_bus(settings, shared=force) as bus:
         yield bus, MonotonicClock()
 
 
