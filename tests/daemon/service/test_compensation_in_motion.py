@@ -5,6 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from hdbridge.daemon.service.interface import StreamPoint, WayPoint
 from support.raised import measured_response, raised_profile, ripple_arcsec
 from support.service import Service, play, stepped_service, until
 
@@ -13,7 +14,6 @@ from hdbridge.analysis.response import harmonics
 from hdbridge.control.bench import axis_view, compensation_for
 from hdbridge.daemon.service.activity import Activity, Kind
 from hdbridge.daemon.service.bridge import ServiceBridge
-from hdbridge.daemon.service.interface import StreamPoint, WayPoint
 from hdbridge.daemon.service.rigs import DaemonRig
 from hdbridge.evaluation.stepping import Scheme
 from hdbridge.procedures.even_speed import EvenSpeed
