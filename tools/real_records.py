@@ -28,11 +28,10 @@ from hdbridge.model import TransmissionModel
 from hdbridge.records.record import Record, concatenate
 from hdbridge.records.recording import Recording
 from hdbridge.sim.truth import Truth
-from hdbridge.twin.comparison import Comparison, compare
-from hdbridge.twin.making import fit_twin
+from hdbridge.twin.compare import Comparison, compare
 from hdbridge.twin.replay import replay_directly
-from hdbridge.twin.result import Twin
-from hdbridge.twin.translation import translate
+from hdbridge.twin.translate import translate
+from hdbridge.twin.twin import Twin, fit_twin
 
 NOTHING = TransmissionModel(100.0, ())
 ARCSEC_PER_N = 0.01

@@ -30,8 +30,8 @@ from hdbridge.model import TransmissionModel
 from hdbridge.procedures.plan import Plan
 from hdbridge.sim.lockstep import simulated_bench
 from hdbridge.sim.truth import Truth
-from hdbridge.twin.making import fit_twin
-from hdbridge.twin.translation import translate
+from hdbridge.twin.translate import translate
+from hdbridge.twin.twin import fit_twin
 
 DATE = datetime(2026, 1, 1, tzinfo=UTC)
 STEPPING, ORDERS_ARCSEC, OFFSET = 0.05, 0.3, 0.02

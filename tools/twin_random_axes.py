@@ -2,10 +2,10 @@
 
     .venv/bin/python tools/twin_random_axes.py --axes 8 --checks
 
-Each axis has its own inertias, friction, loops and feed-forward (half to double the usual), dead time (0 to
-3 ms), resonance (15 to 80 Hz), ratio (30 to 160), law of hysteresis, tooth orders and noise. Its axis file
-allows the following error that such a drive needs; gains near instability are drawn again. It is benched
-over frames on the plan ``dynamics``, twinned from the usual values (`hdbridge.twin.defaults`), and judged on
+Each axis has its own inertias, friction, loops and feed-forward (half to double the usual), dead time (0 to 3
+ms), resonance (15 to 80 Hz), ratio (30 to 160), law of hysteresis, tooth orders and noise. Its axis file
+allows the following error that such a drive needs; gains near instability are drawn again. It is benched over
+frames on the plan ``dynamics``, twinned from the usual values (`hdbridge.twin.parameters`), and judged on
 another motion that the fit has not seen. Prints for each axis the differences on that motion, the number of
 95 % intervals that contain the truth, and the result of the check after one, two or no changes of the plant.
 
@@ -41,11 +41,10 @@ from hdbridge.records.recording import Recording
 from hdbridge.sim.lockstep import simulated_bench
 from hdbridge.sim.truth import Truth
 from hdbridge.twin.check import check
-from hdbridge.twin.comparison import compare
-from hdbridge.twin.defaults import default_truth
-from hdbridge.twin.making import fit_twin
-from hdbridge.twin.parameters import BY_NAME, value_in, with_values
+from hdbridge.twin.compare import compare
+from hdbridge.twin.parameters import BY_NAME, default_truth, value_in, with_values
 from hdbridge.twin.replay import replay
+from hdbridge.twin.twin import fit_twin
 
 DEMO = Path(__file__).parents[1] / "profiles" / "demo"
 LAWS = ("rolling_friction", "maxwell_slip", "bouc_wen", "dahl")

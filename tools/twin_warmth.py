@@ -24,8 +24,8 @@ from hdbridge.records.recording import Recording
 from hdbridge.sim.exercise import Exercise
 from hdbridge.sim.machine import Machine
 from hdbridge.sim.truth import Truth
-from hdbridge.twin.least_squares import Fitted
-from hdbridge.twin.noise import Scales
+from hdbridge.twin.fit import Fitted
+from hdbridge.twin.misfit import Scales
 from hdbridge.twin.parameters import BY_NAME, at_coordinates, coordinates
 from hdbridge.twin.thermal import THERMAL, with_warmth
 

@@ -131,7 +131,7 @@ def discard(profile: ProfileArgument, twin: TwinOption = False) -> None:
 def _store(twin: bool) -> Store[Any]:
     if not twin:
         return MODELS
-    from hdbridge.twin.kept import TWINS
+    from hdbridge.twin.twin import TWINS
 
     return TWINS
 
@@ -140,7 +140,7 @@ def _rows(before: Any, after: Any) -> list[Difference]:
     """Returns the differences of two models or of two twins; ``before`` may be None."""
     if isinstance(after, TransmissionModel):
         return diff(before or after.only(()), after)
-    from hdbridge.twin.kept import diff as diff_of_twins
+    from hdbridge.twin.twin import diff as diff_of_twins
 
     return diff_of_twins(before.truth if before else None, after.truth)
 

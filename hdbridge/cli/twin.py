@@ -34,8 +34,8 @@ if TYPE_CHECKING:
     from hdbridge.records.recording import Recording
     from hdbridge.report.twin import Learned, Named, TwinReport
     from hdbridge.sim.truth import Truth
-    from hdbridge.twin.result import Twin
-    from hdbridge.twin.translation import Translation
+    from hdbridge.twin.translate import Translation
+    from hdbridge.twin.twin import Twin
 
 
 def register(app: typer.Typer) -> None:
@@ -74,7 +74,7 @@ def command(
     are the axis's. `--simulate` uses the twin after `hdbridge model commit PROFILE --twin`.
     """
     from hdbridge.axis import AxisConfig
-    from hdbridge.twin.commands import doubts
+    from hdbridge.twin.replay import doubts
 
     files = Profile.find(profile)
     if check and (compare or afresh or truth is not None):
@@ -112,9 +112,8 @@ def _compared(
     axis: AxisConfig, recording: Recording, begun: Translation, facts: list[tuple[str, str]]
 ) -> TwinReport:
     from hdbridge.report.twin import TwinReport
-    from hdbridge.twin.commands import legs_of
-    from hdbridge.twin.comparison import compare
-    from hdbridge.twin.replay import replay_directly
+    from hdbridge.twin.compare import compare
+    from hdbridge.twin.replay import legs_of, replay_directly
 
     notes.print("the recording's commands run through the simulated drive ...")
     simulated = replay_directly(recording, axis, begun.truth)
@@ -136,9 +135,7 @@ def _learned(
     from hdbridge.model.store import measuring
     from hdbridge.report.page import Command, Status
     from hdbridge.report.twin import TwinReport
-    from hdbridge.twin.kept import TWINS, KeptTwin
-    from hdbridge.twin.making import fit_twin
-    from hdbridge.twin.verdict import judge
+    from hdbridge.twin.twin import TWINS, KeptTwin, fit_twin, judge
 
     with measuring(files.axis), progress_bar() as bar:
         task = bar.add_task("fit", total=1.0)
@@ -168,8 +165,8 @@ def _learned(
 def _values(before: Truth, after: Truth) -> list[Learned]:
     """Returns the fitted values with their intervals, and the values before unless only assumed."""
     from hdbridge.report.twin import Learned
+    from hdbridge.twin.misfit import Values
     from hdbridge.twin.parameters import PARAMETERS, value_in
-    from hdbridge.twin.result import Values
     from hdbridge.twin.thermal import THERMAL
 
     fitted, assumed = after.provenance["fit"]["parameters"], Values.of(before) is Values.USUAL
@@ -213,7 +210,7 @@ def _check(
 ) -> None:
     """Reports in one sentence what has changed since the profile's twin was made."""
     from hdbridge.twin.check import check
-    from hdbridge.twin.kept import KeptTwin
+    from hdbridge.twin.twin import KeptTwin
 
     if html_file is not None:
         raise InputError("--check has no page: leave out --html, or compare with the twin by --compare")
@@ -270,7 +267,7 @@ def _beginning(files: Profile, axis: AxisConfig, truth: Path | None, *, afresh: 
     """
     from hdbridge.model import TransmissionModel
     from hdbridge.sim.truth import Truth
-    from hdbridge.twin.translation import translate
+    from hdbridge.twin.translate import translate
 
     if truth is not None and afresh:
         raise InputError("--afresh begins from usual values: leave out --truth")
@@ -351,8 +348,8 @@ def print_report(report: TwinReport) -> None:
     """Prints the verdict, the figures of the whole record, and the findings."""
     from hdbridge.report.twin import title_of, verdict
     from hdbridge.report.words import sentence
-    from hdbridge.twin.comparison import ALL
-    from hdbridge.twin.result import Values
+    from hdbridge.twin.compare import ALL
+    from hdbridge.twin.misfit import Values
 
     for effect in report.translated:
         if effect.counterpart is None:

@@ -6,7 +6,7 @@
                   history/0001.yaml   each version that was ever active, byte for byte
                   history/log.yaml    what was activated when, and why
 
-Twins are stored in the same way under their own file names (`hdbridge.twin.kept`); everything said of models
+Twins are stored in the same way under their own file names (`hdbridge.twin.twin`); everything said of models
 here applies to any content of a `Store`.
 
 Each file is replaced atomically, in an order such that a kill at any moment leaves a usable profile: a

@@ -28,9 +28,9 @@ from hdbridge.report.page import (
     Table,
 )
 from hdbridge.report.words import figure, sentence
-from hdbridge.twin.comparison import ALL, TITLES, UNITS, Comparison, Row, Spectrum, Trace
-from hdbridge.twin.result import Left, Values
-from hdbridge.twin.translation import Row as Translated
+from hdbridge.twin.compare import ALL, TITLES, UNITS, Comparison, Row, Spectrum, Trace
+from hdbridge.twin.misfit import Left, Values
+from hdbridge.twin.translate import Row as Translated
 
 WINDOW_S: Final = 1.0
 """Duration of a detail chart; s."""
@@ -78,11 +78,11 @@ class TwinReport:
     translated: Sequence[Translated] = ()
     facts: Sequence[tuple[str, str]] = ()
     verdict: str = ""
-    """What the values are worth, and the outcome for the twin, in one sentence."""
+    """Quality of the values, and the outcome for the twin, in one sentence."""
     values: str = ""
-    """Where the values come from (`hdbridge.twin.result.Values`); empty if nothing was fitted."""
+    """Origin of the values (`hdbridge.twin.twin.Values`); empty if nothing was fitted."""
     left: Sequence[Left] = ()
-    """What the twin leaves of each channel."""
+    """Residuals of each channel."""
     commands: Sequence[Command] = ()
     status: Status = Status.MEASURED
 

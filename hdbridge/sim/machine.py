@@ -15,6 +15,7 @@ import numpy as np
 
 from hdbridge.sim import fast
 from hdbridge.sim.axis import Axis, Told
+from hdbridge.sim.response import Response
 from hdbridge.sim.truth import Truth
 from hdbridge.units import ARCSEC_PER_DEG
 
@@ -78,8 +79,12 @@ class Machine:
         self._noise_deg = truth.load_.encoder.noise_arcsec / ARCSEC_PER_DEG
         self._noise = random.Random(f"load encoder {seed}")
         self._rated_nm = truth.motor.rated_torque_nm
+        self._sense = float(truth.motor.encoder.direction)
         self._limit_nm = self._rated_limit_nm = axis.loops.servo.limit_nm
         self._limit_permille = 1000.0 * self._limit_nm / self._rated_nm
+        self._response: Response | None = None
+        if truth.servo.response is not None:
+            self._response = Response(truth.servo.response, math.degrees(axis.motor_counts_per_deg))
         self._take(axis.at_first())
 
     def follow(self, start_counts: float, end_counts: float, substeps: int, outer_nm: float = 0.0) -> None:
@@ -94,6 +99,10 @@ class Machine:
             self._axis = fast.compiled_axis(self._to_compile)
             self._to_compile = None
         noise_deg = self._chance_deg()
+        if self._response is not None:
+            before = self._response.demand_counts
+            self._response.advance(start_counts, end_counts, substeps * self.dt_s)
+            start_counts, end_counts = start_counts + before, end_counts + self._response.demand_counts
         self._take(self._axis.drive(start_counts, end_counts, substeps, self._limit_nm, noise_deg, outer_nm))
 
     def follow_all(
@@ -115,6 +124,7 @@ class Machine:
         told = np.empty((len(substeps), len(Cycles._fields)))
         for cycle, count in enumerate(substeps):
             if isinstance(self._axis, fast.EvenAxis) and min(substeps[cycle:]) > 0:
+                counts, torque_nm = self._responded(counts, substeps, cycle)
                 noise_deg = np.array([self._chance_deg() for _ in substeps[cycle:]])
                 demand = np.array(counts[cycle:], dtype=np.float64)
                 steps = np.array(substeps[cycle:], dtype=np.int64)
@@ -124,6 +134,9 @@ class Machine:
                         demand, steps, self._limit_nm, noise_deg, outer_nm[on], held_nm[on], told[on]
                     )
                 )
+                if self._response is not None:
+                    told[on, 2] += torque_nm
+                    told[on, 3] = [round(1000.0 * each / self._rated_nm) for each in told[on, 2].tolist()]
                 break
             if not math.isnan(held_nm[cycle]):
                 self._axis.hold(float(held_nm[cycle]))
@@ -134,6 +147,8 @@ class Machine:
     def coast(self, substeps: int, braked: bool, outer_nm: float = 0.0) -> None:
         """Runs a cycle with the power stage off; friction and, if ``braked``, the brake slow the motor."""
         brake_nm = self.truth.motor.brake_nm if braked else 0.0
+        if self._response is not None:
+            self._response.rest()
         self._take(self._axis.roll(brake_nm, substeps, self._limit_nm, self._chance_deg(), outer_nm))
 
     @property
@@ -146,6 +161,20 @@ class Machine:
         wanted_nm = max(0.0, permille) / 1000.0 * self._rated_nm
         self._limit_nm = min(wanted_nm, self._rated_limit_nm)
         self._limit_permille = 1000.0 * self._limit_nm / self._rated_nm
+
+    def _responded(
+        self, counts: Sequence[float], substeps: Sequence[int], first: int
+    ) -> tuple[Sequence[float], list[float]]:
+        """Returns the demand with the measured response, and what it adds to the torque of each cycle."""
+        if self._response is None:
+            return counts, []
+        demand, torque_nm = list(counts), []
+        demand[first] += self._response.demand_counts
+        for cycle in range(first, len(substeps)):
+            self._response.advance(counts[cycle], counts[cycle + 1], substeps[cycle] * self.dt_s)
+            demand[cycle + 1] += self._response.demand_counts
+            torque_nm.append(self._sense * self._response.torque_nm)
+        return demand, torque_nm
 
     def _chance_deg(self) -> float:
         """Returns a sample of the load encoder's noise."""
@@ -168,3 +197,6 @@ class Machine:
             self.true_load_deg,
             self.true_output_deg,
         ) = told
+        if self._response is not None and self._response.torque_nm:
+            self.torque_nm += self._sense * self._response.torque_nm
+            self.torque_permille = round(1000.0 * self.torque_nm / self._rated_nm)

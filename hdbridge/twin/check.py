@@ -23,36 +23,30 @@ from hdbridge.effects import FloatArray
 from hdbridge.errors import InputError
 from hdbridge.records.recording import Recording
 from hdbridge.sim.truth import Truth
-from hdbridge.twin.fitting import free_parameters
-from hdbridge.twin.least_squares import SOFT, Fitted, fitted_rows, legs_of_rows, over_legs, solve, told
-from hdbridge.twin.misfit import CHANNELS, Data, coarse, counted, prepare, rounding
+from hdbridge.twin.fit import SOFT, Fitted, fitted_rows, free_parameters, legs_of_rows, over_legs, solve, told
+from hdbridge.twin.misfit import (
+    CHANNELS,
+    Data,
+    Misfit,
+    Replays,
+    Scales,
+    Values,
+    coarse,
+    counted,
+    least_deviation,
+    noise_floor,
+    prepare,
+    rounding,
+)
 from hdbridge.twin.naming import FALSE_ALARM, Finding, Moved, finding, told_apart
-from hdbridge.twin.noise import Scales, least_deviation, noise_floor
 from hdbridge.twin.parameters import BY_NAME, Parameter, at_coordinates, coordinates
-from hdbridge.twin.replays import Replays
-from hdbridge.twin.result import Values
 
 # ----------------------------------------------------------------
 # How sure a change against a twin is: by the new recording, and by what the twin's own recordings left open.
 
-Misfit = Mapping[str, Mapping[str, float]]
-"""Rms of the residuals by channel, in its unit, and kind of leg."""
 STRAY = 4.0
 """Limit at which residuals are clipped, in rms of their kind of leg: a motor that breaks away at a different
 time is not a change of the axis."""
-
-
-def misfit_of(data: Data, residuals: Mapping[str, FloatArray]) -> dict[str, dict[str, float]]:
-    """Returns the rms of the residuals of each recorded channel, by kind of leg."""
-    kinds = np.array(data.kinds)[data.leg.astype(np.intp)]
-    found: dict[str, dict[str, float]] = {}
-    for name, counts in counted(data).items():
-        for kind in dict.fromkeys(data.kinds):
-            inside = (counts > 0.0) & (kinds == kind)
-            if inside.any():
-                rms = math.sqrt(float(np.mean(np.square(residuals[name][inside]))))
-                found.setdefault(name, {})[kind] = float(f"{rms:.6g}")
-    return found
 
 
 def growth(
@@ -196,7 +190,7 @@ BLUNT = (0.1, 0.0)
 """Minimum error of a replay, as a share of the noise, in the two stages of a fit; rounding of the readings
 comes in addition. The second stage starts at the end of the first, without the samples that are still too far
 off. Rounding is not noise: treated as noise it biases delays and feed-forwards, because a smooth replay of
-the true axis then leaves more than the nearest wrong one (see `hdbridge.twin.noise`). The first stage is
+the true axis then leaves more than the nearest wrong one (see `hdbridge.twin.misfit`). The first stage is
 blunt because the likelihood of a rounded reading is steep and gives no direction from far off."""
 LOST = 0.25
 """Clipped mean square, in units of `SOFT` squared, above which a channel that has grown is worse."""

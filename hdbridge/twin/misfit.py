@@ -2,37 +2,59 @@
 
 The replay has no noise, unrounded encoders and torque, and loops that close on a much finer encoder, so the
 residuals are smooth in the plant's parameters. The scale of each channel accounts for rounding and noise.
+
+Parallel replays in worker processes.
+
+Noise of a recording: the reference for a twin's residuals, and the noise of its load encoder.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import Literal
+import math
+import multiprocessing
+import os
+import signal
+import threading
+from collections.abc import Iterable, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from copy import copy
+from dataclasses import dataclass, field, replace
+from enum import StrEnum
+from itertools import repeat
+from typing import Any, Final, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import minimize_scalar
+from scipy.special import log_ndtr, ndtr
 
+from hdbridge.analysis.readings import median_deviation, third_deviation
 from hdbridge.axis import AxisConfig
 from hdbridge.effects import FloatArray
 from hdbridge.records.record import Record
 from hdbridge.records.recording import Recording, Segment
 from hdbridge.sim.truth import Truth
-from hdbridge.twin.commands import Commands, commands_of, legs_of
+from hdbridge.twin.compare import rms
 from hdbridge.twin.parameters import FOLLOWING, LOAD, TORQUE, with_load_encoder
-from hdbridge.twin.replay import run
-from hdbridge.twin.stretches import (
+from hdbridge.twin.replay import (
     RINGING_S,
     RUN_IN_S,
     STANDS_COUNTS,
+    Commands,
     begins_in_motion,
+    commands_of,
     continuous,
     held_rows,
+    legs_of,
+    run,
     stands,
     stretches,
     unknown_rows,
 )
 from hdbridge.units import ARCSEC_PER_DEG
+
+# ----------------------------------------------------------------
+# Residuals between a recording and its replay, by channel, which a fit minimises.
 
 FINEST_STEPS_PER_TURN = 2**40
 """Resolution of the loops' encoder in a smooth replay. One step makes about 1e-9 of the rated torque; with a
@@ -370,3 +392,446 @@ def demand_deg(commands: Commands, axis: AxisConfig) -> FloatArray:
     encoder = axis.motor_encoder
     deg = encoder.direction * counts * 360.0 / encoder.counts_per_turn
     return np.interp(commands.row_cycles, np.arange(len(counts)), deg)
+
+
+# ----------------------------------------------------------------
+# Parallel replays in worker processes.
+
+WORTH_S = 2.0
+"""Duration of the motion up to which replays run in this process, because starting workers costs more."""
+
+_data: tuple[Data, Data] | None = None
+"""A worker's recordings, and a few of their legs."""
+
+
+class Replays:
+    """Replays of the same recordings; a context manager that owns the worker processes."""
+
+    rough: Replays
+    """Replays of a few of their legs, in the same processes."""
+
+    def __init__(self, data: Data, workers: int | None = None) -> None:
+        self.data = data
+        self._place = 0
+        wanted = workers if workers is not None else min(os.cpu_count() or 1, 8)
+        self._pool: ProcessPoolExecutor | None = None
+        few = coarse(data)
+        if wanted > 1 and data.duration_s > WORTH_S:
+            # Not forked, because this process may have threads that hold locks.
+            context = multiprocessing.get_context("spawn")
+            self._pool = ProcessPoolExecutor(wanted, context, _begin, ((data, few),))
+        rough = self.rough = copy(self)
+        rough.data, rough.rough, rough._place = few, rough, 1
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: Any) -> None:
+        if self._pool is not None:
+            self._pool.shutdown(cancel_futures=True)
+
+    def __call__(
+        self, truths: Iterable[Truth], seeds: Iterable[Seed] = repeat(None)
+    ) -> list[dict[str, FloatArray]]:
+        """Returns the residuals of each truth, in order; ``seeds`` as in `misfit.traces_of`."""
+        if self._pool is None or self.data.duration_s <= WORTH_S:
+            return [residuals(self.data, each, seed) for each, seed in zip(truths, seeds, strict=False)]
+        return list(self._pool.map(_residuals, truths, seeds, repeat(self._place)))
+
+    def drawn(self, truths: Sequence[Truth]) -> list[dict[str, FloatArray]]:
+        """Returns the residuals of each truth, in order, from rounded and noisy replays."""
+        return self(truths, range(1, len(truths) + 1))
+
+
+def _begin(data: tuple[Data, Data]) -> None:
+    global _data  # noqa: PLW0603 - a process's own, set once where it begins
+    _data = data
+    # Ctrl-C in a terminal reaches every process; the one that waits for this one decides what to keep.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+
+
+def _end_with_parent() -> None:
+    """Ends this process when its parent has been killed; it would otherwise wait for work forever."""
+    parent = multiprocessing.parent_process()
+    assert parent is not None  # a worker has one
+    parent.join()
+    os._exit(1)
+
+
+def _residuals(truth: Truth, seed: Seed, place: int) -> dict[str, FloatArray]:
+    assert _data is not None
+    return residuals(_data[place], truth, seed)
+
+
+# ----------------------------------------------------------------
+# Noise of a recording: the reference for a twin's residuals, and the noise of its load encoder.
+
+# ----------------------------------------------------------------
+# Likelihood of a rounded reading under an unrounded simulation.
+
+FINE = 1e-3
+"""Half step, in standard deviations, below which rounding is negligible."""
+STRAY = 0.02
+"""Share of outliers among the readings: the break-away of a stuck motor and its position at switching on are
+not evidence of the simulation's error or of a parameter."""
+
+
+def rooted(off: FloatArray, half: FloatArray, stray: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Returns residuals whose half squares are the loss of log likelihood, and their derivative by ``off``.
+
+    ``off`` is reading minus simulation, ``half`` half the resolution, both in standard deviations of the
+    simulation, shape (n,); ``stray`` the probability of an outlier. Without resolution, ``off`` is returned
+    unchanged.
+    """
+    size, plain = np.abs(off), half == 0.0
+    stray = np.where(half < FINE, stray * FINE / np.where(plain, 1.0, half), stray)
+    half = np.maximum(half, FINE)
+    least = surprise(np.zeros_like(half), half, stray)
+    lost = surprise(size, half, stray)
+    root = np.sqrt(2.0 * np.maximum(lost - least, 0.0))
+    rise = np.exp(lost - 0.5 * np.square(size - half)) * -np.expm1(-2.0 * size * half) / np.sqrt(2.0 * np.pi)
+    flat = np.sqrt(2.0 * half * np.exp(least - 0.5 * np.square(half)) / np.sqrt(2.0 * np.pi))
+    inner = root < 1e-4
+    slope = np.where(inner, flat, rise / np.where(inner, 1.0, root))
+    root = np.where(inner, flat * size, root)
+    return np.sign(off) * np.where(plain, size, root), np.where(plain, 1.0, slope)
+
+
+def surprise(size: FloatArray, half: FloatArray, stray: FloatArray) -> FloatArray:
+    """Returns the negative log probability of a reading at distance ``size`` >= 0."""
+    outer, inner = -size - half, size - half
+    near = np.log1p(-np.minimum(ndtr(outer) + ndtr(inner), 1.0 - 1e-15))
+    tail = log_ndtr(-inner)
+    beyond = tail + np.log1p(-np.exp(np.minimum(log_ndtr(outer) - tail, -1e-12)))
+    with np.errstate(divide="ignore"):
+        anyhow = np.log(stray)
+    return np.asarray(-np.logaddexp(np.where(inner < -1.0, near, beyond), anyhow), dtype=np.float64)
+
+
+def deviation(
+    off: FloatArray, step: float, least: float, spread: FloatArray | None = None
+) -> tuple[float, float]:
+    """Estimates a simulation's standard deviation from rounded readings (maximum likelihood, >= ``least``).
+
+    ``spread`` is the additional known deviation of each reading. Also returns the probability of an outlier.
+    """
+    size, known = np.abs(off), np.zeros_like(off) if spread is None else spread
+    farthest = max(float(np.max(size)), least)
+    stray = STRAY / (1.0 - STRAY) * step / (2.0 * farthest + step)
+
+    def cost(log_deviation: float) -> float:
+        each = np.hypot(np.exp(log_deviation), known)
+        half = 0.5 * step / each
+        times = np.minimum(1.0, half / FINE)
+        return float(
+            np.sum(surprise(size / each, np.maximum(half, FINE), stray / times)) - np.sum(np.log(times))
+        )
+
+    bounds = (np.log(least), np.log(2.0 * farthest))
+    found = minimize_scalar(cost, bounds=bounds, method="bounded", options={"xatol": 0.02})
+    return float(np.exp(found.x)), stray
+
+
+# ----------------------------------------------------------------
+# Scales of the residuals: standard deviation of a simulation's error by channel.
+
+MOST_ANSWERED = 1.5
+"""Maximum share of a speed error that a velocity loop corrects within a step; it is unstable at two."""
+
+
+@dataclass(frozen=True, eq=False)
+class Loops:
+    """Deviation of quantised loops from smooth ones, by channel, for each row of a recording.
+
+    The break-away of a stuck motor depends on the value of the integral within an encoder step.
+    """
+
+    mean: Mapping[str, FloatArray]
+    spread: Mapping[str, FloatArray]
+
+    def taken_off(self, found: Mapping[str, FloatArray]) -> dict[str, FloatArray]:
+        """Returns the residuals of a smooth replay corrected by the mean deviation."""
+        return {name: found[name] + self.mean[name] for name in CHANNELS}
+
+
+@dataclass(frozen=True, eq=False)
+class Scales:
+    """Standard deviation of a simulation's error and resolution of the readings, by channel.
+
+    Without resolutions, rounding counts as noise.
+    """
+
+    deviation: Mapping[str, float]
+    step: Mapping[str, float] = field(default_factory=lambda: dict.fromkeys(CHANNELS, 0.0))
+    stray: Mapping[str, float] = field(default_factory=lambda: dict.fromkeys(CHANNELS, 0.0))
+    """Probability of an outlier."""
+    loops: Loops | None = None
+
+    def scaled(self, found: Mapping[str, FloatArray]) -> FloatArray:
+        """Returns the residuals of all channels, one after the other, in standard deviations."""
+        if self.loops is None:
+            return np.concatenate([found[name] / self.deviation[name] for name in CHANNELS])
+        return np.concatenate([self.loops.taken_off(found)[name] / self._rows(name) for name in CHANNELS])
+
+    def halves(self, length: int) -> tuple[FloatArray, FloatArray]:
+        """Returns half the resolution in standard deviations and `stray`, for ``length`` rows per channel."""
+        by_channel = [np.broadcast_to(0.5 * self.step[name] / self._rows(name), length) for name in CHANNELS]
+        strays = [self.stray[name] if self.step[name] else 0.0 for name in CHANNELS]
+        return np.concatenate(by_channel), np.repeat(strays, length)
+
+    def _rows(self, name: str) -> FloatArray | np.float64:
+        return np.hypot(self.deviation[name], 0.0 if self.loops is None else self.loops.spread[name])
+
+    @property
+    def noise(self) -> dict[str, float]:
+        """Standard deviation with the rounding included as noise."""
+        return {name: float(np.hypot(self.deviation[name], self.step[name] / 12.0**0.5)) for name in CHANNELS}
+
+
+def noise_floor(data: Data) -> dict[str, float]:
+    """Returns the minimum noise of each channel: rounding, and the torque noise from encoder rounding."""
+    return Scales(least_deviation(data), rounding(data.axis)).noise
+
+
+def least_deviation(data: Data) -> dict[str, float]:
+    """Returns, by channel, the error of a smooth replay of the true axis beyond the readings' rounding.
+
+    It comes from the resolution of the loops' encoder and the load encoder's noise.
+    """
+    truth = data.base
+    encoder = truth.motor.encoder
+    fine_deg = 360.0 / (encoder.counts_per_turn * encoder.interpolation)
+    return {
+        FOLLOWING: fine_deg / 12.0**0.5,
+        TORQUE: _shaken_nm(truth, math.radians(fine_deg)) / 12.0**0.5,
+        LOAD: float(
+            np.hypot(truth.load_.encoder.noise_arcsec, fine_deg * ARCSEC_PER_DEG / data.axis.gear.ratio)
+        ),
+    }
+
+
+def _shaken_nm(truth: Truth, off_rad: float) -> float:
+    """Returns the rms torque that the velocity loop makes of independent reading errors of this rms.
+
+    Speed is the readings' difference over the step, and the motor responds within the next step. The transfer
+    function is K (1 - 1/z)^2 / (dt (1 - (1 - a)/z)) with a = K dt / J; the result is its norm times the
+    error.
+    """
+    gain, step_s = truth.servo.velocity_gain_nm_s_per_rad, truth.substep_s
+    share = min(gain * step_s / truth.motor.inertia_kg_m2, MOST_ANSWERED)
+    norm = math.sqrt(1.0 + (1.0 + share) ** 2 + share**3 / (2.0 - share))
+    return gain * off_rad / step_s * norm
+
+
+def scales(data: Data, found: Mapping[str, FloatArray], loops: Loops | None = None) -> Scales:
+    """Estimates the scales of the residuals in motion; at least the error of a smooth replay.
+
+    Residuals at rest are excluded, because they would dominate a recording that rests half of the time.
+    """
+    least, counts, steps = least_deviation(data), counted(data), rounding(data.axis)
+    found = found if loops is None else loops.taken_off(found)
+    moving = np.concatenate([each.rest for each in data.pieces]) == 0.0
+    unsteady = None if loops is None else loops.spread
+    given, stray = dict(least), dict.fromkeys(CHANNELS, 0.0)
+    for name in CHANNELS:
+        rows = moving & (counts[name] > 0.0)
+        inside = found[name][rows]
+        if len(inside):
+            # At least half of the readings in motion are not outliers.
+            typical = median_deviation(beyond(inside, 0.5 * steps[name]))
+            spread = None if unsteady is None else unsteady[name][rows]
+            given[name], stray[name] = deviation(inside, steps[name], max(least[name], typical), spread)
+    return Scales(given, steps, stray, loops)
+
+
+# ----------------------------------------------------------------
+
+ARCSEC_PER_TURN = 360.0 * ARCSEC_PER_DEG
+LEAST_ROWS = 8
+
+
+def noise_in_motion(data: Data) -> dict[str, float]:
+    """Estimates the noise in motion by channel, in its unit, from third differences; at least the rounding.
+
+    At rest, count and torque stay constant, which is no reference for a simulation in motion. Motion that is
+    smooth over four rows vanishes in third differences, and the median ignores rows where it is not smooth (a
+    jerk, a reversal).
+    """
+    floor = noise_floor(data)
+    found = {}
+    for name in CHANNELS:
+        rows = []
+        for piece in data.pieces:
+            moving = piece.rest == 0.0
+            whole = moving[3:] & moving[2:-1] & moving[1:-2] & moving[:-3]
+            rows.append(np.diff(piece.measured[name], 3)[whole])
+        third = np.concatenate(rows)
+        found[name] = max(floor[name], third_deviation(third) if len(third) >= LEAST_ROWS else 0.0)
+    return found
+
+
+def expected(data: Data) -> Scales:
+    """Returns the expected scales of the residuals of the true axis, by channel.
+
+    For following error and torque this is the rounding, because third differences of a torque are mostly
+    motion. The load encoder's noise beyond its rounding is estimated from the recording.
+    """
+    return Scales(noise_floor(data) | {LOAD: noise_in_motion(data)[LOAD]})
+
+
+def with_load_noise(truth: Truth, left_arcsec: FloatArray) -> Truth:
+    """Returns the truth with the load encoder's noise, from differences of residuals between rows.
+
+    ``left_arcsec`` are the load's residuals, zero for rows that do not count. Rounding is subtracted.
+    """
+    encoder = truth.load_.encoder
+    inside = left_arcsec != 0.0
+    steps = np.diff(left_arcsec)[inside[1:] & inside[:-1]]
+    if not len(steps):
+        return truth
+    spread = median_deviation(steps) / math.sqrt(2.0)
+    rounding = ARCSEC_PER_TURN / encoder.counts_per_turn / math.sqrt(12.0)
+    noise_arcsec = round(math.sqrt(max(spread**2 - rounding**2, 0.0)), 4)
+    return with_load_encoder(truth, noise_arcsec=noise_arcsec)
+
+
+# ----------------------------------------------------------------
+# Misfit of a twin.
+
+Misfit = Mapping[str, Mapping[str, float]]
+"""Rms of the residuals by channel, in its unit, and kind of leg."""
+
+
+def misfit_of(data: Data, residuals: Mapping[str, FloatArray]) -> dict[str, dict[str, float]]:
+    """Returns the rms of the residuals of each recorded channel, by kind of leg."""
+    kinds = np.array(data.kinds)[data.leg.astype(np.intp)]
+    found: dict[str, dict[str, float]] = {}
+    for name, counts in counted(data).items():
+        for kind in dict.fromkeys(data.kinds):
+            inside = (counts > 0.0) & (kinds == kind)
+            if inside.any():
+                rms = math.sqrt(float(np.mean(np.square(residuals[name][inside]))))
+                found.setdefault(name, {})[kind] = float(f"{rms:.6g}")
+    return found
+
+
+def signals_of(data: Data) -> dict[str, FloatArray]:
+    """Returns the measured signals by channel, in its unit; for the load, its error without the zero."""
+    per_motor_deg = ARCSEC_PER_DEG / data.axis.gear.ratio
+    found = {name: list[FloatArray]() for name in CHANNELS}
+    for piece in data.pieces:
+        inside = piece.counts[LOAD] > 0.0
+        motor_deg = demand_deg(piece.commands, data.axis) - piece.measured[FOLLOWING]
+        error = piece.measured[LOAD] - per_motor_deg * motor_deg
+        found[LOAD].append(error - (np.mean(error[inside]) if inside.any() else 0.0))
+        for name in (FOLLOWING, TORQUE):
+            found[name].append(piece.measured[name])
+    return {name: np.concatenate(each) for name, each in found.items()}
+
+
+SHARE: Final = 0.01
+"""Share of a channel's signal that is the minimum unit of its misfit."""
+
+
+def units(data: Data) -> dict[str, float]:
+    """Returns a hundredth of the signal, or the noise if larger, by channel, in its unit."""
+    noise, counts, found = noise_in_motion(data), counted(data), {}
+    for name, measured in signals_of(data).items():
+        found[name] = max(noise[name], SHARE * rms(measured[counts[name] > 0.0]))
+    return found
+
+
+def judged_rows(data: Data) -> dict[str, NDArray[np.bool_]]:
+    """Returns the mask of the rows that judge a twin, by channel: held-out ones, or all without these."""
+    rows = {}
+    for name, counts in counted(data).items():
+        held_out = (counts > 0.0) & (data.out > 0.0)
+        rows[name] = held_out if held_out.any() else counts > 0.0
+    return rows
+
+
+def misfit(data: Data, left: Mapping[str, FloatArray]) -> float:
+    """Returns the root mean square over the channels in `units`, on held-out legs if there are any."""
+    scale = units(data)
+    squares = [
+        float(np.mean(np.square(left[name][inside] / scale[name])))
+        for name, inside in judged_rows(data).items()
+        if inside.any()
+    ]
+    return math.sqrt(sum(squares) / len(squares))
+
+
+# ----------------------------------------------------------------
+# Verdict on the values of a twin, from what it leaves on held-out legs.
+
+NOISE_LEVEL: Final = 1.3
+"""Rms residual, in units of the noise in motion, up to which a channel is explained: replays of the true
+values of axes 608, 609 and 612 (tools/twin_random_axes.py) leave 0.3 to 1.22."""
+MOST_NOISE: Final = 3.0
+"""Limit if the residual is also a small share of the signal: axis 620, whose intervals hold 1 of 18 true
+values, leaves 2.9 to 28 with its true values."""
+MOST_SHARE: Final = 0.05
+"""Maximum share for `MOST_NOISE`: rms residual over rms signal."""
+
+
+class Values(StrEnum):
+    """Origin of the values of a truth; `provenance.values` in its file."""
+
+    USUAL = "usual"
+    """Assumed for axes of this kind."""
+    AXIS = "axis"
+    """Fitted, with residuals within the noise."""
+    REPLAY = "replay"
+    """Fitted, but a channel has larger residuals: a different drive with similar motion."""
+
+    @classmethod
+    def of(cls, truth: Truth) -> Values | None:
+        """Returns the origin of a truth's values; None for a truth file written by hand."""
+        value = truth.provenance.get("values")
+        return cls(value) if value is not None else None
+
+
+@dataclass(frozen=True, slots=True)
+class Left:
+    """Residual of a channel."""
+
+    channel: str
+    share: float
+    """Rms residual over rms signal."""
+    times_noise: float
+    """Rms residual over the noise in motion."""
+    kind: str
+    """Kind of the legs with the largest residual."""
+
+    @property
+    def explained(self) -> bool:
+        """True if it is within the noise, or nearly so and a small share of the signal."""
+        return self.times_noise <= NOISE_LEVEL or (
+            self.times_noise <= MOST_NOISE and self.share <= MOST_SHARE
+        )
+
+
+def what_is_left(
+    data: Data, residuals: Mapping[str, FloatArray], noise: Mapping[str, float]
+) -> tuple[Left, ...]:
+    """Returns the residual of each recorded channel, on held-out legs if there are any.
+
+    ``residuals`` by channel over all rows of the data, ``noise`` by channel in its unit (`noise_in_motion`).
+    """
+    kinds = np.array(data.kinds)[data.leg.astype(np.intp)]
+    signals, found = signals_of(data), []
+    for name, inside in judged_rows(data).items():
+        if not inside.any():
+            continue
+        squares, signal = np.square(residuals[name][inside]), rms(signals[name][inside])
+        by_kind = {str(kind): float(squares[kinds[inside] == kind].mean()) for kind in set(kinds[inside])}
+        left = math.sqrt(float(squares.mean()))
+        share = left / signal if signal else math.inf
+        found.append(Left(name, share, left / noise[name], max(by_kind, key=lambda kind: by_kind[kind])))
+    return tuple(found)
+
+
+def values_of(left: Sequence[Left]) -> Values:
+    """Returns the origin of fitted values: the axis if all channels are explained, else a replay."""
+    return Values.AXIS if all(each.explained for each in left) else Values.REPLAY

@@ -15,10 +15,10 @@ from scipy.special import chdtrc, ndtri
 
 from hdbridge.effects import FloatArray
 from hdbridge.sim.truth import Truth
-from hdbridge.twin.comparison import rms
-from hdbridge.twin.fitting import as_late
-from hdbridge.twin.least_squares import (
+from hdbridge.twin.compare import rms
+from hdbridge.twin.fit import (
     Fitted,
+    as_late,
     fitted_rows,
     information_of,
     legs_of_rows,
@@ -26,9 +26,8 @@ from hdbridge.twin.least_squares import (
     solve,
     told,
 )
-from hdbridge.twin.misfit import CHANNELS, counted
+from hdbridge.twin.misfit import CHANNELS, Replays, counted
 from hdbridge.twin.parameters import Parameter, at_coordinates, coordinates, free_value
-from hdbridge.twin.replays import Replays
 from hdbridge.units import figure
 
 # ----------------------------------------------------------------

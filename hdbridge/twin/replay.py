@@ -1,4 +1,15 @@
-"""Replays a recording's commands through a simulated drive, over real frames or directly.
+"""Stretches: pieces of long recordings that a fit replays separately, and their unknown rows. Pure.
+
+Commands of a part of a recording, on the grid of its own cycle, preceded by an approach.
+
+The state before a recording is unknown, so the replay switches the drive on at its angle zero and moves to
+the first command at the axis's limits; so does each part that does not follow another one. If the recording
+begins with the drive holding the axis, its torque sets the integrals of the loops; a recorded temperature
+sets the axis's.
+Between parts that follow each other the drive is switched off, as on the bench, and the load continues to
+ring.
+
+Replays a recording's commands through a simulated drive, over real frames or directly.
 
 Both give the same numbers. The frames show what a master sees of a twin; direct replays are fast enough for
 the hundreds that a fit needs. Over frames the drive knows nothing else: neither an external torque on the
@@ -11,25 +22,395 @@ simulated load in place of its own weight, and the recorded temperature sets its
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache
+from itertools import pairwise
 
 import numpy as np
+from numpy.typing import NDArray
+from ruckig import InputParameter, Result, Ruckig, Trajectory
 
 from hdbridge.axis import AxisConfig
 from hdbridge.axis.channels import BY_KEY
 from hdbridge.control.bench import Bench
 from hdbridge.drive.drive import Drive
 from hdbridge.effects import Channel, FloatArray
+from hdbridge.errors import InputError
 from hdbridge.procedures.moves import AxisView, MotionLimits, Path, Sample, Steps
 from hdbridge.records.record import Record, concatenate
-from hdbridge.records.recording import Recording
+from hdbridge.records.recording import Recording, Segment
 from hdbridge.sim.lockstep import simulated_bench
 from hdbridge.sim.machine import Cycles, Machine
 from hdbridge.sim.truth import Truth
-from hdbridge.twin.commands import OFF_AFTER, ON_BEFORE, Commands, commands_of
-from hdbridge.twin.stretches import continuous
+
+# ----------------------------------------------------------------
+# Stretches: pieces of long recordings that a fit replays separately, and their unknown rows. Pure.
+
+# ----------------------------------------------------------------
+
+STRETCH_S = 10.0
+"""Length of a stretch: long against its unknown beginning (60 motor degrees, ringing)."""
+LONG_S = 30.0
+"""Maximum length of a part that is not divided."""
+GAP_S = 0.5
+"""Maximum gap between two parts that follow each other, as between two tasks of a master."""
+SAME_DEG = 1e-6
+"""Maximum change of the command that counts as unchanged; motor degrees."""
+STOPPED_DEG = 5.0
+"""Maximum motor travel from the last row of a procedure to standstill."""
+IDLE = 0.002
+"""Share of a record's largest torque below which the torque counts as zero."""
+RUN_IN_S = 2.0
+"""Time after which earlier motion no longer matters: the ringing of a weakly damped load (15 Hz, damping
+ratio 0.03) has decayed to a three-hundredth."""
+
+
+def stretches(part: Record, legs: Sequence[Segment]) -> list[Record]:
+    """Divides a part into stretches; each begins with a leg, or within a leg longer than a stretch."""
+    start_s, end_s = float(part.time_s[0]), float(part.time_s[-1])
+    if end_s - start_s <= LONG_S:
+        return [part]
+    places: list[float] = []
+    for leg in legs:
+        inside = np.arange(leg.start_s, leg.end_s, STRETCH_S)
+        places += [each for each in inside.tolist() if start_s < each < end_s]
+    cuts = [start_s]
+    for place in sorted(places):
+        if place - cuts[-1] >= 0.5 * STRETCH_S and end_s - place >= 0.5 * STRETCH_S:
+            cuts.append(place)
+    rows = [*np.searchsorted(part.time_s, cuts).tolist(), len(part)]
+    return [part.rows(first, end) for first, end in pairwise(rows)]
+
+
+def continuous(record: Record) -> list[slice]:
+    """Groups parts that follow each other within `GAP_S` with the axis in place; returns their rows.
+
+    In between, the drive is switched off, as on the bench between two procedures, or holds the command.
+    """
+    target, motor, time_s = record.motor_target_deg, record.motor_position_deg, record.time_s
+    firsts = [0]
+    for first in record.starts[1:]:
+        gap_s = float(time_s[first] - time_s[first - 1])
+        # Records that were joined afterwards are one row apart.
+        follows = 1.5 * float(np.median(np.diff(time_s))) < gap_s <= GAP_S
+        held = target is not None and abs(float(target[first] - target[first - 1])) <= SAME_DEG
+        stood = abs(float(motor[first] - motor[first - 1])) <= STOPPED_DEG
+        if not follows or not (held or (stood and just_on(record, first))):
+            firsts.append(first)
+    return [slice(first, end) for first, end in pairwise([*firsts, len(record)])]
+
+
+def just_on(record: Record, row: int) -> bool:
+    """Returns True if the drive has just been switched on at a row, because it has no torque yet.
+
+    Returns True for a record without torque, on the assumption that power is on only during a procedure.
+    """
+    torque_nm = record.columns.get("motor_torque_nm")
+    if torque_nm is None:
+        return True
+    return bool(abs(torque_nm[row]) <= IDLE * np.max(np.abs(torque_nm)))
+
+
+# ----------------------------------------------------------------
+# Standstill in a recording, the holding torque, and rows with an unknown history.
+
+RINGING_S = 0.25
+"""Time after the command's stop in which the torque still shows the motion; later it depends on sticking."""
+STANDS_COUNTS = 1.5
+"""Distance from the rest position within which the motor is at standstill; counts. Its torque is then
+constant or creeps up against friction, depending on a thousandth of a count."""
+HELD_S = 0.1
+"""Standstill after which the integral alone holds the motor; the loops respond within a few milliseconds."""
+LARGEST_UNKNOWN = 0.25
+"""Maximum share of a recording that is excluded for its unknown history."""
+
+
+def stands(moved: NDArray[np.bool_], motor_deg: FloatArray, within_deg: float) -> NDArray[np.bool_]:
+    """Returns the mask of rows from which command and motor stay at rest until the command moves again."""
+    rest = np.cumsum(moved)
+    last = np.searchsorted(rest, rest, side="right") - 1
+    away = np.abs(motor_deg - motor_deg[last]) > within_deg
+    rows = np.arange(len(rest))
+    last_away = np.maximum.accumulate(np.where(away | moved, rows, -1))
+    given: NDArray[np.bool_] = last_away < rows
+    return given
+
+
+def held_rows(part: Record, moved: NDArray[np.bool_], still: NDArray[np.bool_]) -> NDArray[np.intp]:
+    """Returns the rows that show the holding torque of a motor at rest: every `HELD_S`, and the last.
+
+    The last one alone would not do, because the integral may have moved until the motor broke away.
+    """
+    rested_s = part.time_s - np.maximum.accumulate(np.where(moved, part.time_s, part.time_s[0]))
+    times = np.floor(rested_s / HELD_S)
+    told = still & (times >= 1.0)
+    told[1:-1] &= (times[1:-1] > times[:-2]) | moved[2:]
+    told[-1:] = False
+    return np.flatnonzero(told)
+
+
+def begins_in_motion(part: Record) -> bool:
+    """Returns True if the command moves before it has rested for `RINGING_S`."""
+    target, time_s = part.motor_target_deg, part.time_s
+    assert target is not None  # commands_of has refused it
+    return bool(np.any(np.diff(target[time_s - time_s[0] < RINGING_S]) != 0.0))
+
+
+def unknown_rows(record: Record, count_deg: float) -> NDArray[np.bool_]:
+    """Returns the mask of rows in which the load may still ring from an unknown motion.
+
+    This is the motion before a recording that begins (or resumes) in motion, or the cycles before switching
+    off after a procedure that ended in motion. ``count_deg`` is one motor count.
+    """
+    target, time_s = record.motor_target_deg, record.time_s
+    unknown = np.zeros(len(record), dtype=np.bool_)
+    if target is None:
+        return unknown
+    alone = {each.start for each in continuous(record)}
+    parts = []
+    for first, end in pairwise((*record.starts, len(record))):
+        jumps = first > 0 and abs(target[first] - target[first - 1]) > STANDS_COUNTS * count_deg
+        if jumps or (first in alone and begins_in_motion(record.rows(first, end))):
+            parts.append(slice(first, end))
+    rings_s = [min(RUN_IN_S, float(time_s[each][-1] - time_s[each][0])) for each in parts]
+    whole_s = sum(float(np.ptp(each.time_s)) for each in record.parts())
+    share = min(1.0, LARGEST_UNKNOWN * whole_s / max(sum(rings_s), 1e-9))
+    for part, length_s in zip(parts, rings_s, strict=True):
+        unknown[part] = time_s[part] - time_s[part.start] <= share * length_s
+    return unknown
+
+
+# ----------------------------------------------------------------
+# Commands of a part of a recording, on the grid of its own cycle, preceded by an approach.
+
+STANDING_S = 0.3
+"""Standstill between the approach and a recording that begins at rest."""
+SETTLING_S = 1.5
+"""The same if the recording begins with the drive on: long enough for loops with a gain of 4/s."""
+UNEVEN = 0.25
+"""Maximum deviation of a sample's time from the grid; cycles."""
+MOSTLY = 0.95
+"""Minimum share of samples within `UNEVEN`: a few late stamps do not mean late commands."""
+REST_S = 0.1
+"""Minimum rest of the command between two legs if the recording names no legs."""
+RINGS_S = 1.0
+"""Time from the end of a leg's motion to the end of the leg; a longer standstill belongs to no leg."""
+LEAST_LEG_S = 0.4
+"""Minimum length of such a leg: an acceleration and the ringing of a load at 15 Hz."""
+SIGN_SHARE = 0.2
+"""Share of the mean torque that must oppose the motion for the sign to be wrong."""
+TORQUE_MARGIN = 1.5
+"""Ratio of a torque to the axis's limit above which its unit must be wrong."""
+AHEAD_CYCLES = 0.5
+"""Lead of the motor over its command above which the command was logged late; cycles."""
+MOVING_DEG_S = 5.0
+"""Motor speed above which the direction of friction is certain."""
+OFF_AFTER, ON_BEFORE = 2, 1
+"""Cycles between the last row of a procedure and switching off on the bench, and between switching on and the
+first row of the next procedure."""
+
+
+@dataclass(frozen=True, eq=False)
+class Commands:
+    """Commands of one part of a recording by cycle, preceded by the approach."""
+
+    counts: tuple[float, ...]
+    """Motor demand at the end of each cycle, from switching on; counts."""
+    lead: int
+    """Number of cycles of the approach."""
+    row_cycles: FloatArray
+    """Time of each row since the end of the approach, in cycles (fractional if uneven)."""
+    time_s: FloatArray
+    """Time of each row."""
+    cycle_s: float
+    told_nm: FloatArray | None = None
+    """Recorded torque on the load by cycle (during the approach its first value); None if not recorded."""
+    off: tuple[slice, ...] = ()
+    """Cycles in which the drive is switched off."""
+    held: tuple[tuple[int, float], ...] = ()
+    """Cycles before which the loops' integrals are set to a holding torque, and that torque in Nm."""
+    start_c: float | None = None
+    """Initial temperature of the axis; None: the truth's own."""
+
+
+def commands_of(part: Record, axis: AxisConfig, truth: Truth) -> Commands:
+    """Returns the commands of a part on the grid of its own cycle; InputError without usable commands."""
+    target = part.motor_target_deg
+    name = f"{part.source}: " if part.source else ""
+    if target is None or np.isnan(target).any():
+        raise InputError(
+            f"{name}no commanded motor angle (motor_target_deg); expected one in each row: what the drive "
+            "was told is what a simulated one is told again"
+        )
+    if len(part) < 2:
+        raise InputError(f"{name}{len(part)} rows; expected at least two in each part of a recording")
+    time_s = part.time_s
+    cycle_s = cycle_of(part, axis)
+    cycles = counted_cycles(time_s, cycle_s)
+    grid = np.arange(math.floor(cycles[-1]) + 1.0 + (cycles[-1] % 1.0 > 0.0))
+    gaps = [first for first in part.starts[1:] if just_on(part, first)]
+    nodes, values = cycles, target
+    for first in gaps:
+        # After its last row a procedure continues to slow down, but not beyond the start of the next one.
+        later = np.arange(1.0, OFF_AFTER + 1.0)
+        earlier, before, last, rest = target[[max(first - 3, 0), first - 2, first - 1, first]]
+        slowing = last - 2.0 * before + earlier
+        goes_on = last + later * (last - before) + 0.5 * later * (later + 1.0) * slowing
+        nodes = np.append(nodes, cycles[first - 1] + later)
+        values = np.append(values, np.clip(goes_on, min(last, rest), max(last, rest)))
+    order = np.argsort(nodes, kind="stable")
+    demand_deg = np.interp(grid, nodes[order], values[order])
+    if grid[-1] > cycles[-1]:
+        # Extrapolate to the end of the cycle that the last row lies in.
+        speed = (target[-1] - target[-2]) / (cycles[-1] - cycles[-2])
+        demand_deg[-1] = target[-1] + speed * (grid[-1] - cycles[-1])
+    recorded = np.round(axis.motor_encoder.counts(1.0) * demand_deg).tolist()
+    holds = target[0] == target[1] and not just_on(part, 0)
+    approach = _approach(truth, axis, demand_deg, cycle_s, SETTLING_S if holds else STANDING_S)
+    told_nm = part.columns.get(Channel.LOAD_TORQUE.value)
+    if told_nm is not None:
+        told_nm = np.concatenate([np.full(len(approach), told_nm[0]), np.interp(grid, cycles, told_nm)])
+    lead = len(approach)
+    off = [
+        slice(
+            lead + math.floor(cycles[first - 1]) + 1 + OFF_AFTER, lead + math.floor(cycles[first]) - ON_BEFORE
+        )
+        for first in gaps
+    ]
+    if target[0] == target[1] and just_on(part, 0):
+        off.insert(0, slice(lead - math.ceil(0.5 * STANDING_S / cycle_s), lead - ON_BEFORE))
+    off = [each for each in off if each.stop > each.start]
+    torque_nm = part.columns.get(Channel.MOTOR_TORQUE.value)
+    held = () if torque_nm is None or not holds else ((lead, float(torque_nm[0])),)
+    warmth_c = part.columns.get(Channel.TEMPERATURE.value)
+    start_c = None if warmth_c is None else float(warmth_c[0])
+    return Commands(
+        (*map(float, approach), *recorded), lead, cycles, time_s, cycle_s, told_nm, tuple(off), held, start_c
+    )
+
+
+def cycle_of(part: Record, axis: AxisConfig) -> float:
+    """Returns a record's cycle in seconds, as 60C2h can express it, or the axis's if they agree."""
+    own_ms = 1e3 * float(np.median(np.diff(part.time_s)))
+    if not own_ms > 0.0:
+        raise InputError(f"{part.source or 'the record'}: its time stands still; expected rising times")
+    if abs(own_ms / axis.drive.cycle_ms - 1.0) < 0.02:
+        return axis.drive.cycle_s
+    rounded = round(own_ms, 1) if own_ms < 25.5 else float(round(own_ms))
+    return min(max(rounded, 0.5), 255.0) / 1e3
+
+
+def _approach(
+    truth: Truth, axis: AxisConfig, demand_deg: FloatArray, cycle_s: float, standing_s: float
+) -> list[int]:
+    """Plans the motion from the switch-on position to the first command and its speed, at the limits."""
+    ratio, limits = axis.gear.ratio, axis.limits
+    start_counts = truth.motor.encoder.zero_counts
+    start_deg = axis.motor_encoder.degrees(start_counts) / ratio
+    steps = np.diff(demand_deg[:4]) / ratio / cycle_s
+    speed = float(np.median(steps)) if len(steps) and np.all(steps != 0.0) else 0.0
+    demand = InputParameter(1)
+    demand.current_position = [start_deg]
+    demand.target_position = [float(demand_deg[0]) / ratio]
+    demand.target_velocity = [speed]
+    demand.max_velocity = [max(limits.velocity_deg_s, 1.01 * abs(speed))]
+    demand.max_acceleration = [limits.acceleration_deg_s2]
+    demand.max_jerk = [limits.jerk_deg_s3]
+    trajectory = Trajectory(1)
+    if Ruckig(1).calculate(demand, trajectory) not in {Result.Working, Result.Finished}:
+        raise InputError(
+            f"no way from where the simulated drive is switched on, {start_deg:g} deg, to where the "
+            f"recording begins, {demand_deg[0] / ratio:g} deg, within the limits of {axis.path}"
+        )
+    moving = math.ceil(trajectory.duration / cycle_s)
+    standing = math.ceil(standing_s / cycle_s)
+    per_load_deg = axis.motor_encoder.counts(1.0) * ratio
+    # Backwards from its end, so that the last command before the recording has the recording's speed.
+    times = [max(trajectory.duration - (moving - k) * cycle_s, 0.0) for k in range(moving)]
+    way = [round(per_load_deg * float(trajectory.at_time(each)[0][0])) for each in times]
+    here = round(per_load_deg * start_deg)
+    rest = [way[-1] if way else here] if speed else [round(axis.motor_encoder.counts(1.0) * demand_deg[0])]
+    return [here] * standing + way + (rest * standing if not speed else [])
+
+
+def counted_cycles(time_s: FloatArray, cycle_s: float) -> FloatArray:
+    """Returns the cycle number of each row, from zero; fractional if the rows do not follow the cycle.
+
+    Rows are counted, because a late stamp does not mean a late command. Gaps count as whole cycles.
+    """
+    cycles: FloatArray = (time_s - time_s[0]) / cycle_s
+    counted: FloatArray = np.concatenate([[0.0], np.cumsum(np.maximum(np.round(np.diff(cycles)), 1.0))])
+    off = np.abs(cycles - counted)
+    if np.mean(off <= UNEVEN) >= MOSTLY and np.max(off) < 1.0:
+        return counted
+    return cycles
+
+
+def legs_of(recording: Recording) -> tuple[Segment, ...]:
+    """Returns the recording's legs; if it names none, its motions between rests and reversals."""
+    if recording.segments:
+        return recording.segments
+    return tuple(leg for part in recording.record.parts() for leg in _legs_of_command(part))
+
+
+def _legs_of_command(part: Record) -> Iterator[Segment]:
+    """Yields the legs of a part by its command, or the whole part without one."""
+    time_s, target = part.time_s, part.motor_target_deg
+    cuts, moved_s = [float(time_s[0])], [float(time_s[-1])]
+    if target is not None and len(part) > 2:
+        way = np.sign(np.diff(target))
+        moving = np.flatnonzero(way)
+        for before, after in pairwise(moving.tolist()):
+            rests = time_s[after] - time_s[before + 1] >= REST_S
+            if (rests or way[before] != way[after]) and time_s[after] - cuts[-1] >= LEAST_LEG_S:
+                cuts.append(float(time_s[after]))
+                moved_s.insert(-1, float(time_s[before + 1]))
+        if len(moving):
+            moved_s[-1] = float(time_s[moving[-1] + 1])
+    ends = [*cuts[1:], float(time_s[-1])]
+    for start_s, end_s, last_s in zip(cuts, ends, moved_s, strict=True):
+        yield Segment(kind="motion", start_s=start_s, end_s=max(start_s, min(end_s, last_s + RINGS_S)))
+
+
+def doubts(recording: Recording, axis: AxisConfig) -> tuple[str, ...]:
+    """Returns suspected faults of a recording's torque and command, each in a sentence with a remedy."""
+    lags, forward, backward = [], [], []
+    for part in recording.record.parts():
+        target, torque_nm = part.motor_target_deg, part.columns.get(Channel.MOTOR_TORQUE.value)
+        if target is None or len(part) < 3:
+            continue
+        speed = np.gradient(target, part.time_s)
+        moving = np.abs(speed) > MOVING_DEG_S
+        lags += [np.stack([target - part.motor_position_deg, speed])[:, moving]]
+        if torque_nm is not None:
+            forward.append(torque_nm[moving & (speed > 0.0)])
+            backward.append(torque_nm[moving & (speed < 0.0)])
+    found = []
+    if lags and (moved := np.concatenate(lags, axis=1)).size:
+        ahead_s = -float(moved[0] @ moved[1]) / float(moved[1] @ moved[1])
+        cycle_s = float(np.median(np.diff(recording.record.time_s)))
+        if ahead_s > AHEAD_CYCLES * cycle_s:
+            found.append(
+                f"the motor leads its command by {ahead_s / cycle_s:.1f} cycles; expected it behind: "
+                "the command was logged late, move motor_target_deg earlier by as many rows"
+            )
+    if forward and sum(map(len, forward)) and sum(map(len, backward)):
+        ahead, back = np.concatenate(forward), np.concatenate(backward)
+        torques = np.abs(np.concatenate([ahead, back]))
+        most_nm = 0.01 * axis.limits.torque_percent * axis.drive.rated_torque_nm
+        if float(np.mean(ahead) - np.mean(back)) < -2.0 * SIGN_SHARE * float(np.mean(torques)):
+            found.append("motor_torque_nm opposes the motion; expected it to drive it: change its sign")
+        if float(np.max(torques)) > TORQUE_MARGIN * most_nm:
+            found.append(
+                f"motor_torque_nm is up to {np.max(torques):.3g} Nm; expected at most {most_nm:.3g} "
+                "(limits.torque_percent of drive.rated_torque_nm): convert it to Nm if it is in per cent"
+            )
+    return tuple(found)
+
+
+# ----------------------------------------------------------------
+# Replays a recording's commands through a simulated drive, over real frames or directly.
 
 LATENCY_CYCLES = 4
 """Maximum delay until a command appears as the demand; cycles."""

@@ -24,13 +24,12 @@ from hdbridge.axis import AxisConfig
 from hdbridge.effects import Channel, FloatArray
 from hdbridge.records.recording import Recording
 from hdbridge.sim.truth import Truth
-from hdbridge.twin.comparison import least_change
-from hdbridge.twin.least_squares import Fitted, sandwich
+from hdbridge.twin.compare import least_change
+from hdbridge.twin.fit import Fitted, sandwich
 from hdbridge.twin.misfit import held_out_legs
 from hdbridge.twin.naming import FALSE_ALARM, Finding, finding
 from hdbridge.twin.parameters import BY_NAME, Parameter, coordinates
-from hdbridge.twin.replay import replay_directly
-from hdbridge.twin.stretches import continuous
+from hdbridge.twin.replay import continuous, replay_directly
 
 TEMPERATURE: Final = "temperature"
 """Channel in which these constants show."""

@@ -1,4 +1,4 @@
-"""What a simulated drive gets right and wrong of two robot joints that somebody else measured.
+"""Agreement of a simulated drive with two robot joints that somebody else measured.
 
 The records are looked for as in `test_measured_records.py`; without them these tests are skipped.
 """
@@ -12,7 +12,7 @@ import pytest
 import real_records
 
 from hdbridge.records.recording import Recording
-from hdbridge.twin.translation import translate
+from hdbridge.twin.translate import translate
 
 BESIDE = Path(__file__).parents[3] / "shared" / "data"
 

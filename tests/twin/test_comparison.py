@@ -14,7 +14,7 @@ from hdbridge.records.record import Record, concatenate
 from hdbridge.records.recording import Segment
 from hdbridge.sim.exercise import Exercise
 from hdbridge.sim.truth import Truth
-from hdbridge.twin.comparison import ALL, Comparison, compare
+from hdbridge.twin.compare import ALL, Comparison, compare
 
 TRUTH = Truth.load(Path(__file__).parents[2] / "profiles" / "demo")
 N = 50.0

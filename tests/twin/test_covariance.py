@@ -1,10 +1,10 @@
-"""How sure a fit is of its parameters, where residuals of one leg go together."""
+"""Uncertainty of a fit's parameters if the residuals of one leg are correlated."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from hdbridge.twin.least_squares import principal, sandwich
+from hdbridge.twin.fit import principal, sandwich
 
 
 def test_what_slopes_would_still_take_is_no_scatter_of_the_legs() -> None:

@@ -1,4 +1,4 @@
-"""What a fit takes in only where the recording shows it: friction near rest, another loop, a limit."""
+"""A fit takes a part in only if the recording shows it: friction near rest, another loop, a limit."""
 
 from __future__ import annotations
 
@@ -19,13 +19,23 @@ from hdbridge.records.recording import Recording
 from hdbridge.sim.lockstep import simulated_bench
 from hdbridge.sim.truth import Truth
 from hdbridge.sim.truth.encoder import TrueCoupling
-from hdbridge.twin.fitting import free_parameters, with_last, with_limit, with_loop
-from hdbridge.twin.least_squares import Fitted, solve
-from hdbridge.twin.loop_laws import LAWS, LOOP, by_each_law, by_law_of, loop_parameters
-from hdbridge.twin.misfit import prepare
+from hdbridge.twin.fit import (
+    LAWS,
+    LOOP,
+    Fitted,
+    by_each_law,
+    by_law_of,
+    free_parameters,
+    loop_parameters,
+    read_off,
+    solve,
+    start_of,
+    with_last,
+    with_limit,
+    with_loop,
+)
+from hdbridge.twin.misfit import Replays, prepare
 from hdbridge.twin.parameters import BY_NAME, coordinates, value_in, with_values
-from hdbridge.twin.regressions import read_off, start_of
-from hdbridge.twin.replays import Replays
 
 DEMO = Path(__file__).parents[2] / "profiles" / "demo"
 _DEMO = AxisConfig.load(DEMO)

@@ -21,15 +21,21 @@ from hdbridge.records.recording import Recording
 from hdbridge.sim.lockstep import simulated_bench
 from hdbridge.sim.truth import Truth
 from hdbridge.twin.check import Check, check
-from hdbridge.twin.least_squares import solve
-from hdbridge.twin.making import with_knowledge
-from hdbridge.twin.misfit import CHANNELS, counted, prepare, residuals
-from hdbridge.twin.noise import noise_floor, noise_in_motion
+from hdbridge.twin.fit import read_off, solve
+from hdbridge.twin.misfit import (
+    CHANNELS,
+    Replays,
+    Values,
+    counted,
+    noise_floor,
+    noise_in_motion,
+    prepare,
+    residuals,
+    values_of,
+    what_is_left,
+)
 from hdbridge.twin.parameters import BY_NAME, coordinates, value_in, with_values
-from hdbridge.twin.regressions import read_off
-from hdbridge.twin.replays import Replays
-from hdbridge.twin.result import Values
-from hdbridge.twin.verdict import values_of, what_is_left
+from hdbridge.twin.twin import with_knowledge
 
 DEMO = Path(__file__).parents[2] / "profiles" / "demo"
 AXIS = AxisConfig.load(DEMO)
@@ -131,7 +137,7 @@ def test_a_check_is_silent_where_nothing_has_changed() -> None:
 
 
 def test_a_gear_whose_warmth_is_recorded_has_not_changed_by_it() -> None:
-    """By 20 K its friction falls by a fifth, which matters."""
+    """A warming by 20 K lowers the friction by a fifth, which matters."""
     grows = TRUTH.temperature.model_copy(update={"friction_growth_per_k": -0.01, "reference_c": 22.0})
     warm = TRUTH.model_copy(update={"temperature": grows.model_copy(update={"start_c": 42.0})})
     told = {**twin().intervals, "temperature.ambient_c": (21.0, 23.0)}
@@ -176,7 +182,7 @@ def test_a_few_samples_far_off_neither_hide_a_change_nor_make_one() -> None:
 
 
 def test_a_load_that_rings_out_of_step_has_changed() -> None:
-    """By half as much inertia again, at 8 Hz: what the twin leaves is so large that slopes say nothing."""
+    """An inertia larger by half, at 8 Hz: the twin leaves so much that slopes are meaningless."""
     gear, stiffness = TRUTH.gear, TRUTH.load_.whole_inertia_kg_m2 * (math.tau * 8.0) ** 2
     damping = 0.3 * gear.damping_nm_s_per_rad * math.sqrt(stiffness / gear.stiffness_nm_per_rad)
     soft = {"gear stiffness": stiffness, "gear damping": damping}
@@ -191,7 +197,7 @@ def test_a_load_that_rings_out_of_step_has_changed() -> None:
 @cache
 def replay_only() -> Truth:
     """A twin with wrong loops: it leaves several times the noise, so its values are not the axis's."""
-    wrong = with_values(TRUTH, {"position gain": 120.0, "integral time": 40.0, "motor inertia": 6e-5})
+    wrong = with_values(TRUTH, {"position gain": 80.0, "integral time": 40.0, "motor inertia": 6e-5})
     parameters = tuple(BY_NAME[name] for name in NAMES)
     with Replays(prepare(recorded(), AXIS, wrong), 1) as replays:
         prior = np.array(coordinates(wrong, parameters))

@@ -16,7 +16,7 @@ from hdbridge.files.profile import Profile
 from hdbridge.model import store
 from hdbridge.sim.truth import Truth
 from hdbridge.simulated import simulated
-from hdbridge.twin.kept import TWINS, KeptTwin, diff
+from hdbridge.twin.twin import TWINS, KeptTwin, diff
 
 DATE = datetime(2026, 3, 1, 12, tzinfo=UTC)
 SERIAL = Identity(vendor_id=0x4844, product_code=0x402, serial=17)

@@ -1,4 +1,4 @@
-"""How sure a twin is of itself, as its file tells it."""
+"""Certainty of a twin, as its file states it."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import pytest
 
 from hdbridge.sim.truth import Truth
 from hdbridge.twin.check import Known
-from hdbridge.twin.fitting import free_parameters
+from hdbridge.twin.fit import free_parameters
 
 TRUTH = Truth.load(Path(__file__).parents[2] / "profiles" / "demo")
 PARAMETERS = free_parameters(TRUTH)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from hdbridge.twin.least_squares import slopes_at
+from hdbridge.twin.fit import slopes_at
 
 Rows = NDArray[np.float64]
 TRUE = np.random.default_rng(3).standard_normal((400, 2))

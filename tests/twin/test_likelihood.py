@@ -13,11 +13,9 @@ from hdbridge.axis import AxisConfig
 from hdbridge.records.recording import Recording
 from hdbridge.sim.exercise import Exercise
 from hdbridge.sim.truth import Truth
-from hdbridge.twin.least_squares import solve
-from hdbridge.twin.misfit import prepare
-from hdbridge.twin.noise import deviation, expected, rooted
+from hdbridge.twin.fit import solve
+from hdbridge.twin.misfit import Replays, deviation, expected, prepare, rooted
 from hdbridge.twin.parameters import BY_NAME, coordinates, with_values
-from hdbridge.twin.replays import Replays
 
 DEMO = Path(__file__).parents[2] / "profiles" / "demo"
 AXIS = AxisConfig.load(DEMO)

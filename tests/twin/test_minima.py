@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
@@ -14,21 +16,21 @@ from hdbridge.axis import AxisConfig
 from hdbridge.records.recording import Recording, Segment
 from hdbridge.sim.exercise import Exercise
 from hdbridge.sim.truth import Truth
-from hdbridge.twin.fitting import (
+from hdbridge.twin.fit import (
     as_late,
     better_places,
     delays,
     exchanged,
     feedforwards,
+    fit,
     inertias,
     lags,
     neighbours,
+    solve,
     springs,
 )
-from hdbridge.twin.least_squares import solve
-from hdbridge.twin.misfit import Data, prepare
+from hdbridge.twin.misfit import Data, Replays, misfit, prepare
 from hdbridge.twin.parameters import BY_NAME, FOLLOWING, coordinates, free_value, with_values
-from hdbridge.twin.replays import Replays
 
 DEMO = Path(__file__).parents[2] / "profiles" / "demo"
 AXIS = AxisConfig.load(DEMO)
@@ -153,3 +155,25 @@ def test_a_rival_is_as_late_by_filter_or_dead_time_whichever_is_free() -> None:
     slow = as_late(with_values(late, {"command filter": 1.5}), late, [dead_time])
     assert slow.servo.dead_time_ms == 0.0
     assert as_late(TRUTH, late, []) == TRUTH
+
+
+def interrupted_at(least: float) -> Callable[[float], None]:
+    def progress(share: float) -> None:
+        if share >= least:
+            raise KeyboardInterrupt
+
+    return progress
+
+
+def test_a_fit_that_is_interrupted_keeps_the_best_place_so_far() -> None:
+    wrong = with_values(TRUTH, {"Coulomb friction": 2.0 * TRUTH.motor.coulomb_nm})
+    with Replays(replace(data(), base=wrong), 1) as replays:
+        found = fit(replays, interrupted_at(0.2))
+        (before,) = replays([wrong])
+    assert found.interrupted
+    assert misfit(data(), found.residuals) < 0.5 * misfit(data(), before)
+
+
+def test_a_fit_that_is_interrupted_before_it_has_reached_anything_leaves_nothing() -> None:
+    with Replays(data(), 1) as replays, pytest.raises(KeyboardInterrupt):
+        fit(replays, interrupted_at(0.0))

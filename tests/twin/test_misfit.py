@@ -1,4 +1,4 @@
-"""What a replay leaves of a recording: of each channel what is that channel's own."""
+"""Residuals of a replay: each channel has the part that is its own."""
 
 from __future__ import annotations
 
@@ -16,13 +16,11 @@ from hdbridge.records.record import Record
 from hdbridge.records.recording import Recording
 from hdbridge.sim.exercise import Exercise
 from hdbridge.sim.truth import Truth
-from hdbridge.twin.comparison import FOLLOWING_ERROR, LOAD_ERROR, compare
-from hdbridge.twin.least_squares import solve
-from hdbridge.twin.misfit import prepare, remembers, residuals
-from hdbridge.twin.noise import scales
+from hdbridge.twin.compare import FOLLOWING_ERROR, LOAD_ERROR, compare
+from hdbridge.twin.fit import solve
+from hdbridge.twin.misfit import Replays, prepare, remembers, residuals, scales
 from hdbridge.twin.parameters import BY_NAME, FOLLOWING, LOAD, TORQUE, coordinates, with_values
 from hdbridge.twin.replay import replay_directly
-from hdbridge.twin.replays import Replays
 
 DEMO = Path(__file__).parents[2] / "profiles" / "demo"
 AXIS = AxisConfig.load(DEMO)

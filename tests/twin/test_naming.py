@@ -1,4 +1,4 @@
-"""What is named after a fit, on residuals that are known functions of the plant's parameters."""
+"""Names after a fit, on residuals that are known functions of the plant's parameters."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ import numpy as np
 
 from hdbridge.effects import FloatArray
 from hdbridge.sim.truth import Truth
-from hdbridge.twin.least_squares import fitted_rows, legs_of_rows, solve
+from hdbridge.twin.fit import fitted_rows, legs_of_rows, solve
+from hdbridge.twin.misfit import Scales
 from hdbridge.twin.naming import Alike, Finding, alike, name_causes
-from hdbridge.twin.noise import Scales
 from hdbridge.twin.parameters import BY_NAME, FOLLOWING, LOAD, TORQUE, coordinates, with_values
 
 TRUTH = Truth.load(Path(__file__).parents[2] / "profiles" / "demo")
@@ -58,7 +58,7 @@ class Known:
 
 
 def named(axis: Truth, quick: float) -> tuple[tuple[Finding, ...], tuple[Alike, ...]]:
-    """What is said of an axis by a fit that begins at `TRUTH`; and what its slopes cannot tell apart."""
+    """Findings about an axis from a fit that starts at `TRUTH`, and those that slopes cannot separate."""
     replays: Any = Known(axis, quick)
     parameters = tuple(BY_NAME[name] for name in NAMES)
     prior = np.array(coordinates(TRUTH, parameters))

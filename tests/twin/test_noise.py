@@ -14,10 +14,18 @@ from hdbridge.axis import AxisConfig
 from hdbridge.records.recording import Recording
 from hdbridge.sim.exercise import Exercise
 from hdbridge.sim.truth import Truth
-from hdbridge.twin.misfit import CHANNELS, Data, demand_deg, prepare, traces_of
-from hdbridge.twin.noise import noise_floor, noise_in_motion, scales
+from hdbridge.twin.misfit import (
+    CHANNELS,
+    Data,
+    demand_deg,
+    noise_floor,
+    noise_in_motion,
+    prepare,
+    scales,
+    traces_of,
+    what_is_left,
+)
 from hdbridge.twin.parameters import FOLLOWING, LOAD, TORQUE
-from hdbridge.twin.verdict import what_is_left
 
 DEMO = Path(__file__).parents[2] / "profiles" / "demo"
 NOISE = {FOLLOWING: 0.5, TORQUE: 0.02, LOAD: 7.0}

@@ -7,8 +7,7 @@ from pathlib import Path
 import pytest
 
 from hdbridge.sim.truth import Truth
-from hdbridge.twin.defaults import with_sections
-from hdbridge.twin.loop_laws import by_each_law
+from hdbridge.twin.fit import by_each_law
 from hdbridge.twin.parameters import (
     BY_NAME,
     PARAMETERS,
@@ -16,6 +15,7 @@ from hdbridge.twin.parameters import (
     at_coordinates,
     coordinates,
     value_in,
+    with_sections,
     with_values,
 )
 

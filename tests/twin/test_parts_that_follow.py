@@ -16,11 +16,9 @@ from hdbridge.records.record import Record
 from hdbridge.records.recording import Recording
 from hdbridge.sim.lockstep import simulated_bench
 from hdbridge.sim.truth import Truth
-from hdbridge.twin.commands import commands_of
 from hdbridge.twin.misfit import prepare, residuals
 from hdbridge.twin.parameters import LOAD
-from hdbridge.twin.replay import replay, replay_directly
-from hdbridge.twin.stretches import continuous
+from hdbridge.twin.replay import commands_of, continuous, replay, replay_directly
 
 DEMO = Path(__file__).parents[2] / "profiles" / "demo"
 AXIS = AxisConfig.load(DEMO)

@@ -1,4 +1,4 @@
-"""What a fit begins with: read off a recording without any replay."""
+"""Starting values of a fit, read off a recording without any replay."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from hdbridge.axis import AxisConfig
 from hdbridge.records.recording import Recording
 from hdbridge.sim.exercise import Exercise
 from hdbridge.sim.truth import Truth
+from hdbridge.twin.fit import read_off
 from hdbridge.twin.misfit import prepare
 from hdbridge.twin.parameters import with_values
-from hdbridge.twin.regressions import read_off
 
 DEMO = Path(__file__).parents[2] / "profiles" / "demo"
 AXIS = AxisConfig.load(DEMO)

@@ -13,9 +13,8 @@ from hdbridge.axis import AxisConfig
 from hdbridge.records.recording import Recording
 from hdbridge.sim.exercise import Exercise
 from hdbridge.sim.truth import Truth
-from hdbridge.twin.misfit import prepare
+from hdbridge.twin.misfit import Replays, prepare
 from hdbridge.twin.parameters import with_values
-from hdbridge.twin.replays import Replays
 
 DEMO = Path(__file__).parents[2] / "profiles" / "demo"
 WORK = """
@@ -24,7 +23,7 @@ from hdbridge.axis import AxisConfig
 from hdbridge.records.recording import Recording
 from hdbridge.sim.truth import Truth
 from hdbridge.twin.misfit import prepare
-from hdbridge.twin.replays import Replays
+from hdbridge.twin.misfit import Replays
 truth = Truth.load(sys.argv[1])
 data = prepare(Recording.load(sys.argv[2]), AxisConfig.load(sys.argv[1]), truth)
 with Replays(data, 2) as replays:

@@ -1,4 +1,4 @@
-"""Where an axis stands in a recording, and what the recording tells of it there."""
+"""Rests of an axis in a recording, and the values that they give."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from hdbridge.records.record import Record, concatenate
-from hdbridge.twin.stretches import HELD_S, LARGEST_UNKNOWN, held_rows, stands, unknown_rows
+from hdbridge.twin.replay import HELD_S, LARGEST_UNKNOWN, held_rows, stands, unknown_rows
 
 CYCLE_S = 0.01
 COUNT_DEG = 0.045

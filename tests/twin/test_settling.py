@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from hdbridge.twin.comparison import band_arcsec, overshoot_arcsec, scatter_s, settling_s
+from hdbridge.twin.compare import band_arcsec, overshoot_arcsec, scatter_s, settling_s
 
 TIME_S = np.arange(250) * 0.004
 HZ, DECAY_S = 20.0, 0.15

@@ -12,7 +12,7 @@ from hdbridge.records.record import Record
 from hdbridge.records.recording import Recording, Segment
 from hdbridge.sim.truth import Truth
 from hdbridge.twin.misfit import coarse, prepare
-from hdbridge.twin.stretches import stretches
+from hdbridge.twin.replay import stretches
 
 DEMO = Path(__file__).parents[2] / "profiles" / "demo"
 CYCLE_S = 0.01

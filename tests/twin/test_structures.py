@@ -18,17 +18,23 @@ from hdbridge.drive.drive import Drive
 from hdbridge.procedures.plan import Plan
 from hdbridge.records.recording import Recording
 from hdbridge.sim.truth import Truth
-from hdbridge.twin.comparison import compare
-from hdbridge.twin.defaults import default_truth
-from hdbridge.twin.least_squares import Fitted
-from hdbridge.twin.misfit import CHANNELS, Data, prepare, residuals
-from hdbridge.twin.parameters import BY_NAME, at_coordinates, coordinates
-from hdbridge.twin.regressions import start_of
+from hdbridge.twin.compare import compare
+from hdbridge.twin.fit import Fitted, in_best_structure, start_of
+from hdbridge.twin.misfit import (
+    CHANNELS,
+    Data,
+    Replays,
+    Values,
+    counted,
+    misfit,
+    prepare,
+    residuals,
+    units,
+    values_of,
+    what_is_left,
+)
+from hdbridge.twin.parameters import BY_NAME, at_coordinates, coordinates, default_truth
 from hdbridge.twin.replay import replay_directly
-from hdbridge.twin.replays import Replays
-from hdbridge.twin.result import Values
-from hdbridge.twin.structures import fit_structures, misfit, seen, units
-from hdbridge.twin.verdict import values_of, what_is_left
 
 MOTION = """
 schema: hdbridge.plan/1
@@ -110,7 +116,8 @@ def plain_fit(data: Data, start: Truth, steps: int = 25) -> Truth:
     parameters = tuple(BY_NAME[name] for name in PLAIN)
     spread = np.array([each.spread for each in parameters])
     low, high = np.array([each.bounds for each in parameters]).T
-    scale, rows = units(data), seen(data)
+    scale = units(data)
+    rows = {name: (each > 0.0) & (data.out == 0.0) for name, each in counted(data).items()}
 
     def left(place: np.ndarray) -> np.ndarray:
         found = residuals(data, at_coordinates(truth, parameters, place.tolist()))
@@ -157,7 +164,7 @@ def test_a_twin_follows_a_foreign_servo_and_is_never_worse_than_a_plain_fit(
     axis = recorded(structure, 3, tmp_path)
     data = prepare(axis.fitted, axis.axis, axis.start)
     with Replays(data, 1) as replays:
-        found: Fitted = fit_structures(replays, axis.start)
+        found: Fitted = in_best_structure(replays, start_of(axis.start, data))
     plain = plain_fit(data, start_of(axis.start, data))
     assert misfit(data, found.residuals) < 1.02 * misfit(data, residuals(data, plain))
     twin, reference = shares(axis, found.truth), shares(axis, plain)

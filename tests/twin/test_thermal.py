@@ -14,10 +14,9 @@ from hdbridge.sim.exercise import Exercise
 from hdbridge.sim.machine import Machine
 from hdbridge.sim.truth import Truth
 from hdbridge.sim.truth.truth import TrueTemperature
-from hdbridge.twin.least_squares import Fitted, solve
-from hdbridge.twin.misfit import prepare
+from hdbridge.twin.fit import Fitted, solve
+from hdbridge.twin.misfit import Replays, prepare
 from hdbridge.twin.parameters import BY_NAME, coordinates
-from hdbridge.twin.replays import Replays
 from hdbridge.twin.thermal import THERMAL, with_warmth
 
 DEMO = Path(__file__).parents[2] / "profiles" / "demo"

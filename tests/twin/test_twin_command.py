@@ -20,13 +20,12 @@ from hdbridge.model import TransmissionModel
 from hdbridge.records.recording import Recording, Segment
 from hdbridge.sim.exercise import Exercise
 from hdbridge.sim.truth import Truth
-from hdbridge.twin.comparison import compare
-from hdbridge.twin.kept import KeptTwin
+from hdbridge.twin.compare import compare
+from hdbridge.twin.misfit import Left
 from hdbridge.twin.naming import Finding, Moved
 from hdbridge.twin.parameters import with_values
 from hdbridge.twin.replay import replay_directly
-from hdbridge.twin.result import Left, Twin
-from hdbridge.twin.verdict import impossible
+from hdbridge.twin.twin import KeptTwin, Twin, impossible
 
 DEMO = Path(__file__).parents[2] / "profiles" / "demo"
 
@@ -191,7 +190,7 @@ def fitted(truth: Truth, values: str = "axis", times_noise: float = 2.5) -> Call
 def test_a_twin_that_is_better_is_kept_as_pending_with_all_that_is_known(
     profile: Path, recording: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("hdbridge.twin.making.fit_twin", fitted(Truth.load(DEMO)))
+    monkeypatch.setattr("hdbridge.twin.twin.fit_twin", fitted(Truth.load(DEMO)))
     done = run_here(profile, "twin", profile, recording, "--json", "told.json", "--html", "page.html")
     assert done.returncode == 0, done.stderr
     assert "friction: Coulomb friction 0.068 -> 0.034 Nm" in done.stdout
@@ -213,7 +212,7 @@ def test_a_twin_that_is_better_is_kept_as_pending_with_all_that_is_known(
 def test_a_twin_that_is_no_better_is_not_kept(
     profile: Path, recording: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("hdbridge.twin.making.fit_twin", fitted(Truth.load(profile)))
+    monkeypatch.setattr("hdbridge.twin.twin.fit_twin", fitted(Truth.load(profile)))
     done = run_here(profile, "twin", profile, recording, "--json", "told.json", "--html", "page.html")
     assert done.returncode == 0, done.stderr
     assert "not kept" in done.stdout
@@ -229,7 +228,7 @@ def test_a_twin_that_is_no_better_is_not_kept(
 def test_values_that_are_not_the_axis_s_are_offered_as_a_replay_only(
     profile: Path, recording: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("hdbridge.twin.making.fit_twin", fitted(Truth.load(DEMO), "replay", 22.0))
+    monkeypatch.setattr("hdbridge.twin.twin.fit_twin", fitted(Truth.load(DEMO), "replay", 22.0))
     done = run_here(profile, "twin", profile, recording, "--json", "told.json", "--html", "page.html")
     assert done.returncode == 0, done.stderr
     headline = (
@@ -261,7 +260,7 @@ def test_values_that_no_axis_has_are_refused(
         ({"motor inertia": 1e-3}, "motor inertia 0.001 kg m2; expected within a decade"),
         ({"load inertia": 10.0}, "load inertia seen by the motor"),
     ):
-        monkeypatch.setattr("hdbridge.twin.making.fit_twin", fitted(with_values(demo, values), "replay"))
+        monkeypatch.setattr("hdbridge.twin.twin.fit_twin", fitted(with_values(demo, values), "replay"))
         done = run_here(profile, "twin", profile, recording)
         assert done.returncode == 0, done.stderr
         assert done.stdout.startswith("The twin is not kept: no axis has these values:")
@@ -275,7 +274,7 @@ def test_values_that_no_axis_has_are_refused(
 def test_from_usual_values_a_fit_gives_estimates_and_no_changes(
     profile: Path, recording: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("hdbridge.twin.making.fit_twin", fitted(Truth.load(DEMO)))
+    monkeypatch.setattr("hdbridge.twin.twin.fit_twin", fitted(Truth.load(DEMO)))
     done = run_here(profile, "twin", profile, recording, "--afresh", "--json", "told.json")
     assert done.returncode == 0, done.stderr
     assert "estimate: Coulomb friction 0.034 Nm (0.033 to 0.035)" in done.stdout

@@ -57,7 +57,7 @@ SETTLE_S: Final = 20.0
 """In which an axis is enabled again after whatever has stopped it."""
 SPAN_DEG: Final = 20.0
 FAULT_SHARE: Final = 0.12
-"""Of what happens."""
+"""Counts of the events of a day."""
 
 
 Say = Callable[[dict[str, float]], None]
@@ -107,7 +107,7 @@ class Told:
 
 
 class Story:
-    """What happens to the axis, drawn by chance."""
+    """Draws the events of the axis at random."""
 
     def __init__(self, service: Service, bridge: ServiceBridge, seed: int) -> None:
         self.service, self.bridge = service, bridge
@@ -131,7 +131,7 @@ class Story:
         return self.chance.uniform(-SPAN_DEG, SPAN_DEG)
 
     async def fill(self) -> None:
-        """What keeps the newest only is full before anything is measured: the log, answers to commands."""
+        """Fills the buffers that keep the newest entries only: the log, answers to commands."""
         for _ in range(KEPT):
             self.bridge.core.log.note("the log is full")
         for _ in range(ANSWERS_KEPT):
@@ -286,7 +286,7 @@ class Story:
 
 
 def look(clock_s: float, began_s: float) -> dict[str, float]:
-    """What this process holds now, after a collection."""
+    """Returns the memory of this process, after a garbage collection."""
     gc.collect()
     status = Path("/proc/self/status").read_text(encoding="ascii")
     resident = next(line for line in status.splitlines() if line.startswith("RssAnon"))

@@ -51,6 +51,21 @@ class TrueNotch(Part):
     width: float = Field(gt=0, le=10, description="bandwidth over the frequency")
 
 
+class TrueResponse(Part):
+    """Measured response in addition to the loops, by cycle: the latest one first."""
+
+    cycle_ms: float = Field(gt=0, le=1_000, description="control cycle of the responses")
+    demand_ms: tuple[float, ...] = Field(
+        (), max_length=4096, description="added to the demand, per speed of the command"
+    )
+    torque_nm_s_per_rad: tuple[float, ...] = Field(
+        (), max_length=4096, description="added to the reported torque, per speed of the command"
+    )
+    torque_nm: tuple[float, ...] = Field(
+        (), max_length=4096, description="added to it in the direction of the command"
+    )
+
+
 class TrueServo(Part):
     """Loops of the drive: position and velocity cascade with feed-forward, limited in torque."""
 
@@ -98,3 +113,6 @@ class TrueServo(Part):
     )
     dead_time_ms: float = Field(0.0, ge=0, le=100, description="age of the demand when the loops take it in")
     torque_limit_percent: float = Field(gt=0, le=1_000, description="highest torque, of the rated one")
+    response: TrueResponse | None = Field(
+        None, description="what a drive of another make does in addition; without it: nothing"
+    )

@@ -133,7 +133,7 @@ def machine_of(folder: Path, axis: dict[str, Any], machine: dict[str, Any]) -> M
 
 
 def content(machine: Machine) -> str:
-    """All that the files say, whatever is at its default."""
+    """Returns the content of the files, defaults included."""
     axes = [
         (each.config.model_dump_json(), each.compensation, each.adaptation, each.load_loop)
         for each in machine.axes

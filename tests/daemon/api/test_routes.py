@@ -1,4 +1,4 @@
-"""What each route asks of the machine, and how it answers."""
+"""Request of each route to the machine, and its answer."""
 
 import json
 
@@ -132,7 +132,7 @@ def test_the_kernel_says_who_takes_the_lease_without_a_name(api):
 
 
 def test_a_move_that_is_waited_for_keeps_the_lease(api):
-    """It would run out before the axis is there."""
+    """The lease would run out before the axis arrives."""
     bridge = api.bridge
     bridge.lease = type(bridge.lease)(1.5, bridge.lease._now)
     token = bridge.lease.take("patience")

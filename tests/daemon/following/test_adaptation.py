@@ -1,4 +1,4 @@
-"""What the adaptation of an axis does and never does, on work that is not simulated (see test_following)."""
+"""Adaptation of an axis, and its limits, on work that is not simulated (see test_following)."""
 
 from typing import Any
 

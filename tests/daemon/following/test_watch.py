@@ -47,7 +47,7 @@ def with_order(number, amplitude_arcsec):
 
 
 def watched(truth, duration_s=900.0, seed=0, change=None, model=MODEL, batch=250, path=None):
-    """What a watch raises over an axis at work."""
+    """Returns the remarks of a watch over an axis at work."""
     path = moves_and_rests(duration_s, PERIOD_S, seed) if path is None else path
     samples = SampleMaker(AXIS, MODEL, truth, seed).make(path)
     if change is not None:

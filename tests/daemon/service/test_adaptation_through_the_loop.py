@@ -84,7 +84,7 @@ async def work(bridge: ServiceBridge, token: str, stands: int, seed: int = 0) ->
 
 
 def offset_arcsec(bridge: ServiceBridge) -> float:
-    """Of the model that compensates."""
+    """Identifier of the compensating model."""
     effects = bridge.axes["axis1"].models.in_use.compensating.effects
     return next(each.offset_arcsec for each in effects if isinstance(each, Hysteresis))
 

@@ -57,7 +57,7 @@ class Disorder(RuleBasedStateMachine):
         self.run(self.bridge.core.timing.sleep(seconds))
 
     def ask(self, token: str, request: Callable[[str], Awaitable[Any]]) -> bool:
-        """Whether it was done. Refused with words, or not at all; without the lease never done."""
+        """Returns True if the request was carried out. It is refused with a reason without the lease."""
         holds = self.bridge.lease.holds(token)
 
         async def asked() -> Any:

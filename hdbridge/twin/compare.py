@@ -1,0 +1,465 @@
+"""Comparison of a measured and a simulated record of the same commands.
+
+Each difference is given with the noise of the measured channel, which is the best that a simulation can
+reach. Pure.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hdbridge.effects import Channel, FloatArray
+from hdbridge.errors import InputError
+from hdbridge.records.record import Record
+from hdbridge.records.recording import Segment
+from hdbridge.twin.replay import STANDS_COUNTS, stands, unknown_rows
+from hdbridge.units import ARCSEC_PER_DEG
+
+# ----------------------------------------------------------------
+# Two records of a signal over time, and their spectra. Pure.
+
+SPECTRUM_SAMPLES: Final = 1024
+SHORTEST: Final = 32
+"""Minimum samples of a part for a spectrum."""
+
+
+@dataclass(frozen=True, eq=False)
+class Trace:
+    """A signal of both records over time."""
+
+    time_s: FloatArray
+    measured: FloatArray
+    simulated: FloatArray
+
+    @property
+    def difference(self) -> FloatArray:
+        """Measured minus simulated."""
+        return self.measured - self.simulated
+
+
+@dataclass(frozen=True, eq=False)
+class Spectrum:
+    """Amplitude density by frequency, in the signal's unit per root hertz."""
+
+    frequency_hz: FloatArray
+    measured: FloatArray
+    simulated: FloatArray
+    difference: FloatArray
+
+
+def spectrum_of(trace: Trace, parts: Sequence[slice]) -> Spectrum | None:
+    """Estimates the spectrum over the parts by Welch's method; None if all parts are too short."""
+    steps = np.concatenate([np.diff(trace.time_s[part]) for part in parts])
+    period_s = float(np.median(steps)) if len(steps) else 0.0
+    if period_s <= 0.0:
+        return None
+    longest = max(parts, key=lambda part: part.stop - part.start)
+    length = min(SPECTRUM_SAMPLES, longest.stop - longest.start)
+    if length < SHORTEST:
+        return None
+    from scipy.signal import welch  # noqa: PLC0415 - takes a second to load
+
+    powers: list[FloatArray] = []
+    weights: list[int] = []
+    frequency = np.empty(0)
+    for part in parts:
+        time_s = trace.time_s[part]
+        if len(time_s) < length:
+            continue
+        grid = np.arange(time_s[0], time_s[-1], period_s)
+        if len(grid) < length:
+            continue
+        values = (trace.measured[part], trace.simulated[part], trace.difference[part])
+        even = np.stack([np.interp(grid, time_s, each) for each in values])
+        frequency, power = welch(even, 1.0 / period_s, nperseg=length, detrend="linear")
+        powers.append(power)
+        weights.append(len(grid))
+    if not powers:
+        return None
+    mean = np.average(np.stack(powers), axis=0, weights=weights)
+    return Spectrum(frequency, *np.sqrt(mean))
+
+
+# ----------------------------------------------------------------
+# Settling time of the load after a stop, and its scatter by noise. Pure.
+
+SETTLED_ARCSEC: Final = 10.0
+"""Amplitude about the rest position below which a load has settled: three motor counts (8000, ratio 50)."""
+SETTLED_NOISE: Final = 5.0
+"""The same in units of the load reading's noise, if that is larger."""
+OVER_S: Final = 0.04
+"""Window of the rms amplitude: half a period of the slowest ringing, 15 Hz."""
+SHORTEST_SWING: Final = 4
+DRAWS: Final = 24
+
+
+def band_arcsec(noise_arcsec: float) -> float:
+    """Returns the amplitude below which a load with this noise has settled."""
+    return max(SETTLED_ARCSEC, SETTLED_NOISE * noise_arcsec)
+
+
+def settling_s(time_s: FloatArray, load_arcsec: FloatArray, noise_arcsec: float, band: float) -> float:
+    """Returns the time from the first sample, when the command stops, until the load stays settled."""
+    length = min(max(SHORTEST_SWING, round(OVER_S / float(np.median(np.diff(time_s))))), len(time_s))
+    squares = np.square(load_arcsec - _rest_arcsec(load_arcsec))
+    swing = 2.0 * (np.convolve(squares, np.full(length, 1.0 / length), mode="valid") - noise_arcsec**2)
+    outside = np.flatnonzero(swing > band**2)
+    return float(time_s[outside[-1] + 1] - time_s[0]) if len(outside) else 0.0
+
+
+def scatter_s(
+    time_s: FloatArray, load_arcsec: FloatArray, noise_arcsec: float, band: float, noises: Sequence[float]
+) -> float:
+    """Returns the rms difference of two settling times of this motion that noise of these sizes causes."""
+    rng = np.random.default_rng(0)
+    own = settling_s(time_s, load_arcsec, noise_arcsec, band)
+    squares = 0.0
+    for each in noises:
+        for _ in range(DRAWS):
+            noisy = load_arcsec + each * rng.standard_normal(len(load_arcsec))
+            squares += (settling_s(time_s, noisy, float(np.hypot(noise_arcsec, each)), band) - own) ** 2
+    return float(np.sqrt(squares / DRAWS))
+
+
+def overshoot_arcsec(load_arcsec: FloatArray, way: float) -> float:
+    """Returns the overshoot beyond the rest position; ``way`` is the sign of the motion before."""
+    return max(0.0, float(np.max(way * (load_arcsec - _rest_arcsec(load_arcsec)))))
+
+
+def _rest_arcsec(load_arcsec: FloatArray) -> float:
+    return float(np.mean(load_arcsec[-max(SHORTEST_SWING, len(load_arcsec) // 4) :]))
+
+
+# ----------------------------------------------------------------
+
+Rows = NDArray[np.bool_]
+ALL: Final = "all"
+"""Kind of leg for the whole record."""
+LOAD_ERROR, FOLLOWING_ERROR, MOTOR_TORQUE = "load_error", "following_error", "motor_torque"
+TEMPERATURE: Final = "temperature"
+SETTLING_TIME, OVERSHOOT = "settling_time", "overshoot"
+NOISE_AT_REST, NOISE_IN_MOTION = "noise_at_rest", "noise_in_motion"
+UNITS: Final[Mapping[str, str]] = {
+    LOAD_ERROR: "arcsec", FOLLOWING_ERROR: "motor deg", MOTOR_TORQUE: "Nm",
+    TEMPERATURE: "\N{DEGREE SIGN}C", SETTLING_TIME: "s", OVERSHOOT: "arcsec",
+}  # fmt: skip
+TITLES: Final[Mapping[str, str]] = {
+    LOAD_ERROR: "load error", FOLLOWING_ERROR: "following error", MOTOR_TORQUE: "motor torque",
+    TEMPERATURE: "temperature", SETTLING_TIME: "settling time", OVERSHOOT: "overshoot",
+    NOISE_AT_REST: "noise at rest", NOISE_IN_MOTION: "noise in motion",
+}  # fmt: skip
+
+STAND_S: Final = 0.2
+"""Minimum rest of the command after a motion for a stop to count."""
+SIGHT_S: Final = 1.0
+"""Maximum time after a stop in which settling is evaluated; such servo axes settle in tenths of it."""
+CALM_S: Final = 0.3
+"""Time at rest after which the ringing of a stop has ended and only noise remains."""
+MOVING_DEG_S: Final = 0.05
+"""Motor speed above which the command counts as moving."""
+LEAST_SAMPLES: Final = 8
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """One figure of both records for one kind of motion."""
+
+    channel: str
+    """A signal, `settling_time`, `overshoot`, or `noise_at_rest:` and `noise_in_motion:` with a signal."""
+    kind: str
+    """Kind of the legs, or `ALL`."""
+    unit: str
+    measured: float
+    """Rms of a signal (the load error's about its mean); mean of a settling time or overshoot; a noise."""
+    simulated: float
+    difference: float
+    """Rms difference of samples or stops; for a noise, the absolute difference."""
+    noise: float
+    """Difference expected between two equal axes: the noise of the measured channel or of the figure."""
+    count: int
+    """Number of samples or stops."""
+
+    @property
+    def in_noise(self) -> float:
+        """Difference in units of the noise; infinite without noise."""
+        return self.difference / self.noise if self.noise else math.inf if self.difference else 0.0
+
+    @property
+    def share(self) -> float:
+        """Difference as a share of the measured value."""
+        return self.difference / self.measured if self.measured else math.inf if self.difference else 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """Figures, traces and spectra of a measured and a simulated record."""
+
+    rows: tuple[Row, ...]
+    traces: Mapping[str, Trace]
+    """Figures by signal."""
+    spectra: Mapping[str, Spectrum]
+
+    def row(self, channel: str, kind: str = ALL) -> Row | None:
+        """Returns the figure of a channel, or None if the records do not have it."""
+        return next((each for each in self.rows if (each.channel, each.kind) == (channel, kind)), None)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Returns the figures for JSON."""
+        return {
+            "figures": [
+                {
+                    "channel": each.channel,
+                    "kind": each.kind,
+                    "unit": each.unit,
+                    "measured": each.measured,
+                    "simulated": each.simulated,
+                    "difference": each.difference,
+                    "noise": each.noise,
+                    "count": each.count,
+                }
+                for each in self.rows
+            ]
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class _Signals:
+    """Signals of one record; arrays of shape (n,)."""
+
+    time_s: FloatArray
+    command_deg: FloatArray
+    load_arcsec: FloatArray
+    """The load's reading."""
+    by_name: Mapping[str, FloatArray]
+
+
+def compare(measured: Record, simulated: Record, legs: Sequence[Segment], ratio: float) -> Comparison:
+    """Compares two records by kind of leg and as a whole.
+
+    Both records must have the same rows. Offsets between the encoders' zeros, and between command and motor
+    at rest, are removed in each part of the measured record. Rows in which the load may still ring from an
+    unknown motion are excluded, and so is the torque of a motor at standstill. InputError if the numbers of
+    rows differ or there is no command.
+    """
+    if len(measured) != len(simulated):
+        raise InputError(
+            f"{len(measured)} rows were measured and {len(simulated)} simulated; expected one for one"
+        )
+    if measured.motor_target_deg is None or simulated.motor_target_deg is None:
+        raise InputError(
+            f"{measured.source or 'the record'}: no column motor_target_deg; expected the command in each row"
+        )
+    ends = (*measured.starts[1:], len(measured))
+    parts = [slice(start, end) for start, end in zip(measured.starts, ends, strict=True)]
+    real, twin = _signals(measured, ratio, parts), _signals(simulated, ratio, parts)
+    shared = [name for name in real.by_name if name in twin.by_name]
+    for part in parts:
+        offset = np.median(real.by_name[LOAD_ERROR][part] - twin.by_name[LOAD_ERROR][part])
+        twin.by_name[LOAD_ERROR][part] += offset
+    moves = _moving(real, parts)
+    calm = ~moves & (_since_motion_s(real.time_s, moves, parts) > CALM_S)
+    for part in parts:
+        if np.count_nonzero(calm[part]) >= LEAST_SAMPLES:
+            apart = real.by_name[FOLLOWING_ERROR][part] - twin.by_name[FOLLOWING_ERROR][part]
+            twin.by_name[FOLLOWING_ERROR][part] += np.median(apart[calm[part]])
+    motor = measured.motor_position_deg
+    count_deg = least_change(np.concatenate([np.diff(motor[part]) for part in parts]), motor)
+    groups = _groups(measured.time_s, legs, ~unknown_rows(measured, count_deg))
+    goes = ~_stands(measured, parts, count_deg)
+    rows = [
+        row
+        for kind, inside in groups.items()
+        for name in shared
+        for compared in (inside & goes if name == MOTOR_TORQUE else inside,)
+        for row in _of_signal(name, kind, compared, (inside & calm, inside & moves), real, twin, parts)
+    ]
+    stops = list(_stops(real, twin, parts))
+    for kind, inside in groups.items():
+        rows += _of_stops(kind, [stop for stop in stops if inside[stop.moved]], real.time_s)
+    traces = {name: Trace(real.time_s, real.by_name[name], twin.by_name[name]) for name in shared}
+    swings = (name for name in shared if name != TEMPERATURE)
+    spectra = {name: found for name in swings if (found := spectrum_of(traces[name], parts)) is not None}
+    return Comparison(tuple(rows), traces, spectra)
+
+
+def _signals(record: Record, ratio: float, parts: Sequence[slice]) -> _Signals:
+    command = record.motor_target_deg
+    assert command is not None
+    error = record.transmission_error_arcsec(ratio).copy()
+    for part in parts:
+        error[part] -= np.mean(error[part])
+    by_name = {LOAD_ERROR: error, FOLLOWING_ERROR: command - record.motor_position_deg}
+    for name, channel in ((MOTOR_TORQUE, Channel.MOTOR_TORQUE), (TEMPERATURE, Channel.TEMPERATURE)):
+        column = record.columns.get(channel.value)
+        if column is not None:
+            by_name[name] = column
+    return _Signals(record.time_s, command, record.load_position_deg * ARCSEC_PER_DEG, by_name)
+
+
+def _groups(time_s: FloatArray, legs: Sequence[Segment], known: Rows) -> dict[str, Rows]:
+    """Returns the mask of the known rows of each kind of leg, the whole record first."""
+    groups = {ALL: known}
+    for leg in legs:
+        inside = groups.setdefault(leg.kind, np.zeros(len(time_s), dtype=np.bool_))
+        inside |= known & (time_s >= leg.start_s) & (time_s <= leg.end_s)
+    return {kind: inside for kind, inside in groups.items() if np.count_nonzero(inside) >= LEAST_SAMPLES}
+
+
+def _moving(real: _Signals, parts: Sequence[slice]) -> Rows:
+    """Returns the mask of rows in which the command moves."""
+    moves = np.zeros(len(real.time_s), dtype=np.bool_)
+    for part in parts:
+        if part.stop - part.start > 1:
+            step = np.maximum(np.diff(real.time_s[part]), 1e-9)
+            speed = np.abs(np.diff(real.command_deg[part])) / step
+            moves[part] = np.concatenate([speed[:1], speed]) > MOVING_DEG_S
+    return moves
+
+
+def _since_motion_s(time_s: FloatArray, moves: Rows, parts: Sequence[slice]) -> FloatArray:
+    """Returns the time since the command last moved, by part; infinite before its first motion."""
+    since = np.full(len(time_s), np.inf)
+    for part in parts:
+        rows = np.where(moves[part], np.arange(part.start, part.stop), -1)
+        last = np.maximum.accumulate(rows)
+        seen = np.flatnonzero(last >= 0)
+        since[part.start + seen] = time_s[part.start + seen] - time_s[last[seen]]
+    return since
+
+
+def _of_signal(
+    name: str,
+    kind: str,
+    inside: Rows,
+    rest_and_motion: tuple[Rows, Rows],
+    real: _Signals,
+    twin: _Signals,
+    parts: Sequence[slice],
+) -> Iterator[Row]:
+    one, other = real.by_name[name], twin.by_name[name]
+    unit = UNITS[name]
+    if count := int(np.count_nonzero(inside)):
+        apart = rms(one[inside] - other[inside])
+        noise = noise_of(one, inside, parts)
+        if name == TEMPERATURE:
+            # A replay starts at a reading, so both roundings add up to one step at most. A constant reading
+            # does not show its step.
+            noise *= math.sqrt(12.0)
+            if not noise:
+                return
+        yield Row(name, kind, unit, rms(one[inside]), rms(other[inside]), apart, noise, count)
+    for channel, which in zip((NOISE_AT_REST, NOISE_IN_MOTION), rest_and_motion, strict=True):
+        count = int(np.count_nonzero(which))
+        if count < LEAST_SAMPLES or name == TEMPERATURE:
+            continue
+        theirs, ours = noise_of(one, which, parts), noise_of(other, which, parts)
+        apart = abs(theirs - ours)
+        yield Row(
+            f"{channel}:{name}", kind, unit, theirs, ours, apart, theirs / math.sqrt(2.0 * count), count
+        )
+
+
+def noise_of(values: FloatArray, which: Rows, parts: Sequence[slice]) -> float:
+    """Estimates the rms noise of a signal from third differences; at least that of its resolution.
+
+    Motion that is smooth over four samples does not contribute. A resolution q makes a noise of q / sqrt(12).
+    """
+    squares = count = 0.0
+    resolution = math.inf
+    for part in parts:
+        third = np.diff(values[part], 3)
+        inside = which[part]
+        changes = np.diff(values[part])[inside[1:] & inside[:-1]]
+        resolution = min(resolution, least_change(changes, values))
+        whole = inside[3:] & inside[2:-1] & inside[1:-2] & inside[:-3]
+        squares += float(np.sum(third[whole] ** 2))
+        count += float(np.count_nonzero(whole))
+    spread = math.sqrt(squares / count / 20.0) if count else 0.0
+    return max(spread, resolution / math.sqrt(12.0) if math.isfinite(resolution) else 0.0)
+
+
+def _stands(measured: Record, parts: Sequence[slice], count_deg: float) -> Rows:
+    """Returns the mask of rows at standstill, where the torque depends on a thousandth of a count."""
+    target, motor = measured.motor_target_deg, measured.motor_position_deg
+    assert target is not None
+    still = [
+        stands(
+            np.diff(target[part], prepend=target[part.start]) != 0.0, motor[part], STANDS_COUNTS * count_deg
+        )
+        for part in parts
+    ]
+    return np.concatenate(still)
+
+
+def least_change(changes: FloatArray, values: FloatArray) -> float:
+    """Returns the smallest change of a reading above rounding errors."""
+    beyond, size = 1e-9 * float(np.max(np.abs(values), initial=1.0)), np.abs(changes)
+    return float(np.min(size, where=size > beyond, initial=math.inf))
+
+
+@dataclass(frozen=True, slots=True)
+class _Stop:
+    """One stop in both records."""
+
+    moved: int
+    """Last row of the motion before it."""
+    settled_s: tuple[float, float]
+    overshoot_arcsec: tuple[float, float]
+    noise_arcsec: float
+    scatter_s: float
+    """Rms difference of the two settling times due to noise."""
+
+
+def _stops(real: _Signals, twin: _Signals, parts: Sequence[slice]) -> Iterator[_Stop]:
+    """Yields the stops: places at which the command comes to rest after a motion and stays."""
+    moves = _moving(real, parts)
+    for part in parts:
+        edges = np.flatnonzero(moves[part][:-1] & ~moves[part][1:]) + part.start + 1
+        starts = np.flatnonzero(~moves[part][:-1] & moves[part][1:]) + part.start + 1
+        for stop in edges.tolist():
+            later = starts[starts > stop]
+            end = int(later[0]) if len(later) else part.stop
+            end = min(end, int(np.searchsorted(real.time_s, real.time_s[stop] + SIGHT_S)), part.stop)
+            if end - stop < LEAST_SAMPLES or real.time_s[end - 1] - real.time_s[stop] < STAND_S:
+                continue
+            earlier = starts[starts < stop]
+            began = int(earlier[-1]) if len(earlier) else part.start
+            way = float(np.sign(real.command_deg[stop] - real.command_deg[began]))
+            rest = np.zeros(len(real.time_s), dtype=np.bool_)
+            rest[stop + (end - stop) // 2 : end] = True
+            noises = [noise_of(each.load_arcsec, rest, [part]) for each in (real, twin)]
+            loads = [each.load_arcsec[stop:end] for each in (real, twin)]
+            times = real.time_s[stop:end]
+            band = band_arcsec(noises[0])
+            settled = [settling_s(times, *each, band) for each in zip(loads, noises, strict=True)]
+            scatter = scatter_s(times, loads[1], noises[1], band, noises)
+            beyond = [overshoot_arcsec(each, way) for each in loads]
+            yield _Stop(stop - 1, (settled[0], settled[1]), (beyond[0], beyond[1]), noises[0], scatter)
+
+
+def _of_stops(kind: str, stops: Sequence[_Stop], time_s: FloatArray) -> Iterator[Row]:
+    if not stops:
+        return
+    sample_s = float(np.median(np.diff(time_s)))
+    noise = rms(np.array([each.noise_arcsec for each in stops]))
+    scatter = rms(np.array([each.scatter_s for each in stops]))
+    for channel, pairs, own in (
+        (SETTLING_TIME, [each.settled_s for each in stops], max(sample_s, scatter)),
+        (OVERSHOOT, [each.overshoot_arcsec for each in stops], noise),
+    ):
+        values = np.array(pairs)
+        one, other = (float(each) for each in np.mean(values, axis=0))
+        yield Row(
+            channel, kind, UNITS[channel], one, other, rms(values[:, 0] - values[:, 1]), own, len(pairs)
+        )
+
+
+def rms(values: FloatArray) -> float:
+    """Returns the root of the mean square; 0 for no values."""
+    return float(np.sqrt(np.mean(values**2))) if len(values) else 0.0

@@ -1,0 +1,1364 @@
+"""Start values of a fit: linear regressions on the recordings, without replays.
+
+For any spring and loops, the motor's torque is the sum of its inertia times its acceleration, the load's
+divided by the ratio, Coulomb friction times the sign of the speed, and viscous friction times the speed. The
+load's acceleration comes from its own encoder, because it does not follow the command near its resonance. The
+motor inertia is in the regression but not used: the motor accelerates in the first milliseconds after a new
+demand, and the torque is recorded at the end of the cycle. The following error at constant speed is the speed
+times the age of the demand. The highest torque, if held for several rows, may be the drive's limit.
+
+Conversion of the gear's elastic loop between the plant's hysteresis laws.
+
+A calibration's model has one law, whose shape may differ from the gear's. Its offset is then biased, because
+the data include partial loops as well as whole ones.
+
+Least squares over replays: fits the plant's parameters from a start to a minimum of the misfit.
+
+The residuals of following error, torque and load angle are scaled by each channel's own deviation; a weak
+prior about the start holds parameters that the motion does not show. The misfit has long, narrow and curved
+valleys, because filter, dead time and feed-forwards compensate for each other. Steps with several dampings
+are therefore tried, at several lengths along a path that curves with the valley. The covariance allows for
+residuals correlated within a leg (sandwich estimator), because model errors are not white noise.
+
+Servo structures: fits for drives with loops other than those that a fit assumes first.
+
+The simulated servo is put together from blocks (`hdbridge.sim.servo`). Each fit starts at several bandwidths,
+with and without a torque feed-forward, because a servo far from the start is a minimum of its own. Blocks are
+then added one at a time, and kept if they reduce what is left of legs that the fit has not seen.
+
+Fitting the plant's parameters to recordings: regressions first, then least squares over replays.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from itertools import product
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import TypeAdapter
+from scipy.optimize import brentq, least_squares
+
+from hdbridge.analysis.intervals import NORMAL_95
+from hdbridge.analysis.linear import counted as numbered
+from hdbridge.analysis.linear import sums
+from hdbridge.effects import FloatArray
+from hdbridge.sim.hysteresis_laws import law_of
+from hdbridge.sim.truth import Truth
+from hdbridge.sim.truth.hysteresis import Hysteresis, MaxwellSlip
+from hdbridge.sim.truth.motor import TrueNotch
+from hdbridge.twin.misfit import (
+    CHANNELS,
+    FINE,
+    Data,
+    Loops,
+    Piece,
+    Replays,
+    Scales,
+    Values,
+    counted,
+    demand_deg,
+    expected,
+    least_deviation,
+    misfit,
+    noise_in_motion,
+    rooted,
+    rounding,
+    scales,
+    surprise,
+    units,
+    values_of,
+    what_is_left,
+)
+from hdbridge.twin.parameters import (
+    BY_NAME,
+    ELASTIC,
+    FOLLOWING,
+    LOAD,
+    PARAMETERS,
+    TORQUE,
+    VELOCITY_BANDWIDTH_RAD_S,
+    Parameter,
+    at_coordinates,
+    coordinates,
+    free_value,
+    value_in,
+    with_sections,
+    with_values,
+)
+from hdbridge.twin.replay import MOVING_DEG_S
+from hdbridge.units import ARCSEC_PER_DEG
+
+# ----------------------------------------------------------------
+# Start values of a fit: linear regressions on the recordings, without replays.
+
+SMOOTHED_S = 0.03
+"""Averaging time of all signals: without it, quantised angles give no usable acceleration."""
+HELD_ROWS = 3
+"""Minimum rows at the highest torque for a limit; a mere peak lasts one or two."""
+LEAST_ROWS = 50
+LEAST_SHARE = 0.15
+"""Maximum relative standard error of a coefficient that is used: a fifth of the prior's width."""
+
+
+@dataclass(frozen=True, slots=True)
+class Readings:
+    """Results of the regressions; None for values that the motion does not show."""
+
+    lag_s: float | None
+    """Age of the demand: following error over speed."""
+    load_inertia_kg_m2: float | None
+    coulomb_nm: float | None
+    viscous_nm_s_per_rad: float | None
+    held_nm: float | None
+    """Highest motor torque, if it is held while the motor moves."""
+
+
+def read_off(data: Data) -> Readings:
+    """Runs the regressions over all pieces."""
+    return Readings(_lag_s(data), *_mechanics(data), _held_nm(data))
+
+
+def start_of(truth: Truth, data: Data) -> Truth:
+    """Returns the truth with the values that the regressions give."""
+    found = read_off(data)
+    values: dict[str, float] = {}
+    load, servo = truth.load_, truth.servo
+    if found.load_inertia_kg_m2 is not None:
+        scale = found.load_inertia_kg_m2 / load.whole_inertia_kg_m2
+        values["load inertia"] = load.inertia_kg_m2 * scale
+        # Spring and damping are scaled to keep the resonance frequency of the start.
+        values["gear stiffness"] = truth.gear.stiffness_nm_per_rad * scale
+        values["gear damping"] = truth.gear.damping_nm_s_per_rad * scale
+    if found.coulomb_nm is not None:
+        values["Coulomb friction"] = found.coulomb_nm
+    if found.viscous_nm_s_per_rad is not None:
+        values["viscous friction"] = found.viscous_nm_s_per_rad
+    if found.held_nm is not None:
+        held_percent = 100.0 * found.held_nm / truth.motor.rated_torque_nm
+        if held_percent < min(servo.torque_limit_percent, data.axis.limits.torque_percent):
+            values["current limit"] = held_percent
+    if found.lag_s is not None:
+        filtered_ms = 2.0 * servo.command_filter_ms
+        dead_ms = 1e3 * found.lag_s - filtered_ms
+        if dead_ms >= 0.0:
+            values["servo dead time"] = dead_ms
+        else:
+            values |= {"servo dead time": 0.0, "command filter": max(500.0 * found.lag_s, 0.1)}
+    return with_values(truth, values)
+
+
+def _mechanics(data: Data) -> tuple[float | None, float | None, float | None]:
+    """Returns load inertia, Coulomb friction and viscous friction."""
+    tables, torques = zip(*(_torques(piece, data) for piece in data.pieces), strict=True)
+    table, torque = np.concatenate(tables), np.concatenate(torques)
+    if not table[:, -1].any():
+        table = table[:, :-1]
+    if len(torque) <= LEAST_ROWS:
+        return None, None, None
+    columns = list(table.T)
+    found = _slope(torque, columns, LEAST_SHARE)
+    if found and (found[0] is None or found[0] <= 0.0):
+        # The motor inertia is not visible: estimate the load's without it.
+        found = [None, *(_slope(torque, columns[1:], LEAST_SHARE) or [None] * 4)]
+    load, coulomb, viscous = found[1:4] if found else (None, None, None)
+    return _positive(load), _positive(coulomb), _positive(viscous)
+
+
+def _torques(piece: Piece, data: Data) -> tuple[FloatArray, FloatArray]:
+    """Returns the regressors of the motor's torque, shape (n, 5), and the torque, shape (n,).
+
+    The regressors are the accelerations of motor and load (the latter seen by the motor), direction, speed,
+    and a constant for the weight, which is unknown unless the torque on the load is recorded.
+    """
+    commands, truth = piece.commands, data.base
+    cycle_s, ratio = commands.cycle_s, truth.gear.ratio
+    width = _width(cycle_s)
+    motor = np.radians(demand_deg(commands, data.axis) - piece.measured[FOLLOWING])
+    load = np.radians(piece.measured[LOAD] / ARCSEC_PER_DEG)
+    torque = piece.measured[TORQUE]
+    weighs = np.ones(len(motor))
+    if commands.told_nm is not None:
+        weighs = np.zeros(len(motor))
+        cycles = np.arange(len(commands.told_nm) - commands.lead)
+        told = np.interp(commands.row_cycles, cycles, commands.told_nm[commands.lead :])
+        torque = torque + truth.load_.torque_sense * told / ratio
+    speed = _smoothed(np.gradient(motor, cycle_s), 3)
+    direction = np.sign(speed) * (np.abs(speed) > math.radians(MOVING_DEG_S))
+    # A linear law holds between signals that passed the same filter.
+    accelerations = [
+        np.gradient(np.gradient(_smoothed(each, width), cycle_s), cycle_s) for each in (motor, load)
+    ]
+    columns = [
+        accelerations[0], accelerations[1] / ratio, _smoothed(direction, width), _smoothed(speed, width),
+        weighs,
+    ]  # fmt: skip
+    counts = (piece.counts[TORQUE] > 0.0).astype(np.float64)
+    counts[:width] = counts[-width:] = 0.0
+    whole = _smoothed(counts, width + 2) > 1.0 - 1e-9
+    return np.stack(columns, axis=1)[whole], _smoothed(torque, width)[whole]
+
+
+def _held_nm(data: Data) -> float | None:
+    """Returns the highest torque if it is held for `HELD_ROWS`; rows at standstill do not count."""
+    told = [np.abs(piece.measured[TORQUE]) * (piece.counts[TORQUE] > 0.0) for piece in data.pieces]
+    highest = max(float(np.max(each)) for each in told)
+    for each in told:
+        there = np.concatenate([[0.0], each > highest - 0.5 * rounding(data.axis)[TORQUE], [0.0]])
+        first, end = np.flatnonzero(np.diff(there) > 0.0), np.flatnonzero(np.diff(there) < 0.0)
+        if highest > 0.0 and np.any(end - first >= HELD_ROWS):
+            return highest
+    return None
+
+
+def _lag_s(data: Data) -> float | None:
+    """Returns the ratio of following error and speed."""
+    lag_s: float | None = None
+    for _ in range(2):  # the second time with the command delayed by the lag
+        late_s = min(max(lag_s or 0.0, 0.0), 0.1)
+        rows = [_following(piece, data, late_s) for piece in data.pieces]
+        speed, following = (np.concatenate(each) for each in zip(*rows, strict=True))
+        moving = np.abs(speed) > MOVING_DEG_S
+        lag = _slope(following[moving], [speed[moving]])
+        lag_s = lag[0] if lag else None
+    return lag_s
+
+
+def _following(piece: Piece, data: Data, late_s: float) -> tuple[FloatArray, FloatArray]:
+    """Returns the speed of the command, delayed by ``late_s``, and the following error."""
+    commands = piece.commands
+    demand = demand_deg(commands, data.axis)
+    late = np.interp(commands.row_cycles - late_s / commands.cycle_s, commands.row_cycles, demand)
+    width = _width(commands.cycle_s)
+    return np.gradient(_smoothed(late, width), commands.cycle_s), _smoothed(piece.measured[FOLLOWING], width)
+
+
+def _width(cycle_s: float) -> int:
+    """Returns the number of rows to average."""
+    return max(3, round(SMOOTHED_S / cycle_s))
+
+
+def _positive(value: float | None) -> float | None:
+    return value if value is not None and value > 0.0 else None
+
+
+def _smoothed(column: FloatArray, width: int) -> FloatArray:
+    """Smooths a column with a Hann window; the ends are held."""
+    window = np.hanning(width + 2)[1:-1]
+    window /= window.sum()
+    left, right = (width - 1) // 2, width // 2
+    return np.convolve(np.pad(column, (left, right), mode="edge"), window, mode="valid")
+
+
+def _slope(
+    wanted: FloatArray, columns: list[FloatArray], least_share: float = math.inf
+) -> list[float | None] | None:
+    """Fits coefficients by least squares; None for one whose relative standard error is too large."""
+    if len(wanted) <= 2 * len(columns):
+        return None
+    table = np.stack(columns, axis=1)
+    size = np.linalg.norm(table, axis=0)
+    if not np.all(size > 0.0):
+        return None
+    scaled = table / size
+    values, *_ = np.linalg.lstsq(scaled, wanted, rcond=None)
+    left = wanted - scaled @ values
+    spread = math.sqrt(float(left @ left) / (len(wanted) - len(columns)))
+    covariance = np.linalg.pinv(scaled.T @ scaled)
+    errors = spread * np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    known = errors <= least_share * np.abs(values)
+    return [float(value) if sure else None for value, sure in zip(values / size, known, strict=True)]
+
+
+# ----------------------------------------------------------------
+# Conversion of the gear's elastic loop between the plant's hysteresis laws.
+
+LOOP: Final = ("loop offset", "loop width", "loop yield", "loop exponent")
+"""Parameters of the laws; no law has all of them."""
+LAWS: Final[tuple[dict[str, Any], ...]] = (
+    {"law": "rolling_friction", "offset_arcsec": 1.0, "width_deg": 1.0, "exponent": 1.6},
+    {"law": "bouc_wen", "offset_arcsec": 1.0, "yield_deg": 1.0},
+    {"law": "dahl", "offset_arcsec": 1.0, "yield_deg": 1.0},
+)
+"""Unit loops by the laws with few parameters; the exponent of the first is that of a published gear."""
+LONG = 20.0
+"""Travel after which each loop has reached its limit; widths."""
+_TRUE: Final[TypeAdapter[Hysteresis]] = TypeAdapter(Hysteresis)
+
+
+def loop_parameters(truth: Truth) -> tuple[Parameter, ...]:
+    """Returns the parameters that the law of this truth has."""
+    return tuple(BY_NAME[name] for name in LOOP if value_in(truth, BY_NAME[name]) is not None)
+
+
+def by_each_law(truth: Truth) -> list[Truth]:
+    """Returns the truth, and the truth with each other law; an empty list if the gear has no loop."""
+    own = truth.gear.hysteresis
+    if own is None:
+        return []
+    if own.law == "rolling_friction":
+        # A fit may reduce the loop below its initial state, which has no effect after some travel.
+        truth = _with_loop(truth, own.model_copy(update={"start_arcsec": 0.0}))
+    return [truth, *(_with_loop(truth, _like(own, each)) for each in LAWS if each["law"] != own.law)]
+
+
+def by_law_of(truth: Truth, other: Truth) -> Truth:
+    """Returns the truth with its loop converted to the law of another truth."""
+    own, law = truth.gear.hysteresis, other.gear.hysteresis
+    if own is None or law is None or own.law == law.law:
+        return truth
+    return _with_loop(truth, _like(own, next(each for each in LAWS if each["law"] == law.law)))
+
+
+def _like(own: Hysteresis, unit: dict[str, Any]) -> Hysteresis:
+    """Returns a loop of another law with the same height and the same travel to half crossing."""
+    travel_deg = _half_crossed_deg(own) / _half_crossed_deg(_TRUE.validate_python(unit))
+    size = "width_deg" if "width_deg" in unit else "yield_deg"
+    return _TRUE.validate_python(unit | {"offset_arcsec": _offset_arcsec(own), size: travel_deg})
+
+
+def _half_crossed_deg(loop: Hysteresis) -> float:
+    """Returns the motor travel after a reversal at which the error crosses zero; degrees."""
+    far_deg = LONG * _width_deg(loop)
+
+    def left(travel_deg: float) -> float:
+        law = law_of(loop, 0.0)
+        assert law is not None
+        law.advance(far_deg)
+        return law.advance(far_deg - travel_deg)
+
+    return float(brentq(left, 0.0, far_deg))
+
+
+def _offset_arcsec(loop: Hysteresis) -> float:
+    if isinstance(loop, MaxwellSlip):
+        return sum(each.limit_arcsec for each in loop.elements)
+    return loop.offset_arcsec
+
+
+def _width_deg(loop: Hysteresis) -> float:
+    if isinstance(loop, MaxwellSlip):
+        return 2.0 * max(each.yield_deg for each in loop.elements)
+    return loop.width_deg if loop.law == "rolling_friction" else loop.yield_deg
+
+
+def _with_loop(truth: Truth, loop: Hysteresis) -> Truth:
+    return truth.model_copy(update={"gear": truth.gear.model_copy(update={"hysteresis": loop})})
+
+
+# ----------------------------------------------------------------
+# Least squares over replays: fits the plant's parameters from a start to a minimum of the misfit.
+
+# ----------------------------------------------------------------
+# Uncertainty of the coordinates: information from the slopes, and a jackknife over legs.
+
+LEAST = 1e-9
+"""Regularisation of the jackknife: share of the information that a single leg cannot have alone."""
+
+
+def information_of(slopes: FloatArray, spread: FloatArray) -> FloatArray:
+    """Returns the information matrix of unit-variance residuals and the prior, shape (p, p)."""
+    return np.asarray(slopes.T @ slopes + np.diag(spread**-2.0), dtype=np.float64)
+
+
+def over_legs(rows: FloatArray, legs: FloatArray) -> FloatArray:
+    """Sums rows (n, p) over each leg, shape (legs, p), with a correction of the squares for few legs."""
+    by_leg = sums(rows, numbered(legs.astype(np.intp)))
+    return np.asarray(by_leg * np.sqrt(len(by_leg) / max(len(by_leg) - 1, 1)), dtype=np.float64)
+
+
+def principal(slopes: FloatArray, spread: FloatArray) -> FloatArray:
+    """Returns principal directions of the coordinates as columns, shape (p, p), scaled to unit information.
+
+    A long valley is one of them. The covariance may inflate each direction separately; inflating each
+    *coordinate* would lose the well-known combinations of two coordinates.
+    """
+    worth, directions = eigen(slopes, spread)
+    return np.asarray(spread[:, None] * directions / np.sqrt(worth), dtype=np.float64)
+
+
+def sandwich(slopes: FloatArray, left: FloatArray, legs: FloatArray, spread: FloatArray) -> FloatArray:
+    """Returns the covariance of the coordinates for correlated residuals within independent legs, (p, p).
+
+    It is a jackknife over legs: the shift of the fit when one leg is left out (Bell and McCaffrey, Survey
+    Methodology 28, 2002). A leg that a replay cannot follow shifts the fit in every direction that the others
+    leave open, and has small residuals itself.
+
+    Variances are estimated by principal direction, because a few legs do not determine more. Each is at least
+    that of independent residuals of the present size and at most the prior's. The part of the residuals that
+    the slopes can still explain is removed first, because it is not scatter of the legs.
+    """
+    along = principal(slopes, spread)
+    rows = slopes @ along
+    left = left - slopes @ np.linalg.lstsq(slopes, left, rcond=None)[0]
+    numbers = numbered(legs.astype(np.intp))
+    order = np.argsort(numbers, kind="stable")
+    drawn = []
+    for leg in np.split(order, np.flatnonzero(np.diff(numbers[order])) + 1):
+        others = (1.0 + LEAST) * np.eye(len(spread)) - rows[leg].T @ rows[leg]
+        drawn.append(np.linalg.solve(others, rows[leg].T @ left[leg]))
+    squares = np.sum(np.square(drawn), axis=0) * (1.0 - 1.0 / len(drawn))
+    before = 1.0 / np.sum(np.square(along / spread[:, None]), axis=0)
+    white = max(1.0, float(left @ left) / max(len(left) - len(spread), 1))
+    times = np.minimum(np.maximum(squares, white), before)
+    return np.asarray(along * times @ along.T, dtype=np.float64)
+
+
+def eigen(slopes: FloatArray, spread: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Returns information and principal directions of the coordinates, in units of their spreads."""
+    _, size, directions = np.linalg.svd(root_of(slopes * spread, np.eye(len(spread))))
+    return size**2, np.asarray(directions.T, dtype=np.float64)
+
+
+def root_of(*tables: FloatArray) -> FloatArray:
+    """Returns the upper triangular R with R'R equal to the sum of the tables' A'A."""
+    return np.asarray(np.linalg.qr(np.concatenate(tables), mode="r"), dtype=np.float64)
+
+
+# ----------------------------------------------------------------
+
+STEP = 0.01
+"""Step of the first Jacobian's finite differences, in spreads of a parameter."""
+RESPONSE = 1.0
+"""Norm of the scaled residuals' change that sets the later difference steps: one standard deviation, the
+smallest change that a motion shows."""
+FARTHEST = 0.1
+"""Longest of these steps, in spreads, because the valley is curved."""
+WIDE = 3.0
+"""Factor of the difference steps for intervals, which are two-sided. A sticking motor breaks away differently
+in each replay, so short differences are too steep and intervals too narrow."""
+TOO_FAR = 1.0
+"""Change of the scaled residuals (rms) above which the end of a difference has unstable loops."""
+NEARER = 0.1
+"""Factor by which such a difference is shortened."""
+ROUND = 4
+"""Steps between two estimates of the residuals' scales."""
+SETTLED = 3
+"""Number of successive rounds without a gain that ends a fit. After each, the differences become `WIDE` times
+as long, because short ones mislead if a motor sticks (implicit filtering; Kelley, SIAM 2011)."""
+EDGE = 1e-6
+"""Distance to the bounds, in spreads, that `scipy.optimize.least_squares` needs about a place."""
+WORTH = 1.0
+"""Minimum drop of half the sum of squares that counts as a gain."""
+SOFT = 4.0
+"""Residual, in scales, above which it counts less: a motor that slips elsewhere is not evidence."""
+
+Progress = Callable[[float], None]
+
+
+@dataclass(frozen=True, eq=False)
+class Fitted:
+    """Result of a fit of some parameters."""
+
+    truth: Truth
+    parameters: tuple[Parameter, ...]
+    place: FloatArray
+    """Coordinates of the parameters, shape (p,)."""
+    covariance: FloatArray
+    """Covariance of the coordinates, shape (p, p)."""
+    scales: Scales
+    """Scales of the residuals."""
+    residuals: dict[str, FloatArray]
+    rows: NDArray[np.bool_]
+    """Mask of the fitted rows, one channel after the other."""
+    vector: FloatArray
+    """Softened scaled residuals of the fitted rows, shape (n,)."""
+    jacobian: FloatArray
+    """Derivatives of `vector` with respect to the coordinates, shape (n, p)."""
+    interrupted: bool = False
+    """True if the fit was ended before it had reached a minimum."""
+
+    @property
+    def cost(self) -> float:
+        """Half the sum of squares of the softened scaled residuals."""
+        return 0.5 * float(self.vector @ self.vector)
+
+    @property
+    def inflation(self) -> float:
+        """Mean square of the scaled residuals, at least 1."""
+        return max(1.0, float(self.vector @ self.vector) / max(len(self.vector), 1))
+
+    @property
+    def loss(self) -> float:
+        """Negative log likelihood of the fitted readings by the fit's own scales, which must have steps.
+
+        The likelihood ratio of two fits of the same readings is the exponential of the difference.
+        """
+        half, stray = (each[self.rows] for each in self.scales.halves(len(self.rows) // len(CHANNELS)))
+        size = np.abs(self.scales.scaled(self.residuals)[self.rows])
+        wide = np.maximum(half, FINE)
+        return float(np.sum(surprise(size, wide, stray) - np.log(half / wide)))
+
+    def intervals(self) -> dict[str, tuple[float, float]]:
+        """Returns 95 % intervals by parameter name."""
+        spread = NORMAL_95 * np.sqrt(np.diag(self.covariance))
+        return {
+            each.name: (each.value(float(x - s)), each.value(float(x + s)))
+            for each, x, s in zip(self.parameters, self.place, spread, strict=True)
+        }
+
+
+class _Problem:
+    """Residuals and slopes as functions of the coordinates, for one estimate of the scales."""
+
+    def __init__(
+        self,
+        replays: Replays,
+        start: Truth,
+        parameters: tuple[Parameter, ...],
+        prior: FloatArray,
+        rows: NDArray[np.bool_],
+    ) -> None:
+        self._replays, self._start, self._parameters = replays, start, parameters
+        self._prior, self._rows = prior, rows
+        self.spread = np.array([each.spread for each in parameters])
+        self.low, self.high = np.array([each.bounds for each in parameters]).T
+        self.along: FloatArray | None = None
+        """Latest slopes, which give the directions of the next differences."""
+        self.longer = 1.0
+        """Factor of the differences' length."""
+        self.scale = Scales({})
+        self._found: dict[bytes, dict[str, FloatArray]] = {}
+
+    def found(self, place: FloatArray) -> dict[str, FloatArray]:
+        """Returns the residuals by channel; each place is replayed once."""
+        key = place.tobytes()
+        if key not in self._found:
+            self._found = {key: self._shown([place])[0]}
+        return self._found[key]
+
+    def residuals(self, place: FloatArray) -> FloatArray:
+        """Returns the softened scaled residuals, and the distances from the prior."""
+        left = told(self.found(place), self.scale, self._rows)
+        return np.concatenate([left, (place - self._prior) / self.spread])
+
+    def slopes(self, place: FloatArray, *, wide: bool = False) -> FloatArray:
+        """Returns the derivatives of `residuals` by the coordinates in spreads, shape (n + p, p)."""
+        moves = (
+            np.diag(STEP * self.spread)
+            if self.along is None
+            else _moves(self.along, self.spread, self.longer)
+        )
+        now = self.scale.scaled(self.found(place))[self._rows]
+        slopes = slopes_at(self._scaled, now, place, moves, (self.low, self.high), wide=wide)
+        self.along = slopes * counting(now, self.scale, self._rows)[1][:, None]
+        return np.concatenate([self.along * self.spread, np.eye(len(self.spread))])
+
+    def stepped(self, place: FloatArray, steps: int) -> FloatArray:
+        """Returns the best place after at most so many trust-region steps, the first as long as a spread."""
+
+        def at(move: FloatArray) -> FloatArray:
+            there: FloatArray = np.clip(place + move * self.spread, self.low, self.high)
+            return there
+
+        end = least_squares(
+            lambda move: self.residuals(at(move)),
+            np.zeros(len(place)),
+            lambda move: self.slopes(at(move)),
+            ((self.low - place) / self.spread - EDGE, (self.high - place) / self.spread + EDGE),
+            max_nfev=1 + steps,
+            gtol=None,
+        )
+        return at(np.asarray(end.x, dtype=np.float64))
+
+    def _scaled(self, places: Sequence[FloatArray]) -> list[FloatArray]:
+        return [self.scale.scaled(each)[self._rows] for each in self._shown(places)]
+
+    def _shown(self, places: Sequence[FloatArray]) -> list[dict[str, FloatArray]]:
+        return self._replays(
+            [at_coordinates(self._start, self._parameters, each.tolist()) for each in places]
+        )
+
+
+def solve(
+    replays: Replays,
+    start: Truth,
+    parameters: tuple[Parameter, ...],
+    prior: FloatArray,
+    steps: int,
+    progress: Progress = lambda _: None,
+    known: Scales | None = None,
+    everything: bool = False,
+    most: Scales | None = None,
+    near: Fitted | None = None,
+    loops: Loops | None = None,
+    tempered: bool = False,
+    wide: bool = False,
+) -> Fitted:
+    """Fits parameters by `scipy.optimize.least_squares` in at most ``steps`` steps; with none, linearises.
+
+    ``prior`` is the prior's mean, shape (p,). ``known`` are the channels' scales; by default they are
+    estimated from the residuals before each round, at most ``most``, so that a worse channel does not lose
+    weight. ``tempered``: known scales grow with the residuals on the way to the minimum.
+    Held-out legs count only with ``everything``. ``near`` is a fit of the same parameters that gives the
+    directions of the first differences, ``loops`` the deviation of a drive's quantised loops from smooth
+    ones. ``wide``: the covariance uses wide differences.
+    """
+    data = replays.data
+    rows = fitted_rows(data, everything=everything)
+    problem = _Problem(replays, start, parameters, prior, rows)
+    place = np.clip(coordinates(start, parameters), problem.low, problem.high)
+    problem.along = None if near is None else near.jacobian
+    idle = done = 0
+    while True:
+        found = problem.found(place)
+        problem.scale = known if known is not None else _capped(scales(data, found, loops), most)
+        if done >= steps or idle == SETTLED:
+            break
+        if known is not None and tempered:
+            problem.scale = _tempered(known, found, rows)
+        before, problem.longer = problem.residuals(place), WIDE**idle
+        taken = min(ROUND, steps - done)
+        place = problem.stepped(place, taken)
+        after = problem.residuals(place)
+        idle = idle + 1 if 0.5 * float(before @ before - after @ after) < WORTH else 0
+        done += taken
+        progress(done / steps)
+    problem.longer = 1.0
+    slopes = problem.slopes(place, wide=wide)[: -len(parameters)] / problem.spread
+    left = told(found, problem.scale, rows)
+    covariance = sandwich(slopes, left, legs_of_rows(data, rows), problem.spread)
+    truth = at_coordinates(start, parameters, place.tolist())
+    return Fitted(truth, parameters, place, covariance, problem.scale, found, rows, left, slopes)
+
+
+def fitted_rows(data: Data, *, everything: bool = False) -> NDArray[np.bool_]:
+    """Returns the mask of the rows that a fit sees, one channel after the other."""
+    out = 0.0 if everything else data.out
+    return np.concatenate([each * (1.0 - out) > 0.0 for each in counted(data).values()])
+
+
+def legs_of_rows(data: Data, rows: NDArray[np.bool_]) -> FloatArray:
+    """Returns the leg number of each fitted row."""
+    return np.concatenate([data.leg] * len(CHANNELS))[rows]
+
+
+def told(found: dict[str, FloatArray], scale: Scales, rows: NDArray[np.bool_]) -> FloatArray:
+    """Returns the residuals of some rows, transformed by their likelihood and softened."""
+    return counting(scale.scaled(found)[rows], scale, rows)[0]
+
+
+def counting(off: FloatArray, scale: Scales, rows: NDArray[np.bool_]) -> tuple[FloatArray, FloatArray]:
+    """Transforms scaled residuals by their likelihood and softens them; returns also the derivative."""
+    half, stray = (each[rows] for each in scale.halves(len(rows) // len(CHANNELS)))
+    root, slope = rooted(off, half, stray)
+    return softened(root), slope * _softening(root)
+
+
+def _capped(found: Scales, most: Scales | None) -> Scales:
+    if most is None:
+        return found
+    return replace(found, deviation={n: min(s, most.deviation[n]) for n, s in found.deviation.items()})
+
+
+def _tempered(known: Scales, found: dict[str, FloatArray], rows: NDArray[np.bool_]) -> Scales:
+    """Returns scales enlarged by the overall rms of the scaled residuals, if that exceeds one.
+
+    Far from the minimum, residuals are much larger than the noise, and the prior would have no weight. All
+    channels share one factor, so the worst channel still dominates.
+    """
+    left = told(found, known, rows)
+    factor = max(1.0, float(np.sqrt(np.mean(np.square(left)))))
+    return replace(known, deviation={name: factor * each for name, each in known.deviation.items()})
+
+
+def slopes_at(
+    seen: Callable[[Sequence[FloatArray]], list[FloatArray]],
+    now: FloatArray,
+    place: FloatArray,
+    moves: FloatArray,
+    bounds: tuple[FloatArray, FloatArray],
+    *,
+    wide: bool,
+) -> FloatArray:
+    """Returns finite-difference derivatives of the scaled residuals at ``place``, shape (n, p).
+
+    ``seen`` evaluates residuals at places, ``now`` are those at ``place``. Differences go along the moves, in
+    the direction with more space to the bounds; ``wide`` ones, for intervals, are `WIDE` times as long and
+    two-sided.
+    """
+    both = [
+        [np.clip(place + way * move, *bounds) for way in (1.0, -1.0)]
+        for move in moves * (WIDE if wide else 1.0)
+    ]
+    if wide:
+        ends = [end for pair in both for end in pair]
+    else:
+        ends = [max(pair, key=lambda each: float(np.linalg.norm(each - place))) for pair in both]
+    changes = np.stack(seen(ends)) - now
+    far = np.flatnonzero(np.mean(np.square(changes), axis=1) > TOO_FAR**2)
+    if wide and len(far):
+        for each in far:
+            ends[each] = place + NEARER * (ends[each] - place)
+        changes[far] = np.stack(seen([ends[each] for each in far])) - now
+    return np.asarray((np.linalg.pinv(np.stack(ends) - place) @ changes).T, dtype=np.float64)
+
+
+def _moves(slopes: FloatArray, spread: FloatArray, times: float = 1.0) -> FloatArray:
+    """Returns difference steps along the principal directions that change the residuals by `RESPONSE`.
+
+    ``times`` multiplies their length.
+    """
+    worth, directions = eigen(slopes, spread)
+    far = np.minimum(times * RESPONSE / np.sqrt(worth), FARTHEST)
+    moves: FloatArray = (directions * far).T * spread
+    return moves
+
+
+def softened(values: FloatArray) -> FloatArray:
+    """Softens residuals: their squares grow linearly beyond `SOFT` (Huber loss)."""
+    size = np.abs(values) / SOFT
+    bent = np.where(size > 1.0, np.sqrt(np.maximum(2.0 * size - 1.0, 1.0)), size)
+    return np.sign(values) * SOFT * bent
+
+
+def _softening(values: FloatArray) -> FloatArray:
+    """Returns the derivative of `softened`."""
+    size = np.maximum(np.abs(values) / SOFT, 1.0)
+    return np.where(size > 1.0, 1.0 / np.sqrt(2.0 * size - 1.0), 1.0)
+
+
+# ----------------------------------------------------------------
+# Servo structures: fits for drives with loops other than those that a fit assumes first.
+
+BANDWIDTHS: Final = ((25.0, 100.0), (80.0, 300.0), (200.0, 800.0))
+"""Position gain, 1/s, and velocity gain over the whole inertia, rad/s: a geared axis with a soft load, an
+ordinary one, and a stiff one."""
+INTEGRALS: Final = ("speed", "position")
+"""Signal of the integral: speed error (PI velocity loop) or position error (PIV)."""
+INTEGRAL: Final = 3.0
+"""Integral time times that bandwidth (symmetric optimum: 2 to 4)."""
+FILTER_MS: Final = 0.5
+"""Speed and torque filter at the start: half to twice the period of common velocity loops."""
+SHORT_MS: Final = 0.1
+"""Negligible command filter: a fifth of a substep."""
+VELOCITY_FEEDFORWARD: Final = 0.9
+"""Start value between none (rare) and the full speed."""
+BEST: Final = 3
+"""Number of starts that are followed up."""
+FEW_STEPS, BLOCK_STEPS, WHOLE_STEPS = 5, 10, 25
+"""Maximum steps of a fit: from each start, of each structure, and over the whole recording."""
+GAIN: Final = 0.97
+"""Maximum ratio of the misfits with and without a block for keeping it; mere extra parameters gain less."""
+MECHANICS: Final = (
+    "motor inertia", "Coulomb friction", "viscous friction", "friction's rise at rest", "Stribeck speed",
+    "load inertia", "gear stiffness", "gear damping",
+)  # fmt: skip
+SERVOS: Final = (
+    "position gain", "velocity gain", "integral time", "command filter", "velocity feed-forward",
+    "servo dead time", "speed filter", "torque filter", "load encoder delay",
+)  # fmt: skip
+NOTCH: Final = ("notch frequency", "notch depth", "notch width")
+PLACES: Final = (0.7, 1.0, 1.4)
+"""Start values of the notch frequency, relative to the resonance of motor and load."""
+
+
+class Fitting(NamedTuple):
+    """Start of a fit."""
+
+    truth: Truth
+    parameters: tuple[Parameter, ...]
+    prior: FloatArray
+    """Mean of the prior, shape (p,)."""
+
+
+def begun_at(truth: Truth, parameters: tuple[Parameter, ...]) -> Fitting:
+    """Returns a start whose prior is about its own values."""
+    low, high = np.array([each.bounds for each in parameters]).T
+    return Fitting(truth, parameters, np.clip(coordinates(truth, parameters), low, high))
+
+
+def in_best_structure(
+    replays: Replays,
+    begun: Truth,
+    keep: Callable[[Fitted], None] = lambda _: None,
+    progress: Progress = lambda _: None,
+) -> Fitted:
+    """Fits the servo structure that explains a few legs best, on all of them.
+
+    All starts have the mechanics of ``begun``.
+    """
+    few = replays.rough
+    cycle_ms = 1e3 * replays.data.pieces[0].commands.cycle_s
+    tried = [_in_units(few, each, FEW_STEPS) for each in starts(begun, cycle_ms)]
+    progress(0.4)
+    tried.sort(key=lambda each: misfit(few.data, each.residuals))
+    again = [_in_units(few, begun_at(each.truth, each.parameters), BLOCK_STEPS) for each in tried[:BEST]]
+    best = min(again, key=lambda each: misfit(few.data, each.residuals))
+    keep(best)
+    progress(0.6)
+    best = with_blocks(few, best)
+    keep(best)
+    progress(0.8)
+    return _in_units(replays, begun_at(best.truth, best.parameters), WHOLE_STEPS)
+
+
+def with_blocks(few: Replays, best: Fitted) -> Fitted:
+    """Adds blocks to a servo one at a time, as long as one reduces what held-out legs leave."""
+    added: set[str] = set()
+    while True:
+        found = {
+            name: _in_units(few, each, BLOCK_STEPS)
+            for name, each in more_blocks(best)
+            if name.split()[0] not in added
+        }
+        left = {name: misfit(few.data, each.residuals) for name, each in found.items()}
+        name = min(left, key=lambda each: left[each], default=None)
+        if name is None or left[name] > GAIN * misfit(few.data, best.residuals):
+            return best
+        best, added = found[name], added | {name.split()[0]}
+
+
+def _in_units(replays: Replays, start: Fitting, steps: int) -> Fitted:
+    """Fits in `units`, far from the noise."""
+    return solve(replays, *start, steps, known=Scales(units(replays.data)), tempered=True)
+
+
+def starts(truth: Truth, cycle_ms: float) -> Iterator[Fitting]:
+    """Yields the servos at which a fit starts.
+
+    An acceleration feed-forward uses the filtered demand, or differences over whole SYNC cycles, which is a
+    moving average of one cycle.
+    """
+    lag_ms = truth.servo.dead_time_ms + 2.0 * truth.servo.command_filter_ms
+    averaged_ms = min(cycle_ms, BY_NAME["moving average"].most)
+    averaged = {
+        "moving_average_ms": averaged_ms,
+        "command_filter_ms": SHORT_MS,
+        "dead_time_ms": max(lag_ms - 0.5 * averaged_ms, 0.0),
+    }
+    whole = truth.motor.inertia_kg_m2 + truth.load_.whole_inertia_kg_m2 / truth.gear.ratio**2
+    fastest = VELOCITY_BANDWIDTH_RAD_S.value * truth.motor.inertia_kg_m2
+    for gain, rate in BANDWIDTHS:
+        for (forward, command), integral in product(((0.0, {}), (whole, {}), (whole, averaged)), INTEGRALS):
+            servo = truth.servo.model_copy(
+                update={
+                    "position_gain_per_s": gain,
+                    "velocity_gain_nm_s_per_rad": min(rate * whole, fastest),
+                    "integral_of": integral,
+                    "integral_time_ms": 1e3 * INTEGRAL / rate,
+                    "velocity_feedforward": VELOCITY_FEEDFORWARD,
+                    "speed_filter_ms": FILTER_MS,
+                    "torque_filter_ms": FILTER_MS,
+                    "inertia_feedforward_kg_m2": forward,
+                    "load_feedforward": None,
+                    "viscous_feedforward_nm_s_per_rad": 0.0,
+                    "friction_feedforward_nm": 0.0,
+                    **command,
+                }
+            )
+            more = (("inertia feed-forward",) if forward else ()) + (("moving average",) if command else ())
+            names = (*MECHANICS, *SERVOS, *more)
+            parameters = tuple(BY_NAME[each] for each in names)
+            yield begun_at(with_sections(truth.model_copy(update={"servo": servo}), parameters), parameters)
+
+
+def more_blocks(best: Fitted) -> Iterator[tuple[str, Fitting]]:
+    """Yields the servo with one more or a replaced block; the names begin with the block's."""
+    truth, servo = best.truth, best.truth.servo
+    if servo.notch is None:
+        load = truth.load_.whole_inertia_kg_m2
+        motor = truth.motor.inertia_kg_m2 * truth.gear.ratio**2
+        free_hz = math.sqrt(truth.gear.stiffness_nm_per_rad * (1.0 / load + 1.0 / motor)) / math.tau
+        for place in PLACES:
+            notch = TrueNotch(frequency_hz=min(place * free_hz, 600.0), depth=0.5, width=0.7)
+            notched = servo.model_copy(update={"notch": notch})
+            parameters = (*best.parameters, *(BY_NAME[each] for each in NOTCH))
+            yield f"notch {place}", begun_at(truth.model_copy(update={"servo": notched}), parameters)
+    if servo.moving_average_ms == 0.0:
+        lag_ms = min(max(2.0 * servo.command_filter_ms, 0.5), 3.0)
+        averaged = servo.model_copy(update={"moving_average_ms": 2.0 * lag_ms, "command_filter_ms": SHORT_MS})
+        parameters = (*best.parameters, BY_NAME["moving average"])
+        yield "average", begun_at(truth.model_copy(update={"servo": averaged}), parameters)
+    filters = tuple(BY_NAME[each] for each in ("speed filter", "torque filter"))
+    if not {*filters} & {*best.parameters}:
+        yield "filters", begun_at(with_sections(truth, filters), (*best.parameters, *filters))
+    if servo.friction_feedforward_nm == 0.0:
+        with_friction = with_values(truth, {"friction feed-forward": 0.3 * truth.motor.coulomb_nm})
+        yield "friction", begun_at(with_friction, (*best.parameters, BY_NAME["friction feed-forward"]))
+
+
+# ----------------------------------------------------------------
+# Fitting the plant's parameters to recordings: regressions first, then least squares over replays.
+
+# ----------------------------------------------------------------
+# Places at which a fit may have another minimum.
+
+FILTER, DEAD_TIME = BY_NAME["command filter"], BY_NAME["servo dead time"]
+FREQUENCIES_HZ = (11.0, 16.0, 23.0, 33.0, 48.0, 70.0, 100.0)
+"""Start values of the load's resonance frequency, because a fit finds only the nearest minimum."""
+FILTER_SHARES = (0.25, 0.5, 0.75, 0.9)
+"""Start values of the command filter's share of the lag."""
+INERTIA_FACTORS = (0.25, 0.5, 2.0, 4.0)
+"""Factors for start values of the motor's inertia, which shows only just after each new demand."""
+
+
+def elsewhere(truth: Truth, usual: Truth) -> tuple[list[Truth], ...]:
+    """Returns other start values about a truth, by kind; ``usual`` is the start of the fit."""
+    return springs(truth), delays(truth), feedforwards(truth, usual), inertias(truth)
+
+
+def springs(truth: Truth) -> list[Truth]:
+    """Returns the truth with the load's resonance at other frequencies that its time step resolves."""
+    inertia, now = truth.load_.whole_inertia_kg_m2, truth.gear.stiffness_nm_per_rad
+    found = []
+    for hz in FREQUENCIES_HZ:
+        stiffness = inertia * (math.tau * hz) ** 2
+        damping = truth.gear.damping_nm_s_per_rad * math.sqrt(stiffness / now)
+        if stiffness < 0.9 * truth.highest_stiffness_nm_per_rad:
+            found.append(with_values(truth, {"gear stiffness": stiffness, "gear damping": damping}))
+    return found
+
+
+def lags(truth: Truth) -> list[Truth]:
+    """Returns the truth with the same lag divided differently between command filter and dead time."""
+    return [_with_dead_time(truth, (1.0 - share) * _lag_ms(truth)) for share in FILTER_SHARES]
+
+
+def delays(truth: Truth) -> list[Truth]:
+    """Returns the truth with the dead time in each other substep within the lag.
+
+    The demand changes slope at the start of a cycle, and a torque lasts for a substep. A change within a
+    substep is spread over two, as by a filter, so the dead time has a minimum in every substep.
+    """
+    step_ms, now = truth.substep_ms, _substep(truth)
+    most_ms = min(_lag_ms(truth) - 2.0 * FILTER.least, DEAD_TIME.most)
+    places = range(int(most_ms / step_ms + 0.5))
+    return [_with_dead_time(truth, (each + 0.5) * step_ms) for each in places if each != now]
+
+
+def neighbours(truth: Truth) -> list[Truth]:
+    """Returns those of `delays` whose dead time is one substep shorter or longer."""
+    return [each for each in delays(truth) if abs(_substep(each) - _substep(truth)) == 1]
+
+
+def as_late(truth: Truth, other: Truth, free: Collection[Parameter]) -> Truth:
+    """Returns the truth with the total lag of another one, by the free one of filter and dead time."""
+    lag_ms, own = _lag_ms(other), truth.servo
+    if FILTER in free:
+        return with_values(truth, {FILTER.name: max(0.5 * (lag_ms - own.dead_time_ms), FILTER.least)})
+    if DEAD_TIME in free:
+        dead_time_ms = max(lag_ms - 2.0 * own.command_filter_ms, DEAD_TIME.least)
+        return with_values(truth, {DEAD_TIME.name: dead_time_ms})
+    return truth
+
+
+def inertias(truth: Truth) -> list[Truth]:
+    """Returns the truth with other motor inertias; a spring too stiff for the time step becomes softer."""
+    motor = [BY_NAME["motor inertia"]]
+    (now,) = coordinates(truth, motor)
+    return [at_coordinates(truth, motor, [now + math.log(factor)]) for factor in INERTIA_FACTORS]
+
+
+def _substep(truth: Truth) -> int:
+    """Returns the number of the substep in which a delayed demand takes effect."""
+    return int(truth.servo.dead_time_ms / truth.substep_ms)
+
+
+def _lag_ms(truth: Truth) -> float:
+    """Returns the total delay of filter and dead time at constant speed; ms."""
+    return 2.0 * truth.servo.command_filter_ms + truth.servo.dead_time_ms
+
+
+def _with_dead_time(truth: Truth, dead_time_ms: float) -> Truth:
+    """Returns the truth with another dead time and the same lag."""
+    filter_ms = 0.5 * (_lag_ms(truth) - dead_time_ms)
+    return with_values(truth, {FILTER.name: filter_ms, DEAD_TIME.name: dead_time_ms})
+
+
+def feedforwards(truth: Truth, usual: Truth) -> list[Truth]:
+    """Returns the truth with other load feed-forward frequencies and the usual division of the inertias."""
+    servo, load, there = truth.servo, truth.servo.load_feedforward, usual.servo.load_feedforward
+    if load is None or there is None:
+        return []
+    both = servo.inertia_feedforward_kg_m2 + load.inertia_kg_m2
+    share = there.inertia_kg_m2 / (usual.servo.inertia_feedforward_kg_m2 + there.inertia_kg_m2)
+    inertias = {"inertia feed-forward": (1.0 - share) * both, "load feed-forward": share * both}
+    return [with_values(truth, {**inertias, "load feed-forward frequency": hz}) for hz in FREQUENCIES_HZ]
+
+
+def exchanged(truth: Truth) -> Truth:
+    """Returns the truth with position gain and inverse integral time exchanged.
+
+    In motion this is the same loop, because its response depends only on their sum and product, so there are
+    two minima.
+    """
+    servo = truth.servo
+    return with_values(
+        truth,
+        {"position gain": 1e3 / servo.integral_time_ms, "integral time": 1e3 / servo.position_gain_per_s},
+    )
+
+
+# ----------------------------------------------------------------
+# Optional parameters, which a fit adds at the end if the recording shows them.
+
+GROWTH: Final = "friction growth"
+LAST: Final = (
+    ("velocity feed-forward",),
+    ("encoder coupling",),
+    (GROWTH,),
+    ("friction's rise at rest", "Stribeck speed"),
+)
+"""Groups of optional parameters; each is added as a whole or not at all."""
+LIMIT: Final = BY_NAME["current limit"]
+EARNED = 8.0
+"""Minimum log likelihood ratio for adding parameters or for leaving the start's minimum: exp(8) to one."""
+SURE = 4.0
+"""Minimum change of the first parameter of a group of `LAST`; standard deviations."""
+EARNED_STEPS = 6
+"""Steps of a trial fit with added parameters: the Stribeck speed shows only once the rise is not zero."""
+LOOP_STEPS = 10
+"""Steps of a trial fit of each loop law on a few legs, all else held."""
+
+
+def with_last(replays: Replays, best: Fitted, prior: FloatArray) -> tuple[Fitted, FloatArray]:
+    """Adds the significant groups of `LAST`; returns the fit, not yet at its minimum, and its prior."""
+    for names in LAST:
+        extra = [BY_NAME[name] for name in names if BY_NAME[name] not in best.parameters]
+        if not extra or (GROWTH in names and not _warms(replays.data)):
+            continue
+        wider, there = (*best.parameters, *extra), with_sections(best.truth, extra)
+        around = np.append(prior, coordinates(there, extra))
+        tried = solve(replays, there, wider, around, EARNED_STEPS, known=best.scales)
+        new = len(best.parameters)
+        off = abs(float(tried.place[new] - around[new]))
+        sure = off > SURE * math.sqrt(float(tried.covariance[new, new]))
+        if sure and best.cost - tried.cost > EARNED:
+            best, prior = tried, around
+    return best, prior
+
+
+def _warms(data: Data) -> bool:
+    """Returns True if the initial temperatures of the pieces differ by a relevant amount."""
+    begun = [each.commands.start_c for each in data.pieces]
+    known_c = [each for each in begun if each is not None]
+    return len(known_c) == len(begun) and max(known_c) - min(known_c) > BY_NAME["temperature"].least_change
+
+
+def with_loop(replays: Replays, best: Fitted, prior: FloatArray) -> Fitting | None:
+    """Returns the start of a fit with another loop law of the gear, or None if none is better.
+
+    There is none if the load's residuals are as small as those of the true axis, or if no law reduces them.
+    Each law is fitted to a few legs, all else held. Call again after a new fit, because another law may then
+    be the best.
+    """
+    noise, few = expected(replays.data), replays.rough
+    if best.scales.deviation[LOAD] <= noise.deviation[LOAD]:
+        return None
+    led, fitted = [], any(each.cause == ELASTIC for each in best.parameters)
+    for there in by_each_law(best.truth)[fitted:]:
+        own = loop_parameters(there)
+        if own:
+            around = np.array(coordinates(there, own))
+            led.append((solve(few, there, own, around, LOOP_STEPS, known=noise), around))
+    if not led:
+        return None
+    nearest, around = min(led, key=lambda each: each[0].cost)
+    if best.cost - _cost(replays, nearest.truth, best) < EARNED:
+        return None
+    rest = [number for number, each in enumerate(best.parameters) if each.cause != ELASTIC]
+    parameters = (*(best.parameters[number] for number in rest), *nearest.parameters)
+    return Fitting(nearest.truth, parameters, np.append(prior[rest], around))
+
+
+def with_limit(replays: Replays, best: Fitted, prior: FloatArray, usual: Truth) -> Fitting:
+    """Returns the start of a fit of the drive's torque limit if the recording shows it, else the usual limit.
+
+    So far the fit used the highest recorded torque as the limit (`regressions`). It is the drive's limit, and
+    not just the torque that the motion needed, if a replay without it has larger residuals.
+    """
+    highest, unchanged = free_value(usual, LIMIT), Fitting(best.truth, best.parameters, prior)
+    if free_value(best.truth, LIMIT) >= highest or LIMIT in best.parameters:
+        return unchanged
+    without = with_values(best.truth, {LIMIT.name: highest})
+    if _cost(replays, without, best) - best.cost > EARNED:
+        return Fitting(best.truth, (*best.parameters, LIMIT), np.append(prior, coordinates(usual, [LIMIT])))
+    return unchanged._replace(truth=without)
+
+
+def _cost(replays: Replays, truth: Truth, best: Fitted) -> float:
+    """Returns half the sum of squares of a truth's residuals, by the scales of a fit."""
+    (found,) = replays([truth])
+    left = told(found, best.scales, fitted_rows(replays.data))
+    return 0.5 * float(left @ left)
+
+
+# ----------------------------------------------------------------
+
+FIT_S = 60.0
+"""Duration of the pieces on which a longer recording is fitted, with all kinds of motion if possible: a
+thousand replays of a quarter of an hour would take hours."""
+FIRST_STEPS = 6
+"""Steps from each start; as many again from the first and the best of the others, and from the better of
+these with its gains exchanged."""
+MORE_STEPS = 10
+"""Further steps from the first start and the best of the others."""
+PLACE_STEPS = 4
+"""First steps from each place that is tried as another minimum."""
+NEAR_STEPS = 30
+"""Maximum steps over the whole recording with the expected noise."""
+STEPS = 30
+"""Maximum steps of the final fit."""
+LOOPS = 6
+"""Number of replays with quantised loops, and of smooth ones, that show the difference."""
+ROUNDS = 3
+"""Maximum number of times that the difference of the loops is estimated again at the new place."""
+SAME = 0.3
+"""Change of the coordinates below which this ends; standard deviations."""
+MORE = 1.1
+"""Ratio to the true axis's residuals above which a fit leaves more; a scale is not known better than that."""
+MINIMA = 8
+"""Maximum number of moves to a better minimum. The likelihood uses the loops' deviation at the present one,
+so each of two minima may look better from the other."""
+NEAREST = 2
+"""Number of places of each kind that are followed up."""
+APART = 0.1
+"""Distance below which two fits converge to the same place; spreads of a parameter."""
+OPTIONAL = (
+    "velocity feed-forward", "load friction", "temperature", "current limit", "motor encoder delay",
+    "encoder coupling", "friction growth", "moving average", *LOOP,
+)  # fmt: skip
+"""Parameters fitted only on request or if significant: ordinary motion does not show them, others can replace
+them, or a calibration has determined them."""
+
+
+def free_parameters(truth: Truth, more: Sequence[str] = ()) -> tuple[Parameter, ...]:
+    """Returns the parameters to fit: all that the truth has, except `OPTIONAL` ones not in ``more``."""
+    free = []
+    for each in PARAMETERS:
+        value = value_in(truth, each)
+        absent = value is None or (value <= each.least and not each.linear)
+        if not absent and (each.name not in OPTIONAL or each.name in more):
+            free.append(each)
+    return tuple(free)
+
+
+def fit(replays: Replays, progress: Progress = lambda _: None, more: Sequence[str] = ()) -> Fitted:
+    """Fits the parameters, starting from the truth that the recordings were prepared with.
+
+    If its servo leaves many times the noise, other servos join the starts; if it leaves a little, blocks are
+    added. Ctrl-C ends the fit at the best place so far, if there is one.
+    """
+    reached: list[Fitted] = []
+    try:
+        best = _fit(replays, progress, more, reached.append)
+    except KeyboardInterrupt:
+        if not reached:
+            raise
+        last = reached[-1]
+        best = replace(_linearised(replays, last), interrupted=True)
+    # The loops' deviation belongs to these rows; later callers use others.
+    return replace(best, scales=replace(best.scales, loops=None))
+
+
+def _fit(replays: Replays, progress: Progress, more: Sequence[str], keep: Callable[[Fitted], None]) -> Fitted:
+    data, roughly = replays.data, replays.rough
+    start = data.base
+    begun = start_of(start, data)
+    parameters = free_parameters(begun, more)
+    prior = np.array(coordinates(begun, parameters))
+    begun_on_spring = _at_best_frequency(roughly, begun)
+    progress(0.05)
+    first = _best_of(roughly, [begun_on_spring, *lags(begun_on_spring)], parameters, prior)
+    keep(first[-1])
+    progress(0.2)
+    (before,) = replays([start])
+    most = scales(data, before)
+    ends = []
+    for number, each in enumerate(first):
+        # The residuals of a wrong simulation are no estimate of the noise: they would reduce the weight of
+        # the very channel that shows the error.
+        if each.inflation < SOFT**2:
+            about = loops_about(replays, each)
+            near = _led(replays, parameters, prior, each.truth, NEAR_STEPS, each, about)
+            ends.append(_ended(replays, near, prior, most))
+        progress(0.2 + 0.4 * (number + 1) / len(first))
+    if not ends:
+        found = in_best_structure(replays, begun, keep, lambda share: progress(0.2 + 0.8 * share))
+        return _linearised(replays, found)
+    best = min(ends, key=lambda each: each.loss + (EARNED if each is not ends[0] else 0.0))
+    keep(best)
+    laws = len(LAWS)  # maximum number of changes
+    while True:
+        best = _in_best_minimum(replays, best, begun, prior, most)
+        wider, prior = with_last(replays, best, prior)
+        if wider is not best:
+            best = _ended(replays, wider, prior, most)
+            continue
+        keep(best)
+        # The loop comes last, because a wrong spring also leaves residuals of the load angle.
+        other = with_loop(replays, best, prior) if laws else None
+        if other is None:
+            break
+        laws, prior = laws - 1, other.prior
+        best = solve(replays, other.truth, other.parameters, prior, STEPS, most=most, loops=best.scales.loops)
+    best, prior = _limited(replays, best, prior, most)
+    keep(best)
+    progress(0.85)
+    for _ in range(ROUNDS):
+        last = best
+        best = _ended(replays, best, prior, most)
+        if np.all(np.abs(best.place - last.place) < SAME * np.sqrt(np.diag(best.covariance))):
+            break
+    if values_of(what_is_left(data, best.residuals, noise_in_motion(data))) is Values.REPLAY:
+        wider = with_blocks(roughly, best)
+        if wider is not best:
+            whole = _in_units(replays, begun_at(wider.truth, wider.parameters), WHOLE_STEPS)
+            if misfit(data, whole.residuals) < misfit(data, best.residuals):
+                return _linearised(replays, whole)
+    # Wide differences only for the covariance: near a minimum the loops may be unstable.
+    loops, there = best.scales.loops, best.truth
+    best = solve(replays, there, best.parameters, prior, 0, most=most, near=best, loops=loops, wide=True)
+    progress(1.0)
+    return best
+
+
+def _limited(replays: Replays, best: Fitted, prior: FloatArray, most: Scales) -> tuple[Fitted, FloatArray]:
+    """Fits the drive's torque limit if the recording shows it."""
+    limited = with_limit(replays, best, prior, replays.data.base)
+    best = replace(best, truth=limited.truth)
+    if limited.parameters == best.parameters:
+        return best, prior
+    loops = best.scales.loops
+    fitted = solve(replays, best.truth, limited.parameters, limited.prior, STEPS, most=most, loops=loops)
+    return fitted, limited.prior
+
+
+def _linearised(replays: Replays, found: Fitted) -> Fitted:
+    """Returns a fit at the same place, by the scales that its residuals have on these recordings."""
+    place = np.array(coordinates(found.truth, found.parameters))
+    return solve(replays, found.truth, found.parameters, place, 0)
+
+
+def _in_best_minimum(replays: Replays, best: Fitted, begun: Truth, prior: FloatArray, most: Scales) -> Fitted:
+    """Moves the fit to better neighbouring minima until there are none."""
+    for _ in range(MINIMA):
+        last = best
+        if _leaves_more(replays.data, best):
+            for there in better_places(replays.rough, best, elsewhere(best.truth, begun), begun, prior):
+                best = _better(replays, best, there, prior, most)
+        # Always tried: exchanged gains differ only at rest, which a few legs hardly show, and a dead time in
+        # the next substep increases the residuals too little for any channel to show it.
+        for there in (exchanged(best.truth), *neighbours(best.truth)):
+            best = _better(replays, best, there, prior, most)
+        if best is last:
+            break
+    return best
+
+
+def _better(replays: Replays, best: Fitted, there: Truth, prior: FloatArray, most: Scales) -> Fitted:
+    """Returns the fit from another place if it is significantly better, else ``best``."""
+    loops = best.scales.loops
+    other = solve(replays, there, best.parameters, prior, MORE_STEPS, most=most, loops=loops)
+    if other.loss + EARNED >= best.loss:
+        return best
+    return _ended(replays, other, prior, most)
+
+
+def _ended(replays: Replays, near: Fitted, prior: FloatArray, most: Scales) -> Fitted:
+    """Continues a fit to its minimum, with the loops' deviation estimated there."""
+    loops = loops_about(replays, near)
+    return solve(replays, near.truth, near.parameters, prior, STEPS, most=most, near=near, loops=loops)
+
+
+def _leaves_more(data: Data, best: Fitted) -> bool:
+    """Returns True if the residuals of any channel exceed those of the true axis."""
+    least = least_deviation(data) | {LOAD: expected(data).deviation[LOAD]}
+    return any(best.scales.deviation[name] > MORE * least[name] for name in CHANNELS)
+
+
+def better_places(
+    roughly: Replays, best: Fitted, kinds: Iterable[Sequence[Truth]], begun: Truth, prior: FloatArray
+) -> list[Truth]:
+    """Fits a few legs from the best places of each kind; returns competitive results, the best first.
+
+    This comes after the other parameters are known, because at the start of the fit these places were equally
+    good. A few legs can rule a minimum out but seldom decide between two.
+    """
+    (before,) = roughly([begun])
+    most = scales(roughly.data, before)
+
+    def led(truth: Truth, steps: int, near: Fitted | None = None) -> Fitted:
+        return solve(roughly, truth, best.parameters, prior, steps, most=most, near=near)
+
+    def loss(fitted: Fitted) -> float:
+        return fitted.loss
+
+    ends = [led(best.truth, STEPS)]
+    for places in kinds:
+        others = [each for each in (led(place, PLACE_STEPS) for place in places) if _apart(each, ends[0])]
+        for near in sorted(others, key=loss)[:NEAREST]:
+            reached = led(near.truth, STEPS, near)
+            if all(_apart(reached, each) for each in ends):
+                ends.append(reached)
+    least = min(map(loss, ends))
+    return [each.truth for each in sorted(ends[1:], key=loss) if each.loss < least + EARNED]
+
+
+def _apart(one: Fitted, other: Fitted) -> bool:
+    """Returns True if two fits of the same parameters have reached different places."""
+    spread = np.array([each.spread for each in one.parameters])
+    return bool(np.any(np.abs(one.place - other.place) > APART * spread))
+
+
+def loops_about(replays: Replays, fitted: Fitted) -> Loops:
+    """Estimates the deviation of quantised loops from smooth ones, by draws from the fit's covariance."""
+    rng = np.random.default_rng(0)
+    low, high = np.array([each.bounds for each in fitted.parameters]).T
+    places = rng.multivariate_normal(fitted.place, fitted.covariance, LOOPS, method="svd")
+    truths = [
+        at_coordinates(fitted.truth, fitted.parameters, np.clip(each, low, high).tolist()) for each in places
+    ]
+    shown = replays([*truths, *truths], [None] * LOOPS + ["loops"] * LOOPS)
+    pairs = list(zip(shown[:LOOPS], shown[LOOPS:], strict=True))
+    apart = {name: np.stack([other[name] - one[name] for one, other in pairs]) for name in CHANNELS}
+    return Loops(
+        {name: np.mean(each, axis=0) for name, each in apart.items()},
+        {name: np.sqrt(1.0 + 1.0 / LOOPS) * np.std(each, axis=0, ddof=1) for name, each in apart.items()},
+    )
+
+
+def _led(
+    replays: Replays,
+    parameters: tuple[Parameter, ...],
+    prior: FloatArray,
+    start: Truth,
+    steps: int,
+    near: Fitted | None = None,
+    loops: Loops | None = None,
+) -> Fitted:
+    """Fits for at most ``steps`` steps with the expected noise."""
+    noise = replace(expected(replays.data), loops=loops)
+    return solve(replays, start, parameters, prior, steps, known=noise, near=near, tempered=True)
+
+
+def _best_of(
+    replays: Replays, starts: Sequence[Truth], parameters: tuple[Parameter, ...], prior: FloatArray
+) -> tuple[Fitted, ...]:
+    """Returns the fit from the first start, and the best from another start if it is better so far.
+
+    The first start is the present simulation: parameters that the motion does not show keep their values
+    unless another place is significantly better in the end. Worse starts are dropped on the way.
+    """
+    led = partial(_led, replays, parameters, prior)
+
+    def cost(fitted: Fitted) -> float:
+        return fitted.cost
+
+    own, *others = (led(each, FIRST_STEPS) for each in starts)
+    own, other = (led(each.truth, FIRST_STEPS, each) for each in (own, min(others, key=cost)))
+    third = led(exchanged(min(own, other, key=cost).truth), FIRST_STEPS)
+    own, other = (led(each.truth, MORE_STEPS, each) for each in (own, min(other, third, key=cost)))
+    return (own, other) if other.cost < own.cost else (own,)
+
+
+def _at_best_frequency(replays: Replays, truth: Truth) -> Truth:
+    """Returns the truth with the spring that gives the smallest residuals of the load angle."""
+    tried = [truth, *springs(truth)]
+    off = [float(np.mean(np.abs(found[LOAD]))) for found in replays(tried)]
+    return tried[int(np.argmin(off))]

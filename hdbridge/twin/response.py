@@ -1,0 +1,115 @@
+"""Measured response: the fall-back for drives whose loops the simulated servo does not have.
+
+What the best servo leaves of following error and torque is fitted by finite impulse responses to the speed
+and the direction of the command (`hdbridge.sim.response`), by ridge regressions. The simulated motor follows
+a change of the demand as it follows the command, so the response of the demand is fitted to its speed.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import product
+from typing import Final
+
+import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
+
+from hdbridge.effects import FloatArray
+from hdbridge.sim.truth import Truth
+from hdbridge.sim.truth.motor import TrueResponse
+from hdbridge.twin.fit import Fitted
+from hdbridge.twin.misfit import Data, Piece, Replays, demand_deg, misfit
+from hdbridge.twin.parameters import FOLLOWING, TORQUE
+
+SPEED_S: Final = 0.4
+"""Length of the responses to the speed: a load that rings at 15 Hz with a damping ratio of 0.06 decays to a
+tenth."""
+DIRECTION_S: Final = 0.12
+"""Length of the responses to the direction: three periods of a velocity loop of 25 Hz."""
+RIDGES: Final = (1e-1, 1e-2, 1e-3, 1e-4)
+"""Weights of the taps' squares, as a share of what the rows say of each; held-out legs choose."""
+ROUNDS: Final = 2
+"""Number of times that the demand's response is fitted: the second corrects what friction changed."""
+GAIN: Final = 0.97
+"""Maximum ratio of the misfits with and without a response for keeping it."""
+
+
+def with_response(replays: Replays, fitted: Fitted) -> Fitted:
+    """Returns the fit with measured responses, if held-out legs are explained better by them.
+
+    A response of the demand also changes the torque, so it has to be worth that.
+    """
+    best = fitted
+    for demanded, ridge in product((0, ROUNDS), RIDGES):
+        truth, found = fitted.truth, fitted.residuals
+        for channel in (*[FOLLOWING] * demanded, TORQUE):
+            truth = _added(truth, replays.data, found, ridge, channel)
+            (found,) = replays([truth])
+        if misfit(replays.data, found) < GAIN * misfit(replays.data, best.residuals):
+            best = replace(fitted, truth=truth, residuals=found)
+    return best
+
+
+def _added(truth: Truth, data: Data, found: dict[str, FloatArray], ridge: float, channel: str) -> Truth:
+    """Returns the truth with the response that explains most of a channel's residuals."""
+    cycle_s = data.pieces[0].commands.cycle_s
+    lengths = [math.ceil(SPEED_S / cycle_s), math.ceil(DIRECTION_S / cycle_s)]
+    tables, wanted, first = [], [], 0
+    for piece in data.pieces:
+        end = first + len(piece.out)
+        rows = (piece.counts[channel] > 0.0) & (piece.out == 0.0)
+        if channel == FOLLOWING:
+            turned = np.radians(demand_deg(piece.commands, data.axis) - piece.measured[channel])
+            turned = turned + np.radians(found[channel][first:end])  # the simulated motor
+            speed = np.gradient(turned, piece.commands.time_s)
+            tables.append(_lagged(speed, lengths[0])[rows])
+            wanted.append(-np.radians(found[channel][first:end][rows]))
+        else:
+            speed = _command_speed(piece, data)
+            at = piece.commands.lead + np.round(piece.commands.row_cycles).astype(np.intp)
+            table = [_lagged(speed, lengths[0]), _lagged(np.sign(speed), lengths[1])]
+            tables.append(np.concatenate(table, axis=1)[at][rows])
+            wanted.append(found[channel][first:end][rows])
+        first = end
+    taps = _ridge(np.concatenate(tables), np.concatenate(wanted), ridge)
+    own = truth.servo.response or TrueResponse(cycle_ms=1e3 * cycle_s)
+    if channel == FOLLOWING:
+        own = own.model_copy(update={"demand_ms": _rounded(_grown(own.demand_ms, 1e3 * taps))})
+    else:
+        own = own.model_copy(
+            update={
+                "torque_nm_s_per_rad": _rounded(_grown(own.torque_nm_s_per_rad, taps[: lengths[0]])),
+                "torque_nm": _rounded(_grown(own.torque_nm, taps[lengths[0] :])),
+            }
+        )
+    return truth.model_copy(update={"servo": truth.servo.model_copy(update={"response": own})})
+
+
+def _command_speed(piece: Piece, data: Data) -> FloatArray:
+    """Returns the speed of the demand in each cycle, with those of the approach; motor rad/s."""
+    encoder = data.axis.motor_encoder
+    turned = math.tau * encoder.direction / encoder.counts_per_turn * np.asarray(piece.commands.counts)
+    return np.asarray(np.diff(turned, prepend=turned[0]) / piece.commands.cycle_s, dtype=np.float64)
+
+
+def _lagged(column: FloatArray, length: int) -> FloatArray:
+    """Returns a column and its past as columns, the latest first, shape (n, length)."""
+    return sliding_window_view(np.concatenate([np.zeros(length - 1), column]), length)[:, ::-1]
+
+
+def _ridge(table: FloatArray, wanted: FloatArray, ridge: float) -> FloatArray:
+    size = np.sqrt(np.mean(np.square(table), axis=0)) + 1e-12
+    scaled = table / size
+    gram = scaled.T @ scaled + ridge * len(table) * np.eye(len(size))
+    return np.asarray(np.linalg.solve(gram, scaled.T @ wanted) / size, dtype=np.float64)
+
+
+def _grown(before: Sequence[float], taps: FloatArray) -> FloatArray:
+    """Returns the sum of the taps so far and further ones."""
+    return np.append(before, np.zeros(len(taps)))[: len(taps)] + taps
+
+
+def _rounded(taps: FloatArray) -> tuple[float, ...]:
+    return tuple(float(f"{each:.5g}") for each in taps)

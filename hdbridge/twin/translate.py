@@ -1,0 +1,878 @@
+"""Draft of a truth file, written effect by effect.
+
+Translates an axis file and a model to a truth file: each effect to the simulated plant's own physics.
+
+A model describes the error of the load; the plant has parts that cause it. `TABLE` has one row with that part
+for each effect of the catalogue, and a translation reports for each effect of a model if it was translated in
+full, in part or not at all. The transmission error comes from the model alone; everything else (motor, loops,
+friction, load, and the spring unless the model has it) comes from the given truth, or else from usual values
+(`hdbridge.twin.parameters`).
+"""
+
+from __future__ import annotations
+
+import cmath
+import math
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from itertools import pairwise
+from types import MappingProxyType
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+from pydantic import ValidationError
+
+from hdbridge.axis import AxisConfig
+from hdbridge.effects import (
+    CATALOGUE,
+    AmplitudeDrift,
+    Backlash,
+    ChannelSkew,
+    Compliance,
+    CountLoss,
+    Creep,
+    DirectionPhase,
+    Effect,
+    FlexsplineOrders,
+    Hysteresis,
+    HysteresisMemory,
+    HysteresisParameters,
+    InertialWindup,
+    LoadOrders,
+    LocalDefect,
+    MotorEncoderEccentricity,
+    MotorOrder,
+    MotorOrders,
+    RateDependence,
+    RatioError,
+    SubdivisionalError,
+    Synchronous,
+    TorqueModulation,
+    VelocityWindup,
+    Vibration,
+    Wear,
+    ZeroDrift,
+)
+from hdbridge.effects.base import FloatArray
+from hdbridge.effects.direction_phase import STEEPEST
+from hdbridge.effects.elastic_loop import rise
+from hdbridge.effects.warmth import Warmed
+from hdbridge.errors import InputError
+from hdbridge.model import TransmissionModel
+from hdbridge.sim.truth import Truth
+from hdbridge.sim.truth.resonance import Resonance
+from hdbridge.twin.parameters import RESOLVED, default_truth
+from hdbridge.units import ARCSEC_PER_DEG
+
+# ----------------------------------------------------------------
+# Draft of a truth file, written effect by effect.
+
+ARCSEC_PER_RAD = math.degrees(1.0) * ARCSEC_PER_DEG
+
+
+@dataclass(frozen=True, slots=True)
+class Said:
+    """Result of translating an effect: its place in the truth file, and notes on differences."""
+
+    counterpart: str | None
+    notes: tuple[str, ...] = ()
+
+
+def none(why: str) -> Said:
+    """Returns the result for an effect without a counterpart in the plant."""
+    return Said(None, (why,))
+
+
+@dataclass(slots=True)
+class Draft:
+    """Content of a truth file, `data`, which is changed in place."""
+
+    data: dict[str, Any]
+    axis: AxisConfig
+    tells_servo: bool
+    """True if the drive's feed-forward is set to the load that is written, as after commissioning."""
+
+    @property
+    def gear(self) -> dict[str, Any]:
+        """The section ``gear``."""
+        return self.part("gear")
+
+    @property
+    def load(self) -> dict[str, Any]:
+        """The section ``load``."""
+        return self.part("load")
+
+    def part(self, *names: str) -> dict[str, Any]:
+        """Returns a nested section; creates it if it is missing."""
+        place = self.data
+        for name in names:
+            if place.get(name) is None:
+                place[name] = {}
+            place = place[name]
+        return place
+
+    @property
+    def ratio(self) -> float:
+        """Ratio of the axis file, to which the model's orders and travels refer."""
+        return self.axis.gear.ratio
+
+    @property
+    def stiffness_nm_per_rad(self) -> float:
+        """Stiffness of the spring's first stage."""
+        return float(self.gear["stiffness_nm_per_rad"])
+
+    def set_stiffness(self, nm_per_rad: float) -> None:
+        """Sets the stiffness and keeps the damping ratio of the load."""
+        self.gear["damping_nm_s_per_rad"] *= math.sqrt(nm_per_rad / self.stiffness_nm_per_rad)
+        self.gear["stiffness_nm_per_rad"] = nm_per_rad
+
+    @property
+    def hanging_kg_m2(self) -> float:
+        """Inertia of the hanging mass, which is not part of the load's own."""
+        mass = self.load.get("gravity")
+        return float(mass["mass_kg"] * mass["arm_m"] ** 2) if mass else 0.0
+
+    @property
+    def inertia_kg_m2(self) -> float:
+        """Total inertia of the load."""
+        return float(self.load["inertia_kg_m2"]) + self.hanging_kg_m2
+
+    def set_inertia(self, kg_m2: float) -> None:
+        """Sets the load's total inertia, more than the hanging mass's, and keeps the damping ratio."""
+        self.gear["damping_nm_s_per_rad"] *= math.sqrt(kg_m2 / self.inertia_kg_m2)
+        self.load["inertia_kg_m2"] = kg_m2 - self.hanging_kg_m2
+
+    @property
+    def highest_stiffness_nm_per_rad(self) -> float:
+        """Maximum stiffness: half of the stiffest spring that the plant's shortest time step resolves."""
+        return Resonance.of({**self.data, "load": {**self.load, "presliding": ()}}).stiffest_nm_per_rad(
+            math.sqrt(0.5) / (SHORTEST_MS / 1e3)
+        )
+
+    @property
+    def spare_stiffness_nm_per_rad(self) -> float:
+        """Maximum stiffness of sliders at the load whose resonance the present time step resolves."""
+        return Resonance.of(self.data).most_held_nm_per_rad(RESOLVED / (self.data["substep_ms"] / 1e3))
+
+    def finish(self) -> None:
+        """Sets the load feed-forward, and a time step that resolves the fastest resonance."""
+        servo, load = self.data["servo"], self.inertia_kg_m2
+        if self.tells_servo and servo.get("load_feedforward"):
+            turn = math.sqrt(self.stiffness_nm_per_rad / load)
+            servo["load_feedforward"] = {
+                "inertia_kg_m2": load / self.ratio**2,
+                "frequency_hz": min(500.0, max(1.0, turn / math.tau)),
+                "damping_ratio": min(2.0, self.gear["damping_nm_s_per_rad"] / (2.0 * load * turn)),
+            }
+        fastest = Resonance.of(self.data).rad_s
+        while fastest * self.data["substep_ms"] / 1e3 > RESOLVED and self.data["substep_ms"] > SHORTEST_MS:
+            self.data["substep_ms"] = max(SHORTEST_MS, 0.5 * self.data["substep_ms"])
+
+
+SHORTEST_MS = 0.0625
+"""Shortest time step; a whole fraction of a millisecond."""
+
+
+# ----------------------------------------------------------------
+# Translates an axis file and a model to a truth file: each effect to the simulated plant's own physics.
+
+# ----------------------------------------------------------------
+# The branch of an elastic loop as parallel slip elements.
+
+
+def branch(exponent: float, nodes: int) -> tuple[FloatArray, FloatArray]:
+    """Returns xi from 0 to 1 and the branch g(xi), dense in its bend, shape (nodes + 1,) each."""
+    xi = np.linspace(0.0, 1.0, nodes + 1) ** (2.0 / min(max(exponent - 1.0, 0.2), 1.0))
+    return xi, rise(xi, exponent)
+
+
+def elements(travel: FloatArray, height: FloatArray) -> list[tuple[float, float]]:
+    """Returns limit and travel to slipping of each element of a concave curve through the origin.
+
+    The curve is the sum of the elements from rest. Its points are in order, from (0, 0); it is flat beyond
+    the last.
+    """
+    slopes = [(h1 - h0) / (t1 - t0) for (t0, h0), (t1, h1) in pairwise(zip(travel, height, strict=True))]
+    return [
+        (float((slope - after) * end), float(end))
+        for slope, after, end in zip(slopes, [*slopes[1:], 0.0], travel[1:], strict=True)
+        if slope > after and end > 0.0
+    ]
+
+
+# ----------------------------------------------------------------
+# Effects of teeth and ratio.
+
+HIGHEST_ORDER: Final = 512
+FLANK_TRAVEL_DEG: Final = 0.5
+"""Motor travel from flank to flank: a fraction of a degree, like the play between teeth."""
+MOST_YIELD: Final = 0.9
+"""Maximum compliance of the teeth, as a share of the spring's; at one the plant is unstable."""
+
+
+def ratio_error(effect: RatioError, draft: Draft) -> Said:
+    """Sets the true ratio of the gear."""
+    draft.gear["ratio"] = effect.true_ratio(draft.ratio)
+    return Said("gear.ratio")
+
+
+def motor_orders(effect: Synchronous | MotorOrders, draft: Draft) -> Said:
+    """Sets the tooth error by motor angle; orders in two effects are added."""
+    return _orders(effect.orders, draft, "motor_orders")
+
+
+def flexspline_orders(effect: FlexsplineOrders, draft: Draft) -> Said:
+    """Sets the tooth error by the angle between wave generator and flexspline."""
+    return _orders(effect.orders, draft, "flexspline_orders")
+
+
+def gear_load_orders(orders: Iterable[MotorOrder], draft: Draft) -> Said:
+    """Sets the tooth error by load angle."""
+    return _orders(orders, draft, "load_orders")
+
+
+def direction_phase(effect: DirectionPhase, draft: Draft) -> Said:
+    """Sets two flanks; the model's orders are the mean of both, the plant's those of each."""
+    held = []
+    orders: list[dict[str, Any]] = []
+    for each in draft.gear.get("motor_orders", ()):
+        shift = math.radians(each["order"] * effect.shift_deg)
+        share = math.cos(shift)
+        if abs(math.tan(shift)) > STEEPEST or share <= 0.0:
+            held.append(str(each["order"]))
+            share = 1.0 / math.hypot(1.0, STEEPEST)
+        orders.append({**each, "amplitude_arcsec": each["amplitude_arcsec"] / share})
+    draft.gear["motor_orders"] = orders
+    draft.gear["flank"] = {"shift_deg": effect.shift_deg, "travel_deg": FLANK_TRAVEL_DEG}
+    notes = [f"crosses within {FLANK_TRAVEL_DEG:g} motor deg, where the model jumps"]
+    if held:
+        notes.append(f"order {', '.join(held)}: shifted by too much to be told by its mean")
+    return Said("gear.flank", tuple(notes))
+
+
+def torque_modulation(effect: TorqueModulation, draft: Draft) -> Said:
+    """Sets the growth of the tooth error with the magnitude of the torque."""
+    if effect.signed:
+        return none("the plant's teeth grow with the size of the torque, not with its sign")
+    per_nm = 0.01 * effect.growth_percent_per_nm
+    notes = []
+    if effect.torque == "motor_torque_nm":
+        per_nm /= draft.ratio
+        notes.append("by the motor's torque times the ratio, its own friction included")
+    orders = draft.gear.get("motor_orders", ())
+    carried = {each.order for each in effect.orders}
+    if any(each["order"] not in carried for each in orders):
+        notes.append("all motor orders grow, also those that the effect does not carry")
+    yields = sum(each["amplitude_arcsec"] for each in orders) / ARCSEC_PER_RAD * draft.stiffness_nm_per_rad
+    if yields * abs(per_nm) > MOST_YIELD:
+        held = math.copysign(MOST_YIELD / yields, per_nm)
+        notes.append(
+            f"held at {100 * held:.3g} %/Nm: with {100 * per_nm:.3g} teeth would yield more than the spring"
+        )
+        per_nm = held
+    draft.gear["torque_growth_per_nm"] = per_nm
+    return Said("gear.torque_growth_per_nm", tuple(notes))
+
+
+def local_defect(effect: LocalDefect, draft: Draft) -> Said:
+    """Sets a damaged tooth with the same raised cosine."""
+    width = min(180.0, 2.0 * effect.half_width_deg)
+    bump = {"at_deg": effect.centre_deg, "width_deg": width, "height_arcsec": effect.height_arcsec}
+    draft.gear["damage"] = [*draft.gear.get("damage", ()), bump]
+    wide = 2.0 * effect.half_width_deg > width
+    return Said("gear.damage", ("no wider than half a turn",) if wide else ())
+
+
+def _orders(orders: Iterable[MotorOrder], draft: Draft, key: str) -> Said:
+    sums: dict[int, complex] = {
+        each["order"]: cmath.rect(each["amplitude_arcsec"], math.radians(each["phase_deg"]))
+        for each in draft.gear.get(key, ())
+    }
+    beyond = []
+    for each in orders:
+        if each.order > HIGHEST_ORDER:
+            beyond.append(str(each.order))
+            continue
+        phasor = cmath.rect(each.amplitude_arcsec, math.radians(each.phase_deg))
+        sums[each.order] = sums.get(each.order, 0j) + phasor
+    draft.gear[key] = [
+        {
+            "order": order,
+            "amplitude_arcsec": abs(sums[order]),
+            "phase_deg": math.degrees(cmath.phase(sums[order])),
+        }
+        for order in sorted(sums)
+    ]
+    notes = (f"without order {', '.join(beyond)}: the plant's go up to {HIGHEST_ORDER}",) if beyond else ()
+    return Said(f"gear.{key}", notes)
+
+
+# ----------------------------------------------------------------
+# Encoder errors.
+
+RADIUS_MM: Final = 20.0
+"""Assumed radius of a disc's graduation: only the ratio of the eccentricity to it has an effect."""
+LATEST_MS: Final = 100.0
+SMALL_ARCSEC: Final = 0.05
+"""Maximum loss in a translation that is not noted: a tenth of a usual count."""
+_LIMITS: Final = {
+    "sine_offset": 0.5, "cosine_offset": 0.5, "gain_mismatch": 0.5, "phase_mismatch_deg": 45.0,
+    "third_harmonic": 0.3,
+}  # fmt: skip
+
+
+def motor_eccentricity(effect: MotorEncoderEccentricity, draft: Draft) -> Said:
+    """Sets the disc of the motor encoder. The drive controls its reading, so the load has the opposite error.
+
+    A disc reads (e / r) sin(a - a0) too much, so the load lags by this divided by the ratio.
+    """
+    # -sin(a - a0) = cos(a + 90 deg - a0), and the same for twice the angle.
+    disc = _disc(effect.orders, draft.ratio, lambda phase_deg: 90.0 - phase_deg)
+    draft.part("motor", "encoder")["disc"] = disc
+    return Said("motor.encoder.disc", (f"radius assumed as {RADIUS_MM:g} mm",))
+
+
+def load_orders(effect: LoadOrders, draft: Draft) -> Said:
+    """Sets the load encoder's disc if it is the known origin, else a pitch error of the spline."""
+    if effect.origin != "load_encoder":
+        said = gear_load_orders(effect.orders, draft)
+        unknown = ("origin unknown: taken for the gear's",) if effect.origin == "unknown" else ()
+        return Said(said.counterpart, (*unknown, *said.notes))
+    few = [each for each in effect.orders if each.order <= 2]
+    more = [each for each in effect.orders if each.order > 2]
+    # sin(a - a0) = cos(a - a0 - 90 deg)
+    draft.part("load", "encoder")["disc"] = _disc(few, 1.0, lambda phase_deg: -90.0 - phase_deg)
+    notes = [f"radius assumed as {RADIUS_MM:g} mm"]
+    if more:
+        gear_load_orders(more, draft)
+        notes.append("orders beyond 2 go to gear.load_orders: a disc has none")
+    return Said("load.encoder.disc", tuple(notes))
+
+
+def _disc(orders: Iterable[MotorOrder], ratio: float, at_deg: Any) -> dict[str, Any]:
+    disc: dict[str, Any] = {"radius_mm": RADIUS_MM}
+    for each in orders:
+        off_um = each.amplitude_arcsec * ratio / ARCSEC_PER_RAD * RADIUS_MM * 1000.0
+        at = math.remainder(at_deg(each.phase_deg), 360.0)
+        if each.order == 1:
+            disc |= {"eccentricity_um": off_um, "eccentric_at_deg": at}
+        else:
+            disc |= {"ovality_um": off_um, "oval_at_deg": 0.5 * at}
+    return disc
+
+
+def channel_skew(effect: ChannelSkew, draft: Draft) -> Said:
+    """Sets the delay of the other encoder: a load that is read later has an older motor reading."""
+    delay_ms = effect.delay_ms
+    late = "motor" if delay_ms > 0.0 else "load"
+    draft.part(late, "encoder")["late_ms"] = min(abs(delay_ms), LATEST_MS)
+    notes = []
+    if abs(delay_ms) > LATEST_MS:
+        notes.append(f"no more than {LATEST_MS:g} ms")
+    rest_ms2 = effect.second_order_ms2 - delay_ms**2
+    most = 0.5e-6 * abs(rest_ms2) * draft.axis.limits.acceleration_deg_s2 * 3600.0
+    if most > SMALL_ARCSEC:
+        notes.append(
+            f"a pure delay: up to {most:.2g} arcsec of the model's part by acceleration are not of a delay"
+        )
+    return Said(f"{late}.encoder.late_ms", tuple(notes))
+
+
+def subdivisional_error(effect: SubdivisionalError, draft: Draft) -> Said:
+    """Sets offsets, gain, phase and third harmonic of the signals, to first order.
+
+    The angle read from (1 + g) sin p - t sin 3p + s and cos(p + d) + t cos 3p + c is off by
+    s cos p - c sin p + g/2 sin 2p - d/2 cos 2p - t sin 4p, in radians of a line.
+    """
+    line_arcsec = ARCSEC_PER_RAD / effect.lines_per_turn
+    signals: dict[str, float] = {"lines_per_turn": effect.lines_per_turn}
+    lost_arcsec = 0.0
+    for each in effect.orders:
+        part = each.amplitude_arcsec / line_arcsec
+        cosine, sine = (part * of(math.radians(each.phase_deg)) for of in (math.cos, math.sin))
+        if each.order == 1:
+            signals |= {"sine_offset": cosine, "cosine_offset": sine}
+        elif each.order == 2:
+            signals |= {"gain_mismatch": -2.0 * sine, "phase_mismatch_deg": math.degrees(-2.0 * cosine)}
+        else:
+            signals["third_harmonic"] = sine
+            lost_arcsec = abs(cosine) * line_arcsec
+    notes = []
+    if lost_arcsec > SMALL_ARCSEC:
+        notes.append(f"{lost_arcsec:.2g} arcsec of the fourth order are no third harmonic of either signal")
+    for name, limit in _LIMITS.items():
+        if abs(signals.get(name, 0.0)) > limit:
+            notes.append(f"{name} held at {limit:g}: {signals[name]:.2g} is no signal any more")
+            signals[name] = math.copysign(limit, signals[name])
+    draft.part("load", "encoder")["signals"] = signals
+    return Said("load.encoder.signals", tuple(notes))
+
+
+def count_loss(effect: CountLoss, draft: Draft) -> Said:
+    """Sets count losses of the load encoder at the same times after switching on."""
+    counts_per_arcsec = draft.axis.load_encoder.counts(1.0) / 3600.0
+    losses = [
+        {"time_s": each.time_s, "counts": round(each.size_arcsec * counts_per_arcsec)}
+        for each in effect.steps
+        if each.time_s >= 0.0
+    ]
+    if not losses:
+        return none("it was before the record's time zero, and is in the encoders' zero by now")
+    draft.part("load", "encoder")["losses"] = losses
+    return Said(
+        "load.encoder.losses", ("each time again, so long after the axis is switched on; whole counts",)
+    )
+
+
+# ----------------------------------------------------------------
+# Effects of temperature, travel and time.
+
+LINEAR_BUILD_UP: Final = 0.5
+"""Build-up ratio below which the plant's element, with equal times of strain and release, differs."""
+
+
+def zero_drift(effect: ZeroDrift, draft: Draft) -> Said:
+    """Sets a shift with the temperature, delayed as in the model and zero at the ambient temperature."""
+    heat = draft.part("temperature")
+    heat["zero_drift_arcsec_per_k"] = effect.drift_arcsec_per_k
+    if effect.driven_by == "time":
+        return Said("temperature.zero_drift_arcsec_per_k", (_warms_up(effect, draft),))
+    heat["zero_time_constant_s"] = effect.tau_s
+    return Said("temperature.zero_drift_arcsec_per_k", ("zero at the ambient temperature: an offset",))
+
+
+def amplitude_drift(effect: AmplitudeDrift, draft: Draft) -> Said:
+    """Sets the growth of tooth error and friction with the temperature."""
+    heat = draft.part("temperature")
+    heat["tooth_growth_per_k"] = _share(effect.ripple_percent_per_k)
+    heat["friction_growth_per_k"] = _share(effect.friction_percent_per_k)
+    notes = []
+    if effect.driven_by == "time":
+        notes.append(_warms_up(effect, draft))
+        heat["reference_c"] = heat["start_c"]
+    else:
+        heat["reference_c"] = effect.reference_c
+        notes.append(f"at once with the temperature, where the model follows it in {effect.tau_s:.3g} s")
+    if effect.friction_percent_per_k:
+        notes.append("the motor's friction grows with the loop")
+    return Said("temperature.tooth_growth_per_k, temperature.friction_growth_per_k", tuple(notes))
+
+
+def wear(effect: Wear, draft: Draft) -> Said:
+    """Sets a gap between the teeth that grows with the travel; the model's loop may also widen."""
+    if effect.growth_arcsec_per_kiloturn > 0.0:
+        return none("the loop widens in the sense of the elastic one: the plant's teeth wear to a gap only")
+    draft.gear["wear"] = {
+        "arcsec_per_1000_turns": -0.5 * effect.growth_arcsec_per_kiloturn,
+        "exponent": effect.exponent,
+    }
+    notes = ["crossed within the gap's own travel"]
+    if effect.turns_before:
+        notes.append(f"from zero turns on: the {effect.turns_before:.0f} turns before are not in it")
+    return Said("gear.wear", tuple(notes))
+
+
+def creep(effect: Creep, draft: Draft) -> Said:
+    """Sets Kelvin-Voigt elements. The model's strain leads in motion, the plant's yields to the drag."""
+    parts = [
+        {"time_constant_s": each.tau_s, "amplitude_arcsec": -each.amplitude_arcsec} for each in effect.parts
+    ]
+    draft.gear["creep"] = [*draft.gear.get("creep", ()), *parts]
+    fast = effect.build_up < LINEAR_BUILD_UP
+    return Said(
+        "gear.creep",
+        (f"strained as slowly as it lets go, where the model needs {effect.build_up:.2g} of that",)
+        if fast or effect.build_up > 1.0 / LINEAR_BUILD_UP
+        else (),
+    )
+
+
+def _warms_up(effect: Warmed, draft: Draft) -> str:
+    """Sets the plant's initial temperature below ambient by the model's warm-up; returns a note."""
+    heat = draft.part("temperature")
+    ambient_c = heat.get("ambient_c", 22.0)
+    heat["start_c"] = max(-60.0, ambient_c - effect.warm_up_k)
+    heat["time_constant_s"] = effect.tau_s
+    return f"started {effect.warm_up_k:g} K below the ambient temperature, in {effect.tau_s:.3g} s"
+
+
+def _share(percent_per_k: float) -> float:
+    return 0.01 * percent_per_k
+
+
+# ----------------------------------------------------------------
+# Effects of spring, friction, play and loop.
+
+NODES: Final = 24
+"""Nodes of a branch; linear interpolation is then accurate to a hundredth of the offset."""
+SLIDERS: Final = 16
+"""Maximum number of sliders at the load in a truth file."""
+DRY_TIME_S: Final = 0.01
+"""Time constant of a drag that depends only on direction: two or three control cycles."""
+HIGHEST_SHAKE_HZ: Final = 500.0
+HOLDS: Final = 1.5
+"""Friction that holds the load in a dead zone, over its inertial torque at the highest acceleration."""
+MOST_HELD: Final = 0.3
+"""Maximum wind-up of the spring by this friction, as a share of half the gap."""
+
+
+def compliance(effect: Compliance, draft: Draft) -> Said:
+    """Sets the spring in up to three stages, within the torque range of the effect.
+
+    Motor torque is load torque divided by the ratio.
+    """
+    times = draft.ratio if effect.torque == "motor_torque_nm" else 1.0
+    notes = []
+    stages: list[float] = []
+    zones = (
+        (0.0, effect.c1_arcsec_per_nm),
+        (effect.torque1_nm, effect.c2_arcsec_per_nm),
+        (effect.torque2_nm, effect.c3_arcsec_per_nm),
+    )
+    for begins_nm, softness in zones:
+        if begins_nm >= effect.limit_nm:
+            stages.append(stages[-1])
+            continue
+        wanted = ARCSEC_PER_RAD * times / softness if softness else math.inf
+        stages.append(min(wanted, draft.highest_stiffness_nm_per_rad))
+        if stages[-1] < wanted:
+            notes.append(
+                f"{stages[-1]:.3g} Nm/rad is the stiffest spring that the plant's time step resolves"
+            )
+    draft.set_stiffness(stages[0])
+    draft.gear.pop("stiffening", None)
+    if len(set(stages)) > 1:
+        draft.gear["stiffening"] = {
+            "first_torque_nm": effect.torque1_nm * times,
+            "second_stiffness_nm_per_rad": stages[1],
+            "second_torque_nm": effect.torque2_nm * times,
+            "third_stiffness_nm_per_rad": stages[2],
+        }
+    if times != 1.0:
+        notes.append("by the motor's torque times the ratio, friction included")
+    else:
+        draft.load["torque_sense"] = effect.sense
+    return Said("gear.stiffness_nm_per_rad, gear.stiffening", tuple(dict.fromkeys(notes)))
+
+
+def inertial_windup(effect: InertialWindup, draft: Draft) -> Said:
+    """Sets J / K of the load on its spring, minus the wind-up of the load encoder's coupling."""
+    seconds2 = effect.inertia_over_stiffness_s2
+    coupling = draft.part("load", "encoder").get("coupling")
+    if coupling:
+        seconds2 -= 1.0 / (math.tau * coupling["frequency_hz"]) ** 2
+    least = draft.inertia_kg_m2 / draft.highest_stiffness_nm_per_rad
+    notes = []
+    if seconds2 < least:
+        notes.append(
+            f"{math.sqrt(1 / least) / math.tau:.0f} Hz is the highest resonance that the plant resolves"
+        )
+        seconds2 = least
+    inertia = seconds2 * draft.stiffness_nm_per_rad
+    known = draft.gear.get("stiffening") is not None or not draft.tells_servo
+    if known and inertia > draft.hanging_kg_m2:
+        draft.set_inertia(inertia)
+        return Said(
+            "load.inertia_kg_m2", (*notes, "the spring is known otherwise, so the load follows from it")
+        )
+    draft.set_stiffness(draft.inertia_kg_m2 / seconds2)
+    return Said("gear.stiffness_nm_per_rad", (*notes, "with the load's inertia as assumed"))
+
+
+def velocity_windup(effect: VelocityWindup, draft: Draft) -> Said:
+    """Sets shear-thinning viscous friction at the load, and the dry part as a fast creep element.
+
+    Coulomb friction at the load would keep its wind-up at rest, which the model does not.
+    """
+    places = []
+    if effect.viscous_arcsec_s_per_deg:
+        # arcsec per motor deg/s to Nm per load rad/s
+        per_load_rad_s = effect.viscous_arcsec_s_per_deg * draft.ratio * math.degrees(1.0)
+        draft.load["viscous_nm_s_per_rad"] = per_load_rad_s / ARCSEC_PER_RAD * draft.stiffness_nm_per_rad
+        speed = math.radians(effect.shear_deg_s) / draft.ratio
+        draft.load["thinning"] = {"speed_rad_s": min(speed, 1000.0), "exponent": 1.0}
+        places.append("load.viscous_nm_s_per_rad, load.thinning")
+    if effect.coulomb_arcsec:
+        dry = {"time_constant_s": DRY_TIME_S, "amplitude_arcsec": effect.coulomb_arcsec}
+        draft.gear["creep"] = [*draft.gear.get("creep", ()), dry]
+        places.append("gear.creep")
+    return Said(", ".join(places) or "load.viscous_nm_s_per_rad")
+
+
+def hysteresis(effect: Hysteresis, draft: Draft) -> Said:
+    """Sets the same law if the load leads, or friction at the load if it lags."""
+    return _loop(effect, draft, memory=False)
+
+
+def hysteresis_memory(effect: HysteresisMemory, draft: Draft) -> Said:
+    """Sets parallel sliders, which have return-point memory."""
+    return _loop(effect, draft, memory=True)
+
+
+def hysteresis_parameters(effect: HysteresisParameters, draft: Draft) -> Said:
+    """Replaces the model's loop by the changed one."""
+    draft.gear.pop("hysteresis", None)
+    draft.load.pop("presliding", None)
+    return _loop(effect.changed().law(), draft, memory=effect.base.memory)
+
+
+def _loop(effect: Hysteresis | HysteresisMemory, draft: Draft, *, memory: bool) -> Said:
+    if effect.offset_arcsec < 0.0:
+        return _lagging(effect, draft, memory=memory)
+    if memory:
+        xi, height = branch(effect.exponent, NODES)
+        # The virgin curve, half the size of a branch: offset g(2 x / width).
+        parts = elements(0.5 * effect.width_deg * xi, effect.offset_arcsec * height)
+        slips = [{"limit_arcsec": limit, "yield_deg": travel} for limit, travel in parts]
+        if slips:
+            draft.gear["hysteresis"] = {"law": "maxwell_slip", "elements": slips}
+        return Said("gear.hysteresis", (f"straight between {NODES} points of a branch",))
+    draft.gear["hysteresis"] = {
+        "law": "rolling_friction",
+        "offset_arcsec": effect.offset_arcsec,
+        "width_deg": effect.width_deg,
+        "exponent": effect.exponent,
+    }
+    return Said("gear.hysteresis")
+
+
+def _lagging(effect: Hysteresis | HysteresisMemory, draft: Draft, *, memory: bool) -> Said:
+    """Sets presliding friction at the load, which winds up the gear's spring, so that the load lags.
+
+    Over a branch the motor moves by x and the load's lag grows by 2 offset g(x / width). The rest of x is the
+    load's travel, over which the friction grows. If nothing remains, the load stands still.
+    """
+    offset, stiffness = -effect.offset_arcsec, draft.stiffness_nm_per_rad / ARCSEC_PER_RAD
+    xi, height = branch(effect.exponent, 4 * NODES)
+    travel = xi * effect.width_deg * ARCSEC_PER_DEG / draft.ratio - 2.0 * offset * height
+    still = int(np.flatnonzero(travel <= 1e-9)[-1])
+    most = draft.spare_stiffness_nm_per_rad
+    limit_nm = offset * stiffness
+    while True:
+        dry_nm = limit_nm * float(height[still])
+        wanted = np.linspace(0.0, 1.0, SLIDERS + 1)[1:]
+        places = np.unique(np.searchsorted(height[still:], height[still] + wanted * (1.0 - height[still])))
+        places = still + np.minimum(places, len(height) - 1 - still)
+        reach = np.concatenate([[0.0], 0.5 * (travel[places] - max(travel[still], 0.0))])
+        force = np.concatenate([[0.0], limit_nm * (height[places] - height[still])])
+        parts = elements(reach, force) if still < len(height) - 1 and np.all(np.diff(reach) > 0.0) else []
+        stiff = sum(limit / (travel_arcsec / ARCSEC_PER_RAD) for limit, travel_arcsec in parts)
+        if still >= len(height) - 1 or (parts and stiff <= most):
+            break
+        still += 1
+    draft.load["coulomb_nm"] = dry_nm
+    draft.load["presliding"] = [
+        {"limit_nm": limit, "travel_deg": travel_arcsec / ARCSEC_PER_DEG} for limit, travel_arcsec in parts
+    ]
+    notes = ["friction at the load; after a fast stop the load's inertia pushes it on"]
+    if not memory:
+        notes.append("with return-point memory, which the model's law has not")
+    return Said("load.presliding, load.coulomb_nm", tuple(notes))
+
+
+def backlash(effect: Backlash, draft: Draft) -> Said:
+    """Sets a dead zone between spring and load, with friction that holds the load in it."""
+    half, per_nm = 0.5 * effect.gap_arcsec, ARCSEC_PER_RAD / draft.stiffness_nm_per_rad
+    acceleration = math.radians(draft.axis.limits.acceleration_deg_s2)
+    already_nm = float(draft.load.get("coulomb_nm") or 0.0)
+    friction_nm = min(HOLDS * draft.inertia_kg_m2 * acceleration, MOST_HELD * half / per_nm)
+    friction_nm = max(friction_nm - already_nm, 0.0)
+    draft.load["coulomb_nm"] = already_nm + friction_nm
+    draft.gear["backlash_arcsec"] = effect.gap_arcsec - 2.0 * friction_nm * per_nm
+    return Said(
+        "gear.backlash_arcsec, load.coulomb_nm",
+        (
+            f"{friction_nm:.2g} Nm of friction hold the load on its side; a stop that is harder than "
+            f"{math.degrees(friction_nm / draft.inertia_kg_m2):.0f} deg/s^2 throws it across",
+        ),
+    )
+
+
+def rate_dependence(effect: RateDependence, draft: Draft) -> Said:
+    """Sets the growth of the loop with speed."""
+    if draft.gear.get("hysteresis") is None:
+        return none("there is no leading loop that could grow")
+    draft.gear["rate_dependence"] = {
+        "growth_per_decade": 0.01 * effect.growth_percent,
+        "from_deg_s": effect.reference_deg_s,
+    }
+    return Said("gear.rate_dependence", ("follows the speed within 50 ms",))
+
+
+def vibration(effect: Vibration, draft: Draft) -> Said:
+    """Sets a torque that shakes the load by the same amplitude with the motor held."""
+    if effect.frequency_hz > HIGHEST_SHAKE_HZ:
+        return none(f"the plant is shaken by up to {HIGHEST_SHAKE_HZ:g} Hz")
+    turn = math.tau * effect.frequency_hz
+    # Load on its spring, then the encoder on its coupling.
+    dynamic = complex(
+        draft.stiffness_nm_per_rad - draft.inertia_kg_m2 * turn**2, turn * draft.gear["damping_nm_s_per_rad"]
+    )
+    reads: complex = 1.0 / dynamic
+    coupling: dict[str, Any] | None = draft.part("load", "encoder").get("coupling")
+    if coupling:
+        part = effect.frequency_hz / coupling["frequency_hz"]
+        lag = 2j * coupling["damping_ratio"] * part
+        reads *= (1.0 + lag) / (1.0 - part**2 + lag)
+    # The plant's torque is a sine, the model's movement a cosine.
+    phase = effect.phase_deg + 90.0 - math.degrees(cmath.phase(reads))
+    shake = {
+        "frequency_hz": effect.frequency_hz,
+        "torque_nm": effect.amplitude_arcsec / ARCSEC_PER_RAD / abs(reads),
+        "phase_deg": math.remainder(phase, 360.0),
+    }
+    draft.load["vibration"] = [*draft.load.get("vibration", ()), shake]
+    return Said("load.vibration", ("phase at the moment when the axis is switched on",))
+
+
+# ----------------------------------------------------------------
+
+OF_GEAR: Final = (
+    "motor_orders", "flexspline_orders", "load_orders", "hysteresis", "second_hysteresis", "flank", "jumps",
+    "torque_growth_per_nm", "backlash_arcsec", "rate_dependence", "wear", "ageing", "creep", "damage",
+    "roller", "seat",
+)  # fmt: skip
+"""Keys of the section `gear` for transmission error, which a model replaces."""
+OF_ENCODERS: Final = ("disc", "late_ms", "losses", "signals", "cable", "sensor_warming")
+OF_TEMPERATURE: Final = (
+    "zero_drift_arcsec_per_k", "zero_time_constant_s", "reference_c", "tooth_growth_per_k",
+    "friction_growth_per_k",
+)  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """Result of the translation of one effect."""
+
+    effect: str
+    counterpart: str | None
+    """Dotted paths in the truth file; None if the plant has no counterpart."""
+    note: str
+    """Differences, or the reason why there is no counterpart; empty for an exact translation."""
+
+
+@dataclass(frozen=True, slots=True)
+class Translation:
+    """A translated truth, with the result for each effect."""
+
+    truth: Truth
+    rows: tuple[Row, ...]
+    """One row per effect of the model, in the order of the catalogue; effects outside it come last."""
+
+
+class Entry(NamedTuple):
+    """One row of `TABLE`."""
+
+    counterpart: str
+    """Dotted paths in the truth file."""
+    write: Callable[[Any, Draft], Said]
+    """Writes an effect of this kind to a draft, and returns the place and differences."""
+
+
+TABLE: Final[Mapping[str, Entry]] = MappingProxyType(
+    {
+        # In the order of writing: the spring comes first, because torques are derived from it.
+        "ratio_error": Entry("gear.ratio", ratio_error),
+        "compliance": Entry("gear.stiffness_nm_per_rad, gear.stiffening", compliance),
+        "inertial_windup": Entry("gear.stiffness_nm_per_rad or load.inertia_kg_m2", inertial_windup),
+        "velocity_windup": Entry("load.viscous_nm_s_per_rad, load.thinning, gear.creep", velocity_windup),
+        "synchronous": Entry("gear.motor_orders", motor_orders),
+        "motor_order": Entry("gear.motor_orders", motor_orders),
+        "flexspline_order": Entry("gear.flexspline_orders", flexspline_orders),
+        "load_order": Entry("gear.load_orders or load.encoder.disc", load_orders),
+        "motor_encoder_eccentricity": Entry("motor.encoder.disc", motor_eccentricity),
+        "direction_phase": Entry("gear.flank", direction_phase),
+        "torque_modulation": Entry("gear.torque_growth_per_nm", torque_modulation),
+        "hysteresis": Entry("gear.hysteresis or load.presliding", hysteresis),
+        "hysteresis_memory": Entry("gear.hysteresis or load.presliding", hysteresis_memory),
+        "hysteresis_parameters": Entry("gear.hysteresis", hysteresis_parameters),
+        "backlash": Entry("gear.backlash_arcsec, load.coulomb_nm", backlash),
+        "rate_dependence": Entry("gear.rate_dependence", rate_dependence),
+        "channel_skew": Entry("motor.encoder.late_ms or load.encoder.late_ms", channel_skew),
+        "subdivisional_error": Entry("load.encoder.signals", subdivisional_error),
+        "count_loss": Entry("load.encoder.losses", count_loss),
+        "zero_drift": Entry("temperature.zero_drift_arcsec_per_k", zero_drift),
+        "amplitude_drift": Entry(
+            "temperature.tooth_growth_per_k, temperature.friction_growth_per_k", amplitude_drift
+        ),
+        "wear": Entry("gear.wear", wear),
+        "creep": Entry("gear.creep", creep),
+        "local_defect": Entry("gear.damage", local_defect),
+        "vibration": Entry("load.vibration", vibration),
+    }
+)
+"""One row per effect of the catalogue."""
+UNKNOWN: Final = none("the simulated drive has no part for an effect that is not of hdbridge's own catalogue")
+"""Result for an effect that was registered by an extension."""
+
+
+def translate(
+    axis: AxisConfig, model: TransmissionModel | None = None, base: Truth | None = None
+) -> Translation:
+    """Returns the simulated drive with the model's errors, on the axis of the axis file.
+
+    ``base`` (default: usual values) provides everything that the model does not describe. Without a model it
+    keeps its transmission error. InputError if the model has another gear ratio, or a value that the plant
+    cannot have.
+    """
+    truth = _of_axis(axis, base) if base is not None else default_truth(axis)
+    if model is None:
+        return Translation(truth, ())
+    model.check_ratio(axis)
+    draft = Draft(_without_error(truth, axis), axis, tells_servo=base is None)
+    by_name = {each.name: each for each in model.effects}
+    said = {
+        name: entry.write(by_name[name], draft)
+        for name, entry in TABLE.items()
+        if by_name.get(name) is not None
+    }
+    draft.finish()
+    order = [name for name in (*CATALOGUE, *by_name) if name in by_name]
+    rows = tuple(_row(by_name[name], said.get(name, UNKNOWN)) for name in dict.fromkeys(order))
+    return Translation(_validated(draft.data), rows)
+
+
+def _row(effect: Effect, said: Said) -> Row:
+    return Row(effect.name, said.counterpart, "; ".join(said.notes))
+
+
+def _validated(data: dict[str, Any]) -> Truth:
+    try:
+        return Truth.model_validate(data)
+    except ValidationError as problem:
+        first = problem.errors()[0]
+        place = ".".join(map(str, first["loc"]))
+        raise InputError(
+            f"the model asks the simulated drive for what it cannot be: {place}: {first['msg']}; look at the "
+            "effect of the model that says so"
+        ) from None
+
+
+def _of_axis(axis: AxisConfig, base: Truth) -> Truth:
+    """Returns the plant with encoders and rated torque of the axis file; its provenance keeps ``values``."""
+    data = base.model_dump(by_alias=True)
+    data["name"] = axis.name
+    data["motor"]["rated_torque_nm"] = axis.drive.rated_torque_nm
+    for section, encoder in (("motor", axis.motor_encoder), ("load", axis.load_encoder)):
+        data[section]["encoder"]["counts_per_turn"] = max(4, encoder.counts_per_turn)
+        data[section]["encoder"]["direction"] = encoder.direction
+    values = base.provenance.get("values")
+    data["intervals"], data["provenance"] = {}, {} if values is None else {"values": values}
+    return Truth.model_validate(data)
+
+
+def _without_error(truth: Truth, axis: AxisConfig) -> dict[str, Any]:
+    """Returns the truth file's content without the transmission errors that a model describes."""
+    data = truth.model_dump(by_alias=True)
+    data["gear"]["ratio"] = axis.gear.ratio
+    parts = (
+        (data["gear"], OF_GEAR),
+        (data["motor"]["encoder"], OF_ENCODERS),
+        (data["load"]["encoder"], OF_ENCODERS),
+        (data["temperature"], OF_TEMPERATURE),
+        (data["load"], ("vibration",)),
+    )
+    for part, names in parts:
+        for name in names:
+            part.pop(name, None)
+    return data

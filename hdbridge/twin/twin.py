@@ -1,0 +1,448 @@
+"""Result of `fit_twin`: the simulated drive's parameters, their intervals, and the residuals.
+
+Verdict on a twin, from its residuals in each channel on held-out legs. Pure.
+
+A fit assumes that the simulated drive can behave like the axis. The residuals show if that is so. Only a twin
+that explains every channel has the values of the axis. Any other twin replays the motion, and its values are
+those of a different drive with similar motion.
+
+The twin of an axis as a file: a truth file with provenance, stored like a model.
+
+profiles/NAME/twin.yaml           the active twin, which `hdbridge simulate` and `--simulate` use
+              pending-twin.yaml   proposed by `hdbridge twin`, not yet committed
+              twin-history/       each version that was ever active, and the log
+
+Makes a twin from recordings: fit, causes by which the start was wrong, inseparable sets, residuals.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final, Self
+
+from hdbridge.axis import AxisConfig, Identity
+from hdbridge.errors import InputError
+from hdbridge.files.profile import TWIN_NAME
+from hdbridge.files.yamlfile import Hex, Line, dump_yaml, write_atomically
+from hdbridge.model.binding import binding, check_binding
+from hdbridge.model.difference import Difference, flat
+from hdbridge.model.file import Provenance
+from hdbridge.model.store import Store
+from hdbridge.records.record import WRONG_RATIO
+from hdbridge.records.recording import Recording, versions_here
+from hdbridge.sim.truth import Truth
+from hdbridge.twin.compare import (
+    ALL,
+    FOLLOWING_ERROR,
+    LOAD_ERROR,
+    MOTOR_TORQUE,
+    TEMPERATURE,
+    TITLES,
+    Comparison,
+    compare,
+)
+from hdbridge.twin.fit import FIT_S, Fitted, by_law_of, fit, fitted_rows, legs_of_rows
+from hdbridge.twin.misfit import (
+    CHANNELS,
+    NOISE_LEVEL,
+    Data,
+    Left,
+    Replays,
+    Values,
+    coarse,
+    held_out_legs,
+    misfit_of,
+    noise_in_motion,
+    prepare,
+    values_of,
+    what_is_left,
+    with_load_noise,
+)
+from hdbridge.twin.naming import Alike, Finding, alike, name_causes
+from hdbridge.twin.parameters import LOAD, default_truth, with_sections
+from hdbridge.twin.replay import legs_of, replay_directly
+from hdbridge.twin.response import with_response
+from hdbridge.twin.thermal import with_warmth
+from hdbridge.units import figure
+
+# ----------------------------------------------------------------
+# Result of `fit_twin`: the simulated drive's parameters, their intervals, and the residuals.
+
+HELD_OUT = "held out"
+"""Kind of leg for the held-out legs in a comparison."""
+
+
+@dataclass(frozen=True)
+class Twin:
+    """A simulated drive fitted to an axis."""
+
+    truth: Truth
+    """Parameters with the intervals of the fitted ones; its provenance holds the data that `check` needs."""
+    findings: tuple[Finding, ...]
+    """Causes by which the initial simulation was wrong, if its values were the axis's."""
+    alike: tuple[Alike, ...]
+    """Sets of parameters that the recorded motion does not separate."""
+    left: tuple[Left, ...]
+    """Residual of each recorded channel, on held-out legs if there are any."""
+    before: Comparison
+    """Recordings against the initial simulation; the kind `HELD_OUT` covers the held-out legs."""
+    after: Comparison
+    """Recordings against the twin."""
+    impossible: tuple[str, ...] = ()
+    """Implausible values, each in a sentence; only for a twin whose values are not the axis's."""
+
+    @property
+    def values(self) -> Values:
+        """Origin of its values: the axis, or only a replay."""
+        return Values.of(self.truth) or Values.REPLAY
+
+    @property
+    def unexplained(self) -> tuple[Left, ...]:
+        """Channels with residuals above their noise."""
+        return tuple(each for each in self.left if each.times_noise > NOISE_LEVEL)
+
+    @property
+    def intervals(self) -> dict[str, tuple[float, float]]:
+        """95 % intervals by path in the truth file; empty unless the values are the axis's."""
+        return self.truth.intervals
+
+    @property
+    def provenance(self) -> dict[str, Any]:
+        """Provenance of the truth."""
+        return self.truth.provenance
+
+
+# ----------------------------------------------------------------
+# Verdict on a twin, from its residuals in each channel on held-out legs. Pure.
+
+SIGNALS: Final = (LOAD_ERROR, FOLLOWING_ERROR, MOTOR_TORQUE, TEMPERATURE)
+LEAST_GAIN: Final = 0.01
+"""Minimum reduction of the mean ratio of the differences; smaller ones are due to noise."""
+WORSE: Final = 1.1
+"""Ratio of the differences after and before above which a signal is worse, if it exceeds its noise."""
+DECADE: Final = 10.0
+"""Maximum ratio of a motor's inertia to the usual one for its rated torque, and of load and motor inertia
+seen by the motor. Servo motors of equal torque differ by a factor of three to five (catalogues)."""
+MOST_DEAD_CYCLES: Final = 2.0
+"""Maximum dead time in SYNC cycles: one to take over the demand, one to execute it (CiA 402)."""
+
+
+def impossible(truth: Truth, axis: AxisConfig, cycle_s: float) -> tuple[str, ...]:
+    """Returns values of a truth that are impossible for this axis file, each in a sentence."""
+    motor, servo = truth.motor, truth.servo
+    usual = default_truth(axis).motor.inertia_kg_m2
+    load = truth.load_.whole_inertia_kg_m2 / axis.gear.ratio**2
+    found = []
+    for name, value, of, other in (
+        ("motor inertia", motor.inertia_kg_m2, usual, "the one usual for its rated torque"),
+        ("load inertia seen by the motor", load, motor.inertia_kg_m2, "the motor's"),
+    ):
+        if not 1.0 / DECADE <= value / of <= DECADE:
+            found.append(f"{name} {figure(value, 3)} kg m2; expected within a decade of {other}, {of:.3g}")
+    most_rad_s = math.radians(axis.limits.velocity_deg_s * axis.gear.ratio)
+    rise = 1.0 + motor.stribeck.rise if motor.stribeck else 1.0
+    friction_nm = motor.coulomb_nm * rise + motor.viscous_nm_s_per_rad * most_rad_s
+    if servo.friction_feedforward_nm > friction_nm:
+        found.append(
+            f"friction feed-forward {figure(servo.friction_feedforward_nm, 3)} Nm; expected at most the "
+            f"friction, {figure(friction_nm, 3)}"
+        )
+    most_ms = 1e3 * MOST_DEAD_CYCLES * cycle_s
+    if servo.dead_time_ms > most_ms:
+        found.append(
+            f"dead time {figure(servo.dead_time_ms, 3)} ms; expected at most two cycles, {figure(most_ms, 3)}"
+        )
+    return tuple(found)
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """Decision to keep a twin or not, with its reason."""
+
+    kept: bool
+    text: str
+    """Reason in a sentence or two, beginning with the validity of the values."""
+
+
+def judge(twin: Twin) -> Verdict:
+    """Decides if a twin is kept, and states the validity of its values."""
+    gain = better(twin.before, twin.after)
+    if twin.impossible:
+        return Verdict(False, f"the twin is not kept: no axis has these values: {'; '.join(twin.impossible)}")
+    if not gain.better:
+        return Verdict(False, f"the twin is not kept: {gain.text}")
+    text = f"the twin is kept as pending: {gain.text}"
+    if twin.values is not Values.AXIS:
+        text = f"{replays_only(twin)}; {text}"
+    if twin.provenance.get("interrupted"):
+        text = f"the fit was interrupted, so this is the best place so far; {text}"
+    return Verdict(True, text)
+
+
+def replays_only(twin: Twin) -> str:
+    """Returns the headline of a twin whose values are not the axis's."""
+    shown = ", ".join(f"{each.channel} to {_percent(each.share)}" for each in twin.left)
+    lost = [
+        f"{each.channel} is left with {figure(each.times_noise, 3)} times its noise"
+        for each in twin.left
+        if not each.explained
+    ]
+    if twin.truth.servo.response is not None:
+        lost.append("a measured response stands for what its loops do not do")
+    why = f": {'; '.join(lost)}" if lost else ""
+    return f"the twin replays this drive ({shown}), but its values are not the axis's{why}"
+
+
+def _percent(share: float) -> str:
+    return f"{figure(100.0 * share, 2)} %" if math.isfinite(share) else "no share"
+
+
+@dataclass(frozen=True, slots=True)
+class Gain:
+    """Improvement by a fit."""
+
+    better: bool
+    text: str
+
+
+def better(before: Comparison, after: Comparison) -> Gain:
+    """Compares the rms differences of load error, following error, torque and temperature, if recorded.
+
+    On held-out legs, or on all legs if none was held out.
+    """
+    kind = HELD_OUT if any(row.kind == HELD_OUT for row in after.rows) else ALL
+    where = "on legs that the fit has not seen" if kind == HELD_OUT else "on the legs that it was fitted to"
+    pairs = {
+        name: (was, now)
+        for name in SIGNALS
+        if (was := before.row(name, kind)) is not None and (now := after.row(name, kind)) is not None
+    }
+    # A replay starts at a reading and may be off by a step from there on; smaller differences are equal.
+    step_k = max((each.noise for each in pairs.get(TEMPERATURE, ())), default=0.0)
+    if max((each.difference for each in pairs.get(TEMPERATURE, ())), default=0.0) <= step_k:
+        pairs.pop(TEMPERATURE, None)
+    worse = [
+        f"{TITLES[name]} differs by {now.difference:.3g} {now.unit}, before by {was.difference:.3g}"
+        for name, (was, now) in pairs.items()
+        if now.difference > WORSE * was.difference and now.difference > max(now.noise, 1e-12)
+    ]
+    # Noise is in both differences. Differences below these limits are rounding errors.
+    least = {name: step_k if name == TEMPERATURE else 1e-12 for name in pairs}
+    ratios = [
+        math.log(max(now.difference, least[name]) / max(was.difference, least[name]))
+        for name, (was, now) in pairs.items()
+    ]
+    gain = 1.0 - math.exp(sum(ratios) / len(ratios)) if ratios else 0.0
+    if worse:
+        return Gain(False, f"{where}, {'; '.join(worse)}")
+    if gain < LEAST_GAIN:
+        return Gain(False, f"{where} it is no nearer to the axis than the simulation was")
+    return Gain(True, f"{where} the differences from the axis are {100.0 * gain:.0f} % smaller in the mean")
+
+
+# ----------------------------------------------------------------
+# The twin of an axis as a file: a truth file with provenance, stored like a model.
+
+# ----------------------------------------------------------------
+# Difference of two twins by parameter. Pure.
+
+SECTIONS = ("motor", "servo", "gear", "load", "temperature")
+
+
+def diff(before: Truth | None, after: Truth) -> list[Difference]:
+    """Returns all non-default parameters of both twins, changed or not, in the order of the file."""
+    old, new = dict(_parameters(before)) if before else {}, dict(_parameters(after))
+    widths = {
+        place: 0.5 * (upper - lower)
+        for twin in (before, after)
+        if twin is not None
+        for place, (lower, upper) in twin.intervals.items()
+    }
+    keys = list(dict.fromkeys([*old, *new]))
+    keys.sort(key=lambda key: SECTIONS.index(key[0]) if key[0] else -1)
+    return [
+        Difference(*key, old.get(key), new.get(key), widths.get(".".join(part for part in key if part)))
+        for key in keys
+    ]
+
+
+def _parameters(truth: Truth) -> Iterator[tuple[tuple[str, str], Any]]:
+    data = truth.model_dump(by_alias=True, mode="json", exclude_defaults=True)
+    for section in SECTIONS:
+        for name, value in flat(data.get(section, {})):
+            yield (section, name), value
+
+
+# ----------------------------------------------------------------
+
+HEADER: Final = (
+    "# The twin of an axis, by hdbridge: what the simulated drive is, learned from recordings.\n"
+    "# docs/ci.md describes its keys, docs/twin.md how it came about.\n"
+)
+
+
+@dataclass(frozen=True)
+class KeptTwin:
+    """A twin and the file that it was read from."""
+
+    truth: Truth
+    path: Path | None = field(default=None, compare=False)
+
+    @classmethod
+    def load(cls, path: Path | str) -> Self:
+        """Reads a twin's file; InputError with file:line:column."""
+        return cls(Truth.load(path), Path(path))
+
+    @property
+    def provenance(self) -> Mapping[str, Any]:
+        """Axis, drive and gear to which it is bound, date, reason and recordings."""
+        return self.truth.provenance
+
+    def with_provenance(self, **provenance: Any) -> Self:
+        """Returns the twin with these entries added to its provenance."""
+        known = {**self.truth.provenance, **provenance}
+        return type(self)(self.truth.model_copy(update={"provenance": known}), self.path)
+
+    def bound_to(self, axis: AxisConfig, identity: Identity | None = None) -> Self:
+        """Returns the twin bound to an axis and the drive that answered (else the axis file's)."""
+        return self.with_provenance(**binding(axis, identity))
+
+    def check_ratio(self, axis: AxisConfig) -> None:
+        """Raises InputError if the twin has another gear ratio than the axis file.
+
+        The ratio compared is the one of the measurement; the gear's true ratio may differ by a `ratio_error`.
+        """
+        bound = Provenance.model_validate(self.truth.provenance).gear
+        ratio, allowed = (bound.ratio, 1e-9) if bound else (self.truth.gear.ratio, WRONG_RATIO)
+        if not math.isclose(ratio, axis.gear.ratio, rel_tol=allowed):
+            raise InputError(
+                f"{self._name()}: gear.ratio: this twin is of a gear with ratio {ratio:g}, but {axis.path} "
+                f"says {axis.gear.ratio:g}; use the twin of this gear, or make one"
+            )
+
+    def check_bound_to(self, axis: AxisConfig, identity: Identity | None = None) -> None:
+        """Raises InputError if the twin belongs to another drive, axis or gear."""
+        self.check_ratio(axis)
+        check_binding(self.truth.provenance, axis, identity, self._name(), "twin", "make one")
+
+    def dump(self) -> str:
+        """Returns the file's text, which reads back exactly; default values are omitted."""
+        data = self.truth.model_dump(by_alias=True, mode="json", exclude_defaults=True)
+        provenance = data.get("provenance", {})
+        drive, about = provenance.get("drive"), provenance.get("fit")
+        if isinstance(drive, dict):
+            provenance["drive"] = {
+                name: Hex(value) if isinstance(value, int) else value for name, value in drive.items()
+            }
+        if isinstance(about, dict) and "covariance" in about:
+            provenance["fit"] = {**about, "covariance": [Line(row) for row in about["covariance"]]}
+        if "intervals" in data:
+            data["intervals"] = {place: Line(pair) for place, pair in data["intervals"].items()}
+        return HEADER + dump_yaml(data)
+
+    def save(self, path: Path | str) -> None:
+        """Writes the file atomically."""
+        write_atomically(path, self.dump())
+
+    def _name(self) -> str:
+        return str(self.path) if self.path else "this twin"
+
+
+TWINS: Final = Store(
+    "twin",
+    TWIN_NAME,
+    "pending-twin.yaml",
+    "twin-history",
+    "make one with 'hdbridge twin'",
+    "hdbridge model log PROFILE --twin",
+    KeptTwin.load,
+)
+"""The twins of a profile."""
+
+
+# ----------------------------------------------------------------
+# Makes a twin from recordings: fit, causes by which the start was wrong, inseparable sets, residuals.
+
+
+def fit_twin(
+    recordings: Sequence[Recording],
+    axis: AxisConfig,
+    start: Truth,
+    progress: Callable[[float], None] = lambda _: None,
+    workers: int | None = None,
+) -> Twin:
+    """Fits the twin of an axis to recordings that have the commanded motor angle.
+
+    ``start`` is the initial simulation: the translated axis file and model, or an older twin. Replays run in
+    ``workers`` processes. InputError if a recording has no command or is of another gear.
+
+    Causes are named only if the values before and after the fit are the axis's; intervals are given only if
+    those after it are. Otherwise a measured response is added, if held-out legs confirm it.
+    """
+    whole = Recording.joined(list(recordings))
+    plain = start.model_copy(update={"servo": start.servo.model_copy(update={"response": None})})
+    data = coarse(prepare(whole, axis, plain), FIT_S)
+    with Replays(data, workers) as replays:
+        noise = noise_in_motion(data)
+        fitted = fit(replays, lambda share: progress(0.9 * share))
+        left = what_is_left(data, fitted.residuals, noise)
+        values = Values.REPLAY if fitted.interrupted else values_of(left)
+        if values is Values.REPLAY and not fitted.interrupted:
+            fitted = with_response(replays, fitted)
+            left = what_is_left(data, fitted.residuals, noise)
+        findings: tuple[Finding, ...] = ()
+        sets: dict[Alike, None] = {}
+        if values is Values.AXIS:
+            if Values.of(start) in {None, Values.AXIS}:
+                like = by_law_of(with_sections(start, fitted.parameters), fitted.truth)
+                findings, rivals = name_causes(replays, like, fitted)
+                sets = dict.fromkeys(rivals)
+            sets |= dict.fromkeys(alike(fitted, legs_of_rows(data, fitted_rows(data))))
+    truth, warmth = with_warmth(whole, axis, fitted, with_knowledge(fitted, data, values))
+    if values is Values.REPLAY:
+        truth = truth.model_copy(update={"intervals": {}})
+    elif warmth is not None and Values.of(start) in {None, Values.AXIS}:
+        findings = (*findings, warmth)
+    before, after = (_compared(whole, axis, each) for each in (start, truth))
+    cycle_s = data.pieces[0].commands.cycle_s
+    progress(1.0)
+    return Twin(
+        truth,
+        findings,
+        tuple(sets),
+        left,
+        before,
+        after,
+        impossible(truth, axis, cycle_s) if values is Values.REPLAY else (),
+    )
+
+
+def _compared(whole: Recording, axis: AxisConfig, truth: Truth) -> Comparison:
+    """Compares a recording with one simulation by kind of leg, and on the held-out legs."""
+    held = [each.model_copy(update={"kind": HELD_OUT}) for each in held_out_legs(whole)]
+    simulated = replay_directly(whole, axis, truth)
+    return compare(whole.record, simulated, [*legs_of(whole), *held], axis.gear.ratio)
+
+
+def with_knowledge(fitted: Fitted, data: Data, values: Values = Values.AXIS) -> Truth:
+    """Returns the fitted truth with its intervals, and the data for a later check in its provenance."""
+    intervals = fitted.intervals()
+    about: dict[str, Any] = {
+        "parameters": [each.name for each in fitted.parameters],
+        "covariance": [[float(f"{value:.6g}") for value in row] for row in fitted.covariance.tolist()],
+        "noise": {name: float(f"{fitted.scales.noise[name]:.6g}") for name in CHANNELS},
+        "misfit": misfit_of(data, fitted.residuals),
+    }
+    truth = with_load_noise(fitted.truth, fitted.residuals[LOAD])
+    return truth.model_copy(
+        update={
+            "intervals": {".".join(each.path): intervals[each.name] for each in fitted.parameters},
+            "provenance": {
+                **truth.provenance, "values": str(values), "versions": versions_here(), "fit": about,
+                **({"interrupted": True} if fitted.interrupted else {}),
+            },
+        }
+    )  # fmt: skip
