@@ -46,6 +46,10 @@ class Outcome(NamedTuple):
     proposal: Proposal | None = None
 
 
+NOTHING: Final = Outcome([])
+"""Outcome of samples that are not evaluated yet."""
+
+
 class Follower:
     """Follows one axis and one committed model. Call all methods from one thread."""
 
@@ -113,7 +117,7 @@ class Follower:
         if len(samples):
             self._waiting.append(samples)
         if sum(map(len, self._waiting)) < SAMPLES_TOGETHER:
-            return Outcome([])
+            return NOTHING
         together, self._waiting = joined_samples(self._waiting), []
         return self.advance(together, self.health.take(together))
 
