@@ -29,7 +29,7 @@ from hdbridge.records.record import Record, concatenate
 from hdbridge.records.recording import Recording
 from hdbridge.sim.truth import Truth
 from hdbridge.twin.compare import Comparison, compare
-from hdbridge.twin.replay import replay_directly
+from hdbridge.twin.replay import replay
 from hdbridge.twin.translate import translate
 from hdbridge.twin.twin import Twin, fit_twin
 
@@ -131,7 +131,7 @@ def twin_of_others(recordings: Sequence[Recording], out: int) -> tuple[Twin, dic
 
 def held_against(recording: Recording, truth: Truth) -> Comparison:
     """Compares a recording with its replay."""
-    simulated = replay_directly(recording, joint_axis(), truth)
+    simulated = replay(recording, joint_axis(), truth)
     return compare(recording.record, simulated, (), NOTHING.ratio)
 
 

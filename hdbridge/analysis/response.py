@@ -163,7 +163,7 @@ def following_lag_s(runs: Iterable[Harmonics]) -> float:
 class _Found(NamedTuple):
     frequency_hz: float
     response: complex
-    """Load per correction and transmission error, without the following lag."""
+    """Load per correction and transmission error."""
     deviation: float
     """Standard deviation of the response."""
 
@@ -298,10 +298,9 @@ def agree(one: Response, other: Response) -> bool:
 
 
 def _at(response: Response, hertz: FloatArray) -> tuple[ComplexArray, FloatArray]:
-    """Interpolates response (with the following lag) and uncertainty linearly at some frequencies."""
+    """Interpolates response and uncertainty linearly at some frequencies."""
     known = np.array(response.frequency_hz)
-    late = np.exp(-2j * math.pi * response.following_lag_ms / 1000.0 * known)
-    values = np.array(response.gain) * np.exp(1j * np.radians(response.phase_deg)) * late
+    values = np.array(response.gain) * np.exp(1j * np.radians(response.phase_deg))
     found: ComplexArray = np.interp(hertz, known, values.real) + 1j * np.interp(hertz, known, values.imag)
     return found, np.interp(hertz, known, response.uncertainty)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
@@ -16,6 +16,7 @@ from hdbridge.analysis.response import (
     Trial,
     agree,
     difference,
+    following_lag_s,
     gain,
     harmonics,
     order_hz,
@@ -23,17 +24,17 @@ from hdbridge.analysis.response import (
 )
 from hdbridge.axis import AxisConfig
 from hdbridge.calibration.measure import Pace
-from hdbridge.calibration.path import PathError, path_errors
+from hdbridge.calibration.path import PathError, inertia_over_stiffness, path_errors
 from hdbridge.control.bench import axis_view, compensation_for
 from hdbridge.control.rig import Rig, bench_on
 from hdbridge.drive.drive import Drive
 from hdbridge.drive.gains import changed_gains, read_gains
-from hdbridge.effects import Motion, Synchronous
+from hdbridge.effects import InertialWindup, Motion, Synchronous
 from hdbridge.effects.orders import MotorOrder, OrderSeries
 from hdbridge.errors import InputError
 from hdbridge.model import TransmissionModel
 from hdbridge.model.response import Response
-from hdbridge.procedures.even_speed import EvenRun, EvenSpeed
+from hdbridge.procedures.even_speed import SHARES, EvenRun, EvenSpeed
 from hdbridge.procedures.path_test import PathRun, PathTest
 from hdbridge.procedures.rehearsal import rehearse
 from hdbridge.units import ARCSEC_PER_DEG
@@ -49,6 +50,8 @@ RETUNED = (
     "{:.1f} ms now; the response differs by {:.0f} %): it was retuned, or the load changed; measure the "
     "response again"
 )
+CHECKED = (0.64, 0.38, 0.18)
+"""Speeds of a check of the stored response, as shares of the limit."""
 NO_LOAD_ENCODER = (
     "load_encoder.source is the motor encoder: the ripple is that of the load angle predicted from motor "
     "encoder and model; path errors are not measured"
@@ -71,12 +74,15 @@ class OrderRipple:
 
 @dataclass(frozen=True, slots=True)
 class PathResult:
-    """Error on one path without correction, with the static one, and with the filtered one."""
+    """Error on one path without correction, with the static one, with the filtered one, and with the
+    wind-up compensated as well.
+    """
 
     name: str
     none: PathError
     static: PathError
     filtered: PathError | None = None
+    wind_up: PathError | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,6 +127,13 @@ class MotionTest:
     """Response with the filter of the correction; None if no filter helps."""
     remarks: tuple[str, ...] = ()
     paths: tuple[PathResult, ...] = ()
+    wind_up: InertialWindup | None = None
+    """Wind-up of the load in acceleration, if compensating for it makes the path error smaller."""
+
+    def applied(self, model: TransmissionModel) -> TransmissionModel:
+        """Returns a model with the response and the wind-up of this test."""
+        effects = model.effects if self.wind_up is None else (*model.effects, self.wind_up)
+        return replace(model, effects=effects, response=self.response)
 
     @property
     def helps_to_deg_s(self) -> float | None:
@@ -159,6 +172,13 @@ class MotionTest:
         )
 
     @property
+    def gains_by_wind_up(self) -> bool:
+        """True if the error with wind-up, on all paths together, is smaller once that is compensated."""
+        pairs = [(each.filtered, each.wind_up) for each in self.paths]
+        before, after = ([one.delayed_arcsec for one in each if one] for each in zip(*pairs, strict=True))
+        return bool(after) and CHANCE * _rms(after) < _rms(before)
+
+    @property
     def remaining(self) -> float:
         """Mean share of the ripple that the filtered correction leaves; 1 without one."""
         shares = [
@@ -187,6 +207,7 @@ class MotionTest:
             ],
             "paths": [asdict(each) for each in self.paths],
             "response": self.response.model_dump(mode="json") if self.response else None,
+            "wind_up": self.wind_up.parameters() if self.wind_up else None,
             "remarks": list(self.remarks),
         }
 
@@ -209,19 +230,20 @@ class MotionTest:
                 each["name"],
                 PathError(**each["none"]),
                 PathError(**each["static"]),
-                PathError(**each["filtered"]) if each["filtered"] else None,
+                *(PathError(**each[name]) if each[name] else None for name in ("filtered", "wind_up")),
             )
             for each in data.get("paths", ())
         )
         response = Response.model_validate(data["response"]) if data["response"] else None
-        return cls(ripples, response, tuple(map(str, data["remarks"])), paths)
+        wind_up = InertialWindup.model_validate(data["wind_up"]) if data["wind_up"] else None
+        return cls(ripples, response, tuple(map(str, data["remarks"])), paths, wind_up)
 
 
 def motion_test_s(axis: AxisConfig, runs: int = 2 + TRIALS) -> float:
     """Returns the longest duration of the test on an ideal axis."""
     view = axis_view(axis)
     middle = 0.5 * (axis.limits.position_min_deg + axis.limits.position_max_deg)
-    paths_s = 3.0 * rehearse(PathTest(), view, middle).duration_s
+    paths_s = 4.0 * rehearse(PathTest(), view, middle).duration_s
     return paths_s + runs * rehearse(EvenSpeed.spread(view), view, middle).duration_s
 
 
@@ -250,21 +272,29 @@ def motion_test(
         found = replace(found, remarks=(*found.remarks, *changed))
     if drive.axis.load_encoder.is_motor_encoder:
         return replace(found, remarks=(*found.remarks, NO_LOAD_ENCODER))
-    used = [model.only(()), replace(model, response=None)]
+    used = [replace(model.only(()), response=None), replace(model, response=None)]
     if found.response is not None:
         used.append(replace(model, response=found.response))
-    errors = path_errors([runner.run_paths(each) for each in used], model.ratio)
+    runs = [runner.run_paths(each) for each in used]
+    errors = path_errors(runs, model.ratio, runner.lag_s)
+    if measure and found.response is not None and (wind_up := runner.wind_up(runs[-1])) is not None:
+        found = replace(found, wind_up=wind_up)
+        corrected = runner.run_paths(found.applied(model))
+        errors.append(path_errors([runs[0], corrected], model.ratio, runner.lag_s)[1])
     found = replace(found, paths=tuple(PathResult(each[0].name, *each) for each in zip(*errors, strict=True)))
+    if found.wind_up is not None and not found.gains_by_wind_up:
+        found = replace(found, wind_up=None)
     if measure and found.harms_paths:
         remark = "no filter is kept: with it the path error is larger than without correction"
-        return replace(found, response=None, remarks=(*found.remarks, remark))
+        return replace(found, response=None, wind_up=None, remarks=(*found.remarks, remark))
     return found
 
 
 def _ripple_test(runner: _Runner, model: TransmissionModel, measure: bool) -> MotionTest:
     """Runs the constant-speed part of the test."""
     axis = runner.axis
-    none = runner.run("without correction", model.only(()))
+    none = runner.run("without correction", replace(model.only(()), response=None))
+    runner.lag_s = following_lag_s(none)
     static_model = replace(model, response=None)
     static = runner.run("correction of rest", static_model)
     limits = limits_of(axis, model)
@@ -315,12 +345,61 @@ def _tested(
     if stored is None:
         return MotionTest(_ripples(runner, none, static), None)
     filtered = runner.run("filtered correction", model)
-    found = response_of(none, [Trial(static)], runner.orders, model.ratio, runner.cycle_s, limits)
-    remarks: tuple[str, ...] = ()
-    if found is not None and not agree(stored, found):
-        apart = 100.0 * difference(stored, found)
-        remarks = (RETUNED.format(stored.following_lag_ms, found.following_lag_ms, apart),)
+    trials = [Trial(static), Trial(filtered, stored.filter)]
+    found = response_of(none, trials, runner.orders, model.ratio, runner.cycle_s, limits)
+    remark = None if found is None else ServoCheck.of(stored, found).remark
+    remarks = () if remark is None else (remark,)
     return MotionTest(_ripples(runner, none, static, filtered, stored), stored, remarks)
+
+
+@dataclass(frozen=True, slots=True)
+class ServoCheck:
+    """Comparison of the stored response with a new measurement."""
+
+    stored_lag_ms: float
+    lag_ms: float
+    difference: float
+    """Rms relative difference of the responses over the frequencies that both have, less its noise."""
+    agrees: bool
+
+    @classmethod
+    def of(cls, stored: Response, found: Response) -> ServoCheck:
+        """Compares two responses."""
+        apart = difference(stored, found)
+        return cls(stored.following_lag_ms, found.following_lag_ms, apart, agree(stored, found))
+
+    @property
+    def remark(self) -> str | None:
+        """Reason why the stored response is not valid any more; None if it is."""
+        if self.agrees:
+            return None
+        return RETUNED.format(self.stored_lag_ms, self.lag_ms, 100.0 * self.difference)
+
+
+def servo_check(
+    drive: Drive, model: TransmissionModel, interrupted: Callable[[], bool] = lambda: False
+) -> ServoCheck:
+    """Measures a few frequencies of a booted drive's response, and compares them with the model's response.
+
+    InputError if the model has no response or no motor order, or if the ripple is too small.
+    """
+    stored = model.response
+    if stored is None:
+        raise InputError(f"{model.path}: has no response in motion; measure it: hdbridge motion --propose")
+    runner = _Runner(drive, model, lambda *_: None, interrupted, CHECKED)
+    none = runner.run("without correction", replace(model.only(()), response=None))
+    filtered = runner.run("filtered correction", model)
+    found = response_of(
+        none,
+        [Trial(filtered, stored.filter)],
+        runner.orders,
+        model.ratio,
+        runner.cycle_s,
+        limits_of(drive.axis, model),
+    )
+    if found is None:
+        raise InputError("the response cannot be measured: the ripple is too small")
+    return ServoCheck.of(stored, found)
 
 
 class _Runner:
@@ -332,6 +411,7 @@ class _Runner:
         model: TransmissionModel,
         progress: Callable[[str, float, float], None],
         interrupted: Callable[[], bool],
+        shares: Sequence[float] = SHARES,
     ) -> None:
         axis = self.axis = drive.axis
         self.orders = tuple(each.order for each in motor_orders(model))
@@ -340,7 +420,10 @@ class _Runner:
                 f"the model has no motor order of {LEAST_ARCSEC:g} arcsec or more: there is no ripple to "
                 "measure the response by; calibrate the axis first"
             )
-        self.procedure = EvenSpeed.spread(axis_view(axis))
+        self.lag_s = 0.0
+        """Following lag, from the runs without correction."""
+        self._model = model
+        self.procedure = EvenSpeed.spread(axis_view(axis), shares)
         self._orders_only = TransmissionModel(model.ratio, (Synchronous(orders=tuple(motor_orders(model))),))
         self.ratio, self.cycle_s = model.ratio, axis.drive.cycle_s
         self._drive = drive
@@ -355,11 +438,29 @@ class _Runner:
             runs = tuple(predicted_run(each, self._orders_only) for each in runs)
         return tuple(harmonics(each, self.orders, self.ratio) for each in runs)
 
+    def wind_up(self, runs: Sequence[PathRun]) -> InertialWindup | None:
+        """Returns the wind-up in compensated runs; None if it is not significant or the model has it."""
+        if wind_up_of(self._model) is not None:
+            return None
+        moves = [each for each in runs if not each.skipped]
+        found_s2, spread_s2 = inertia_over_stiffness(moves, self._orders_only, self.lag_s)
+        if found_s2 < 2.0 * spread_s2:
+            return None
+        limit_deg_s2 = self.axis.limits.acceleration_deg_s2 * self.ratio
+        return InertialWindup(
+            ratio=self.ratio, inertia_over_stiffness_s2=float(f"{found_s2:.3g}"), limit_deg_s2=limit_deg_s2
+        )
+
     def run_paths(self, model: TransmissionModel) -> tuple[PathRun, ...]:
         """Runs the paths with this model."""
         self._pace.begin("path error")
         compensation = compensation_for(self.axis, model)
         return bench_on(self._drive, compensation, interrupted=self._pace.interrupted).run(PathTest()).outcome
+
+
+def wind_up_of(model: TransmissionModel) -> InertialWindup | None:
+    """Returns the wind-up of the load in acceleration that a model has."""
+    return next((each for each in model.effects if isinstance(each, InertialWindup)), None)
 
 
 def motor_orders(model: TransmissionModel) -> list[MotorOrder]:

@@ -2,11 +2,13 @@
 
 The motor's lag and the wind-up of the gear's spring would be the same on a gear without error. They are
 fitted to the runs as responses to the target, and removed. The gear's error depends on the angle, so a
-response to a smooth target cannot reproduce it.
+response to a smooth target cannot reproduce it. The error with wind-up is that against the target delayed by
+the following lag.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -14,6 +16,8 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from hdbridge.effects import Motion
+from hdbridge.model import TransmissionModel
 from hdbridge.procedures.path_test import PathRun
 from hdbridge.units import ARCSEC_PER_DEG
 
@@ -38,14 +42,18 @@ class PathError:
     name: str
     path_arcsec: float
     """Rms over the path."""
+    delayed_arcsec: float
+    """Rms over the path, wind-up and the servo's error in acceleration included."""
     rest_arcsec: float
     """Mean error at rest after it."""
     settle_s: float
     """Time from the end of the path until the load has settled."""
 
 
-def path_errors(variants: Sequence[Sequence[PathRun]], ratio: float) -> list[list[PathError]]:
+def path_errors(variants: Sequence[Sequence[PathRun]], ratio: float, lag_s: float) -> list[list[PathError]]:
     """Returns the errors of the same paths run with several corrections, the first without one.
+
+    ``lag_s`` is the following lag of the axis.
 
     The motor's response is fitted to the motor encoder of the first, and the wind-up to the others, because
     in the first the hysteresis hides it.
@@ -64,22 +72,51 @@ def path_errors(variants: Sequence[Sequence[PathRun]], ratio: float) -> list[lis
     )
     return [
         [
-            _judged(run, error - _wind_up_columns(run) @ spring)
+            _judged(run, error - _wind_up_columns(run) @ spring, lag_s)
             for run, error in zip(variant, found, strict=True)
         ]
         for variant, found in zip(variants, errors, strict=True)
     ]
 
 
-def _judged(run: PathRun, error_arcsec: FloatArray) -> PathError:
+def inertia_over_stiffness(
+    runs: Sequence[PathRun], model: TransmissionModel, lag_s: float
+) -> tuple[float, float]:
+    """Fits J / K of the load on its spring to compensated runs; returns it and its 95 % half width, s^2.
+
+    The load lags behind the motor by J / K times the acceleration, in addition to the model's motor orders.
+    """
+    found = []
+    for run in runs:
+        motor_deg = np.array([each.motor_position_deg for each in run.samples])
+        load_deg = np.array([each.load_position_deg for each in run.samples])
+        rest = load_deg - motor_deg / model.ratio - model.predict(Motion(motor_deg)) / ARCSEC_PER_DEG
+        late = _delayed(run, lag_s)
+        period_s = run.samples[1].time_s - run.samples[0].time_s
+        acceleration = np.gradient(np.gradient(late)) / period_s**2
+        design = np.column_stack([-acceleration, np.ones_like(late)])
+        found.append(float(np.linalg.lstsq(design, rest, rcond=None)[0][0]))
+    return float(np.mean(found)), 2.0 * float(np.std(found, ddof=1)) / math.sqrt(len(found))
+
+
+def _delayed(run: PathRun, lag_s: float) -> FloatArray:
+    """Returns the load target delayed by a lag; degrees, shape (n,)."""
+    time_s = np.array([each.time_s for each in run.samples])
+    target = np.array([each.load_target_deg for each in run.samples])
+    late: FloatArray = np.interp(time_s - lag_s, time_s, target)
+    return late
+
+
+def _judged(run: PathRun, error_arcsec: FloatArray, lag_s: float) -> PathError:
+    load = np.array([each.load_position_deg for each in run.samples])
+    delayed = ARCSEC_PER_DEG * (load - _delayed(run, lag_s))
     time = np.array([each.time_s for each in run.rest])
     error = ARCSEC_PER_DEG * np.array([each.load_position_deg - each.load_target_deg for each in run.rest])
     mean = float(error[time > time[-1] - AT_REST_S].mean())
     moving = np.flatnonzero(abs(error - mean) > SETTLED_ARCSEC)
     settle_s = float(time[moving[-1]] - run.samples[-1].time_s) if moving.size else 0.0
-    return PathError(
-        run.name, float(np.sqrt(np.mean(error_arcsec[run.skipped :] ** 2))), mean, max(settle_s, 0.0)
-    )
+    path, late = (float(np.sqrt(np.mean(each[run.skipped :] ** 2))) for each in (error_arcsec, delayed))
+    return PathError(run.name, path, late, mean, max(settle_s, 0.0))
 
 
 def _servo_columns(run: PathRun) -> FloatArray:

@@ -12,7 +12,7 @@ from hdbridge.axis import AxisConfig
 from hdbridge.calibration.identification import identify, provenance, standings, with_provenance
 from hdbridge.calibration.journal import Journal, survived_in, tasks_of
 from hdbridge.calibration.measure import measure
-from hdbridge.calibration.motion import MotionTest, motion_test
+from hdbridge.calibration.motion import MotionTest, motion_test, wind_up_of
 from hdbridge.calibration.result import Calibration, Offer
 from hdbridge.calibration.validation import Validation, floor_of, validate
 from hdbridge.control.caps import cap_remark
@@ -56,8 +56,11 @@ def calibrate(
     recording = journal.recording()
     result = conclude({journal.folder: recording}, axis.gear.ratio, active, axis=axis)
     if active and active.response and active.response.fits_cycle(axis.drive.cycle_s):
-        # This calibration measured the gear again, but not the servo.
-        result = replace(result, model=replace(result.model, response=active.response))
+        # This calibration measured the gear again, but neither the servo nor the load's inertia.
+        kept = MotionTest(
+            (), active.response, wind_up=wind_up_of(active) if not wind_up_of(result.model) else None
+        )
+        result = replace(result, model=kept.applied(result.model))
     if not result.fit.held_out.improves:
         result = replace(result, offer=Offer(False, f"not offered for commit: {result.fit.held_out.text}"))
         return _kept(journal.folder, result)
@@ -70,7 +73,7 @@ def calibrate(
         except InputError as problem:
             tell(f"not tested in motion: {problem}")
         else:
-            result = replace(result, model=replace(result.model, response=tested.response), motion=tested)
+            result = replace(result, model=tested.applied(result.model), motion=tested)
     tell("testing it on the axis, before and after")
     floor = floor_of(axis, recording)
     checked = validate(

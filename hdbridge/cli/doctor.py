@@ -32,6 +32,10 @@ _WARNING = (
     "with a ratio above 75), slowly, with at most {torque:g} % of the rated torque. Keep the way clear and a "
     "hardware emergency stop at hand. Move now?"
 )
+_FAST = (
+    "After these, the last check runs the axis at up to 64 % of its speed limit in the middle of its "
+    "travel, with its full torque."
+)
 DECLINED = "motion was not confirmed (on a terminal: answer y; in a script: --yes)"
 LEFT_OUT = "left out by --no-motion"
 
@@ -56,6 +60,14 @@ def doctor(
     motion: Annotated[
         bool, typer.Option("--motion/--no-motion", help="Without: only what can be checked unpowered.")
     ] = True,
+    servo: Annotated[
+        bool,
+        typer.Option(
+            "--servo",
+            help="Also run the axis up to 64 % of its speed limit, in the middle of its travel, and compare "
+            "the servo with the model's response in motion.",
+        ),
+    ] = False,
     json_file: JsonOption = None,
 ) -> None:
     """Check an axis before its first long motion: files, bus, drive, encoders, directions, ratio, stops.
@@ -69,6 +81,7 @@ def doctor(
     from hdbridge.bringup.checks import run_checks
     from hdbridge.bringup.context import BringUpContext
     from hdbridge.bringup.doctor import CHECKS
+    from hdbridge.cli.servo import SERVO
 
     files = session.files
     refused: list[str] = []
@@ -76,7 +89,7 @@ def doctor(
     def permitted() -> str | None:
         if not motion:
             return LEFT_OUT
-        if session.simulate or yes or _confirm(torque_percent):
+        if session.simulate or yes or _confirm(torque_percent, servo):
             return None
         refused.append(DECLINED)
         return DECLINED
@@ -88,7 +101,8 @@ def doctor(
         force=session.force,
         interruptible=deferred_interrupt,
     ) as context:
-        rows = run_checks(context, CHECKS, permitted=permitted, tell=_tell)
+        checks = (*CHECKS, SERVO) if servo else CHECKS
+        rows = run_checks(context, checks, permitted=permitted, tell=_tell)
     failures = [row for row in rows if row.verdict.outcome is Outcome.FAIL]
     write_json(
         json_file,
@@ -111,7 +125,9 @@ def doctor(
     console.print("all right" if motion else "all right, as far as it can be checked without motion")
 
 
-def _confirm(torque_percent: float) -> bool:
+def _confirm(torque_percent: float, servo: bool) -> bool:
+    if servo:
+        notes.print(_FAST)
     try:
         return typer.confirm(_WARNING.format(torque=torque_percent), err=True)
     except typer.Abort:  # no terminal, or end of input

@@ -78,11 +78,9 @@ def motion(
         write_result(html_file, render(motion_page(axis.name, result)))
     print_motion(result)
     if propose and result.response is not None:
-        from dataclasses import replace
-
         pending = keep(
             files.axis.parent,
-            replace(used, response=result.response),
+            result.applied(used),
             f"response in motion, known up to {result.response.known_to_hz:.0f} Hz",
             datetime.now().astimezone(),
             identity,
@@ -124,6 +122,11 @@ def print_motion(result: MotionTest) -> None:
             f"following lag {result.response.following_lag_ms:.2f} ms",
             soft_wrap=True,
         )
+    if result.wind_up is not None:
+        console.print(
+            f"wind-up J / K {result.wind_up.inertia_over_stiffness_s2:.3g} s2: compensated in acceleration",
+            soft_wrap=True,
+        )
     if (reached := result.helps_to_deg_s) is not None:
         console.print(f"the compensation removes half of the ripple or more up to {reached:g} deg/s")
     for line in result.remarks:
@@ -131,16 +134,20 @@ def print_motion(result: MotionTest) -> None:
 
 
 def _paths(result: MotionTest) -> Table:
-    title = "Error on a path, rms arcsec, and time until the load has settled, ms"
+    title = (
+        "Error on a path, rms arcsec, with the wind-up in acceleration and corrected for it, and time until "
+        "the load has settled, ms"
+    )
     table = Table(title=title, title_justify="left")
     table.add_column("path")
-    for name in ("none", "static", "filtered", "settled", "static", "filtered"):
+    for name in ("none", "static", "filtered", "wound up", "corrected", "settled", "static", "filtered"):
         table.add_column(name, justify="right")
     for each in result.paths:
         variants = (each.none, each.static, each.filtered)
         table.add_row(
             each.name,
             *(_figure(one.path_arcsec if one else None) for one in variants),
+            *(_figure(one.delayed_arcsec if one else None) for one in (each.filtered, each.wind_up)),
             *(f"{1000.0 * one.settle_s:.0f}" if one else "" for one in variants),
         )
     return table

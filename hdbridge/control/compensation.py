@@ -300,7 +300,9 @@ class Compensation:
         self._target = 0.0
         self._correction = self._static = 0.0
         self._prefilter = (
-            None if model.response is None else Prefilter(_lead(model.response, period_s), period_s)
+            None
+            if model.response is None
+            else Prefilter(_lead(model.response, period_s), period_s, self._inverse.needs)
         )
         self._known = LOSABLE
         self._fading = False

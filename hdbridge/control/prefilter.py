@@ -13,8 +13,10 @@ from collections.abc import Callable
 from itertools import repeat
 from operator import mul
 
-from hdbridge.effects import Moment
+from hdbridge.effects import Channel, Moment
 from hdbridge.model.response import LeadFilter
+
+_VARYING = frozenset({Channel.SPEED, Channel.LOAD_ANGLE})
 
 
 class Prefilter:
@@ -22,11 +24,13 @@ class Prefilter:
 
     __slots__ = (
         "_before", "_feedback", "_full_step", "_last", "_output", "_predicted", "_reaches", "_step",
-        "_weights",
+        "_varies", "_weights",
     )  # fmt: skip
 
-    def __init__(self, lead: LeadFilter, period_s: float) -> None:
+    def __init__(self, lead: LeadFilter, period_s: float, needs: frozenset[Channel]) -> None:
+        """``needs`` are the channels of the corrected effects; the predictions share their acceleration."""
         self._weights = lead.weights
+        self._varies = not _VARYING.isdisjoint(needs)
         self._feedback = (*lead.feedback, 0.0, 0.0)[:2]
         self._output = self._before = 0.0
         """Outputs of the last two cycles, arcsec."""
@@ -79,7 +83,7 @@ class Prefilter:
         grown = moment.motor_speed_deg_s * change / step if step else 0.0
         for by_step, by_change in self._reaches:
             ahead_deg = load_deg + by_step * step + by_change * change
-            if moment.direction:  # an effect needs the motion channels
+            if self._varies:
                 then = moment._replace(
                     motor_speed_deg_s=moment.motor_speed_deg_s + by_step * grown, load_deg=ahead_deg
                 )

@@ -9,13 +9,11 @@ import sys
 from contextlib import ExitStack
 
 from hdbridge.daemon.api.sockets import file_of, tcp_socket, unix_socket
-from hdbridge.daemon.keeper import SIMULATED, Keeper, Times
+from hdbridge.daemon.keeper import SIMULATED, Keeper, Notifier, Times
 from hdbridge.daemon.logs import LogSettings, begin_log
 from hdbridge.daemon.machine import Machine
 from hdbridge.daemon.memory import Memory
-from hdbridge.daemon.notify import Notifier
-from hdbridge.daemon.runtime import runtime_folder, socket_path
-from hdbridge.daemon.start import Simulation, Start
+from hdbridge.daemon.start import Simulation, Start, runtime_folder
 from hdbridge.drive.interfacelock import interface_lock
 
 
@@ -41,7 +39,7 @@ def hold(
         if simulation is None and not force:
             stack.enter_context(interface_lock(machine.bus.interface, machine.bus.channel))
         given = machine.api.socket
-        path = socket_path(machine.name, folder, machine.beside(given) if given is not None else None)
+        path = machine.beside(given) if given is not None else folder / f"{machine.name}.sock"
         listeners = [stack.enter_context(unix_socket(path, machine.api.group))]
         stack.callback(path.unlink, missing_ok=True)
         if (tcp := machine.api.tcp) is not None:

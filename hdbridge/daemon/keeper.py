@@ -22,17 +22,17 @@ import os
 import selectors
 import signal
 import socket
+import subprocess
+import sys
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from collections import deque
+from collections.abc import Iterator, MutableMapping, Sequence
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
 from types import FrameType
-from typing import Final
+from typing import Final, Self
 
-from hdbridge.daemon.child import Child
 from hdbridge.daemon.memory import Cell, Memory
-from hdbridge.daemon.notify import Notifier
-from hdbridge.daemon.patience import BackOff, Budget, Pulse
 from hdbridge.daemon.start import Start
 from hdbridge.errors import HdbridgeError
 
@@ -43,6 +43,8 @@ _ERRORS: Final = range(2, 16)
 """Exit statuses of an `HdbridgeError`. The child has reported the error, and a restart would only repeat
 it."""
 _FIRST_ATTEMPTS: Final = 3
+PATIENCE_S: Final = 1.0
+"""Maximum wait for a manager whose queue is full, for messages that it must not miss."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,6 +78,160 @@ SIMULATED: Final = Times(begin_s=600.0, gateway_hung_s=120.0, stop_s=300.0, serv
 """Time-outs with simulated drives, long enough for a busy computer."""
 
 
+class Child:
+    """A child process, from its start to its end."""
+
+    def __init__(self, program: Sequence[str], start_fd: int, handed: Sequence[int], now_s: float) -> None:
+        """Runs ``program`` in this interpreter, with the number of ``start_fd`` as its argument.
+
+        It also inherits the descriptors in ``handed``. It has its own session, so that signals of the
+        terminal reach only the keeper.
+        """
+        self.started_s = now_s
+        self._process = subprocess.Popen(
+            [sys.executable, "-P", *program, str(start_fd)],
+            pass_fds=(start_fd, *handed),
+            stdin=subprocess.DEVNULL,
+            start_new_session=True,
+        )
+        self.pid = self._process.pid
+        self.pidfd = os.pidfd_open(self.pid)
+        """Descriptor that becomes readable when the process has ended."""
+
+    @property
+    def ended(self) -> int | None:
+        """Exit status, negative after a signal; None while it runs."""
+        return self._process.poll()
+
+    @property
+    def how(self) -> str:
+        """Exit status or signal in words."""
+        status = self.ended
+        if status is None:
+            return "runs"
+        if status >= 0:
+            return f"exit status {status}"
+        with suppress(ValueError):
+            return f"ended by {signal.Signals(-status).name}"
+        return f"ended by signal {-status}"
+
+    def send(self, number: signal.Signals) -> None:
+        """Sends a signal, unless the process has ended; its id cannot be reused before `ended` is called."""
+        self._process.send_signal(number)
+
+    def close(self) -> None:
+        """Kills the process if it still runs, and closes the descriptor."""
+        if self.ended is None:
+            self._process.kill()
+            self._process.wait()
+        os.close(self.pidfd)
+
+
+class Budget:
+    """Maximum number of events within a sliding time window."""
+
+    def __init__(self, most: int, window_s: float) -> None:
+        self._most, self._window_s = most, window_s
+        self._times: deque[float] = deque()
+
+    def spend(self, now_s: float) -> bool:
+        """Counts an event; returns False if the window's budget is used up."""
+        while self._times and now_s - self._times[0] >= self._window_s:
+            self._times.popleft()
+        if len(self._times) >= self._most:
+            return False
+        self._times.append(now_s)
+        return True
+
+
+class BackOff:
+    """Delays that double with each failure up to a maximum; a long life resets them."""
+
+    def __init__(self, first_s: float, longest_s: float, well_after_s: float) -> None:
+        self._first_s, self._longest_s, self._well_after_s = first_s, longest_s, well_after_s
+        self._next_s = first_s
+
+    def delay_s(self, lived_s: float) -> float:
+        """Returns the delay before the restart of a process that ran for ``lived_s``."""
+        if lived_s >= self._well_after_s:
+            self._next_s = self._first_s
+        delay_s, self._next_s = self._next_s, min(2.0 * self._next_s, self._longest_s)
+        return delay_s
+
+
+class Heartbeat:
+    """Hang detection by a counter, measured in looks without an advance.
+
+    It does not use time, so a monitor that was itself suspended blames nobody else.
+    """
+
+    def __init__(self) -> None:
+        self._last = 0
+        self.misses = 0
+        """Consecutive looks without an advance."""
+        self.begun = False
+        """True if the counter has advanced since the restart."""
+
+    def look(self, value: int) -> bool:
+        """Returns True if the counter has advanced since the last look."""
+        advanced = value != self._last
+        self._last = value
+        self.misses = 0 if advanced else self.misses + 1
+        self.begun = self.begun or advanced
+        return advanced
+
+    def restart(self, value: int) -> None:
+        """Starts again with a restarted process, whose counter has this value."""
+        self._last, self.misses, self.begun = value, 0, False
+
+
+class Notifier:
+    """Notifies the service manager, if there is one. It never fails."""
+
+    def __init__(self, address: str | None = None, watchdog_s: float | None = None) -> None:
+        """``address`` is the manager's socket; one that begins with @ is abstract."""
+        self.watchdog_s = watchdog_s
+        """Watchdog time-out of the manager; None without a watchdog."""
+        self._address = "\0" + address[1:] if address and address.startswith("@") else address
+        self._status = ""
+
+    @classmethod
+    def of_environment(cls, environment: MutableMapping[str, str] = os.environ) -> Self:
+        """Returns the notifier of the environment, and removes it there so that children do not notify."""
+        address = environment.pop("NOTIFY_SOCKET", None)
+        period_us = environment.pop("WATCHDOG_USEC", "")
+        meant = environment.pop("WATCHDOG_PID", str(os.getpid())) == str(os.getpid())
+        return cls(address, int(period_us) / 1e6 if period_us.isdigit() and meant else None)
+
+    def ready(self) -> None:
+        """Reports that the daemon is ready."""
+        self._tell("READY=1", PATIENCE_S)
+
+    def alive(self) -> None:
+        """Reports a sign of life to the watchdog."""
+        if self.watchdog_s is not None:
+            self._tell("WATCHDOG=1")
+
+    def stopping(self) -> None:
+        """Reports that the daemon is stopping."""
+        self._tell("STOPPING=1", PATIENCE_S)
+
+    def status(self, words: str) -> None:
+        """Sets the line in ``systemctl status``, if it has changed."""
+        if words != self._status and self._tell(f"STATUS={words}"):
+            self._status = words
+
+    def _tell(self, line: str, patience_s: float = 0.0) -> bool:
+        """Returns True if the manager took the message; waits at most ``patience_s`` for it."""
+        if self._address is None:
+            return True
+        with suppress(OSError), socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as sender:
+            sender.settimeout(patience_s)
+            sender.sendto(line.encode(), self._address)
+            return True
+        return False
+
+
 @dataclass(slots=True)
 class _Helper:
     """A process in addition to the control process; restarted after increasing delays, whatever ended it."""
@@ -90,7 +246,7 @@ class _Helper:
     hung_s: float
     child: Child | None = None
     due_s: float | None = None
-    pulse: Pulse = field(default_factory=Pulse)
+    heartbeat: Heartbeat = field(default_factory=Heartbeat)
     back_off: BackOff = field(default_factory=lambda: BackOff(0.5, 30.0, 60.0))
 
 
@@ -109,7 +265,7 @@ class Keeper:
         self._start, self._memory, self._listeners = start, memory, listeners
         self._notifier, self._programs, self._times = notifier, programs, times
         self._budget = Budget(start.machine.limits.restarts_per_minute, 60.0)
-        self._turns = Pulse()
+        self._turns = Heartbeat()
         self._control: Child | None = None
         api = tuple(each.fileno() for each in listeners)
         self._helpers = [
@@ -183,7 +339,7 @@ class Keeper:
         helper.due_s = None
         self._memory.status.set(helper.alive, 0)
         helper.child = self._started(helper.program, helper.name, helper.listening, now_s)
-        helper.pulse.restart(0)
+        helper.heartbeat.restart(0)
 
     def _started(self, program: Sequence[str], name: str, listening: tuple[int, ...], now_s: float) -> Child:
         fd = self._start.hand_over(restarts=self._restarts[name], api_fds=listening)
@@ -240,8 +396,8 @@ class Keeper:
         self._kill_hung(self._control, self._turns, self._times.hung_s)
         serving = True
         for helper in self._helpers:
-            helper.pulse.look(status.get(helper.alive))
-            self._kill_hung(helper.child, helper.pulse, helper.hung_s)
+            helper.heartbeat.look(status.get(helper.alive))
+            self._kill_hung(helper.child, helper.heartbeat, helper.hung_s)
             serving &= helper.child is not None and status.get(helper.begun) == helper.child.pid
         if not self._ready and self._turns.begun and serving:
             self._ready = True
@@ -255,9 +411,11 @@ class Keeper:
         words = f"holds {axes}" if self._ready else "begins"
         self._notifier.status(f"{words}; {restarts}" if restarts else words)
 
-    def _kill_hung(self, child: Child | None, pulse: Pulse, limit_s: float) -> None:
-        if child is not None and pulse.misses * TICK_S >= (limit_s if pulse.begun else self._times.begin_s):
-            _log.error("process hangs", {"pid": child.pid, "for_s": pulse.misses * TICK_S})
+    def _kill_hung(self, child: Child | None, heartbeat: Heartbeat, limit_s: float) -> None:
+        if child is not None and heartbeat.misses * TICK_S >= (
+            limit_s if heartbeat.begun else self._times.begin_s
+        ):
+            _log.error("process hangs", {"pid": child.pid, "for_s": heartbeat.misses * TICK_S})
             child.send(signal.SIGKILL)
 
     def _facts(self) -> dict[str, object]:

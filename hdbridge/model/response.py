@@ -60,7 +60,7 @@ class Response(Strict):
     frequency_hz: tuple[float, ...] = Field(description="measured frequencies, rising")
     gain: tuple[float, ...] = Field(description="amplitude that the load makes of a correction of 1, at each")
     phase_deg: tuple[float, ...] = Field(
-        description="phase of the load against the correction at each, following lag excluded"
+        description="phase of the load against the correction at each, following lag included"
     )
     uncertainty: tuple[float, ...] = Field(
         description="half width of the 95 % interval at each, as a share of the gain"

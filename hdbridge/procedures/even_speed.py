@@ -36,8 +36,8 @@ class EvenSpeed:
     window_s: float = WINDOW_S
 
     @classmethod
-    def spread(cls, axis: AxisView) -> EvenSpeed:
-        """Spreads speeds over the shares `SHARES` of the fastest run that fits the travel.
+    def spread(cls, axis: AxisView, shares: Sequence[float] = SHARES) -> EvenSpeed:
+        """Spreads speeds over shares of the fastest run that fits the travel.
 
         Raises `InputError` if the travel is too short for any run.
         """
@@ -51,7 +51,7 @@ class EvenSpeed:
                     f"the travel of {travel_deg:g} deg is too short for a run of {TURNS:g} motor turns at "
                     "constant speed: widen position_min_deg and position_max_deg in the axis file"
                 )
-        return cls(tuple(round(share * fastest, 3) for share in SHARES))
+        return cls(tuple(round(share * fastest, 3) for share in shares))
 
     def travel_deg(self, axis: AxisView, speed_deg_s: float) -> float:
         """Returns the travel of one run including its ramps; load degrees."""

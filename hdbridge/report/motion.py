@@ -104,12 +104,25 @@ def _spectrum(ripple: Ripple) -> Chart:
 
 def _paths(result: MotionTest) -> Table:
     rows = [
-        [each.name, name, f"{one.path_arcsec:.2f}", f"{one.rest_arcsec:.2f}", f"{1000.0 * one.settle_s:.0f}"]
+        [
+            each.name,
+            name,
+            f"{one.path_arcsec:.2f}",
+            f"{one.delayed_arcsec:.2f}",
+            f"{one.rest_arcsec:.2f}",
+            f"{1000.0 * one.settle_s:.0f}",
+        ]
         for each in result.paths
-        for name, one in (("none", each.none), ("static", each.static), ("filtered", each.filtered))
+        for name, one in (
+            ("none", each.none),
+            ("static", each.static),
+            ("filtered", each.filtered),
+            ("filtered, wind-up", each.wind_up),
+        )
         if one is not None
     ]
-    return Table(["path", "correction", "path, rms arcsec", "at rest, arcsec", "settled after, ms"], rows)
+    names = ("path, rms arcsec", "with wind-up", "at rest, arcsec", "settled after, ms")
+    return Table(["path", "correction", *names], rows)
 
 
 def _response(response: Response) -> list[Chart]:

@@ -63,7 +63,7 @@ from hdbridge.twin.misfit import (
 )
 from hdbridge.twin.naming import Alike, Finding, alike, name_causes
 from hdbridge.twin.parameters import LOAD, default_truth, with_sections
-from hdbridge.twin.replay import legs_of, replay_directly
+from hdbridge.twin.replay import legs_of, replay
 from hdbridge.twin.response import with_response
 from hdbridge.twin.thermal import with_warmth
 from hdbridge.units import figure
@@ -423,7 +423,7 @@ def fit_twin(
 def _compared(whole: Recording, axis: AxisConfig, truth: Truth) -> Comparison:
     """Compares a recording with one simulation by kind of leg, and on the held-out legs."""
     held = [each.model_copy(update={"kind": HELD_OUT}) for each in held_out_legs(whole)]
-    simulated = replay_directly(whole, axis, truth)
+    simulated = replay(whole, axis, truth)
     return compare(whole.record, simulated, [*legs_of(whole), *held], axis.gear.ratio)
 
 

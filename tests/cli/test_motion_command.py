@@ -27,6 +27,10 @@ def test_it_measures_the_response_proposes_it_and_the_committed_model_uses_it(hd
         none, static, filtered = (each[name]["path_arcsec"] for name in ("none", "static", "filtered"))
         assert filtered < 0.8 * static < 0.8 * none, each
         assert abs(each["filtered"]["rest_arcsec"]) < abs(each["static"]["rest_arcsec"]) + 0.5
+        assert each["wind_up"]["delayed_arcsec"] < 0.6 * each["filtered"]["delayed_arcsec"], each
+        assert abs(each["wind_up"]["rest_arcsec"]) < abs(each["static"]["rest_arcsec"]) + 0.5
+    # The article's load on its spring: 0.225 kg m2 on 16,000 Nm/rad.
+    assert result["wind_up"]["inertia_over_stiffness_s2"] == pytest.approx(0.225 / 16000.0, rel=0.1)
     assert "Path error" in (tmp_path / "out.html").read_text()
     assert "Gain" in (tmp_path / "out.html").read_text()
     done = hdbridge("model", "commit", "fast")
@@ -43,15 +47,19 @@ def test_it_measures_the_response_proposes_it_and_the_committed_model_uses_it(hd
     assert done.returncode == 0, done.stderr
     assert json.loads((tmp_path / "step.json").read_text())["both"]["pooled"]["three_sigma_arcsec"] < 4.5
 
-    # Another servo is noticed.
+    # Another servo is noticed, with the gain at which the responses differ by 11 %.
+    done = hdbridge("doctor", "fast", "--simulate", "--servo")
+    assert done.returncode == 0, done.stdout
     path = fast / "truth.yaml"
     text = path.read_text(encoding="utf-8")
-    for tuned in ("command_filter_ms: 1.0", "command_filter_ms: 4.0"), ("gain_per_s: 200", "gain_per_s: 110"):
+    for tuned in ("command_filter_ms: 1.0", "command_filter_ms: 1.6"), ("gain_per_s: 200", "gain_per_s: 130"):
         assert tuned[0] in text
         path.write_text(text.replace(*tuned), encoding="utf-8")
-        done = hdbridge("motion", "fast", "--simulate", "--no-measure")
-        assert done.returncode == 0, done.stderr
-        assert "measure the response again" in done.stdout, tuned
+        done = hdbridge("doctor", "fast", "--simulate", "--servo", "--json", "doctor.json")
+        assert done.returncode == 4, done.stdout
+        checks = json.loads((tmp_path / "doctor.json").read_text())["checks"]
+        assert [each["name"] for each in checks if each["outcome"] != "pass"] == ["servo"]
+        assert "measure it again" in done.stdout, tuned
 
 
 def test_a_model_without_orders_and_a_proposal_without_a_measurement_are_refused(hdbridge, tmp_path):

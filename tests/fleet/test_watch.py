@@ -6,9 +6,11 @@ import shutil
 import signal
 import subprocess
 import sys
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
+from distributed import Client, LocalCluster
 from support.command import run_here
 from support.fleet import MODEL, record
 
@@ -30,22 +32,11 @@ class Here:
         read = diagnosing.read
         monkeypatch.setattr(diagnosing, "read", lambda source: self.read.append(source.path) or read(source))
 
+    @contextmanager
     def client(self):
-        from distributed import Client, LocalCluster
-
-        class Both:
-            def __enter__(self):
-                self.cluster = LocalCluster(
-                    n_workers=1, threads_per_worker=1, processes=False, dashboard_address=None
-                )
-                self.client = Client(self.cluster, set_as_default=False)
-                return self.client
-
-            def __exit__(self, *_):
-                self.client.close()
-                self.cluster.close()
-
-        return Both()
+        options = {"n_workers": 1, "threads_per_worker": 1, "processes": False, "dashboard_address": None}
+        with LocalCluster(**options) as cluster, Client(cluster, set_as_default=False) as client:
+            yield client
 
 
 @pytest.fixture

@@ -114,7 +114,7 @@ class Laws:
             assert asked or braking, f"motion in mode {self.mode} without a target"
             before = max(LOW - (start - self.home), (start - self.home) - HIGH, 0.0)
             outside = max(LOW - (end - self.home), (end - self.home) - HIGH, 0.0)
-            assert outside <= max(before, 1.0) or braking, f"{end:.0f} counts"
+            assert outside <= before + 1.0 or braking, f"{end:.0f} counts"
         self.velocity = speed
 
 

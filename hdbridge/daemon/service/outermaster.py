@@ -18,8 +18,8 @@ from hdbridge.motion import MotionMode
 
 if TYPE_CHECKING:
     from hdbridge.daemon.machinefile import GatewaySettings
+    from hdbridge.daemon.service.axis import ServiceAxis
     from hdbridge.daemon.service.core import Core
-    from hdbridge.daemon.service.ports import ServiceAxis
 
 _OWN: Final = frozenset({AxisState.ENABLING, AxisState.ENABLED})
 _STOPPED: Final = frozenset({AxisState.UNVERIFIED, AxisState.QUICK_STOPPED, AxisState.LATCHED})
@@ -72,7 +72,7 @@ class OuterMaster:
                     and timing.clock.now() >= prepare_s
                     and axis.link.state is AxisState.DISABLED
                     and axis.link.power is State.SWITCH_ON_DISABLED
-                    and not axis.power.is_prepared
+                    and not axis.is_prepared
                 ):
                     prepare_s = timing.clock.now() + PREPARE_AGAIN_S
                     await axis.prepare()

@@ -63,7 +63,7 @@ class RelayBus(can.BusABC):
         nmt = can_id == objects.COB_NMT and len(msg.data) == 2 and msg.data[1] in self._nodes
         if not (to_node or nmt):
             raise can.CanOperationError(f"{can_id:03X}h is not for the service to send")
-        if not self._outgoing.put(int(1e9 * self._clock.now()), can_id, bytes(msg.data)):
+        if not self._outgoing.add(RelayedFrame(int(1e9 * self._clock.now()), can_id, bytes(msg.data))):
             raise can.CanOperationError("the control process takes no frames: it hangs or is gone")
 
     def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:

@@ -7,10 +7,9 @@ import sys
 from pathlib import Path
 from types import SimpleNamespace
 
-from hdbridge.daemon.keeper import Keeper, Programs, Times
+from hdbridge.daemon.keeper import Keeper, Notifier, Programs, Times
 from hdbridge.daemon.logs import LogSettings, begin_log
 from hdbridge.daemon.memory import Memory
-from hdbridge.daemon.notify import Notifier
 from hdbridge.daemon.start import Start
 
 STANDIN = str(Path(__file__).with_name("standin.py"))
