@@ -46,6 +46,20 @@ def test_links_lead_somewhere(page):
     assert lost == []
 
 
+def test_pages_that_messages_profiles_and_tools_name_exist():
+    files = (
+        path for folder in ("hdbridge", "profiles", "tools", "tests") for path in (ROOT / folder).rglob("*")
+    )
+    named = {
+        (path, page)
+        for path in files
+        if path.suffix in {".py", ".yaml", ".html", ".js", ".sh"}
+        for page in re.findall(r"\bdocs/[\w-]+\.md", path.read_text(encoding="utf-8"))
+    }
+    assert len(named) > 30
+    assert [(name(path), page) for path, page in named if not (ROOT / page).exists()] == []
+
+
 @pytest.mark.parametrize("page", PAGES, ids=name)
 def test_commands_on_the_pages_exist_with_their_options(page):
     wrong = [command_reference.refused(line) for line in command_lines(page)]
