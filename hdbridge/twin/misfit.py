@@ -20,7 +20,7 @@ from concurrent.futures import ProcessPoolExecutor
 from copy import copy
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
-from itertools import repeat
+from itertools import pairwise, repeat
 from typing import Any, Final, Literal, Self
 
 import numpy as np
@@ -33,7 +33,7 @@ from hdbridge.effects import FloatArray
 from hdbridge.records.record import Record
 from hdbridge.records.recording import Recording, Segment
 from hdbridge.sim.truth import Truth
-from hdbridge.twin.compare import rms
+from hdbridge.twin.compare import MAD_TO_SIGMA, noise_of, rms
 from hdbridge.twin.parameters import FOLLOWING, LOAD, TORQUE, with_load_encoder
 from hdbridge.twin.replay import (
     RINGING_S,
@@ -535,7 +535,6 @@ def deviation(
 # ----------------------------------------------------------------
 # Scales of the residuals: standard deviation of a simulation's error by channel.
 
-MAD_TO_SIGMA = 1.4826
 MOST_ANSWERED = 1.5
 """Maximum share of a speed error that a velocity loop corrects within a step; it is unstable at two."""
 
@@ -648,31 +647,20 @@ def scales(data: Data, found: Mapping[str, FloatArray], loops: Loops | None = No
 # ----------------------------------------------------------------
 
 ARCSEC_PER_TURN = 360.0 * ARCSEC_PER_DEG
-THIRD_DIFFERENCE = math.sqrt(20.0)
-"""Amplification of white noise by third differences: the root of 1 + 9 + 9 + 1."""
-LEAST_ROWS = 8
 
 
 def noise_in_motion(data: Data) -> dict[str, float]:
-    """Estimates the noise in motion by channel, in its unit, from third differences; at least the rounding.
+    """Estimates the noise in motion by channel, in its unit (`compare.noise_of`); at least the rounding.
 
-    At rest, count and torque stay constant, which is no reference for a simulation in motion. Motion that is
-    smooth over four rows vanishes in third differences, and the median ignores rows where it is not smooth (a
-    jerk, a reversal).
+    At rest, count and torque stay constant, which is no reference for a simulation in motion.
     """
-    floor = noise_floor(data)
+    floor, ends = noise_floor(data), np.cumsum([len(each.rest) for each in data.pieces]).tolist()
+    parts = [slice(first, end) for first, end in pairwise([0, *ends])]
+    moving = np.concatenate([each.rest for each in data.pieces]) == 0.0
     found = {}
     for name in CHANNELS:
-        rows = []
-        for piece in data.pieces:
-            moving = piece.rest == 0.0
-            whole = moving[3:] & moving[2:-1] & moving[1:-2] & moving[:-3]
-            rows.append(np.diff(piece.measured[name], 3)[whole])
-        third = np.abs(np.concatenate(rows))
-        spread = (
-            MAD_TO_SIGMA * float(np.median(third)) / THIRD_DIFFERENCE if len(third) >= LEAST_ROWS else 0.0
-        )
-        found[name] = max(floor[name], spread)
+        values = np.concatenate([each.measured[name] for each in data.pieces])
+        found[name] = max(floor[name], noise_of(values, moving, parts))
     return found
 
 
