@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 def simulated(axis: AxisConfig, truth: Path | str | None = None, seed: int = 0) -> Iterator[Drive]:
     """Yields the drive of an axis, simulated in this process and faster than real time; not booted yet.
 
-    ``truth`` describes the axis (docs/truth-file.md); the default is the ``twin.yaml`` next to the axis file,
+    ``truth`` describes the axis (docs/ci.md); the default is the ``twin.yaml`` next to the axis file,
     or else the ``truth.yaml``. The same truth and seed give the same frames, bit for bit. Raises `InputError`
     if there is no truth, or it is wrong.
     """

@@ -1,4 +1,4 @@
-"""What all tests share: no test asserts wall-clock time, Hypothesis included."""
+"""Settings of all tests: no test asserts wall-clock time, Hypothesis included."""
 
 import gc
 import os
@@ -27,7 +27,7 @@ for number, handler in ((signal.SIGINT, signal.default_int_handler), (signal.SIG
 
 @pytest.fixture
 def at_a_terminal() -> Iterator[None]:
-    """What a test starts hears of a terminal that is closed, though the tests themselves run under nohup."""
+    """Processes that a test starts receive the hang-up of a terminal, even if the tests run under nohup."""
     ours = signal.signal(signal.SIGHUP, signal.SIG_DFL)
     yield
     signal.signal(signal.SIGHUP, ours)

@@ -1,4 +1,4 @@
-"""Shows why the article's Tables 1 and 2 cannot give its Table 3: all figures of docs/article-table-3.md.
+"""Shows why the article's Tables 1 and 2 cannot give its Table 3: all figures of docs/method.md.
 
     python tools/article_table3.py [--json FILE] [--simulate] [--as-data]
 

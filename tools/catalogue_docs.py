@@ -16,48 +16,25 @@ from hdbridge.effects import CATALOGUE, Effect, aliases_of
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "causes.md"
 
-_UNITS = {
-    "arcsec_per_kiloturn": "arcsec per 1000 motor turns",
-    "arcsec_s_per_deg": "arcsec per motor deg/s",
-    "percent_per_nm": "% per Nm",
-    "arcsec_per_turn": "arcsec per motor turn",
-    "arcsec_per_nm": "arcsec/Nm",
-    "arcsec_per_k": "arcsec/K",
-    "percent_per_k": "%/K",
-    "deg_s2": "deg/s²",
-    "deg_s": "deg/s",
-    "percent": "%",
-    "arcsec": "arcsec",
-    "deg": "deg",
-    "ms2": "ms²",
-    "s2": "s²",
-    "hz": "Hz",
-    "nm": "Nm",
-    "ms": "ms",
-    "s": "s",
-    "k": "K",
-    "c": "°C",
-}
-
 _INTRODUCTION = """# Causes of transmission error
 
 <!-- Written by tools/catalogue_docs.py from hdbridge/effects; do not edit. -->
 
-What a gear does wrong, cause by cause: how it shows in a record, what it does to the axis, what to do
-about it. The names are those of findings and of the model file's `effects`. The error is how far the load is
-ahead of motor angle / N, in arcsec at the load.
+The catalogue: how each cause shows in a record, and what to do about it. The names are those of findings and
+of the model file's `effects`. The error is how far the load is ahead of motor angle / N, in arcsec at the
+load.
 
-- **Separate it** is the measurement that distinguishes it from its look-alikes (*taken for*).
-- **Compensated** says whether the compensation should make up for it. Errors of the measurement should not
-  be: that would move the load away from where it should be. What cannot be foreseen cannot be.
-- **Needs** are the record's columns in addition to `motor_position_deg`. Speed, acceleration and direction
-  are derived: backward differences of the commanded motor angle over the samples' own time steps, the
-  direction held at rest; in the control loop those of the command before compensation. `load_deg` is the
-  predicted load angle.
-- Parameters marked *shape* enter non-linearly; a fit searches them within the range given. `orders` are a
-  list of `{order, amplitude_arcsec, phase_deg}`. A `loop` (or `base`) is a copy of the model's loop that the
-  effect modulates: `{offset_arcsec, width_deg, exponent, memory}`.
-- Beyond a *limit* an effect is held, so that a faulty sensor cannot move the axis far.
+- **Separate it**: the measurement that distinguishes a cause from its look-alikes.
+- **Compensated**: yes, unless stated otherwise. An error of the measurement is not, because that would move
+  the load away from its target; neither is what cannot be predicted.
+- **Needs**: columns of the record in addition to `motor_position_deg`. Speed, acceleration and direction are
+  derived from the commanded motor angle by backward differences; the direction is held at rest. `load_deg`
+  is the predicted load angle.
+- Parameters: the name ends in the unit. In brackets: the permitted range; *sought* is the range of the
+  search for a parameter that enters non-linearly; = is the default. `orders` are a list of `{order,
+  amplitude_arcsec, phase_deg}`. A `loop` (or `base`) is a copy of the model's loop: `{offset_arcsec,
+  width_deg, exponent, memory}`. `ratio` is N of the model. Beyond a `limit_*` of its input an effect is
+  held, so that a faulty sensor cannot move the axis far.
 """
 
 
@@ -68,12 +45,11 @@ def page() -> str:
 
 
 def _overview() -> Iterator[str]:
-    yield "| cause | signature | size | compensated |"
-    yield "|---|---|---|---|"
+    yield "| cause | signature | size |"
+    yield "|---|---|---|"
     for name, kind in CATALOGUE.items():
         about = kind.about
-        yes = "yes" if kind.compensable.possible else "no"
-        yield f"| [`{name}`](#{name}) | {_cell(about.signature)} | {_cell(about.size)} | {yes} |"
+        yield f"| [`{name}`](#{name}) | {_cell(about.signature)} | {_cell(about.size)} |"
     yield ""
 
 
@@ -81,27 +57,27 @@ def _section(kind: type[Effect]) -> Iterator[str]:
     about = kind.about
     yield f"## {kind.name}"
     yield ""
-    yield f"{about.title[0].upper()}{about.title[1:]}. Typical size: {about.size}."
+    yield f"{about.title[0].upper()}{about.title[1:]}: {about.consequence}."
     yield ""
     yield f"    {about.equation}"
     yield ""
-    yield f"- **Signature**: {about.signature}."
-    yield f"- **What it does to the axis**: {about.consequence}."
-    yield f"- **What to do about it**: {about.remedy}."
+    yield f"- **What to do**: {about.remedy}."
     yield f"- **Separate it**: {about.experiment}."
     if aliases_of(kind.name):
         yield f"- **Taken for**: {', '.join(f'[`{each}`](#{each})' for each in aliases_of(kind.name))}."
-    possible = "yes" if kind.compensable.possible else "no"
     why = kind.compensable.why.removeprefix("no, ")
-    yield f"- **Compensated**: {possible}; {why}."
+    if not kind.compensable.possible:
+        yield f"- **Not compensated**: {why}."
+    elif not why.startswith("the load really"):
+        yield f"- **Compensated**: {why}."
+    elif condition := why.partition(", where ")[2]:
+        yield f"- **Compensated** where {condition}."
     if kind.replaces:
-        yield f"- **In a model** it stands in place of [`{kind.replaces}`](#{kind.replaces})."
-    yield f"- **Needs**: {_needs(kind)}."
+        yield f"- In a model it replaces [`{kind.replaces}`](#{kind.replaces})."
+    if needs := _needs(kind):
+        yield f"- **Needs**: {needs}."
     yield f"- **Source**: {about.source}."
-    yield ""
-    yield "| parameter | unit | range | meaning |"
-    yield "|---|---|---|---|"
-    yield from _parameters(kind, kind)
+    yield f"- **Parameters**: {'; '.join(_once(kind))}."
     yield ""
 
 
@@ -112,25 +88,42 @@ def _needs(kind: type[Effect]) -> str:
         "driven_by": ", `temperature_c` (unless driven by time)",
     }
     more = "".join(text for field, text in others.items() if field in kind.model_fields)
-    return (channels or "no more") + more
+    return channels + more
+
+
+def _once(kind: type[Effect]) -> Iterator[str]:
+    """Yields the parameters of an effect; those that another effect describes as names only."""
+    earlier = list(CATALOGUE.values())[: list(CATALOGUE).index(kind.name)]
+    first = {each: other.name for other in reversed(earlier) for each in _parameters(other, other)}
+    same: dict[str, list[str]] = {}
+    for each in _parameters(kind, kind):
+        if ":" in each and each in first:
+            same.setdefault(first[each], []).append(each.split(" (")[0])
+        else:
+            yield each
+    for name, names in same.items():
+        yield f"{', '.join(names)} as in [`{name}`](#{name})"
 
 
 def _parameters(kind: type[Effect], model: type[BaseModel], within: str = "") -> Iterator[str]:
     shapes = {} if within else {each.name: each for each in kind.shape}
     for name, field in model.model_fields.items():
         inner = _model(field.annotation)
-        if inner is not None:
-            yield f"| `{name}` | | | {_cell(field.description or '')} |"
-            if name not in {"orders", "loop", "base"}:
-                yield from _parameters(kind, inner, f"{name}.")
+        if name in {"orders", "loop", "base", "ratio"} and not within:
+            yield f"`{name}`"
+        elif inner is not None:
+            yield f"`{name}`: {field.description or ''}"
+            yield from _parameters(kind, inner, f"{name}.")
         else:
-            text = _cell(field.description or "")
+            bounds = [_range(field.annotation, field.metadata)]
             if name in shapes:
-                text += f"; *shape*, sought from {shapes[name].lower:g} to {shapes[name].upper:g}"
+                bounds.append(f"*sought* {shapes[name].lower:g} to {shapes[name].upper:g}")
             if not field.is_required():
-                text += f"; {field.default} where not given"
-            limits = _range(field.annotation, field.metadata)
-            yield f"| `{within}{name}` | {_unit(name)} | {limits} | {text} |"
+                default = field.default
+                bounds.append(f"= {f'{default:g}' if isinstance(default, float) else str(default).lower()}")
+            limits = ", ".join(each for each in bounds if each)
+            about = "" if name.startswith("limit_") else f": {field.description or ''}"
+            yield f"`{within}{name}` ({limits}){about}"
 
 
 def _model(annotation: Any) -> type[BaseModel] | None:
@@ -138,10 +131,6 @@ def _model(annotation: Any) -> type[BaseModel] | None:
         if isinstance(each, type) and issubclass(each, BaseModel):
             return each
     return None
-
-
-def _unit(name: str) -> str:
-    return next((text for ending, text in _UNITS.items() if name.endswith(f"_{ending}")), "")
 
 
 def _range(annotation: Any, metadata: list[Any]) -> str:
@@ -156,7 +145,7 @@ def _range(annotation: Any, metadata: list[Any]) -> str:
         if hasattr(each, limit)
     }
     low = f"above {limits['gt']:g}" if "gt" in limits else ""
-    low = f"from {limits['ge']:g}" if "ge" in limits else low
+    low = f"{limits['ge']:g}" if "ge" in limits else low
     high = f"to {limits['le']:g}" if "le" in limits else ""
     return f"{low} {high}".strip()
 

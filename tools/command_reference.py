@@ -10,7 +10,7 @@ import re
 import shlex
 import sys
 import typing
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Container, Iterator
 from dataclasses import dataclass
 from enum import Enum
 from pathlib import Path
@@ -25,26 +25,20 @@ PAGE = Path(__file__).resolve().parents[1] / "docs" / "commands.md"
 
 _INTRODUCTION = """# Commands
 
-Made from the command line by `python tools/command_reference.py`; a test compares them. `hdbridge COMMAND
---help` says the same. What the commands read and write: [files](files.md).
+Made from the command line by `python tools/command_reference.py`; `hdbridge COMMAND --help` says the same.
+Formats of what is read and written: [files](files.md).
 
-**PROFILE** is the folder of an axis (`axis.yaml` and what belongs to it), an axis file, or the name of a
-bundled profile: `article`, `demo`. Tables and results go to standard output, progress and remarks to the
-standard error. `--json FILE` writes the result for machines.
+Tables and results go to standard output, progress and remarks to standard error. Every output is checked
+before anything is read or moves: a result replaces only a result of its kind, never an input or a file of a
+profile or a recording; a folder for measurements is new or empty. A proposed model is `PROFILE/pending.yaml`
+until `hdbridge model commit`. `-` is standard output; text for people then goes to standard error.
 
-**Outputs destroy nothing.** Before anything is read or moves, each output is checked: a result replaces only
-a result of its kind, never an input, another output, or a file of a profile or a recording; a folder for
-measurements is new or empty. A model goes to a profile as `PROFILE/pending.yaml`, and is used after
-`hdbridge model commit`. Pipes and character devices are written straight through; `-` is the standard output,
-and what is printed for a person then goes to the standard error.
+Options before the command: `-v` logs the bus traffic to standard error (`-vv`: every SDO transfer), `--log
+FILE` appends the log as JSON lines (`date`, `level`, `where`, `event` and its facts; none during the control
+cycle), `--install-completion` sets up your shell, `--version`.
 
-**Before the command** stand `-v` (tell on standard error what is done on the bus; `-vv`: every SDO
-transfer), `--log FILE` (append all of it, a JSON object per line: `date`, `level`, `where`, `event` and its
-facts; nothing is written while the axis is in its control cycle), and `--install-completion` for your shell.
-
-**Ctrl-C** (and SIGTERM, SIGQUIT, and SIGHUP of a terminal that is closed) lets the control cycle end its
-period and stops the axis; what was measured is kept.
-The third one ends the program at once.
+**Ctrl-C** (SIGTERM, SIGQUIT, SIGHUP) ends the control cycle at its next period and stops the axis; what was
+measured is kept. The third one ends the program at once.
 
 | exit status | |
 |---|---|
@@ -54,10 +48,16 @@ The third one ends the program at once.
 | 3 | the bus: cannot be opened, or went away |
 | 4 | the drive: absent, refuses, not the one expected, reports a fault |
 | 5 | the supervision stopped the axis while it moved |
-| 6 | a result could not be written after all, on a full disk for example; what was measured is printed |
+| 6 | a result could not be written (full disk, for example); what was measured is printed |
 | 7 | the daemon: not reached, or does not do this for this client now; nothing moved for it |
 | 130 | Ctrl-C: the axis was stopped, the record kept |
+
+## Arguments and options of several commands
+
 """
+
+_COMMON = 3
+"""Number of commands from which an option is described once, for all of them."""
 
 _VALUES = {int: "INTEGER", float: "NUMBER", str: "TEXT", Path: "FILE"}
 
@@ -112,22 +112,41 @@ def commands() -> Iterator[Command]:
 def page() -> str:
     """Returns the whole page."""
     known = list(commands())
-    parts = [_INTRODUCTION]
+    users: dict[Parameter, list[str]] = {}
+    for command in known:
+        for each in command.parameters:
+            users.setdefault(each, []).append(command.name)
+    common = {each: names for each, names in users.items() if len(names) >= _COMMON}
+    shared = sorted(common.items(), key=lambda item: (item[0].is_option, item[0].names[0].lstrip("-")))
+    parts = [_INTRODUCTION + "\n".join(_common_item(*each) for each in shared) + "\n"]
     for panel, names in PANELS.items():
         parts.append(f"## {panel}\n")
         for name in names:
-            parts += (_section(each) for each in known if each.name.split()[0] == name)
+            parts += (_section(each, common) for each in known if each.name.split()[0] == name)
     return "\n".join(parts)
 
 
-def _section(command: Command) -> str:
+def _section(command: Command, common: Container[Parameter]) -> str:
     lines = [f"### `{command.usage}`", "", command.text, ""]
-    if command.parameters:
-        lines += ["| | default | |", "|---|---|---|"]
-    for each in command.parameters:
-        name = ", ".join(f"`{name}{f' {each.value}' if each.value else ''}`" for name in each.names)
-        lines.append(f"| {name.replace('|', chr(92) + '|')} | {each.default} | {each.help} |")
-    return "\n".join(lines) + ("\n" if command.parameters else "")
+    own = [_item(each) for each in command.parameters if each not in common]
+    shared = [f"`{each.names[0]}`" for each in command.parameters if each in common and each.is_option]
+    if shared:
+        own.append(f"- {'also ' if own else ''}{', '.join(shared)}")
+    return "\n".join([*lines, *own]) + ("\n" if own else "")
+
+
+def _common_item(parameter: Parameter, names: list[str]) -> str:
+    groups = {name.split()[0] for name in names}
+    return _item(parameter, f" of `hdbridge {groups.pop()}`" if len(groups) == 1 else "")
+
+
+def _item(parameter: Parameter, owner: str = "") -> str:
+    """Returns an option or argument as an item of a list."""
+    value = f" {parameter.value}" if parameter.value else ""
+    names = ", ".join(f"`{name}{value}`" for name in parameter.names)
+    names = names if parameter.is_option or parameter.required else f"`[{parameter.names[0]}]`"
+    default = f" ({parameter.default})" if parameter.default.strip("`") else ""
+    return f"- {names}{owner}{default}: {parameter.help}"
 
 
 def _command(prefix: str, registered: Any) -> Command:
@@ -185,11 +204,17 @@ def _range(info: OptionInfo) -> str:
     if low is None and high is None:
         return ""
     if high is None:
-        return f" At least {low:,.10g}."
+        return (
+            f" At least {low:,.10g}."
+            if low is not None and low > 1e-6
+            else f" {'Above' if low else 'From'} 0."
+        )
     return f" {low:,.10g} to {high:,.10g}."
 
 
 def _text(default: Any) -> str:
+    if isinstance(default, Enum):
+        return str(default.value)
     return f"{default:g}" if isinstance(default, float) else str(default)
 
 

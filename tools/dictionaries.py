@@ -1,4 +1,4 @@
-"""Prints the tables of docs/drives.md: answers of `hdbridge check` to a folder of dictionaries (EDS, DCF).
+"""Prints the tables of docs/bring-up.md: answers of `hdbridge check` to a folder of dictionaries (EDS, DCF).
 
     python tools/dictionaries.py FOLDER
 

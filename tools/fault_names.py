@@ -1,4 +1,4 @@
-"""Writes the table of faults in docs/ci.md from the table of `hdbridge.testing`.
+"""Writes the list of faults in docs/ci.md from the table of `hdbridge.testing`.
 
 python tools/fault_names.py
 """
@@ -16,11 +16,8 @@ _BLOCK = re.compile(r"(<!-- faults: .*? -->\n).*?(<!-- end -->)", re.DOTALL)
 
 def table() -> str:
     """Returns the rows."""
-    rows = [
-        f"| `{name}` | {f'`{arguments}`' if arguments else ''} | {what} |"
-        for name, arguments, what in sentences()
-    ]
-    return "\n".join(["| name | arguments | what happens |", "|---|---|---|", *rows]) + "\n"
+    rows = [f"- `{name}({arguments})`: {what}" for name, arguments, what in sentences()]
+    return "\n".join(rows) + "\n"
 
 
 def page() -> str:

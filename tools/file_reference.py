@@ -1,5 +1,5 @@
 """Writes the tables of docs/files.md and of plans (docs/calibration.md) from the models that read the files,
-that of faults (docs/daemon.md) from the fault table, and that of docs/twin.md from the translation.
+that of faults (docs/reliability.md) from the fault table, and that of docs/twin.md from the translation.
 
 python tools/file_reference.py           rewrite the tables
 python tools/file_reference.py --check   report if they are up to date (exit status 1 if not)
@@ -11,6 +11,7 @@ import re
 import sys
 from collections.abc import Iterator, Mapping
 from enum import Enum
+from functools import cache
 from pathlib import Path
 from typing import Any, get_args
 
@@ -21,7 +22,7 @@ from pydantic_core import PydanticUndefined
 from hdbridge.axis import AxisConfig
 from hdbridge.daemon.machinefile import MachineFile
 from hdbridge.device.behaviour import Behaviour
-from hdbridge.drive.supervision import TABLE, Reaction
+from hdbridge.drive.supervision import TABLE, Fault, Reaction
 from hdbridge.effects import CATALOGUE
 from hdbridge.files.expectation import Field, field_at, key_of, type_words
 from hdbridge.fleet.dataset import COLUMNS as FLEET_COLUMNS
@@ -45,16 +46,16 @@ DOCS = Path(__file__).resolve().parent.parent / "docs"
 PAGES = (
     DOCS / "files.md",
     DOCS / "calibration.md",
-    DOCS / "daemon.md",
+    DOCS / "reliability.md",
     DOCS / "fleet.md",
     DOCS / "twin.md",
-    DOCS / "truth-file.md",
+    DOCS / "ci.md",
 )
 _BLOCK = re.compile(r"(<!-- generated: (?P<name>[a-z-]+) -->\n).*?(<!-- end -->)", re.DOTALL)
 
 
 REACTION_WORDS = {
-    Reaction.GO: "go on, count",
+    Reaction.GO: "count",
     Reaction.FREEZE: "freeze",
     Reaction.QUICK_STOP: "quick stop",
     Reaction.LATCH: "latch",
@@ -69,9 +70,13 @@ ENTRIES: tuple[type[BaseModel], ...] = (
 
 
 def key_table(model: type[BaseModel]) -> str:
-    """Returns every key of a file with its expected values, default and meaning."""
-    lines = ["| key | expected | default | meaning |", "|---|---|---|---|"]
-    lines += (f"| `{key}` | {what} | {default} | {about} |" for key, what, default, about in _rows(model))
+    """Returns every key of a file with its expected value and its meaning."""
+    lines = ["| key: value | meaning |", "|---|---|"]
+    lines += (
+        f"| {key}{what and ': '}{what} | {about} |"
+        for key, what, about in _rows(model)
+        if key != "**`schema`**"
+    )
     return "\n".join(lines) + "\n"
 
 
@@ -85,23 +90,48 @@ def column_table() -> str:
 
 def procedure_table() -> str:
     """Returns the procedures of a plan, with the keys of each."""
-    lines = ["| procedure | key | expected | default | meaning |", "|---|---|---|---|---|"]
+    lines = ["| procedure | key | value | meaning |", "|---|---|---|---|"]
     for entry in ENTRIES:
         _, *keys = _rows(entry)
         procedure = entry.model_fields["procedure"].annotation
-        lines += (
-            f"| `{get_args(procedure)[0]}` | `{key}` | {what} | {default} | {about} |"
-            for key, what, default, about in keys
-        )
+        lines += (f"| `{get_args(procedure)[0]}` | {key} | {what} | {about} |" for key, what, about in keys)
     return "\n".join(lines) + "\n"
+
+
+SEEN_BY: Mapping[Fault, str] = {
+    Fault.LOST_TPDO: "not all TPDOs within the window: lost, remote, 29-bit, cable pulled",
+    Fault.OVERRUN: "more than half a period late; whole periods are skipped",
+    Fault.HANG: "no cycle for heartbeat_ms or four cycles with power on; before the next SYNC",
+    Fault.DUPLICATE_TPDO: "drained before SYNC, or twice in the window",
+    Fault.WRONG_LENGTH: "the PDO's length",
+    Fault.DISCARDED_FRAME: "remote, 29-bit, FD or error frame",
+    Fault.FLOOD: "more than 256 frames before SYNC",
+    Fault.EMERGENCY: "EMCY; the statusword decides. The newest 64 are kept",
+    Fault.MASTER_LOST: "EMCY 8130h or 8250h while enabled; before the next SYNC",
+    Fault.DRIVE_FAULT: "statusword, also for one between two SYNCs",
+    Fault.DROPPED_OUT: "statusword, also for one between two SYNCs",
+    Fault.BOOT_UP: "boot-up message of a node of the cycle",
+    Fault.NMT_CHANGE: "heartbeat of a node of the cycle",
+    Fault.HEARTBEAT_LOST: "heartbeat older than twice heartbeat_ms",
+    Fault.OWN_ID_ELSEWHERE: "RPDO, heartbeat of the master, NMT or SDO request from elsewhere",
+    Fault.FOREIGN_SYNC: "SYNC from elsewhere",
+    Fault.ENCODER_JUMP: "more than 1.5 x velocity limit x time + 180 arcsec at the load, while enabled",
+    Fault.FOLLOWING_ERROR: "6062h minus 6064h above following_error_deg, while enabled",
+    Fault.BAD_TARGET: "NaN, infinite, not an integer or outside the limits, before it is sent",
+    Fault.BUS_DOWN: "any failing call, or the error frame: down, deleted, bus-off",
+    Fault.TRANSMIT_FULL: "ENOBUFS; the frame is dropped, never sent again",
+    Fault.CHANNEL_HELD: "its PDO, and the range in the axis file; the last reading is held",
+    Fault.CHANNEL_LOST: "no reading for hold_ms; its part of the correction fades out",
+}
 
 
 def fault_table() -> str:
     """Returns the reactions to each fault, and the advice."""
-    lines = ["| fault | at once | again in the next cycles | what to do |", "|---|---|---|---|"]
+    lines = ["| fault | at once | in the next cycle | seen by | what to do |", "|---|---|---|---|---|"]
     for row in TABLE:
         later = REACTION_WORDS[row.then] if row.then is not row.first else ""
-        lines.append(f"| {row.fault.value} | {REACTION_WORDS[row.first]} | {later} | {row.hint} |")
+        first = REACTION_WORDS[row.first]
+        lines.append(f"| {row.fault.value} | {first} | {later} | {SEEN_BY[row.fault]} | {row.hint} |")
     return "\n".join(lines) + "\n"
 
 
@@ -154,16 +184,55 @@ def updated(page: str) -> str:
     return _BLOCK.sub(lambda match: match[1] + BLOCKS[match["name"]]() + match[3], page)
 
 
-def _rows(model: type[BaseModel], prefix: str = "") -> Iterator[tuple[str, str, str, str]]:
+_SHORTER = (
+    (r"\ban? (mapping)(, not empty)?", ""),
+    (r"\ban? (integer|number|list)\b", r"\1"),
+    (r"\bfrom (\S+ to)", r"\1"),
+    (r"\bnumber (above|from|-?\d)", r"\1"),
+    (r"\b(of at least|at least)\b", "from"),
+    (r", at most\b", " to"),
+    (r"\bat most\b", "to"),
+    (r"integer 0 to 4294967295", "32-bit integer"),
+    (r" or '", ", '"),
+    (r"'([^']*)'", r"`\1`"),
+)
+"""Words of an error message in the style of a table."""
+
+
+def _rows(
+    model: type[BaseModel], prefix: str = "", shown: dict[type[BaseModel], str] | None = None
+) -> Iterator[tuple[str, str, str]]:
+    """Yields key (bold if required), expected value (default) and meaning.
+
+    A mapping that was ``shown`` before is a reference to it.
+    """
+    shown = ({} if model is AxisConfig else dict(_of_the_axis_file())) if shown is None else shown
     for name, info in model.model_fields.items():
         key = key_of(name, info)
         place = field_at(model, (key,))
         assert place is not None
         inner, many = _inner(place)
-        what = type_words(place).replace("|", "\\|")
-        yield prefix + key, what, _default(key, info), place.description.replace("|", "\\|")
-        if inner is not None:
-            yield from _rows(inner, f"{prefix}{key}{'[]' if many else ''}.")
+        what = type_words(place)
+        for pattern, shorter in _SHORTER:
+            what = re.sub(pattern, shorter, what)
+        same = f"as {shown[inner]}" if inner in shown else ""
+        value = " ".join(each for each in (what, same, _default(key, info)) if each)
+        yield (
+            f"**`{prefix}{key}`**" if info.is_required() else f"`{prefix}{key}`",
+            value.replace("|", "\\|"),
+            place.description.replace("|", "\\|"),
+        )
+        if inner is not None and inner not in shown:
+            shown[inner] = f"`{prefix}{key}`"
+            yield from _rows(inner, f"{prefix}{key}{'[]' if many else ''}.", shown)
+
+
+@cache
+def _of_the_axis_file() -> dict[type[BaseModel], str]:
+    """Returns the mappings within an axis file, with their keys."""
+    shown: dict[type[BaseModel], str] = {}
+    list(_rows(AxisConfig, shown=shown))
+    return {model: f"{key} of an axis file" for model, key in shown.items()}
 
 
 def _inner(place: Field) -> tuple[type[BaseModel] | None, bool]:
@@ -179,19 +248,19 @@ def _inner(place: Field) -> tuple[type[BaseModel] | None, bool]:
 
 def _default(key: str, info: FieldInfo) -> str:
     if info.is_required():
-        return "required"
+        return ""
     value = info.get_default(call_default_factory=True, validated_data={})
     if value is None or value is PydanticUndefined or value in ((), {}, "") or isinstance(value, BaseModel):
         return ""
     if isinstance(value, Enum):
         value = value.value
     if key == "index":
-        return f"`{value:#x}`"
+        return f"(`{value:#x}`)"
     if isinstance(value, bool):
-        return f"`{value}`".lower()
+        return f"(`{value}`)".lower()
     if isinstance(value, tuple):
-        return f"`{[*value]}`".replace(".0", "")
-    return f"`{value:g}`" if isinstance(value, float) else f"`{value}`"
+        return f"(`{[*value]}`)".replace(".0", "")
+    return f"(`{value:g}`)" if isinstance(value, float) else f"(`{value}`)"
 
 
 def main(arguments: list[str]) -> int:

@@ -1,4 +1,4 @@
-"""Measures accuracy and cost of the simulated axis alone, for docs/truth-file.md.
+"""Measures accuracy and cost of the simulated axis alone, for docs/how-well.md.
 
 .venv/bin/python tools/plant_figures.py [--steps 240]
 """

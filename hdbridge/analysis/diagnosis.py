@@ -10,6 +10,7 @@ import numpy as np
 from hdbridge.analysis import changes
 from hdbridge.analysis.acceptance import gate
 from hdbridge.analysis.calibrated import calibrated
+from hdbridge.analysis.capability import capability
 from hdbridge.analysis.checks import check_once, check_records, zeros_apart_arcsec
 from hdbridge.analysis.cuts import observed
 from hdbridge.analysis.extend import as_named, extended_model, supported
@@ -27,8 +28,8 @@ from hdbridge.analysis.hypothesis import Estimator, Fitted, Hypothesis
 from hdbridge.analysis.identifiability import identifiability
 from hdbridge.analysis.linear import about_zeros
 from hdbridge.analysis.parameters import confounded, covariance, parameters_of, precisely
-from hdbridge.analysis.prepared import gather
-from hdbridge.analysis.probability import Context, weighed
+from hdbridge.analysis.prepared import Observed, gather
+from hdbridge.analysis.probability import Context, Prior, weighed
 from hdbridge.analysis.scales import Scales
 from hdbridge.analysis.search import (
     Search,
@@ -37,6 +38,7 @@ from hdbridge.analysis.search import (
     waves_alike,
     with_measured,
 )
+from hdbridge.analysis.swing import allowed_for, ordinary
 from hdbridge.analysis.unexplained import (
     LESS,
     Rest,
@@ -67,12 +69,14 @@ def diagnose(
     independent_zeros: bool = False,
     progress: Callable[[str], None] = lambda _: None,
     scales: Scales | None = None,
+    prior: Prior | None = None,
 ) -> Diagnosis:
     """Diagnoses how a model differs from one or several recordings, and why; ``.as_dict()`` is the document.
 
     ``independent_zeros`` states that the encoders' zeros were lost between recordings. ``progress`` receives
-    a description of each step. ``scales`` overrides the decision thresholds. InputError if a recording is
-    too short, does not match the model's ratio, or lacks a channel that the model needs.
+    a description of each step. ``scales`` overrides the decision thresholds; ``prior`` holds
+    what a fleet says of the causes. InputError if a recording is too short, does not match the model's ratio,
+    or lacks a channel that the model needs.
     """
     recordings = by_name(recording)
     agreed_ratio(recordings, [(str(model.path or "the model"), model.ratio)])
@@ -91,23 +95,29 @@ def diagnose(
     data = gather(
         record, model.ratio, legs, independent_zeros, lambda motion: model.predict(motion, Start.VIRGIN)
     )
-    estimator = Estimator(data, scales or Scales())
-    estimator.calibrated = calibrated(
-        model.effects,
-        model.uncertainty,
-        lambda effect: estimator.columns(effect, Start.VIRGIN),
-        estimator.scales,
-    )
-    search = Search(estimator, model.effects)
+    search = _search(data, model, scales or Scales())
+    begun = search.begun()
+    swing = ordinary(search.estimator, begun)
+    search = _search(allowed_for(search.estimator, begun, swing), model, search.scales)
+    estimator = search.estimator
     first = unfitted(estimator, model.effects)
     held = beyond_limit(model.effects, data.full.motion)
-    data = replace(data, remarks=(*((first,) if first else ()), *held, *data.remarks))
-    estimator.data = data
+    own = [swing.remark()] if swing is not None else []
+    told = (*((first,) if first else ()), *held, *data.remarks, *own)
+    estimator.data = replace(estimator.data, remarks=told)
     progress("searching for causes")
     found = search.run()
     progress("judging what was found")
-    diagnosis = _Judge(search, model, bool(first)).of(found)
+    diagnosis = _Judge(search, model, bool(first), prior).of(found)
     return replace(diagnosis, remarks=(*remarks, *diagnosis.remarks))
+
+
+def _search(data: Observed, model: TransmissionModel, scales: Scales) -> Search:
+    estimator = Estimator(data, scales)
+    estimator.calibrated = calibrated(
+        model.effects, model.uncertainty, lambda effect: estimator.columns(effect, Start.VIRGIN), scales
+    )
+    return Search(estimator, model.effects)
 
 
 def _of_zeros(parts: Sequence[Record], ratio: float) -> tuple[str, ...]:
@@ -135,6 +145,7 @@ class _Judge:
     model: TransmissionModel
     unfitted: bool
     """True if the model lacks a loop that makes up most of its residual."""
+    prior: Prior | None = None
     considered: list[str] = field(default_factory=list)
     """Causes that were considered but not reported, with the reason."""
 
@@ -171,13 +182,15 @@ class _Judge:
         before = min(each_start, key=lambda error: float(error @ error))
         after = self._left_by(extended.effects, fitted.hypothesis.start)
         measured = estimator.observed - estimator.level - fitted.zeros[estimator.zero]
+        visible = identifiability(estimator, refitted, given)
         return Diagnosis(
             baseline=_figures(before),
             refitted=_figures(refitted.residual / estimator.weight),
             extended=_figures(after),
             noise_floor_arcsec=float(np.sqrt(np.mean(estimator.weight**-2.0))),
             findings=tuple(findings),
-            identifiability=identifiability(estimator, fitted, given),
+            identifiability=visible,
+            capability=capability(estimator.data, given, visible, estimator.scales),
             by_kind=self._by_kind(before, after),
             remarks=estimator.data.remarks,
             model=extended,
@@ -239,7 +252,10 @@ class _Judge:
                 each for each in judged.findings if each.probability >= self.estimator.scales.named_from
             ]
             doubted = [each for each in judged.findings if each not in likely]
-            self.considered.extend(f"{each.cause}: more likely something else" for each in doubted)
+            self.considered.extend(
+                f"{each.cause}: more likely something else" + f" (prior: {each.prior})" * bool(each.prior)
+                for each in doubted
+            )
             effects = {id(each.effect) for each in doubted}
             kept = [
                 each
@@ -274,7 +290,7 @@ class _Judge:
             findings = [each for each in findings if each not in doubtful]
             left = rest(estimator, self._with_given_loop(fitted))
         words = [f"{each.cause}: {LESS}" for each in doubtful]
-        findings = weighed(findings, Context(left.arcsec, excess, unknown), estimator.scales)
+        findings = weighed(findings, Context(left.arcsec, excess, unknown), estimator.scales, self.prior)
         if estimator.data.reversals < 2:  # speed, torque, place and time are correlated
             most = estimator.scales.one_way
             findings = [replace(each, probability=min(each.probability, most)) for each in findings]

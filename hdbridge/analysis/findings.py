@@ -8,11 +8,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
-from typing import Any, Final
+from dataclasses import asdict, dataclass, field, replace
+from typing import Any, Final, Self
 
 from hdbridge.analysis.acceptance import Gate
+from hdbridge.analysis.capability import Capability, Identifiability, certainty
 from hdbridge.analysis.gain import Gain
+from hdbridge.analysis.intervals import NORMAL_95
 from hdbridge.analysis.prepared import means
 from hdbridge.analysis.scales import Scales
 from hdbridge.analysis.views import ResidualViews, coordinates
@@ -69,6 +71,7 @@ def depends_on(lives_in: str) -> str:
 
 
 SCHEMA = "hdbridge.diagnosis/1"
+UNEXPLAINED: Final = "unexplained"
 UNWEIGHED = math.nan
 """Probability of a finding before the findings are weighed."""
 
@@ -95,6 +98,15 @@ class Parameter:
     high: float
     is_size: bool = False
     """True for a size: at zero the effect would vanish."""
+
+    def combined(self, middle: float, deviation: float) -> Self:
+        """Combines it with a normal prior; unchanged if they are three standard deviations apart."""
+        own = (self.high - self.low) / (2.0 * NORMAL_95)
+        if not 0.0 < own < math.inf or abs(self.value - middle) > 3.0 * math.hypot(own, deviation):
+            return self
+        share = deviation**2 / (own**2 + deviation**2)
+        value, half = middle + share * (self.value - middle), NORMAL_95 * own * math.sqrt(share)
+        return replace(self, value=value, low=value - half, high=value + half)
 
     def as_dict(self) -> dict[str, Any]:
         """Returns the JSON object."""
@@ -130,6 +142,8 @@ class Finding:
     lives_in: str = ""
     """Coordinate on which an unexplained residual depends."""
     note: str = ""
+    prior: str = ""
+    """What other joints say of it, if a fleet was given."""
     effect: Effect | None = field(default=None, repr=False)
     """Effect to add to the model."""
     gate: Gate | None = field(default=None, repr=False)
@@ -140,7 +154,8 @@ class Finding:
     def as_dict(self) -> dict[str, Any]:
         """Returns the JSON object."""
         gain = self.gain
-        words = {"lives_in": self.lives_in, "note": self.note, "not_offered": self.refusal()}
+        words = {"lives_in": self.lives_in, "note": self.note, "prior": self.prior}
+        words["not_offered"] = self.refusal()
         return {
             "cause": self.cause,
             "probability": round(self.probability, 3),
@@ -176,31 +191,6 @@ class Finding:
         if sizes and not self.aliases and all(each.low <= 0.0 <= each.high for each in sizes):
             return "zero is in the 95 % interval of everything that says how large it is"
         return ""
-
-
-@dataclass(frozen=True, slots=True)
-class Identifiability:
-    """Ability of a record to show a cause."""
-
-    detectable: bool
-    detection_limit_arcsec: float | None
-    """Smallest peak that would be reported; None if the cause is invisible."""
-    aliases: tuple[str, ...]
-    """Causes that this record could not separate from it."""
-    share_left: float
-    """Share of its square that the baseline cannot absorb."""
-    reason: str = ""
-
-    def as_dict(self) -> dict[str, Any]:
-        """Returns the JSON object."""
-        limit = self.detection_limit_arcsec
-        data: dict[str, Any] = {
-            **asdict(self),
-            "detection_limit_arcsec": None if limit is None else _round(limit),
-            "aliases": list(self.aliases),
-            "share_left": float(f"{self.share_left:.3g}"),
-        }
-        return {name: each for name, each in data.items() if name != "reason" or each}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -251,8 +241,10 @@ class Diagnosis:
     noise_floor_arcsec: float
     findings: tuple[Finding, ...]
     identifiability: Mapping[str, Identifiability]
+    capability: Capability
+    """Causes that the record can show."""
     by_kind: Mapping[str, tuple[Figures, Figures]]
-    """By kind of motion and by direction: given and extended model."""
+    """Figures of the given and the extended model, by kind of motion and by direction."""
     remarks: tuple[str, ...]
     model: TransmissionModel = field(repr=False)
     """Extended model; the refitted one if nothing was found."""
@@ -266,6 +258,7 @@ class Diagnosis:
         """Returns the JSON document, schema hdbridge.diagnosis/1."""
         return {
             "schema": SCHEMA,
+            "record": self.capability.as_dict(),
             "baseline": self.baseline.as_dict(),
             "refitted": self.refitted.as_dict(),
             "noise_floor_arcsec": _round(self.noise_floor_arcsec),
@@ -297,7 +290,10 @@ class Diagnosis:
         )
 
     def verdict(self) -> str:
-        """Returns a summary in one sentence."""
+        """Returns two sentences: the causes that the record can show, and those that were found."""
+        return f"{self.capability.sentence()} {self._found()}"
+
+    def _found(self) -> str:
         if not self.findings:
             return (
                 "Nothing found: the model differs from the measurement by no more than noise and calibration."
@@ -305,8 +301,10 @@ class Diagnosis:
         words = []
         for each in self.findings:
             others = f" (or {', '.join(each.aliases)})" if each.aliases else ""
-            where = f" that depends on the {each.lives_in or 'time'}" if each.cause == "unexplained" else ""
-            words.append(f"{each.cause}{others}{where}, {each.peak_arcsec:.2g} arcsec")
+            name = f"{certainty(each.probability)}{each.cause}{others}"
+            if each.cause == UNEXPLAINED:
+                name = f"{UNEXPLAINED} that depends on the {each.lives_in or 'time'}"
+            words.append(f"{name}, {each.peak_arcsec:.2g} arcsec")
         return (
             f"The model is off by {self.baseline.rms_arcsec:.3g} arcsec rms: {'; '.join(words)}; "
             f"extended it is off by {self.extended.rms_arcsec:.3g}."

@@ -9,14 +9,14 @@ from typing import Any, Final
 
 import numpy as np
 
-from hdbridge.analysis.findings import Identifiability
+from hdbridge.analysis.capability import Capability, Identifiability, capability
 from hdbridge.analysis.hypothesis import Estimator, Fitted, Hypothesis
-from hdbridge.analysis.linear import Effort, orthonormal
+from hdbridge.analysis.linear import Effort, orthonormal, side_by_side
 from hdbridge.analysis.orders import NOT_APART
 from hdbridge.analysis.prepared import gather
 from hdbridge.analysis.screening import SHARE_LEFT, candidates
 from hdbridge.analysis.search import lookalikes, waves_alike
-from hdbridge.effects import CATALOGUE, Effect, FloatArray, Motion, Start, causes
+from hdbridge.effects import CATALOGUE, Effect, FloatArray, Motion, Part, Sought, Start, causes
 from hdbridge.model import TransmissionModel
 from hdbridge.procedures.moves import AxisView, MotionLimits
 from hdbridge.procedures.plan import Plan
@@ -37,21 +37,26 @@ INFLATION = 2.5
 def identifiability(
     estimator: Estimator, fitted: Fitted, base: Sequence[Effect]
 ) -> dict[str, Identifiability]:
-    """Returns detection limit and look-alikes of each cause of the catalogue."""
+    """Returns detection limit and look-alikes of each cause of the catalogue; ``fitted`` is the model."""
     best: dict[str, tuple[float, float, FloatArray, Effect]] = {}
+    reasons: dict[str, str] = {}
     stride = -(-len(estimator.index) // ENOUGH)
-    # A basis is no longer orthonormal when points are left out.
-    basis = orthonormal(fitted.linearised.basis[::stride])
-    weight = estimator.weight[::stride, np.newaxis]
+    background = _Background(estimator, fitted, base, stride)
+    start, weight = fitted.hypothesis.start, estimator.weight[::stride, np.newaxis]
     for candidate in candidates(estimator.data, base, screened=False):
-        columns = estimator.columns(candidate, fitted.hypothesis.start)
+        reasons[candidate.name] = candidate.unidentifiable(estimator.data)
+        columns = _columns(estimator, candidate, base, start)
         low, high = np.quantile(columns, [estimator.rare, 1.0 - estimator.rare], axis=0)
         columns, span = columns[::stride], high - low
         seen = span > 1e-12
-        if not np.any(seen):
+        if reasons[candidate.name] or not np.any(seen):
             continue
         unit = weight * columns[:, seen] / (0.5 * span[seen])  # one arcsec at its peak
-        rest = unit - basis @ (basis.T @ unit)
+        rest = background.left(candidate, unit)
+        if candidate.tracker().memory_deg > 0.0:
+            before = background.left(candidate, weight * _before(estimator, candidate, base, start)[::stride])
+            before = orthonormal(before)
+            rest = rest - before @ (before.T @ rest)
         squares = np.sum(rest**2, axis=0)
         size, share = np.sqrt(stride * np.max(squares)), np.max(squares / np.sum(unit**2, axis=0))
         if candidate.name not in best or size > best[candidate.name][0]:
@@ -60,7 +65,9 @@ def identifiability(
     result: dict[str, Identifiability] = {}
     for cause in causes():
         if cause not in best:
-            result[cause] = Identifiability(False, None, (), 0.0, _missing(estimator, cause))
+            result[cause] = Identifiability(
+                False, None, (), 0.0, reasons.get(cause) or _missing(estimator, cause)
+            )
             continue
         size, share, rest, example = best[cause]
         if share < SHARE_LEFT or size <= 0.0:
@@ -78,6 +85,11 @@ def identifiability(
             if name != cause and (name in waves or _correlation(spans[cause], spans[name]) > NOT_APART)
         ]
         result[cause] = Identifiability(limit <= WORST_ARCSEC, limit, tuple(alike), share)
+    for cause, each in result.items():
+        # A tone looks like a wave over an angle only at its frequency, which is that of no example.
+        tones = [name for name in each.aliases if CATALOGUE[name].sought is Sought.TONE]
+        for tone in tones:
+            result[tone] = replace(result[tone], aliases=tuple(dict.fromkeys((*result[tone].aliases, cause))))
     for candidate in candidates(estimator.data, ()):
         # An effect of a missing channel may look like a measured one.
         each = result[candidate.name]
@@ -85,6 +97,66 @@ def identifiability(
             if kind.channels - estimator.motion.available() and kind.name not in each.aliases:
                 result[candidate.name] = replace(each, aliases=(*each.aliases, kind.name))
     return result
+
+
+def _columns(estimator: Estimator, candidate: Effect, base: Sequence[Effect], start: Start) -> FloatArray:
+    """Returns a candidate's columns, of a changed part the change alone, arcsec, shape (m, p)."""
+    columns = estimator.columns(candidate, start)
+    if candidate.changes is None:
+        return columns
+    change = columns @ candidate.coefficients()
+    if candidate.replaces:
+        change = change - sum(
+            estimator.columns(each, start) @ each.coefficients()
+            for each in base
+            if each.name == candidate.replaces
+        )
+    return np.asarray(change[:, np.newaxis])
+
+
+def _before(estimator: Estimator, candidate: Effect, base: Sequence[Effect], start: Start) -> FloatArray:
+    """Returns the part of a candidate that an unknown motion before the record could cause, shape (m, k)."""
+    own = _columns(estimator, candidate, base, start)
+    others = [_columns(estimator, candidate, base, each) - own for each in Start if each is not start]
+    return side_by_side(others, len(estimator.index))
+
+
+class _Background:
+    """Explanations of a record without a cause: the model, the motion before, errors of turning points."""
+
+    def __init__(self, estimator: Estimator, fitted: Fitted, base: Sequence[Effect], stride: int) -> None:
+        start = fitted.hypothesis.start
+        before = [
+            estimator.weighted(estimator.columns(each, other) - estimator.columns(each, start))
+            for each in base
+            if each.tracker().memory_deg > 0.0
+            for other in Start
+            if other is not start
+        ]
+        further = side_by_side([*before, estimator.turn_discrepancy(base, start)], len(estimator.index))
+        self._estimator, self._stride = estimator, stride
+        self._columns = side_by_side(
+            [fitted.tangent[::stride], further[::stride]], len(fitted.residual[::stride])
+        )
+        self._part = [None if each.effect < 0 else base[each.effect].part for each in fitted.parameters]
+        self._part += [None] * further.shape[1]
+        self._bases: dict[tuple[Part | None, str], FloatArray] = {}
+
+    def left(self, candidate: Effect, columns: FloatArray) -> FloatArray:
+        """Returns what the background does not explain of columns (m, k), where the candidate must show.
+
+        A change of a part of the model is sought in addition to the rest of the model.
+        """
+        stretch = candidate.shows(self._estimator.motion)
+        rows = np.ones(len(columns), dtype=bool)
+        if stretch is not None:
+            rows = stretch.rows[self._estimator.index][:: self._stride]
+        key = candidate.changes, stretch.otherwise if stretch else ""
+        if key not in self._bases:
+            kept = [part is None or part is not candidate.changes for part in self._part]
+            self._bases[key] = orthonormal(self._columns[:, kept] * rows[:, np.newaxis])
+        basis, columns = self._bases[key], columns * rows[:, np.newaxis]
+        return np.asarray(columns - basis @ (basis.T @ columns))
 
 
 def _missing(estimator: Estimator, cause: str) -> str:
@@ -98,6 +170,17 @@ def _correlation(one: FloatArray, other: FloatArray) -> float:
     """Returns the smallest canonical correlation of the smaller space with the larger."""
     values = np.linalg.svd(one.T @ other, compute_uv=False)
     return float(np.min(values)) if len(values) else 0.0
+
+
+def examined(
+    record: Record, model: TransmissionModel, legs: Sequence[Segment] = (), start: Start = Start.VIRGIN
+) -> tuple[dict[str, Identifiability], Capability]:
+    """Returns what a record could show of each cause, whether it is there or not, and the summary."""
+    data = gather(record, model.ratio, legs, expected=lambda motion: model.predict(motion, start))
+    estimator = Estimator(data)
+    fitted = estimator.fit(Hypothesis(model.effects, start), effort=Effort(steps=2))
+    found = identifiability(estimator, fitted, model.effects)
+    return found, capability(data, model.effects, found, estimator.scales)
 
 
 # Planned records: detectable causes, and those that are not separable.
@@ -132,15 +215,13 @@ def plan_report(plan: Plan, model: TransmissionModel, limits: MotionLimits = LIM
     record = Record(
         {"time_s": time, "motor_position_deg": motor, "load_position_deg": load, "motor_target_deg": motor}
     )
-    data = gather(record, model.ratio, legs, expected=lambda given: model.predict(given, start))
-    estimator = Estimator(data)
-    fitted = estimator.fit(Hypothesis(model.effects, start), effort=Effort(steps=2))
-    found = identifiability(estimator, fitted, model.effects)
+    found, shown = examined(record, model, legs, start)
     return {
         "schema": "hdbridge.plan-diagnosis/1",
         "plan": plan.name,
         "duration_s": float(time[-1]),
         "noise_arcsec": NOISE_ARCSEC,
+        "record": shown.as_dict(),
         "identifiability": {name: each.as_dict() for name, each in found.items()},
         "notes": list(tasks.notes),
     }

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 from hdbridge.analysis.acceptance import Gate
 from hdbridge.analysis.findings import Finding
@@ -25,6 +25,33 @@ class Context:
     excess: float
     """Chi square per point of the whole fit."""
     unexplained: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Prior:
+    """What other joints say of a cause before this record is seen (`hdbridge.fleet.prior`)."""
+
+    right: Mapping[str, float]
+    """Probability, by cause, that a name of it is right in a joint of this group."""
+    words: Mapping[str, str]
+    """The same in words, for the output."""
+    ranges: Mapping[tuple[str, str], tuple[float, float]] = field(default_factory=dict)
+    """Median and standard deviation between joints, by cause and parameter."""
+
+    def log_odds(self, cause: str, scales: Scales) -> float:
+        """Returns by how much a name of the cause is more credible than in the records of the formula."""
+        share = self.right.get(cause, scales.right)
+        return math.log(share / (1.0 - share)) - math.log(scales.right / (1.0 - scales.right))
+
+    def narrowed(self, finding: Finding) -> Finding:
+        """Combines the parameters with their ranges, unless the two disagree."""
+        parameters = {
+            name: each.combined(*self.ranges[finding.cause, name])
+            if (finding.cause, name) in self.ranges
+            else each
+            for name, each in finding.parameters.items()
+        }
+        return replace(finding, parameters=parameters, prior=self.words.get(finding.cause, ""))
 
 
 def coefficients(scales: Scales) -> dict[str, float]:
@@ -52,17 +79,27 @@ def features(finding: Finding, largest: float, context: Context, scales: Scales)
     }
 
 
-def weighed(findings: Sequence[Finding], context: Context, scales: Scales) -> list[Finding]:
+def weighed(
+    findings: Sequence[Finding], context: Context, scales: Scales, prior: Prior | None = None
+) -> list[Finding]:
     """Returns the findings with the probability that each (or one of its aliases) is present."""
     largest = max((each.robust for each in findings), default=0.0)
-    terms = [features(each, largest, context, scales) for each in findings]
-    return [
-        replace(each, probability=probability(own, scales), terms=own)
-        for each, own in zip(findings, terms, strict=True)
-    ]
+    weighed = []
+    for each in findings:
+        terms = features(each, largest, context, scales)
+        more = prior.log_odds(each.cause, scales) if prior else 0.0
+        found = replace(each, probability=probability(terms, scales, more), terms=terms)
+        weighed.append(prior.narrowed(found) if prior else found)
+    return weighed
 
 
-def probability(terms: Mapping[str, float], scales: Scales) -> float:
-    """Returns the probability from the terms of the formula."""
+def probability(terms: Mapping[str, float], scales: Scales, prior: float = 0.0) -> float:
+    """Returns the probability from the terms of the formula and the log odds of a prior.
+
+    A prior does not make a name likely that the record alone does not support.
+    """
     score = sum(each * terms[name] for name, each in coefficients(scales).items())
-    return min(1.0 / (1.0 + math.exp(-score)), scales.surest)
+    alone, most = 1.0 / (1.0 + math.exp(-score)), scales.surest
+    if prior and alone < scales.named_from:
+        most = 0.5
+    return min(1.0 / (1.0 + math.exp(-score - prior)), most)

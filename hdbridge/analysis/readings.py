@@ -24,7 +24,9 @@ FINEST_COUNT_DEG = 360.0 / 2**20 - ROUNDED_DEG
 COUNTS_PER_DIGIT = 6.0
 """Smallest count that can be recognised in a rounded file, in units of its last digit."""
 _THIRD = np.sqrt(20.0)
+"""Amplification of white noise by third differences: the root of 1 + 9 + 9 + 1."""
 _MAD = 1.4826
+"""Standard deviation of a normal distribution per median absolute deviation."""
 _UNIFORM = np.sqrt(12.0)
 
 

@@ -110,6 +110,7 @@ class Scales:
     odds_size: float = _scale(1.22, "log odds per log of peak over what is left", 0.0, FITTED)
     odds_excess: float = _scale(-1.19, "log odds per log of chi square per point", 0.0, FITTED)
     odds_unexplained: float = _scale(-1.30, "log odds", 0.0, FITTED)
+    right: float = _scale(115 / 128, "share of the names that the formula is fitted to", 0.5, FITTED)
     strong: float = _scale(
         12.0, "times the needed evidence", math.inf, "more says that something is there, not what it is"
     )

@@ -17,7 +17,8 @@ from hdbridge.analysis.acceptance import all_pieces_seen, evident, gate
 from hdbridge.analysis.hypothesis import Estimator, Fitted, Hypothesis
 from hdbridge.analysis.linear import orthonormal, unknown
 from hdbridge.analysis.screening import Score, Screen, candidates, filtered, proposed, score_of
-from hdbridge.effects import CATALOGUE, Channel, Effect, Part, Start, aliases_of, in_place
+from hdbridge.effects import CATALOGUE, Channel, Effect, Motion, Part, Sought, Start, aliases_of, in_place
+from hdbridge.units import DEG_PER_TURN
 
 MOST = 6
 BEST = 3
@@ -45,7 +46,7 @@ class Search:
 
     def run(self) -> Fitted:
         """Adds causes, best first, then removes those that no longer improve the fit enough."""
-        fitted = self._with_best_law(self._with_best_sign(self._begin()))
+        fitted = self._with_best_law(self._with_best_sign(self.begun()))
         for number in range(MOST):
             found = self._best_addition(fitted)
             if number < ANEW and fitted.hypothesis.nuisances is None:
@@ -66,7 +67,8 @@ class Search:
             fitted = self._swapped(fitted)
         return self._with_best_law(self.eliminated(fitted, self._least, []))
 
-    def _begin(self) -> Fitted:
+    def begun(self) -> Fitted:
+        """Fits the model alone, from the best elastic state at the start."""
         fits = [self.estimator.fit(Hypothesis(self._base, start)) for start in Start]
         return min(fits, key=lambda each: each.chi_square)
 
@@ -80,12 +82,12 @@ class Search:
         if self.estimator.data.reversals < 2 or not loops or any(each.coefficients()[0] for each in loops):
             return known  # a coefficient that is not held at zero confirms the model's sign
         self.estimator.loop_sign *= -1.0
-        other = self._begin()
+        other = self.begun()
         self.estimator.loop_sign *= -1.0
         rival = self._best_addition(known) or known
         if self.cost(other) + self.scales.enter < self.cost(rival):
             self.estimator.loop_sign *= -1.0
-        return self._begin()
+        return self.begun()
 
     def _with_best_law(self, fitted: Fitted) -> Fitted:
         """Exchanges the hysteresis law for an equivalent one if that fits better."""
@@ -213,13 +215,14 @@ class Search:
     def _refusal(self, trial: Fitted, cause: str, as_alias: bool = False) -> str:
         """Returns the reason to reject the last effect of this name, or an empty string.
 
-        The effect must be physically possible and visible in the record. An alias need not be identifiable.
+        The effect must be physically possible and visible in the record. An alias need not be identifiable,
+        and its size need not be known.
         """
         place = _last(trial, cause)
         effect = trial.hypothesis.effects[place]
         reason = self.refusal(effect, as_alias)
         most = self.scales.extrapolated * self.peak(trial, place)
-        if not reason and effect.largest_piece_arcsec() > most:
+        if not reason and not as_alias and effect.largest_piece_arcsec() > most:
             reason = "the record shows too little of it to say how large it is"
         elif (
             not reason and Channel.TIME in effect.needs() and effect.shows(self.estimator.motion) is not None
@@ -432,17 +435,18 @@ def waves_alike(estimator: Estimator, effects: Sequence[Effect], start: Start) -
     """Yields other kinds of waves that this record cannot separate from one of the effects, all of one kind.
 
     Kinds over the same angle count as similar if both can have the orders concerned. On an arc of a turn
-    different orders cancel, so the comparison uses their amplitudes, not their sum.
+    different orders cancel, so the comparison uses their amplitudes, not their sum. A wave over an angle is
+    compared with one in time of the frequency that it has at the usual speed: at one speed they are the same.
     """
     data, most = estimator.data, estimator.scales.in_step
-    effects = [each for each in effects if each.waves()]
+    effects = [each for each in effects if _is_wave(each)]
     if not effects:
         return
     angle = effects[0].coordinate(data.motion, data.ratio).name
     for name in aliases_of(effects[0].name):
         kind = CATALOGUE.get(name)
-        own = [] if kind is None else [*kind.proposals(data, ())]
-        near = [each for each in own if each.waves() and each.part is not Part.LOOP]
+        own = [] if kind is None else in_time(kind, effects, data.motion) or [*kind.proposals(data, ())]
+        near = [each for each in own if _is_wave(each) and each.part is not Part.LOOP]
         if not near:
             continue
         if near[0].coordinate(data.motion, data.ratio).name == angle:
@@ -450,13 +454,34 @@ def waves_alike(estimator: Estimator, effects: Sequence[Effect], start: Start) -
             if any(_share_in(each, orders) > most for each in effects):
                 yield name
             continue
-        seen = orthonormal(np.hstack([estimator.columns(each, start) for each in near]))
+        columns = [estimator.columns(each, start) for each in near]
+        if near[0].sought is effects[0].sought is None:
+            columns = [np.hstack(columns)]  # several orders are one effect, several tones are not
+        spans = [orthonormal(each - np.mean(each, axis=0)) for each in columns]
         for each in effects:
             does = estimator.columns(each, start) @ each.coefficients()
             does -= np.mean(does)
-            if float(np.sum((seen.T @ does) ** 2)) > most * float(does @ does):
+            if any(float(np.sum((span.T @ does) ** 2)) > most * float(does @ does) for span in spans):
                 yield name
                 break
+
+
+def _is_wave(effect: Effect) -> bool:
+    return bool(effect.waves()) or effect.sought is Sought.TONE
+
+
+def in_time(kind: type[Effect], effects: Sequence[Effect], motion: Motion) -> list[Effect]:
+    """Returns tones of a ``kind`` at the frequencies that waves over an angle have at the median speed."""
+    speed = motion.motor_speed_deg_s
+    if kind.sought is not Sought.TONE or speed is None or not np.any(speed):
+        return []
+    example = kind.candidate(1.0)
+    turns_s = float(np.median(np.abs(speed[speed != 0.0]))) / DEG_PER_TURN
+    return [
+        example.fitted(example.coefficients(), {kind.shape[0].name: turns * turns_s})
+        for each in effects
+        for turns, _, _ in each.waves()
+    ]
 
 
 def _share_in(effect: Effect, orders: Container[float]) -> float:

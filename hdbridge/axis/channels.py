@@ -44,10 +44,10 @@ class ChannelSource(Strict):
 class LoadTorque(Strict):
     """Torque on the load, from a sensor at its flange or from the drive."""
 
-    source: ChannelSource = Field(description="the object that tells it")
+    source: ChannelSource = Field(description="object with the reading")
     newton_metres_per_count: float = Field(gt=0, le=1e6, description="torque at the load per count")
     direction: Literal[1, -1] = Field(
-        1, description="-1 where it counts down when the torque pushes the load forward"
+        1, description="-1 if it counts down when the torque pushes the load forward"
     )
     maximum_nm: float = Field(
         1000.0, gt=0, le=1e6, description="torque in either direction beyond which a reading is not believed"
@@ -65,10 +65,10 @@ class LoadTorque(Strict):
 class Temperature(Strict):
     """Temperature of the gear."""
 
-    source: ChannelSource = Field(description="the object that tells it")
+    source: ChannelSource = Field(description="object with the reading")
     celsius_per_count: float = Field(gt=0, le=1000, description="degrees Celsius per count")
     celsius_at_zero: float = Field(
-        0.0, ge=-1000, le=1000, description="temperature at a reading of zero (-273.15 where it is in kelvin)"
+        0.0, ge=-1000, le=1000, description="temperature at a reading of zero (-273.15 for kelvin)"
     )
     minimum_celsius: float = Field(
         -40.0, ge=-273.15, le=1000, description="temperature below which a reading is not believed"
@@ -98,7 +98,7 @@ class Temperature(Strict):
 class Quantity(Strict):
     """Any other measured channel, in its unit."""
 
-    source: ChannelSource = Field(description="the object that tells it")
+    source: ChannelSource = Field(description="object with the reading")
     per_count: float = Field(ge=-1e6, le=1e6, description="its unit per count")
     at_zero: float = Field(0.0, ge=-1e9, le=1e9, description="what a reading of zero means, in its unit")
     minimum: float = Field(-1e9, description="below this a reading is not believed")

@@ -37,10 +37,10 @@ class BusConfig(_Part):
     )
     channel: str | int = Field(description="channel of that interface, for example can0")
     bitrate_bps: int | None = Field(
-        None, ge=10_000, le=1_000_000, description="bit rate, where the interface sets it"
+        None, ge=10_000, le=1_000_000, description="bit rate, if the interface sets it"
     )
     options: dict[str, str | int | float | bool] = Field(
-        default_factory=dict, description="further options of the interface, handed on as they are"
+        default_factory=dict, description="further options of the interface, passed on unchanged"
     )
 
 
@@ -87,7 +87,7 @@ class DriveConfig(_Part):
     )
     feed_scales: bool = Field(
         True,
-        description="whether 6092h (feed) scales positions, as CiA 402 has it; false where it only informs",
+        description="6092h (feed) scales positions, as in CiA 402; false if it only informs",
     )
     halt_option: int = Field(1, ge=1, le=4, description="605Dh: how a halt brakes")
     shutdown_option: int = Field(
@@ -267,11 +267,9 @@ class AxisConfig(OtherChannels):
     motor_encoder: MotorEncoder = Field(description="the encoder of the motor")
     load_encoder: LoadEncoder = Field(description="the encoder at the load")
     gear: Gear = Field(description="the gear between them")
-    load_torque: LoadTorque | None = Field(
-        None, description="the torque on the load, where the drive can tell it"
-    )
+    load_torque: LoadTorque | None = Field(None, description="torque on the load, if the drive reports it")
     temperature: Temperature | None = Field(
-        None, description="the temperature of the gear, where the drive can tell it"
+        None, description="temperature of the gear, if the drive reports it"
     )
     limits: Limits = Field(description="what the axis may do")
     compensation: CompensationConfig = Field(
@@ -397,6 +395,14 @@ class AxisConfig(OtherChannels):
             return f"{self.path}: {key}"
         line, column = self._document.position(tuple(key.split(".")))
         return f"{self.path}:{line}:{column}: {key}"
+
+    def require_load_encoder(self) -> None:
+        """Raises `InputError` if the axis has no encoder at its load."""
+        if self.load_encoder.is_motor_encoder:
+            raise InputError(
+                f"{self.where('load_encoder.source')}: found the motor encoder (6064h); expected an encoder "
+                "at the load, which this measurement needs"
+            )
 
     @property
     def is_from_file(self) -> bool:

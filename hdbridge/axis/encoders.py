@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated, ClassVar, Literal, Self
+from typing import Annotated, ClassVar, Final, Literal, Self
 
 from pydantic import Field, model_validator
 
@@ -40,9 +40,7 @@ class Encoder(Strict):
     counts_per_turn: int = Field(
         ge=1, le=INT32_MAX, description="counts per turn of its own shaft, after multiplication"
     )
-    direction: Direction = Field(
-        1, description="-1 where it counts down as the axis (as the axis file means it) turns forward"
-    )
+    direction: Direction = Field(1, description="-1 if it counts down while the axis turns forward")
 
     @property
     def scale(self) -> Scale:
@@ -77,13 +75,13 @@ class Source(Strict):
     type: Literal["int32", "uint32", "int16", "uint16"] = Field("int32", description="type of the object")
     via: Literal["tpdo"] = Field("tpdo", description="how it comes; an SDO is too slow for the cycle")
     node: NodeId | None = Field(
-        None, description="node id of the encoder, where it is a node of its own (for example CiA 406, 6004h)"
+        None, description="node id of an encoder with a node of its own (CiA 406, 6004h)"
     )
     range_counts: int | None = Field(
         None,
         ge=2,
         le=2**32,
-        description="reading at which it begins anew at zero (a single-turn encoder: its counts per turn); "
+        description="reading at which it wraps to zero (single-turn encoder: its counts per turn); "
         "without it the whole range of the type",
     )
 
@@ -104,7 +102,16 @@ class Source(Strict):
         return self.range_counts or self.WRAPS[self.type]
 
 
+POSITION_ACTUAL: Final = (0x6064, 0)
+"""Position actual value of the motor (CiA 402-2)."""
+
+
 class LoadEncoder(Encoder):
     """The encoder at the load, which measures the positioning error."""
 
-    source: Source = Field(default_factory=Source, description="where its reading comes from")
+    source: Source = Field(default_factory=Source, description="source of its reading")
+
+    @property
+    def is_motor_encoder(self) -> bool:
+        """True if the reading is that of the motor encoder: the axis has no encoder at its load."""
+        return self.source.node is None and self.source.address == POSITION_ACTUAL

@@ -89,7 +89,11 @@ def start_journal(
     identity: Identity,
     notes: dict[str, Any] | None = None,
 ) -> Journal:
-    """Creates a journal; its notes list how the plan was shortened for this axis."""
+    """Creates a journal; its notes list how the plan was shortened for this axis.
+
+    InputError if the axis has no encoder at its load.
+    """
+    axis.require_load_encoder()
     shortened = outlook(plan, axis).notes
     return Journal.create(
         folder,

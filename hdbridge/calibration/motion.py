@@ -28,13 +28,15 @@ from hdbridge.control.bench import axis_view, compensation_for
 from hdbridge.control.rig import Rig, bench_on
 from hdbridge.drive.drive import Drive
 from hdbridge.drive.gains import changed_gains, read_gains
+from hdbridge.effects import Motion, Synchronous
 from hdbridge.effects.orders import MotorOrder, OrderSeries
 from hdbridge.errors import InputError
 from hdbridge.model import TransmissionModel
 from hdbridge.model.response import Response
-from hdbridge.procedures.even_speed import EvenSpeed
+from hdbridge.procedures.even_speed import EvenRun, EvenSpeed
 from hdbridge.procedures.path_test import PathRun, PathTest
 from hdbridge.procedures.rehearsal import rehearse
+from hdbridge.units import ARCSEC_PER_DEG
 
 LEAST_ARCSEC = 0.2
 """Minimum amplitude of the orders that are evaluated."""
@@ -46,6 +48,10 @@ RETUNED = (
     "the servo does not answer as it did when the response was measured (following lag {:.1f} ms then, "
     "{:.1f} ms now; the response differs by {:.0f} %): it was retuned, or the load changed; measure the "
     "response again"
+)
+NO_LOAD_ENCODER = (
+    "load_encoder.source is the motor encoder: the ripple is that of the load angle predicted from motor "
+    "encoder and model; path errors are not measured"
 )
 TRIALS = 3
 """Maximum number of filters tried, each based on the runs of those before it. The first one explores: it
@@ -231,7 +237,8 @@ def motion_test(
 
     With ``measure`` the response is measured, otherwise the model's own is tested. A filter is kept only if
     at every speed it leaves no more ripple than no correction, and no larger path error. InputError if no
-    motor order of the model is large enough to measure, or if the travel is too short.
+    motor order of the model is large enough to measure, or if the travel is too short. Without an encoder at
+    the load, the ripple is that of the load angle predicted from the motor encoder, and no path is run.
     """
     runner = _Runner(drive, model, progress, interrupted)
     gains = read_gains(drive.sdo) if isinstance(drive, Drive) else {}
@@ -241,6 +248,8 @@ def motion_test(
     elif found.response is not None:
         changed = changed_gains(found.response.gain_objects, gains)
         found = replace(found, remarks=(*found.remarks, *changed))
+    if drive.axis.load_encoder.is_motor_encoder:
+        return replace(found, remarks=(*found.remarks, NO_LOAD_ENCODER))
     used = [model.only(()), replace(model, response=None)]
     if found.response is not None:
         used.append(replace(model, response=found.response))
@@ -258,13 +267,7 @@ def _ripple_test(runner: _Runner, model: TransmissionModel, measure: bool) -> Mo
     none = runner.run("without correction", model.only(()))
     static_model = replace(model, response=None)
     static = runner.run("correction of rest", static_model)
-    speed = axis.limits.velocity_deg_s
-    limits = Limits(
-        tuple((float(order_hz(at, speed, model.ratio)), each) for at, each in runner.amplitudes.items()),
-        axis.compensation.maximum_arcsec,
-        axis.compensation.slew_arcsec_s,
-        axis.limits.acceleration_deg_s2,
-    )
+    limits = limits_of(axis, model)
     if not measure:
         return _tested(runner, model, none, static, limits)
     trials = [Trial(static)]
@@ -331,14 +334,14 @@ class _Runner:
         interrupted: Callable[[], bool],
     ) -> None:
         axis = self.axis = drive.axis
-        self.amplitudes = {each.order: each.amplitude_arcsec for each in motor_orders(model)}
-        if not self.amplitudes:
+        self.orders = tuple(each.order for each in motor_orders(model))
+        if not self.orders:
             raise InputError(
                 f"the model has no motor order of {LEAST_ARCSEC:g} arcsec or more: there is no ripple to "
                 "measure the response by; calibrate the axis first"
             )
-        self.orders = tuple(self.amplitudes)
         self.procedure = EvenSpeed.spread(axis_view(axis))
+        self._orders_only = TransmissionModel(model.ratio, (Synchronous(orders=tuple(motor_orders(model))),))
         self.ratio, self.cycle_s = model.ratio, axis.drive.cycle_s
         self._drive = drive
         self._pace = Pace(motion_test_s(axis), self.cycle_s, progress, interrupted)
@@ -347,7 +350,10 @@ class _Runner:
         """Runs all speeds with this model; returns the orders of each run."""
         self._pace.begin(name)
         bench = bench_on(self._drive, compensation_for(self.axis, model), interrupted=self._pace.interrupted)
-        return tuple(harmonics(each, self.orders, self.ratio) for each in bench.run(self.procedure).outcome)
+        runs = bench.run(self.procedure).outcome
+        if self.axis.load_encoder.is_motor_encoder:
+            runs = tuple(predicted_run(each, self._orders_only) for each in runs)
+        return tuple(harmonics(each, self.orders, self.ratio) for each in runs)
 
     def run_paths(self, model: TransmissionModel) -> tuple[PathRun, ...]:
         """Runs the paths with this model."""
@@ -365,6 +371,29 @@ def motor_orders(model: TransmissionModel) -> list[MotorOrder]:
     ]
     found = {order.order: order for each in series for order in each.orders}
     return [found[number] for number in sorted(found) if found[number].amplitude_arcsec >= LEAST_ARCSEC]
+
+
+def predicted_run(run: EvenRun, model: TransmissionModel) -> EvenRun:
+    """Returns a run with the load angle that the motor encoder and the model predict."""
+    motor_deg = np.array([each.motor_position_deg for each in run.samples])
+    load_deg = motor_deg / model.ratio + model.predict(Motion(motor_deg)) / ARCSEC_PER_DEG
+    samples = zip(run.samples, load_deg.tolist(), strict=True)
+    return replace(run, samples=tuple(each._replace(load_position_deg=load) for each, load in samples))
+
+
+def limits_of(axis: AxisConfig, model: TransmissionModel) -> Limits:
+    """Returns the limits of the axis file on a correction of the model's motor orders."""
+    speed = axis.limits.velocity_deg_s
+    tops = (
+        (float(order_hz(each.order, speed, model.ratio)), each.amplitude_arcsec)
+        for each in motor_orders(model)
+    )
+    return Limits(
+        tuple(tops),
+        axis.compensation.maximum_arcsec,
+        axis.compensation.slew_arcsec_s,
+        axis.limits.acceleration_deg_s2,
+    )
 
 
 def _ripples(

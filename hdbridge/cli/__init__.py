@@ -40,6 +40,8 @@ PANELS: Final = {
         "axis file.",
         "doctor": "Check an axis before its first long motion: files, bus, drive, encoders, directions, "
         "ratio, stops.",
+        "conform": "Check a node against CiA 301 and CiA 402: NMT, SDO, PDO, SYNC, EMCY, its EDS, the drive "
+        "profile.",
         "sdo": "Read or write an object of the drive by SDO, typed by its EDS.",
         "latency": "Measure timer latency; print its histogram and the shortest cycle that this computer "
         "sustains.",

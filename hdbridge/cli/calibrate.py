@@ -11,20 +11,13 @@ from rich.markup import escape
 
 from hdbridge.cli.measuring import PlanOption, out_option, resume_option
 from hdbridge.cli.options import (
-    ChannelOption,
-    ForceOption,
     HtmlOption,
-    InterfaceOption,
     JsonOption,
-    ProfileArgument,
-    SeedOption,
-    SimulateOption,
-    TruthOption,
     console,
-    load_axis,
     notes,
     write_json,
 )
+from hdbridge.cli.session import Session, on_axis
 from hdbridge.errors import InputError
 from hdbridge.files.outputs import Kind
 from hdbridge.files.profile import Profile
@@ -35,22 +28,16 @@ if TYPE_CHECKING:
 
 def register(app: typer.Typer) -> None:
     """Adds the command."""
-    app.command("calibrate")(command)
+    app.command("calibrate")(on_axis(command))
 
 
 def command(
-    profile: ProfileArgument,
+    session: Session,
     plan: PlanOption = "quick",
     out: Annotated[Path | None, out_option("Where the recording goes"), Kind.FOLDER] = None,
     resume: Annotated[
         Path | None, resume_option("Go on with an interrupted calibration: what its plan still lacks.")
     ] = None,
-    simulate: SimulateOption = False,
-    truth: TruthOption = None,
-    seed: SeedOption = 0,
-    interface: InterfaceOption = None,
-    channel: ChannelOption = None,
-    force: ForceOption = False,
     json_file: JsonOption = None,
     html_file: HtmlOption = None,
 ) -> None:
@@ -65,16 +52,15 @@ def command(
     from hdbridge.calibration.validation import validation_s
     from hdbridge.cli.measuring import Measurement, phases
 
-    files = Profile.find(profile)
-    axis = load_axis(files, interface, channel, simulate=simulate)
+    files, axis = session.files, session.axis
     work = Measurement.asked(axis, plan, out, resume)
     test_s = validation_s(work.plan, axis)
     if work.plan.validation.motion:
         with suppress(InputError):  # too little travel: the calibration reports it and skips the test
             test_s += motion_test_s(axis)
     work.announce(f"{test_s / 60:.1f} min to test the model")
-    with work.booted(files, simulate=simulate, truth=truth, seed=seed, force=force) as (drive, interrupted):
-        journal = work.begun(drive, seed if simulate else None)
+    with work.booted(session) as (drive, interrupted):
+        journal = work.begun(drive, session.simulated_seed)
         with phases() as progress:
             result = calibrate(
                 drive,

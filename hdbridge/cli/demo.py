@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from hdbridge.cli.options import console, load_axis, write_json
+from hdbridge.cli.options import console, write_json
+from hdbridge.cli.session import Session
 from hdbridge.files.atomic import make_folder, new_folder
 from hdbridge.files.outputs import Kind
-from hdbridge.files.profile import Profile
 
 if TYPE_CHECKING:
     from hdbridge.evaluation.comparison import Comparison
@@ -40,25 +40,21 @@ def demo(
     from hdbridge.model import TransmissionModel
     from hdbridge.procedures.stepping import Stepping
 
-    files = Profile.find("article")
-    axis = load_axis(files, None, None)
+    session = Session("article", simulate=True, seed=seed)
+    files, axis = session.files, session.axis
     stepping = Stepping(count=count)
     folder = new_folder(Path("demo-output")) if out is None else make_folder(out)
 
     def tell(comparison: Comparison) -> None:
         write_json(folder / "stepping.json", comparison.as_dict())
-        write_page(folder / "stepping.html", axis, files.model, comparison, stepping, simulated_seed=seed)
+        write_page(folder / "stepping.html", axis, files.model, comparison, stepping, seed)
         print_result(axis, comparison)
 
     run_comparison(
-        axis,
-        files,
+        session,
         TransmissionModel.load(files.model),
         stepping,
         None,
-        simulate=True,
-        truth=None,
-        seed=seed,
         record=folder,
         tell=tell,
     )

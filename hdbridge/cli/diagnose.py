@@ -21,6 +21,7 @@ from hdbridge.cli.options import (
     console,
     load_recordings,
     model_file,
+    need_extra,
     notes,
     print_table,
     write_json,
@@ -31,6 +32,7 @@ from hdbridge.files.outputs import Kind
 
 if TYPE_CHECKING:
     from hdbridge.analysis.findings import Diagnosis, Finding, Parameter
+    from hdbridge.analysis.probability import Prior
     from hdbridge.records.recording import Recording
 
 WORTH_TELLING = 0.01
@@ -77,6 +79,22 @@ def run(
         bool,
         typer.Option("--independent-zeros", help="The encoders' zeros were lost between the records."),
     ] = False,
+    prior: Annotated[
+        Path | None,
+        typer.Option(
+            "--prior",
+            metavar="FLEET.parquet",
+            help="What a fleet says of the causes: fleet.parquet in the --out of hdbridge fleet run.",
+        ),
+    ] = None,
+    group: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--group",
+            metavar="NAME=VALUE",
+            help="Group of this joint in the prior: gear=..., batch=..., cell=..., lubricant=...",
+        ),
+    ] = None,
     plan: Annotated[
         str | None,
         typer.Option(
@@ -136,13 +154,15 @@ def run(
         recordings,
         known,
         independent_zeros=independent_zeros,
+        prior=_prior(prior, group or []),
         progress=lambda words: notes.print(f"{words} ..."),
     )
     recording = Recording.joined(list(recordings.values()))
     options = {"--columns": columns, "--units": units, "--unwrap": unwrap}
     said = [word for name, texts in options.items() for text in texts or () for word in (name, text)]
-    single = {"--model": model, "--axis": axis, "--from": begin, "--to": end}
-    said += [word for name, text in single.items() if text for word in (name, text)]
+    single = {"--model": model, "--axis": axis, "--from": begin, "--to": end, "--prior": prior}
+    said += [word for text in group or () for word in ("--group", text)]
+    said += [word for name, text in single.items() if text for word in (name, str(text))]
     document = result.as_dict()
     # Files first, because the reader of the tables may close the pipe (`| head`).
     write_json(json_file, document)
@@ -159,6 +179,26 @@ def run(
     print_diagnosis(result)
     _print_figures(result)
     _print_shares(document["seen_over"])
+
+
+def _prior(path: Path | None, groups: Sequence[str]) -> Prior | None:
+    """Reads the prior for a joint of these groups."""
+    if path is None:
+        if groups:
+            raise InputError("--group says what a joint has in common with a fleet; name that with --prior")
+        return None
+    need_extra("a prior needs", ("pyarrow",), "fleet")
+    from hdbridge.fleet.prior import GROUPS, read_prior
+
+    of = {}
+    for each in groups:
+        name, equals, value = each.partition("=")
+        if name not in GROUPS or not equals:
+            raise InputError(
+                f"--group: found '{each}'; expected NAME=VALUE with NAME one of {', '.join(GROUPS)}"
+            )
+        of[name] = value
+    return read_prior(path, of)
 
 
 def print_diagnosis(result: Diagnosis) -> None:
@@ -192,6 +232,8 @@ def _details(finding: Finding) -> Iterator[str]:
         said.append(f"not offered: {refused}")
     if finding.experiment:
         said.append(f"measure next: {finding.experiment}")
+    if finding.prior:
+        said.append(f"prior: {finding.prior}")
     if said:
         yield f"{finding.cause}:"
         yield from (f"  {each}" for each in said)
@@ -251,6 +293,7 @@ def _provenance(recording: Recording, records: Sequence[Path], model: Path) -> l
 
 
 def _print_plan(report: dict[str, Any]) -> None:
+    _say(report["record"]["sentence"].replace("record", "plan", 1))
     table = Table("cause", "detected from", "not distinguished from")
     for name, each in report["identifiability"].items():
         limit = each["detection_limit_arcsec"]

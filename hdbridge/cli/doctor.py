@@ -10,23 +10,13 @@ from hdbridge.bringup import TORQUE_PERCENT
 from hdbridge.bringup.checks import Outcome
 from hdbridge.cli.interrupt import deferred_interrupt
 from hdbridge.cli.options import (
-    ChannelOption,
-    ForceOption,
-    InterfaceOption,
     JsonOption,
-    ProfileArgument,
-    SeedOption,
-    SimulateOption,
-    TruthOption,
-    check_bus_options,
-    connected,
     console,
-    load_axis,
     notes,
     write_json,
 )
+from hdbridge.cli.session import Session, on_axis
 from hdbridge.errors import DriveError
-from hdbridge.files.profile import Profile
 
 if TYPE_CHECKING:
     from hdbridge.bringup.checks import Row
@@ -48,17 +38,11 @@ LEFT_OUT = "left out by --no-motion"
 
 def register(app: typer.Typer) -> None:
     """Adds the command."""
-    app.command("doctor")(doctor)
+    app.command("doctor")(on_axis(doctor))
 
 
 def doctor(
-    profile: ProfileArgument,
-    simulate: SimulateOption = False,
-    truth: TruthOption = None,
-    seed: SeedOption = 0,
-    interface: InterfaceOption = None,
-    channel: ChannelOption = None,
-    force: ForceOption = False,
+    session: Session,
     torque_percent: Annotated[
         float,
         typer.Option(
@@ -86,23 +70,22 @@ def doctor(
     from hdbridge.bringup.context import BringUpContext
     from hdbridge.bringup.doctor import CHECKS
 
-    check_bus_options(interface, channel, simulate=simulate)
-    files = Profile.find(profile)
+    files = session.files
     refused: list[str] = []
 
     def permitted() -> str | None:
         if not motion:
             return LEFT_OUT
-        if simulate or yes or _confirm(torque_percent):
+        if session.simulate or yes or _confirm(torque_percent):
             return None
         refused.append(DECLINED)
         return DECLINED
 
     with BringUpContext(
-        lambda: load_axis(files, interface, channel),
-        lambda axis: connected(axis, files, simulate=simulate, truth=truth, seed=seed, force=force),
+        lambda: session.axis,
+        lambda _axis: session.connected(),
         torque_percent=torque_percent,
-        force=force,
+        force=session.force,
         interruptible=deferred_interrupt,
     ) as context:
         rows = run_checks(context, CHECKS, permitted=permitted, tell=_tell)
@@ -112,7 +95,7 @@ def doctor(
         {
             "schema": "hdbridge.doctor/1",
             "axis_file": str(files.axis),
-            "simulated": simulate,
+            "simulated": session.simulate,
             "passed": not failures and not refused,
             "checks": [row.as_dict() for row in rows],
         },

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -19,12 +21,17 @@ from hdbridge.cli.options import (
     write_result,
 )
 from hdbridge.errors import InputError
+from hdbridge.files.expectation import nearest
 from hdbridge.files.outputs import Kind
 
 if TYPE_CHECKING:
-    from hdbridge.fleet.summary import Summary
+    from hdbridge.fleet.dataset import Dataset
+    from hdbridge.fleet.engine import Cluster
+    from hdbridge.fleet.sources import Source, Stored
+    from hdbridge.fleet.summary import Row, Summary
 
 PAGE_NAME = "fleet.html"
+PRIOR_NAME = "fleet.parquet"
 _EXTRA = ("distributed", "pyarrow", "fsspec")
 
 OutArgument = Annotated[Path, typer.Argument(metavar="OUT", help="The --out folder of a run.")]
@@ -70,6 +77,10 @@ WorkersOption = Annotated[
     int | None,
     typer.Option("--workers", min=1, max=1000, help="Processes on this computer; else one per core."),
 ]
+PagesOption = Annotated[
+    bool,
+    typer.Option("--pages", help="Write the page of each joint in the list too, into OUT/pages."),
+]
 MemoryOption = Annotated[str, typer.Option("--memory", metavar="SIZE", help="Memory limit of each of them.")]
 
 
@@ -81,6 +92,7 @@ def register(app: typer.Typer) -> None:
         rich_markup_mode="markdown",
     )
     group.command()(run)
+    group.command()(watch)
     group.command()(report)
     group.command()(simulate)
     app.add_typer(group, name="fleet")
@@ -96,69 +108,160 @@ def run(
     workers: WorkersOption = None,
     memory: MemoryOption = "2GB",
     limit_arcsec: LimitOption = 10.0,
+    pages: PagesOption = False,
 ) -> None:
     """Diagnose every recording that is not in FOLDER yet, and write Parquet and a page there.
 
     A joint without a model gets one fitted to its earliest recording. A recording that cannot be used is a
     row with the reason. Ctrl-C keeps what is done; the same command continues.
     """
-    from hdbridge.fleet.dataset import Dataset
-    from hdbridge.fleet.engine import Cluster, Progress
-    from hdbridge.fleet.engine import run as run_fleet
     from hdbridge.fleet.sources import find_sources
-    from hdbridge.model import TransmissionModel
 
-    need_extra("a fleet needs", _EXTRA, "fleet")
-    if out is None:
-        raise InputError("--out is missing; name a new folder, or one of an earlier run")
-    if not sources and manifest is None:
-        raise InputError(
-            "no source; name folders, globs or URLs of recordings, or a manifest with --manifest"
-        )
-    if scheduler is not None and workers is not None:
-        raise InputError(
-            "--workers: a cluster that exists has its own workers; leave out --workers or --scheduler"
-        )
-    _check_memory(memory)
-    if scheduler == "":
-        raise InputError("--scheduler: found no address; expected one such as tcp://HOST:8786")
-    if "" in (sources or []):
-        raise InputError("SOURCE: found an empty name; expected a folder, a glob or a URL")
-    if model is not None:
-        TransmissionModel.load(model)
-    if models is not None and not models.is_dir():
-        raise InputError(f"--models: '{models}' is not a folder; expected one with JOINT.yaml for each joint")
-    found = find_sources(sources or [], manifest)
-    dataset = Dataset(out)
-    dataset.create()
-    notes.print(f"{len(found)} sources, {len({each.joint for each in found})} joints")
-    with deferred_interrupt() as interrupted, progress_bar() as bar:
-        task = bar.add_task("diagnosing", total=len(found))
+    fleet = _Fleet.checked(sources, out, manifest, model, models, scheduler, workers, memory)
+    found = find_sources(sources or [], manifest, fleet.dataset.stored())
+    with deferred_interrupt() as interrupted:
+        try:
+            fleet.diagnose(found, interrupted)
+        except KeyboardInterrupt:
+            fleet.say_interrupted()
+            raise
+    _summarise(fleet.dataset, limit_arcsec, pages=pages)
 
-        def tell(now: Progress) -> None:
-            words = f"{now.done} of {now.total}" + f", {now.failed} failed" * bool(now.failed)
-            bar.update(task, completed=now.done, total=max(now.total, 1), description=words)
+
+def watch(
+    sources: JoinsOption = None,
+    out: OutOption = None,
+    manifest: ManifestOption = None,
+    model: ModelOption = None,
+    models: ModelsOption = None,
+    scheduler: SchedulerOption = None,
+    workers: WorkersOption = None,
+    memory: MemoryOption = "2GB",
+    limit_arcsec: LimitOption = 10.0,
+    pages: PagesOption = False,
+    interval_s: Annotated[
+        float,
+        typer.Option(
+            "--interval", metavar="SECONDS", min=0.1, max=86_400.0, help="Time between two listings."
+        ),
+    ] = 60.0,
+    once: Annotated[
+        bool, typer.Option("--once", help="End after one round, for a timer such as cron.")
+    ] = False,
+) -> None:
+    """Diagnose new recordings as they arrive, and update Parquet and page in FOLDER.
+
+    A recording is ready when its size and time are the same in two listings; one that is still being written
+    waits for the next round. Ctrl-C ends it and keeps what is done (exit status 0).
+    """
+    from hdbridge.fleet.engine import watch as watch_fleet
+    from hdbridge.fleet.sources import find_sources
+
+    fleet = _Fleet.checked(sources, out, manifest, model, models, scheduler, workers, memory)
+
+    def find(stored: Stored) -> Sequence[Source]:
+        return find_sources(sources or [], manifest, stored, may_be_empty=True)
+
+    with deferred_interrupt() as interrupted:
+
+        def diagnose(found: Sequence[Source], retried: Collection[str]) -> None:
+            fleet.diagnose(found, interrupted, retried)
+            _summarise(fleet.dataset, limit_arcsec, pages=pages)
 
         try:
-            end = run_fleet(
-                found,
-                dataset,
-                Cluster(scheduler, workers, memory),
-                model=model,
-                models=models,
-                progress=tell,
-                interrupted=interrupted,
+            watch_fleet(
+                find, fleet.dataset, interval_s, diagnose, once=once, report=_note, interrupted=interrupted
             )
         except KeyboardInterrupt:
-            notes.print(
-                f"interrupted; {out} keeps what is done, and the same command continues", soft_wrap=True
+            fleet.say_interrupted()
+
+
+@dataclass(frozen=True)
+class _Fleet:
+    """Checked options of a run."""
+
+    dataset: Dataset
+    cluster: Cluster
+    model: Path | None
+    models: Path | None
+
+    @classmethod
+    def checked(
+        cls,
+        sources: list[str] | None,
+        out: Path | None,
+        manifest: Path | None,
+        model: Path | None,
+        models: Path | None,
+        scheduler: str | None,
+        workers: int | None,
+        memory: str,
+    ) -> _Fleet:
+        """Checks the options; InputError names the wrong one."""
+        from hdbridge.fleet.dataset import Dataset
+        from hdbridge.fleet.engine import Cluster
+        from hdbridge.model import TransmissionModel
+
+        need_extra("a fleet needs", _EXTRA, "fleet")
+        if out is None:
+            raise InputError("--out is missing; name a new folder, or one of an earlier run")
+        if not sources and manifest is None:
+            raise InputError(
+                "no source; name folders, globs or URLs of recordings, or a manifest with --manifest"
             )
-            raise
-    _say(
-        f"{out}: {end.done} recordings, {end.known} of them known already, {end.failed} newly failed; "
-        f"largest memory of a worker {end.memory_mb:.0f} MB"
-    )
-    _summarise(dataset, limit_arcsec, out / PAGE_NAME)
+        if scheduler is not None and workers is not None:
+            raise InputError(
+                "--workers: a cluster that exists has its own workers; leave out --workers or --scheduler"
+            )
+        _check_memory(memory)
+        if scheduler == "":
+            raise InputError("--scheduler: found no address; expected one such as tcp://HOST:8786")
+        if "" in (sources or []):
+            raise InputError("SOURCE: found an empty name; expected a folder, a glob or a URL")
+        if model is not None:
+            TransmissionModel.load(model)
+        if models is not None and not models.is_dir():
+            raise InputError(
+                f"--models: '{models}' is not a folder; expected one with JOINT.yaml for each joint"
+            )
+        return cls(Dataset(out), Cluster(scheduler, workers, memory), model, models)
+
+    def diagnose(
+        self,
+        found: Sequence[Source],
+        interrupted: Callable[[], bool],
+        retried: Collection[str] | None = None,
+    ) -> None:
+        """Runs over the recordings with a progress bar."""
+        from hdbridge.fleet.engine import RETRIED, Progress
+        from hdbridge.fleet.engine import run as run_fleet
+
+        _note(f"{len(found)} sources, {len({each.joint for each in found})} joints")
+        with progress_bar() as bar:
+            task = bar.add_task("diagnosing", total=len(found))
+
+            def tell(now: Progress) -> None:
+                words = f"{now.done} of {now.total}" + f", {now.failed} failed" * bool(now.failed)
+                bar.update(task, completed=now.done, total=max(now.total, 1), description=words)
+
+            end = run_fleet(
+                found,
+                self.dataset,
+                self.cluster,
+                model=self.model,
+                models=self.models,
+                progress=tell,
+                interrupted=interrupted,
+                retried=RETRIED if retried is None else retried,
+            )
+        _say(
+            f"{self.dataset.folder}: {end.done} recordings, {end.known} of them known already, "
+            f"{end.failed} newly failed; largest memory of a worker {end.memory_mb:.0f} MB"
+        )
+
+    def say_interrupted(self) -> None:
+        """Reports that the finished part is kept."""
+        _note(f"interrupted; {self.dataset.folder} keeps what is done, and the same command continues")
 
 
 def report(
@@ -170,6 +273,11 @@ def report(
     ] = None,
     json_file: JsonOption = None,
     limit_arcsec: LimitOption = 10.0,
+    pages: PagesOption = False,
+    joints: Annotated[
+        list[str] | None,
+        typer.Option("--joint", metavar="NAME", help="Write the page of this joint too."),
+    ] = None,
 ) -> None:
     """Write the page of a run again, and print which joints to look at first."""
     from hdbridge.fleet.dataset import Dataset
@@ -177,7 +285,7 @@ def report(
     need_extra("a fleet needs", _EXTRA, "fleet")
     dataset = Dataset(out)
     dataset.check()
-    _summarise(dataset, limit_arcsec, html_file or out / PAGE_NAME, json_file)
+    _summarise(dataset, limit_arcsec, html_file, json_file, pages=pages, joints=joints or ())
 
 
 def simulate(
@@ -201,17 +309,37 @@ def simulate(
     _say(f"{folder}: {joints} joints with {recordings} recordings each")
 
 
-def _summarise(dataset: object, limit_arcsec: float, page: Path, json_file: Path | None = None) -> None:
+def _summarise(
+    dataset: Dataset,
+    limit_arcsec: float,
+    page: Path | None = None,
+    json_file: Path | None = None,
+    *,
+    pages: bool = False,
+    joints: Sequence[str] = (),
+) -> None:
+    """Prints and writes what the data set says; also the pages of these joints, and of all of the list."""
     from rich.table import Table
 
-    from hdbridge.fleet.dataset import Dataset
-    from hdbridge.fleet.report import fleet_page, hours_words
-    from hdbridge.fleet.summary import summarise
+    from hdbridge.fleet.prior import write_prior
+    from hdbridge.fleet.report import ROWS, fleet_page, hours_words
+    from hdbridge.fleet.summary import own_recordings, summarise
     from hdbridge.report.page import render
 
-    assert isinstance(dataset, Dataset)
-    summary: Summary = summarise(dataset.recordings(), limit_arcsec)
+    rows = dataset.recordings()
+    latest = {joint: own[-1] for joint, own in own_recordings(rows)[0].items()}
+    for joint in joints:
+        if joint not in latest:
+            close = nearest(joint, [*latest])
+            raise InputError(
+                f"--joint: no diagnosis of '{joint}' in {dataset.folder}"
+                + (f" (did you mean {close}?)" if close else "")
+            )
+    summary: Summary = summarise(rows, limit_arcsec)
     write_json(json_file, summary.as_dict())
+    write_prior(dataset.folder / PRIOR_NAME, rows)
+    listed = [each.joint for each in summary.first[:ROWS]] if pages else []
+    found = _with_pages(dataset.folder, latest, dict.fromkeys([*joints, *listed]))
     table = Table("joint", "cause", "probability", "peak, arcsec", "hours to the limit")
     for each in summary.first:
         table.add_row(
@@ -227,7 +355,28 @@ def _summarise(dataset: object, limit_arcsec: float, page: Path, json_file: Path
         _say("No joint stands out.")
     for line in summary.lines():
         _say(line)
-    write_result(page, render(fleet_page(summary, dataset.folder)))
+    target = page or dataset.folder / PAGE_NAME
+    beside = target.resolve().parent == dataset.folder.resolve()
+    if not beside:  # pages are in OUT
+        found = {joint: (dataset.folder.resolve() / each).as_uri() for joint, each in found.items()}
+    write_result(target, render(fleet_page(summary, dataset.folder, found)))
+
+
+def _with_pages(folder: Path, latest: Mapping[str, Row], wanted: Collection[str]) -> dict[str, str]:
+    """Writes the wanted pages of joints that are missing; returns the addresses of all that are there."""
+    from hdbridge.fleet.pages import links, write_page
+
+    there = links(folder, latest)
+    missing = [each for each in wanted if each not in there]
+    if missing:
+        with progress_bar() as bar:
+            for each in bar.track(missing, description="pages of joints"):
+                try:
+                    write_page(folder, latest[each])
+                except InputError as problem:  # such as a recording that was removed
+                    _note(f"no page of {each}: {problem}")
+        there = links(folder, latest)
+    return there
 
 
 def _check_memory(text: str) -> None:
@@ -241,6 +390,10 @@ def _check_memory(text: str) -> None:
         raise InputError(
             f"--memory: found '{text}'; expected at least 200MB: the libraries alone need so much"
         )
+
+
+def _note(line: str) -> None:
+    notes.print(line, markup=False, soft_wrap=True)
 
 
 def _say(line: str) -> None:

@@ -7,21 +7,12 @@ from typing import Annotated
 import typer
 
 from hdbridge.cli.options import (
-    ChannelOption,
-    ForceOption,
-    InterfaceOption,
     JsonOption,
-    ProfileArgument,
-    SeedOption,
-    SimulateOption,
-    TruthOption,
-    connected,
     console,
-    load_axis,
     notes,
     write_json,
 )
-from hdbridge.files.profile import Profile
+from hdbridge.cli.session import Session, on_axis
 
 TOWARDS_SWITCH = 0.1
 """Share of the axis's velocity limit."""
@@ -30,11 +21,11 @@ TOWARDS_ZERO = 0.02
 
 def register(app: typer.Typer) -> None:
     """Adds the command."""
-    app.command("home")(home)
+    app.command("home")(on_axis(home))
 
 
 def home(
-    profile: ProfileArgument,
+    session: Session,
     method: Annotated[
         int,
         typer.Option("--method", min=-128, max=127, help="Homing method, 6098h: see the drive's manual."),
@@ -65,12 +56,6 @@ def home(
     timeout_s: Annotated[
         float, typer.Option("--timeout", min=0.1, max=3600.0, help="Seconds that it may take.")
     ] = 60.0,
-    simulate: SimulateOption = False,
-    truth: TruthOption = None,
-    seed: SeedOption = 0,
-    interface: InterfaceOption = None,
-    channel: ChannelOption = None,
-    force: ForceOption = False,
     json_file: JsonOption = None,
 ) -> None:
     """Home the drive by one of its own methods (CiA 402, mode HM); print the position of the axis.
@@ -78,19 +63,16 @@ def home(
     The drive plans the motion, within the given speeds. Ctrl-C stops it (exit status 130). A model belongs to
     the zero that the axis had when it was calibrated: an absolute encoder needs no homing.
     """
-    from hdbridge.drive.drive import Drive
     from hdbridge.drive.modes import Homing
 
-    files = Profile.find(profile)
-    axis = load_axis(files, interface, channel, simulate=simulate)
+    axis = session.axis
     highest_deg_s = axis.limits.velocity_deg_s
     towards_switch_deg_s = switch_velocity_deg_s or TOWARDS_SWITCH * highest_deg_s
     towards_zero_deg_s = zero_velocity_deg_s or TOWARDS_ZERO * highest_deg_s
     wanted = (method, towards_switch_deg_s, towards_zero_deg_s, acceleration_deg_s2, offset_deg, timeout_s)
     Homing.checked(axis, *wanted)  # refused before anything is connected
     with (
-        connected(axis, files, simulate=simulate, truth=truth, seed=seed, force=force) as (bus, clock),
-        Drive(bus, axis, clock, force=force) as drive,
+        session.drive() as drive,
     ):
         drive.boot()
         notes.print(f"booted node {axis.drive.node_id} over {drive.link.name}")

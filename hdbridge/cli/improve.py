@@ -12,25 +12,18 @@ from rich.markup import escape
 
 from hdbridge.cli.measuring import PlanOption, out_option, resume_option
 from hdbridge.cli.options import (
-    ChannelOption,
     ColumnsOption,
-    ForceOption,
     HtmlOption,
-    InterfaceOption,
     JsonOption,
-    ProfileArgument,
-    SeedOption,
-    SimulateOption,
-    TruthOption,
     UnitsOption,
     UnwrapOption,
     console,
-    load_axis,
     load_recordings,
     notes,
     write_json,
     write_result,
 )
+from hdbridge.cli.session import Session, on_axis
 from hdbridge.errors import InputError
 from hdbridge.files.outputs import Kind
 from hdbridge.files.profile import Profile
@@ -45,11 +38,11 @@ LEFT_OF_FLOOR = 1.5
 
 def register(app: typer.Typer) -> None:
     """Adds the command."""
-    app.command("improve")(command)
+    app.command("improve")(on_axis(command))
 
 
 def command(
-    profile: ProfileArgument,
+    session: Session,
     plan: PlanOption = "quick",
     given: Annotated[
         list[Path] | None,
@@ -77,12 +70,6 @@ def command(
     resume: Annotated[
         Path | None, resume_option("Go on with an interrupted improvement: what it still lacks.")
     ] = None,
-    simulate: SimulateOption = False,
-    truth: TruthOption = None,
-    seed: SeedOption = 0,
-    interface: InterfaceOption = None,
-    channel: ChannelOption = None,
-    force: ForceOption = False,
     json_file: JsonOption = None,
     html_file: HtmlOption = None,
 ) -> None:
@@ -96,8 +83,7 @@ def command(
     from hdbridge.improvement import Source, improve
     from hdbridge.improvement.trial import trial_s
 
-    files = Profile.find(profile)
-    axis = load_axis(files, interface, channel, simulate=simulate)
+    files, axis = session.files, session.axis
     active = _active(files)
     if given and resume is not None:
         raise InputError("--from measures nothing that --resume could go on with: leave one of them out")
@@ -108,8 +94,8 @@ def command(
         notes.print(f"nothing is measured first; {trial}", soft_wrap=True)
     else:
         work.announce(trial)
-    with work.booted(files, simulate=simulate, truth=truth, seed=seed, force=force) as (drive, interrupted):
-        journal = None if recordings else work.begun(drive, seed if simulate else None)
+    with work.booted(session) as (drive, interrupted):
+        journal = None if recordings else work.begun(drive, session.simulated_seed)
         with phases() as progress:
             result = improve(
                 drive,

@@ -10,27 +10,19 @@ from rich.markup import escape
 
 from hdbridge.cli.measuring import out_option, resume_option
 from hdbridge.cli.options import (
-    ChannelOption,
-    ForceOption,
-    InterfaceOption,
-    ProfileArgument,
-    SeedOption,
-    SimulateOption,
-    TruthOption,
     console,
-    load_axis,
 )
+from hdbridge.cli.session import Session, on_axis
 from hdbridge.files.outputs import Kind
-from hdbridge.files.profile import Profile
 
 
 def register(app: typer.Typer) -> None:
     """Adds the command."""
-    app.command("measure")(command)
+    app.command("measure")(on_axis(command))
 
 
 def command(
-    profile: ProfileArgument,
+    session: Session,
     plan: Annotated[
         str,
         typer.Option(
@@ -43,12 +35,6 @@ def command(
     resume: Annotated[
         Path | None, resume_option("Go on with an interrupted recording: what its plan still lacks.")
     ] = None,
-    simulate: SimulateOption = False,
-    truth: TruthOption = None,
-    seed: SeedOption = 0,
-    interface: InterfaceOption = None,
-    channel: ChannelOption = None,
-    force: ForceOption = False,
 ) -> None:
     """Move an axis by a plan and keep the recording, for diagnose, twin and fit.
 
@@ -58,16 +44,15 @@ def command(
     from hdbridge.calibration import measure
     from hdbridge.cli.measuring import Measurement, phases
 
-    files = Profile.find(profile)
-    axis = load_axis(files, interface, channel, simulate=simulate)
+    files, axis = session.files, session.axis
     work = Measurement.asked(axis, plan, out, resume)
     work.announce()
-    with work.booted(files, simulate=simulate, truth=truth, seed=seed, force=force) as (drive, interrupted):
-        journal = work.begun(drive, seed if simulate else None)
+    with work.booted(session) as (drive, interrupted):
+        journal = work.begun(drive, session.simulated_seed)
         with phases() as progress:
             measure(drive, journal, progress=progress, interrupted=interrupted)
     recording = journal.recording()
-    name, folder = escape(profile), escape(str(work.folder))
+    name, folder = escape(session.profile), escape(str(work.folder))
     lines = [f"recording: {folder}, {len(journal.done)} tasks, {len(recording.record)} samples"]
     if files.model.exists():
         lines.append(f"what the model lacks: hdbridge diagnose {folder} --model {escape(str(files.model))}")

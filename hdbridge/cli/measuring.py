@@ -19,8 +19,8 @@ from hdbridge.files.atomic import make_folder, new_folder
 if TYPE_CHECKING:
     from hdbridge.axis import AxisConfig
     from hdbridge.calibration import Journal
+    from hdbridge.cli.session import Session
     from hdbridge.drive.drive import Drive
-    from hdbridge.files.profile import Profile
     from hdbridge.procedures.plan import Plan
 
 PlanOption = Annotated[
@@ -98,18 +98,11 @@ class Measurement:
         return start_journal(self.folder, self.axis, self.plan, self.date, drive.identity, about)
 
     @contextmanager
-    def booted(
-        self, profile: Profile, *, simulate: bool, truth: Path | None, seed: int, force: bool
-    ) -> Iterator[tuple[Drive, Callable[[], bool]]]:
-        """Yields the drive as `hdbridge.cli.booted` does, and locks the axis against other measurements."""
-        from hdbridge.cli.booted import booted
+    def booted(self, session: Session) -> Iterator[tuple[Drive, Callable[[], bool]]]:
+        """Yields the booted drive, and locks the axis against other measurements."""
         from hdbridge.model.store import measuring
 
-        with (
-            _kept_in(self.folder),
-            measuring(profile.axis),
-            booted(self.axis, profile, simulate=simulate, truth=truth, seed=seed, force=force) as ready,
-        ):
+        with _kept_in(self.folder), measuring(session.files.axis), session.booted() as ready:
             yield ready
 
 

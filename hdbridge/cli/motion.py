@@ -9,26 +9,18 @@ import typer
 from rich.table import Table
 
 from hdbridge.cli.options import (
-    ChannelOption,
-    ForceOption,
     HtmlOption,
-    InterfaceOption,
     JsonOption,
     ModelOption,
-    ProfileArgument,
-    SeedOption,
-    SimulateOption,
-    TruthOption,
     compensating_model,
     console,
-    load_axis,
     notes,
     print_table,
     write_json,
     write_result,
 )
+from hdbridge.cli.session import Session, on_axis
 from hdbridge.errors import InputError
-from hdbridge.files.profile import Profile
 
 if TYPE_CHECKING:
     from hdbridge.calibration.motion import MotionTest
@@ -36,11 +28,11 @@ if TYPE_CHECKING:
 
 def register(app: typer.Typer) -> None:
     """Adds the command."""
-    app.command("motion")(motion)
+    app.command("motion")(on_axis(motion))
 
 
 def motion(
-    profile: ProfileArgument,
+    session: Session,
     model: ModelOption = None,
     measure: Annotated[
         bool,
@@ -53,12 +45,6 @@ def motion(
         bool,
         typer.Option("--propose", help="Keep the model with the measured response as pending."),
     ] = False,
-    simulate: SimulateOption = False,
-    truth: TruthOption = None,
-    seed: SeedOption = 0,
-    interface: InterfaceOption = None,
-    channel: ChannelOption = None,
-    force: ForceOption = False,
     json_file: JsonOption = None,
     html_file: HtmlOption = None,
 ) -> None:
@@ -67,21 +53,19 @@ def motion(
     Measures the response of the axis to a correction in motion, and compensates for it.
     """
     from hdbridge.calibration.motion import motion_test, motion_test_s
-    from hdbridge.cli.booted import booted
     from hdbridge.cli.measuring import phases
     from hdbridge.model import TransmissionModel
     from hdbridge.model.store import propose as keep
 
-    files = Profile.find(profile)
-    axis = load_axis(files, interface, channel, simulate=simulate)
-    chosen = compensating_model(files, profile, model)
+    files, axis = session.files, session.axis
+    chosen = compensating_model(files, session.profile, model)
     if propose and not measure:
         raise InputError("--propose needs a measured response: leave --no-measure out")
     used = TransmissionModel.load(chosen)
     used.check_bound_to(axis)
     notes.print(f"motion test: {motion_test_s(axis) / 60.0:.1f} min at most")
     with (
-        booted(axis, files, simulate=simulate, truth=truth, seed=seed, force=force) as (drive, interrupted),
+        session.booted() as (drive, interrupted),
         phases() as progress,
     ):
         result = motion_test(drive, used, measure=measure, progress=progress, interrupted=interrupted)
@@ -103,7 +87,9 @@ def motion(
             datetime.now().astimezone(),
             identity,
         )
-        console.print(f"pending: {pending}; commit it with: hdbridge model commit {profile}", soft_wrap=True)
+        console.print(
+            f"pending: {pending}; commit it with: hdbridge model commit {session.profile}", soft_wrap=True
+        )
 
 
 def print_motion(result: MotionTest) -> None:

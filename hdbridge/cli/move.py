@@ -11,23 +11,16 @@ import typer
 from rich.table import Table
 
 from hdbridge.cli.options import (
-    ChannelOption,
-    ForceOption,
-    InterfaceOption,
     JsonOption,
     ModelOption,
-    ProfileArgument,
-    SeedOption,
-    SimulateOption,
-    TruthOption,
     console,
-    load_axis,
     note_clamped,
     notes,
     print_table,
     progress_bar,
     write_json,
 )
+from hdbridge.cli.session import Session, on_axis
 from hdbridge.errors import HdbridgeError, InputError
 from hdbridge.files.profile import Profile
 
@@ -42,11 +35,11 @@ KEPT_S = 60.0
 
 def register(app: typer.Typer) -> None:
     """Adds the command."""
-    app.command("move", context_settings={"ignore_unknown_options": True})(move)
+    app.command("move", context_settings={"ignore_unknown_options": True})(on_axis(move))
 
 
 def move(
-    profile: ProfileArgument,
+    session: Session,
     angles_deg: Annotated[
         list[float], typer.Argument(metavar="ANGLE...", help="Load angles in degrees, one after the other.")
     ],
@@ -70,12 +63,6 @@ def move(
         bool,
         typer.Option("--compensated/--uncompensated", help="Use the active model, if there is one."),
     ] = True,
-    simulate: SimulateOption = False,
-    truth: TruthOption = None,
-    seed: SeedOption = 0,
-    interface: InterfaceOption = None,
-    channel: ChannelOption = None,
-    force: ForceOption = False,
     json_file: JsonOption = None,
 ) -> None:
     """Move the load to one angle or to several, compensated by the active model, and hold the last.
@@ -84,20 +71,18 @@ def move(
     if it would leave the limits. Ctrl-C on the way stops the axis (exit status 130); while it holds, it
     ends the command in good order. Power is then switched off: a suspended load needs a brake.
     """
-    from hdbridge.cli.booted import booted
     from hdbridge.control.bench import Bench, axis_view, compensation_for
     from hdbridge.procedures.rehearsal import rehearse
     from hdbridge.procedures.waypoints import Hold, WayPoints
 
-    files = Profile.find(profile)
-    axis = load_axis(files, interface, channel, simulate=simulate)
+    files, axis = session.files, session.axis
     if not relative:  # refused before anything is connected
         rehearse(WayPoints(tuple(angles_deg)), axis_view(axis), angles_deg[0])
     chosen = _model(files, model, axis.gear.ratio, compensated=compensated)
     compensation = compensation_for(axis, chosen)  # refused before anything is connected
     note_clamped(axis.limits, velocity_deg_s=velocity_deg_s)
-    with booted(axis, files, simulate=simulate, truth=truth, seed=seed, force=force) as (drive, interrupted):
-        if simulate and hold_s is None:
+    with session.booted() as (drive, interrupted):
+        if session.simulate and hold_s is None:
             hold_s = 0.0  # a simulated axis need not hold
         hold = Hold(math.inf if hold_s is None else hold_s, released=interrupted)
         stands_deg = drive.read_positions().motor_deg / axis.gear.ratio

@@ -17,16 +17,12 @@ from rich.progress import BarColumn, Progress, ProgressColumn, Task, TextColumn
 from rich.table import Column, Table
 from rich.text import Text
 
-from hdbridge.clock import Clock, MonotonicClock
 from hdbridge.errors import InputError
 from hdbridge.files.atomic import is_stream, write_atomically
 from hdbridge.files.outputs import Kind, writing
 from hdbridge.files.profile import Profile
 
 if TYPE_CHECKING:
-    import can
-
-    from hdbridge.axis import AxisConfig
     from hdbridge.records.recording import Recording
 
 
@@ -191,78 +187,6 @@ def compensating_model(files: Profile, profile: str, model: Path | None, otherwi
             f"{profile}{otherwise}"
         )
     return model or files.model
-
-
-def check_bus_options(interface: str | None, channel: str | None, *, simulate: bool) -> None:
-    """Refuses a bus option for a simulated drive, which would not use it."""
-    if simulate and (interface is not None or channel is not None):
-        raise InputError(
-            "--simulate has a bus of its own in this process: leave out --interface and --channel; a "
-            "simulated drive on a bus is 'hdbridge simulate' in another process"
-        )
-
-
-def load_axis(
-    profile: Profile, interface: str | None, channel: str | None, *, simulate: bool = False
-) -> AxisConfig:
-    """Loads the axis file, with the bus replaced by the options."""
-    from hdbridge.axis import AxisConfig
-    from hdbridge.drive.link import check_interface
-
-    check_bus_options(interface, channel, simulate=simulate)
-    axis = AxisConfig.load(profile.axis)
-    if not simulate:
-        check_interface(
-            interface or axis.bus.interface, "--interface" if interface else axis.where("bus.interface")
-        )
-    changes = {
-        name: value for name, value in (("interface", interface), ("channel", channel)) if value is not None
-    }
-    return axis.on_bus(**changes) if changes else axis
-
-
-@contextmanager
-def connected(
-    axis: AxisConfig, profile: Profile, *, simulate: bool, truth: Path | None, seed: int, force: bool
-) -> Iterator[tuple[can.BusABC, Clock]]:
-    """Yields the axis's bus and its clock: those of a simulated drive, or the real ones.
-
-    With ``force``, the bus is opened even if another process on this computer masters it.
-    """
-    from hdbridge.control.realtime import prepare_realtime
-    from hdbridge.drive.link import open_bus
-    from hdbridge.sim.lockstep import simulated_bench
-
-    if not simulate:
-        if truth is not None:
-            raise InputError("--truth says what a simulated axis is like: give --simulate with it")
-        if axis.bus.interface == "virtual":
-            raise InputError(
-                f"{axis.where('bus.interface')}: found virtual, which reaches nothing outside this process; "
-                "expected the interface of the bus (socketcan), or give --simulate, which puts a simulated "
-                "drive there"
-            )
-        wanted, bus_of = axis.realtime, open_bus(axis.bus, shared=force)
-        with prepare_realtime(wanted.priority, wanted.cpus) as conditions, bus_of as bus:
-            notes.print(f"this process: {conditions}")
-            yield bus, MonotonicClock()
-        return
-    plant = simulated_by(profile, truth)
-    source = axis.load_encoder.source.address
-    with simulated_bench(plant, axis.eds_path, axis.drive.node_id, seed, load_object=source) as (
-        bus,
-        clock,
-        _,
-    ):
-        yield bus, clock
-
-
-def simulated_by(profile: Profile, truth: Path | None) -> Path:
-    """Returns the file that describes the simulated axis; prints a note if it is the axis's twin."""
-    plant = truth or profile.simulated
-    if plant == profile.twin:
-        notes.print(f"simulated by the axis's twin, {plant}", markup=False, soft_wrap=True)
-    return plant
 
 
 def note_clamped(limits: Any, **wanted: float | None) -> None:

@@ -5,35 +5,20 @@ from __future__ import annotations
 import typer
 
 from hdbridge.cli.options import (
-    ChannelOption,
-    ForceOption,
-    InterfaceOption,
     JsonOption,
-    ProfileArgument,
-    SeedOption,
-    SimulateOption,
-    TruthOption,
-    connected,
     console,
-    load_axis,
     write_json,
 )
-from hdbridge.files.profile import Profile
+from hdbridge.cli.session import Session, on_axis
 
 
 def register(app: typer.Typer) -> None:
     """Adds the command."""
-    app.command("reset")(reset)
+    app.command("reset")(on_axis(reset))
 
 
 def reset(
-    profile: ProfileArgument,
-    simulate: SimulateOption = False,
-    truth: TruthOption = None,
-    seed: SeedOption = 0,
-    interface: InterfaceOption = None,
-    channel: ChannelOption = None,
-    force: ForceOption = False,
+    session: Session,
     json_file: JsonOption = None,
 ) -> None:
     """Reset a fault of the drive when its cause is gone; power stays off.
@@ -42,14 +27,11 @@ def reset(
     fault that comes back at once is an error (exit status 4): its cause is still there. A drive that a daemon
     holds is reset with `hdbridge ctl reset`.
     """
-    from hdbridge.drive.drive import Drive
     from hdbridge.drive.states import State
 
-    files = Profile.find(profile)
-    axis = load_axis(files, interface, channel, simulate=simulate)
+    axis = session.axis
     with (
-        connected(axis, files, simulate=simulate, truth=truth, seed=seed, force=force) as (bus, clock),
-        Drive(bus, axis, clock, force=force) as drive,
+        session.drive() as drive,
     ):
         drive.boot()
         faulty = drive.state() is State.FAULT

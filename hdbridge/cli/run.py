@@ -14,10 +14,9 @@ from hdbridge.cli.options import (
     InterfaceOption,
     MachineArgument,
     SeedOption,
-    check_bus_options,
     need_extra,
-    simulated_by,
 )
+from hdbridge.cli.session import check_bus_options, simulated_by
 from hdbridge.errors import InputError
 
 if TYPE_CHECKING:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -17,21 +15,16 @@ from hdbridge.cli.options import (
     SeedOption,
     SimulateOption,
     TruthOption,
-    connected,
     console,
-    load_axis,
     notes,
     progress_bar,
     write_json,
 )
-from hdbridge.clock import Clock, MonotonicClock
+from hdbridge.cli.session import Session, bare_bus
 from hdbridge.errors import DriveError, InputError
-from hdbridge.files.profile import Profile
 
 if TYPE_CHECKING:
-    import can
-
-    from hdbridge.axis import AxisConfig, BusConfig
+    from hdbridge.axis import AxisConfig
     from hdbridge.bringup.scan import Node, Scan
 
 
@@ -75,20 +68,18 @@ def scan(
 
     Exit status 4 when no node was found, or when PROFILE's drive is not among them.
     """
-    from hdbridge.axis import BusConfig
     from hdbridge.bringup.match import compare
     from hdbridge.bringup.scan import scan_bus
     from hdbridge.drive.link import Link
 
     axis = None
     if profile is not None:
-        files = Profile.find(profile)
-        axis = load_axis(files, interface, channel, simulate=simulate)
-        opened = connected(axis, files, simulate=simulate, truth=truth, seed=seed, force=force)
+        session = Session(profile, simulate, truth, seed, interface, channel, force)
+        axis, opened = session.axis, session.connected()
     elif simulate or interface is None or channel is None:
         raise InputError("scan needs a bus: give a PROFILE, or --interface and --channel (socketcan, can0)")
     else:
-        opened = _opened(BusConfig(interface=interface, channel=channel, bitrate_bps=bitrate_bps), force)
+        opened = bare_bus(interface, channel, bitrate_bps, force=force)
     with opened as (bus, clock), progress_bar() as bar:
         link = Link(bus, clock)
         task = bar.add_task("asking nodes", total=1.0)
@@ -108,14 +99,6 @@ def scan(
     if axis is not None:
         _print_match(axis, matches, lines)
     _judge(link.name, found, axis, matches)
-
-
-@contextmanager
-def _opened(settings: BusConfig, force: bool) -> Iterator[tuple[can.BusABC, Clock]]:
-    from hdbridge.drive.link import open_bus
-
-    with open_bus(settings, shared=force) as bus:
-        yield bus, MonotonicClock()
 
 
 def _print(name: str, found: Scan) -> None:

@@ -2,33 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from hdbridge.cli.options import (
-    ChannelOption,
-    ForceOption,
-    InterfaceOption,
     JsonOption,
-    ProfileArgument,
-    SeedOption,
-    SimulateOption,
-    TruthOption,
-    connected,
     console,
-    load_axis,
     write_json,
 )
+from hdbridge.cli.session import Session, on_axis
 from hdbridge.errors import InputError
-from hdbridge.files.profile import Profile
 
 if TYPE_CHECKING:
-    from hdbridge.axis import AxisConfig
-    from hdbridge.drive.drive import Drive
     from hdbridge.drive.values import Object, Value
 
 ObjectArgument = Annotated[
@@ -46,28 +32,21 @@ def register(app: typer.Typer) -> None:
         no_args_is_help=True,
         rich_markup_mode="markdown",
     )
-    group.command()(get)
-    group.command("set", context_settings={"ignore_unknown_options": True})(put)
+    group.command()(on_axis(get))
+    group.command("set", context_settings={"ignore_unknown_options": True})(on_axis(put))
     app.add_typer(group, name="sdo")
 
 
 def get(
-    profile: ProfileArgument,
+    session: Session,
     object_: ObjectArgument,
-    simulate: SimulateOption = False,
-    truth: TruthOption = None,
-    seed: SeedOption = 0,
-    interface: InterfaceOption = None,
-    channel: ChannelOption = None,
-    force: ForceOption = False,
     json_file: JsonOption = None,
 ) -> None:
     """Read an object of the drive. The drive is neither booted nor enabled."""
     from hdbridge.drive.values import find_object
 
-    files = Profile.find(profile)
-    axis = load_axis(files, interface, channel, simulate=simulate)
-    with _drive(axis, files, simulate=simulate, truth=truth, seed=seed, force=force) as drive:
+    with session.drive() as drive:
+        drive.listen()
         wanted = find_object(object_, drive.sdo.od)
         if not wanted.readable:
             raise InputError(f"{wanted}: can only be written, by the EDS")
@@ -77,17 +56,11 @@ def get(
 
 
 def put(
-    profile: ProfileArgument,
+    session: Session,
     object_: ObjectArgument,
     value: Annotated[
         str, typer.Argument(metavar="VALUE", help="Decimal or 0x...; text, or bytes in hexadecimal.")
     ],
-    simulate: SimulateOption = False,
-    truth: TruthOption = None,
-    seed: SeedOption = 0,
-    interface: InterfaceOption = None,
-    channel: ChannelOption = None,
-    force: ForceOption = False,
     json_file: JsonOption = None,
 ) -> None:
     """Write an object of the drive, and read it back. The drive is neither booted nor enabled by this.
@@ -99,32 +72,17 @@ def put(
     from hdbridge.drive.dictionary import load_eds
     from hdbridge.drive.values import find_object
 
-    files = Profile.find(profile)
-    axis = load_axis(files, interface, channel, simulate=simulate)
+    axis = session.axis
     wanted = find_object(object_, load_eds(axis.eds_path, axis.drive.node_id))
     if not wanted.writable:
         raise InputError(f"{wanted}: can only be read, by the EDS; nothing was written")
     data = wanted.encode(value)
-    with _drive(axis, files, simulate=simulate, truth=truth, seed=seed, force=force) as drive:
+    with session.drive() as drive:
+        drive.listen()
         drive.sdo.write_bytes(wanted.index, wanted.sub, data)
         now = wanted.decode(drive.sdo.read_bytes(wanted.index, wanted.sub) if wanted.readable else data)
     write_json(json_file, _document(wanted, now))
     _print(wanted, now)
-
-
-@contextmanager
-def _drive(
-    axis: AxisConfig, files: Profile, *, simulate: bool, truth: Path | None, seed: int, force: bool
-) -> Iterator[Drive]:
-    """Yields the drive without booting it: its objects are accessed as they are."""
-    from hdbridge.drive.drive import Drive
-
-    with (
-        connected(axis, files, simulate=simulate, truth=truth, seed=seed, force=force) as (bus, clock),
-        Drive(bus, axis, clock, force=force) as drive,
-    ):
-        drive.listen()
-        yield drive
 
 
 def _document(wanted: Object, value: Value) -> dict[str, object]:

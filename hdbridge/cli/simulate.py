@@ -13,10 +13,9 @@ from hdbridge.cli.options import (
     ProfileArgument,
     SeedOption,
     TruthOption,
-    load_axis,
     notes,
-    simulated_by,
 )
+from hdbridge.cli.session import load_axis, simulated_by
 from hdbridge.clock import MonotonicClock
 from hdbridge.errors import InputError
 from hdbridge.files.profile import Profile

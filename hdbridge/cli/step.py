@@ -11,29 +11,21 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from hdbridge.cli.options import (
-    ChannelOption,
-    ForceOption,
     HtmlOption,
-    InterfaceOption,
     JsonOption,
     ModelOption,
-    ProfileArgument,
-    SeedOption,
-    SimulateOption,
-    TruthOption,
     compensating_model,
     console,
-    load_axis,
     notes,
     progress_bar,
     write_json,
     write_result,
 )
+from hdbridge.cli.session import Session, on_axis
 from hdbridge.errors import InputError
 from hdbridge.evaluation.stepping import Scheme
 from hdbridge.files.atomic import make_folder
 from hdbridge.files.outputs import Kind, writing
-from hdbridge.files.profile import Profile
 
 if TYPE_CHECKING:
     from hdbridge.axis import AxisConfig
@@ -46,11 +38,11 @@ if TYPE_CHECKING:
 
 def register(app: typer.Typer) -> None:
     """Adds the command."""
-    app.command("step")(step)
+    app.command("step")(on_axis(step))
 
 
 def step(
-    profile: ProfileArgument,
+    session: Session,
     model: ModelOption = None,
     scheme: Annotated[
         list[Scheme] | None,
@@ -64,12 +56,6 @@ def step(
     start_deg: Annotated[
         float, typer.Option("--start-deg", help="Load angle of the start, in degrees.")
     ] = 0.0,
-    simulate: SimulateOption = False,
-    truth: TruthOption = None,
-    seed: SeedOption = 0,
-    interface: InterfaceOption = None,
-    channel: ChannelOption = None,
-    force: ForceOption = False,
     json_file: JsonOption = None,
     html_file: HtmlOption = None,
     record: Annotated[
@@ -87,47 +73,35 @@ def step(
     from hdbridge.procedures.rehearsal import rehearse
     from hdbridge.procedures.stepping import Stepping
 
-    files = Profile.find(profile)
-    axis = load_axis(files, interface, channel, simulate=simulate)
+    files, axis = session.files, session.axis
     stepping = Stepping(count=count, step_deg=step_deg, start_deg=start_deg)
     rehearse(stepping, axis_view(axis), start_deg)  # refused before anything is connected
     chosen: Path | None = None
     if model is not None or not scheme or set(scheme) != {Scheme.NONE}:  # no compensation needs no model
-        chosen = compensating_model(files, profile, model, ", or step without one: --scheme none")
+        chosen = compensating_model(files, session.profile, model, ", or step without one: --scheme none")
 
     def tell(comparison: Comparison) -> None:
         write_json(json_file, comparison.as_dict())
         if html_file is not None:
-            seed_told = seed if simulate else None
-            write_page(html_file, axis, chosen, comparison, stepping, simulated_seed=seed_told)
+            write_page(html_file, axis, chosen, comparison, stepping, session.simulated_seed)
         print_result(axis, comparison)
 
     run_comparison(
-        axis,
-        files,
+        session,
         TransmissionModel.load(chosen) if chosen else TransmissionModel(axis.gear.ratio),
         stepping,
         scheme,
-        simulate=simulate,
-        truth=truth,
-        seed=seed,
-        force=force,
         record=record,
         tell=tell,
     )
 
 
 def run_comparison(
-    axis: AxisConfig,
-    files: Profile,
+    session: Session,
     model: TransmissionModel,
     stepping: Stepping,
     schemes: list[Scheme] | None,
     *,
-    simulate: bool,
-    truth: Path | None,
-    seed: int,
-    force: bool = False,
     record: Path | None = None,
     tell: Callable[[Comparison], None],
 ) -> None:
@@ -136,11 +110,11 @@ def run_comparison(
 
     ``tell`` receives the result, also of an interrupted test: then that of the completed schemes.
     """
-    from hdbridge.cli.booted import booted
     from hdbridge.control.bench import compensation_for
     from hdbridge.control.caps import cap_remark
     from hdbridge.evaluation.comparison import compare_schemes
 
+    axis = session.axis
     offered = Scheme.offered_by(model)
     wanted = tuple(schemes) if schemes else offered
     if Scheme.EXTENDED in wanted and Scheme.EXTENDED not in offered:
@@ -172,7 +146,7 @@ def run_comparison(
 
     with (
         _told_when_stopped(axis, done, tell),
-        booted(axis, files, simulate=simulate, truth=truth, seed=seed, force=force) as (drive, interrupted),
+        session.booted() as (drive, interrupted),
         progress_bar() as bar,
     ):
         bars = {each: bar.add_task(f"{each.value:>12}", total=1.0, visible=False) for each in wanted}
@@ -241,7 +215,6 @@ def write_page(
     model: Path | None,
     comparison: Comparison,
     stepping: Stepping,
-    *,
     simulated_seed: int | None,
 ) -> None:
     """Writes the result as a self-contained page, with what was stepped, when, and by which model."""

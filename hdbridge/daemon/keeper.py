@@ -50,7 +50,7 @@ class Programs:
     """Programs of the children; tests substitute others."""
 
     control: Sequence[str] = ("-m", "hdbridge.daemon.loop.process")
-    service: Sequence[str] = ("-m", "hdbridge.daemon.service.process")
+    service: Sequence[str] = ("-m", "hdbridge.daemon.serve")
     gateway: Sequence[str] = ("-m", "hdbridge.daemon.gateway.process")
 
 

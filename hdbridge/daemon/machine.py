@@ -14,7 +14,7 @@ from typing import Self
 
 from hdbridge.axis import AxisConfig, BusConfig, RealtimeConfig
 from hdbridge.control.bench import compensation_for
-from hdbridge.daemon.adaptation.settings import AdaptationSettings
+from hdbridge.daemon.following.settings import AdaptationSettings
 from hdbridge.daemon.machinechecks import (
     Places,
     agreed,

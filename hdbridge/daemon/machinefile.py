@@ -13,7 +13,7 @@ from typing import Annotated, Literal
 from pydantic import Field
 
 from hdbridge.axis import BusConfig, RealtimeConfig
-from hdbridge.daemon.adaptation.settings import AdaptationSettings, Mode
+from hdbridge.daemon.following.settings import AdaptationSettings, Mode
 from hdbridge.daemon.memory.layout import AXES_AT_MOST
 from hdbridge.daemon.recorder.settings import RecorderSettings
 from hdbridge.evaluation.stepping import Scheme

@@ -13,18 +13,18 @@ class Controlword(Enum):
     """Reaction of the drive to a repeated controlword."""
 
     EDGE = "edge"
-    """It is ignored."""
+    """Ignored."""
     LEVEL = "level"
-    """It is evaluated again: a repeated 000Fh in *quick stop active* is transition 16."""
+    """Evaluated again: a repeated 000Fh in *quick stop active* is transition 16."""
 
 
 class HeartbeatConsumer(Enum):
     """Supervision of the master's heartbeat (1016h) after one was lost."""
 
     RESTARTS = "restarts"
-    """It starts again with the next heartbeat."""
+    """Starts again with the next heartbeat."""
     STOPS = "stops"
-    """It stays off until 1016h is written or the node is reset."""
+    """Stays off until 1016h is written or the node is reset."""
 
 
 class Behaviour(Strict):

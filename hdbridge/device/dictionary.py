@@ -76,6 +76,16 @@ class SdoAbortError(Exception):
         self.code = code
 
 
+def only(*allowed: int) -> Callable[[int], None]:
+    """Returns a guard that refuses every other value."""
+
+    def check(value: int) -> None:
+        if value not in allowed:
+            raise SdoAbortError(Abort.RANGE)
+
+    return check
+
+
 class Entry:
     """One (index, sub-index).
 

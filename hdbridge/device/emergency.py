@@ -8,7 +8,7 @@ from enum import IntEnum
 from functools import partial
 from typing import Final
 
-from hdbridge.device.dictionary import Abort, Dictionary, SdoAbortError
+from hdbridge.device.dictionary import Abort, Dictionary, SdoAbortError, only
 
 HISTORY_DEPTH: Final = 8
 _FRAME: Final = struct.Struct("<HB5s")
@@ -38,7 +38,7 @@ class Emergency:
         """Codes of the errors that have not ended, oldest first."""
         dictionary[0x1001, 0].bind(self._register)
         dictionary[0x1014, 0].guard = self._check_can_id
-        dictionary[0x1003, 0].guard = _only_zero
+        dictionary[0x1003, 0].guard = only(0)
         dictionary[0x1003, 0].bind(lambda: len(self._history))
         dictionary[0x1003, 0].follower = lambda _: self._history.clear()
         self._history: list[int] = []
@@ -105,8 +105,3 @@ def _register_bit(code: int) -> int:
         if code & mask == high_byte << 8:
             return bit
     return 0
-
-
-def _only_zero(value: int) -> None:
-    if value != 0:
-        raise SdoAbortError(Abort.RANGE)

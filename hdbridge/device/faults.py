@@ -26,7 +26,7 @@ class Faults:
     hold_tpdos: int = 0
     """The next n come delayed by one SYNC, after the fresh ones."""
     reverse_tpdos: int = 0
-    """Those of the next n SYNCs come in reverse order."""
+    """The TPDOs of the next n SYNCs come in reverse order."""
     mute_heartbeat: bool = False
     """The heartbeat stops; everything else continues."""
     silent: bool = False

@@ -9,7 +9,7 @@ from __future__ import annotations
 from typing import Final
 
 from hdbridge.device.behaviour import Behaviour, Controlword
-from hdbridge.device.dictionary import Abort, Dictionary, SdoAbortError
+from hdbridge.device.dictionary import Abort, Dictionary, SdoAbortError, only
 from hdbridge.device.emergency import Emergency, ErrorCode
 from hdbridge.device.faults import Faults
 from hdbridge.device.modes import (
@@ -137,6 +137,7 @@ class Firmware:
         entry[0x60E5, 1].bind(lambda: round(motion.load_velocity_counts_s))
         entry[0x6040, 0].follower = self.control
         entry[0x6072, 0].follower = self._limit_torque
+        entry[0x6086, 0].guard = only(0)  # trapezoidal profiles
         entry[0x6060, 0].guard = self._check_mode
         entry[0x6060, 0].follower = self._change_mode
         for index, sub in ((0x60C2, 1), (0x60C2, 2), (0x607E, 0)):
@@ -353,24 +354,31 @@ class Firmware:
 
     def power_cut(self) -> None:
         """Switches the power stage off without an error, as a hardware enable input does when it opens."""
-        if self.state is not State.FAULT:
-            self._power_off(State.SWITCH_ON_DISABLED)
+        self._cut()
+
+    def _cut(self) -> None:
+        """Switches the power stage off; a fault remains one."""
+        in_fault = self.state in (State.FAULT, State.FAULT_REACTION_ACTIVE)
+        self._power_off(State.FAULT if in_fault else State.SWITCH_ON_DISABLED)
 
     def connection_lost(self, code: int) -> None:
         """Reacts to the loss of the master as 6007h says; ``code`` is the EMCY code of the loss."""
         option = self._dictionary.value(0x6007)
+        if option and self._awaits_power:
+            self._power_off(self.state)  # the request came from the master that is lost
         if option == 1 and self.state in POWERED:
             self.fault(code)
         elif option == 2 and self.state in POWERED:
-            self._power_off(State.SWITCH_ON_DISABLED)
+            self._cut()
         elif option == 3 and self.state is State.OPERATION_ENABLED:
             self._stopped_itself = True
             self._quick_stop()
 
     @property
     def follows_the_bus(self) -> bool:
-        """True if the axis needs cyclic set-points: enabled in a cyclic mode."""
-        return self.state is State.OPERATION_ENABLED and isinstance(self._mode, CyclicSynchronousPosition)
+        """True if the axis needs cyclic set-points: enabled, or about to be, in a cyclic mode."""
+        enabled = self.state is State.OPERATION_ENABLED or self._awaits_power
+        return enabled and isinstance(self._mode, CyclicSynchronousPosition)
 
     def _judge_stage(self) -> None:
         """Reacts to a failure of the power stage, without a ramp, or to the end of a pending request."""

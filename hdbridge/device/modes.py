@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from typing import ClassVar, Final
 
-from hdbridge.device.dictionary import Abort, SdoAbortError
+from hdbridge.device.dictionary import only
 from hdbridge.device.motion import Motion, wrap_int32
 from hdbridge.device.powerstate import Control, Status
 from hdbridge.device.profile import Profile, move
@@ -96,7 +96,7 @@ class InterpolatedPosition(CyclicSynchronousPosition):
         super().__init__(motion)
         self._data = motion.dictionary[0x60C1, 1]
         self._active = False
-        motion.dictionary[0x60C0, 0].guard = _check_submode
+        motion.dictionary[0x60C0, 0].guard = only(0)  # linear interpolation
 
     def _aim(self) -> int:
         data: int = self._data.value
@@ -220,7 +220,7 @@ class Homing(Mode):
         super().__init__(motion)
         self.referenced = False
         self.enter()
-        motion.dictionary[0x6098, 0].guard = _check_method
+        motion.dictionary[0x6098, 0].guard = only(*HOMING_METHODS)
 
     def enter(self) -> None:
         self._attained = False
@@ -273,13 +273,3 @@ class Homing(Mode):
         if self._profile is not None:
             return 0
         return _REACHED | (_BIT_12 if self._attained else 0) | (_BIT_13 if self._failed else 0)
-
-
-def _check_submode(submode: int) -> None:
-    if submode != 0:  # linear interpolation
-        raise SdoAbortError(Abort.RANGE)
-
-
-def _check_method(method: int) -> None:
-    if method not in HOMING_METHODS:
-        raise SdoAbortError(Abort.RANGE)

@@ -8,6 +8,8 @@ from typing import Final
 from hdbridge.device.dictionary import Dictionary
 
 LOAD_OBJECT: Final = (0x60E4, 1)
+MOTOR_POSITION: Final = (0x6064, 0)
+"""Position actual value, always that of the motor: an axis file that names it has no load encoder."""
 
 
 @dataclass(frozen=True)

@@ -19,12 +19,12 @@ import can
 from hdbridge.canframe import DataFrame
 from hdbridge.clock import Clock
 from hdbridge.device.behaviour import Behaviour, HeartbeatConsumer
-from hdbridge.device.dictionary import Abort, Dictionary, SdoAbortError
+from hdbridge.device.dictionary import Abort, Dictionary, SdoAbortError, only
 from hdbridge.device.emergency import Emergency, ErrorCode
 from hdbridge.device.faults import Faults, Outgoing
 from hdbridge.device.firmware import Firmware
 from hdbridge.device.motion import Machine
-from hdbridge.device.nameplate import Nameplate
+from hdbridge.device.nameplate import MOTOR_POSITION, Nameplate
 from hdbridge.device.nmt import Nmt, NmtCommand
 from hdbridge.device.parameters import StoredParameters
 from hdbridge.device.pdo import ReceivePdo, TransmitPdo
@@ -93,7 +93,7 @@ class DriveNode:
         self._parameters.restore()
         self.emergency = Emergency(self.dictionary, self._send_unless_stopped)
         self.firmware = Firmware(self.dictionary, machine, self.emergency, self.faults, self.behaviour, stage)
-        if nameplate.load_object in self.dictionary:
+        if nameplate.load_object in self.dictionary and nameplate.load_object != MOTOR_POSITION:
             self.dictionary[nameplate.load_object].bind(self.firmware.motion.load_position)
         self._sdo = SdoServer(self.dictionary)
         self._tpdos = [TransmitPdo(self.dictionary, number, self._route) for number in self._pdos(0x1800)]
@@ -102,6 +102,7 @@ class DriveNode:
         entry = self.dictionary
         entry[0x1005, 0].guard = _check_sync_id
         entry[0x1005, 0].follower = lambda _: self._route()
+        entry[0x1019, 0].guard = only(0, *range(2, 241))
         entry[0x1016, 1].guard = _check_consumer
         entry[0x1016, 1].follower = lambda _: self._change_watch()
         entry[0x1017, 0].follower = lambda _: self._start_heartbeat()

@@ -108,7 +108,7 @@ class Drive:
         self._may_speak = True
 
     def boot(self, *, reset: bool = True) -> BootReport:
-        """Boots the drive up to OPERATIONAL with power off; docs/master.md describes each step.
+        """Boots the drive up to OPERATIONAL with power off; docs/architecture.md describes each step.
 
         By default (``reset``) the node's communication is reset first, so that it starts from known settings.
         Raises `DriveError` if the drive is absent or refuses, `IdentityError` if it is another drive or

@@ -52,7 +52,7 @@ class _MessageLink(Link):
         if self._down is not None:
             raise BusError(self._down)
         try:
-            self._send(DataFrame(can_id, data, self._mark))
+            self._send(DataFrame(can_id, data, self.mark))
         except (can.CanError, OSError) as error:
             raise self._failure("send", error) from error
 

@@ -149,7 +149,9 @@ class ProcessImage:
             )
         }
         takers |= {(self.node_id, *key): each.accept for key, each in self._followers.items()}
-        takers[source.node or self.node_id, source.index, source.subindex] = self._take_load
+        takers[source.node or self.node_id, source.index, source.subindex] = (
+            self._take_only_encoder if self.axis.load_encoder.is_motor_encoder else self._take_load
+        )
         handlers = {}
         for layout in tpdos:
             taken = []
@@ -202,6 +204,10 @@ class ProcessImage:
 
     def _take_torque(self, permille: int) -> None:
         self.torque_permille = permille
+
+    def _take_only_encoder(self, counts: int) -> None:
+        self._take_position(counts)
+        self._take_load(counts)
 
     def _take_load(self, counts: int) -> None:
         self.load_counts = self._unwrap_load.update(counts)

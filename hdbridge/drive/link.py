@@ -100,7 +100,7 @@ class Link:
     """
 
     __slots__ = (
-        "_down", "_mark", "_matches", "_raw_recv", "_recv", "_send", "bus", "clock", "dropped", "name", "now",
+        "_down", "_matches", "_raw_recv", "_recv", "_send", "bus", "clock", "dropped", "mark", "name", "now",
         "private",
     )  # fmt: skip
 
@@ -113,7 +113,8 @@ class Link:
         self.private: bool = getattr(bus, "private", False)
         """True if the bus declares that only the drive and this link can be on it."""
         self._down: str | None = None
-        self._mark = _mark(bus)
+        self.mark = _mark(bus)
+        """Channel name of own frames on a back end that echoes them, else None."""
         self._send = bus.send
         # BusABC.recv measures its remaining time on the *wall* clock: if that is set back during a wait, recv
         # blocks for as long. The hook below has no such loop, so it is used for back ends that rely on
@@ -137,9 +138,7 @@ class Link:
         if self._down is not None:
             raise BusError(self._down)
         try:
-            self._send(
-                can.Message(arbitration_id=can_id, is_extended_id=False, data=data, channel=self._mark)
-            )
+            self._send(can.Message(arbitration_id=can_id, is_extended_id=False, data=data, channel=self.mark))
         except (can.CanError, OSError) as error:
             raise self._failure("send", error) from error
 
@@ -169,7 +168,7 @@ class Link:
                 if timeout_s == 0.0 or now() >= deadline_s:
                     return None
                 continue
-            if self._mark is not None and message.channel == self._mark:
+            if self.mark is not None and message.channel == self.mark:
                 continue
             if type(message) is not DataFrame and (
                 message.is_extended_id or message.is_error_frame or message.is_remote_frame or message.is_fd

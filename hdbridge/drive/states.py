@@ -312,7 +312,7 @@ def states_on_the_way(state: State, target: State) -> Iterator[State]:
 
 
 def mermaid() -> str:
-    """Returns the table as a Mermaid state diagram, which docs/master.md contains."""
+    """Returns the table as a Mermaid state diagram, which docs/architecture.md contains."""
     lines = ["stateDiagram-v2"]
     lines += [f"    {state.name}: {state.value}" for state in State if state is not State.UNKNOWN]
     lines.append(f"    [*] --> {State.NOT_READY_TO_SWITCH_ON.name}")

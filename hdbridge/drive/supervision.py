@@ -98,7 +98,7 @@ TABLE: Final[tuple[Row, ...]] = (
     Row(Fault.ENCODER_JUMP, _FREEZE, 2, _STOP, "check the encoder, its cable and counts_per_turn"),
     Row(Fault.FOLLOWING_ERROR, _GO, 2, _STOP, "check for an obstacle, the tuning and following_error_deg"),
     Row(Fault.BAD_TARGET, _STOP, 1, _STOP, "correct what computes the target"),
-    Row(Fault.BUS_DOWN, _LATCH, 1, _LATCH, "bring the interface up, open it anew and boot the drive again"),
+    Row(Fault.BUS_DOWN, _LATCH, 1, _LATCH, "bring the interface up, open it and boot the drive again"),
     Row(Fault.TRANSMIT_FULL, _STOP, 1, _STOP, "check that another node acknowledges and the bus load"),
     Row(Fault.CHANNEL_HELD, _GO, 1, _GO, "check the sensor, its range in the axis file and the bus load"),
     Row(Fault.CHANNEL_LOST, _GO, 1, _GO, "check the sensor and its cable"),

@@ -40,6 +40,7 @@ class AmplitudeDrift(Linear, Warmed):
     name: ClassVar[str] = "amplitude_drift"
     about: ClassVar[Cause] = Cause(
         title="ripple and friction change with temperature",
+        subject="drift",
         equation="w (ripple S + friction H), S the model's orders (times 1 + growth tau where they grow with "
         "torque), H its loop, w the gear's warmth as in zero_drift",
         signature="the ripple within a motor turn, or the height of the loop, follows the temperature",

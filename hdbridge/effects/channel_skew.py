@@ -40,6 +40,7 @@ class ChannelSkew(Linear):
     channels: ClassVar[frozenset[Channel]] = frozenset({Channel.SPEED, Channel.ACCELERATION})
     about: ClassVar[Cause] = Cause(
         title="delay between the two encoder samples",
+        subject="delays",
         equation="delay omega_L + second alpha_L / 2; omega_L, alpha_L = commanded motor speed and "
         "acceleration / N, limited",
         signature="an error in proportion to the speed, a straight line through zero, none at rest",

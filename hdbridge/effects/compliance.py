@@ -49,6 +49,7 @@ class Compliance(Linear):
     channels: ClassVar[frozenset[Channel]] = frozenset({Channel.LOAD_TORQUE})
     about: ClassVar[Cause] = Cause(
         title="wind-up by the load torque",
+        subject="effects of torque",
         equation="sense sgn(T) (c1 min(|T|, T1) + c2 (|T| between T1 and T2) + c3 (|T| beyond T2)), c = "
         "206265 arcsec / K",
         signature="the error follows the torque; with a mass off centre it looks like once per load turn",

@@ -47,6 +47,7 @@ class CountLoss(Effect):
     channels: ClassVar[frozenset[Channel]] = frozenset({Channel.TIME})
     about: ClassVar[Cause] = Cause(
         title="a step that stays",
+        subject="lost counts",
         equation="sum of size_j over the steps with t >= t_j",
         signature="at one instant everything shifts, by whole counts of an encoder or by a tooth, and "
         "stays so",

@@ -98,6 +98,8 @@ class Cause:
     """Source of the equation."""
     size: str = ""
     """Typical size."""
+    subject: str = ""
+    """Plural noun that summaries of several causes use; empty for the name."""
     apart: Mapping[str, Experiment] = field(default_factory=dict)
     """Measurement that separates it from another cause, by that cause's name. Either of the two may declare
     it.

@@ -19,6 +19,7 @@ class FlexsplineOrders(OrderSeries):
     name: ClassVar[str] = "flexspline_order"
     about: ClassVar[Cause] = Cause(
         title="order of the wave generator relative to the flexspline",
+        subject="orders",
         equation="sum over k of A_k cos(k (1 + 1/N) theta_M + phi_k)",
         signature="nearly an order of the motor, but its phase runs through once per load turn (k times "
         "for order k)",

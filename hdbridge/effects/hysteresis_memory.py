@@ -45,6 +45,7 @@ class HysteresisMemory(ElasticLoop):
     changes: ClassVar[Part | None] = Part.LOOP
     about: ClassVar[Cause] = Cause(
         title="hysteresis with return-point memory",
+        subject="hysteresis",
         equation="theta_rev + sgn(omega) 2 offset g(|theta_M - theta_M,rev| / width) from each reversal; "
         "back at the angle "
         "of the reversal before, both are forgotten and the outer branch goes on",

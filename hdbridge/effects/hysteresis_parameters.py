@@ -38,6 +38,7 @@ class HysteresisParameters(Effect):
     name: ClassVar[str] = "hysteresis_parameters"
     about: ClassVar[Cause] = Cause(
         title="the elastic loop has changed",
+        subject="hysteresis",
         equation="H(offset, width, exponent) - H(the model's offset, width, exponent)",
         signature="a rest of the loop after each reversal, or a constant distance between the two directions",
         consequence="the compensation makes up for a loop that is not the axis's any more",

@@ -34,6 +34,7 @@ class InertialWindup(Linear):
     channels: ClassVar[frozenset[Channel]] = frozenset({Channel.ACCELERATION})
     about: ClassVar[Cause] = Cause(
         title="wind-up by inertia",
+        subject="wind-up",
         equation="-(J / K) alpha_L, alpha_L = commanded motor acceleration / N, limited to the limit / N",
         signature="the error follows the acceleration; nothing at rest or at constant speed",
         consequence="the load lags in each acceleration and leads in each deceleration",

@@ -31,6 +31,7 @@ class LoadOrders(OrderSeries):
     name: ClassVar[str] = "load_order"
     about: ClassVar[Cause] = Cause(
         title="once or twice per load turn",
+        subject="load orders",
         equation="sum over k of A_k cos(k theta_M / N + phi_k)",
         signature="k periods per turn of the load, the same in both directions and on every turn",
         consequence="if it is the spline's pitch, the load is off by this much across its turn; if it is "

@@ -47,6 +47,7 @@ class LocalDefect(Linear):
     name: ClassVar[str] = "local_defect"
     about: ClassVar[Cause] = Cause(
         title="bump at one load angle",
+        subject="local defects",
         equation="height (1 + cos(pi u)) / 2 where |u| < 1, u = ((theta_M / N - centre) mod 360 deg) / "
         "half_width",
         signature="the same bump on every pass over one load angle, in both directions, and nothing "

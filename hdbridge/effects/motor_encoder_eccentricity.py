@@ -17,6 +17,7 @@ class MotorEncoderEccentricity(OrderSeries):
     few: ClassVar[frozenset[int]] = frozenset({1, 2})
     about: ClassVar[Cause] = Cause(
         title="eccentric motor encoder disc",
+        subject="orders",
         equation="A_1 cos(theta_M + phi_1) + A_2 cos(2 theta_M + phi_2); A_1 = (e / r) / N for a disc of "
         "radius r "
         "that is out of centre by e",

@@ -15,6 +15,7 @@ class MotorOrders(OrderSeries):
     name: ClassVar[str] = "motor_order"
     about: ClassVar[Cause] = Cause(
         title="an order of the motor that the model does not have",
+        subject="orders",
         equation="sum over k of A_k cos(k theta_M + phi_k), k not among the synchronous part's orders",
         signature="repeats with every motor turn; the same in both directions, at every load angle and speed",
         consequence="a ripple of the load within each motor turn that the compensation leaves",

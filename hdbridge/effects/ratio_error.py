@@ -25,6 +25,14 @@ from hdbridge.effects.base import (
 )
 from hdbridge.units import ARCSEC_PER_DEG, DEG_PER_TURN
 
+TEETH_PER_TURN = 2.0
+"""Difference of the tooth numbers of circular spline and flexspline: teeth passed per turn of the motor."""
+SCALE = 1e-3
+"""Largest scale error of an encoder that was mounted as intended: a tape on a drum of 100 mm whose radius is
+0.1 mm off. A disc has none, because its lines are whole per turn."""
+SAME_TEETH = 1e-4
+"""Share of a ratio to which a ramp shows it next to other causes: a tenth of `SCALE`."""
+
 
 class RatioError(Linear):
     """(1 / N_true - 1 / N) theta_M: a ramp in the motor angle."""
@@ -32,6 +40,7 @@ class RatioError(Linear):
     name: ClassVar[str] = "ratio_error"
     about: ClassVar[Cause] = Cause(
         title="wrong gear ratio or encoder scale",
+        subject="ratio errors",
         equation="ramp theta_M, ramp = 3600 (1 / N_true - 1 / N), theta_M limited to +- limit",
         signature="a ramp over the motor angle, the same in both directions, undone on the return",
         consequence="the load is off in proportion to its distance from zero",
@@ -62,6 +71,20 @@ class RatioError(Linear):
     def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[RatioError]:  # noqa: ARG003
         """Yields the single candidate."""
         yield cls(ramp_arcsec_per_turn=1.0)
+
+    def implausible(self, observations: Observations) -> str:
+        """Requires whole tooth numbers, a whole turn of the load, or a small error of an encoder's scale.
+
+        The ratio of a strain wave gear is half the tooth number of its flexspline, or one more. On less than
+        a turn of the load, any other ramp is an arc of something that returns.
+        """
+        ratio = self.true_ratio(observations.ratio)
+        teeth = TEETH_PER_TURN * ratio
+        turned = float(np.ptp(observations.motion.motor_deg)) >= DEG_PER_TURN * observations.ratio
+        off = abs(teeth - round(teeth)) / teeth
+        if turned or abs(observations.ratio / ratio - 1.0) < SCALE or off < SAME_TEETH:
+            return ""
+        return f"no teeth have the ratio {ratio:.6g}, and no encoder's scale is so wrong"
 
     def coordinate(self, motion: Motion, ratio: float) -> Coordinate:
         """Returns the load angle over all turns."""

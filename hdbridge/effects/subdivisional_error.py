@@ -45,6 +45,12 @@ _HARMONICS = (1, 2, 4)
 LEAST_LINES = 256
 """Minimum line count of an encoder that interpolates."""
 
+RESOLVED = 0.05
+"""Share of the moving samples that suffices to see a line, if they are denser than half a line."""
+IN_STEP = 0.85
+"""Mean resultant length of the steps within a line, above which a slow wave has the same values: it
+explains its square, 0.72, of the line's."""
+
 
 class SubdivisionalError(Effect):
     """Sum over k = 1, 2, 4 of A_k cos(k lines theta_L + phi_k).
@@ -57,6 +63,7 @@ class SubdivisionalError(Effect):
     channels: ClassVar[frozenset[Channel]] = frozenset({Channel.LOAD_ANGLE})
     about: ClassVar[Cause] = Cause(
         title="interpolation error of the load encoder",
+        subject="interpolation errors",
         equation="sum over k of A_k cos(k lines theta_L + phi_k), k = 1 (offset), 2 (gain, phase), 4 "
         "(distortion)",
         signature="very many periods per load turn: as many as the encoder has lines, or twice, or four "
@@ -110,6 +117,23 @@ class SubdivisionalError(Effect):
             if lines_per_turn % part == 0 and lines_per_turn // part >= LEAST_LINES:
                 few = (1, 2) if part == 2 else _HARMONICS
                 yield cls(lines_per_turn=lines_per_turn // part, orders=orders_from(few))
+
+    def unidentifiable(self, observations: Observations) -> str:
+        """Requires samples denser than the lines or at varied speeds, because equal steps over many lines
+        cannot be distinguished from equal steps over the rest of a line, a slow wave.
+        """
+        speed = observations.motion.motor_speed_deg_s
+        if speed is None or not np.any(speed):
+            return ""
+        moved = np.abs(speed[speed != 0.0]) * observations.period_s / observations.ratio
+        lines = moved * (self.lines_per_turn / DEG_PER_TURN)  # between two samples
+        if np.quantile(lines, RESOLVED) < 0.5 or abs(np.mean(np.exp(2j * np.pi * lines))) < IN_STEP:
+            return ""
+        return "sampled in equal steps over many lines, which a slow wave explains as well"
+
+    def largest_piece_arcsec(self) -> float:
+        """Returns the largest amplitude, because in a coarsely sampled record an order shows only in part."""
+        return max((each.amplitude_arcsec for each in self.orders), default=0.0)
 
     def shows(self, motion: Motion) -> Stretch | None:
         """Returns the samples away from reversals, where a loop of another shape leaves no bumps."""

@@ -39,6 +39,7 @@ class TorqueModulation(TorqueGrowth, Linear):
     channels: ClassVar[frozenset[Channel]] = frozenset({Channel.LOAD_TORQUE})
     about: ClassVar[Cause] = Cause(
         title="ripple that grows with load",
+        subject="effects of torque",
         equation="growth tau S(theta_M), S the carried orders, tau = |T| (or T where signed), limited to "
         "T_limit",
         signature="the amplitude of the ripple within a motor turn follows the load torque",

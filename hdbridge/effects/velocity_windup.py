@@ -50,6 +50,7 @@ class VelocityWindup(Linear):
     channels: ClassVar[frozenset[Channel]] = frozenset({Channel.SPEED})
     about: ClassVar[Cause] = Cause(
         title="wind-up by drag on the output",
+        subject="drag",
         equation="-(coulomb sgn(v) + viscous v / (1 + |v| / v_shear)), v the commanded motor speed, "
         "limited to v_limit",
         signature="the error follows the speed, less than linearly, and goes back at rest",

@@ -44,7 +44,7 @@ class Vibration(Effect):
         "resonance of the axis",
         experiment="a standstill, and sweeps at two speeds: an order moves in hertz with the speed, a "
         "vibration stays",
-        aliases=("motor_order", "subdivisional_error"),
+        aliases=("motor_order", "load_order", "flexspline_order", "subdivisional_error"),
         source="a sinusoid in time",
         size="0.1-5 arcsec",
         apart={

@@ -32,6 +32,7 @@ class ZeroDrift(Linear, Warmed):
     name: ClassVar[str] = "zero_drift"
     about: ClassVar[Cause] = Cause(
         title="zero moves with temperature",
+        subject="drift",
         equation="drift w, w = u - reference, tau du/dt = temperature - u "
         "(or w = warm_up (1 - exp(-t / tau)))",
         signature="everything shifts slowly and alike in both directions, with a time constant of minutes "

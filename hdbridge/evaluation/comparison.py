@@ -64,6 +64,7 @@ def compare_schemes(
     ``progress`` receives the completed share of the present scheme, ``finished`` each completed run, and
     ``stopped`` the measurements of an interrupted one, so that nothing measured is lost.
     """
+    drive.axis.require_load_encoder()
     # All of them first, so that an impossible compensation is refused before anything moves.
     compensations = {scheme: compensation_for(drive.axis, scheme.of(model)) for scheme in schemes}
     runs: dict[Scheme, Run[SteppingOutcome]] = {}

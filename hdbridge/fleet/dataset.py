@@ -8,14 +8,17 @@ a contract.
 
 from __future__ import annotations
 
+import fcntl
 import os
 from collections import defaultdict
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from hdbridge.errors import InputError, OutputError
 from hdbridge.files.atomic import make_folder
+from hdbridge.fleet.sources import Stored
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -38,7 +41,7 @@ COLUMNS: Final[Mapping[str, Mapping[str, tuple[str, str]]]] = {
             "text",
             "SHA-256 of what the row was made from: see below",
         ),
-        "path": ("text", "recording: path or URL"),
+        "path": ("text", "recording: absolute path or URL"),
         "joint": ("text", "name of the joint; empty if nothing says it"),
         "axis": ("text", "axis of a flight recording, or axis file of a bus log"),
         "gear": ("text", "type of the gear: the manifest's, else the ratio"),
@@ -75,6 +78,15 @@ COLUMNS: Final[Mapping[str, Mapping[str, tuple[str, str]]]] = {
         "remarks": ("texts", "restrictions of the data"),
         "reason": ("text", "why there is no diagnosis; null if there is one"),
         "duplicate_of": ("text", "path of the first recording with the same samples; null for that one"),
+        "stamp": (
+            "text",
+            "SHA-256 of size and times (or etag) of its files and of its row in the manifest; "
+            "null if it could not be fetched",
+        ),
+        "axes": ("integer", "number of axes in a flight recording"),
+        "columns": ("text", "from the manifest"),
+        "units": ("text", "from the manifest"),
+        "unwrap": ("text", "from the manifest"),
     },
     FINDINGS: {
         "key": ("text", "of the recording"),
@@ -93,6 +105,11 @@ COLUMNS: Final[Mapping[str, Mapping[str, tuple[str, str]]]] = {
     },
 }
 """Columns of the two data sets: kind, and meaning."""
+STORED: Final = [
+    *("key", "path", "joint", "axis", "date", "ratio"),
+    *("model_sha256", "version", "reason", "stamp", "axes"),
+]
+"""Columns from which a run sees whether it has to read a recording."""
 
 
 def schema(name: str) -> pa.Schema:
@@ -117,7 +134,7 @@ def schema(name: str) -> pa.Schema:
 
 
 class Dataset:
-    """Data set in a folder. Only one process may write to it at a time."""
+    """Data set in a folder."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -142,9 +159,37 @@ class Dataset:
     def _is_one(self) -> bool:
         return any((self.folder / each).is_dir() for each in (RECORDINGS, INCREMENTS))
 
-    def known(self) -> frozenset[tuple[str, str]]:
-        """Returns key and path of every row."""
-        return frozenset((row["key"], row["path"]) for row in self._rows(RECORDINGS, ["key", "path"]))
+    @contextmanager
+    def locked(self) -> Iterator[None]:
+        """Creates the folder and allows one writer at a time; the lock ends with its process."""
+        self.create()
+        folder = os.open(self.folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+        try:
+            fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise InputError(
+                f"{self.folder}: another hdbridge fleet writes to this folder; wait until it has ended, or "
+                "stop it"
+            ) from None
+        else:
+            yield
+        finally:
+            os.close(folder)
+
+    def stored(self) -> Stored:
+        """Returns what a run needs to know of the rows: no figures, no findings."""
+        return Stored(self._rows(RECORDINGS, STORED))
+
+    def renew(self, changes: Mapping[tuple[str, str], Mapping[str, Any]]) -> None:
+        """Replaces columns of rows, by key and path, and keeps their findings."""
+        if changes:
+            self.add(
+                [
+                    {**row, **changes[row["key"], row["path"]]}
+                    for row in self.recordings()
+                    if (row["key"], row["path"]) in changes
+                ]
+            )
 
     def add(self, rows: Sequence[Mapping[str, Any]]) -> None:
         """Writes rows of recordings, each with its ``findings``; after a crash all of them or none exist."""
@@ -155,7 +200,7 @@ class Dataset:
             max((int(each.stem.partition("-")[2]) for each in folder.glob("*-*.parquet")), default=-1) + 1
         )
         findings = [
-            {"key": row["key"], "path": row["path"], "joint": row["joint"], **each}
+            {**each, "key": row["key"], "path": row["path"], "joint": row["joint"]}
             for row in rows
             for each in row["findings"]
         ]

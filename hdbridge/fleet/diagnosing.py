@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -19,14 +20,13 @@ from hdbridge import __version__
 from hdbridge.effects import FloatArray
 from hdbridge.errors import HdbridgeError, InputError
 from hdbridge.files.expectation import one_line
-from hdbridge.fleet.sources import BUS_LOGS, Source, fetched
+from hdbridge.fleet.sources import BUS_LOGS, NotFetchedError, Source, fetched
 from hdbridge.records.record import Record
 from hdbridge.records.recording import Recording
 from hdbridge.units import DEG_PER_TURN
 
 if TYPE_CHECKING:
     from hdbridge.analysis.findings import Diagnosis
-    from hdbridge.model import TransmissionModel
 
 ORDERS: Final = (1, 2, 3, 4, 5, 6, 7, 8)
 """Motor orders that identify a joint."""
@@ -34,6 +34,7 @@ SETTLED_DEG: Final = 90.0
 """Motor travel after a reversal that is excluded from the orders, because the loop is not yet crossed."""
 TURNS: Final = 2.0
 """Minimum travel for estimating orders; motor turns."""
+NO_MEMORY: Final = "more memory was needed than a worker has; raise --memory"
 Row = dict[str, Any]
 
 
@@ -44,17 +45,21 @@ class Model:
     text: str = ""
     where: str = ""
     reason: str = ""
+    sha256: str | None = None
+    """Of the model without its provenance."""
 
 
+@cache
 def model_in(text: str, where: str) -> Model:
     """Checks the text of a model file; an invalid one returns a `Model` with the reason."""
     from hdbridge.model import TransmissionModel
 
     try:
-        TransmissionModel.from_text(text, where)
+        document = TransmissionModel.from_text(text, where).document()
     except InputError as problem:
         return Model(where=where, reason=str(problem))
-    return Model(text, where)
+    content = {name: each for name, each in document.items() if name != "provenance"}
+    return Model(text, where, sha256=hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest())
 
 
 def fitted(sources: Sequence[Source], where: str) -> Model:
@@ -65,7 +70,7 @@ def fitted(sources: Sequence[Source], where: str) -> Model:
     for source in sources:
         try:
             recording = read(source)
-            return Model(fit(recording, ratio=source.ratio or recording.ratio).model.dump(), where)
+            return model_in(fit(recording, ratio=source.ratio or recording.ratio).model.dump(), where)
         except Exception as problem:
             reasons.append(_reason(problem))
     return Model(where=where, reason=f"no model could be fitted: {reasons[0] if reasons else 'no recording'}")
@@ -106,22 +111,9 @@ def read(source: Source) -> Recording:
             raise InputError(str(problem).replace(str(path), source.path)) from None
 
 
-def diagnosed(source: Source, model: Model, known: Collection[tuple[str, str]] = ()) -> Row:
-    """Diagnoses a recording and returns its row; only key and path if these are ``known``."""
-    row: Row = {
-        "path": source.path,
-        "joint": source.joint or "",
-        "axis": source.axis,
-        "gear": source.gear,
-        "batch": source.batch,
-        "cell": source.cell,
-        "lubricant": source.lubricant,
-        "hours": source.hours,
-        "date": source.date,
-        "version": __version__,
-        "model": model.where or None,
-        "findings": [],
-    }
+def diagnosed(source: Source, model: Model, known: str = "") -> Row:
+    """Diagnoses a recording and returns its row; without ``findings`` if its key is the ``known`` one."""
+    row = _described(source) | {"model": model.where or None, "model_sha256": model.sha256}
     try:
         if source.joint is None:
             raise InputError(f"{source.path}: the joint is not known; name it in the manifest: joint")
@@ -134,10 +126,10 @@ def diagnosed(source: Source, model: Model, known: Collection[tuple[str, str]] =
 
         used = TransmissionModel.from_text(model.text, model.where or "model.yaml")
         ratio = source.ratio or recording.ratio or used.ratio
-        row |= {"ratio": ratio, "gear": source.gear or f"ratio {ratio:g}", "model_sha256": _of_model(used)}
+        row |= {"ratio": ratio, "gear": source.gear or f"ratio {ratio:g}"}
         row["key"] = _key(row)
-        if (row["key"], row["path"]) in known:
-            return {"path": row["path"], "key": row["key"]}
+        if row["key"] == known:
+            return row
         row |= _orders(recording.record, ratio)
         recording = replace(recording, ratio=ratio)
         from hdbridge.analysis.diagnosis import diagnose
@@ -148,24 +140,29 @@ def diagnosed(source: Source, model: Model, known: Collection[tuple[str, str]] =
             row["remarks"].append(origin.remark.replace(str(origin.file.path), source.path))
     except Exception as problem:
         row["reason"] = _reason(problem)
-    if row.get("reason"):
         row["key"] = _key(row)
-    if (row["key"], row["path"]) in known:
-        return {"path": row["path"], "key": row["key"]}
-    return row
+        if isinstance(problem, NotFetchedError):
+            row["stamp"] = None
+        if row["key"] == known:
+            return row
+    return {"findings": [], **row}
 
 
 def lost(source: Source, reason: str) -> Row:
     """Returns the row of a recording without a diagnosis, for example because it kills its worker."""
-    row = {"path": source.path, "joint": source.joint or "", "axis": source.axis, "version": __version__}
-    row |= {name: getattr(source, name) for name in ("gear", "batch", "cell", "lubricant", "hours", "date")}
-    return {**row, "findings": [], "reason": reason, "key": _key({**row, "reason": reason})}
+    row = _described(source) | {"reason": reason, "findings": []}
+    return {**row, "key": _key(row)}
+
+
+def _described(source: Source) -> Row:
+    """Returns the columns that are known before a recording is read."""
+    return asdict(source) | {"joint": source.joint or "", "version": __version__}
 
 
 def _reason(problem: Exception) -> str:
     text = str(problem) if isinstance(problem, HdbridgeError) else f"{type(problem).__name__}: {problem}"
     if isinstance(problem, MemoryError):
-        text = "more memory was needed than a worker has; raise --memory"
+        text = NO_MEMORY
     elif not isinstance(problem, HdbridgeError):
         text = f"an error in hdbridge, please report it: {text}"
     return one_line(text)
@@ -184,11 +181,6 @@ def _of_samples(recording: Recording) -> Row:
         "travel_deg": float(np.ptp(record.load_position_deg)),
         "temperature_c": None if temperature is None else float(np.mean(temperature)),
     }
-
-
-def _of_model(model: TransmissionModel) -> str:
-    document = {name: each for name, each in model.document().items() if name != "provenance"}
-    return hashlib.sha256(json.dumps(document, sort_keys=True).encode()).hexdigest()
 
 
 def _key(row: Mapping[str, Any]) -> str:

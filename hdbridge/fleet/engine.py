@@ -6,20 +6,24 @@ kills its worker is diagnosed once more at the end, alone; if that fails too, it
 
 from __future__ import annotations
 
+import signal
 import time
 from collections import defaultdict
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, replace
+from functools import cache
+from multiprocessing.resource_tracker import ensure_running
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 from urllib.parse import quote
 
+from hdbridge import __version__
 from hdbridge.errors import InputError
 from hdbridge.files.atomic import write_atomically
 from hdbridge.fleet.dataset import Dataset
-from hdbridge.fleet.diagnosing import Model, Row, axes_of, diagnosed, fitted, local_model, lost
-from hdbridge.fleet.sources import Source, with_axes
+from hdbridge.fleet.diagnosing import NO_MEMORY, Model, Row, axes_of, diagnosed, fitted, local_model, lost
+from hdbridge.fleet.sources import Source, Stored, with_axes
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -34,6 +38,8 @@ AHEAD: Final = 2000
 KILLED: Final = (
     "it kills its worker each time, most likely for memory; raise --memory, or shorten the recording"
 )
+RETRIED: Final = (KILLED, NO_MEMORY)
+"""Reasons for which a recording is diagnosed again although nothing has changed: --memory may have."""
 
 
 @dataclass(frozen=True)
@@ -73,16 +79,21 @@ class Cluster:
             with client:
                 yield client
             return
-        with (
-            LocalCluster(
+        # Threads and processes inherit the mask: Ctrl-C reaches this process only, not the workers. The start
+        # of the resource tracker would lift it.
+        ensure_running()
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+        try:
+            local = LocalCluster(
                 n_workers=self.workers,
                 threads_per_worker=1,
                 memory_limit=self.memory,
                 dashboard_address="127.0.0.1:0",
                 silence_logs=50,
-            ) as cluster,
-            Client(cluster, set_as_default=False) as client,
-        ):
+            )
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        with local, Client(local, set_as_default=False) as client:
             yield client
 
 
@@ -95,30 +106,97 @@ def run(
     models: Path | None = None,
     progress: Callable[[Progress], None] = lambda _: None,
     interrupted: Callable[[], bool] = lambda: False,
+    retried: Collection[str] = RETRIED,
 ) -> Progress:
     """Diagnoses the recordings that are not in the data set yet, and adds them.
+
+    A recording whose files, manifest row and model are as they were is not read. One that failed for a reason
+    in ``retried`` is tried again.
 
     ``model`` is the model of every joint, ``models`` a folder of JOINT.yaml; a joint without one gets a model
     fitted to its earliest usable recording, kept in OUT/models. Raises KeyboardInterrupt when interrupted;
     the rows made until then are kept.
     """
-    dataset.create()
-    with cluster.client() as client:
-        return _Run(client, dataset, progress, interrupted).of(sources, model, models)
+    with dataset.locked(), ExitStack() as stack:
+        clients = cache(lambda: stack.enter_context(cluster.client()))
+        return _Run(clients, dataset, progress, interrupted, retried).of(sources, model, models)
+
+
+def watch(
+    find: Callable[[Stored], Sequence[Source]],
+    dataset: Dataset,
+    interval_s: float,
+    diagnose: Callable[[Sequence[Source], Collection[str]], None],
+    *,
+    once: bool = False,
+    report: Callable[[str], None] = lambda _: None,
+    interrupted: Callable[[], bool] = lambda: False,
+) -> None:
+    """Passes sources and ``retried`` to ``diagnose`` whenever some are new, until interrupted; or ``once``.
+
+    A recording is ready when two listings, ``interval_s`` apart, agree on it, so one that is still being
+    written waits for a later round. The first call gets all recordings that are ready, because models may
+    have changed. An error of a later listing is reported, and the next round tries again.
+    """
+    before: dict[tuple[str, str | None], str | None] | None = None
+    done = False
+    while not interrupted():
+        stored = dataset.stored()
+        try:
+            found = find(stored)
+        except InputError as problem:
+            if before is None:
+                raise
+            report(f"{problem}; the next round tries again")
+        else:
+            files: dict[str, list[Source]] = defaultdict(list)
+            for each in found:
+                files[each.path].append(each)
+            new = {path for path, own in files.items() if _is_new(own, stored)}
+            if before is not None or not new:
+                same = before or {}
+                wait = {
+                    each.path for each in found if each.path in new and same.get(_name(each)) != each.stamp
+                }
+                if not done or new - wait:
+                    diagnose([each for each in found if each.path not in wait], () if done else RETRIED)
+                    done = True
+                if once:
+                    return
+            before = {_name(each): each.stamp for each in found}
+        until_s = time.monotonic() + interval_s
+        while time.monotonic() < until_s and not interrupted():
+            time.sleep(min(POLL_S, interval_s))
+
+
+def _name(source: Source) -> tuple[str, str | None]:
+    return source.path, source.axis
+
+
+def _is_new(file: Sequence[Source], stored: Stored) -> bool:
+    """Returns True for a file that has to be read; not for one that is missing, as it was before."""
+    if any(each.stamp is None for each in file):
+        return any(stored.row(each) is None for each in file)
+    return not stored.unchanged(file)
 
 
 class _Run:
     def __init__(
         self,
-        client: Client,
+        clients: Callable[[], Client],
         dataset: Dataset,
         progress: Callable[[Progress], None],
         interrupted: Callable[[], bool],
+        retried: Collection[str],
     ) -> None:
-        self._client = client
+        self._clients = clients
+        """Returns the client of the cluster; the first call starts it."""
         self._dataset = dataset
+        self._stored = dataset.stored()
         self._tell = progress
         self._interrupted = interrupted
+        self._retried = retried
+        self._renewed: dict[tuple[str, str], Row] = {}
         self._rows: list[Row] = []
         self._present: list[tuple[str, str]] = []
         self._written_s = time.monotonic()
@@ -130,25 +208,39 @@ class _Run:
         try:
             sources = self._split_flights(sources)
             self._total = len(sources) + len(self._present)
-            given = self._models(sources, model, models)
-            known = self._dataset.known()
-            shared = self._client.scatter([known], broadcast=True, hash=False)[0] if known else ()
-            tasks = ((diagnosed, (each, given[each.joint or ""], shared)) for each in sources)
+            rows = [self._unchanged(each) for each in sources]
+            given = self._models(sources, rows, model, models)
+            tasks = []
+            for source, row in zip(sources, rows, strict=True):
+                own = given[source.joint or ""]
+                if row is not None and row["model_sha256"] == own.sha256:
+                    self._known += 1
+                    self._present.append((row["key"], row["path"]))
+                else:
+                    stored = self._stored.row(source)
+                    tasks.append((diagnosed, (source, own, stored["key"] if stored else "")))
             again = []
             for place, row in self._results(tasks):
                 if row is None:
-                    again.append(place)
+                    again.append(tasks[place])
                 else:
                     self._take(row)
-            for place in again:  # alone, so that no recording is blamed for another
-                task = (diagnosed, (sources[place], given[sources[place].joint or ""], shared))
+            for task in again:  # alone, so that no recording is blamed for another
                 for _, row in self._results([task]):
-                    self._take(row if row is not None else lost(sources[place], KILLED))
+                    self._take(row if row is not None else lost(task[1][0], KILLED))
         finally:
             self._write()
+            self._dataset.renew(self._renewed)
             self._dataset.compact(self._present)
         self._report()
         return self._state()
+
+    def _unchanged(self, source: Source) -> Mapping[str, Any] | None:
+        """Returns the row of a recording that need not be read again if its model is the same, or None."""
+        row = self._stored.row(source)
+        if row is None or source.stamp is None or row["reason"] in self._retried:
+            return None
+        return row if row["stamp"] == source.stamp and row["version"] == __version__ else None
 
     def _split_flights(self, sources: Sequence[Source]) -> list[Source]:
         """Replaces each flight recording by one source for each of its axes."""
@@ -157,20 +249,34 @@ class _Run:
         for each in sources:
             if each.is_flight:
                 flights[each.path].append(each)
+        for path, described in [*flights.items()]:
+            rows = self._stored.unchanged(described)
+            if rows and not any(row["reason"] in self._retried for row in rows):
+                result += with_axes(path, sorted((row["axis"] for row in rows), key=str), described)
+                del flights[path]
         paths = list(flights)
         for place, axes in self._results((axes_of, (path,)) for path in paths):
             described = flights[paths[place]]
             if isinstance(axes, list):
                 result += with_axes(paths[place], axes, described)
             else:
-                self._take(lost(described[0], axes or KILLED))
+                self._take(lost(replace(described[0], axes=1), axes or KILLED))
         return sorted(result, key=lambda each: (each.path, each.axis or ""))
 
-    def _models(self, sources: Sequence[Source], model: Path | None, models: Path | None) -> dict[str, Model]:
-        """Returns the model of each joint; fits the missing ones."""
+    def _models(
+        self,
+        sources: Sequence[Source],
+        rows: Sequence[Mapping[str, Any] | None],
+        model: Path | None,
+        models: Path | None,
+    ) -> dict[str, Model]:
+        """Returns the model of each joint; fits the missing ones, unless nothing new could be fitted."""
         joints: dict[str, list[Source]] = defaultdict(list)
-        for each in sources:
+        fitting: set[str] = set()
+        for each, row in zip(sources, rows, strict=True):
             joints[each.joint or ""].append(each)
+            if row is None or row["model_sha256"]:
+                fitting.add(each.joint or "")
         folder = self._dataset.folder / "models"
         found: dict[str, Model] = {"": Model(reason="the joint is not known")}
         to_fit = []
@@ -187,8 +293,10 @@ class _Run:
                 found[joint] = local_model(str(model))
             elif kept.is_file():
                 found[joint] = replace(local_model(str(kept)), where=f"models/{kept.name}")
-            else:
+            elif joint in fitting:
                 to_fit.append((joint, own, kept))
+            else:
+                found[joint] = Model(reason="no recording for a model")
         total, self._total = self._total, self._total + len(to_fit)
         fits = ((fitted, (own, f"models/{kept.name}")) for _, own, kept in to_fit)
         for place, made in self._results(fits):
@@ -206,9 +314,13 @@ class _Run:
         """Yields number and result of each task as it completes; None for one that kills its workers."""
         from distributed import KilledWorker, as_completed
 
+        tasks = list(tasks)
+        if not tasks:
+            return
+        client = self._clients()
         numbered = enumerate(tasks)
         numbers: dict[Any, int] = {}
-        done = as_completed([], loop=self._client.loop)
+        done = as_completed([], loop=client.loop)
         more, waiting = True, 0
 
         def submit() -> None:
@@ -219,7 +331,7 @@ class _Run:
                     more = False
                     return
                 number, (work, arguments) = found
-                future = self._client.submit(work, *arguments, pure=False)
+                future = client.submit(work, *arguments, pure=False)
                 numbers[future.key] = number
                 done.add(future)
                 waiting += 1
@@ -242,16 +354,14 @@ class _Run:
             submit()
             if time.monotonic() - seen_s > 5.0:
                 seen_s = time.monotonic()
-                self._measure()
+                self._measure(client)
             if not batch:
                 time.sleep(POLL_S)
 
-    def _measure(self) -> None:
+    def _measure(self, client: Client) -> None:
         """Updates the largest memory of a worker."""
         with suppress(OSError):
-            workers: Collection[Mapping[str, Any]] = self._client.scheduler_info(n_workers=-1)[
-                "workers"
-            ].values()
+            workers: Collection[Mapping[str, Any]] = client.scheduler_info(n_workers=-1)["workers"].values()
             self._memory = max(
                 self._memory, *(each["metrics"].get("memory", 0) / 1e6 for each in workers), 0.0
             )
@@ -260,6 +370,7 @@ class _Run:
         self._present.append((row["key"], row["path"]))
         if "findings" not in row:
             self._known += 1
+            self._renewed[row["key"], row["path"]] = row
         else:
             self._failed += bool(row.get("reason"))
             self._rows.append(row)

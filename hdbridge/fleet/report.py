@@ -7,18 +7,22 @@ from __future__ import annotations
 import posixpath
 import shlex
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import Final
 
 from hdbridge import __version__
 from hdbridge.fleet.statistics import Interval
 from hdbridge.fleet.summary import Candidate, Mistaken, Summary
-from hdbridge.report.page import Command, Facts, Heading, Page, Section, Status, Table
+from hdbridge.report.page import Cell, Command, Heading, Link, Page, Section, Status, Table
 
 ROWS: Final = 200
 """Maximum number of rows of a table, so that the page of ten thousand joints opens quickly."""
 NOT_KNOWN: Final = "not known yet"
+NO_PAGES: Final[Mapping[str, str]] = MappingProxyType({})
+Joint = Callable[[str], Cell]
+"""Returns the name of a joint, with a link to its page if there is one."""
 _FAILURES: Final = 40
 """Length of the prefix by which failure reasons are grouped; characters."""
 
@@ -32,21 +36,31 @@ def hours_words(remaining: Interval | None) -> str:
     return f"{_two(remaining.value)} ({_two(remaining.low)} to {_two(remaining.high)})"
 
 
-def fleet_page(summary: Summary, folder: Path) -> Page:
-    """Returns the page of a summary; ``folder`` holds the data set."""
+def fleet_page(summary: Summary, folder: Path, pages: Mapping[str, str] = NO_PAGES) -> Page:
+    """Returns the page of a summary.
+
+    ``folder`` holds the data set, ``pages`` the addresses of the joints' pages that exist.
+    """
+
+    def joint(name: str) -> Cell:
+        return Link(name, pages[name]) if name in pages else name
+
     sections = [
-        _first(summary, folder),
+        _first(summary, joint),
         *_prevalence(summary),
-        *_mistaken(summary),
-        *_odd(summary),
-        *_silent(summary),
-        *_failed(summary),
+        *_mistaken(summary, joint),
+        *_odd(summary, joint),
+        *_silent(summary, joint),
+        *_failed(summary, joint),
         _rates(summary),
     ]
+    without = next((each.joint for each in summary.first if each.joint not in pages), None)
     command = None
-    if summary.first:
-        each = summary.first[0]
-        command = Command(_diagnose(each, folder), f"the page of {each.joint}, first of the list")
+    if without is not None:
+        line = shlex.join(["hdbridge", "fleet", "report", str(folder), "--joint", without])
+        command = Command(
+            line, f"writes the page of {without}; with --pages, those of all joints of the list"
+        )
     return Page(
         title=f"Fleet of {summary.joints:,} joints",
         verdict=_verdict(summary),
@@ -61,7 +75,7 @@ def _verdict(summary: Summary) -> str:
     count = len(summary.first)
     if count:
         soonest = summary.first[0]
-        text = f"{count} of {summary.joints:,} joints {'need' if count > 1 else 'needs'} a look; first "
+        text = f"{count:,} of {summary.joints:,} joints {'need' if count > 1 else 'needs'} a look; first "
         text += f"{soonest.joint}: {_words(soonest.cause)}, {soonest.peak_arcsec:.1f} arcsec"
         if soonest.remaining is not None and soonest.remaining.high > 0.0:
             text += f", {summary.limit_arcsec:g} arcsec in {hours_words(soonest.remaining)} h"
@@ -75,7 +89,7 @@ def _verdict(summary: Summary) -> str:
     return text
 
 
-def _first(summary: Summary, folder: Path) -> Section:
+def _first(summary: Summary, joint: Joint) -> Section:
     text = (
         "Joints with a cause that appeared after the first recording and repeats, or that grows: more "
         "often than "
@@ -85,11 +99,11 @@ def _first(summary: Summary, folder: Path) -> Section:
     )
     if not summary.first:
         return Section("Look at first", f"{text}\n\nThere is none.")
-    rows: list[list[str | float]] = []
+    rows: list[list[Cell]] = []
     for each in summary.first[:ROWS]:
         rows.append(
             [
-                each.joint,
+                joint(each.joint),
                 _words(each.cause)
                 + (f" (or {', '.join(map(_words, each.aliases))})" if each.aliases else ""),
                 hours_words(each.remaining),
@@ -114,22 +128,7 @@ def _first(summary: Summary, folder: Path) -> Section:
         "data",
         "last recording",
     ]
-    commands = [(each.joint, _diagnose(each, folder)) for each in summary.first[:20]]
-    return Section(
-        "Look at first",
-        f"{text} The commands below the table write the page of a joint.",
-        [Table(header, rows, _more(len(summary.first))), Facts(commands)],
-    )
-
-
-def _diagnose(each: Candidate, folder: Path) -> str:
-    recording = shlex.quote(each.path)
-    model = shlex.quote(_model(each, folder))
-    return f"hdbridge diagnose {recording} --model {model} --html {shlex.quote(f'{each.joint}.html')}"
-
-
-def _model(each: Candidate, folder: Path) -> str:
-    return str(folder / each.model) if each.model.startswith("models/") else each.model
+    return Section("Look at first", text, [Table(header, rows, _more(len(summary.first)))])
 
 
 def _growth(each: Candidate) -> str:
@@ -142,7 +141,7 @@ def _growth(each: Candidate) -> str:
 
 def _prevalence(summary: Summary) -> Iterator[Section]:
     for attribute, causes in summary.prevalence.items():
-        rows: list[list[str | float]] = []
+        rows: list[list[Cell]] = []
         ranked = sorted(causes.items(), key=lambda each: -sum(cases for cases, _, _ in each[1].values()))
         for cause, groups in ranked:
             for group, (cases, joints, share) in groups.items():
@@ -158,7 +157,7 @@ def _prevalence(summary: Summary) -> Iterator[Section]:
         if rows:
             yield Section(
                 f"Causes by {attribute}",
-                "Joints in which the cause was named at least twice and is there with 95 % probability. "
+                "Joints in which the cause was named at least twice and is more likely there than not. "
                 "The share is "
                 "partially pooled: a small group is drawn to the others.",
                 [
@@ -177,14 +176,14 @@ def _prevalence(summary: Summary) -> Iterator[Section]:
             )
 
 
-def _mistaken(summary: Summary) -> Iterator[Section]:
-    rows: list[list[str | float]] = [
-        [each.joint, _KINDS[each.kind], each.text, each.path]
+def _mistaken(summary: Summary, joint: Joint) -> Iterator[Section]:
+    rows: list[list[Cell]] = [
+        [joint(each.joint), _KINDS[each.kind], each.text, each.path]
         for each in sorted(summary.mistaken, key=_gravity)
     ]
     rows += [
-        [joint, "there twice", f"the same samples as {first}", path]
-        for joint, path, first in summary.duplicates
+        [joint(name), "there twice", f"the same samples as {first}", path]
+        for name, path, first in summary.duplicates
     ]
     if rows:
         yield Section(
@@ -203,11 +202,11 @@ def _gravity(each: Mistaken) -> tuple[int, str, str]:
     return (list(_KINDS).index(each.kind), each.joint, each.path)
 
 
-def _odd(summary: Summary) -> Iterator[Section]:
+def _odd(summary: Summary, joint: Joint) -> Iterator[Section]:
     if not summary.odd:
         return
-    rows: list[list[str | float]] = [
-        [each.joint, each.gear, _words(each.figure), each.value, each.normal.low, each.normal.high]
+    rows: list[list[Cell]] = [
+        [joint(each.joint), each.gear, _words(each.figure), each.value, each.normal.low, each.normal.high]
         for each in summary.odd[:ROWS]
     ]
     yield Section(
@@ -232,9 +231,9 @@ def _odd(summary: Summary) -> Iterator[Section]:
     )
 
 
-def _silent(summary: Summary) -> Iterator[Section]:
+def _silent(summary: Summary, joint: Joint) -> Iterator[Section]:
     if summary.silent:
-        rows: list[list[str | float]] = [list(each) for each in summary.silent[:ROWS]]
+        rows: list[list[Cell]] = [[joint(name), why] for name, why in summary.silent[:ROWS]]
         yield Section(
             "Silent joints",
             "Joints of which nothing is known now.",
@@ -242,12 +241,12 @@ def _silent(summary: Summary) -> Iterator[Section]:
         )
 
 
-def _failed(summary: Summary) -> Iterator[Section]:
+def _failed(summary: Summary, joint: Joint) -> Iterator[Section]:
     if not summary.failed:
         return
     kinds = Counter(_kind(path, reason) for _, path, reason in summary.failed)
-    rows: list[list[str | float]] = [
-        [joint or "?", path, reason] for joint, path, reason in summary.failed[:ROWS]
+    rows: list[list[Cell]] = [
+        [joint(name) if name else "?", path, reason] for name, path, reason in summary.failed[:ROWS]
     ]
     yield Section(
         "What failed",
@@ -263,7 +262,7 @@ def _kind(path: str, reason: str) -> str:
 
 def _rates(summary: Summary) -> Section:
     ranked = sorted(summary.rates.items(), key=lambda each: -each[1][0])
-    rows: list[list[str | float]] = [
+    rows: list[list[Cell]] = [
         [_words(cause), *(f"{100.0 * each:.1f} %" for each in rates)] for cause, rates in ranked
     ]
     return Section(

@@ -8,19 +8,24 @@ from __future__ import annotations
 
 import csv
 import glob
+import hashlib
+import os
 import posixpath
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections import defaultdict
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
+from stat import S_ISREG
 from tempfile import TemporaryDirectory
 from typing import Any, Final
 
+from hdbridge import __version__
 from hdbridge.errors import InputError
 from hdbridge.files.expectation import nearest
-from hdbridge.records.recording import ABOUT_NAME
+from hdbridge.files.profile import Profile
+from hdbridge.records.recording import ABOUT_NAME, CSV_NAMES, recordings_among
 
-CSV: Final = (".csv", ".csv.gz")
 FLIGHT: Final = (".mcap",)
 BUS_LOG: Final = (".log", ".asc", ".blf", ".trc", ".mf4")
 BUS_LOGS: Final = (*BUS_LOG, *(f"{each}.gz" for each in BUS_LOG))
@@ -41,6 +46,8 @@ MANIFEST: Final[Mapping[str, str]] = {
     "unwrap": "`--unwrap` of a CSV file",
 }
 """Columns of a manifest. Only ``path`` is required."""
+MARKS: Final = ("size", "ETag", "mtime", "LastModified", "created")
+"""Attributes of a remote file that change with its content, as fsspec's file systems name them."""
 
 
 @dataclass(frozen=True)
@@ -61,6 +68,10 @@ class Source:
     columns: str | None = None
     units: str | None = None
     unwrap: str | None = None
+    stamp: str | None = None
+    """Equal to that of its row in the data set if neither its files nor its row in the manifest changed."""
+    axes: int | None = None
+    """Number of axes in a flight recording."""
 
     @property
     def is_flight(self) -> bool:
@@ -73,82 +84,156 @@ class Source:
         return (self.hours if self.hours is not None else -1.0, self.date or "", self.path)
 
 
-def find_sources(given: Sequence[str], manifest: Path | None = None) -> list[Source]:
+class Stored:
+    """Rows of a data set without their figures, to find the recordings that need not be read again."""
+
+    def __init__(self, rows: Iterable[Mapping[str, Any]] = ()) -> None:
+        self._rows: dict[str, dict[str | None, Mapping[str, Any]]] = defaultdict(dict)
+        for row in rows:
+            self._rows[row["path"]][row["axis"]] = row
+
+    def row(self, source: Source) -> Mapping[str, Any] | None:
+        """Returns the row of a source, whatever has changed since."""
+        return self._rows[source.path].get(source.axis) if source.path in self._rows else None
+
+    def unchanged(self, sources: Sequence[Source]) -> list[Mapping[str, Any]]:
+        """Returns all rows of one file; none if it, its rows in the manifest or hdbridge have changed."""
+        stamps = {each.stamp for each in sources} - {None}
+        rows = [
+            row
+            for row in self._rows.get(sources[0].path, {}).values()
+            if row["stamp"] in stamps and row["version"] == __version__
+        ]
+        return rows if rows and len(rows) == (rows[0]["axes"] or 1) else []
+
+
+NOTHING_STORED: Final = Stored()
+
+
+class NotFetchedError(InputError):
+    """A remote recording cannot be fetched; that says nothing about its content."""
+
+
+def find_sources(
+    given: Sequence[str],
+    manifest: Path | None = None,
+    stored: Stored = NOTHING_STORED,
+    *,
+    may_be_empty: bool = False,
+) -> list[Source]:
     """Returns all recordings at the given places and in the manifest, each once, sorted by path.
 
-    InputError for a place that does not exist or holds no recording, and for a wrong manifest.
+    InputError for a place that does not exist or holds no recording (unless it ``may_be_empty``), and for a
+    wrong manifest. A recording that is ``stored`` unchanged is not opened.
     """
-    described = read_manifest(manifest) if manifest else {}
-    known = {path for path, _ in described}
-    found: dict[tuple[str, str | None], Source] = dict(described)
+    found: dict[tuple[str, str | None], Source] = dict(read_manifest(manifest)) if manifest else {}
+    described = {path for path, _ in found}
+    marks: dict[str, str] = {}
     for place in given:
-        paths = list(_recordings(place, known))
-        if not paths:
+        marked = _recordings(_listing(place), described)
+        if not marked and not may_be_empty:
             raise InputError(
                 f"{place}: no recording; expected recording folders, or files that end in .csv, .csv.gz "
                 "or .mcap "
                 "(a bus log needs a row in the manifest)"
             )
-        for path in paths:
-            if path not in known:
-                found.setdefault((path, None), _about(path))
-    return sorted(found.values(), key=lambda each: (each.path, each.axis or ""))
+        marks |= marked
+        for path in marked:
+            if path not in described:
+                found[path, None] = Source(path)
+    marks |= _marks_of(described - marks.keys())
+    sources = [
+        _with_about(replace(each, stamp=_stamp(each, marks.get(each.path))), stored)
+        for each in found.values()
+    ]
+    return sorted(sources, key=lambda each: (each.path, each.axis or ""))
 
 
-def _recordings(place: str, described: Iterable[str]) -> Iterator[str]:
-    """Yields the recordings at one place: a folder, a glob, a file or a URL."""
+def _recordings(files: Mapping[str, str], described: Collection[str]) -> dict[str, str]:
+    """Returns the recordings among files, with the marks of their own files joined."""
+    found = recordings_among(files)
+    found |= {each: [each] for each in files if each.endswith(FLIGHT) or each in described}
+    return {path: "\n".join(f"{each} {files[each]}" for each in own) for path, own in found.items()}
+
+
+def _marks_of(paths: Iterable[str]) -> dict[str, str]:
+    """Returns the marks of the recordings that a manifest names; a missing one has none."""
+    places = {path if "://" not in path else posixpath.dirname(path) for path in paths}
+    files: dict[str, str] = {}
+    for place in places:
+        with suppress(InputError):  # the worker that reads the recording reports the error
+            files |= _listing(place)
+    return _recordings(files, paths if isinstance(paths, Collection) else set(paths))
+
+
+def _listing(place: str) -> dict[str, str]:
+    """Returns all files at or below a place (folder, glob, file or URL), each with its mark: size and times.
+
+    InputError if there is nothing.
+    """
     if "://" not in place:
+        place = os.path.abspath(place)  # noqa: PTH100 - workers run in another folder
         matched = sorted(glob.glob(place, recursive=True)) if glob.has_magic(place) else [place]  # noqa: PTH207
-        files = [file for each in matched for file in _local(Path(each))]
-    else:
-        import fsspec
+        return {file: mark for each in matched for file, mark in _local(Path(each))}
+    import fsspec
 
-        try:
-            system, root = fsspec.core.url_to_fs(place)
-            host = place.rstrip("/").removesuffix(root)  # protocol and host, which `system` paths lack
-            matched = system.glob(root) if glob.has_magic(root) else [root]
-            files = [
-                host + file
-                for each in matched
-                for file in (system.find(each) if system.isdir(each) else [each])
-            ]
-        except (OSError, ValueError, ImportError) as problem:
-            raise InputError(f"{place}: cannot be listed: {problem}") from None
-    folders = {posixpath.dirname(each) for each in files if posixpath.basename(each) == ABOUT_NAME}
-    logs = set(described)
-    yield from folders
-    for each in files:
-        if posixpath.dirname(each) not in folders and (each.endswith(CSV + FLIGHT) or each in logs):
-            yield each
+    try:
+        system, root = fsspec.core.url_to_fs(place)
+        host = place.rstrip("/").removesuffix(root)  # protocol and host, which `system` paths lack
+        system.invalidate_cache()
+        matched = system.glob(root) if glob.has_magic(root) else [root]
+        return {
+            host + file: " ".join(str(about.get(each)) for each in MARKS)
+            for each in matched
+            for file, about in system.find(each, detail=True).items()
+        }
+    except (OSError, ValueError, ImportError) as problem:
+        raise InputError(f"{place}: cannot be listed: {problem}") from None
 
 
-def _local(path: Path) -> list[str]:
-    if path.is_dir():
-        return [str(each) for each in sorted(path.rglob("*")) if each.is_file()]
+def _local(path: Path) -> Iterator[tuple[str, str]]:
     if not path.exists():
         raise InputError(f"{path}: no such file or folder; expected recordings")
-    return [str(path)]
+    for each in sorted(path.rglob("*")) if path.is_dir() else [path]:
+        with suppress(OSError):  # removed in the meantime
+            about = each.stat()
+            if S_ISREG(about.st_mode):
+                yield str(each), f"{about.st_size} {about.st_mtime_ns} {about.st_ctime_ns}"
 
 
-def _about(path: str) -> Source:
-    """Returns the source of a path that no manifest describes; joint and date come from recording.yaml."""
-    source = Source(path)
-    if path.endswith(CSV + FLIGHT + BUS_LOGS):
+def _stamp(source: Source, mark: str | None) -> str | None:
+    """Hashes the mark of a recording and its row in the manifest; None for a recording that is not there."""
+    if mark is None:
+        return None
+    if source.axis and source.path.endswith(BUS_LOGS):
+        with suppress(InputError, OSError):  # the worker reports it
+            mark += Profile.find(source.axis).axis.read_text(encoding="utf-8")
+    return hashlib.sha256("\n".join([mark, repr(source)]).encode()).hexdigest()
+
+
+def _with_about(source: Source, stored: Stored) -> Source:
+    """Fills in what only ``recording.yaml`` says: joint, ratio and date."""
+    if source.joint is not None or source.path.endswith(CSV_NAMES + FLIGHT + BUS_LOGS):
         return source
-    with suppress(Exception):  # the worker that reads the recording reports the error
-        import fsspec
-        import yaml
+    about: Mapping[str, Any] = {}
+    row = stored.row(source)
+    if row is not None and row["stamp"] == source.stamp is not None:
+        about = {"axis": row["joint"] or None, "ratio": row["ratio"], "date": row["date"]}
+    else:
+        with suppress(Exception):  # the worker that reads the recording reports the error
+            import fsspec
+            import yaml
 
-        with fsspec.open(f"{path}/{ABOUT_NAME}", "r", encoding="utf-8") as file:
-            about = yaml.load(file, Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader))
-        ratio, date = about.get("ratio"), about.get("date")
-        return replace(
-            source,
-            joint=about.get("axis"),
-            ratio=float(ratio) if ratio else None,
-            date=str(date) if date else None,
-        )
-    return source
+            with fsspec.open(f"{source.path}/{ABOUT_NAME}", "r", encoding="utf-8") as file:
+                about = yaml.load(file, Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader))
+            about = {**about, "date": str(about["date"]) if about.get("date") else None}
+            about["ratio"] = float(about["ratio"]) if about.get("ratio") else None
+    return replace(
+        source,
+        joint=about.get("axis"),
+        ratio=source.ratio or about.get("ratio"),
+        date=source.date or about.get("date"),
+    )
 
 
 def read_manifest(path: Path) -> dict[tuple[str, str | None], Source]:
@@ -186,6 +271,7 @@ def read_manifest(path: Path) -> dict[tuple[str, str | None], Source]:
 
 
 def _described(row: Mapping[str, Any], manifest: Path, number: int) -> Source:
+    folder = manifest.absolute().parent
     values: dict[str, Any] = {}
     for name, value in row.items():
         if name is None or (isinstance(value, str) and not value.strip()) or value is None:
@@ -201,33 +287,26 @@ def _described(row: Mapping[str, Any], manifest: Path, number: int) -> Source:
         raise InputError(f"{manifest}:{number}: path: found nothing; expected the path of a recording")
     for name in ("path", "model"):
         if name in values and "://" not in values[name]:
-            values[name] = str(manifest.parent / values[name])
+            values[name] = str(folder / values[name])
     source = Source(**values)
-    if source.axis and source.path.endswith(BUS_LOGS) and (manifest.parent / source.axis).exists():
-        source = replace(source, axis=str(manifest.parent / source.axis))
-    if source.joint is None and not source.is_flight:
-        about = _about(source.path)
-        source = replace(
-            source,
-            joint=about.joint,
-            ratio=source.ratio or about.ratio,
-            date=source.date or about.date,
-        )
+    if source.axis and source.path.endswith(BUS_LOGS) and (folder / source.axis).exists():
+        source = replace(source, axis=str(folder / source.axis))
     return source
 
 
-def with_axes(path: str, axes: Iterable[str], described: Iterable[Source]) -> list[Source]:
+def with_axes(path: str, axes: Iterable[str | None], described: Iterable[Source]) -> list[Source]:
     """Returns one source for each axis of a flight recording; rows of the manifest describe some of them."""
     rows = {each.axis: each for each in described}
-    common = rows.get(None, Source(path))
-    return [rows.get(name) or replace(common, axis=name, joint=common.joint or name) for name in axes]
+    common = rows.get(None) or Source(path, stamp=next(iter(rows.values())).stamp)
+    found = [rows.get(name) or replace(common, axis=name, joint=common.joint or name) for name in axes]
+    return [replace(each, axes=len(found)) for each in found]
 
 
 @contextmanager
 def fetched(path: str) -> Iterator[Path]:
     """Provides a recording as a local path; a remote one is copied to a temporary folder for the block.
 
-    InputError if it cannot be fetched.
+    NotFetchedError if it cannot be fetched.
     """
     if "://" not in path:
         yield Path(path)
@@ -240,5 +319,5 @@ def fetched(path: str) -> Iterator[Path]:
             system, place = fsspec.core.url_to_fs(path)
             system.get(place, str(target), recursive=system.isdir(place))
         except Exception as problem:  # each file system raises its own
-            raise InputError(f"{path}: cannot be fetched: {problem}") from None
+            raise NotFetchedError(f"{path}: cannot be fetched: {problem}") from None
         yield target

@@ -17,11 +17,13 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.special import betaln, chdtri, expit, logsumexp, ndtr, ndtri
 
+from hdbridge.analysis.intervals import NORMAL_95
+from hdbridge.analysis.readings import median_deviation
 from hdbridge.effects import FloatArray, IntArray
 
 Complexes = NDArray[np.complex128]
-MAD: Final = 1.4826
-"""Standard deviation of a normal distribution per median absolute deviation."""
+OUTLIERS_FROM: Final = 8
+"""Minimum number of values for a range: below it, the median absolute deviation is uncertain by half."""
 DRAWS: Final = 4001
 GOLDEN: Final = 0.6180339887498949
 INTERVAL: Final = (0.05, 0.95)
@@ -150,7 +152,7 @@ def within_false_discoveries(probability: FloatArray, rate: float) -> FloatArray
 def normal_range(values: FloatArray) -> Interval:
     """Returns the median and the range of 95 % of normal values, by the median absolute deviation."""
     middle = float(np.median(values))
-    half = 1.96 * MAD * float(np.median(np.abs(values - middle)))
+    half = NORMAL_95 * median_deviation(values - middle)
     return Interval(middle - half, middle, middle + half)
 
 
@@ -159,8 +161,8 @@ def outliers(values: FloatArray, rate: float = 0.05) -> NDArray[np.bool_]:
 
     There are none among fewer than eight values, or if more than half of the values are equal.
     """
-    scale = MAD * float(np.median(np.abs(values - np.median(values)))) if len(values) else 0.0
-    if len(values) < 8 or scale == 0.0:
+    scale = median_deviation(values - np.median(values)) if len(values) else 0.0
+    if len(values) < OUTLIERS_FROM or scale == 0.0:
         return np.zeros(len(values), dtype=bool)
     chance = 2.0 * ndtr(-np.abs(values - np.median(values)) / scale)
     order = np.argsort(chance)
@@ -366,7 +368,7 @@ def identities(orders: Complexes, joint: Sequence[int], time: Sequence[Any]) -> 
     with NaN have none. Each recording is compared with the first one of its joint.
     """
     numbers = np.asarray(joint)
-    known = np.all(np.isfinite(orders), axis=1) if len(orders) else np.zeros(0, dtype=bool)
+    known = np.all(np.isfinite(orders), axis=1) & (orders.shape[1] > 0)
     first: dict[int, int] = {}
     for place in sorted(range(len(numbers)), key=lambda each: time[each]):
         if known[place]:

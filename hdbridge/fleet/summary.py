@@ -15,6 +15,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from hdbridge.analysis.intervals import NORMAL_95
 from hdbridge.fleet.statistics import (
     Interval,
     Series,
@@ -67,8 +68,6 @@ class Candidate:
     path: str
     """Path of its last recording."""
     gear: str
-    model: str
-    """Model file; `models/...` is in the folder of the data set."""
 
 
 @dataclass(frozen=True)
@@ -139,13 +138,7 @@ _KINDS: Final = {
 
 def summarise(rows: Sequence[Row], limit_arcsec: float) -> Summary:
     """Summarises the recordings of a data set (`Dataset.recordings`)."""
-    good = [row for row in rows if row["reason"] is None and row["duplicate_of"] is None]
-    good.sort(key=_when)
-    mistaken, foreign = _mistaken(good)
-    joints: dict[str, list[Row]] = defaultdict(list)
-    for row in good:
-        if (row["key"], row["path"]) not in foreign:
-            joints[row["joint"]].append(row)
+    joints, mistaken = own_recordings(rows)
     has, rates, sizes = _causes(joints)
     changed = _figures(joints)
     first = _first(joints, has, sizes, changed, limit_arcsec)
@@ -168,6 +161,18 @@ def summarise(rows: Sequence[Row], limit_arcsec: float) -> Summary:
     )
 
 
+def own_recordings(rows: Sequence[Row]) -> tuple[dict[str, list[Row]], tuple[Mistaken, ...]]:
+    """Returns the diagnosed recordings of each joint in time, without copies and mistaken ones; and these."""
+    good = [row for row in rows if row["reason"] is None and row["duplicate_of"] is None]
+    good.sort(key=_when)
+    mistaken, foreign = _mistaken(good)
+    joints: dict[str, list[Row]] = defaultdict(list)
+    for row in good:
+        if (row["key"], row["path"]) not in foreign:
+            joints[row["joint"]].append(row)
+    return joints, mistaken
+
+
 def _when(row: Row) -> tuple[float, str, str]:
     return (row["hours"] if row["hours"] is not None else -1.0, row["date"] or "", row["path"])
 
@@ -181,12 +186,13 @@ def _mistaken(good: Sequence[Row]) -> tuple[tuple[Mistaken, ...], set[tuple[str,
         gears[f"{row['gear']}"].append(row)
     for rows in gears.values():
         names = sorted({row["joint"] for row in rows})
+        numbers = {name: number for number, name in enumerate(names)}
         count = max((len(row["orders"] or ()) for row in rows), default=0)
         orders = np.full((len(rows), count), np.nan + 0j)
         for place, row in enumerate(rows):
             if count and len(row["orders"] or ()) == count:
                 orders[place] = [complex(each["cos_arcsec"], -each["sin_arcsec"]) for each in row["orders"]]
-        found = identities(orders, [names.index(row["joint"]) for row in rows], [_when(row) for row in rows])
+        found = identities(orders, [numbers[row["joint"]] for row in rows], [_when(row) for row in rows])
         for row, each in zip(rows, found, strict=True):
             if each is None:
                 continue
@@ -222,8 +228,14 @@ def _causes(
     return has, rates, sizes
 
 
+def named_by(row: Row, cause: str) -> Mapping[str, Any] | None:
+    """Returns the finding of a recording that names a cause, or None."""
+    return next((each for each in row["findings"] if each["cause"] == cause), None)
+
+
 def _peak(row: Row, cause: str) -> float | None:
-    return next((each["peak_arcsec"] for each in row["findings"] if each["cause"] == cause), None)
+    found = named_by(row, cause)
+    return found["peak_arcsec"] if found else None
 
 
 def _size(rows: Sequence[Row], cause: str) -> Series:
@@ -262,7 +274,7 @@ def _figures(joints: Mapping[str, Sequence[Row]]) -> dict[str, list[tuple[float,
                     and each["half_width"] > 0.0
                     and not each["name"].endswith("phase_deg")
                 ):
-                    table[each["name"]][name].append((row, each["value"], each["half_width"] / 1.96))
+                    table[each["name"]][name].append((row, each["value"], each["half_width"] / NORMAL_95))
     result: dict[str, list[tuple[float, str]]] = defaultdict(list)
     for figure, of_joint in table.items():
         if figure.split(".")[0] not in {"synchronous", "hysteresis"}:
@@ -325,7 +337,6 @@ def _first(
                     remarks=tuple(rows[-1]["remarks"] or ()),
                     path=rows[-1]["path"],
                     gear=rows[-1]["gear"],
-                    model=rows[-1]["model"] or "MODEL.yaml",
                 )
             )
     kept = within_false_discoveries(np.array([each.probability for each in claims]), FALSE_DISCOVERIES)

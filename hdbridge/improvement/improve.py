@@ -73,6 +73,7 @@ def improve(
     in stepping. Raises `InputError` if model or recordings belong to another axis or drive.
     """
     active.check_bound_to(drive.axis, drive.identity)
+    drive.axis.require_load_encoder()
     bench = _Bench(drive, date, progress, interrupted)
     earlier = source.journal is None or bool(source.journal.done)  # measured before the drive was booted
     recordings, apart = _begin(source, bench)

@@ -55,7 +55,7 @@ class ModelFile(BaseModel):
     schema_: Literal["hdbridge.model/1"] = Field(alias="schema", description="kind and version of this file")
     ratio: float = Field(gt=0, le=1000, description="N: motor turns per load turn")
     effects: tuple[EffectEntry, ...] = Field(description="the effects whose sum is the transmission error")
-    provenance: Provenance | None = Field(None, description="where the numbers come from")
+    provenance: Provenance | None = Field(None, description="origin of the numbers")
     response: Response | None = Field(None, description="response of the axis to the correction in motion")
 
 

@@ -111,7 +111,7 @@ class ReversalsEntry(Strict):
     )
     motor_deg_per_s: float = Field(10.0, gt=0, le=3600, description="speed of the motor")
     beyond: bool = Field(
-        False, description="all depths in one curve, each beyond where the last turned: shows memory"
+        False, description="all depths in one curve, each beyond the last turning point: shows memory"
     )
 
     def fitted(self, room: Room, name: str) -> Iterator[Procedure[object]]:
@@ -201,7 +201,7 @@ class Plan(Strict):
     name: str = Field(
         pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$", description="name: letters, digits, '.', '_', '-'"
     )
-    about: str = Field("", description="what it is good for, in words")
+    about: str = Field("", description="purpose, in words")
     precondition_deg: float = Field(
         100.0,
         gt=0,
@@ -216,7 +216,7 @@ class Plan(Strict):
         description="acceleration of its moves at the load, if the axis file allows it: gentle, so that the "
         "load does not wind the gear's spring up",
     )
-    procedures: tuple[Entry, ...] = Field(min_length=1, max_length=1000, description="what is run, in order")
+    procedures: tuple[Entry, ...] = Field(min_length=1, max_length=1000, description="procedures, in order")
     validation: ValidationEntry = Field(
         default_factory=ValidationEntry, description="the stepping test of the new model"
     )

@@ -10,11 +10,12 @@ from __future__ import annotations
 import hashlib
 import importlib.metadata
 import platform
-from collections.abc import Iterator, Sequence
+import posixpath
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cache
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any, Final, Literal, Self
 
 from pydantic import Field, model_validator
@@ -32,6 +33,8 @@ PART_SAMPLES: Final = 50
 """Minimum number of samples of a part when a recording is cut at its gaps; shorter parts are left out."""
 RECORD_NAME = "record.csv.gz"
 ABOUT_NAME = "recording.yaml"
+CSV_NAMES: Final = (".csv", ".csv.gz")
+"""Endings of the names of CSV files."""
 HEADER = "# What was recorded next to this file, by hdbridge. docs/files.md describes its keys.\n"
 """First line of ``recording.yaml``."""
 
@@ -39,12 +42,10 @@ HEADER = "# What was recorded next to this file, by hdbridge. docs/files.md desc
 class Segment(Strict):
     """One leg of the motion."""
 
-    kind: str = Field(
-        min_length=1, description="what the leg was for: precondition, standstill, sweep, sine, step, ..."
-    )
+    kind: str = Field(min_length=1, description="purpose: precondition, standstill, sweep, sine, step, ...")
     start_s: float = Field(description="time of its first sample")
     end_s: float = Field(description="time of its last sample")
-    notes: dict[str, Any] = Field(default_factory=dict, description="more about it, as one likes")
+    notes: dict[str, Any] = Field(default_factory=dict, description="free notes")
 
     @model_validator(mode="after")
     def _forwards(self) -> Self:
@@ -76,7 +77,7 @@ class RecordingFile(Strict):
     files: tuple[RecordedFile, ...] = Field(
         min_length=1, description="the CSV files, in the order of their time"
     )
-    segments: tuple[Segment, ...] = Field((), description="what moved how, in the order of time")
+    segments: tuple[Segment, ...] = Field((), description="legs of the motion, in the order of time")
 
 
 @dataclass(frozen=True)
@@ -201,6 +202,31 @@ class Recording:
         for segment in self.segments:
             if not kinds or segment.kind in kinds:
                 yield segment, self.record.between(segment.start_s, segment.end_s)
+
+
+def recordings_among(files: Iterable[str]) -> dict[str, list[str]]:
+    """Returns the recordings that `Recording.load` reads among files (paths or URLs), each with its files.
+
+    A folder with ``recording.yaml`` is one recording, and each CSV file elsewhere is another. A folder with
+    the raw data of a recording but without ``recording.yaml``, which is written last, is not complete yet.
+    """
+    folders: dict[str, list[str]] = {}
+    for each in files:
+        if each.endswith(CSV_NAMES) or PurePosixPath(each).name == ABOUT_NAME:
+            folders.setdefault(posixpath.dirname(each) or ".", []).append(each)
+    found: dict[str, list[str]] = {}
+    for folder, own in folders.items():
+        if any(PurePosixPath(each).name == ABOUT_NAME for each in own):
+            found[folder] = own
+        elif not any(_is_raw(each) for each in own):
+            found |= {each: [each] for each in own}
+    return found
+
+
+def _is_raw(path: str) -> bool:
+    """Returns True for the name of a file that `Recording.save` writes before ``recording.yaml``."""
+    name = PurePosixPath(path)
+    return name.name == RECORD_NAME or name.match("record-[0-9][0-9][0-9]*.csv.gz")
 
 
 def versions_here() -> dict[str, str]:

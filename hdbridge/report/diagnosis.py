@@ -6,7 +6,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Final
 
 from hdbridge import __version__
-from hdbridge.analysis.findings import Diagnosis, Finding
+from hdbridge.analysis.capability import certainty
+from hdbridge.analysis.findings import UNEXPLAINED, Diagnosis, Finding
 from hdbridge.analysis.views import ResidualViews
 from hdbridge.calibration.result import Offer
 from hdbridge.calibration.validation import Validation
@@ -19,11 +20,8 @@ from hdbridge.report.verdict import of_offer
 from hdbridge.report.words import SIGMA, sentence, with_interval
 from hdbridge.units import without_unit
 
-SURE: Final = 0.9
-LIKELY: Final = 0.6
 TOLD: Final = 3
 """Number of findings in the verdict."""
-UNEXPLAINED: Final = "unexplained"
 PLUS_MINUS: Final = "\N{PLUS-MINUS SIGN} 95 %"
 
 
@@ -112,6 +110,7 @@ def _verdict(diagnosis: Diagnosis, stepping: Validation | None) -> str:
             text += f" No cause of the catalogue fits it; {noise}."
         else:
             text += f" With that in the model {after} remain, without it {own} at best; {noise}."
+    text = f"{diagnosis.capability.sentence()} {text}"
     if stepping is not None:
         before, now = stepping.before.pooled.three_sigma_arcsec, stepping.after.pooled.three_sigma_arcsec
         text += f" On the axis, stepping went from {SIGMA} = {before:.2f} to {now:.2f} arcsec."
@@ -126,8 +125,7 @@ def _claim(finding: Finding) -> str:
     name = _title(finding.cause)
     if finding.aliases:
         name = _listed([name, *map(_title, finding.aliases)], "or")
-    doubt = "" if finding.probability >= SURE else "probably " if finding.probability > LIKELY else "perhaps "
-    return f"{doubt}{name}, up to {_two(finding.peak_arcsec)} arcsec"
+    return f"{certainty(finding.probability)}{name}, up to {_two(finding.peak_arcsec)} arcsec"
 
 
 def _to_do(diagnosis: Diagnosis) -> Section:
@@ -238,6 +236,8 @@ def _about(finding: Finding) -> Iterator[tuple[str, str]]:
         yield "name in files", finding.cause
     if finding.note:
         yield "note", sentence(finding.note)
+    if finding.prior:
+        yield "prior", sentence(finding.prior)
 
 
 def _sure(finding: Finding) -> str:

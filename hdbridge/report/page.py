@@ -109,7 +109,7 @@ class Table:
     """Rows of cells. Columns of figures are right-aligned; numbers are shown with two decimals."""
 
     header: Sequence[str | Heading]
-    rows: Sequence[Sequence[str | float]]
+    rows: Sequence[Sequence[Cell]]
     caption: str = ""
 
 
@@ -120,6 +120,15 @@ class Facts:
     rows: Sequence[tuple[str, str]]
 
 
+@dataclass(frozen=True, slots=True)
+class Link:
+    """Cell with a link to another page, by its address relative to this one."""
+
+    text: str
+    address: str
+
+
+Cell = str | float | Link
 Block = Chart | Grid | Table | Facts
 
 
@@ -309,9 +318,11 @@ def _significant(values: FloatArray) -> list[float | None]:
     return [float(f"{value:.{DIGITS - 1}g}") if math.isfinite(value) else None for value in values.tolist()]
 
 
-def _text_of(cell: str | float) -> str:
+def _text_of(cell: Cell) -> str:
     if isinstance(cell, str):
         return cell
+    if isinstance(cell, Link):
+        return Markup('<a href="{}">{}</a>').format(cell.address, cell.text)
     text = f"{cell:.2f}"
     return text.lstrip("-") if float(text) == 0.0 else text.replace("-", "\N{MINUS SIGN}")
 
@@ -320,7 +331,8 @@ def _is_words(table: Table, column: int) -> bool:
     """Returns True for a column of text, which is left-aligned, without figures."""
     cells = [row[column] for row in table.rows if column < len(row)]
     return column == 0 or not any(
-        isinstance(cell, int | float) or _FIGURE.match(cell) is not None for cell in cells
+        isinstance(cell, int | float) or (isinstance(cell, str) and _FIGURE.match(cell) is not None)
+        for cell in cells
     )
 
 

@@ -155,6 +155,6 @@ def _table(results: Mapping[Scheme, SchemeResult], with_article: bool) -> Table:
     if with_article:
         caption = (
             "On the right the article's Table 3. Its own Tables 1 and 2, which this axis has, cannot give "
-            "it: see docs/article-table-3.md"
+            "it: see docs/method.md"
         )
     return Table(header, rows, caption)

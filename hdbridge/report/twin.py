@@ -78,11 +78,11 @@ class TwinReport:
     translated: Sequence[Translated] = ()
     facts: Sequence[tuple[str, str]] = ()
     verdict: str = ""
-    """What the values are worth, and the outcome for the twin, in one sentence."""
+    """Quality of the values, and the outcome for the twin, in one sentence."""
     values: str = ""
-    """Where the values come from (`hdbridge.twin.twin.Values`); empty if nothing was fitted."""
+    """Origin of the values (`hdbridge.twin.twin.Values`); empty if nothing was fitted."""
     left: Sequence[Left] = ()
-    """What the twin leaves of each channel."""
+    """Residuals of each channel."""
     commands: Sequence[Command] = ()
     status: Status = Status.MEASURED
 

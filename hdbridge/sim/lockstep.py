@@ -27,6 +27,7 @@ from hdbridge.device.behaviour import Behaviour
 from hdbridge.device.motion import Machine as AnyMachine
 from hdbridge.device.nameplate import LOAD_OBJECT, Nameplate
 from hdbridge.device.node import DriveNode
+from hdbridge.device.powerstate import PowerStage
 from hdbridge.errors import InputError
 from hdbridge.sim.machine import Machine
 from hdbridge.sim.truth import Truth
@@ -231,6 +232,7 @@ def lockstep_bench(
     nameplate: Nameplate | None = None,
     others: Sequence[Node] = (),
     behaviour: Behaviour | None = None,
+    stage: PowerStage | None = None,
 ) -> Iterator[tuple[LockstepBus, VirtualClock, DriveNode]]:
     """Provides a simulated drive that moves ``machine``, with the master's bus and clock.
 
@@ -242,7 +244,7 @@ def lockstep_bench(
     channel = channel or f"hdbridge-{uuid4()}"
     clock = VirtualClock()
     with _unsearched(), _PolledBus(channel) as node_bus:
-        node = DriveNode(node_bus, machine, eds_path, node_id, clock, nameplate, behaviour)
+        node = DriveNode(node_bus, machine, eds_path, node_id, clock, nameplate, behaviour, stage)
         node.poll(clock.now())
         clock.nodes += [node, *others]
         with LockstepBus(channel, clock) as bus:

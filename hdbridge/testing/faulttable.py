@@ -1,6 +1,6 @@
 """Faults of a simulated drive by name: one row each.
 
-They are those of the fault table in docs/timing-and-faults.md, seen from the other end of the bus: actions of
+They are those of the fault table in docs/reliability.md, seen from the other end of the bus: actions of
 the drive, its encoders, other nodes and the interface. Faults of the program itself (a target that is not a
 number, a full disk) must be made by the program.
 """
@@ -272,11 +272,13 @@ def _slow_brakes(reach: Reach, counts_per_s2: float) -> End:
 
 
 _MISSING = "a TPDO is missing"
-_DUPLICATED = "duplicated, delayed or stale TPDO"
-_WRONG_KIND = "a frame of the wrong kind"
-_JUMP = "encoder jump"
-_OWN_ID = "own identifier from elsewhere"
-_CHANNEL = "a load torque or temperature"
+_DUPLICATED = "a TPDO came twice or out of its cycle"
+_WRONG_KIND = "a frame of the wrong kind was thrown away"
+_JUMP = "an encoder moved faster than the axis can"
+_OWN_ID = "another node sends with an identifier of this master"
+_CHANNEL = "a load torque or temperature did not come, or is not believed"
+_AWAY = "the CAN interface went away"
+_DROPPED_OUT = "the drive left 'operation enabled' by itself"
 
 _ROWS: Final = (
     Row("lost_tpdo", "The next `count` TPDOs are not sent.", _counted("drop_tpdos"), {"count": 1}, _MISSING),
@@ -288,39 +290,39 @@ _ROWS: Final = (
     Row("reordered_tpdos", "After the next `count` SYNCs the TPDOs come in reverse order.",
         _counted("reverse_tpdos"), {"count": 1}),
     Row("short_tpdo", "The next `count` TPDOs come without their last byte.",
-        _counted("shorten_tpdos"), {"count": 1}, "a TPDO of the wrong length"),
+        _counted("shorten_tpdos"), {"count": 1}, "a TPDO has the wrong length"),
     Row("tpdo_stopped", "TPDO `number` is not sent any more, the others are.",
         _tpdo_stopped, {"number": 1}, _CHANNEL, touches=_tpdo),
     Row("cable_pulled", "The drive hears nothing and says nothing.", _wish("silent", True), answers=_MISSING),
-    Row("drive_deaf", "The drive hears nothing, and goes on speaking: to its watchdogs the program hangs.",
-        _wish("deaf", True), answers="hang"),
+    Row("drive_deaf", "The drive hears nothing, but continues to send: to its watchdogs the program hangs.",
+        _wish("deaf", True), answers="the control process stalled for longer than the drive waits"),
     Row("program_stalls", "The program's next wait takes `duration_s` longer (only in lockstep).",
-        _stall, {"duration_s": 0.1}, "overrun", Needs.CLOCK),
+        _stall, {"duration_s": 0.1}, "the cycle started too late", Needs.CLOCK),
     Row("remote_frame", "A remote frame (RTR) with the identifier of TPDO 1.",
         _frame(0x180, own=True, is_remote_frame=True), answers=_WRONG_KIND),
     Row("extended_frame", "A frame with a 29-bit identifier, of the number of TPDO 1.",
         _frame(0x180, bytes(8), own=True, is_extended_id=True), answers=_WRONG_KIND),
     Row("error_frame", "An error frame.", _frame(0x004, bytes(8), is_error_frame=True), answers=_WRONG_KIND),
     Row("bus_off", "The error frame with which a CAN controller says that it went bus-off.",
-        _frame(_BUS_OFF, bytes(8), is_error_frame=True), answers="interface down, deleted, bus-off"),
+        _frame(_BUS_OFF, bytes(8), is_error_frame=True), answers=_AWAY),
     Row("babbling_node", "`count` frames of a node that nobody knows, at once.",
         lambda reach, count: reach.send(0x7E5, bytes(8), times=count), {"count": 300},
-        "more than 256 frames waiting"),
+        "more frames waited than one cycle reads"),
     Row("emergency_burst", "`count` EMCY messages with `code`; the drive goes on.",
-        _emergencies, {"count": 32, "code": 0x3110}, "EMCY"),
+        _emergencies, {"count": 32, "code": 0x3110}, "the drive sent an emergency message"),
     Row("drive_fault", "The drive detects an error, sends EMCY `code`, brakes and goes into FAULT.",
         _drive_fault, {"code": 0x3210}, "the drive reports a fault"),
     Row("enable_lost", "The power stage goes off without a word, as by a hardware enable input.",
-        _once(lambda drive: drive.faults.open_enable_input()), answers="the drive reports a fault"),
+        _once(lambda drive: drive.faults.open_enable_input()), answers=_DROPPED_OUT),
     Row("master_missed", "The drive misses its master, sends EMCY `code` and stops as 6007h says.",
-        _missed, {"code": 0x8130}, "EMCY 8130h or 8250h"),
+        _missed, {"code": 0x8130}, "the drive reports that it missed its master"),
     Row("restart", "The drive restarts, as after a brown-out: boot-up message, every object as at power-on.",
-        _once(lambda drive: drive.faults.boot_up()), answers="boot-up message"),
+        _once(lambda drive: drive.faults.boot_up()), answers="a node restarted"),
     Row("leaves_operational", "The drive goes into NMT PRE-OPERATIONAL; its heartbeat says so.",
-        _once(lambda drive: drive.faults.leave_operational()), answers="boot-up message"),
+        _once(lambda drive: drive.faults.leave_operational()), answers="a node is not operational"),
     Row("heartbeat_lost", "The drive's heartbeat stays away, the rest goes on.",
-        _wish("mute_heartbeat", True), answers="heartbeat older"),
-    Row("second_master_sync", "SYNC of another master.", _frame(0x080), answers="SYNC from elsewhere"),
+        _wish("mute_heartbeat", True), answers="the drive's heartbeat stays away"),
+    Row("second_master_sync", "SYNC of another master.", _frame(0x080), answers="another node sends SYNC"),
     Row("second_master_set_point", "An RPDO of another master: no power, target 0.",
         _frame(0x200, bytes(6), own=True), answers=_OWN_ID),
     Row("second_master_heartbeat", "A heartbeat of another master, node `node_id`.",
@@ -334,22 +336,22 @@ _ROWS: Final = (
         {"counts": 100_000}, _JUMP),
     Row("encoder_glitch", "The load encoder reads `counts` more for the next `samples` samples.",
         _glitch, {"counts": 100_000, "samples": 1}, _JUMP),
-    Row("encoder_frozen", "The load encoder goes on telling the same counts.", _frozen),
+    Row("encoder_frozen", "The load encoder keeps reporting the same counts.", _frozen),
     Row("encoder_drift", "The load encoder drifts by `counts_per_s`.", _drift, {"counts_per_s": 1000.0}),
     Row("motor_encoder_jump", "The motor encoder reads `counts` more; the servo loops act on it.",
         lambda reach, counts: reach.wish("motor_jump_counts", reach.drive.faults.motor_jump_counts + counts),
         {"counts": 1000}, _JUMP),
     Row("motor_weak", "The motor gives at most `percent` of its rated torque, and falls behind.",
-        _weak, {"percent": 0.0}, "following error"),
+        _weak, {"percent": 0.0}, "the drive does not follow its demand"),
     Row("bus_down", "The program's interface goes down (ENETDOWN); its end brings it up again.",
-        _gone(Condition.DOWN), answers="interface down, deleted, bus-off", needs=Needs.INTERFACE),
-    Row("bus_deleted", "The program's interface is deleted (ENXIO); after its end it can be opened anew.",
-        _gone(Condition.DELETED), answers="interface down, deleted, bus-off", needs=Needs.INTERFACE),
+        _gone(Condition.DOWN), answers=_AWAY, needs=Needs.INTERFACE),
+    Row("bus_deleted", "The program's interface is deleted (ENXIO); after its end it can be opened again.",
+        _gone(Condition.DELETED), answers=_AWAY, needs=Needs.INTERFACE),
     Row("transmit_queue_full", "The program's next `count` frames find the transmit queue full (ENOBUFS).",
-        _full, {"count": 1}, "transmit queue full", Needs.INTERFACE),
+        _full, {"count": 1}, "the transmit queue is full", Needs.INTERFACE),
     Row("sdo_silent", "SDO requests are not answered.",
         lambda reach: reach.mute(0x580 + reach.drive.node_id)),
-    Row("wrong_value", "The drive tells `value` for an object, by SDO and in its TPDOs.",
+    Row("wrong_value", "The drive reports `value` for an object, by SDO and in its TPDOs.",
         _told, {"index": 0x2100, "subindex": 0, "value": 32767}, _CHANNEL, touches=_named_object),
     Row("wrong_identity", "Object 1018h:02 says another `product_code`.", _identity, {"product_code": 1}),
     Row("missing_object", "The drive has no object `index`:`subindex` (for good).",
@@ -363,7 +365,10 @@ _ROWS: Final = (
 FAULTS: Final[Mapping[str, Row]] = MappingProxyType({row.name: row for row in _ROWS})
 """All faults by name."""
 
-OF_THE_PROGRAM: Final = ("target NaN", "it stays away for longer")
+OF_THE_PROGRAM: Final = (
+    "the target is not a number within the limits",
+    "a load torque or temperature stays away",
+)
 """Rows of the fault table without a fault here: those of the program, and consequences of another row."""
 
 

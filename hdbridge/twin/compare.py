@@ -14,6 +14,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from hdbridge.analysis.readings import third_deviation
 from hdbridge.effects import Channel, FloatArray
 from hdbridge.errors import InputError
 from hdbridge.records.record import Record
@@ -202,7 +203,7 @@ class Comparison:
 
     rows: tuple[Row, ...]
     traces: Mapping[str, Trace]
-    """By signal."""
+    """Figures by signal."""
     spectra: Mapping[str, Spectrum]
 
     def row(self, channel: str, kind: str = ALL) -> Row | None:
@@ -365,12 +366,6 @@ def _of_signal(
         )
 
 
-MAD_TO_SIGMA: Final = 1.4826
-"""Standard deviation of a normal distribution over its median absolute deviation."""
-THIRD_DIFFERENCE: Final = math.sqrt(20.0)
-"""Amplification of white noise by third differences: the root of 1 + 9 + 9 + 1."""
-
-
 def noise_of(values: FloatArray, which: Rows, parts: Sequence[slice]) -> float:
     """Estimates the noise of a signal from third differences; at least that of its resolution.
 
@@ -383,9 +378,9 @@ def noise_of(values: FloatArray, which: Rows, parts: Sequence[slice]) -> float:
         changes = np.diff(values[part])[inside[1:] & inside[:-1]]
         resolution = min(resolution, least_change(changes, values))
         whole = inside[3:] & inside[2:-1] & inside[1:-2] & inside[:-3]
-        thirds.append(np.abs(np.diff(values[part], 3)[whole]))
+        thirds.append(np.diff(values[part], 3)[whole])
     third = np.concatenate(thirds)
-    spread = MAD_TO_SIGMA * float(np.median(third)) / THIRD_DIFFERENCE if len(third) >= LEAST_SAMPLES else 0.0
+    spread = third_deviation(third) if len(third) >= LEAST_SAMPLES else 0.0
     return max(spread, resolution / math.sqrt(12.0) if math.isfinite(resolution) else 0.0)
 
 

@@ -28,12 +28,13 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 from scipy.special import log_ndtr, ndtr
 
+from hdbridge.analysis.readings import median_deviation
 from hdbridge.axis import AxisConfig
 from hdbridge.effects import FloatArray
 from hdbridge.records.record import Record
 from hdbridge.records.recording import Recording, Segment
 from hdbridge.sim.truth import Truth
-from hdbridge.twin.compare import MAD_TO_SIGMA, noise_of, rms
+from hdbridge.twin.compare import noise_of, rms
 from hdbridge.twin.parameters import FOLLOWING, LOAD, TORQUE, with_load_encoder
 from hdbridge.twin.replay import (
     RINGING_S,
@@ -638,7 +639,7 @@ def scales(data: Data, found: Mapping[str, FloatArray], loops: Loops | None = No
         inside = found[name][rows]
         if len(inside):
             # At least half of the readings in motion are not outliers.
-            typical = MAD_TO_SIGMA * float(np.median(np.abs(beyond(inside, 0.5 * steps[name]))))
+            typical = median_deviation(beyond(inside, 0.5 * steps[name]))
             spread = None if unsteady is None else unsteady[name][rows]
             given[name], stray[name] = deviation(inside, steps[name], max(least[name], typical), spread)
     return Scales(given, steps, stray, loops)
@@ -683,7 +684,7 @@ def with_load_noise(truth: Truth, left_arcsec: FloatArray) -> Truth:
     steps = np.diff(left_arcsec)[inside[1:] & inside[:-1]]
     if not len(steps):
         return truth
-    spread = MAD_TO_SIGMA * float(np.median(np.abs(steps))) / math.sqrt(2.0)
+    spread = median_deviation(steps) / math.sqrt(2.0)
     rounding = ARCSEC_PER_TURN / encoder.counts_per_turn / math.sqrt(12.0)
     noise_arcsec = round(math.sqrt(max(spread**2 - rounding**2, 0.0)), 4)
     return with_load_encoder(truth, noise_arcsec=noise_arcsec)

@@ -280,7 +280,7 @@ def _parameters(truth: Truth) -> Iterator[tuple[tuple[str, str], Any]]:
 
 HEADER: Final = (
     "# The twin of an axis, by hdbridge: what the simulated drive is, learned from recordings.\n"
-    "# docs/truth-file.md describes its keys, docs/twin.md how it came about.\n"
+    "# docs/ci.md describes its keys, docs/twin.md how it came about.\n"
 )
 
 

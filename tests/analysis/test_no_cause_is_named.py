@@ -1,4 +1,4 @@
-"""What fits and what diagnoses knows no cause: what is particular to one stands in its own file."""
+"""Fit and diagnosis know no particular cause: its particulars are in its own file."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How finely an angle was read, and how often it turned, whatever wrote it down."""
+"""Resolution of an angle and its number of turns, for records from any program."""
 
 from __future__ import annotations
 

@@ -179,7 +179,7 @@ def test_a_read_only_object_is_left_to_the_drive_unless_it_is_right(
 
 
 def test_limits_of_the_eds_are_compared_beforehand(tmp_path: Path) -> None:
-    """What a person chose is refused with its line; what nobody chose is left to the drive."""
+    """A value chosen by the user is refused with its line; a default is left to the drive."""
     eds = stating(OWN, "6007", LowLimit=0, HighLimit=1)
     (left,) = left_to_drive(profile_with(tmp_path, eds))
     assert str(left).startswith("6007h:00, for which drive.eds permits 0 to 1, not 3: what it does when")

@@ -23,7 +23,7 @@ TARGETS = (10.0, 17.3, 25.1, 20.2, 12.7, 12.6, 12.7)
 MAXIMUM = 40.0
 BACK = 5600
 Seen = Callable[[float], float | None]
-"""What the encoder shows instead of its reading, degrees."""
+"""Offset of the encoder's reading, degrees."""
 
 
 class Places:

@@ -42,9 +42,9 @@ class Case:
     eds: dict[str, str] = field(default_factory=dict)
     """Edits of the EDS that the axis file names; the drive has the original."""
     drive_has_eds: bool = False
-    """Whether the drive has the edited EDS as well."""
+    """True if the drive has the edited EDS as well."""
     honest: bool = False
-    """Whether the drive's own objects say what the plant really is, rather than what the axis file says."""
+    """True if the drive's own objects describe the real plant rather than the axis file."""
     node_id: int = 1
     spoil: Callable[[DriveNode], None] = lambda node: None
     rows: dict[str, Row[BringUpContext]] = field(default_factory=dict)

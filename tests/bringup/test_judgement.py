@@ -1,4 +1,4 @@
-"""What measured figures mean: the keys that are accused, and the limits between pass and fail."""
+"""Judgement of measured figures: the keys that are at fault, and the limits between pass and fail."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def file(
 
 
 def turned(truth: AxisConfig, by: AxisConfig, motor_deg: float = 360.0) -> Turned:
-    """What is read when an axis that is really ``truth`` is told to turn by the file ``by``."""
+    """Returns the readings of the axis ``truth`` that is commanded to turn by the file ``by``."""
     counts = by.motor_encoder.counts(motor_deg)
     true_motor_deg = truth.motor_encoder.degrees(counts)
     return Turned(counts, truth.load_encoder.counts(true_motor_deg / truth.gear.ratio))

@@ -1,4 +1,4 @@
-"""What a scan finds on a bus, and that it leaves everything as it was."""
+"""A scan finds the nodes of a bus, and leaves everything as it was."""
 
 from __future__ import annotations
 

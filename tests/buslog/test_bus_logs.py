@@ -33,14 +33,14 @@ CYCLES = 1500
 
 @dataclass
 class Logged:
-    """What was on the bus, and what the master knew itself."""
+    """Frames of the bus, and the master's own values."""
 
     messages: list[can.Message] = field(default_factory=list)
     rows: list[tuple[float, int, int, int]] = field(default_factory=list)
     """Time of SYNC in s, motor, load and demand of the drive in counts."""
 
     def write(self, path: Path, *, skip: Callable[[can.Message], bool] = lambda _: False) -> Path:
-        """By python-can's writer for the name."""
+        """Writes the frames by python-can's writer for the file's name."""
         with can.Logger(path) as logger:
             for message in self.messages:
                 if not skip(message):

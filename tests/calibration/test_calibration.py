@@ -11,7 +11,7 @@ from hdbridge.records.recording import Recording
 
 
 def truth(cell):
-    """What only the simulated drive knows."""
+    """Values that only the simulated drive knows."""
     return yaml.safe_load((cell.axis / "truth.yaml").read_text())["gear"]
 
 

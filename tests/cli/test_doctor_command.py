@@ -1,8 +1,9 @@
 """`hdbridge doctor` as a person uses it."""
 
 import json
+from dataclasses import replace
 
-from hdbridge.cli import doctor
+from hdbridge.cli.session import Session
 
 
 def test_doctor_passes_a_sound_axis(hdbridge, tmp_path):
@@ -54,10 +55,8 @@ def test_doctor_on_a_real_bus_without_a_drive(hdbridge):
 
 def test_a_real_axis_moves_only_when_somebody_says_so(hdbridge, monkeypatch):
     """The bus is simulated, but the command does not know it."""
-    real = doctor.connected
-    monkeypatch.setattr(
-        doctor, "connected", lambda axis, files, **options: real(axis, files, **{**options, "simulate": True})
-    )
+    real = Session.connected
+    monkeypatch.setattr(Session, "connected", lambda session: real(replace(session, simulate=True)))
     done = hdbridge("doctor", "article")
     assert done.returncode == 4
     assert "Keep the way clear" in done.stderr

@@ -1,34 +1,14 @@
 """`hdbridge motion` on the simulated drive."""
 
 import json
-import shutil
-from pathlib import Path
 
 import pytest
-
-PROFILE = Path(__file__).resolve().parents[2] / "profiles" / "article"
-RAISED = {
-    "velocity_deg_s: 20": "velocity_deg_s: 130",
-    "acceleration_deg_s2: 200": "acceleration_deg_s2: 300",
-    "following_error_deg: 5.0": "following_error_deg: 90.0",
-    "position_min_deg: -400": "position_min_deg: -1500",
-    "position_max_deg: 400": "position_max_deg: 1500",
-    "maximum_arcsec: 300": "maximum_arcsec: 600",
-    "slew_arcsec_s: 20000": "slew_arcsec_s: 100000",
-}
+from support.raised import raised_profile
 
 
 @pytest.fixture
 def fast(tmp_path):
-    """The article's axis with raised limits."""
-    shutil.copytree(PROFILE, tmp_path / "fast")
-    path = tmp_path / "fast" / "axis.yaml"
-    text = path.read_text(encoding="utf-8")
-    for low, high in RAISED.items():
-        assert low in text
-        text = text.replace(low, high)
-    path.write_text(text, encoding="utf-8")
-    return tmp_path / "fast"
+    return raised_profile(tmp_path / "fast")
 
 
 def test_it_measures_the_response_proposes_it_and_the_committed_model_uses_it(hdbridge, fast, tmp_path):

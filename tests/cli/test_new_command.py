@@ -13,7 +13,7 @@ from hdbridge.sim.lockstep import simulated_bench
 
 @pytest.fixture(scope="module")
 def node():
-    """What the scan of a simulated drive finds."""
+    """Result of a scan of a simulated drive."""
     axis = AxisConfig.load(bundled_profile("article"))
     truth = axis.path.parent / "truth.yaml"
     with simulated_bench(truth, axis.eds_path, axis.drive.node_id) as (bus, clock, _):

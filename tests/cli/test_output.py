@@ -1,4 +1,4 @@
-"""What every command has in common: results that can be written, tables that are whole, a way out."""
+"""Properties of every command: results that can be written, complete tables, a way out."""
 
 import json
 import os

@@ -38,7 +38,7 @@ RIGHT = {
     "--method": "35", "--model": "axis/model.yaml", "--on": "", "--out": "out", "--manifest": "fleet.csv",
     "OUT": "axis", "FOLDER": "out",
 }  # fmt: skip
-"""What a command is given in addition to the wrong value; nothing is ever done with it."""
+"""Arguments in addition to the wrong value; nothing is ever done with them."""
 NEEDED = {
     ("diagnose", "--model"), ("record", "export", "--out"), ("record", "import", "--out"),
     ("fleet", "run", "--out"), ("fleet", "run", "--manifest"),
@@ -57,7 +57,7 @@ PRINTS = {("doctor",)}
 
 @dataclass(frozen=True)
 class Parameter:
-    """What a person types for one parameter of a command, and which values cannot be right."""
+    """Texts for one parameter of a command, and the values that cannot be right."""
 
     name: str
     option: str

@@ -1,4 +1,4 @@
-"""What starts quickly does not load what fits and diagnoses, and the overview says what the commands say."""
+"""Commands that start quickly do not load fit and diagnosis; the overview has the commands' own summaries."""
 
 import inspect
 import subprocess

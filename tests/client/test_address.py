@@ -1,4 +1,4 @@
-"""How a daemon is found."""
+"""Search for a daemon."""
 
 import socket
 from contextlib import ExitStack

@@ -32,7 +32,7 @@ def run_with(effect) -> TransmissionModel:
 
 
 def moments(loads):
-    """What a control loop would know on the way, with a torque and a temperature that change."""
+    """Yields the readings of a control loop on the way, with changing torque and temperature."""
     observer = Observer()
     for index, load in enumerate(loads):
         time_s = index * PERIOD

@@ -143,7 +143,7 @@ lagging = st.builds(
 @settings(deadline=None)
 @given(model=lagging, path=load_paths, start=st.sampled_from(list(Start)))
 def test_the_inverse_of_a_load_that_lags_lets_it_stand_still_and_never_run_back(model, path, start):
-    """Where the law is steeper than the gear, what is inverted is the same law as steep as can be."""
+    """The inverse limits a law that is steeper than the gear to the steepest possible slope."""
     (loop,) = model.effects
     steepest = 0.9 * 3600.0 / model.ratio
     steep = loop.slope_bound_arcsec_per_deg() > steepest

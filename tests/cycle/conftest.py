@@ -105,7 +105,7 @@ class Rig:
         return self.cycle.period_s
 
     def bad_target(self, counts: float) -> None:
-        """What the next cycle is to command."""
+        """Returns the command of the next cycle."""
         self.bad = counts
 
     def move(self, cycles: int = 1) -> Feedback:

@@ -124,7 +124,7 @@ class Disorder(RuleBasedStateMachine):
     @precondition(stopped)
     @rule()
     def start(self) -> None:
-        """All that a person and a service do to get a stopped machine going again."""
+        """Does all that a user and a service do to get a stopped machine going again."""
         for node in self.daemon.nodes:
             node.faults.silent = node.faults.mute_heartbeat = False
         self.go(5)

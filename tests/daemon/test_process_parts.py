@@ -1,4 +1,4 @@
-"""What the processes of the daemon are made of: runtime folder, start, notification, patience, log."""
+"""Parts of the daemon's processes: runtime folder, start, notification, patience, log."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What CiA 301 gives a master besides: node guarding, SYNC with a counter, stored parameters."""
+"""Further services of CiA 301: node guarding, SYNC with a counter, stored parameters."""
 
 from __future__ import annotations
 

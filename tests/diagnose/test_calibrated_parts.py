@@ -1,4 +1,4 @@
-"""What the model knows stays within its calibration, unless the data show that it has changed."""
+"""A known part of the model stays within its calibration, unless the data show that it has changed."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def run_out(
 
 
 def holds(known: float, result: Diagnosis) -> bool:
-    """Whether the order is named alone, with its size, and the spring stays what it was."""
+    """True if the order alone is named, with its size, and the spring is unchanged."""
     (spring,) = (each for each in result.model.effects if each.name == "compliance")
     if [each.cause for each in result.findings] != ["load_order"]:
         return False

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -38,6 +39,9 @@ def test_it_writes_findings_and_an_extended_model(files: tuple[Path, Path], tmp_
     assert [each["cause"] for each in data["findings"]] == ["motor_order"]
     assert "motor_order" in [each.name for each in TransmissionModel.load(new).effects]
     assert "motor_order" in result.output
+    sentence = data["record"]["sentence"]
+    assert result.stdout.startswith(sentence)
+    assert html.escape(sentence) in page.read_text()
     shares = {name: each["share_of_baseline"] for name, each in data["seen_over"].items()}
     assert max(shares, key=lambda name: shares[name]) == "motor angle"
     assert "motor angle" in result.output
@@ -70,7 +74,9 @@ def test_a_plan_is_judged_before_anything_moves(files: tuple[Path, Path], tmp_pa
     )
     out = tmp_path / "plan.json"
     command = ["diagnose", "--plan", str(plan), "--model", str(files[1]), "--json", str(out)]
-    assert RUN.invoke(app, command, catch_exceptions=False).exit_code == 0
+    result = RUN.invoke(app, command, catch_exceptions=False)
+    assert result.exit_code == 0
+    assert result.stdout.startswith("This plan has no torque at the load: ")
     found = json.loads(out.read_text())["identifiability"]
     assert found["motor_order"]["detectable"]
     # Six motor turns are an eighth of a load turn: nothing tells these apart.

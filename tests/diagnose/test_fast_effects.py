@@ -1,4 +1,4 @@
-"""What is fast is no noise: the floor beside it, its frequency, and what is over soon after a stop."""
+"""Fast effects are not noise: the floor beside them, their frequency, and decay soon after a stop."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from hdbridge.model import TransmissionModel
 from hdbridge.records.record import Record, concatenate
 
 NOISE_ARCSEC = 0.35
-"""Of the plant: white noise, and the rounding of its load encoder."""
+"""Noise of the plant: white noise, and the rounding of its load encoder."""
 
 
 def diagnosed(plant: ModuleType, effects: dict[str, Any], seed: int, rate_hz: float = 16.0) -> Diagnosis:
@@ -32,7 +32,7 @@ def names(found: Diagnosis) -> list[str]:
 
 
 def often_enough(right: int, of: int, rate: float) -> bool:
-    """Whether so many right ones are no evidence against a rate, at 1 %."""
+    """True if so many right ones are no evidence against a rate, at 1 %."""
     return float(bdtr(right, of, rate)) > 0.01
 
 
@@ -90,7 +90,7 @@ def test_a_damaged_tooth_is_named_beside_an_order_of_the_load(plant: ModuleType)
 
 
 def test_more_than_an_arcsec_that_depends_on_nothing_is_unexplained(plant: ModuleType) -> None:
-    """It wanders while the axis moves, by 1.7 arcsec; a count of the motor is 0.9 arcsec rms in addition."""
+    """The error wanders in motion by 1.7 arcsec; a count of the motor adds 0.9 arcsec rms."""
     record = plant.record(plant.Truth(), plant.Plan(rate_hz=16.0, scale=0.1, load_turns=1.05, steps=8), 71)
     time_s = record["time_s"]
     decay = float(np.exp(time_s[0] - time_s[1]))

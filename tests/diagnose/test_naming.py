@@ -1,4 +1,4 @@
-"""What separates causes that look alike, and how sure a name is."""
+"""Separation of causes that look alike, and the certainty of a name."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def test_a_drift_of_ripple_stands_beside_a_much_larger_skew(diagnosed: Diagnosed
 
 
 def test_a_ripple_that_is_loaded_and_warm_has_grown_by_both(diagnosed: Diagnosed) -> None:
-    """By the product of both; a sum would put a quarter of the one down to the other."""
+    """The causes combine as a product; a sum would attribute a quarter of one to the other."""
     effects = {"torque_modulation": {"growth": 0.06}, "amplitude_drift": {"ripple": -0.04}}
     result = diagnosed(effects, torque_nm=9.0, temperature_rise_k=10.0)
     found = {each.cause: each.parameters for each in result.findings}
@@ -86,7 +86,7 @@ def test_what_is_left_in_one_episode_casts_no_shadow_on_what_is_seen_everywhere(
 def test_a_wind_up_that_every_axis_has_is_allowed_for_and_not_named(diagnosed: Diagnosed) -> None:
     result = diagnosed({"inertial_windup": {"s2": 6e-6}})
     assert names(result) == []
-    assert "inertial_windup: no more than usual" in result.considered
+    assert any("swings on its spring" in each for each in result.remarks)
     assert "inertial_windup" not in {each.name for each in result.model.effects}
 
 

@@ -1,4 +1,4 @@
-"""How often a hidden cause is named first, and how often something is named that is not there.
+"""Rate of hidden causes that are named first, and rate of false names.
 
 One record says little: what is claimed is a rate, and what is counted over records drawn at random has to be
 as large as that rate allows. A few in every run; more of them in the slow tests, and in the blind suites.
@@ -32,7 +32,7 @@ def judged(names: Iterable[str], seeds: Iterable[int]) -> dict[str, Verdict]:
 
 
 def holds(verdicts: dict[str, Verdict], rate: float, good: str) -> None:
-    """Whether as many are ``good`` (a member of `Verdict`, or ``silent``) as the rate allows."""
+    """True if as many are ``good`` (a member of `Verdict`, or ``silent``) as the rate allows."""
     bad = [
         (name, each)
         for name, each in verdicts.items()

@@ -40,7 +40,7 @@ HELD = 0.95
 
 
 def parameters(record: dict[str, Any], model: TransmissionModel, effect: Effect) -> dict[str, Parameter]:
-    """Of an effect that is fitted to a record together with the model."""
+    """Returns the figures of an effect that is fitted to a record together with the model."""
     estimator = Estimator(gather(Record(record), 50.0))
     hypothesis = Hypothesis((*model.effects, effect), Start.FORWARD)
     precise = precisely(estimator, estimator.fit(hypothesis))
@@ -54,7 +54,7 @@ def holds(parameter: Parameter, truth: float) -> bool:
 
 
 def enough(inside: list[bool]) -> bool:
-    """Whether as many are inside as the intervals say, but for chance."""
+    """True if as many are inside as the intervals promise, but for chance."""
     return sum(inside) >= least(len(inside), HELD)
 
 
@@ -97,7 +97,7 @@ def test_what_is_there_without_a_delay_is_no_evidence_of_one(
 def test_a_motor_that_comes_back_within_its_counts_at_rest_is_no_evidence_of_creep(
     plant: ModuleType, columns: Columns, model: TransmissionModel, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """It moves 0.8 counts ahead of its command, stays so for 0.3 s after each stop, and lets go."""
+    """The motor is 0.8 counts ahead of its command, stays so for 0.3 s after each stop, and then lets go."""
     path, told = plant.path, []
 
     def ahead(plan: Any, rng: np.random.Generator) -> Any:

@@ -1,4 +1,4 @@
-"""What the catalogue lacks: how little of it is seen, and what is no such thing."""
+"""Causes that the catalogue lacks: the smallest visible size, and what must not count as one."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The example of docs/ci.md, taken from the page: on every bus that is here, by real runs of pytest."""
+"""The example of docs/ci.md, in docs/ci-example: on every bus that is here, by real runs of pytest."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def test_the_example_in_two_processes(pytester):
 
 def steps() -> list[str]:
     """The commands of the workflow."""
-    workflow = yaml.safe_load(ci_page.files()[ci_page.WORKFLOW])
+    workflow = yaml.safe_load(ci_page.WORKFLOW.read_text("utf-8"))
     return [step["run"] for job in workflow["jobs"].values() for step in job["steps"] if "run" in step]
 
 
@@ -76,7 +76,7 @@ def test_what_stands_for_gitlab_does_the_same():
     lines = re.search(r"\n\n((?: {4}.*\n)+)", after)
     assert lines is not None
     job = yaml.safe_load(textwrap.dedent(lines[1]))["motion"]
-    one_process = yaml.safe_load(ci_page.files()[ci_page.WORKFLOW])["jobs"]["one-process"]
+    one_process = yaml.safe_load(ci_page.WORKFLOW.read_text("utf-8"))["jobs"]["one-process"]
     assert job["script"] == [step["run"] for step in one_process["steps"] if "run" in step]
 
 
@@ -98,7 +98,7 @@ def test_the_workflow_takes_vcan_where_it_is(tmp_path: Path, has_vcan: bool, bus
 
 
 def test_the_program_knows_nothing_of_hdbridge(tmp_path):
-    """It runs where there is none."""
+    """The workflow runs on a runner without a CAN interface."""
     ci_page.write(tmp_path)
     loaded = "sorted(each for each in sys.modules if each.partition('.')[0] in ('hdbridge', 'canopen'))"
     done = subprocess.run(

@@ -1,4 +1,4 @@
-"""What the documents promise: links that lead somewhere, commands that exist, examples that run."""
+"""Promises of the documents: links lead somewhere, commands exist, examples run."""
 
 import re
 from pathlib import Path

@@ -158,7 +158,7 @@ def test_another_drive_or_another_scale_is_refused(
 
 
 def test_a_feed_that_only_informs(bus: Any, tiny: Any, clock: Any, build_axis: Any) -> None:
-    """Where 6092h does not scale, the error names the line that says so, and with it the drive is taken."""
+    """If 6092h does not scale, the error names the line that does; with it, the drive is accepted."""
     tiny.values[0x6092, 1] = 360_000
     with pytest.raises(IdentityError, match=r"'feed_scales: false' under axis.yaml: drive"):
         Drive(bus, build_axis(), clock, tiny.od).boot()

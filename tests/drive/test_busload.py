@@ -21,7 +21,7 @@ def with_bus(axis: AxisConfig, bitrate_bps: int) -> AxisConfig:
 
 
 def stuffed_bits(bits: list[int]) -> list[int]:
-    """What the bit-stuffing rule makes of bits: after five alike comes one of the other kind."""
+    """Applies the bit-stuffing rule: after five equal bits follows one of the other kind."""
     sent: list[int] = []
     alike = 0
     for bit in bits:

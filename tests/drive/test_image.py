@@ -242,7 +242,7 @@ def test_the_statusword_is_taken_from_wherever_it_is_mapped(other: Callable[[str
 def test_without_a_demand_the_target_stands_in_that_the_drive_has_reached(
     other: Callable[[str], ProcessImage],
 ) -> None:
-    """What is sent after SYNC k is taken at SYNC k+1, and reached at SYNC k+2."""
+    """A target sent after SYNC k is taken at SYNC k+1, and reached at SYNC k+2."""
     image = other(without(OWN, 0x6062))
     image.seed(1000, 0, 0x0027)
     image.power.go(State.OPERATION_ENABLED)

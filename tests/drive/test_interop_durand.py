@@ -11,112 +11,12 @@ from typing import Any
 
 import can
 import pytest
-from durand.datatypes import DatatypeEnum as DT
-from durand.network import NetworkABC
-from durand.node import MinimalNode
-from durand.object_dictionary import Array, Record, Variable
-from durand.scheduler import VirtualScheduler, get_scheduler, set_scheduler
+from durand.scheduler import get_scheduler, set_scheduler
+from support.foreign_slaves import NODE_ID, DurandDrive
 
 from hdbridge.axis import AxisConfig
 from hdbridge.drive import Drive, Mode, State, load_eds
 from hdbridge.errors import IdentityError, SdoError
-
-NODE_ID = 5
-
-
-class PolledNetwork(NetworkABC):
-    """durand's network over a python-can bus, without a thread."""
-
-    def __init__(self, bus: can.BusABC) -> None:
-        self.bus = bus
-        self.subscriptions: dict[int, Callable[[int, bytes], None]] = {}
-
-    def add_subscription(self, cob_id: int, callback: Callable[[int, bytes], None]) -> None:
-        self.subscriptions[cob_id] = callback
-
-    def remove_subscription(self, cob_id: int) -> None:
-        self.subscriptions.pop(cob_id)
-
-    def send(self, cob_id: int, msg: bytes) -> None:
-        self.bus.send(can.Message(arbitration_id=cob_id, data=msg, is_extended_id=False))
-
-    def poll(self) -> None:
-        while (message := self.bus.recv(0)) is not None:
-            callback = self.subscriptions.get(message.arbitration_id)
-            if callback is not None:
-                callback(message.arbitration_id, bytes(message.data))
-
-
-class DurandDrive:
-    """A durand node with the objects of CiA 402 and a state machine of a few lines."""
-
-    def __init__(self, bus: can.BusABC, clock: Any) -> None:
-        self.clock, self.last_s = clock, clock.now()
-        self.scheduler = VirtualScheduler()
-        set_scheduler(self.scheduler)
-        self.network = PolledNetwork(bus)
-        self.node = MinimalNode(self.network, NODE_ID)
-        self.od = self.node.object_dictionary
-        self.state = 0x40
-        self._objects()
-        self.od.download_callbacks[0x6040, 0].add(self._control)
-        self.od.download_callbacks[0x607A, 0].add(self._target)
-
-    def _objects(self) -> None:
-        od = self.od
-        for index, datatype, access, value in (
-            (0x6007, DT.INTEGER16, "rw", 1),
-            (0x6040, DT.UNSIGNED16, "rw", 0),
-            (0x6041, DT.UNSIGNED16, "ro", 0x40),
-            (0x605A, DT.INTEGER16, "rw", 2),
-            (0x605D, DT.INTEGER16, "rw", 1),
-            (0x6060, DT.INTEGER8, "rw", 0),
-            (0x6062, DT.INTEGER32, "ro", 0),
-            (0x6064, DT.INTEGER32, "ro", 1234),
-            (0x6065, DT.UNSIGNED32, "rw", 0),
-            (0x6066, DT.UNSIGNED16, "rw", 0),
-            (0x6072, DT.UNSIGNED16, "rw", 0),
-            (0x6077, DT.INTEGER16, "ro", 0),
-            (0x607A, DT.INTEGER32, "rw", 0),
-            (0x6080, DT.UNSIGNED32, "rw", 0),
-            (0x6502, DT.UNSIGNED32, "ro", 0x81),
-        ):
-            od[index] = Variable(datatype, access, value, name=f"Object {index:04X}")
-        od[0x6061] = Variable(DT.INTEGER8, "ro", 0, name="Modes of operation display")
-        od.set_read_callback(0x6061, 0, lambda: od.read(0x6060, 0))
-        limits, cycle = Record(name="Software position limit"), Record(name="Interpolation time period")
-        for sub in (1, 2):
-            limits[sub] = Variable(DT.INTEGER32, "rw", 0, name=f"Limit {sub}")
-        cycle[1] = Variable(DT.UNSIGNED8, "rw", 1, name="Value")
-        cycle[2] = Variable(DT.INTEGER8, "rw", -3, name="Index")
-        od[0x607D], od[0x60C2] = limits, cycle
-        od[0x60E4] = Array(Variable(DT.INTEGER32, "ro", 0, name="Additional position"), length=1)
-        od.write(0x1000, 0, 0x0002_0192)
-        for sub, value in ((1, 0x4844), (2, 0x402), (3, 0x10000)):
-            od.write(0x1018, sub, value)
-        od.write(0x60E4, 1, 1234 * 36 // 5)
-
-    def poll(self) -> None:
-        now_s = self.clock.now()
-        self.scheduler.run(now_s - self.last_s)
-        self.last_s = now_s
-        self.network.poll()
-
-    def _control(self, word: int) -> None:
-        if not word & 0x02:
-            self.state = 0x40
-        elif not word & 0x04:
-            self.state = 0x07 if self.state in (0x27, 0x07) else 0x40
-        else:
-            steps = {(0x40, 0x06): 0x21, (0x21, 0x07): 0x23, (0x23, 0x0F): 0x27, (0x27, 0x07): 0x23}
-            self.state = steps.get((self.state, word & 0x0F), self.state)
-        self.od.write(0x6041, 0, self.state)
-
-    def _target(self, counts: int) -> None:
-        if self.state == 0x27:
-            self.od.write(0x6062, 0, counts)
-            self.od.write(0x6064, 0, counts)
-            self.od.write(0x60E4, 1, counts * 36 // 5)
 
 
 @pytest.fixture

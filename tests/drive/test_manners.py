@@ -178,7 +178,7 @@ def test_a_lock_that_cannot_be_opened_is_said(tmp_path: Path) -> None:
 
 
 def test_opening_a_bus_takes_the_lock(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """What the interface is does not matter: nothing of it is opened before the lock is there."""
+    """The kind of interface does not matter: it is not opened before the lock is held."""
     monkeypatch.setattr("hdbridge.drive.interfacelock._folder", lambda: tmp_path)
     settings = AXIS.on_bus(interface="socketcan", channel="absent0").bus
     with interface_lock("socketcan", "absent0"):

@@ -200,5 +200,5 @@ def test_without_an_aim_no_statusword_ever_makes_it_enable(words: list[int]) -> 
 
 
 def test_the_diagram_of_the_docs_is_that_of_the_table() -> None:
-    page = Path(__file__).parents[2] / "docs" / "master.md"
+    page = Path(__file__).parents[2] / "docs" / "architecture.md"
     assert mermaid() in page.read_text(encoding="utf-8")

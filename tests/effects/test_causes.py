@@ -1,4 +1,4 @@
-"""What is each cause's own: the figures of its source, its limits, what makes it what it is."""
+"""Particulars of each cause: the figures of its source, its limits, its characteristic form."""
 
 import math
 

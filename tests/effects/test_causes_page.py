@@ -12,10 +12,14 @@ def test_the_page_of_causes_is_up_to_date():
 
 
 def test_every_cause_has_its_section_with_every_parameter():
+    overview = catalogue_docs.page().split("\n## ")[0]
     sections = {each.split("\n", 1)[0]: each for each in catalogue_docs.page().split("\n## ")[1:]}
     assert list(sections) == list(CATALOGUE)
     for name, kind in CATALOGUE.items():
         for parameter in kind.model_fields:
             assert f"`{parameter}`" in sections[name]
-        for words in ("Signature", "What it does to the axis", "What to do about it", "Separate it", "Needs"):
+        for words in ("What to do", "Separate it", "Source"):
             assert f"**{words}**" in sections[name]
+        assert ("**Not compensated**" in sections[name]) is not kind.compensable.possible
+        assert kind.about.signature in overview
+        assert kind.about.consequence in sections[name]

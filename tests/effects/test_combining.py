@@ -1,4 +1,4 @@
-"""How effects go together in a model, and that the compensation makes up for what it should."""
+"""Effects combine in a model, and the compensation corrects what it should."""
 
 import math
 

@@ -112,7 +112,7 @@ def test_a_name_is_taken_once(taut_cable: type[Effect]) -> None:
     assert register(taut_cable) is taut_cable
 
     class Other(taut_cable):  # type: ignore[misc, valid-type]
-        """Of the same name."""
+        """The effect of the same name."""
 
     with pytest.raises(InputError, match="give yours another name"):
         register(Other)

@@ -43,7 +43,7 @@ NrOfEntries=2
 
 
 def described(dictionary):
-    """All that a file says of each object."""
+    """Returns the entries of a file for each object."""
     found = {}
     for entry in dictionary.values():
         for each in [entry] if hasattr(entry, "data_type") else entry.subindices.values():

@@ -53,7 +53,7 @@ WORDS = {
     "order": expected_words(field_at(Synchronous, ("orders", 0, "order"))),
     **{name: expected_words(field_at(Hysteresis, (name,))) for name in Hysteresis.model_fields},
 }
-"""What the effects' own fields say of themselves."""
+"""Descriptions of the effects' own fields."""
 
 
 def test_the_words_of_a_field_are_its_type_its_range_and_its_description():

@@ -1,6 +1,7 @@
 """``hdbridge fleet`` as a person types it."""
 
 import json
+import re
 
 import pytest
 from support.command import run_here
@@ -23,6 +24,28 @@ def test_run_and_report_print_and_write_what_they_say(fleet, scheduler, tmp_path
     assert found["joints"] == 3
     assert len(found["failed"]) == 2
     assert (tmp_path / "page.html").exists()
+    check_pages(tmp_path)
+
+
+def check_pages(folder):
+    """The page of a joint is written on demand, and its link still works after the folder was moved."""
+    assert 'href="pages' not in (folder / "out" / "fleet.html").read_text()
+    done = run_here(folder, "fleet", "report", "out", "--joint", "J2", "--pages")
+    assert done.returncode == 0, done.stderr
+    (folder / "out").rename(folder / "moved")
+    page = (folder / "moved" / "fleet.html").read_text()
+    links = dict(re.findall(r'<a href="(pages/[^"]+)">([^<]+)</a>', page))
+    assert "J2" in links.values()
+    for address, joint in links.items():
+        assert f"Diagnosis of joint {joint}" in (folder / "moved" / address).read_text()
+    (old,) = (folder / "moved" / "pages").glob("J2-*.html")
+    old.rename(old.with_name("J2-0123456789ab.html"))  # of an earlier recording
+    done = run_here(folder, "fleet", "report", "moved", "--joint", "J2", "--html", "elsewhere.html")
+    assert [each.name for each in (folder / "moved" / "pages").glob("J2-*.html")] == [old.name]
+    assert f'href="{old.resolve().as_uri()}"' in (folder / "elsewhere.html").read_text()
+    wrong = run_here(folder, "fleet", "report", "moved", "--joint", "J22")
+    assert wrong.returncode == 2
+    assert "did you mean J2?" in wrong.stderr
 
 
 @pytest.mark.parametrize(

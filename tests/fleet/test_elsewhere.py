@@ -13,11 +13,11 @@ from support.fleet import MODEL, record
 from support.flight import flight_log, samples
 
 from hdbridge.daemon.recorder.flightlog import Batch
-from hdbridge.fleet.diagnosing import Model, axes_of, diagnosed
+from hdbridge.fleet.diagnosing import axes_of, diagnosed, model_in
 from hdbridge.fleet.sources import Source, find_sources, with_axes
 from hdbridge.records.recording import Recording
 
-KNOWN = Model(MODEL)
+KNOWN = model_in(MODEL, "model.yaml")
 pytestmark = pytest.mark.filterwarnings("ignore")  # of the servers and clients
 
 
@@ -33,7 +33,7 @@ def check_fleet_at(url):
 
 @pytest.fixture(autouse=True)
 def collected():
-    """What clients leave open is closed within the test that opened it."""
+    """Closes the files that clients leave open within the test that opened them."""
     yield
     for protocol in ("s3", "sftp"):
         with suppress(ImportError):

@@ -1,4 +1,4 @@
-"""Where recordings come from: folders, globs, URLs and manifests."""
+"""Sources of recordings: folders, globs, URLs and manifests."""
 
 from contextlib import suppress
 

@@ -1,4 +1,4 @@
-"""What the statistics of a fleet promise, on fleets whose truth is known."""
+"""Promises of the statistics of a fleet, on fleets of known truth."""
 
 import numpy as np
 import pytest
@@ -204,3 +204,4 @@ def test_recordings_without_orders_are_left_out():
     orders = np.full((3, 8), np.nan + 0j)
     assert identities(orders, [0, 0, 1], [0, 1, 2]) == [None, None, None]
     assert identities(np.empty((0, 8), dtype=complex), [], []) == []
+    assert identities(np.empty((2, 0), dtype=complex), [0, 0], [0, 1]) == [None, None]

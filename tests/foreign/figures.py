@@ -48,7 +48,7 @@ def ripple_arcsec(truth: Truth, speed_deg_s: float, correction: np.ndarray) -> f
 
 
 def removed_percent(truth: Truth, speed_deg_s: float) -> tuple[float, float]:
-    """By the static correction, and by the one that the response is taken out of."""
+    """Figures of the static correction, and of the one filtered by the response."""
     orders = truth.mechanics.motor_orders
     frequency_hz = np.array([o.order for o in orders]) * speed_deg_s * truth.mechanics.ratio / 360.0
     error = np.array([o.amplitude_arcsec * np.exp(1j * math.radians(o.phase_deg)) for o in orders])

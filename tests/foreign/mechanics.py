@@ -1,6 +1,6 @@
 """A harmonic-drive axis: motor, gear with transmission error, spring, load and friction.
 
-Parameters have the names and units of docs/truth-file.md. With q the motor angle and p the load angle:
+Parameters have the names and units of docs/ci.md. With q the motor angle and p the load angle:
 
     output  u(q) = q / N + tooth(q) + h(q)          h: hysteresis, a function of the motor's travel
     spring  T    = K (u - p) + D (u' - p')

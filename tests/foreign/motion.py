@@ -29,6 +29,7 @@ import yaml
 from foreign.bench import foreign_bench
 from foreign.draw import draw
 from foreign.servos import STRUCTURES
+from support.raised import ARTICLE, raised_axis
 
 from hdbridge import Bench, Drive
 from hdbridge.analysis.response import Harmonics, harmonics, order_hz
@@ -61,24 +62,15 @@ validation: {count: 20, step_deg: 43.56, motion: true}
 """
 """The plan `quick` without its long sweep: minutes."""
 DATE = datetime(2026, 1, 1, tzinfo=UTC)
-PROFILE = Path(__file__).resolve().parents[2] / "profiles" / "article"
-RAISED = {
-    "position_min_deg": -4000.0,
-    "position_max_deg": 4000.0,
-    "velocity_deg_s": 130.0,
-    "acceleration_deg_s2": 300.0,
-}
 
 
 @contextmanager
 def simulated(seed: int, folder: Path) -> Iterator[tuple[Drive, TransmissionModel]]:
     """The article's gear on a drawn servo, load and spring; the axis file with raised limits."""
     rng = np.random.default_rng([32, seed])
-    axis = yaml.safe_load((PROFILE / "axis.yaml").read_text(encoding="utf-8"))
-    truth = yaml.safe_load((PROFILE / "truth.yaml").read_text(encoding="utf-8"))
-    axis["limits"] |= RAISED
+    axis = yaml.safe_load(raised_axis())
+    truth = yaml.safe_load((ARTICLE / "truth.yaml").read_text(encoding="utf-8"))
     axis["drive"]["following_error_deg"] = 360.0
-    axis["compensation"] |= {"maximum_arcsec": 600, "slew_arcsec_s": 100000}
     load = float(0.225 * math.exp(rng.uniform(math.log(0.3), math.log(3.0))))
     held = float(rng.uniform(15.0, 80.0))
     truth["load"]["inertia_kg_m2"] = load
@@ -98,7 +90,7 @@ def simulated(seed: int, folder: Path) -> Iterator[tuple[Drive, TransmissionMode
     (folder / "axis.yaml").write_text(yaml.safe_dump(axis), encoding="utf-8")
     (folder / "truth.yaml").write_text(yaml.safe_dump(truth), encoding="utf-8")
     config = AxisConfig.load(folder)
-    model = TransmissionModel.load(PROFILE / "model.yaml")
+    model = TransmissionModel.load(ARTICLE / "model.yaml")
     with (
         simulated_bench(folder / "truth.yaml", config.eds_path, seed=seed) as (bus, clock, _),
         Drive(bus, config, clock) as drive,

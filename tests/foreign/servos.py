@@ -8,7 +8,7 @@
 | `StateFeedback` | position and speed of an extended state observer | reference model | acceleration |
 
 A servo samples the demand and the motor encoder once per period and holds its torque until the next sample.
-Parameters that docs/truth-file.md has keep its names and units. Gains refer to motor radians.
+Parameters that docs/ci.md has keep its names and units. Gains refer to motor radians.
 """
 
 from __future__ import annotations

@@ -111,7 +111,7 @@ def bouc_wen() -> Truth:
 
 @dataclass(frozen=True)
 class Bench:
-    """What is hidden, and what is run to find it."""
+    """The hidden cause, and the command that has to find it."""
 
     parts: Parts
     causes: tuple[str, ...]
@@ -203,7 +203,7 @@ def cell(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactor
 
 
 def told(cell: Cell) -> str:
-    """What was hidden and what was found, for a person who looks at a failure."""
+    """Returns the hidden cause and the findings, for the message of a failure."""
     hidden = "; ".join(each.text for each in cell.hidden) or "nothing"
     findings = cell.diagnosis.findings
     found = "; ".join(f"{each.cause} {each.probability:.2f} or {each.aliases}" for each in findings)

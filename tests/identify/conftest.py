@@ -29,7 +29,7 @@ class Axis:
     load_first: float = 0.0
     motor_counts: float = 65536.0
     behind_counts: float = 0.0
-    """By so many counts the motor lags what its encoder says, in the direction of motion."""
+    """Lag of the motor behind its encoder in the direction of motion, counts."""
     zero_arcsec: float = 700.0
 
     def error(self, motor_deg: np.ndarray, state: float = 1.0) -> np.ndarray:
@@ -108,7 +108,7 @@ def bench_plan(turns: float = 20.0, speed: float = 200.3) -> list[tuple[str, np.
 
 @dataclass(frozen=True)
 class Bench:
-    """What tests need of this file."""
+    """Names of this file that the tests use."""
 
     axis = Axis
     ramp = staticmethod(ramp)

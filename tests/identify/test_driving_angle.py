@@ -100,7 +100,7 @@ def test_what_follows_the_acceleration_is_as_large_as_it_is_at_any_sampling_rate
 def test_a_record_that_begins_and_ends_in_motion_has_the_acceleration_that_is_seen_of_it(
     rate_hz: float,
 ) -> None:
-    """It grows in proportion to time, and so needs no correction, neither inside nor at the ends."""
+    """The drift is proportional to time, and needs no correction, neither inside nor at the ends."""
     time = np.arange(0.0, 1.0, 1.0 / rate_hz)
     command = 200.0 * time + 300.0 * time**3
     acceleration = kinematics(command, command, time, reading_of(command))[2]

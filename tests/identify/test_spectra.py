@@ -29,7 +29,7 @@ def all_fitted(motor_deg, error_arcsec, orders):
 
 
 def test_a_stepping_test_shows_each_order_where_it_is():
-    """By sample number order 6 would stand at 2.26 and order 8 at 0.26 per turn."""
+    """Against the sample number, order 6 would be at 2.26 and order 8 at 0.26 per turn."""
     motor = np.arange(240) * 43.56
     truth = [(1, 4.9, -126.8), (2, 9.33, -132.1), (6, 3.18, -127.0), (8, 1.87, 124.3)]
     found = all_fitted(motor, waves(motor, truth) + 12.0, motor_orders(10))

@@ -1,4 +1,4 @@
-"""Where a record cannot tell something, the fit says so in words and does not make it up."""
+"""Limits of a record: the fit reports what cannot be determined, and does not invent it."""
 
 from dataclasses import replace
 

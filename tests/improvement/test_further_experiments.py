@@ -1,4 +1,4 @@
-"""What the axis runs next by itself: the shortest experiment that is predicted to tell causes apart."""
+"""Choice of the next experiment: the shortest one that is predicted to separate causes."""
 
 from dataclasses import dataclass
 

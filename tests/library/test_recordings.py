@@ -1,4 +1,4 @@
-"""What a bench has measured goes straight into a file, a fit and a diagnosis, which check it."""
+"""A measurement of a bench goes straight into a file, a fit and a diagnosis, which check it."""
 
 import numpy as np
 import pytest

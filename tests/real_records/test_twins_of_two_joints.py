@@ -1,4 +1,4 @@
-"""What a simulated drive gets right and wrong of two robot joints that somebody else measured.
+"""Agreement of a simulated drive with two robot joints that somebody else measured.
 
 The records are looked for as in `test_measured_records.py`; without them these tests are skipped.
 """

@@ -1,4 +1,4 @@
-"""What the page about the article's Table 3 says is what its script computes."""
+"""The page about the article's Table 3 has the figures that its script computes."""
 
 import re
 from pathlib import Path
@@ -21,7 +21,7 @@ def figures(tool):
 
 @pytest.fixture(scope="module")
 def page():
-    return (ROOT / "docs" / "article-table-3.md").read_text(encoding="utf-8")
+    return (ROOT / "docs" / "method.md").read_text(encoding="utf-8")
 
 
 def test_the_computed_table_of_the_page_is_the_computed_one(figures, page):

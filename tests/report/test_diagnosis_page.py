@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from hdbridge.analysis.capability import Capability
 from hdbridge.analysis.findings import Diagnosis, Figures, Finding, Identifiability, Parameter, Traces
 from hdbridge.analysis.gain import Gain
 from hdbridge.calibration.result import Offer
@@ -108,6 +109,9 @@ def unexplained(lives_in="load angle and direction"):
     )
 
 
+CAPABILITY = Capability(("no slow motion", "no reversals"), ("orders",), (), ("hysteresis", "backlash"), 0.97)
+
+
 def diagnosis(*findings, driven=MOTION, noise=0.5):
     rng = np.random.default_rng(7)
     model = MODEL.predict(driven, Start.FORWARD)
@@ -129,6 +133,7 @@ def diagnosis(*findings, driven=MOTION, noise=0.5):
             "load_order": Identifiability(True, 0.7, ("compliance",), 0.9),
             "vibration": Identifiability(False, None, (), 0.0, "nothing <in> this record"),
         },
+        capability=CAPABILITY,
         by_kind={"standing": (Figures(2.0, 6.0), Figures(0.4, 1.2)), "forward": (Figures(3.0, 9.0),) * 2},
         remarks=("no command (motor_target_deg)",),
         model=TransmissionModel(RATIO, effects),
@@ -343,7 +348,8 @@ def test_a_stepping_test_says_what_was_gained_on_the_axis():
     offer = Offer(True, "offered for commit: stepping 12 to 3.2 arcsec", Path("my-axis/pending.yaml"))
     text = page(finding(), stepping=Validation(before, after, Floor(2.84, 0.0)), offer=offer)
     said = words(text)
-    assert "Pending. Offered for commit: stepping 12 to 3.2 arcsec. The model is off by" in said
+    assert "Pending. Offered for commit: stepping 12 to 3.2 arcsec. This record has no slow motion" in said
+    assert "hysteresis and backlash cannot. The model is off by" in said
     assert "hdbridge model commit my-axis" in said
     assert "On the axis, stepping went from 3σ = 12.00 to 3.20 arcsec." in said
     assert "before: the active model 12.00" in said

@@ -190,7 +190,7 @@ def truths(draw: st.DrawFn) -> Truth:
 
 
 def led(machine: Machine, seed: int, cycles: int = 150) -> list[tuple[Any, ...]]:
-    """What it says in moves, holds and with its power off."""
+    """Readings in moves, at rest and without power."""
     lot = random.Random(seed)
     rows, place, speed = [], 0.0, 0.0
     for cycle in range(cycles):

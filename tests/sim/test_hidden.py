@@ -88,13 +88,13 @@ def bare() -> Errors:
 
 
 def peak(there: Errors, here: Errors) -> float:
-    """Of a wave about zero, while moving evenly."""
+    """Returns the amplitude of a wave about zero, while moving evenly."""
     change = there.even() - here.even()
     return float(np.quantile(np.abs(change - np.mean(change)), 0.995))
 
 
 def moving(there: Errors, here: Errors) -> float:
-    """Of a shift that is there as long as the axis moves."""
+    """Returns the size of a shift that lasts as long as the axis moves."""
     return float(np.median(np.abs((there.even() - here.even())[-500:])))
 
 

@@ -106,7 +106,7 @@ def parts(model: type[BaseModel]) -> set[type[BaseModel]]:
 
 
 def test_every_key_is_described_in_the_reference() -> None:
-    reference = (ROOT / "docs" / "truth-file.md").read_text()
+    reference = (ROOT / "docs" / "ci.md").read_text()
     models = parts(Truth)
     keys = {field.alias or name for model in models for name, field in model.model_fields.items()}
     assert len(models) > 30

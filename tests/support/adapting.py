@@ -6,6 +6,7 @@ import math
 import random
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from datetime import UTC, datetime
 from itertools import pairwise
 from pathlib import Path
 
@@ -14,14 +15,12 @@ import yaml
 
 from hdbridge.axis import AxisConfig
 from hdbridge.control.bench import Bench
-from hdbridge.daemon.adaptation.adaptation import Adaptation
-from hdbridge.daemon.adaptation.proposal import Entry
-from hdbridge.daemon.adaptation.regressors import Regressors
-from hdbridge.daemon.adaptation.settings import AdaptationSettings
-from hdbridge.daemon.adaptation.sink import reading_of
+from hdbridge.daemon.following.adaptation import Adaptation, Entry, Learned
+from hdbridge.daemon.following.follower import Follower
+from hdbridge.daemon.following.measuring import DriftModel
+from hdbridge.daemon.following.settings import AdaptationSettings
 from hdbridge.daemon.loop.states import AxisState
 from hdbridge.daemon.memory import AXIS_SAMPLE, NO_FAULT, SampleArray, SampleFlag, sample_dtype
-from hdbridge.daemon.watch.encoder_health import EncoderHealth
 from hdbridge.device.node import DriveNode
 from hdbridge.drive import Drive
 from hdbridge.effects import Moment, Motion, Start
@@ -103,13 +102,40 @@ def wandering(stands: int, seed: int = 0, span_deg: float = 2000.0) -> list[floa
 
 def worn(offset_arcsec: float = 0.0, second_order_arcsec: float = 0.0) -> TransmissionModel:
     """Returns the article's model with changed offset and cosine of the second order."""
-    regressors = Regressors(MODEL)
-    change = np.zeros(regressors.followed)
-    for each in regressors.terms:
+    drift = DriftModel(MODEL)
+    change = np.zeros(drift.zero)
+    for each in drift.terms:
         change[each.columns.start + (0 if each.memory else 2)] = (
             offset_arcsec if each.memory else second_order_arcsec
         )
-    return regressors.changed(change)
+    return drift.changed(change)
+
+
+def packed(times_s: np.ndarray, axis: np.ndarray) -> SampleArray:
+    """Returns samples of a machine with one axis, numbered by their time."""
+    samples = np.zeros(len(times_s), sample_dtype(1))
+    samples["cycle"] = np.round(times_s / PERIOD_S)
+    samples["time_ns"] = np.round(1e9 * times_s)
+    samples["axes"][:, 0] = axis
+    return samples
+
+
+class History:
+    """Files of an adaptation, in memory."""
+
+    def __init__(self, learned: Learned | None = None) -> None:
+        self.learned = learned
+        self.entries: list[Entry] = []
+
+    def load(self) -> Learned | None:
+        return self.learned
+
+    def now(self) -> datetime:
+        return datetime(2026, 3, 1, 12, tzinfo=UTC)
+
+    def write(self, entries: Sequence[Entry], learned: Learned) -> None:
+        self.entries += entries
+        self.learned = learned
 
 
 class Sampler:
@@ -154,11 +180,12 @@ class Work:
     """Axis that runs tests; the adaptation receives the samples and may change the model."""
 
     def __init__(self, drive: Drive, node: DriveNode, settings: AdaptationSettings | None) -> None:
-        self.history: list[Entry] = []
-        self.adaptation = settings and Adaptation(MODEL, settings, reading_of(AXIS), self.history.append)
-        self.health = EncoderHealth(AXIS, MODEL)
-        self.disbelieved: list[str] = []
-        """Reasons for not trusting the load encoder, each once."""
+        self._files = History()
+        self.follower = Follower(AXIS, MODEL, settings=settings)
+        if settings is not None:
+            self.follower.adapt(settings.mode, self._files)  # type: ignore[arg-type]
+        self.encoder_faults: list[str] = []
+        """Faults of the load encoder, each once."""
         self.errors_arcsec: list[list[float]] = []
         """True load position minus its target; one list per test."""
         self.faults = node.faults
@@ -167,6 +194,16 @@ class Work:
         self._loads_deg: list[float] = []
         self._sampler = Sampler(AXIS, MODEL)
         self._use(MODEL)
+
+    @property
+    def adaptation(self) -> Adaptation | None:
+        """Adaptation of the axis; None without settings."""
+        return self.follower.adaptation
+
+    @property
+    def history(self) -> list[Entry]:
+        """Lines of the history."""
+        return self._files.entries
 
     @property
     def time_s(self) -> float:
@@ -211,18 +248,14 @@ class Work:
         self._sampler.use(model)
 
     def _adapt(self, samples: SampleArray) -> None:
-        times_s = 1e-9 * samples["time_ns"].astype(float)
-        for part in np.array_split(np.arange(len(samples)), max(len(samples) // 125, 1)):  # half a second
-            judgement = self.health.take(samples[part])
-            why = "" if judgement.believed else judgement.why
-            if why and why not in self.disbelieved:
-                self.disbelieved.append(why)
-            if self.adaptation is None:
-                continue
-            proposal = self.adaptation.take(times_s[part], samples["axes"][part, 0], why)
+        for part in np.array_split(samples, max(len(samples) // 125, 1)):  # half a second
+            proposal = self.follower.take(part).proposal
+            reason = self.follower.health.status.reason
+            if reason and reason not in self.encoder_faults:
+                self.encoder_faults.append(reason)
             if proposal is not None and proposal.apply:
                 self._use(proposal.model)
-                self.health.use(proposal.model)
+                self.follower.health.restart()
 
 
 Misreading = Callable[[int], int]

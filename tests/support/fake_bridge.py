@@ -16,8 +16,10 @@ import numpy as np
 
 from hdbridge.client import messages
 from hdbridge.daemon.memory import sample_dtype
-from hdbridge.daemon.service.interface import Batch, StreamPoint, WayPoint
 from hdbridge.daemon.service.lease import Lease
+from hdbridge.daemon.service.moves import WayPoint
+from hdbridge.daemon.service.observer import Batch
+from hdbridge.daemon.service.streams import StreamPoint
 from hdbridge.drive.objects import IntegerType
 from hdbridge.drive.values import Object, Value
 from hdbridge.errors import InputError, RefusedError

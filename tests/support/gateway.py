@@ -157,7 +157,7 @@ class GatewayBench:
         return int.from_bytes(answer[4 : 8 - (answer[0] >> 2 & 3)], "little", signed=signed)
 
     async def configure(self, mode: int = 8) -> None:
-        """What a PLC does before it cycles: PDOs mapped by the master, mode, NMT start."""
+        """Prepares the slave as a PLC does before it cycles: PDOs mapped by the master, mode, NMT start."""
         plc = self.plc
         for first, cob, words in (
             (0x1400, 0x200, (0x60400010, 0x607A0020)),
@@ -188,7 +188,7 @@ class GatewayBench:
 
     @property
     def load_deg(self) -> float:
-        """Where the load truly is."""
+        """Returns the true angle of the load."""
         return float(self.daemon.nodes[0].firmware.motion.machine.load_reading) / 2_880_000 * 360.0
 
 

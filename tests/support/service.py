@@ -52,12 +52,12 @@ def in_this_thread(work: Work, rig: DaemonRig, told: Told) -> dict[str, Any]:
     return run(work, rig, told)
 
 
-def article_profiles(folder: Path, count: int) -> list[Profile]:
+def article_profiles(folder: Path, count: int, profile: Path = PROFILE) -> list[Profile]:
     """Makes ``count`` profiles of the article's axis on one bus, nodes 1, 2, ..., which tests may change."""
     made = []
     for node in range(1, count + 1):
         own = folder / f"axis{node}"
-        shutil.copytree(PROFILE, own)
+        shutil.copytree(profile, own)
         text = (own / "axis.yaml").read_text()
         text = re.sub(r"(?m)^name: .*$", f"name: axis{node}", text)
         text = re.sub(r"(?m)^  node_id: .*$", f"  node_id: {node}", text)
@@ -121,10 +121,11 @@ def stepped_service(
     axes: int = 1,
     lease_s: float = 10.0,
     character: Character = FRIENDLY,
+    profile: Path = PROFILE,
     **options: Any,
 ) -> Iterator[Service]:
     """Provides a service on a control loop with simulated drives, none verified yet."""
-    files = article_profiles(folder, axes)
+    files = article_profiles(folder, axes, profile)
     configs = [character.of_axis(AxisConfig.load(each.axis)) for each in files]
     with stepped_daemon(configs, character=character, **options) as daemon:
         machine = replace(

@@ -15,7 +15,7 @@ from hdbridge.testing import SimulatedDrive, simulated_drive
 
 PERIOD_S = 0.004
 STEP_COUNTS = 40
-"""Of the motor per cycle: 9 deg/s at the load of the profile 'article'."""
+"""Motion of the motor per cycle: 9 deg/s at the load of the profile 'article'."""
 
 
 class Program:
@@ -26,7 +26,7 @@ class Program:
         self.bus = drive.open_bus()
         self.target = 0
         self.others: list[can.Message] = []
-        """What came beside the answers to SYNC."""
+        """Frames beside the answers to SYNC."""
 
     def send(self, can_id: int, data: bytes = b"") -> None:
         self.bus.send(can.Message(arbitration_id=can_id, data=data, is_extended_id=False))

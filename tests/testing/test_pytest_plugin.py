@@ -12,7 +12,7 @@ from hdbridge.files.bundled import bundled_profile
 
 STRICT = ("--strict-markers", "-W", "error", "-p", "no:cacheprovider")
 IN_PROCESS = ("-W", "ignore:Module already imported:pytest.PytestAssertRewriteWarning")
-"""What these tests have imported, a second pytest in their process cannot rewrite."""
+"""A second pytest in this process cannot rewrite modules that these tests have imported."""
 PASSES = "def test_it(hdbridge_drive):\n    assert hdbridge_drive.state == 'switch on disabled'\n"
 
 
@@ -33,7 +33,7 @@ def show(name: str) -> str:
 
 
 def test_pytest_loads_next_to_nothing_for_it():
-    """What loads in every run of an environment with hdbridge, whether or not it is used."""
+    """Modules that load in every run of an environment with hdbridge, used or not."""
     program = (
         "import sys, pytest; before = {*sys.modules}; import hdbridge.pytest_plugin; "
         "print(sorted({*sys.modules} - before))"

@@ -1,4 +1,4 @@
-"""What `tools/compile_tests.py` keeps is what pytest looks for."""
+"""`tools/compile_tests.py` writes the files that pytest looks for."""
 
 import subprocess
 import sys

@@ -1,4 +1,4 @@
-"""`tools/dictionaries.py` makes the rows of docs/drives.md from what `hdbridge check` says."""
+"""`tools/dictionaries.py` makes the rows of docs/bring-up.md from what `hdbridge check` says."""
 
 import subprocess
 import sys

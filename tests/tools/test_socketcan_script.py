@@ -1,4 +1,4 @@
-"""What ``tools/socketcan.sh`` does where user-mode-linux does not boot: it says why and ends with 69."""
+"""``tools/socketcan.sh`` without a bootable user-mode-linux: it gives the reason and ends with 69."""
 
 import os
 import re

@@ -1,4 +1,4 @@
-"""What is read off a recording before it is replayed: cycles, legs, and what looks wrong."""
+"""Reading of a recording before its replay: cycles, legs, and remarks."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def test_legs_of_a_bare_record_are_cut_where_its_command_sets_out(bare: Record) 
 
 
 def test_a_long_standstill_belongs_to_no_leg() -> None:
-    """What is held out is motion, not the hour in which a gear cools down."""
+    """Motion is held out, not the hour in which a gear cools down."""
     time_s = np.arange(0.0, 20.0, 0.01)
     angle = np.interp(time_s, [0.0, 1.0, 15.0, 16.0], [0.0, 90.0, 90.0, 0.0])
     record = Record({"time_s": time_s, "motor_target_deg": angle, "motor_position_deg": angle,

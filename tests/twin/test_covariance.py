@@ -1,4 +1,4 @@
-"""How sure a fit is of its parameters, where residuals of one leg go together."""
+"""Uncertainty of a fit's parameters if the residuals of one leg are correlated."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a fit takes in only where the recording shows it: friction near rest, another loop, a limit."""
+"""A fit takes a part in only if the recording shows it: friction near rest, another loop, a limit."""
 
 from __future__ import annotations
 

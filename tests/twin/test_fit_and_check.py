@@ -137,7 +137,7 @@ def test_a_check_is_silent_where_nothing_has_changed() -> None:
 
 
 def test_a_gear_whose_warmth_is_recorded_has_not_changed_by_it() -> None:
-    """By 20 K its friction falls by a fifth, which matters."""
+    """A warming by 20 K lowers the friction by a fifth, which matters."""
     grows = TRUTH.temperature.model_copy(update={"friction_growth_per_k": -0.01, "reference_c": 22.0})
     warm = TRUTH.model_copy(update={"temperature": grows.model_copy(update={"start_c": 42.0})})
     told = {**twin().intervals, "temperature.ambient_c": (21.0, 23.0)}
@@ -182,7 +182,7 @@ def test_a_few_samples_far_off_neither_hide_a_change_nor_make_one() -> None:
 
 
 def test_a_load_that_rings_out_of_step_has_changed() -> None:
-    """By half as much inertia again, at 8 Hz: what the twin leaves is so large that slopes say nothing."""
+    """An inertia larger by half, at 8 Hz: the twin leaves so much that slopes are meaningless."""
     gear, stiffness = TRUTH.gear, TRUTH.load_.whole_inertia_kg_m2 * (math.tau * 8.0) ** 2
     damping = 0.3 * gear.damping_nm_s_per_rad * math.sqrt(stiffness / gear.stiffness_nm_per_rad)
     soft = {"gear stiffness": stiffness, "gear damping": damping}

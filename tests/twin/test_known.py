@@ -1,4 +1,4 @@
-"""How sure a twin is of itself, as its file tells it."""
+"""Certainty of a twin, as its file states it."""
 
 from __future__ import annotations
 

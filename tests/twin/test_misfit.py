@@ -1,4 +1,4 @@
-"""What a replay leaves of a recording: of each channel what is that channel's own."""
+"""Residuals of a replay: each channel has the part that is its own."""
 
 from __future__ import annotations
 

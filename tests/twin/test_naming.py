@@ -1,4 +1,4 @@
-"""What is named after a fit, on residuals that are known functions of the plant's parameters."""
+"""Names after a fit, on residuals that are known functions of the plant's parameters."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ class Known:
 
 
 def named(axis: Truth, quick: float) -> tuple[tuple[Finding, ...], tuple[Alike, ...]]:
-    """What is said of an axis by a fit that begins at `TRUTH`; and what its slopes cannot tell apart."""
+    """Findings about an axis from a fit that starts at `TRUTH`, and those that slopes cannot separate."""
     replays: Any = Known(axis, quick)
     parameters = tuple(BY_NAME[name] for name in NAMES)
     prior = np.array(coordinates(TRUTH, parameters))

@@ -1,4 +1,4 @@
-"""What a fit begins with: read off a recording without any replay."""
+"""Starting values of a fit, read off a recording without any replay."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where an axis stands in a recording, and what the recording tells of it there."""
+"""Rests of an axis in a recording, and the values that they give."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Whether what is left of a recording distinguishes a twin from a rival."""
+"""Residuals of a recording that distinguish a twin from a rival, or do not."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def test_a_rival_that_leaves_less_is_not_told_apart() -> None:
 
 
 def test_a_spring_that_is_put_back_is_no_stiffer_than_the_time_step_resolves() -> None:
-    """It was stiff with a larger inertia; with the twin's it would ring faster than the plant is stepped."""
+    """The stiff axis had a larger inertia; with the twin's it would ring faster than the time step."""
     light = with_values(DEMO, {"motor inertia": 1e-7, "load inertia": 1e-3, "gear stiffness": 100.0})
     rival = put_back(DEMO, light, [BY_NAME["gear stiffness"]])
     assert rival.load_.inertia_kg_m2 == pytest.approx(1e-3)

@@ -152,7 +152,7 @@ class Case:
     effects: tuple[Effect, ...]
     lead: Callable[[Exercise], None] = to_and_fro
     left: float = 0.03
-    """Of the effect's own part, rms: what a translation of another shape may leave."""
+    """Share of the effect's own part, rms, that a translation of another shape may leave."""
     floor_arcsec: float = 0.5
     """... and what the plant's dynamics add at these speeds."""
     plant: Callable[[Truth], Truth] = lambda truth: truth
@@ -281,7 +281,7 @@ def predicted(effects: tuple[Effect, ...], record: Record) -> np.ndarray:
 
 
 def after(record: Record, error: np.ndarray) -> np.ndarray:
-    """What comes after the first move, without its mean."""
+    """Returns the signal after the first move, without its mean."""
     begun = int(np.argmax(record.columns["motor_target_deg"] >= BEFORE_DEG))
     return error[begun:] - error[begun:].mean()
 

@@ -1,4 +1,4 @@
-"""Whether a twin is better than the simulation before it."""
+"""Judgement: a twin is better than the simulation before it, or not."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def test_below_what_counts_as_noise_there_may_be_much_to_gain() -> None:
 
 
 def test_a_temperature_counts_beyond_the_step_of_its_reading() -> None:
-    """Of 0.1 K here."""
+    """Share for 0.1 K."""
     cold, near = comparison(load_error=4.0, temperature=0.05), comparison(load_error=1.0, temperature=0.09)
     assert "75 % smaller" in better(cold, near).text
     far = comparison(load_error=1.0, temperature=0.4)

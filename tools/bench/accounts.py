@@ -6,21 +6,21 @@ from typing import Any
 
 
 class Accounts:
-    """What a reader of the sample ring has seen of the numbers of the cycles."""
+    """Counts the cycle numbers that a reader of the sample ring has seen."""
 
     def __init__(self) -> None:
         self.samples = 0
         self.lost = 0
-        """By this reader, which was too slow."""
+        """Samples that this reader was too slow for."""
         self.missing = 0
         """Numbers between two samples that have none."""
         self.skipped = 0
-        """What the samples say was skipped."""
+        """Cycles that the samples report as skipped."""
         self._cycle: int | None = None
         self._skipped = 0
 
     def take(self, samples: Any, lost: int) -> None:
-        """What the reader gave."""
+        """Counts the samples of one read."""
         self.lost += lost
         for cycle, skipped in zip(samples["cycle"].tolist(), samples["skipped"].tolist(), strict=True):
             if self._cycle is not None:
@@ -31,11 +31,11 @@ class Accounts:
 
     @property
     def balanced(self) -> bool:
-        """Whether every number that is missing was told as skipped, or was lost by the reader."""
+        """True if every missing number was reported as skipped, or was lost by the reader."""
         return self.missing == self.skipped + self.lost
 
     def report(self) -> dict[str, int | bool]:
-        """As JSON."""
+        """Returns the JSON object."""
         return {
             "samples": self.samples, "lost": self.lost, "missing": self.missing, "skipped": self.skipped,
             "balanced": self.balanced,

@@ -1,4 +1,4 @@
-"""What the control cycle of n axes costs in CPU time, and one axis before a change and after it.
+"""CPU time of the control cycle of n axes, and of one axis before and after a change.
 
     python tools/bench/buscycle.py [--before FOLDER] [--interface virtual|loopback]... [--json FILE]
 
@@ -157,7 +157,7 @@ class Worker:
 
     @staticmethod
     def _cost(bus: Any, answer: Callable[[], object], cycles: int) -> float:
-        """What the answering nodes cost in one cycle; nothing that they sent stays on the bus."""
+        """Returns the CPU time of the answering nodes in one cycle; clears the bus of their frames."""
         cost_us = block_us(answer, cycles)
         while bus.recv(0.0) is not None:
             pass

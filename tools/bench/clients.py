@@ -45,7 +45,7 @@ QUICK_STOP_EVERY: Final = 20
 
 
 class Seen:
-    """What the clients of this process have seen."""
+    """Figures of the clients of this process."""
 
     def __init__(self) -> None:
         self.samples = self.lost = self.requests = self.points = self.rounds = 0
@@ -54,14 +54,14 @@ class Seen:
 
     @asynccontextmanager
     async def request(self) -> AsyncIterator[None]:
-        """How long it took, and that it was."""
+        """Counts a request and its duration."""
         begin_s = time.monotonic()
         yield
         self.requests += 1
         self.longest_s = max(self.longest_s, time.monotonic() - begin_s)
 
     def report(self) -> dict[str, Any]:
-        """As JSON."""
+        """Returns the JSON object."""
         return {**vars(self), "errors": dict(self.errors.most_common(20))}
 
 
@@ -81,7 +81,7 @@ async def watch(client: AsyncClient, seen: Seen, every: int = 1) -> None:
 
 
 async def page(client: AsyncClient, seen: Seen) -> None:
-    """What the page asks for."""
+    """Requests of the page."""
     state = await client.state()
     every = max(1, round(1.0 / (PAGE_HZ * state.cycle.period_s)))
 
@@ -137,7 +137,7 @@ async def stream_on(client: AsyncClient, seen: Seen) -> None:
 
 
 async def story(client: AsyncClient, seen: Seen) -> None:
-    """All that a client may ask of an axis, round after round."""
+    """Requests every motion of an axis, round after round."""
     chance = random.Random(1)
     async with client.lease(force=True):
         axis = next(iter((await client.axes()).values()))
@@ -167,7 +167,7 @@ async def story(client: AsyncClient, seen: Seen) -> None:
 async def persistent(
     socket: str, seen: Seen, what: Callable[[AsyncClient, Seen], Coroutine[Any, Any, None]]
 ) -> None:
-    """What a client does; after an error, which is counted, it begins anew."""
+    """Runs a client; after an error, which is counted, the client starts again."""
     while True:
         try:
             async with AsyncClient(socket, name=what.__name__, timeout_s=60.0) as client:
@@ -196,7 +196,7 @@ async def serve(options: argparse.Namespace) -> None:
 
 
 async def lines() -> AsyncIterator[str]:
-    """Of standard input."""
+    """Yields the lines of standard input."""
     loop = asyncio.get_running_loop()
     reader = asyncio.StreamReader()
     await loop.connect_read_pipe(lambda: asyncio.StreamReaderProtocol(reader), sys.stdin)

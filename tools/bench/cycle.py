@@ -1,4 +1,4 @@
-"""What one control cycle costs in CPU time, next to a bare exchange of the same frames and to canopen.
+"""CPU time of one control cycle, beside a bare exchange of the same frames and beside canopen.
 
     python tools/bench/cycle.py [--interface virtual|loopback|socketcan]... [--channel vcan0] [--json FILE]
 
@@ -155,7 +155,7 @@ class LoopbackSocket:
                 self.drive.recv(100, socket.MSG_DONTWAIT)
 
     def answer_nobody(self) -> None:
-        """What answering costs, by itself."""
+        """Returns the CPU time of the answering side alone."""
         self.answer()
         with suppress(BlockingIOError):
             while True:
@@ -428,7 +428,7 @@ def report(result: dict[str, float], where: str) -> str:
 def measure(
     interface: str, options: argparse.Namespace, axis: AxisConfig, model: TransmissionModel
 ) -> Result:
-    """Where it was measured, and the median of each variant."""
+    """Returns the JSON object: the machine, and the median of each variant."""
     node_id, blocks, cycles = axis.drive.node_id, options.blocks, options.cycles
     if interface == "virtual":
         with AnsweringBus(node_id) as bus:

@@ -1,4 +1,4 @@
-"""What clients cost the daemon's control loop: CPU time of a turn and lateness, against idle and the bench.
+"""Cost of clients for the daemon's control loop: CPU time of a turn and lateness, against idle and the bench.
 
     python tools/bench/daemon.py [--rounds 5] [--seconds 12] [--json FILE]
 
@@ -59,7 +59,7 @@ KINDS: Final = ("bench", "idle", "busy")
 
 @dataclass(frozen=True)
 class Phase:
-    """Of one phase; microseconds."""
+    """Figures of one phase, microseconds."""
 
     turns: int
     cpu_us: float
@@ -160,7 +160,7 @@ def moving(daemon: RunningDaemon) -> None:
 
 
 def measured(daemon: RunningDaemon, memory: Memory, seconds: float) -> Phase | None:
-    """What the loop tells of itself in so much time; None where the axis was stopped in it."""
+    """Returns the loop's own figures over a duration; None if the axis was stopped in it."""
     pids = daemon.pids()
     reader = memory.reader()
     reader.read()

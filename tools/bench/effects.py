@@ -1,4 +1,4 @@
-"""What each effect costs: per peek and advance in the control loop, and per million samples of a record.
+"""Cost of each effect: per peek and advance in the control loop, and per million samples of a record.
 
 python tools/bench/effects.py
 """

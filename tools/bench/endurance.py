@@ -1,4 +1,4 @@
-"""Whether the daemon grows, and whether every missed cycle is accounted for.
+"""Endurance run of the daemon: growth of its processes, and an account of every missed cycle.
 
     python tools/bench/endurance.py stepped [--hours 24] [--every MINUTES] [--json FILE]
     python tools/bench/endurance.py real [--minutes 30] [--every SECONDS] [--json FILE]
@@ -36,7 +36,7 @@ RECORDER = "size_mb: 8, file_mb: 2, file_s: 60, kept_mb: 4, before_s: 10, after_
 
 @dataclass(frozen=True)
 class Growth:
-    """Of one figure over a run."""
+    """Growth of one figure over a run."""
 
     name: str
     first: float
@@ -55,7 +55,7 @@ class Growth:
 
     @property
     def grows(self) -> bool:
-        """Whether the run shows more growth than is allowed."""
+        """True if the run shows more growth than is allowed."""
         return self.last - self.second > self.allowed
 
     def __str__(self) -> str:

@@ -32,7 +32,7 @@ MEAN_S = 0.1
 
 
 class Errors:
-    """Of the load at rest, arcsec, in both directions."""
+    """Errors of the load at rest, arcsec, in both directions."""
 
     def __init__(self) -> None:
         self.found: dict[int, list[float]] = {1: [], -1: []}

@@ -1,4 +1,4 @@
-"""What each layer of the simulated bench's cycle takes: `python tools/bench/layers.py`.
+"""Cost of each layer of the simulated bench's cycle: `python tools/bench/layers.py`.
 
 The same targets are run in cycles that lack one layer more each time: the samples, the compensation, the axis
 (its encoders follow the demand at once), the drive (the same two TPDOs answer each SYNC), the master. What is
@@ -165,7 +165,7 @@ def frames_alone(bus: LockstepBus) -> Block:
 
 
 def variants(stack: ExitStack) -> Iterator[tuple[str, Block]]:
-    """What is left out, and the cycle without it and all before it."""
+    """Yields each omitted layer, and the cycle without that layer and all before."""
     targets = [round(AXIS.motor_encoder.counts(deg * AXIS.gear.ratio)) for deg in WAVE_DEG]
     drive, cycle, *_ = cycle_on(stack, None)
     yield "nothing", compensated(drive, cycle, keep=True)

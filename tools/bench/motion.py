@@ -1,4 +1,4 @@
-"""What a set-point and a correction cost: medians in microseconds, and ratios to a plain Python loop.
+"""Cost of a set-point and of a correction: medians in microseconds, and ratios to a plain Python loop.
 
     python tools/bench/motion.py [--json FILE]
 
@@ -62,7 +62,7 @@ def moving() -> SetPoint:
 
 
 def set_points() -> dict[str, float]:
-    """What the calls of a set-point cost."""
+    """Measures the calls of a set-point."""
     holding, going, streaming = SetPoint(LIMITS, PERIOD_S), moving(), SetPoint(LIMITS, PERIOD_S)
     streaming.stream(1.0)
     streaming.begin_stream()
@@ -91,7 +91,7 @@ def set_points() -> dict[str, float]:
 
 
 def corrections() -> dict[str, float]:
-    """What a cycle of the compensation costs, alone and behind a `Correction`, and the slow loop's."""
+    """Measures a cycle of the compensation, alone and behind a `Correction`, and the load loop's."""
     model = TransmissionModel.load(PROFILES / "article" / "model.yaml")
     moment = Moment()
     # So slow a ramp that the change lasts as long as it is measured.
@@ -129,7 +129,7 @@ def corrections() -> dict[str, float]:
 
 
 def pickles() -> dict[str, float]:
-    """What the loop pays to take a compensation that the service has made, per bundled model."""
+    """Measures the adoption of a compensation that the service has made, per bundled model."""
     taken = {}
     for path in sorted(PROFILES.rglob("model.yaml")):
         axis = AxisConfig.load(path.with_name("axis.yaml"))

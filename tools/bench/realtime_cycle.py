@@ -1,4 +1,4 @@
-"""What a cycle of 1 ms costs on a PREEMPT_RT kernel, in instructions, and whether one is ever missed.
+"""Instructions of a cycle of 1 ms on a PREEMPT_RT kernel, and the number of missed cycles.
 
     make bench-realtime
     tools/realtime/run.sh .venv/bin/python tools/bench/realtime_cycle.py --master build/realtime/master
@@ -59,7 +59,7 @@ class Waking:
 
 @dataclass(frozen=True)
 class Figures:
-    """Of one kind of cycle; times in microseconds."""
+    """Figures of one kind of cycle; times in microseconds."""
 
     name: str
     busy_median_us: float

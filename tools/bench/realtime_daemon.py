@@ -1,4 +1,4 @@
-"""What a turn of the daemon's control loop costs on a PREEMPT_RT kernel, in instructions; is one ever missed?
+"""Instructions of a turn of the daemon's control loop on a PREEMPT_RT kernel, and missed turns.
 
     make bench-realtime
     tools/realtime/run.sh .venv/bin/python tools/bench/realtime_daemon.py
@@ -60,17 +60,17 @@ POLL_S = 0.02
 JOG_EVERY_S = 0.05
 SDO_UPLOAD = bytes.fromhex("4041600000000000")
 SPEED = 5.0
-"""Of the moves, deg/s at the load."""
+"""Velocity of the moves, deg/s at the load."""
 
 
 class TurnClock(Waking):
-    """It keeps how long the loop was busy between two sleeps, and how late it woke."""
+    """Records the busy time of the loop between two sleeps, and the lateness of its waking."""
 
     def __init__(self, turns: int) -> None:
         super().__init__()
         self.busy_s, self.lateness_s = np.zeros(turns), np.zeros(turns)
         self.turns = 0
-        """That were kept."""
+        """Number of turns kept."""
         self.keeping = False
 
     def sleep_until(self, deadline_s: float) -> None:
@@ -91,7 +91,7 @@ class TurnClock(Waking):
 
 
 class Clients:
-    """What the clients of one axis ask for, as time passes; about six seconds, and again."""
+    """Requests of the clients of one axis over time; about six seconds, then again."""
 
     def __init__(self, memory: Memory, axis: int, setting: CompensationSetting) -> None:
         """``setting`` compensates the axis; it is changed to in motion."""
@@ -285,7 +285,7 @@ def of_bench(cycle_ms: float, turns: int, channel: str) -> Figures:
 
 
 def report(seen: dict[str, Any]) -> None:
-    """What the service saw, where there was one."""
+    """Returns the figures of the service, if there was one."""
     if seen:
         told = ", ".join(f"{count} {name}" for name, count in sorted(seen["told"].items()))
         print(f"the service saw {seen['samples']} samples and lost none; events: {told}", flush=True)

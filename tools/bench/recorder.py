@@ -1,4 +1,4 @@
-"""What the flight recorder costs: processor time per message, share of a core, bytes an hour.
+"""Cost of the flight recorder: processor time per message, share of a core, bytes an hour.
 
     python tools/bench/recorder.py [--axes 1 6] [--seconds 120] [--rate 250] [--json FILE]
 

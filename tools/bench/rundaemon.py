@@ -27,7 +27,7 @@ CONTROL, SERVICE, KEEPER = "control", "service", "keeper"
 
 @dataclass(frozen=True)
 class Cost:
-    """Of a process, from the kernel."""
+    """Figures of a process, from the kernel."""
 
     cpu_s: float
     rss_kb: int

@@ -1,4 +1,4 @@
-"""How much faster than the axis itself the bench on the virtual bus is: `python tools/bench/speed.py`.
+"""Speed of the bench on the virtual bus, relative to the axis itself: `python tools/bench/speed.py`.
 
 One run measures, side by side: the whole bench (master, compensation, bus, simulated drive and plant), the
 same with load torque and temperature on the bus and compliance in the model, and the plant alone, moved along

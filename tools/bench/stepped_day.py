@@ -35,18 +35,19 @@ from accounts import Accounts
 sys.path.append(str(Path(__file__).resolve().parents[2] / "tests"))
 from support.service import Service, stepped_service
 
-from hdbridge.daemon.adaptation.settings import AdaptationSettings
 from hdbridge.daemon.api.metrics import Metrics
+from hdbridge.daemon.following.settings import AdaptationSettings
 from hdbridge.daemon.memory import Event, EventKind, SampleArray
 from hdbridge.daemon.recorder.about import About, AxisAbout
 from hdbridge.daemon.recorder.flightlog import Batch, FlightLog
 from hdbridge.daemon.recorder.settings import RecorderSettings
 from hdbridge.daemon.recorder.store import Store
-from hdbridge.daemon.service.adapting import Adapting
 from hdbridge.daemon.service.bridge import ServiceBridge
 from hdbridge.daemon.service.eventlog import ANSWERS_KEPT, KEPT
-from hdbridge.daemon.service.interface import StreamPoint, WayPoint
+from hdbridge.daemon.service.following import Following
 from hdbridge.daemon.service.journal import Journal
+from hdbridge.daemon.service.moves import WayPoint
+from hdbridge.daemon.service.streams import StreamPoint
 from hdbridge.errors import HdbridgeError
 from hdbridge.evaluation.stepping import Scheme
 
@@ -56,7 +57,7 @@ SETTLE_S: Final = 20.0
 """In which an axis is enabled again after whatever has stopped it."""
 SPAN_DEG: Final = 20.0
 FAULT_SHARE: Final = 0.12
-"""Of what happens."""
+"""Counts of the events of a day."""
 
 
 Say = Callable[[dict[str, float]], None]
@@ -106,7 +107,7 @@ class Told:
 
 
 class Story:
-    """What happens to the axis, drawn by chance."""
+    """Draws the events of the axis at random."""
 
     def __init__(self, service: Service, bridge: ServiceBridge, seed: int) -> None:
         self.service, self.bridge = service, bridge
@@ -130,7 +131,7 @@ class Story:
         return self.chance.uniform(-SPAN_DEG, SPAN_DEG)
 
     async def fill(self) -> None:
-        """What keeps the newest only is full before anything is measured: the log, answers to commands."""
+        """Fills the buffers that keep the newest entries only: the log, answers to commands."""
         for _ in range(KEPT):
             self.bridge.core.log.note("the log is full")
         for _ in range(ANSWERS_KEPT):
@@ -285,7 +286,7 @@ class Story:
 
 
 def look(clock_s: float, began_s: float) -> dict[str, float]:
-    """What this process holds now, after a collection."""
+    """Returns the memory of this process, after a garbage collection."""
     gc.collect()
     status = Path("/proc/self/status").read_text(encoding="ascii")
     resident = next(line for line in status.splitlines() if line.startswith("RssAnon"))
@@ -317,16 +318,15 @@ async def day(
     rows: list[dict[str, float]] = []
     began_s = time.monotonic()
     with ExitStack() as stack:
-        writer = stack.enter_context(ThreadPoolExecutor(1))
+        worker = stack.enter_context(ThreadPoolExecutor(1))
         async with service.ready() as bridge:
-            adapting = [
-                Adapting(
-                    place, port, AdaptationSettings(mode="observe"), service.folder / f"adapt{place}", writer
-                )
-                for place, port in enumerate(bridge.axes.values())
+            observe = AdaptationSettings(mode="observe")
+            following = [
+                Following(index, axis, observe, service.folder / f"adapt{index}", worker)
+                for index, axis in enumerate(bridge.axes.values())
             ]
             recorder = Recorder(service)
-            for sink in (told, Journal([*bridge.axes]), Metrics(), recorder, *adapting):
+            for sink in (told, Journal([*bridge.axes]), Metrics(), recorder, *following):
                 bridge.core.observer.add(sink)
             bridge.subscribe()  # a client that never reads
             reading = asyncio.create_task(_read(bridge.subscribe()))
@@ -338,8 +338,8 @@ async def day(
             while daemon.clock.now() < end_s and time.monotonic() < began_s + at_most_s:
                 await story.step()
                 accounts.take(*reader.read())
-                for each in adapting:
-                    await each.follow()
+                for each in following:
+                    await each.apply()
                 if daemon.clock.now() >= due_s:
                     due_s += every_s
                     rows.append(look(daemon.clock.now() - begin_s, began_s))
@@ -347,7 +347,7 @@ async def day(
             reading.cancel()
             bridge.core.observer.poll()
             accounts.take(*reader.read())
-            for each in adapting:
+            for each in following:
                 each.close()
             recorded = recorder.close()
     cycle = daemon.controller.cycle

@@ -81,7 +81,7 @@ class Case:
     over_noise: float | None = None
     """Size over the noise of a reading; None: drawn."""
     axis: str = ""
-    """Of an everyday case: the axis that was calibrated for it."""
+    """Axis of an everyday case, with its calibration."""
     law: str = "rolling_friction"
     bench: bool = False
     """An everyday case on a plan of the bench, not on everyday work."""
@@ -89,7 +89,7 @@ class Case:
     """Draws as the case with the same pair does."""
 
     def folder(self, suite: Path, seed: int) -> Path:
-        """Where the case lies; of a held-out suite the folder's name says nothing."""
+        """Folder of the case; the name of a folder of a held-out suite reveals nothing."""
         hashed = hashlib.sha256(f"{seed} {self.name}".encode()).hexdigest()[:10]
         return suite / (self.name if seed < HELD_OUT_FROM else hashed)
 
@@ -301,7 +301,7 @@ def axis_of(case: Case, seed: int) -> EverydayAxis:
 
 @dataclass
 class Course:
-    """What an axis was told to do, and which of it was recorded."""
+    """Commands of an axis, and the part of them that was recorded."""
 
     rig: PlantRig
     motion: str
@@ -312,7 +312,7 @@ class Course:
     """Put between two parts."""
 
     def run(self, ratio: float) -> Run:
-        """What the course means for the size of a cause."""
+        """Returns the scale of a cause's size for the course."""
         period_s = self.rig.axis.drive.cycle_s
         ways = [np.array(self.rig.target_deg[first:end]) for first, end in self.parts]
         speeds = [np.diff(each) / period_s for each in ways]
@@ -476,7 +476,7 @@ def _channels(case: Case, rng: random.Random) -> list[str]:
 
 @dataclass(frozen=True)
 class _Layout:
-    """How a course becomes a record: which cycles, at which times, in which columns and files."""
+    """Conversion of a course to a record: cycles, times, columns and files."""
 
     course: Course
     every: int
@@ -493,7 +493,7 @@ class _Layout:
         return column[np.concatenate(self._places())]
 
     def _times(self) -> list[Any]:
-        """Of each part."""
+        """Scale of each part."""
         first = self.course.parts[0][0]
         period_s = self.course.rig.axis.drive.cycle_s
         return [

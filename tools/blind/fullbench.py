@@ -23,7 +23,7 @@ CYCLES_PER_SAMPLE = 5
 
 @dataclass(frozen=True)
 class Plan:
-    """What the bench does, in degrees and turns of the motor."""
+    """Motion of the bench, in degrees and turns of the motor."""
 
     fast_deg_s: float
     slow_deg_s: float
@@ -143,7 +143,7 @@ class Bench:
 
 
 def run_of(plan: Plan, truth: Truth) -> Run:
-    """What a plan means for the size of a cause."""
+    """Returns the scale of a cause's size for a plan."""
     ratio = truth.gear.ratio
     sweep_s = 2.0 * 360.0 * plan.sweep_turns / plan.fast_deg_s
     slow_s = 2.0 * 360.0 * plan.slow_turns / plan.slow_deg_s

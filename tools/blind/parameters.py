@@ -27,10 +27,10 @@ ALWAYS_THERE = ("inertial_windup", "compliance")
 
 @dataclass(frozen=True)
 class Secret:
-    """What is known of a case."""
+    """Known truth of a case."""
 
     parameters: Data
-    """Those of the cause; empty if it is there without having been hidden."""
+    """Parameters of the cause; empty if it is present without having been hidden."""
     found: Data = field(default_factory=dict)
     """Values of the finding, by name."""
     truth: Data = field(default_factory=dict)
@@ -60,7 +60,7 @@ def _phasor(amplitude: float, phase_deg: float) -> complex:
 
 
 def _polar(order: float, value: complex) -> Values:
-    """By the names of a finding; no phase where there is nothing."""
+    """Returns the values by the names of a finding; no phase of a zero amplitude."""
     if abs(value) < 1e-9:
         return {}
     name = f"order_{order:.0f}"
@@ -322,13 +322,13 @@ TRUE: Mapping[str, Callable[[Secret], Values]] = {
     "vibration": _named(frequency_hz="frequency_hz"),
     "local_defect": _local_defect,
 }
-"""By the finding's cause. `creep` is not there: its finding is a sum of exponentials on a fixed grid of time
+"""Expected parameters by cause, without `creep`: its finding is a sum of exponentials on a fixed grid of time
 constants, not the plant's elements.
 """
 
 
 def true_parameters(cause: str, found: Data, hidden: Data, truth: Data, model: Data) -> Values:
-    """What a finding of this cause with these values should say; empty where the cause is not there."""
+    """Returns the values that a finding of this cause should report; empty if the cause is absent."""
     known = {each["cause"]: each["parameters"] for each in hidden["hidden"]}
     parameters = known.get(cause) or known.get(TWINS.get(cause, ""))
     if parameters is None and truth and cause in ALWAYS_THERE and cause in hidden["also"]:

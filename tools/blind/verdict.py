@@ -26,7 +26,7 @@ SORTS = {
     "triple": "several", "none": "healthy", "healthy_bench": "healthy", "healthy_work": "healthy",
     "other_law": "law", "law": "law", "unknown": "unknown", "outside": "unknown",
 }  # fmt: skip
-"""What each kind of case asks; of a flickering pair it depends on the case."""
+"""Question of each kind of case; that of a flickering pair depends on the case."""
 PARTS = {
     "hysteresis_parameters": "hysteresis", MEMORY: "hysteresis", "motor_order": "synchronous",
     "motor_encoder_eccentricity": "synchronous",
@@ -54,13 +54,13 @@ class Compared:
 
     @property
     def covered(self) -> bool:
-        """Whether the interval has the truth in it."""
+        """True if the interval contains the truth."""
         return self.low <= self.true <= self.high
 
 
 @dataclass(frozen=True)
 class Answer:
-    """What the diagnosis of a case came to; None and empty for what there is not."""
+    """Result of the diagnosis of a case; None and empty for absent values."""
 
     diagnosis: Data | None = None
     extended: Data | None = None
@@ -92,7 +92,7 @@ class Verdict:
     """Rms of what the cause does in the record, over the noise of a reading."""
     hidden: tuple[str, ...]
     first: str
-    """What leads: ``right``, ``wrong``, ``unexplained`` or ``nothing``."""
+    """Returns the kind of the leading finding: ``right``, ``wrong``, ``unexplained`` or ``nothing``."""
     first_names_it: bool
     """Right without the help of an alias."""
     named: tuple[str, ...]
@@ -208,7 +208,7 @@ def _detectable(diagnosis: Data | None, known: tuple[str, ...], secret: Data) ->
 
 
 def _fresh(answer: Answer, named: list[Data]) -> tuple[float | None, float | None]:
-    """How the written model does on a fresh record, over what was claimed: gain and what is left."""
+    """Returns the gain and the rest of the written model on a fresh record, over those claimed."""
     before, after = ((each or {}).get("baseline", {}).get("rms_arcsec") for each in (
         answer.fresh_given, answer.fresh_extended
     ))  # fmt: skip

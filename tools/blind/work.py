@@ -24,7 +24,7 @@ class Burst:
 
     legs: tuple[Move, ...]
     pause_s: float = 0.0
-    """How long the axis stands afterwards, unrecorded."""
+    """Duration of the rest afterwards, unrecorded."""
 
     def moves(self, axis: AxisView) -> Steps[None]:
         """The legs, one after the other."""
@@ -100,7 +100,7 @@ class Draft:
             self.add(Dwell(duration_s))
 
     def burst(self, pause_s: float = 0.0) -> Burst:
-        """What was drawn since the last burst."""
+        """Commands drawn since the last burst."""
         legs, self.legs = tuple(self.legs), []
         return Burst(legs, pause_s)
 

@@ -2,26 +2,25 @@
 
 from __future__ import annotations
 
-from functools import cache
 from http import HTTPStatus
 from typing import Any, Final
 
 from fastapi import FastAPI
 from fastapi.openapi.utils import get_openapi
-from fastapi.responses import HTMLResponse, JSONResponse, Response
+from fastapi.responses import JSONResponse, Response
 from fastapi.routing import APIRoute
 from prometheus_client import CONTENT_TYPE_LATEST
 
 from hdbridge import __version__
 from hdbridge.client.messages.problem import CONTENT_TYPE
-from hdbridge.daemon.api import describe, problems
+from hdbridge.daemon.api import problems
 from hdbridge.daemon.api.metrics import Metrics, exposition
 from hdbridge.daemon.api.routes.axis import axis_routes
 from hdbridge.daemon.api.routes.machine import machine_routes
 from hdbridge.daemon.api.routes.sockets import socket_routes
 from hdbridge.daemon.api.traffic import Traffic
 from hdbridge.daemon.page import PAGE, POLICY, page_file
-from hdbridge.daemon.service.interface import Bridge
+from hdbridge.daemon.service.bridge import ServiceBridge
 
 PREFIX: Final = "/api/v1"
 TAGS: Final = (
@@ -44,7 +43,7 @@ _ABOUT: Final = (
 )
 
 
-def create_app(bridge: Bridge, metrics: Metrics, traffic: Traffic) -> FastAPI:
+def create_app(bridge: ServiceBridge, metrics: Metrics, traffic: Traffic) -> FastAPI:
     """Returns the ASGI application; each listener's `guard.py` decides who may reach it."""
     app = FastAPI(
         title="hdbridge",
@@ -66,21 +65,11 @@ def create_app(bridge: Bridge, metrics: Metrics, traffic: Traffic) -> FastAPI:
     return app
 
 
-def _add_pages(app: FastAPI, bridge: Bridge, metrics: Metrics, traffic: Traffic) -> None:
-    @cache
-    def described() -> str:
-        return describe.page(app.openapi())
-
+def _add_pages(app: FastAPI, bridge: ServiceBridge, metrics: Metrics, traffic: Traffic) -> None:
     @app.get(f"{PREFIX}/openapi.json", include_in_schema=False)
     async def get_description() -> JSONResponse:
         """Returns the description of the API, OpenAPI 3.1."""
         return JSONResponse(app.openapi())
-
-    @app.get("/docs", include_in_schema=False)
-    async def get_docs() -> HTMLResponse:
-        """Returns the same as a page to read."""
-        policy = "default-src 'none'; style-src 'unsafe-inline'; frame-ancestors 'none'"
-        return HTMLResponse(described(), headers={"Content-Security-Policy": policy})
 
     @app.get("/", include_in_schema=False)
     async def get_page() -> Response:

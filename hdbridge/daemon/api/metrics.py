@@ -18,7 +18,7 @@ from prometheus_client.registry import Collector
 from hdbridge.client.messages import ControlState, MachineState
 from hdbridge.daemon.api.traffic import Traffic
 from hdbridge.daemon.memory import EventKind
-from hdbridge.daemon.service.interface import Bridge
+from hdbridge.daemon.service.bridge import ServiceBridge
 from hdbridge.drive.supervision import Fault
 
 BOUNDS_US: Final = (10, 20, 50, 100, 200, 500, 1000, 2000, 5000, 10_000, 50_000, 100_000)
@@ -72,7 +72,7 @@ class Histogram:
         return HistogramMetricFamily(_PREFIX + name, about, buckets, self._sum_us / 1e6)
 
 
-def exposition(bridge: Bridge, metrics: Metrics, traffic: Traffic) -> bytes:
+def exposition(bridge: ServiceBridge, metrics: Metrics, traffic: Traffic) -> bytes:
     """Returns all metrics in Prometheus' text format, from a separate registry."""
     registry = CollectorRegistry()
     registry.register(_Scrape(bridge, metrics, traffic))
@@ -82,7 +82,7 @@ def exposition(bridge: Bridge, metrics: Metrics, traffic: Traffic) -> bytes:
 class _Scrape(Collector):
     """Collector of one scrape."""
 
-    def __init__(self, bridge: Bridge, metrics: Metrics, traffic: Traffic) -> None:
+    def __init__(self, bridge: ServiceBridge, metrics: Metrics, traffic: Traffic) -> None:
         self._bridge, self._metrics, self._traffic = bridge, metrics, traffic
 
     def collect(self) -> Iterator[Metric]:

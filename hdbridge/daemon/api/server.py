@@ -25,7 +25,7 @@ from hdbridge.daemon.api.metrics import Metrics
 from hdbridge.daemon.api.policy import BODY_MAXIMUM, Policy
 from hdbridge.daemon.api.sockets import BACKLOG, peer_of
 from hdbridge.daemon.api.traffic import Traffic
-from hdbridge.daemon.service.interface import Bridge
+from hdbridge.daemon.service.bridge import ServiceBridge
 
 CONNECTIONS_MAXIMUM: Final = 256
 """Maximum number of connections per listener. It exceeds the limits of requests and WebSockets under way,
@@ -54,7 +54,9 @@ class Listener:
 class ApiServer:
     """Serves a `Bridge` until `stop`."""
 
-    def __init__(self, bridge: Bridge, listeners: Sequence[Listener], metrics: Metrics | None = None) -> None:
+    def __init__(
+        self, bridge: ServiceBridge, listeners: Sequence[Listener], metrics: Metrics | None = None
+    ) -> None:
         self.traffic = Traffic()
         self._app = create_app(bridge, metrics or Metrics(), self.traffic)
         self._servers = [(self._server(each), each) for each in listeners]

@@ -61,7 +61,7 @@ The statusword also comes every 50 ms, for masters that take it for periodic.
 """
 _MOST: Final = 0xFFFF_FFFF
 _FOLLOWING_TIME_S: Final = 0.2
-"""Of the highest speed: default of 6065h."""
+"""Share of the highest speed for the default of 6065h."""
 
 
 def nameplate(axis: AxisConfig, settings: GatewaySettings) -> Nameplate:

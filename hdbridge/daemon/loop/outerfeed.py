@@ -14,7 +14,7 @@ FIRST_KNOT_S: Final = 2.0
 
 
 class OuterFeed:
-    """Of one axis. Between two set-points the position is linear, as in the interpolation of a CiA-402 drive.
+    """Set-points of the outer master for one axis. Between two of them the position is linear, as in CiA 402.
 
     A late set-point is bridged by going on for as long as the last two were apart. An axis at rest waits for
     longer. Set-points of another series are dropped, so none from before an interruption takes effect.

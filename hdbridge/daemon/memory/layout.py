@@ -174,7 +174,7 @@ class Knot(NamedTuple):
 
 
 class OuterCell(IntEnum):
-    """What gateway process and service write about one axis, each cell with one writer."""
+    """Cells that gateway process and service share about one axis, each with one writer."""
 
     WANTED = 0
     """Gateway: number of the series of set-points for which power is wanted; 0: no power."""

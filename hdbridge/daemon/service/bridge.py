@@ -5,6 +5,16 @@
 
 All of it runs in one event loop. An axis holds its position without this process: if the process dies, the
 axes complete the commands they have, and the next service process takes them over as they are.
+
+Angles are load angles in degrees, speeds in deg/s. ``holder`` is the lease token. All coroutines of machine
+and axes raise an `HdbridgeError` whose text is one line with the cause and the remedy:
+
+    InputError      a value is invalid: outside the limits, not finite, no such model or object
+    RefusedError    not possible in this state: not enabled, in motion, a job runs, a fault is latched
+    LeaseError      ``holder`` is not the token of the present lease
+    DriveError      the drive refuses the request or does not answer
+    SafetyStop      the supervision stopped the axis during the call
+    BusError        the CAN interface is gone
 """
 
 from __future__ import annotations
@@ -12,11 +22,11 @@ from __future__ import annotations
 import asyncio
 import logging
 import time
-from collections.abc import Callable, Coroutine, Mapping, Sequence
+from collections.abc import Callable, Coroutine, Mapping
 from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Protocol, Self
+from typing import TYPE_CHECKING, Any, Final, Self
 
 from hdbridge.client import messages
 from hdbridge.daemon.memory import Cell, CommandKind, EventKind
@@ -37,6 +47,7 @@ from hdbridge.errors import HdbridgeError, InputError
 if TYPE_CHECKING:
     from hdbridge.daemon.machine import Machine
     from hdbridge.daemon.memory import Memory
+    from hdbridge.daemon.service.following import Following
     from hdbridge.daemon.service.lease import Lease
 
 VERIFY_AGAIN_S: Final = (0.0, 1.0, 2.0, 5.0, 10.0)
@@ -47,16 +58,8 @@ EVENTS_TOLD: Final = 1000
 _log = logging.getLogger(__name__)
 
 
-class Adaptation(Protocol):
-    """Adaptation of one axis, as the bridge uses it."""
-
-    def state(self) -> messages.AdaptationState: ...
-    async def set_mode(self, mode: messages.AdaptationMode) -> None: ...
-    async def back(self) -> None: ...
-
-
 class ServiceBridge:
-    """The machine; `interface.Bridge` documents each method."""
+    """The machine, for the API."""
 
     def __init__(
         self,
@@ -76,10 +79,8 @@ class ServiceBridge:
             axis.name: ServiceAxis(index, axis, self.core, self.book.begin, self.axis_state)
             for index, axis in enumerate(machine.axes)
         }
-        self.adaptations: dict[str, Adaptation] = {}
-        """Adaptations by axis name."""
-        self.advice: Callable[[str], Sequence[str]] = lambda _: ()
-        """Returns the watch's advice about an axis."""
+        self.following: dict[str, Following] = {}
+        """Watch and adaptation by axis name."""
         self.recorder: Callable[[], messages.RecorderState] = lambda: messages.RecorderState(on=False)
         self.marks: list[Callable[[str], None]] = []
         """Receivers of remarks, such as the recorder."""
@@ -270,14 +271,14 @@ class ServiceBridge:
     def axis_state(self, name: str) -> messages.AxisState:
         """Returns the state of one axis in the newest cycle."""
         self._look()
-        adaptation = self.adaptations.get(name)
+        following = self.following.get(name)
         return reports.axis_state(
             self._axis(name),
             self._stopped.get(name),
             self._loop_doubts.get(name, "the reason is in the log of an earlier service"),
             self.book.of_axis(name),
-            adaptation.state() if adaptation is not None else messages.AdaptationState(),
-            self.advice(name),
+            following.state if following is not None else messages.AdaptationState(),
+            following.advice if following is not None else (),
             self._outer(name),
         )
 
@@ -315,7 +316,7 @@ class ServiceBridge:
         )
 
     def subscribe(self, most: int = 512) -> Subscription:
-        """Subscribes to samples and events."""
+        """Subscribes to samples and events; at most the newest ``most`` samples wait to be fetched."""
         return Subscription(self.core.observer, self._messages_since, most)
 
     def _messages_since(self, number: int) -> tuple[list[messages.Event], int]:
@@ -330,7 +331,7 @@ class ServiceBridge:
     # ---------------------------------------------------------------- requests
 
     async def quick_stop(self) -> None:
-        """Quick-stops all axes."""
+        """Quick-stops all axes. Requires no lease."""
         for axis in self.axes.values():
             axis.give_up("it was stopped by a quick stop")
         await self.core.dispatch.do(CommandKind.QUICK_STOP)
@@ -338,7 +339,7 @@ class ServiceBridge:
     async def coordinated(
         self, holder: str, moves: Mapping[str, float], speed: float = 1.0, wait: bool = True
     ) -> None:
-        """Moves several axes so that all begin and end together."""
+        """Moves several axes so that all begin and end together; ``speed`` is a share of the limits."""
         if not moves:
             raise InputError("a coordinated move of no axis; expected a target for at least one")
         axes = [self._axis(name) for name in moves]
@@ -356,18 +357,18 @@ class ServiceBridge:
             hear(text)
 
     async def load_loop(self, holder: str, axis: str, on: bool) -> None:
-        """Switches an axis's load loop on or off."""
+        """Switches an axis's load loop on or off; raises InputError if it has none."""
         await self._axis(axis).switch_load_loop(holder, on=on)
 
     async def adapt(self, holder: str, axis: str, mode: messages.AdaptationMode) -> None:
         """Sets the adaptation mode of an axis."""
         self.core.lease.check(holder)
-        await self._adaptation(axis).set_mode(mode)
+        await self._following(axis).set_mode(mode)
 
     async def adaptation_back(self, holder: str, axis: str) -> None:
-        """Discards the adapted parameters of an axis."""
+        """Discards the adapted parameters of an axis and restores its model as it was activated."""
         self.core.lease.check(holder)
-        await self._adaptation(axis).back()
+        await self._following(axis).revert()
 
     def _axis(self, name: str) -> ServiceAxis:
         axis = self.axes.get(name)
@@ -375,14 +376,14 @@ class ServiceBridge:
             raise InputError(f"there is no axis '{name}'; expected one of: {', '.join(self.axes)}")
         return axis
 
-    def _adaptation(self, name: str) -> Adaptation:
+    def _following(self, name: str) -> Following:
         self._axis(name)
-        adaptation = self.adaptations.get(name)
-        if adaptation is None:
+        following = self.following.get(name)
+        if following is None:
             raise InputError(
                 f"{name}: nothing adapts on this axis; give it an adaptation in the machine file"
             )
-        return adaptation
+        return following
 
     def _start(self, coroutine: Coroutine[Any, Any, None]) -> None:
         task = asyncio.get_running_loop().create_task(coroutine)

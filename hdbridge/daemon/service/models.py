@@ -60,7 +60,7 @@ class AxisModels:
         setting = CompensationSetting(model, Scheme.EXTENDED if model.effects else Scheme.NONE)
         for scheme in Scheme:
             known = replace(self.chosen, scheme=scheme, load_loop=False)
-            if model.effects and known.compensating.effects == model.effects:
+            if model.effects and known.compensating == model:
                 setting = known
                 break
         return self.send(setting)

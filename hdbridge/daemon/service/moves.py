@@ -10,13 +10,12 @@ import asyncio
 import math
 from collections import deque
 from collections.abc import Coroutine, Sequence
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from hdbridge.daemon.loop.states import AxisState
 from hdbridge.daemon.memory import CommandKind
 from hdbridge.daemon.service.activity import ENDS_WITH_LEASE, Activity, Kind
 from hdbridge.daemon.service.axislink import AxisLink
-from hdbridge.daemon.service.interface import WayPoint
 from hdbridge.daemon.service.streams import ServiceStream
 from hdbridge.errors import HdbridgeError, InputError, RefusedError
 
@@ -25,6 +24,18 @@ if TYPE_CHECKING:
 
 QUEUE_MOST: Final = 1000
 """Maximum number of waiting way points."""
+
+
+class WayPoint(NamedTuple):
+    """One move of a queue."""
+
+    target_deg: float
+    velocity_deg_s: float | None = None
+    """Maximum velocity; None for the axis's limit."""
+    acceleration_deg_s2: float | None = None
+    """Maximum acceleration; None for the axis's limit."""
+    dwell_s: float = 0.0
+    """Rest before the next move."""
 
 
 class AxisMotion:

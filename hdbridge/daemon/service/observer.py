@@ -6,7 +6,7 @@ import asyncio
 import logging
 from collections import deque
 from collections.abc import AsyncIterator, Callable, Sequence
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
@@ -14,7 +14,6 @@ from hdbridge.client import messages
 from hdbridge.clock import Clock
 from hdbridge.daemon.memory import Event, Memory, SampleArray, joined_samples, sample_dtype
 from hdbridge.daemon.service.eventlog import EventLog
-from hdbridge.daemon.service.interface import Batch
 
 PERIOD_S = 0.02
 GONE_S = 3.0
@@ -90,6 +89,16 @@ class Observer:
                 if id(sink) not in self._broken:
                     self._broken.add(id(sink))
                     _log.exception("a sink failed", extra={"sink": type(sink).__name__})
+
+
+class Batch(NamedTuple):
+    """Samples and events delivered to a subscriber at once."""
+
+    samples: SampleArray
+    """One row per cycle, with the fields of `hdbridge.daemon.memory.sample_dtype`."""
+    events: Sequence[messages.Event]
+    lost: int
+    """Cycles lost because the subscriber was too slow."""
 
 
 class Subscription:

@@ -37,7 +37,7 @@ class OuterMaster:
         self._token = ""
 
     def holds(self) -> bool:
-        """Whether the lease is the outer master's; it is taken if nobody has it, and renewed."""
+        """Returns True if the lease is the outer master's; takes the lease if it is free, and renews it."""
         lease = self._core.lease
         if lease.holder is None:
             self._token = lease.take(self._name)
@@ -80,7 +80,7 @@ class OuterMaster:
                 self._core.log.note(f"for {self._name}: {error}", axis.link.index)
 
     def _is_left(self, axis: ServiceAxis, cells: OuterCells) -> bool:
-        """Whether the axis has power by a request that is over: of this gateway process or of one before."""
+        """Returns True if the axis has power by a request that is over, of this or an earlier process."""
         granted = cells[OuterCell.GRANTED]
         return axis.link.state in _OWN and granted != 0 and cells[OuterCell.WANTED] != granted
 

@@ -14,9 +14,8 @@ from hdbridge.daemon.memory import CommandKind, EventKind
 from hdbridge.daemon.service.activity import Activity, Kind
 from hdbridge.daemon.service.axislink import AxisLink
 from hdbridge.daemon.service.commissioning import Commissioning, HomingRun
-from hdbridge.daemon.service.interface import WayPoint
 from hdbridge.daemon.service.models import AxisModels
-from hdbridge.daemon.service.moves import AxisMotion
+from hdbridge.daemon.service.moves import AxisMotion, WayPoint
 from hdbridge.daemon.service.power import UNKNOWN, AxisPower
 from hdbridge.daemon.service.reports import job_words
 from hdbridge.daemon.service.streams import ServiceStream
@@ -37,7 +36,7 @@ _POWERED: Final = frozenset({AxisState.ENABLING, AxisState.ENABLED, AxisState.ST
 
 
 class ServiceAxis:
-    """One axis of the machine; `interface.AxisPort` documents each method."""
+    """One axis of the machine. Every method that moves it requires the lease; stopping and reading do not."""
 
     def __init__(
         self,
@@ -106,7 +105,7 @@ class ServiceAxis:
     # ---------------------------------------------------------------- power
 
     async def enable(self, holder: str) -> None:
-        """Switches power on, at rest."""
+        """Switches power on, at rest; boots and verifies the drive first if that was not done."""
         self.check_may(holder)
         async with self._alone("the axis is being enabled"):
             self.motion.replace(None, "the axis was enabled anew")
@@ -121,7 +120,7 @@ class ServiceAxis:
                 await self.power.prepare()
 
     async def disable(self, holder: str) -> None:
-        """Brakes to rest, then switches power off."""
+        """Brakes to rest, then switches power off. Cancels the axis's job."""
         self.core.lease.check(holder)
         self.motion.replace(None, "the axis was disabled")
         async with self._alone("the axis is being disabled"):
@@ -133,17 +132,17 @@ class ServiceAxis:
         self.power.interrupt(f"{self.name}: {why}")
 
     async def quick_stop(self) -> None:
-        """Quick-stops the axis and latches the stop."""
+        """Quick-stops the axis and latches the stop until `reset`. Requires no lease."""
         self.give_up("it was stopped by a quick stop")
         await self.link.do(CommandKind.QUICK_STOP)
 
     async def stop(self) -> None:
-        """Brakes to rest within the limits and stays enabled."""
+        """Brakes to rest and stays enabled. Cancels queue, stream and job. Requires no lease."""
         self.give_up("it was stopped by a client")
         await self.link.do(CommandKind.STOP)
 
     async def reset(self, holder: str) -> None:
-        """Releases a latched stop; the axis is disabled afterwards."""
+        """Releases a latched stop: resets the drive's fault, verifies the drive if needed; disabled."""
         self.check_may(holder)
         async with self._alone("the axis is being reset"):
             self.motion.replace(None, "the axis was reset")
@@ -172,7 +171,7 @@ class ServiceAxis:
         offset_deg: float = 0.0,
         timeout_s: float = 60.0,
     ) -> float:
-        """Homes by the drive's own method, disabled before and after; returns the load angle."""
+        """Homes by a method of 6098h, disabled before and after; returns the load angle afterwards."""
         self.check_may(holder)
         run = HomingRun(
             method, switch_velocity_deg_s, zero_velocity_deg_s, acceleration_deg_s2, offset_deg, timeout_s
@@ -190,29 +189,35 @@ class ServiceAxis:
         acceleration_deg_s2: float | None = None,
         wait: bool = True,
     ) -> None:
-        """Moves to a target, from rest or during any motion."""
+        """Moves to ``target_deg``, or redirects a present motion there; with ``wait`` returns at rest there.
+
+        Raises RefusedError if another command replaced this one before its end.
+        """
         self.check_may(holder)
         activity = await self.motion.move(holder, WayPoint(target_deg, velocity_deg_s, acceleration_deg_s2))
         if wait:
             await self.link.arrival(activity)
 
     async def jog(self, holder: str, velocity_deg_s: float, timeout_s: float = 0.5) -> None:
-        """Turns at a speed until the time-out."""
+        """Turns at a speed; brakes to rest unless called again within ``timeout_s``."""
         self.check_may(holder)
         await self.motion.jog(holder, velocity_deg_s, timeout_s)
 
     async def queue(self, holder: str, points: Sequence[WayPoint]) -> int:
-        """Appends moves to the queue; returns the number of waiting moves."""
+        """Appends moves, each begun when the one before has ended; returns the number of waiting moves."""
         self.check_may(holder)
         return await self.motion.queue(holder, points)
 
     async def clear_queue(self, holder: str) -> int:
-        """Discards the waiting moves and returns their number."""
+        """Discards the waiting moves and returns their number. The present move continues."""
         self.check_may(holder)
         return self.motion.clear_queue()
 
     async def stream(self, holder: str, timeout_s: float = 0.5) -> ServiceStream:
-        """Opens a stream of set-points."""
+        """Opens a stream of set-points. It begins at rest, with the first set-points that are put.
+
+        If none come for ``timeout_s`` and all are used up, the axis brakes to rest.
+        """
         self.check_may(holder)
         return await self.motion.stream(holder, timeout_s)
 
@@ -236,13 +241,16 @@ class ServiceAxis:
     # ---------------------------------------------------------------- compensation
 
     async def compensate(self, holder: str, scheme: Scheme) -> None:
-        """Selects the part of the model that compensates."""
+        """Selects the part of the model that compensates; fades it in, also during motion."""
         self.check_may(holder)
         async with self._changing:
             await self._use(await self.core.timing.work(self.models.with_scheme, scheme))
 
     async def activate_model(self, holder: str, version: int | Literal["pending", "active"]) -> None:
-        """Makes another model of the profile the active one, and uses it."""
+        """Activates a model of the profile and uses it: a version, ``pending`` or ``active``.
+
+        ``pending`` commits it; ``active`` reads the profile's model again. Fades it in, also during motion.
+        """
         self.check_may(holder)
         identity = self.commissioning.identity
         async with self._changing:
@@ -288,11 +296,11 @@ class ServiceAxis:
     # ---------------------------------------------------------------- objects of the drive, jobs
 
     async def sdo_read(self, object_: str) -> tuple[Object, Value]:
-        """Reads an object of the drive."""
+        """Reads an object of the drive by its number (``6064h``, ``0x1018:4``) or EDS name."""
         return await self.core.timing.work(self.commissioning.read, object_)
 
     async def sdo_write(self, holder: str, object_: str, value: str) -> Object:
-        """Writes an object of the drive, unless the axis is enabled."""
+        """Writes an object of the drive, given as text; refused while the axis is enabled."""
         self.check_may(holder)
         if self.link.state in _POWERED:
             raise RefusedError(
@@ -303,7 +311,7 @@ class ServiceAxis:
     async def job(
         self, holder: str, kind: messages.JobKind, options: Mapping[str, Any] | None = None
     ) -> messages.Job:
-        """Begins a job."""
+        """Begins a job with the options of the command of that name."""
         self.check_may(holder)
         return self._begin_job(self, holder, kind, options or {})
 

@@ -41,7 +41,7 @@ class AxisPower:
         self._drive = commissioning
         self._check_drive = check_drive
         self.is_prepared = False
-        """Whether all is done by SDO that precedes power; nothing has been done by SDO since."""
+        """True if all SDO work that precedes power is done, and no SDO transfer has followed."""
         self._work = link.core.timing.work
 
     async def enable(self) -> None:

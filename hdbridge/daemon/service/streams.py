@@ -11,12 +11,11 @@ import math
 from collections.abc import Sequence
 from itertools import pairwise
 from types import TracebackType
-from typing import Final, Self
+from typing import Final, NamedTuple, Self
 
 from hdbridge.daemon.memory import CommandKind, Knot
 from hdbridge.daemon.service.activity import Activity
 from hdbridge.daemon.service.axislink import AxisLink
-from hdbridge.daemon.service.interface import StreamPoint
 from hdbridge.errors import InputError, RefusedError
 
 LEAD_S: Final = 0.1
@@ -24,6 +23,16 @@ LEAD_S: Final = 0.1
 ROOM_POLL_S: Final = 0.02
 BEGIN_DEG: Final = 1e-6
 """Maximum distance between the first point of a stream and the axis's position."""
+
+
+class StreamPoint(NamedTuple):
+    """One set-point of a stream."""
+
+    time_s: float
+    """Time since the stream began; later than that of the point before."""
+    position_deg: float
+    velocity_deg_s: float | None = None
+    """Velocity of the path at this point; None for the slope between its neighbours, or rest at the last."""
 
 
 class Knots:

@@ -1,6 +1,6 @@
 """Truth file: the true values of all parameters of the simulated axis.
 
-A calibration does not read this file; it must find the values. docs/truth-file.md describes each key, and
+A calibration does not read this file; it must find the values. docs/ci.md describes each key, and
 `profiles/article/truth.yaml` is the article's bench. Angles and torques of the gear are at the load.
 Other modules of this package define the sections.
 """

@@ -77,7 +77,7 @@ def test_an_axis_is_in_one_state_and_its_figures_are_there():
 
 
 def test_a_client_cannot_make_the_page_grow(api):
-    """By methods, paths or names of its own."""
+    """Counts requests with methods, paths or names that the client made up."""
     with api.over_socket() as client:
         url = "http://hdbridge/metrics"
         for number in range(20):

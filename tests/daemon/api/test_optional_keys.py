@@ -23,7 +23,7 @@ from hdbridge.daemon.api.policy import Policy
 from hdbridge.daemon.api.server import ApiServer, Listener
 from hdbridge.daemon.api.sockets import unix_socket
 from hdbridge.daemon.machine import Machine
-from hdbridge.daemon.service.process import _adaptations
+from hdbridge.daemon.serve import follow
 from hdbridge.errors import DaemonError, HdbridgeError, InputError
 from hdbridge.files.yamlfile import document_from_text
 
@@ -133,7 +133,7 @@ def machine_of(folder: Path, axis: dict[str, Any], machine: dict[str, Any]) -> M
 
 
 def content(machine: Machine) -> str:
-    """All that the files say, whatever is at its default."""
+    """Returns the content of the files, defaults included."""
     axes = [
         (each.config.model_dump_json(), each.compensation, each.adaptation, each.load_loop)
         for each in machine.axes
@@ -164,7 +164,7 @@ def call_everything(machine: Machine, folder: Path) -> list[str]:
         path = folder / "cell.sock"
         async with AsyncExitStack() as stack:
             bridge = await stack.enter_async_context(service.ready(simulated=True))
-            for each in _adaptations(machine, bridge, stack):
+            for each in follow(machine, bridge, None, stack):
                 bridge.core.observer.add(each)
             metrics = Metrics()
             bridge.core.observer.add(metrics)

@@ -1,4 +1,4 @@
-"""Who may ask what: sockets, token, host and origin, sizes, the log."""
+"""Permissions: sockets, token, host and origin, sizes, the log."""
 
 import grp
 import logging

@@ -79,7 +79,7 @@ def test_what_is_no_wish_ends_the_connection_and_says_why(api, wrong):
 
 
 def test_a_client_that_does_not_read_loses_samples_and_nobody_else_does(api):
-    """It reads nothing until thousands of cycles have gone by: the newest come then, the rest is counted."""
+    """A client that reads nothing for thousands of cycles gets the newest samples, and a count of others."""
     api.bridge.rows = 40
     with socket.socket(socket.AF_UNIX) as raw:
         raw.connect(str(api.socket))

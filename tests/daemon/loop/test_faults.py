@@ -1,4 +1,4 @@
-"""What follows a fault: the way back, what is told, who goes on. `test_reliability` has each fault itself."""
+"""Recovery from a fault, its reports, and the axes that go on. `test_reliability` has each fault itself."""
 
 from __future__ import annotations
 

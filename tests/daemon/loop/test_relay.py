@@ -1,4 +1,4 @@
-"""What the relay lets through, by itself and on the bus."""
+"""Requests that the relay accepts, by itself and on the bus."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What only the daemon shows of the fault table: clients that err, processes that end, a bus that is back."""
+"""Rows of the fault table that need the daemon: clients that err, processes that end, a bus that is back."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def faults(bench: DaemonBench, axis: int = 0) -> set[Fault]:
 
 
 def powered(node: DriveNode) -> bool:
-    """Whether a drive would follow a set-point."""
+    """True if the drive would follow a set-point."""
     return node.firmware.state.name == State.OPERATION_ENABLED.name
 
 

@@ -46,7 +46,7 @@ def _command(kind: CommandKind, **fields: float) -> Event:
 
 
 def _bring_back(daemon: SteppedDaemon) -> None:
-    """What a service does for a client that wants to go on: verify, reset, enable."""
+    """Does for a client the steps to go on: verify, reset, enable."""
     daemon.bus.down = None
     try:
         daemon.run(0.6)

@@ -91,7 +91,7 @@ def test_a_day_in_short(tmp_path: Path) -> None:
 
 
 def test_without_room_on_the_disk_and_then_without_its_keeper(tmp_path: Path) -> None:
-    """It says that nothing is recorded, and works; then it stops the axes and ends."""
+    """The daemon reports that nothing is recorded, and works; then it stops the axes and ends."""
     (tmp_path / "machine.yaml").write_text(
         "schema: hdbridge.machine/1\nname: full\naxes: [{profile: article}]\nrecorder: {free_mb: 1e7}\n",
         encoding="utf-8",

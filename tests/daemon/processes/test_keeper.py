@@ -58,7 +58,7 @@ class Kept:
         until(met, lambda: f"{what}: {self.said} {self.events}")
 
     def pids(self, kind: str) -> list[int]:
-        """Of all processes of a kind that have begun, oldest first."""
+        """Returns all processes of a kind that have started, oldest first."""
         found = [line.split() for line in self.said]
         return [int(words[1]) for words in found if words[0] == kind and words[1] != "ends"]
 

@@ -1,4 +1,4 @@
-"""What comes is on the disk, within the limits; what a fault is near to stays."""
+"""Samples reach the disk within the limits; those near a fault stay."""
 
 import json
 

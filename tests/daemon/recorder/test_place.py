@@ -1,4 +1,4 @@
-"""Where the flight recorder writes."""
+"""Folder of the flight recorder."""
 
 import shutil
 from pathlib import Path

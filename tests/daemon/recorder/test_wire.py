@@ -1,4 +1,4 @@
-"""What is written is what the schema in the file says, as protobuf's own library reads it."""
+"""Messages follow the schema in the file, as protobuf's own library reads it."""
 
 import numpy as np
 import pytest

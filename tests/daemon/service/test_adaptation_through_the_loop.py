@@ -14,10 +14,10 @@ from support.adapting import truth_of
 from support.service import Service, play, stepped_service, until
 
 from hdbridge.client import messages
-from hdbridge.daemon.adaptation.settings import AdaptationSettings
+from hdbridge.daemon.following.settings import AdaptationSettings
 from hdbridge.daemon.memory import EventKind
-from hdbridge.daemon.service.adapting import Adapting
 from hdbridge.daemon.service.bridge import ServiceBridge
+from hdbridge.daemon.service.following import Following
 from hdbridge.effects import Hysteresis
 from hdbridge.evaluation.stepping import Scheme
 
@@ -37,7 +37,7 @@ def service(tmp_path: Path):
 
 
 @asynccontextmanager
-async def adapting(service: Service) -> AsyncIterator[tuple[ServiceBridge, str, Adapting]]:
+async def adapting(service: Service) -> AsyncIterator[tuple[ServiceBridge, str, Following]]:
     """As the service process puts it together."""
     async with service.enabled() as (bridge, token):
         made = begin(service, bridge)
@@ -51,17 +51,17 @@ async def adapting(service: Service) -> AsyncIterator[tuple[ServiceBridge, str, 
             made.close()
 
 
-def begin(service: Service, bridge: ServiceBridge) -> Adapting:
+def begin(service: Service, bridge: ServiceBridge) -> Following:
     axis = service.machine.axes[0]
-    made = Adapting(0, bridge.axes["axis1"], axis.adaptation, axis.profile.folder / "adaptation", AtOnce())
-    bridge.adaptations["axis1"] = made
+    made = Following(0, bridge.axes["axis1"], axis.adaptation, axis.profile.folder / "adaptation", AtOnce())
+    bridge.following["axis1"] = made
     bridge.core.observer.add(made)
     return made
 
 
-async def follow(bridge: ServiceBridge, made: Adapting) -> None:
+async def follow(bridge: ServiceBridge, made: Following) -> None:
     while True:
-        await made.follow()
+        await made.apply()
         await bridge.core.timing.sleep(1.0)
 
 
@@ -84,7 +84,7 @@ async def work(bridge: ServiceBridge, token: str, stands: int, seed: int = 0) ->
 
 
 def offset_arcsec(bridge: ServiceBridge) -> float:
-    """Of the model that compensates."""
+    """Identifier of the compensating model."""
     effects = bridge.axes["axis1"].models.in_use.compensating.effects
     return next(each.offset_arcsec for each in effects if isinstance(each, Hysteresis))
 
@@ -129,7 +129,7 @@ def test_a_service_that_begins_anew_goes_on_with_what_was_learnt(service: Servic
             assert offset_arcsec(bridge) == learnt  # what the control process still uses
             made = begin(service, bridge)
             await until(bridge, lambda: bridge.axis_state("axis1").adaptation.frozen is not None)
-            await made.follow()
+            await made.apply()
             assert offset_arcsec(bridge) == pytest.approx(learnt)
             made.close()
 

@@ -16,7 +16,8 @@ from support.service import stepped_service, until
 
 from hdbridge.client.messages import JobKind
 from hdbridge.daemon.loop.states import AxisState
-from hdbridge.daemon.service.interface import StreamPoint, WayPoint
+from hdbridge.daemon.service.moves import WayPoint
+from hdbridge.daemon.service.streams import StreamPoint
 from hdbridge.errors import HdbridgeError, LeaseError
 
 LEASE_S = 2.0
@@ -56,7 +57,7 @@ class Disorder(RuleBasedStateMachine):
         self.run(self.bridge.core.timing.sleep(seconds))
 
     def ask(self, token: str, request: Callable[[str], Awaitable[Any]]) -> bool:
-        """Whether it was done. Refused with words, or not at all; without the lease never done."""
+        """Returns True if the request was carried out. It is refused with a reason without the lease."""
         holds = self.bridge.lease.holds(token)
 
         async def asked() -> Any:

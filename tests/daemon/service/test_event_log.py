@@ -1,4 +1,4 @@
-"""What clients are told of: the newest, whatever many legs a job has ended meanwhile."""
+"""Clients receive the newest events, however many legs a job has ended meanwhile."""
 
 from __future__ import annotations
 

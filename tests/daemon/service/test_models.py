@@ -1,4 +1,4 @@
-"""What compensates an axis: schemes and models, changed at rest and in motion without a step."""
+"""Compensation of an axis: schemes and models, changed at rest and in motion without a step."""
 
 from dataclasses import replace
 from datetime import UTC, datetime
@@ -50,7 +50,7 @@ def commit(service: Service, model: TransmissionModel) -> None:
 
 
 def steps(samples: np.ndarray) -> np.ndarray:
-    """By how much the correction changes from cycle to cycle, arcsec."""
+    """Returns the change of the correction from cycle to cycle, arcsec."""
     return np.abs(np.diff(samples["axes"][:, 0]["correction_arcsec"]))
 
 

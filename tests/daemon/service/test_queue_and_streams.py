@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from support.service import Service, play, stepped_service, until
 
-from hdbridge.daemon.service.interface import StreamPoint, WayPoint
+from hdbridge.daemon.service.moves import WayPoint
+from hdbridge.daemon.service.streams import StreamPoint
 from hdbridge.errors import InputError, LeaseError, RefusedError
 
 

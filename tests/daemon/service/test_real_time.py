@@ -13,7 +13,8 @@ from support.service import Service, stepped_service
 
 from hdbridge.client.messages import JobKind
 from hdbridge.daemon.service.bridge import ServiceBridge
-from hdbridge.daemon.service.interface import StreamPoint, WayPoint
+from hdbridge.daemon.service.moves import WayPoint
+from hdbridge.daemon.service.streams import StreamPoint
 from hdbridge.daemon.service.timing import RealTiming, SimulatedClock
 from hdbridge.errors import RefusedError
 

@@ -16,11 +16,12 @@ from hdbridge.daemon.api.routes.parts import (
     refusals,
     stopped,
 )
-from hdbridge.daemon.service.interface import Bridge, WayPoint
+from hdbridge.daemon.service.bridge import ServiceBridge
+from hdbridge.daemon.service.moves import WayPoint
 from hdbridge.evaluation.stepping import Scheme
 
 
-def axis_routes(bridge: Bridge) -> APIRouter:
+def axis_routes(bridge: ServiceBridge) -> APIRouter:
     """Returns all routes below ``/axes/{axis}`` except stream and jobs."""
     routes = APIRouter(prefix="/axes/{axis}")
     _add_power(routes, bridge)
@@ -30,7 +31,7 @@ def axis_routes(bridge: Bridge) -> APIRouter:
     return routes
 
 
-def _add_power(routes: APIRouter, bridge: Bridge) -> None:
+def _add_power(routes: APIRouter, bridge: ServiceBridge) -> None:
     @routes.get("", tags=["Look"], responses=refusals(LOOKING))
     async def get_axis(axis: AxisName) -> messages.AxisState:
         """Report the state of an axis in the newest cycle."""
@@ -73,7 +74,7 @@ def _add_power(routes: APIRouter, bridge: Bridge) -> None:
         return found.state()
 
 
-def _add_motion(routes: APIRouter, bridge: Bridge) -> None:
+def _add_motion(routes: APIRouter, bridge: ServiceBridge) -> None:
     @routes.post("/home", tags=["Move"], responses=refusals(MOVING))
     async def home(
         axis: AxisName, home: messages.Home, request: Request, holder: Holder = ""
@@ -114,7 +115,7 @@ def _add_motion(routes: APIRouter, bridge: Bridge) -> None:
         return found.state()
 
 
-def _add_compensation(routes: APIRouter, bridge: Bridge) -> None:
+def _add_compensation(routes: APIRouter, bridge: ServiceBridge) -> None:
     @routes.post("/compensate", tags=["Compensate"], responses=refusals(MOVING))
     async def compensate(
         axis: AxisName, compensate: messages.Compensate, holder: Holder = ""
@@ -157,7 +158,7 @@ def _add_compensation(routes: APIRouter, bridge: Bridge) -> None:
         return found.state()
 
 
-def _add_objects(routes: APIRouter, bridge: Bridge) -> None:
+def _add_objects(routes: APIRouter, bridge: ServiceBridge) -> None:
     @routes.get("/objects/{name:path}", tags=["Drive"], responses=refusals((*LOOKING, 409, 502, 503)))
     async def read_object(axis: AxisName, name: str) -> messages.SdoValue:
         """Read an object of the drive by SDO, by its number (6064h, 0x1018:4) or its EDS name."""

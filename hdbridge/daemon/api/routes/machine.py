@@ -19,11 +19,11 @@ from hdbridge.daemon.api.routes.parts import (
     refusals,
     stopped,
 )
-from hdbridge.daemon.service.interface import Bridge
+from hdbridge.daemon.service.bridge import ServiceBridge
 from hdbridge.drive.interfacelock import user_name
 
 
-def machine_routes(bridge: Bridge) -> APIRouter:
+def machine_routes(bridge: ServiceBridge) -> APIRouter:
     """Returns the routes that concern no single axis, and those of jobs."""
     routes = APIRouter()
     _add_looking(routes, bridge)
@@ -33,7 +33,7 @@ def machine_routes(bridge: Bridge) -> APIRouter:
     return routes
 
 
-def _add_looking(routes: APIRouter, bridge: Bridge) -> None:
+def _add_looking(routes: APIRouter, bridge: ServiceBridge) -> None:
     @routes.get("/state", tags=["Look"])
     async def get_state() -> messages.MachineState:
         """Report the state of the machine and its axes in the newest cycle."""
@@ -56,7 +56,7 @@ def _add_looking(routes: APIRouter, bridge: Bridge) -> None:
         return bridge.events(before)
 
 
-def _add_lease(routes: APIRouter, bridge: Bridge) -> None:
+def _add_lease(routes: APIRouter, bridge: ServiceBridge) -> None:
     def state() -> messages.LeaseState:
         return bridge.state().lease
 
@@ -85,7 +85,7 @@ def _add_lease(routes: APIRouter, bridge: Bridge) -> None:
         return state()
 
 
-def _add_motion(routes: APIRouter, bridge: Bridge) -> None:
+def _add_motion(routes: APIRouter, bridge: ServiceBridge) -> None:
     @routes.post("/quick-stop", tags=["Stop"], responses=refusals((409, 502, 503)))
     async def quick_stop_all() -> messages.MachineState:
         """Stop every axis as fast as its drive can, latched until a reset. Needs no lease."""
@@ -112,7 +112,7 @@ def _add_motion(routes: APIRouter, bridge: Bridge) -> None:
         return bridge.state()
 
 
-def _add_jobs(routes: APIRouter, bridge: Bridge) -> None:
+def _add_jobs(routes: APIRouter, bridge: ServiceBridge) -> None:
     def job(id_: str) -> messages.Job:
         for each in bridge.jobs():
             if each.id == id_:

@@ -10,7 +10,8 @@ from fastapi import Header, Path, Request
 
 from hdbridge.client.messages import ControlState, Problem
 from hdbridge.daemon.api.problems import UnknownError
-from hdbridge.daemon.service.interface import AxisPort, Bridge
+from hdbridge.daemon.service.bridge import ServiceBridge
+from hdbridge.daemon.service.ports import ServiceAxis
 from hdbridge.errors import LeaseError
 
 T = TypeVar("T")
@@ -52,7 +53,7 @@ def refusals(statuses: tuple[int, ...]) -> dict[int | str, dict[str, Any]]:
     return {each: {"model": Problem, "description": _WORDS[each]} for each in statuses}
 
 
-def port(bridge: Bridge, axis: str) -> AxisPort:
+def port(bridge: ServiceBridge, axis: str) -> ServiceAxis:
     """Returns the axis of this name; raises UnknownError (404) if there is none."""
     found = bridge.axes.get(axis)
     if found is None:
@@ -60,7 +61,7 @@ def port(bridge: Bridge, axis: str) -> AxisPort:
     return found
 
 
-async def stopped(*axes: AxisPort) -> None:
+async def stopped(*axes: ServiceAxis) -> None:
     """Waits briefly until a quick stop shows in the axes' states, because samples arrive in batches."""
     for _ in range(STOP_LOOKS):
         if all(each.state().state not in _ON for each in axes):
@@ -68,7 +69,7 @@ async def stopped(*axes: AxisPort) -> None:
         await asyncio.sleep(STOP_LOOK_S)
 
 
-async def kept(bridge: Bridge, holder: str, request: Request, motion: Awaitable[T]) -> T:
+async def kept(bridge: ServiceBridge, holder: str, request: Request, motion: Awaitable[T]) -> T:
     """Waits for a motion and renews its holder's lease meanwhile, unless the client disconnects.
 
     The motion itself completes in any case.

@@ -16,7 +16,8 @@ from hdbridge.client.messages import LiveOptions, Problem, StreamAnswer, StreamB
 from hdbridge.daemon.api.columns import columns
 from hdbridge.daemon.api.policy import SUBPROTOCOL
 from hdbridge.daemon.api.routes.parts import port
-from hdbridge.daemon.service.interface import Bridge, StreamPoint
+from hdbridge.daemon.service.bridge import ServiceBridge
+from hdbridge.daemon.service.streams import StreamPoint
 from hdbridge.errors import HdbridgeError, InputError
 
 M = TypeVar("M", bound=BaseModel)
@@ -34,7 +35,7 @@ _NORMAL: Final = 1000
 _GONE: Final = 1006
 
 
-def socket_routes(bridge: Bridge) -> APIRouter:
+def socket_routes(bridge: ServiceBridge) -> APIRouter:
     """Returns the routes ``/live`` and ``/axes/{axis}/stream``."""
     routes = APIRouter()
 
@@ -70,7 +71,7 @@ def socket_routes(bridge: Bridge) -> APIRouter:
 class _Feed:
     """One client of the live samples."""
 
-    def __init__(self, bridge: Bridge, websocket: WebSocket) -> None:
+    def __init__(self, bridge: ServiceBridge, websocket: WebSocket) -> None:
         self._bridge = bridge
         self._websocket = websocket
         self._options = LiveOptions()
@@ -106,7 +107,7 @@ class _Feed:
             await asyncio.sleep(BATCH_S)  # collects samples, so that messages are fewer and larger
 
 
-async def _stream(bridge: Bridge, websocket: WebSocket, axis: str) -> None:
+async def _stream(bridge: ServiceBridge, websocket: WebSocket, axis: str) -> None:
     try:
         async with asyncio.timeout(BEGIN_S):
             begin = await _receive(websocket, StreamBegin)

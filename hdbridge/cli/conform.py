@@ -1,0 +1,238 @@
+"""``hdbridge conform``: checks of CiA 301 and CiA 402 on any node."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from rich.table import Table
+
+from hdbridge.cli.options import (
+    ForceOption,
+    JsonOption,
+    SeedOption,
+    SimulateOption,
+    TruthOption,
+    notes,
+    print_table,
+    progress_bar,
+    write_json,
+)
+from hdbridge.cli.session import Session, bare_bus
+from hdbridge.errors import DriveError, InputError
+
+if TYPE_CHECKING:
+    from hdbridge.conformance import Check, Result
+
+
+def register(app: typer.Typer) -> None:
+    """Adds the command."""
+    app.command("conform")(conform)
+
+
+def conform(
+    profile: Annotated[
+        str | None,
+        typer.Argument(
+            metavar="PROFILE", help="Axis whose drive is checked. Without it: --channel, --node and --eds."
+        ),
+    ] = None,
+    interface: Annotated[
+        str | None,
+        typer.Option("--interface", help="python-can interface; else the axis file's, or socketcan."),
+    ] = None,
+    channel: Annotated[
+        str | None, typer.Option("--channel", help="Channel of the bus, for example can0.")
+    ] = None,
+    bitrate_bps: Annotated[
+        int | None,
+        typer.Option("--bitrate", min=10_000, max=1_000_000, help="Bit rate, where the interface sets it."),
+    ] = None,
+    node_id: Annotated[
+        int | None, typer.Option("--node", min=1, max=127, help="Node id; else the axis file's.")
+    ] = None,
+    eds: Annotated[
+        Path | None,
+        typer.Option(
+            "--eds", metavar="FILE", help="EDS of the node, which is compared with it; else the axis file's."
+        ),
+    ] = None,
+    motion: Annotated[
+        bool,
+        typer.Option("--motion", help="Also switch power on and move the axis; without it power stays off."),
+    ] = False,
+    store: Annotated[
+        bool,
+        typer.Option(
+            "--store", help="Also save parameters (1010h) and restore defaults (1011h): stored ones are lost."
+        ),
+    ] = False,
+    travel: Annotated[
+        int | None,
+        typer.Option(
+            "--travel",
+            min=1,
+            metavar="UNITS",
+            help="Length of a test move; the axis stays within ten of them. Default: 0.02 turns (608Fh).",
+        ),
+    ] = None,
+    only: Annotated[
+        list[str] | None, typer.Option("--only", metavar="ID", help="Only checks whose id begins so.")
+    ] = None,
+    timeout_ms: Annotated[
+        float, typer.Option("--timeout-ms", min=1.0, max=60_000.0, help="Longest time to an SDO answer.")
+    ] = 500.0,
+    list_checks: Annotated[bool, typer.Option("--list", help="List the checks and end.")] = False,
+    simulate: SimulateOption = False,
+    truth: TruthOption = None,
+    seed: SeedOption = 0,
+    force: ForceOption = False,
+    json_file: JsonOption = None,
+) -> None:
+    """Check a node against CiA 301 and CiA 402: NMT, SDO, PDO, SYNC, EMCY, its EDS, the drive profile.
+
+    hdbridge conform --channel can0 --node 5 --eds drive.eds
+
+    It listens first and sends nothing if another master is heard. The node is reset several times, and what a
+    check changes is changed back; in the end it is PRE-OPERATIONAL without power. Without --motion power is
+    never switched on. With it, the axis must be free to move.
+
+    Exit status 4 when a check failed, or when the node does not answer or is not without power.
+    """  # fmt: skip
+    from hdbridge.cli.interrupt import deferred_interrupt
+    from hdbridge.conformance import NodeTester, checks, run
+    from hdbridge.conformance.tester import StoppedError, Timing
+    from hdbridge.drive.link import Link
+    from hdbridge.drive.manners import Ear, listening_s
+    from hdbridge.files.edsfile import read_eds
+
+    wanted = _chosen(checks(moves=motion, stores=store), checks(moves=True, stores=True), only)
+    if list_checks:
+        write_json(
+            json_file, {"schema": "hdbridge.conform/1", "checks": [_described(each) for each in wanted]}
+        )
+        _print_list(wanted)
+        return
+    axis = None
+    if profile is not None:
+        session = Session(profile, simulate, truth, seed, interface, channel, force)
+        axis, opened = session.axis, session.connected()
+        node_id, eds = node_id or axis.drive.node_id, eds or axis.eds_path
+    elif simulate or channel is None or node_id is None:
+        raise InputError("conform needs a node: give a PROFILE, or --channel (can0) and --node")
+    else:
+        opened = bare_bus(interface or "socketcan", channel, bitrate_bps, force=force)
+    assert node_id is not None
+    od = None if eds is None else read_eds(eds, node_id).dictionary
+    with deferred_interrupt() as interrupted, opened as (bus, clock), progress_bar() as bar:
+        link = Link(bus, clock)
+        task = bar.add_task(f"{len(wanted)} checks", total=len(wanted))
+        if not simulate and not force:
+            ear = Ear((node_id,), asked=(node_id,))
+            ear.listen(link, listening_s())
+            ear.refuse(link.name, listening_s())
+        tester = NodeTester(
+            link,
+            node_id,
+            od=od,
+            travel=travel,
+            timing=Timing(answer_s=timeout_ms / 1000.0),
+            stopped=interrupted,
+        )
+        results = run(tester, wanted, lambda _: bar.advance(task))
+    write_json(json_file, _document(link.name, node_id, eds, results))
+    _print(results)
+    if len(results) < len(wanted):
+        raise StoppedError(f"ended after {len(results)} of {len(wanted)} checks; the power is off")
+    failed = [each.check.id for each in results if each.verdict.value == "fail"]
+    if failed:
+        raise DriveError(
+            f"node {node_id} on {link.name}: {len(failed)} of {len(results)} checks failed: "
+            f"{', '.join(failed[:5])}"
+            f"{' and more' if len(failed) > 5 else ''}; expected none to fail"
+        )
+
+
+def _chosen(allowed: Sequence[Check], every: Sequence[Check], only: Sequence[str] | None) -> list[Check]:
+    if not only:
+        return [*allowed]
+    for prefix in only:
+        if not any(each.id.startswith(prefix) for each in every):
+            raise InputError(
+                f"--only {prefix}: no check has such an id; 'hdbridge conform --list' shows them"
+            )
+        if not any(each.id.startswith(prefix) for each in allowed):
+            raise InputError(f"--only {prefix}: these checks need --motion or --store")
+    return [each for each in allowed if each.id.startswith(tuple(only))]
+
+
+def _described(check: Check) -> dict[str, Any]:
+    return {
+        "id": check.id,
+        "text": check.text,
+        "clause": check.clause,
+        "motion": check.moves,
+        "store": check.stores,
+    }
+
+
+def _document(name: str, node_id: int, eds: Path | None, results: Sequence[Result]) -> dict[str, Any]:
+    return {
+        "schema": "hdbridge.conform/1",
+        "bus": name,
+        "node_id": node_id,
+        "eds": None if eds is None else str(eds),
+        "summary": _count(results),
+        "checks": [
+            {
+                **_described(each.check),
+                "result": each.verdict.value,
+                "found": each.found,
+                "expected": each.expected,
+                "duration_s": round(each.duration_s, 6),
+            }
+            for each in results
+        ],
+    }
+
+
+def _count(results: Sequence[Result]) -> dict[str, int]:
+    from hdbridge.conformance import Verdict
+
+    return {each.value: sum(result.verdict is each for result in results) for each in Verdict}
+
+
+def _print_list(checks: Sequence[Check]) -> None:
+    table = Table("id", "check", "clause", "needs")
+    for each in checks:
+        needs = "--motion" if each.moves else "--store" if each.stores else ""
+        table.add_row(each.id, each.text, each.clause, needs)
+    print_table(table)
+
+
+def _print(results: Sequence[Result]) -> None:
+    from hdbridge.conformance import Verdict
+
+    summary = Table("subject", "pass", "fail", "not applicable")
+    subjects = dict.fromkeys(each.check.id.split(".", maxsplit=1)[0] for each in results)
+    for subject in subjects:
+        counts = _count([each for each in results if each.check.id.split(".", maxsplit=1)[0] == subject])
+        summary.add_row(subject, *(str(count) for count in counts.values()))
+    summary.add_section()
+    summary.add_row("all", *(str(count) for count in _count(results).values()))
+    print_table(summary)
+    if failed := [each for each in results if each.verdict is Verdict.FAIL]:
+        table = Table("failed", "check", "found", "expected", "clause")
+        for each in failed:
+            table.add_row(each.check.id, each.check.text, each.found, each.expected, each.check.clause)
+        print_table(table)
+    reasons: dict[str, int] = {}
+    for each in results:
+        if each.verdict is Verdict.NOT_APPLICABLE:
+            reasons[each.found] = reasons.get(each.found, 0) + 1
+    for reason, count in reasons.items():
+        notes.print(
+            f"not applicable, {count} check{'s' * (count > 1)}: {reason}", markup=False, soft_wrap=True
+        )

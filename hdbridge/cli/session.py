@@ -1,0 +1,194 @@
+"""The axis of a command: its profile, its options, and its drive on the bus or a simulated one."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cached_property, wraps
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Concatenate, ParamSpec, get_type_hints
+
+from hdbridge.cli.interrupt import deferred_interrupt
+from hdbridge.cli.options import (
+    ChannelOption,
+    ForceOption,
+    InterfaceOption,
+    ProfileArgument,
+    SeedOption,
+    SimulateOption,
+    TruthOption,
+    notes,
+)
+from hdbridge.clock import Clock, MonotonicClock
+from hdbridge.errors import InputError
+from hdbridge.files.profile import Profile
+
+if TYPE_CHECKING:
+    import can
+
+    from hdbridge.axis import AxisConfig
+    from hdbridge.drive.drive import Drive
+
+P = ParamSpec("P")
+
+
+@dataclass(frozen=True)
+class Session:
+    """An axis as the user of one command names it. Nothing is connected before it is asked for.
+
+    The fields are the options of every command that reaches an axis: see `on_axis`.
+    """
+
+    profile: ProfileArgument
+    simulate: SimulateOption = False
+    truth: TruthOption = None
+    seed: SeedOption = 0
+    interface: InterfaceOption = None
+    channel: ChannelOption = None
+    force: ForceOption = False
+
+    def __post_init__(self) -> None:
+        check_bus_options(self.interface, self.channel, simulate=self.simulate)
+
+    @cached_property
+    def files(self) -> Profile:
+        """Files of the profile; raises `InputError` if there is no such profile."""
+        return Profile.find(self.profile)
+
+    @cached_property
+    def axis(self) -> AxisConfig:
+        """The axis file, with the bus replaced by the options."""
+        return load_axis(self.files, self.interface, self.channel, simulate=self.simulate)
+
+    @property
+    def simulated_seed(self) -> int | None:
+        """Seed of the simulated axis; None for a real one."""
+        return self.seed if self.simulate else None
+
+    @contextmanager
+    def connected(self) -> Iterator[tuple[can.BusABC, Clock]]:
+        """Yields the axis's bus and its clock: those of a simulated drive, or the real ones.
+
+        With ``force``, the bus is opened even if another process on this computer masters it.
+        """
+        from hdbridge.control.realtime import prepare_realtime
+        from hdbridge.drive.link import open_bus
+        from hdbridge.sim.lockstep import simulated_bench
+
+        axis = self.axis
+        if self.simulate:
+            plant = simulated_by(self.files, self.truth)
+            source, node_id = axis.load_encoder.source.address, axis.drive.node_id
+            with simulated_bench(plant, axis.eds_path, node_id, self.seed, load_object=source) as bench:
+                yield bench[0], bench[1]
+            return
+        if self.truth is not None:
+            raise InputError("--truth says what a simulated axis is like: give --simulate with it")
+        if axis.bus.interface == "virtual":
+            raise InputError(
+                f"{axis.where('bus.interface')}: found virtual, which reaches nothing outside this process; "
+                "expected the interface of the bus (socketcan), or give --simulate, which puts a simulated "
+                "drive there"
+            )
+        wanted, bus_of = axis.realtime, open_bus(axis.bus, shared=self.force)
+        with prepare_realtime(wanted.priority, wanted.cpus) as conditions, bus_of as bus:
+            notes.print(f"this process: {conditions}")
+            yield bus, MonotonicClock()
+
+    @contextmanager
+    def drive(self) -> Iterator[Drive]:
+        """Yields the drive, not booted. With ``force``, frames are sent even if another master is heard."""
+        from hdbridge.drive.drive import Drive
+
+        with self.connected() as (bus, clock), Drive(bus, self.axis, clock, force=self.force) as drive:
+            yield drive
+
+    @contextmanager
+    def booted(self) -> Iterator[tuple[Drive, Callable[[], bool]]]:
+        """Yields the booted drive, and a function that reports a request to end. Ctrl-C stops the axis."""
+        with deferred_interrupt() as interrupted, self.drive() as drive:
+            report = drive.boot()
+            notes.print(f"booted node {self.axis.drive.node_id} over {drive.link.name}")
+            for note in report.notes:
+                notes.print(note, markup=False, soft_wrap=True)
+            yield drive, interrupted
+
+
+def on_axis(command: Callable[Concatenate[Session, P], None]) -> Callable[..., None]:
+    """Gives a command the options of a `Session`, which the command receives as its first argument.
+
+    PROFILE stands first, the other options of the session behind the command's own.
+    """
+    own = _parameters(command)[1:]
+    profile, *options = _parameters(Session)
+
+    @wraps(command)
+    def with_options(**values: Any) -> None:
+        session = Session(**{each.name: values.pop(each.name) for each in (profile, *options)})
+        command(session, **values)  # type: ignore[call-arg]
+
+    parameters = [each.replace(kind=inspect.Parameter.KEYWORD_ONLY) for each in (profile, *own, *options)]
+    with_options.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+    with_options.__annotations__ = {each.name: each.annotation for each in parameters}
+    return with_options
+
+
+def _parameters(function: Callable[..., Any]) -> list[inspect.Parameter]:
+    """Returns the parameters with their annotations evaluated."""
+    hints = get_type_hints(function, include_extras=True)
+    given = inspect.signature(function).parameters.values()
+    return [each.replace(annotation=hints[each.name]) for each in given]
+
+
+def check_bus_options(interface: str | None, channel: str | None, *, simulate: bool) -> None:
+    """Refuses a bus option for a simulated drive, which would not use it."""
+    if simulate and (interface is not None or channel is not None):
+        raise InputError(
+            "--simulate has a bus of its own in this process: leave out --interface and --channel; a "
+            "simulated drive on a bus is 'hdbridge simulate' in another process"
+        )
+
+
+def load_axis(
+    files: Profile, interface: str | None, channel: str | None, *, simulate: bool = False
+) -> AxisConfig:
+    """Loads the axis file, with the bus replaced by the options."""
+    from hdbridge.axis import AxisConfig
+    from hdbridge.drive.link import check_interface
+
+    axis = AxisConfig.load(files.axis)
+    if not simulate:
+        check_interface(
+            interface or axis.bus.interface, "--interface" if interface else axis.where("bus.interface")
+        )
+    changes = {
+        name: value for name, value in (("interface", interface), ("channel", channel)) if value is not None
+    }
+    return axis.on_bus(**changes) if changes else axis
+
+
+def simulated_by(files: Profile, truth: Path | None) -> Path:
+    """Returns the file that describes the simulated axis; prints a note if it is the axis's twin."""
+    plant = truth or files.simulated
+    if plant == files.twin:
+        notes.print(f"simulated by the axis's twin, {plant}", markup=False, soft_wrap=True)
+    return plant
+
+
+@contextmanager
+def bare_bus(
+    interface: str, channel: str, bitrate_bps: int | None, *, force: bool
+) -> Iterator[tuple[can.BusABC, Clock]]:
+    """Yields a bus without an axis file, and the monotonic clock.
+
+    With ``force``, the bus is opened even if another process on this computer masters it.
+    """
+    from hdbridge.axis import BusConfig
+    from hdbridge.drive.link import check_interface, open_bus
+
+    check_interface(interface, "--interface")
+    settings = BusConfig(interface=interface, channel=channel, bitrate_bps=bitrate_bps)
+    with open_bus(settings, shared=force) as bus:
+        yield bus, MonotonicClock()

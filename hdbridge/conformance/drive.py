@@ -1,0 +1,435 @@
+"""Checks of CiA 402 that need no power: objects, units, modes, and the states up to *ready to switch on*."""
+
+from __future__ import annotations
+
+import struct
+from typing import Final
+
+from hdbridge.conformance.tester import (
+    NMT_RESET_NODE,
+    NMT_START,
+    RANGE,
+    READ_ONLY,
+    READY_TO_SWITCH_ON,
+    SWITCH_ON_DISABLED,
+    NodeTester,
+    Table,
+    expedited,
+    pack,
+    power_state,
+)
+
+CHECKS: Final = Table()
+check: Final = CHECKS.check
+_PROFILE: Final = "CiA 402-2"
+_STATES: Final = "CiA 402-2, finite state automaton"
+_MODES: Final = "CiA 402-2, objects 6060h, 6061h, 6502h"
+_OPTIONS: Final = "CiA 402-2, objects 605Ah to 605Eh, 6007h"
+_UNITS: Final = "CiA 402-2, objects 608Fh, 6091h, 6092h"
+MODES: Final = {
+    1: "profile position",
+    2: "velocity (frequency converter)",
+    3: "profile velocity",
+    4: "torque profile",
+    6: "homing",
+    7: "interpolated position",
+    8: "cyclic synchronous position",
+    9: "cyclic synchronous velocity",
+    10: "cyclic synchronous torque",
+}
+
+
+@check("402.type", "1000h has the profile number 402 and a drive's type", _PROFILE)
+def _(t: NodeTester) -> None:
+    t.need_402()
+    kind = t.read(0x1000) >> 16 & 0xFF
+    t.true(
+        kind & 0x07, f"type {kind:02X}h", "frequency converter, servo drive or stepper motor (bits 0 to 2)"
+    )
+
+
+def _mandatory(index: int, size: int, name: str, *, writable: bool) -> None:
+    @check(
+        f"402.object.{index:04X}",
+        f"{index:04X}h, {name}, exists with {size} byte{'s' * (size > 1)}",
+        _PROFILE,
+    )
+    def _(t: NodeTester) -> None:
+        t.need_402()
+        data = t.upload(index)
+        t.equal(len(data), size, "bytes")
+        if not writable:
+            t.aborts(expedited(index, 0, data), READ_ONLY, f"download to {index:04X}h")
+
+
+_mandatory(0x6040, 2, "controlword", writable=True)
+_mandatory(0x6041, 2, "statusword", writable=False)
+_mandatory(0x6060, 1, "modes of operation", writable=True)
+_mandatory(0x6061, 1, "modes of operation display", writable=False)
+_mandatory(0x6502, 4, "supported drive modes", writable=False)
+
+
+@check("402.modes", "6502h names at least one mode", _MODES)
+def _(t: NodeTester) -> None:
+    t.need_402()
+    t.true(t.read(0x6502) & 0x3FF, f"6502h = {t.read(0x6502):08X}h", "a bit from 0 to 9")
+
+
+def _mode(number: int, name: str) -> None:
+    @check(
+        f"402.mode.{number}", f"Mode {number}, {name}, is accepted if 6502h names it, else refused", _MODES
+    )
+    def _(t: NodeTester) -> None:
+        t.need_402()
+        if t.read(0x6502) >> number - 1 & 1:
+            t.write(0x6060, 0, number, 1)
+            t.wait(0.05)
+            t.equal(t.read(0x6061, signed=True), number, "6061h")
+        else:
+            wanted = t.read(0x6060, signed=True)
+            t.write(0x6060, 0, wanted, 1)
+            t.ask(expedited(0x6060, 0, pack(number, 1)))
+            t.wait(0.05)
+            t.true(t.read(0x6061, signed=True) != number, f"6061h = {number}", "another mode")
+
+
+for _number, _name in MODES.items():
+    _mode(_number, _name)
+
+
+@check("402.mode.reserved", "A reserved mode, 5, is refused or not displayed", _MODES)
+def _(t: NodeTester) -> None:
+    t.need_402()
+    t.write(0x6060, 0, t.read(0x6060, signed=True), 1)
+    t.ask(expedited(0x6060, 0, b"\x05"))
+    t.wait(0.05)
+    t.true(t.read(0x6061, signed=True) != 5, "6061h = 5", "another mode")
+
+
+# ---------------------------------------------------------------- states without power
+
+
+@check("402.state.reset", "After a reset the drive reaches switch on disabled", _STATES)
+def _(t: NodeTester) -> None:
+    t.need_402()
+    t.reset(NMT_RESET_NODE)
+    t.reaches(SWITCH_ON_DISABLED)
+
+
+@check("402.state.shutdown", "Shutdown leads from switch on disabled to ready to switch on (2)", _STATES)
+def _(t: NodeTester) -> None:
+    ready(t)
+
+
+def ready(t: NodeTester) -> None:
+    """Leads to READY TO SWITCH ON."""
+    t.need_402()
+    t.disable()
+    t.control(0x06)
+    t.reaches(READY_TO_SWITCH_ON)
+
+
+def _back(name: str, word: int, command: str) -> None:
+    @check(f"402.state.{name}", f"{command} leads from ready to switch on to switch on disabled (7)", _STATES)
+    def _(t: NodeTester) -> None:
+        ready(t)
+        t.control(word)
+        t.reaches(SWITCH_ON_DISABLED)
+
+
+_back("disable-voltage", 0x00, "Disable voltage")
+_back("quick-stop", 0x02, "Quick stop")
+
+
+def _no_effect(name: str, word: int, text: str) -> None:
+    @check(f"402.state.disabled.{name}", f"{text} changes nothing in switch on disabled", _STATES)
+    def _(t: NodeTester) -> None:
+        t.need_402()
+        t.disable()
+        t.control(word)
+        t.stays(SWITCH_ON_DISABLED)
+
+
+_no_effect("disable-voltage", 0x00, "Disable voltage")
+_no_effect("quick-stop", 0x02, "Quick stop")
+_no_effect("fault-reset", 0x80, "Fault reset")
+
+
+@check("402.state.ready.repeated", "Repeated shutdown changes nothing in ready to switch on", _STATES)
+def _(t: NodeTester) -> None:
+    ready(t)
+    t.control(0x06)
+    t.stays(READY_TO_SWITCH_ON)
+
+
+@check("402.state.mode-bits", "Bits 4 to 6 and 8 of the controlword do not disturb shutdown", _STATES)
+def _(t: NodeTester) -> None:
+    t.need_402()
+    t.disable()
+    t.control(0x176)
+    t.reaches(READY_TO_SWITCH_ON)
+
+
+@check("402.state.stable", "The drive stays in ready to switch on without a command", _STATES)
+def _(t: NodeTester) -> None:
+    ready(t)
+    t.stays(READY_TO_SWITCH_ON, 0.5)
+
+
+@check("402.status.quick-stop", "Bit 5 of the statusword is 1 in ready to switch on", _STATES)
+def _(t: NodeTester) -> None:
+    ready(t)
+    t.equal(t.read(0x6041) & 0x6F, 0x21, "bits 0 to 3, 5 and 6")
+
+
+@check("402.status.fault", "Bit 3 of the statusword is 0 without a fault", _STATES)
+def _(t: NodeTester) -> None:
+    t.need_402()
+    t.disable()
+    t.equal(t.read(0x6041) & 0x08, 0, "bit 3")
+
+
+@check("402.status.remote", "Bit 9 of the statusword, remote, is 1 while the controlword is obeyed", _STATES)
+def _(t: NodeTester) -> None:
+    ready(t)
+    t.equal(t.read(0x6041) >> 9 & 1, 1, "bit 9")
+
+
+@check("402.status.limit", "Bit 11 of the statusword, internal limit, is 0 at rest without power", _STATES)
+def _(t: NodeTester) -> None:
+    t.need_402()
+    t.disable()
+    t.equal(t.read(0x6041) >> 11 & 1, 0, "bit 11")
+
+
+@check("402.error-code", "603Fh is 0 without a fault", "CiA 402-2, object 603Fh")
+def _(t: NodeTester) -> None:
+    t.need_402()
+    t.require(0x603F)
+    t.disable()
+    t.equal(t.read(0x603F), 0, "603Fh")
+
+
+@check("402.controlword.read", "6040h reads as the controlword that was written", "CiA 402-2, object 6040h")
+def _(t: NodeTester) -> None:
+    ready(t)
+    t.equal(t.read(0x6040), 0x06, "6040h")
+
+
+@check("402.controlword.pdo", "The controlword is obeyed as an RPDO", _STATES)
+def _(t: NodeTester) -> None:
+    t.need_402()
+    t.disable()
+    can_id = t.map_pdo(0x1400, ((0x6040, 0, 16),), 255)
+    t.nmt(NMT_START)
+    t.send(can_id, b"\x06\0")
+    t.reaches(READY_TO_SWITCH_ON)
+    t.send(can_id, b"\0\0")
+    t.reaches(SWITCH_ON_DISABLED)
+
+
+@check("402.controlword.pdo.sync", "A synchronous controlword is obeyed at SYNC, not before", _STATES)
+def _(t: NodeTester) -> None:
+    t.need_402()
+    t.disable()
+    can_id = t.map_pdo(0x1400, ((0x6040, 0, 16),), 1)
+    t.nmt(NMT_START)
+    t.send(can_id, b"\x06\0")
+    t.stays(SWITCH_ON_DISABLED)
+    t.sync()
+    t.reaches(READY_TO_SWITCH_ON)
+
+
+@check("402.statusword.pdo", "A TPDO carries the statusword", _STATES)
+def _(t: NodeTester) -> None:
+    ready(t)
+    can_id = t.map_pdo(0x1800, ((0x6041, 0, 16),), 1)
+    t.nmt(NMT_START)
+    since = t.mark()
+    t.sync()
+    frame = t.hears(can_id, since=since)
+    t.true(frame, "no TPDO", "the statusword")
+    assert frame is not None
+    t.equal(power_state(struct.unpack("<H", frame.data)[0]), READY_TO_SWITCH_ON, "state in the TPDO")
+
+
+@check("402.statusword.event", "An event-driven statusword is sent when the state changes", _STATES)
+def _(t: NodeTester) -> None:
+    ready(t)
+    can_id = t.map_pdo(0x1800, ((0x6041, 0, 16),), 255)
+    t.nmt(NMT_START)
+    t.wait(0.05)
+    since = t.mark()
+    t.control(0x00)
+    t.wait(0.1)
+    words = [struct.unpack("<H", frame.data)[0] for frame in t.heard(can_id, since)]
+    t.true(
+        SWITCH_ON_DISABLED in [power_state(word) for word in words],
+        f"statuswords {[f'{word:04X}h' for word in words]}", "one in switch on disabled",
+    )  # fmt: skip
+
+
+# ---------------------------------------------------------------- option codes
+
+
+def _option(index: int, name: str, reserved: int) -> None:
+    @check(
+        f"402.option.{index:04X}.reserved",
+        f"{index:04X}h, {name}: the reserved value {reserved} is refused",
+        _OPTIONS,
+    )
+    def _(t: NodeTester) -> None:
+        t.need_402()
+        t.require(index)
+        t.refuses_value(index, 0, pack(reserved, 2), RANGE)
+
+    @check(f"402.option.{index:04X}", f"{index:04X}h, {name}, holds a defined value", _OPTIONS)
+    def _(t: NodeTester) -> None:
+        t.need_402()
+        t.require(index)
+        data = t.upload(index)
+        t.equal(len(data), 2, "bytes")
+        value = int.from_bytes(data, "little", signed=True)
+        t.true(value in _DEFINED[index] or value < 0, f"{index:04X}h = {value}", f"one of {_DEFINED[index]}")
+
+
+_DEFINED: Final = {
+    0x6007: (0, 1, 2, 3),
+    0x605A: (0, 1, 2, 3, 4, 5, 6, 7, 8),
+    0x605B: (0, 1),
+    0x605C: (0, 1),
+    0x605D: (1, 2, 3, 4),
+    0x605E: (0, 1, 2, 3, 4),
+}
+_option(0x6007, "abort connection", 4)
+_option(0x605A, "quick stop", 9)
+_option(0x605B, "shutdown", 2)
+_option(0x605C, "disable operation", 2)
+_option(0x605D, "halt", 5)
+_option(0x605E, "fault reaction", 5)
+
+
+# ---------------------------------------------------------------- units and limits
+
+
+@check("402.units.encoder", "608Fh: increments and revolutions are not 0", _UNITS)
+def _(t: NodeTester) -> None:
+    t.need_402()
+    t.require(0x608F, 1)
+    found = [t.read(0x608F, sub) for sub in (1, 2)]
+    t.true(all(found), f"608Fh = {found}", "both above 0")
+
+
+@check("402.units.gear", "6091h: motor and driving shaft revolutions are not 0", _UNITS)
+def _(t: NodeTester) -> None:
+    t.need_402()
+    t.require(0x6091, 1)
+    found = [t.read(0x6091, sub) for sub in (1, 2)]
+    t.true(all(found), f"6091h = {found}", "both above 0")
+
+
+@check("402.units.feed", "6092h: feed and driving shaft revolutions are not 0", _UNITS)
+def _(t: NodeTester) -> None:
+    t.need_402()
+    t.require(0x6092, 1)
+    found = [t.read(0x6092, sub) for sub in (1, 2)]
+    t.true(all(found), f"6092h = {found}", "both above 0")
+
+
+@check("402.units.position", "6064h is 6063h · 6092h / (608Fh · 6091h) apart from a home offset", _UNITS)
+def _(t: NodeTester) -> None:
+    t.need_402()
+    for index, sub in ((0x6063, 0), (0x608F, 1), (0x6091, 1), (0x6092, 1)):
+        t.require(index, sub)
+    increments, turns = t.read(0x608F, 1), t.read(0x608F, 2)
+    motor, shaft = t.read(0x6091, 1), t.read(0x6091, 2)
+    feed, driven = t.read(0x6092, 1), t.read(0x6092, 2)
+    scale = feed * shaft * turns / (increments * motor * driven)
+    offset = t.read(0x607C, signed=True) if t.has(0x607C) else 0
+    internal, actual = t.read(0x6063, signed=True), t.read(0x6064, signed=True)
+    t.need(abs(internal) > 1000, "the axis is too near to zero to see a scale")
+    t.true(
+        abs(abs(actual - offset) - abs(internal) * scale) <= 2 + 0.001 * abs(internal) * scale,
+        f"6064h = {actual} at 6063h = {internal}", f"{internal * scale:.0f}",
+    )  # fmt: skip
+
+
+@check(
+    "402.limits.position", "607Dh: the lower position limit is below the upper one", "CiA 402-2, object 607Dh"
+)
+def _(t: NodeTester) -> None:
+    t.need_402()
+    t.require(0x607D, 1)
+    low, high = (t.read(0x607D, sub, signed=True) for sub in (1, 2))
+    t.true(low < high or low == high == 0, f"607Dh = {low}, {high}", "lower below upper")
+
+
+def _positive(index: int, name: str) -> None:
+    @check(f"402.limits.{index:04X}", f"{index:04X}h, {name}, is above 0", f"CiA 402-2, object {index:04X}h")
+    def _(t: NodeTester) -> None:
+        t.need_402()
+        t.require(index)
+        t.true(t.read(index), f"{index:04X}h = 0", "a value above 0")
+
+
+_positive(0x607F, "max profile velocity")
+_positive(0x6080, "max motor speed")
+_positive(0x6081, "profile velocity")
+_positive(0x6083, "profile acceleration")
+_positive(0x6084, "profile deceleration")
+_positive(0x6085, "quick stop deceleration")
+_positive(0x6076, "motor rated torque")
+
+
+@check("402.period", "60C2h is a period from 0.1 ms to 1 s", "CiA 402-2, object 60C2h")
+def _(t: NodeTester) -> None:
+    t.need_402()
+    t.require(0x60C2, 1)
+    period_s = t.read(0x60C2, 1) * 10.0 ** t.read(0x60C2, 2, signed=True)
+    t.true(1e-4 <= period_s <= 1.0, f"{period_s:g} s", "0.1 ms to 1 s")
+
+
+@check("402.homing.methods", "Every method in 60E3h is accepted by 6098h", "CiA 402-2, objects 6098h, 60E3h")
+def _(t: NodeTester) -> None:
+    t.need_402()
+    t.require(0x60E3)
+    for sub in range(1, t.read(0x60E3) + 1):
+        t.write(0x6098, 0, t.read(0x60E3, sub, signed=True), 1)
+
+
+@check("402.homing.reserved", "A reserved homing method, 38, is refused", "CiA 402-2, object 6098h")
+def _(t: NodeTester) -> None:
+    t.need_402()
+    t.require(0x6098)
+    t.refuses_value(0x6098, 0, b"\x26", RANGE)
+
+
+@check(
+    "402.profile-type.reserved",
+    "6086h, motion profile type: the reserved value 5 is refused",
+    "CiA 402-2, object 6086h",
+)
+def _(t: NodeTester) -> None:
+    t.need_402()
+    t.require(0x6086)
+    t.refuses_value(0x6086, 0, b"\x05\0", RANGE)
+
+
+@check("402.following-error", "60F4h is 6062h minus 6064h", "CiA 402-2, object 60F4h")
+def _(t: NodeTester) -> None:
+    t.need_402()
+    for index in (0x60F4, 0x6062):
+        t.require(index)
+    error = t.read(0x60F4, signed=True)
+    found = t.read(0x6062, signed=True) - t.read(0x6064, signed=True)
+    noise = max(2, t.travel // 10)
+    t.true(abs(error - found) <= noise, f"60F4h = {error}", f"about {found}")
+
+
+@check("402.still", "The axis has not moved during the checks without power", _PROFILE)
+def _(t: NodeTester) -> None:
+    t.need_402()
+    t.need(t.start_position is not None, "the position at the start is not known")
+    assert t.start_position is not None
+    moved = t.read(0x6064, signed=True) - t.start_position
+    t.true(abs(moved) <= t.travel, f"moved by {moved}", f"at most {t.travel}")

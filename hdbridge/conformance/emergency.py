@@ -1,0 +1,279 @@
+"""Checks of EMCY, the error objects, stored parameters and identity."""
+
+from __future__ import annotations
+
+import struct
+from typing import Final
+
+from hdbridge.conformance.network import lose_heartbeat
+from hdbridge.conformance.tester import (
+    NMT_RESET_NODE,
+    PDO_INVALID,
+    RANGE,
+    READ_ONLY,
+    NodeTester,
+    Table,
+    expedited,
+    pack,
+)
+
+CHECKS: Final = Table()
+check: Final = CHECKS.check
+_EMCY: Final = "CiA 301, 7.2.7 and object 1014h"
+_REGISTER: Final = "CiA 301, object 1001h"
+_HISTORY: Final = "CiA 301, object 1003h"
+_STORE: Final = "CiA 301, objects 1010h and 1011h"
+_IDENTITY: Final = "CiA 301, objects 1000h and 1018h"
+_NO_STORAGE: Final = (0x08000020, 0x08000022)
+_SAVE: Final = b"save"
+_LOAD: Final = b"load"
+
+
+@check("emcy.register", "1001h is 0 without an error", _REGISTER)
+def _(t: NodeTester) -> None:
+    t.reset(NMT_RESET_NODE)
+    t.equal(t.upload(0x1001), b"\0", "1001h")
+
+
+@check("emcy.register.error", "An error sets bit 0 of 1001h", _REGISTER)
+def _(t: NodeTester) -> None:
+    lose_heartbeat(t)
+    t.equal(t.read(0x1001) & 1, 1, "bit 0")
+
+
+@check("emcy.register.communication", "A communication error sets bit 4 of 1001h", _REGISTER)
+def _(t: NodeTester) -> None:
+    lose_heartbeat(t)
+    t.equal(t.read(0x1001) & 0x10, 0x10, "bit 4")
+
+
+@check("emcy.register.read-only", "1001h cannot be written", _REGISTER)
+def _(t: NodeTester) -> None:
+    t.aborts(expedited(0x1001, 0, b"\0"), READ_ONLY, "download to 1001h")
+
+
+@check("emcy.identifier", "1014h is 80h + node id by default", _EMCY)
+def _(t: NodeTester) -> None:
+    t.require(0x1014)
+    t.reset()
+    t.equal(f"{t.read(0x1014) & 0x7FF:03X}h", f"{0x80 + t.node_id:03X}h", "identifier")
+
+
+@check("emcy.frame", "An EMCY message has eight bytes", _EMCY)
+def _(t: NodeTester) -> None:
+    lose_heartbeat(t)
+    t.equal({len(frame.data) for frame in t.heard(0x80 + t.node_id)}, {8}, "length")
+
+
+@check("emcy.frame.register", "Byte 2 of an EMCY message is 1001h", _EMCY)
+def _(t: NodeTester) -> None:
+    lose_heartbeat(t)
+    t.equal(t.heard(0x80 + t.node_id)[-1].data[2], t.read(0x1001), "error register")
+
+
+@check("emcy.once", "An error is reported once", _EMCY)
+def _(t: NodeTester) -> None:
+    lose_heartbeat(t)
+    t.wait(0.5)
+    t.equal(t.emergencies(0).count(0x8130), 1, "number of EMCY messages")
+
+
+@check("emcy.disabled", "1014h with bit 31 set sends no EMCY", _EMCY)
+def _(t: NodeTester) -> None:
+    t.require(0x1014)
+    lose_heartbeat(t)
+    t.send(0x77E, b"\x05")
+    t.wait(0.02)
+    t.write(0x1014, 0, t.read(0x1014) | PDO_INVALID, 4)
+    since = t.mark()
+    t.wait(0.4)
+    t.equal(t.emergencies(since), [], "EMCY codes")
+
+
+@check("emcy.identifier.other", "EMCY is sent with the identifier in 1014h", _EMCY)
+def _(t: NodeTester) -> None:
+    t.require(0x1014)
+    other = 0x80 + (t.node_id ^ 1 or 2)
+    t.write(0x1014, 0, t.read(0x1014) | PDO_INVALID, 4)
+    t.write(0x1014, 0, other, 4)
+    t.require(0x1016, 1)
+    t.write(0x1016, 1, 126 << 16 | 50, 4)
+    since = t.mark()
+    t.send(0x77E, b"\x05")
+    t.wait(0.2)
+    t.true(t.heard(other, since), "no EMCY with the new identifier", "EMCY 8130h")
+
+
+@check("emcy.history", "An error is the first entry of 1003h", _HISTORY)
+def _(t: NodeTester) -> None:
+    t.require(0x1003)
+    lose_heartbeat(t)
+    t.equal(f"{t.read(0x1003, 1) & 0xFFFF:04X}h", "8130h", "1003h:01")
+
+
+@check("emcy.history.count", "1003h:00 counts the errors", _HISTORY)
+def _(t: NodeTester) -> None:
+    t.require(0x1003)
+    t.put(0x1003, 0, 0, 1)
+    lose_heartbeat(t)
+    t.equal(t.read(0x1003, 0), 1, "1003h:00")
+
+
+@check("emcy.history.clear", "Writing 0 to 1003h:00 clears the history", _HISTORY)
+def _(t: NodeTester) -> None:
+    t.require(0x1003)
+    lose_heartbeat(t)
+    t.put(0x1003, 0, 0, 1)
+    t.equal(t.read(0x1003, 0), 0, "1003h:00")
+
+
+@check("emcy.history.write", "Writing anything else to 1003h:00 is abort 06090030h", _HISTORY)
+def _(t: NodeTester) -> None:
+    t.require(0x1003)
+    t.aborts(expedited(0x1003, 0, b"\x01"), RANGE, "1003h:00 = 1")
+
+
+@check("emcy.history.order", "The newest error is in 1003h:01", _HISTORY)
+def _(t: NodeTester) -> None:
+    t.require(0x1003)
+    index, sub, bits = t.scratch()
+    can_id = t.map_pdo(0x1400, ((index, sub, bits),), 255)
+    lose_heartbeat(t)
+    t.nmt(1)
+    t.send(can_id, b"")
+    t.wait(0.05)
+    t.need(t.emergencies(0)[-1:] == [0x8210], "a short RPDO is not EMCY 8210h")
+    codes = [t.read(0x1003, place) & 0xFFFF for place in (1, 2)]
+    t.send(can_id, bytes(t.upload(index, sub)))
+    t.equal([f"{code:04X}h" for code in codes], ["8210h", "8130h"], "1003h:01 and 02")
+
+
+# ---------------------------------------------------------------- identity
+
+
+@check("identity.type", "1000h is read-only and has four bytes", _IDENTITY)
+def _(t: NodeTester) -> None:
+    value = t.upload(0x1000)
+    t.equal(len(value), 4, "bytes")
+    t.aborts(expedited(0x1000, 0, value), READ_ONLY, "download to 1000h")
+
+
+@check("identity.entries", "1018h:00 is 1 to 4, and so many entries exist", _IDENTITY)
+def _(t: NodeTester) -> None:
+    count = t.read(0x1018, 0)
+    t.true(1 <= count <= 4, f"1018h:00 = {count}", "1 to 4")
+    for sub in range(1, count + 1):
+        t.equal(len(t.upload(0x1018, sub)), 4, f"bytes of 1018h:{sub:02X}")
+
+
+@check("identity.vendor", "1018h:01 is not 0", _IDENTITY)
+def _(t: NodeTester) -> None:
+    t.true(t.read(0x1018, 1), "vendor id 0", "a number assigned by CiA")
+
+
+@check("identity.read-only", "1018h:01 cannot be written", _IDENTITY)
+def _(t: NodeTester) -> None:
+    t.aborts(expedited(0x1018, 1, t.upload(0x1018, 1)), READ_ONLY, "download to 1018h:01")
+
+
+def _identity(sub: int, key: str, name: str) -> None:
+    @check(
+        f"identity.eds.{key.split('_', maxsplit=1)[0]}",
+        f"1018h:{sub:02X} is the {name} of the EDS",
+        "CiA 306, [DeviceInfo]",
+    )
+    def _(t: NodeTester) -> None:
+        t.need(t.od is not None, "no EDS is given")
+        assert t.od is not None
+        expected = getattr(t.od.device_information, key)
+        t.need(expected, f"the EDS has no {name}")
+        t.require(0x1018, sub)
+        t.equal(f"{t.read(0x1018, sub):08X}h", f"{expected:08X}h", name)
+
+
+_identity(1, "vendor_number", "vendor number")
+_identity(2, "product_number", "product number")
+_identity(3, "revision_number", "revision number")
+
+
+# ---------------------------------------------------------------- stored parameters
+
+
+def _storage(index: int, verb: str) -> None:
+    @check(f"store.{index:04X}.capability", f"{index:04X}h:01 says that parameters can be {verb}", _STORE)
+    def _(t: NodeTester) -> None:
+        t.require(index, 1)
+        t.true(t.read(index, 1) & 3, f"{index:04X}h:01 = {t.read(index, 1)}", "bit 0 or bit 1")
+
+    @check(f"store.{index:04X}.signature", f"{index:04X}h:01 refuses a wrong signature", _STORE)
+    def _(t: NodeTester) -> None:
+        t.require(index, 1)
+        t.aborts(expedited(index, 1, b"evil"), _NO_STORAGE, "signature 'evil'")
+
+    @check(f"store.{index:04X}.entries", f"{index:04X}h:00 is 1 to 127", _STORE)
+    def _(t: NodeTester) -> None:
+        t.require(index, 1)
+        t.true(1 <= t.read(index, 0) <= 127, f"{index:04X}h:00 = {t.read(index, 0)}", "1 to 127")
+
+
+_storage(0x1010, "saved")
+_storage(0x1011, "restored")
+
+
+def _saved(t: NodeTester, value: int) -> None:
+    t.require(0x1010, 1)
+    t.require(0x1011, 1)
+    t.put(0x1017, 0, value, 2)
+    t.download(0x1010, 1, _SAVE)
+
+
+def _forget(t: NodeTester) -> None:
+    t.download(0x1011, 1, _LOAD)
+    t.reset(NMT_RESET_NODE)
+
+
+@check("store.save", "Saved parameters survive a reset", _STORE, stores=True)
+def _(t: NodeTester) -> None:
+    _saved(t, 700)
+    t.reset(NMT_RESET_NODE)
+    found = t.read(0x1017)
+    _forget(t)
+    t.equal(found, 700, "1017h")
+
+
+@check("store.unsaved", "Parameters that were not saved do not survive a reset", _STORE, stores=True)
+def _(t: NodeTester) -> None:
+    _saved(t, 700)
+    t.put(0x1017, 0, 800, 2)
+    t.reset(NMT_RESET_NODE)
+    found = t.read(0x1017)
+    _forget(t)
+    t.equal(found, 700, "1017h")
+
+
+@check("store.load.later", "Default values become valid at the next reset, not at once", _STORE, stores=True)
+def _(t: NodeTester) -> None:
+    _saved(t, 700)
+    t.download(0x1011, 1, _LOAD)
+    found = t.read(0x1017)
+    t.reset(NMT_RESET_NODE)
+    t.equal(found, 700, "1017h before the reset")
+
+
+@check("store.load", "Default values are valid after the reset", _STORE, stores=True)
+def _(t: NodeTester) -> None:
+    _forget(t)
+    before = t.read(0x1017)
+    _saved(t, before + 300)
+    _forget(t)
+    t.equal(t.read(0x1017), before, "1017h")
+
+
+@check("store.evil", "A wrong signature saves nothing", _STORE, stores=True)
+def _(t: NodeTester) -> None:
+    t.require(0x1010, 1)
+    before = t.read(0x1017)
+    t.put(0x1017, 0, before + 300, 2)
+    t.ask(expedited(0x1010, 1, pack(struct.unpack("<I", b"evas")[0], 4)))
+    t.reset(NMT_RESET_NODE)
+    t.equal(t.read(0x1017), before, "1017h")

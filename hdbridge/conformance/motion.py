@@ -1,0 +1,925 @@
+"""Checks of CiA 402 with power: states, options, moves, cyclic targets, homing; the axis moves a little."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable
+from typing import Final
+
+from hdbridge.conformance.drive import MODES
+from hdbridge.conformance.tester import (
+    FAULT,
+    NMT_PRE_OPERATIONAL,
+    NMT_RESET_NODE,
+    NMT_START,
+    NMT_STOP,
+    OPERATION_ENABLED,
+    POWER_STATES,
+    QUICK_STOP_ACTIVE,
+    READY_TO_SWITCH_ON,
+    SWITCH_ON_DISABLED,
+    SWITCHED_ON,
+    NodeTester,
+    Table,
+    pack,
+    power_state,
+)
+
+CHECKS: Final = Table()
+_STATES: Final = "CiA 402-2, finite state automaton"
+_OPTIONS: Final = "CiA 402-2, objects 605Ah to 605Eh, 6007h"
+_PP: Final = "CiA 402-2, profile position mode"
+_CSP: Final = "CiA 402-2, cyclic synchronous position mode"
+_HM: Final = "CiA 402-2, homing mode"
+_REACHED: Final = 1 << 10
+_LIMIT: Final = 1 << 11
+_BIT_12: Final = 1 << 12
+_BIT_13: Final = 1 << 13
+_MASTER: Final = 126
+_CYCLE_S: Final = 0.01
+_STOP_S: Final = 0.5
+"""Time after which an axis that was told to stop must stand."""
+
+
+def check(
+    name: str,
+    text: str,
+    clause: str,
+) -> Callable[[Callable[[NodeTester], None]], Callable[[NodeTester], None]]:
+    """Decorates a check that may switch power on."""
+    return CHECKS.check(name, text, clause, moves=True)
+
+
+# ---------------------------------------------------------------- on the way
+
+
+def _position(t: NodeTester) -> int:
+    return t.read(0x6064, signed=True)
+
+
+def _stands(t: NodeTester, duration_s: float = 0.1, within: float = 0.1) -> None:
+    """Fails if the axis moves by more than a share of the test distance."""
+    start, end_s = _position(t), t.now + duration_s
+    while t.now < end_s:
+        t.wait(0.01)
+        moved = abs(_position(t) - start)
+        t.true(moved <= max(2.0, within * t.travel), f"the axis moves: {moved} units", "standstill")
+
+
+def _select(t: NodeTester, mode: int) -> None:
+    t.need_402()
+    t.need(t.read(0x6502) >> mode - 1 & 1, f"the drive has no {MODES[mode]} mode (6502h)")
+    t.write(0x6060, 0, mode, 1)
+    end_s = t.now + t.timing.power_s
+    while t.read(0x6061, signed=True) != mode:
+        t.true(t.now < end_s, f"6061h = {t.read(0x6061, signed=True)}", mode)
+        t.wait(0.01)
+
+
+def _some_mode(t: NodeTester) -> int:
+    t.need_402()
+    has = t.read(0x6502)
+    for mode in (1, 8, 7, 6):
+        if has >> mode - 1 & 1:
+            return mode
+    t.need(False, "the drive has no position mode (6502h)")
+    raise AssertionError
+
+
+def _enable(t: NodeTester, mode: int | None = None) -> None:
+    _bring(t, OPERATION_ENABLED, mode)
+
+
+def _bring(t: NodeTester, state: int, mode: int | None = None) -> None:
+    """Leads to a power state, at rest."""
+    mode = _some_mode(t) if mode is None else mode
+    t.disable()
+    _select(t, mode)
+    if state == QUICK_STOP_ACTIVE:
+        t.require(0x605A)
+        t.write(0x605A, 0, 6, 2)
+    if state == FAULT:
+        _fault(t)
+        return
+    words = (
+        (READY_TO_SWITCH_ON, 0x06),
+        (SWITCHED_ON, 0x07),
+        (OPERATION_ENABLED, 0x0F),
+        (QUICK_STOP_ACTIVE, 0x02),
+    )
+    for reached, word in words if state != SWITCH_ON_DISABLED else ():
+        t.control(word)
+        t.reaches(reached)
+        if reached == state:
+            return
+
+
+def _fault(t: NodeTester) -> None:
+    """Makes the enabled drive lose the heartbeat of its master, with the reaction *fault* (6007h = 1)."""
+    t.require(0x6007)
+    t.require(0x1016, 1)
+    t.write(0x6007, 0, 1, 2)
+    _lose_master(t)
+    t.reaches(FAULT)
+
+
+def _lose_master(t: NodeTester) -> None:
+    _guarded(t)
+    _enable_after_select(t)
+    t.wait(0.35)
+
+
+def _guarded(t: NodeTester) -> None:
+    t.require(0x1016, 1)
+    t.write(0x1016, 1, _MASTER << 16 | 300, 4)
+
+
+def _enable_after_select(t: NodeTester) -> None:
+    for reached, word in ((READY_TO_SWITCH_ON, 0x06), (SWITCHED_ON, 0x07), (OPERATION_ENABLED, 0x0F)):
+        t.control(word)
+        t.reaches(reached)
+    t.send(0x700 + _MASTER, b"\x05")
+
+
+# ---------------------------------------------------------------- transitions
+
+
+def _transition(number: str, state: int, word: int, command: str, then: int) -> None:
+    text = f"{command} leads from {POWER_STATES[state]} to {POWER_STATES[then]}"
+
+    @check(f"402.transition.{number}", f"Transition {number.split('.', maxsplit=1)[0]}: {text}", _STATES)
+    def _(t: NodeTester) -> None:
+        _bring(t, state)
+        before = _position(t)
+        t.control(word)
+        t.reaches(then)
+        moved = abs(_position(t) - before)
+        t.true(moved <= t.travel, f"the axis moved by {moved}", "standstill")
+
+
+_transition("2", SWITCH_ON_DISABLED, 0x06, "Shutdown", READY_TO_SWITCH_ON)
+_transition("3", READY_TO_SWITCH_ON, 0x07, "Switch on", SWITCHED_ON)
+_transition("3+4", READY_TO_SWITCH_ON, 0x0F, "Switch on and enable operation", OPERATION_ENABLED)
+_transition("4", SWITCHED_ON, 0x0F, "Enable operation", OPERATION_ENABLED)
+_transition("5", OPERATION_ENABLED, 0x07, "Disable operation", SWITCHED_ON)
+_transition("6", SWITCHED_ON, 0x06, "Shutdown", READY_TO_SWITCH_ON)
+_transition("8", OPERATION_ENABLED, 0x06, "Shutdown", READY_TO_SWITCH_ON)
+_transition("9", OPERATION_ENABLED, 0x00, "Disable voltage", SWITCH_ON_DISABLED)
+_transition("10", SWITCHED_ON, 0x00, "Disable voltage", SWITCH_ON_DISABLED)
+_transition("10.quick-stop", SWITCHED_ON, 0x02, "Quick stop", SWITCH_ON_DISABLED)
+_transition("12", QUICK_STOP_ACTIVE, 0x00, "Disable voltage", SWITCH_ON_DISABLED)
+_transition("16", QUICK_STOP_ACTIVE, 0x0F, "Enable operation", OPERATION_ENABLED)
+_transition("15", FAULT, 0x80, "Fault reset", SWITCH_ON_DISABLED)
+
+
+def _unmoved(name: str, state: int, word: int, command: str) -> None:
+    @check(f"402.no-transition.{name}", f"{command} changes nothing in {POWER_STATES[state]}", _STATES)
+    def _(t: NodeTester) -> None:
+        _bring(t, state)
+        t.control(word)
+        t.stays(state)
+
+
+_unmoved("disabled.switch-on", SWITCH_ON_DISABLED, 0x07, "Switch on")
+_unmoved("disabled.enable", SWITCH_ON_DISABLED, 0x0F, "Enable operation")
+_unmoved("switched-on.repeated", SWITCHED_ON, 0x07, "Repeated switch on")
+_unmoved("enabled.repeated", OPERATION_ENABLED, 0x0F, "Repeated enable operation")
+_unmoved("stopped.shutdown", QUICK_STOP_ACTIVE, 0x06, "Shutdown")
+_unmoved("stopped.repeated", QUICK_STOP_ACTIVE, 0x02, "Repeated quick stop")
+_unmoved("fault.disable-voltage", FAULT, 0x00, "Disable voltage")
+_unmoved("fault.shutdown", FAULT, 0x06, "Shutdown")
+_unmoved("fault.switch-on", FAULT, 0x07, "Switch on")
+_unmoved("fault.enable", FAULT, 0x0F, "Enable operation")
+_unmoved("fault.quick-stop", FAULT, 0x02, "Quick stop")
+
+
+@check("402.fault.reset.again", "A second fault is reset by another rising edge of bit 7", _STATES)
+def _(t: NodeTester) -> None:
+    _bring(t, FAULT)
+    t.control(0x80)
+    t.reaches(SWITCH_ON_DISABLED)
+    _lose_master_again(t)
+    t.control(0x8F)
+    t.reaches(SWITCH_ON_DISABLED)
+
+
+def _lose_master_again(t: NodeTester) -> None:
+    _enable_after_select(t)
+    t.wait(0.35)
+    t.reaches(FAULT)
+
+
+@check(
+    "402.fault.reset.edge",
+    "Bit 7 that is held does not reset a fault: only a rising edge of bit 7 resets a fault",
+    _STATES,
+)
+def _(t: NodeTester) -> None:
+    _bring(t, FAULT)
+    t.control(0x00)
+    t.control(0x80)
+    t.reaches(SWITCH_ON_DISABLED)
+    # Bit 7 is high before the next fault comes, through the last controlword that enables: there is no edge.
+    t.control(0x06)
+    t.reaches(READY_TO_SWITCH_ON)
+    t.control(0x0F)
+    t.reaches(OPERATION_ENABLED)
+    t.send(0x700 + _MASTER, b"\x05")
+    t.control(0x8F)
+    t.stays(OPERATION_ENABLED, 0.0)
+    t.wait(0.35)
+    t.reaches(FAULT)
+    t.control(0x8F)
+    t.stays(FAULT, 0.1)
+
+
+@check(
+    "402.fault.reset.enables-nothing",
+    "A fault reset with the bits of enable operation does not enable",
+    _STATES,
+)
+def _(t: NodeTester) -> None:
+    _bring(t, FAULT)
+    t.control(0x8F)
+    t.reaches(SWITCH_ON_DISABLED)
+    t.control(0x0F)
+    t.stays(SWITCH_ON_DISABLED, 0.1)
+
+
+@check("402.fault.code", "603Fh is the code of the fault", "CiA 402-2, object 603Fh")
+def _(t: NodeTester) -> None:
+    t.require(0x603F)
+    _bring(t, FAULT)
+    t.equal(f"{t.read(0x603F):04X}h", "8130h", "603Fh")
+
+
+@check("402.fault.code.reset", "603Fh is 0 after the fault reset", "CiA 402-2, object 603Fh")
+def _(t: NodeTester) -> None:
+    t.require(0x603F)
+    _bring(t, FAULT)
+    t.control(0x80)
+    t.reaches(SWITCH_ON_DISABLED)
+    t.equal(t.read(0x603F), 0, "603Fh")
+
+
+@check("402.fault.emergency", "A fault is reported by EMCY with its code", _STATES)
+def _(t: NodeTester) -> None:
+    _bring(t, FAULT)
+    t.true(0x8130 in t.emergencies(0), f"EMCY codes {t.emergencies(0)}", "8130h")
+
+
+@check("402.fault.emergency.reset", "The fault reset is reported by EMCY 0000h", _STATES)
+def _(t: NodeTester) -> None:
+    _bring(t, FAULT)
+    since = t.mark()
+    t.control(0x80)
+    t.reaches(SWITCH_ON_DISABLED)
+    t.wait(0.05)
+    t.equal(t.emergencies(since)[-1:], [0], "last EMCY code")
+
+
+@check("402.fault.register", "1001h is not 0 during a fault, and 0 after its reset", _STATES)
+def _(t: NodeTester) -> None:
+    _bring(t, FAULT)
+    t.true(t.read(0x1001), "1001h = 0 during the fault", "bit 0")
+    t.control(0x80)
+    t.reaches(SWITCH_ON_DISABLED)
+    t.wait(0.05)
+    t.equal(t.read(0x1001), 0, "1001h after the reset")
+
+
+# ---------------------------------------------------------------- option codes
+
+
+def _lost_master(code: int, states: tuple[int, ...], text: str) -> None:
+    @check(f"402.option.6007.{code}", f"6007h = {code}: a lost heartbeat {text}", _OPTIONS)
+    def _(t: NodeTester) -> None:
+        t.require(0x6007)
+        mode = _some_mode(t)
+        t.disable()
+        _select(t, mode)
+        t.write(0x6007, 0, code, 2)
+        t.write(0x1029, 1, 1, 1) if t.has(0x1029, 1) else None
+        _lose_master(t)
+        if code:
+            _settles(t, states)
+        else:
+            t.stays(OPERATION_ENABLED, 0.1)
+
+
+def _settles(t: NodeTester, states: tuple[int, ...]) -> None:
+    """Waits until one of the states is reached."""
+    end_s = t.now + t.timing.power_s
+    while (found := t.power_state()) not in states:
+        if t.now > end_s:
+            t.fail(
+                POWER_STATES.get(found, f"{found:02X}h"), " or ".join(POWER_STATES[each] for each in states)
+            )
+        t.wait(0.01)
+
+
+_lost_master(0, (OPERATION_ENABLED,), "changes nothing")
+_lost_master(1, (FAULT,), "is a fault")
+_lost_master(2, (SWITCH_ON_DISABLED,), "disables the voltage")
+_lost_master(3, (QUICK_STOP_ACTIVE, SWITCH_ON_DISABLED), "is a quick stop")
+
+
+def _stopping(index: int, code: int, word: int, state: int, name: str) -> None:
+    @check(
+        f"402.option.{index:04X}.{code}",
+        f"{name} of a move with {index:04X}h = {code}: {POWER_STATES[state]}",
+        _OPTIONS,
+    )
+    def _(t: NodeTester) -> None:
+        t.require(index)
+        before = t.read(index, signed=True)
+        _enable_slowly(t)
+        _set_option(t, index, code, before)
+        target = _begin_move(t, 4)
+        t.control(word)
+        t.reaches(state)
+        t.wait(_STOP_S)
+        _stands(t)
+        t.true(_position(t) != target, "the move was completed", "a stop before the target")
+        t.stays(state)
+
+
+def _set_option(t: NodeTester, index: int, code: int, before: int) -> None:
+    if code != before:
+        answer = t.answer(struct.pack("<BHBh2x", 0x2B, index, 0, code))
+        t.need(answer[0] != 0x80, f"{index:04X}h = {code} is not supported")
+        t.download(index, 0, pack(before, 2))
+        t.write(index, 0, code, 2)
+
+
+for _code, _state in ((0, SWITCH_ON_DISABLED), (1, SWITCH_ON_DISABLED), (2, SWITCH_ON_DISABLED)):
+    _stopping(0x605A, _code, 0x02, _state, "Quick stop")
+for _code in (5, 6):
+    _stopping(0x605A, _code, 0x02, QUICK_STOP_ACTIVE, "Quick stop")
+for _code in (0, 1):
+    _stopping(0x605B, _code, 0x06, READY_TO_SWITCH_ON, "Shutdown")
+    _stopping(0x605C, _code, 0x07, SWITCHED_ON, "Disable operation")
+for _code in (1, 2):
+    _stopping(0x605D, _code, 0x10F, OPERATION_ENABLED, "Halt")
+
+
+def _reaction(code: int) -> None:
+    @check(
+        f"402.option.605E.{code}", f"A fault in a move with 605Eh = {code} ends in fault, at rest", _OPTIONS
+    )
+    def _(t: NodeTester) -> None:
+        t.require(0x605E)
+        t.require(0x6007)
+        before = t.read(0x605E, signed=True)
+        _select_slowly(t)
+        t.write(0x6007, 0, 1, 2)
+        _set_option(t, 0x605E, code, before)
+        _guarded(t)
+        _enable_after_select(t)
+        _begin_move(t, 8)
+        t.wait(0.35)
+        t.reaches(FAULT)
+        t.wait(_STOP_S)
+        _stands(t)
+
+
+for _code in (0, 1, 2):
+    _reaction(_code)
+
+# ---------------------------------------------------------------- profile position
+
+
+def _select_slowly(t: NodeTester) -> None:
+    """Selects profile position at one test distance in 0.2 s."""
+    t.need_402()
+    t.disable()
+    _select(t, 1)
+    t.require(0x6081)
+    t.write(0x6081, 0, min(5 * t.travel, t.read(0x6081)), 4)
+
+
+def _enable_slowly(t: NodeTester) -> None:
+    _select_slowly(t)
+    for reached, word in ((READY_TO_SWITCH_ON, 0x06), (SWITCHED_ON, 0x07), (OPERATION_ENABLED, 0x0F)):
+        t.control(word)
+        t.reaches(reached)
+
+
+def _direction(t: NodeTester, distances: int) -> int:
+    """Returns 1 or -1: the side on which the software limits leave room."""
+    if not t.has(0x607D, 1):
+        return 1
+    low, high = (t.read(0x607D, sub, signed=True) for sub in (1, 2))
+    reach = _position(t) + distances * t.travel
+    return 1 if not low < high or reach < high else -1
+
+
+def _set_point(t: NodeTester, target: int, extra: int = 0) -> None:
+    t.put(0x607A, 0, target, 4)
+    t.control(0x0F)
+    t.control(0x1F | extra)
+
+
+def _begin_move(t: NodeTester, distances: int) -> int:
+    """Begins a move of so many test distances and returns its target, once the axis moves."""
+    start = _position(t)
+    target = start + _direction(t, distances) * distances * t.travel
+    _set_point(t, target)
+    end_s = t.now + 2.0
+    while abs(_position(t) - start) < 0.2 * t.travel:
+        t.true(t.now < end_s, "the axis does not move", "a move to the new set-point")
+        t.wait(0.005)
+    t.need(abs(_position(t) - target) > 0.5 * t.travel, "the move is over before anything can be done")
+    return target
+
+
+def _window(t: NodeTester) -> float:
+    return max(t.read(0x6067) if t.has(0x6067) else 0, 0.05 * t.travel, 3)
+
+
+def _arrives(t: NodeTester, target: int, timeout_s: float = 10.0) -> None:
+    """Waits for target reached; the axis must be at the target then."""
+    end_s = t.now + timeout_s
+    while not t.read(0x6041) & _REACHED or abs(_position(t) - target) > _window(t):
+        if t.now > end_s:
+            t.fail(f"position {_position(t)}, statusword {t.read(0x6041):04X}h", f"{target}, target reached")
+        t.wait(0.01)
+
+
+@check("402.enable.still", "Enabling does not move the axis", _STATES)
+def _(t: NodeTester) -> None:
+    mode = _some_mode(t)
+    t.disable()
+    before = _position(t)
+    _enable(t, mode)
+    _stands(t, 0.3)
+    moved = abs(_position(t) - before)
+    t.true(moved <= 0.5 * t.travel, f"the axis moved by {moved}", "standstill")
+
+
+@check("402.pp.move", "A new set-point is reached", _PP)
+def _(t: NodeTester) -> None:
+    _enable_slowly(t)
+    _arrives(t, _begin_move(t, 2))
+
+
+@check("402.pp.acknowledge", "Bit 12 acknowledges a new set-point", _PP)
+def _(t: NodeTester) -> None:
+    _enable_slowly(t)
+    t.equal(t.read(0x6041) & _BIT_12, 0, "bit 12 before the set-point")
+    _begin_move(t, 2)
+    t.equal(t.read(0x6041) & _BIT_12, _BIT_12, "bit 12 while bit 4 of the controlword is 1")
+
+
+@check("402.pp.acknowledge.end", "Bit 12 falls when bit 4 of the controlword falls", _PP)
+def _(t: NodeTester) -> None:
+    _enable_slowly(t)
+    _begin_move(t, 2)
+    t.control(0x0F)
+    t.wait(0.05)
+    t.equal(t.read(0x6041) & _BIT_12, 0, "bit 12")
+
+
+@check("402.pp.reached", "Target reached is 0 during a move and 1 after it", _PP)
+def _(t: NodeTester) -> None:
+    _enable_slowly(t)
+    target = _begin_move(t, 3)
+    t.equal(t.read(0x6041) & _REACHED, 0, "bit 10 in motion")
+    _arrives(t, target)
+
+
+@check("402.pp.target-alone", "A target without a new set-point moves nothing", _PP)
+def _(t: NodeTester) -> None:
+    _enable_slowly(t)
+    t.put(0x607A, 0, _position(t) + _direction(t, 3) * 3 * t.travel, 4)
+    t.control(0x0F)
+    _stands(t, 0.3)
+
+
+@check("402.pp.held", "Bit 4 that is held does not start a second move", _PP)
+def _(t: NodeTester) -> None:
+    _enable_slowly(t)
+    target = _begin_move(t, 2)
+    _arrives(t, target)
+    t.put(0x607A, 0, 2 * _position(t) - target + _direction(t, 2) * t.travel, 4)
+    t.control(0x1F)
+    _stands(t, 0.3)
+
+
+@check("402.pp.stale", "A target from before enabling moves nothing", _PP)
+def _(t: NodeTester) -> None:
+    _select_slowly(t)
+    t.put(0x607A, 0, _position(t) + _direction(t, 3) * 3 * t.travel, 4)
+    for reached, word in ((READY_TO_SWITCH_ON, 0x06), (SWITCHED_ON, 0x07), (OPERATION_ENABLED, 0x0F)):
+        t.control(word)
+        t.reaches(reached)
+    _stands(t, 0.3)
+
+
+@check("402.pp.relative", "A relative set-point counts from the one before", _PP)
+def _(t: NodeTester) -> None:
+    _enable_slowly(t)
+    first = _begin_move(t, 1)
+    _arrives(t, first)
+    distance = _direction(t, 2) * t.travel
+    _set_point(t, distance, 0x40)
+    t.wait(0.02)
+    _arrives(t, first + distance)
+
+
+@check("402.pp.again", "A set-point where the axis is already is acknowledged and reached", _PP)
+def _(t: NodeTester) -> None:
+    _enable_slowly(t)
+    target = _begin_move(t, 1)
+    _arrives(t, target)
+    _set_point(t, target)
+    t.wait(0.05)
+    t.equal(t.read(0x6041) & _BIT_12, _BIT_12, "bit 12")
+    _arrives(t, target)
+
+
+def _there_and_back(t: NodeTester, extra: int) -> tuple[int, int]:
+    """A second set-point, back at the start, during the first move; (farthest distance, first distance)."""
+    _enable_slowly(t)
+    start = _position(t)
+    first = _begin_move(t, 3)
+    _set_point(t, start, extra)
+    farthest, end_s, came_back = 0, t.now + 10.0, False
+    while not came_back:
+        t.true(t.now < end_s, f"position {_position(t)}", f"{start}, the second set-point")
+        distance = abs(_position(t) - start)
+        farthest = max(farthest, distance)
+        came_back = farthest > 0.2 * t.travel and distance <= _window(t) and bool(t.read(0x6041) & _REACHED)
+        t.wait(0.005)
+    return farthest, abs(first - start)
+
+
+@check("402.pp.queue", "A set-point during a move is executed after it", _PP)
+def _(t: NodeTester) -> None:
+    farthest, first = _there_and_back(t, 0)
+    t.true(farthest >= first - 2 * _window(t), f"the axis turned back at {farthest}", f"{first}")
+
+
+@check("402.pp.immediately", "With bit 5 a set-point during a move is executed at once", _PP)
+def _(t: NodeTester) -> None:
+    farthest, first = _there_and_back(t, 0x20)
+    t.true(farthest < 0.9 * first, f"the axis turned back at {farthest}", f"clearly before {first}")
+
+
+@check("402.pp.velocity", "A move is not faster than the profile velocity", _PP)
+def _(t: NodeTester) -> None:
+    _enable_slowly(t)
+    speed = t.read(0x6081)
+    start, begun_s = _position(t), t.now
+    target = start + _direction(t, 4) * 4 * t.travel
+    _set_point(t, target)
+    _arrives(t, target)
+    duration_s = t.now - begun_s
+    shortest_s = max(0.0, abs(target - start) - _window(t)) / speed
+    t.true(duration_s > 0.9 * shortest_s, f"{duration_s:.3f} s", f"at least {shortest_s:.3f} s")
+
+
+@check("402.pp.halt", "Halt stops a move, and bit 10 is 1 at rest", _PP)
+def _(t: NodeTester) -> None:
+    _enable_slowly(t)
+    target = _begin_move(t, 4)
+    t.control(0x11F)
+    t.wait(_STOP_S)
+    _stands(t)
+    t.true(abs(_position(t) - target) > _window(t), "the move was completed", "a stop before the target")
+    t.equal(t.read(0x6041) & _REACHED, _REACHED, "bit 10 at rest")
+    t.stays(OPERATION_ENABLED)
+
+
+@check("402.pp.halt.end", "When halt ends the move is continued", _PP)
+def _(t: NodeTester) -> None:
+    _enable_slowly(t)
+    target = _begin_move(t, 4)
+    t.control(0x11F)
+    t.wait(_STOP_S)
+    t.control(0x1F)
+    _arrives(t, target)
+
+
+@check("402.pp.limit", "A set-point beyond 607Dh leads at most to the limit", _PP)
+def _(t: NodeTester) -> None:
+    t.require(0x607D, 1)
+    _select_slowly(t)
+    start = _position(t)
+    side = _direction(t, 3)
+    edge = start + side * t.travel
+    low, high = sorted((start - side * 3 * t.travel, edge))
+    t.write(0x607D, 1, low, 4)
+    t.write(0x607D, 2, high, 4)
+    for reached, word in ((READY_TO_SWITCH_ON, 0x06), (SWITCHED_ON, 0x07), (OPERATION_ENABLED, 0x0F)):
+        t.control(word)
+        t.reaches(reached)
+    _set_point(t, start + side * 3 * t.travel)
+    for _ in range(100):
+        beyond = side * (_position(t) - edge)
+        t.true(beyond <= _window(t), f"{beyond} units beyond the limit", "the limit")
+        t.wait(0.01)
+
+
+def _ends_the_move(name: str, text: str, act: Callable[[NodeTester], None]) -> None:
+    @check(f"402.pp.ends.{name}", text, _PP)
+    def _(t: NodeTester) -> None:
+        _enable_slowly(t)
+        target = _begin_move(t, 5)
+        act(t)
+        t.wait(_STOP_S)
+        t.true(abs(_position(t) - target) > _window(t), "the move was completed", "a stop before the target")
+        _stands(t)
+        t.nmt(NMT_START)
+        _stands(t)
+
+
+def _resets(t: NodeTester) -> None:
+    t.reset(NMT_RESET_NODE)
+    t.reaches(SWITCH_ON_DISABLED)
+
+
+_ends_the_move("disable-voltage", "Disable voltage ends a move", lambda t: t.control(0x00))
+_ends_the_move(
+    "mode", "Another mode ends a move", lambda t: t.put(0x6060, 0, 6 if t.read(0x6502) & 0x20 else 8, 1)
+)
+_ends_the_move("reset", "NMT reset node ends a move, and power is off", _resets)
+
+
+# ---------------------------------------------------------------- cyclic synchronous position
+
+
+class _Stream:
+    """A cyclic master: RPDO with controlword and target, SYNC, TPDO with statusword and position."""
+
+    def __init__(self, t: NodeTester) -> None:
+        self.t = t
+        t.need_402()
+        t.disable()
+        _select(t, 8)
+        if t.has(0x60C2, 1):
+            t.write(0x60C2, 2, -3, 1)
+            t.write(0x60C2, 1, round(1000 * _CYCLE_S), 1)
+        self.tpdo = t.map_pdo(0x1800, ((0x6041, 0, 16), (0x6064, 0, 32)), 1)
+        self.rpdo = t.map_pdo(0x1400, ((0x6040, 0, 16), (0x607A, 0, 32)), 1)
+        self.word, self.target = 0x00, _position(t)
+        self.status, self.position = 0, self.target
+        self._next_s = t.now
+        t.nmt(NMT_START)
+
+    def cycle(self, count: int = 1, step: float = 0.0) -> None:
+        """So many cycles, the target advancing by ``step`` in each."""
+        t, start = self.t, self.target
+        for place in range(1, count + 1):
+            since = t.mark()
+            self.target = start + round(place * step)
+            t.send(self.rpdo, struct.pack("<Hi", self.word, self.target))
+            t.sync()
+            self._next_s = max(self._next_s + _CYCLE_S, t.now)
+            t.wait(self._next_s - t.now)
+            for frame in t.heard(self.tpdo, since):
+                self.status, self.position = struct.unpack("<Hi", frame.data)
+
+    def enable(self) -> None:
+        """Walks to OPERATION ENABLED with the target at the actual position."""
+        self.t.powered = True
+        for word, state in ((0x06, READY_TO_SWITCH_ON), (0x07, SWITCHED_ON), (0x0F, OPERATION_ENABLED)):
+            self.word = word
+            end_s = self.t.now + self.t.timing.power_s
+            while power_state(self.status) != state:
+                self.t.true(
+                    self.t.now < end_s, POWER_STATES.get(power_state(self.status)), POWER_STATES[state]
+                )
+                self.cycle()
+                if word != 0x0F:
+                    self.target = self.position
+        self.cycle(5)
+
+    def move(self, side: int = 0) -> float:
+        """Moves by one test distance in 0.5 s, by default to where there is room; returns the step."""
+        step = (side or _direction(self.t, 2)) * self.t.travel * _CYCLE_S / 0.5
+        self.cycle(50, step)
+        return step
+
+
+@check("402.csp.enable", "Enabling in mode 8 with the target at the position moves nothing", _CSP)
+def _(t: NodeTester) -> None:
+    stream = _Stream(t)
+    before = stream.position
+    stream.enable()
+    stream.cycle(20)
+    moved = abs(stream.position - before)
+    t.true(moved <= 0.5 * t.travel, f"the axis moved by {moved}", "standstill")
+
+
+@check("402.csp.follow", "The position follows the target of every SYNC", _CSP)
+def _(t: NodeTester) -> None:
+    stream = _Stream(t)
+    stream.enable()
+    stream.move()
+    stream.cycle(20)
+    off = abs(stream.position - stream.target)
+    t.true(off <= _window(t), f"{off} units from the target", "the target")
+
+
+@check("402.csp.status", "Bit 12 is 1 while the drive follows the target", _CSP)
+def _(t: NodeTester) -> None:
+    stream = _Stream(t)
+    stream.enable()
+    stream.move()
+    t.equal(stream.status & (_BIT_12 | _BIT_13), _BIT_12, "bits 12 and 13")
+
+
+@check("402.csp.status.off", "Bit 12 is 0 without power", _CSP)
+def _(t: NodeTester) -> None:
+    stream = _Stream(t)
+    stream.cycle(5)
+    t.equal(stream.status & _BIT_12, 0, "bit 12")
+
+
+@check("402.csp.halt", "Halt stops an axis that follows targets", _CSP)
+def _(t: NodeTester) -> None:
+    stream = _Stream(t)
+    stream.enable()
+    step = stream.move()
+    stream.word = 0x10F
+    stream.cycle(20, step)
+    before = stream.position
+    stream.cycle(30, step)
+    moved = abs(stream.position - before)
+    t.true(moved <= 0.1 * t.travel + 2, f"the axis moved by {moved}", "standstill")
+
+
+@check("402.csp.limit", "A target beyond 607Dh leads at most to the limit", _CSP)
+def _(t: NodeTester) -> None:
+    t.require(0x607D, 1)
+    stream = _Stream(t)
+    side = _direction(t, 3)
+    edge = stream.position + side * t.travel // 2
+    low, high = sorted((stream.position - side * 3 * t.travel, edge))
+    t.write(0x607D, 1, low, 4)
+    t.write(0x607D, 2, high, 4)
+    stream.enable()
+    stream.move(side)
+    stream.cycle(30)
+    beyond = side * (stream.position - edge)
+    t.true(beyond <= _window(t), f"{beyond} units beyond the limit", "the limit")
+
+
+@check("402.csp.lost-sync", "Without SYNC the axis does not continue to move", _CSP)
+def _(t: NodeTester) -> None:
+    stream = _Stream(t)
+    stream.enable()
+    stream.move()
+    t.wait(_STOP_S)
+    _stands(t)
+
+
+@check(
+    "402.csp.lost-heartbeat", "A lost heartbeat stops the axis and takes it out of operation enabled", _CSP
+)
+def _(t: NodeTester) -> None:
+    t.require(0x6007)
+    stream = _Stream(t)
+    t.write(0x6007, 0, 1, 2)
+    _guarded(t)
+    stream.enable()
+    t.send(0x700 + _MASTER, b"\x05")
+    stream.cycle(50, 0.02 * t.travel * _direction(t, 3))
+    _settles(t, (FAULT,))
+    _stands(t)
+
+
+@check(
+    "402.csp.return", "After a stop, repeated controlwords and targets do not set the axis in motion", _CSP
+)
+def _(t: NodeTester) -> None:
+    t.require(0x6007)
+    stream = _Stream(t)
+    t.write(0x6007, 0, 1, 2)
+    stream.enable()
+    stream.move()
+    t.nmt(NMT_STOP)
+    t.wait(_STOP_S)
+    t.nmt(NMT_START)
+    before = _position(t)
+    stream.target = before + _direction(t, 2) * t.travel
+    stream.cycle(20)
+    t.true(power_state(stream.status) != OPERATION_ENABLED, "operation enabled", "any other state")
+    moved = abs(stream.position - before)
+    t.true(moved <= 0.1 * t.travel + 2, f"the axis moved by {moved}", "standstill")
+
+
+def _leaves(name: str, command: int, text: str) -> None:
+    @check(f"402.csp.nmt.{name}", f"{text} stops an axis that follows targets", _CSP)
+    def _(t: NodeTester) -> None:
+        t.require(0x6007)
+        stream = _Stream(t)
+        t.write(0x6007, 0, 1, 2)
+        stream.enable()
+        stream.move()
+        t.nmt(command)
+        t.wait(_STOP_S)
+        t.nmt(NMT_PRE_OPERATIONAL)
+        _stands(t)
+        state = t.power_state()
+        t.true(state != OPERATION_ENABLED, "operation enabled", "any other state")
+
+
+_leaves("stop", NMT_STOP, "NMT stop")
+_leaves("pre-operational", NMT_PRE_OPERATIONAL, "NMT enter pre-operational")
+
+
+# ---------------------------------------------------------------- homing
+
+
+def _home(t: NodeTester, offset: int) -> None:
+    t.put(0x607C, 0, offset, 4)
+    t.control(0x0F)
+    t.control(0x1F)
+    end_s = t.now + t.timing.power_s
+    while (word := t.read(0x6041)) & (_REACHED | _BIT_12 | _BIT_13) != _REACHED | _BIT_12:
+        t.true(not word & _BIT_13, "homing error (bit 13)", "homing attained")
+        t.true(t.now < end_s, f"statusword {word:04X}h", "bits 10 and 12")
+        t.wait(0.01)
+
+
+def _homing(method: int) -> None:
+    @check(
+        f"402.homing.{method}",
+        f"Homing method {method} makes the present position 607Ch, without motion",
+        _HM,
+    )
+    def _(t: NodeTester) -> None:
+        t.need_402()
+        t.require(0x607C)
+        _enable_for_homing(t, method)
+        before, offset = _position(t), t.read(0x607C, signed=True)
+        wanted = t.travel if abs(before) > t.travel else 3 * t.travel
+        _home(t, wanted)
+        t.wait(0.05)
+        found = _position(t)
+        _home_back(t, before + found - wanted, offset)
+        t.true(abs(found - wanted) <= _window(t), f"6064h = {found}", f"607Ch = {wanted}")
+
+
+def _home_back(t: NodeTester, position: int, offset: int) -> None:
+    """Restores the coordinates from before the check."""
+    _home(t, position)
+    t.control(0x0F)
+    t.put(0x607C, 0, offset, 4)
+
+
+def _enable_for_homing(t: NodeTester, method: int) -> None:
+    t.disable()
+    _select(t, 6)
+    before = t.read(0x6098, signed=True)
+    if before != method:
+        answer = t.answer(struct.pack("<BHBb3x", 0x2F, 0x6098, 0, method))
+        t.need(answer[0] != 0x80, f"6098h = {method} is not supported")
+        t.put(0x6098, 0, before, 1)
+        t.write(0x6098, 0, method, 1)
+    _enable_after_select(t)
+
+
+_homing(35)
+_homing(37)
+
+
+@check("402.homing.start", "Homing needs the rising edge of bit 4", _HM)
+def _(t: NodeTester) -> None:
+    t.require(0x607C)
+    _enable_for_homing(t, 37)
+    before = _position(t)
+    t.write(0x607C, 0, before + 3 * t.travel, 4)
+    t.control(0x0F)
+    t.wait(0.1)
+    moved = abs(_position(t) - before)
+    t.true(moved <= t.travel, f"6064h changed by {moved}", "no change")
+
+
+@check(
+    "402.following-error.fault",
+    "A following error beyond 6065h is fault 8611h or bit 13",
+    "CiA 402-2, objects 6065h, 6066h",
+)
+def _(t: NodeTester) -> None:
+    for index in (0x6065, 0x6066, 0x60F4):
+        t.require(index)
+    _select_slowly(t)
+    t.write(0x6065, 0, 1, 4)
+    t.write(0x6066, 0, 0, 2)
+    for reached, word in ((READY_TO_SWITCH_ON, 0x06), (SWITCHED_ON, 0x07), (OPERATION_ENABLED, 0x0F)):
+        t.control(word)
+        t.reaches(reached)
+    target = _position(t) + _direction(t, 4) * 4 * t.travel
+    _set_point(t, target)
+    exceeded = 0
+    for _ in range(100):
+        word = t.read(0x6041)
+        if power_state(word) == FAULT or word & _BIT_13:
+            return
+        exceeded += abs(t.read(0x60F4, signed=True)) > 1
+        t.wait(0.01)
+    t.need(exceeded, "the drive follows without any error")
+    t.fail(f"60F4h above 1 in {exceeded} of 100 readings, and no reaction", "fault 8611h, or bit 13")

@@ -1,0 +1,456 @@
+"""Checks of network management: NMT, boot-up, heartbeat, node guarding."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from statistics import median
+from typing import Final
+
+from hdbridge.conformance.tester import (
+    NMT_PRE_OPERATIONAL,
+    NMT_RESET_COMMUNICATION,
+    NMT_RESET_NODE,
+    NMT_START,
+    NMT_STOP,
+    OPERATIONAL,
+    PRE_OPERATIONAL,
+    STOPPED,
+    NodeTester,
+    Table,
+    upload_request,
+)
+
+CHECKS: Final = Table()
+check: Final = CHECKS.check
+_NMT: Final = "CiA 301, 7.2.8"
+_BOOT: Final = "CiA 301, 7.3.2"
+_HEARTBEAT: Final = "CiA 301, 7.2.8 and object 1017h"
+_CONSUMER: Final = "CiA 301, 7.2.8 and object 1016h"
+_GUARDING: Final = "CiA 301, 7.2.8 and objects 100Ch, 100Dh"
+_MASTER: Final = 126
+"""Node id of the heartbeat that the tester produces."""
+
+# ---------------------------------------------------------------- boot-up
+
+
+def _boots(command: int) -> None:
+    name = "node" if command == NMT_RESET_NODE else "communication"
+
+    @check(f"nmt.reset-{name}", f"NMT reset {name} is followed by a boot-up message", _BOOT)
+    def _(t: NodeTester) -> None:
+        t.reset(command)
+
+    @check(f"nmt.reset-{name}.pre-operational", f"After reset {name} the node is PRE-OPERATIONAL", _BOOT)
+    def _(t: NodeTester) -> None:
+        t.reset(command)
+        t.watch_state()
+        t.equal(t.state(), PRE_OPERATIONAL, "NMT state")
+
+    @check(f"nmt.reset-{name}.first", f"After reset {name} nothing is sent before the boot-up message", _BOOT)
+    def _(t: NodeTester) -> None:
+        t.enter(NMT_START, OPERATIONAL)
+        t.put(0x1017, 0, 0, 2)
+        since = t.mark()
+        t.nmt(command)
+        boot = t.boot_up(since)
+        before = t.log[since : t.log.index(boot)]
+        own = [f"{frame.can_id:03X}h" for frame in before if _is_own(t, frame.can_id)]
+        t.true(not own, f"before the boot-up message: {', '.join(own)}", "nothing")
+
+
+def _is_own(t: NodeTester, can_id: int) -> bool:
+    return can_id & 0x7F == t.node_id and can_id & 0x780 in (0x180, 0x280, 0x380, 0x480, 0x580)
+
+
+_boots(NMT_RESET_NODE)
+_boots(NMT_RESET_COMMUNICATION)
+
+
+@check("nmt.boot-up.frame", "The boot-up message is 700h + node id with one byte, 00h", _BOOT)
+def _(t: NodeTester) -> None:
+    t.equal(t.reset().data, b"\0", "data of the boot-up message")
+
+
+@check("nmt.boot-up.once", "A reset is followed by one boot-up message", _BOOT)
+def _(t: NodeTester) -> None:
+    since = t.mark()
+    t.reset()
+    t.wait(0.1)
+    boots = [frame for frame in t.heard(0x700 + t.node_id, since) if frame.data == b"\0"]
+    t.equal(len(boots), 1, "number of boot-up messages")
+
+
+@check("nmt.reset-communication.parameters", "Reset communication restores 1000h to 1FFFh", _BOOT)
+def _(t: NodeTester) -> None:
+    t.require(0x1017)
+    t.reset()
+    before = t.read(0x1017)
+    t.put(0x1017, 0, before + 500, 2)
+    t.reset()
+    t.equal(t.read(0x1017), before, "1017h")
+
+
+@check("nmt.reset-communication.application", "Reset communication leaves application objects alone", _BOOT)
+def _(t: NodeTester) -> None:
+    index, sub, bits = t.scratch()
+    value = t.other_value(index, sub, bits)
+    t.write(index, sub, value, bits // 8)
+    t.reset()
+    t.equal(t.read(index, sub), value, f"{index:04X}h:{sub:02X}")
+
+
+@check("nmt.reset-node.application", "Reset node restores application objects", _BOOT)
+def _(t: NodeTester) -> None:
+    index, sub, bits = t.scratch()
+    t.need(index != 0x607A, "the object that can be written, 607Ah, is no parameter")
+    t.reset(NMT_RESET_NODE)
+    before = t.read(index, sub)
+    t.write(index, sub, t.other_value(index, sub, bits), bits // 8)
+    t.reset(NMT_RESET_NODE)
+    t.equal(t.read(index, sub), before, f"{index:04X}h:{sub:02X}")
+
+
+# ---------------------------------------------------------------- states
+
+
+def _transition(name: str, first: tuple[int, str], command: int, state: str) -> None:
+    @check(f"nmt.{name}", f"NMT command {command} leads from {first[1]} to {state}", _NMT)
+    def _(t: NodeTester) -> None:
+        t.enter(*first)
+        t.enter(command, state)
+
+
+_PRE: Final = (NMT_PRE_OPERATIONAL, PRE_OPERATIONAL)
+_RUNNING: Final = (NMT_START, OPERATIONAL)
+_HALTED: Final = (NMT_STOP, STOPPED)
+_transition("start", _PRE, NMT_START, OPERATIONAL)
+_transition("stop", _PRE, NMT_STOP, STOPPED)
+_transition("start-from-stopped", _HALTED, NMT_START, OPERATIONAL)
+_transition("stop-from-operational", _RUNNING, NMT_STOP, STOPPED)
+_transition("enter-pre-operational", _RUNNING, NMT_PRE_OPERATIONAL, PRE_OPERATIONAL)
+_transition("enter-pre-operational-from-stopped", _HALTED, NMT_PRE_OPERATIONAL, PRE_OPERATIONAL)
+
+
+@check("nmt.repeated", "A repeated NMT start changes nothing", _NMT)
+def _(t: NodeTester) -> None:
+    t.enter(*_RUNNING)
+    t.enter(*_RUNNING)
+
+
+@check("nmt.reset-from-stopped", "Reset communication is obeyed in STOPPED", _NMT)
+def _(t: NodeTester) -> None:
+    t.enter(*_HALTED)
+    t.reset()
+
+
+@check("nmt.broadcast", "A command to node 0 is obeyed", _NMT)
+def _(t: NodeTester) -> None:
+    t.watch_state()
+    t.nmt(NMT_START, 0)
+    t.equal(t.state(), OPERATIONAL, "NMT state")
+
+
+def _ignored(name: str, what: str, send: object) -> None:
+    @check(f"nmt.ignores.{name}", f"The node ignores {what}", _NMT)
+    def _(t: NodeTester) -> None:
+        t.watch_state()
+        assert callable(send)
+        send(t)
+        t.equal(t.state(), PRE_OPERATIONAL, "NMT state")
+
+
+_ignored("other-node", "a command to another node", lambda t: t.nmt(NMT_START, t.node_id % 127 + 1))
+_ignored("reserved", "a reserved command", lambda t: t.nmt(3))
+_ignored("short", "a command of one byte", lambda t: t.send(0x000, bytes((NMT_START,))))
+_ignored(
+    "extended",
+    "a command with a 29-bit identifier",
+    lambda t: t.send_special(0, bytes((NMT_START, t.node_id))),
+)
+
+
+def _sdo(command: int, state: str, *, answers: bool) -> None:
+    text = "are answered" if answers else "are not answered"
+
+    @check(f"nmt.sdo.{state.lower()}", f"SDO requests {text} in {state}", _BOOT)
+    def _(t: NodeTester) -> None:
+        t.enter(command, state)
+        answer = t.ask(upload_request(0x1000))
+        t.equal("an answer" if answer else "no answer", "an answer" if answers else "no answer")
+
+
+_sdo(*_PRE, answers=True)
+_sdo(*_RUNNING, answers=True)
+_sdo(*_HALTED, answers=False)
+
+
+def _no_pdo(command: int, state: str) -> None:
+    @check(f"nmt.pdo.{state.lower()}", f"No PDO is sent in {state}", _BOOT)
+    def _(t: NodeTester) -> None:
+        can_id = t.map_pdo(0x1800, ((0x1001, 0, 8),), 1)
+        t.enter(command, state)
+        since = t.mark()
+        for _ in range(3):
+            t.sync()
+            t.wait(0.02)
+        t.equal(len(t.heard(can_id, since)), 0, "number of TPDOs")
+
+
+_no_pdo(*_PRE)
+_no_pdo(*_HALTED)
+
+# ---------------------------------------------------------------- heartbeat
+
+
+def _beats(t: NodeTester, period_ms: int, count: int = 5) -> list[float]:
+    t.require(0x1017)
+    t.write(0x1017, 0, period_ms, 2)
+    since = t.mark()
+    t.wait(1e-3 * period_ms * (count + 1) + t.timing.jitter_s)
+    times = [frame.time_s for frame in t.heard(0x700 + t.node_id, since)]
+    t.true(len(times) >= count - 1, f"{len(times)} heartbeats in {count + 1} periods", f"about {count}")
+    return times
+
+
+def _period(t: NodeTester, period_ms: int) -> None:
+    times = _beats(t, period_ms)
+    intervals = [after - before for before, after in pairwise(times)]
+    t.near(median(intervals), 1e-3 * period_ms, "period of the heartbeat")
+
+
+@check("heartbeat.period", "Heartbeats come with the period of 1017h", _HEARTBEAT)
+def _(t: NodeTester) -> None:
+    _period(t, 100)
+
+
+@check("heartbeat.period.other", "A new value of 1017h changes the period", _HEARTBEAT)
+def _(t: NodeTester) -> None:
+    t.require(0x1017)
+    t.write(0x1017, 0, 100, 2)
+    t.wait(0.25)
+    _period(t, 250)
+
+
+@check("heartbeat.off", "1017h = 0 ends the heartbeat", _HEARTBEAT)
+def _(t: NodeTester) -> None:
+    _beats(t, 50)
+    t.put(0x1017, 0, 0, 2)
+    since = t.mark()
+    t.wait(0.3)
+    t.equal(len(t.heard(0x700 + t.node_id, since)), 0, "number of heartbeats")
+
+
+@check("heartbeat.frame", "A heartbeat has one byte", _HEARTBEAT)
+def _(t: NodeTester) -> None:
+    _beats(t, 50)
+    lengths = {len(frame.data) for frame in t.heard(0x700 + t.node_id)}
+    t.equal(lengths, {1}, "length")
+
+
+@check("heartbeat.toggle", "Bit 7 of a heartbeat is 0", _HEARTBEAT)
+def _(t: NodeTester) -> None:
+    _beats(t, 50)
+    bits = {frame.data[0] >> 7 for frame in t.heard(0x700 + t.node_id) if frame.data}
+    t.equal(bits, {0}, "bit 7")
+
+
+def _heartbeat_state(command: int, state: str, value: int) -> None:
+    @check(f"heartbeat.{state.lower()}", f"The heartbeat in {state} is {value:02X}h", _HEARTBEAT)
+    def _(t: NodeTester) -> None:
+        t.require(0x1017)
+        t.write(0x1017, 0, 50, 2)
+        t.nmt(command)
+        since = t.mark()
+        frame = t.hears(0x700 + t.node_id, 0.2 + t.timing.jitter_s, since)
+        t.equal(None if frame is None else frame.data, bytes((value,)), "data")
+
+
+_heartbeat_state(*_PRE, 0x7F)
+_heartbeat_state(*_RUNNING, 0x05)
+_heartbeat_state(*_HALTED, 0x04)
+
+# ---------------------------------------------------------------- heartbeat consumer
+
+
+def _watch(t: NodeTester, time_ms: int = 100) -> None:
+    t.require(0x1016, 1)
+    t.write(0x1016, 1, _MASTER << 16 | time_ms, 4)
+
+
+def _beat(t: NodeTester, count: int = 3, period_s: float = 0.04) -> None:
+    for _ in range(count):
+        t.send(0x700 + _MASTER, b"\x05")
+        t.wait(period_s)
+
+
+@check("consumer.idle", "The consumer waits for the first heartbeat", _CONSUMER)
+def _(t: NodeTester) -> None:
+    _watch(t)
+    since = t.mark()
+    t.wait(0.4)
+    t.equal(t.emergencies(since), [], "EMCY codes")
+
+
+@check("consumer.regular", "Heartbeats in time cause no error", _CONSUMER)
+def _(t: NodeTester) -> None:
+    _watch(t, 200)
+    since = t.mark()
+    _beat(t, 8, 0.05)
+    t.equal(t.emergencies(since), [], "EMCY codes")
+
+
+@check("consumer.loss", "A lost heartbeat is EMCY 8130h within the consumer time", _CONSUMER)
+def _(t: NodeTester) -> None:
+    lose_heartbeat(t)
+
+
+@check("consumer.loss.time", "The EMCY comes when the consumer time is over", _CONSUMER)
+def _(t: NodeTester) -> None:
+    _watch(t, 200)
+    _beat(t, 3)
+    begun_s = t.now
+    t.send(0x700 + _MASTER, b"\x05")
+    frame = t.hears(0x080 + t.node_id, 0.4 + t.timing.jitter_s)
+    t.true(frame, "no EMCY", "EMCY 8130h after 200 ms")
+    assert frame is not None
+    t.near(frame.time_s - begun_s, 0.2, "time to the EMCY")
+
+
+@check("consumer.off", "1016h with time 0 supervises nothing", _CONSUMER)
+def _(t: NodeTester) -> None:
+    _watch(t)
+    _beat(t)
+    t.put(0x1016, 1, _MASTER << 16, 4)
+    since = t.mark()
+    t.wait(0.4)
+    t.equal(t.emergencies(since), [], "EMCY codes")
+
+
+@check("consumer.other-node", "Heartbeats of another node do not count", _CONSUMER)
+def _(t: NodeTester) -> None:
+    _watch(t)
+    _beat(t)
+    since = t.mark()
+    for _ in range(8):
+        t.send(0x700 + _MASTER - 1, b"\x05")
+        t.wait(0.05)
+    t.true(0x8130 in t.emergencies(since), f"EMCY codes {t.emergencies(since)}", "8130h")
+
+
+@check("consumer.recovery", "A heartbeat that returns ends the error", _CONSUMER)
+def _(t: NodeTester) -> None:
+    lose_heartbeat(t)
+    since = t.mark()
+    _beat(t)
+    t.equal(t.emergencies(since)[-1:], [0], "last EMCY code")
+
+
+def lose_heartbeat(t: NodeTester) -> None:
+    """Makes the node lose the tester's heartbeat."""
+    _watch(t)
+    _beat(t)
+    since = t.mark()
+    t.wait(0.3)
+    codes = t.emergencies(since)
+    t.true(0x8130 in codes, f"EMCY codes {[f'{code:04X}h' for code in codes]}", "8130h within 100 ms")
+
+
+def _behaviour(value: int, state: str) -> None:
+    @check(
+        f"error-behaviour.{value}",
+        f"1029h:01 = {value}: after a lost heartbeat {state}",
+        "CiA 301, object 1029h",
+    )
+    def _(t: NodeTester) -> None:
+        t.require(0x1029, 1)
+        t.write(0x1029, 1, value, 1)
+        t.enter(*_RUNNING)
+        lose_heartbeat(t)
+        t.equal(t.state(), state, "NMT state")
+        t.nmt(NMT_PRE_OPERATIONAL)
+        _beat(t)
+
+
+_behaviour(0, PRE_OPERATIONAL)
+_behaviour(1, OPERATIONAL)
+_behaviour(2, STOPPED)
+
+# ---------------------------------------------------------------- node guarding
+
+
+def _guard(t: NodeTester) -> bytes:
+    since = t.mark()
+    t.send_special(0x700 + t.node_id, remote=True)
+    frame = t.hears(0x700 + t.node_id, since=since)
+    t.true(frame, "no answer to the remote frame", "the NMT state")
+    assert frame is not None
+    return frame.data
+
+
+def _need_guarding(t: NodeTester) -> None:
+    t.require(0x100C)
+    t.require(0x100D)
+
+
+@check("guarding.answer", "A remote frame is answered with the NMT state", _GUARDING)
+def _(t: NodeTester) -> None:
+    _need_guarding(t)
+    answer = _guard(t)
+    t.equal((len(answer), answer[0] & 0x7F), (1, 0x7F), "length and state")
+
+
+@check("guarding.state", "The answer in OPERATIONAL has the state 05h", _GUARDING)
+def _(t: NodeTester) -> None:
+    _need_guarding(t)
+    t.nmt(NMT_START)
+    t.equal(_guard(t)[0] & 0x7F, 0x05, "state")
+
+
+@check("guarding.toggle", "The toggle bit changes with every answer", _GUARDING)
+def _(t: NodeTester) -> None:
+    _need_guarding(t)
+    bits = [_guard(t)[0] >> 7 for _ in range(4)]
+    t.true(bits in ([0, 1, 0, 1], [1, 0, 1, 0]), f"toggle bits {bits}", "alternating")
+
+
+@check("guarding.toggle.first", "The first toggle bit after a reset is 0", _GUARDING)
+def _(t: NodeTester) -> None:
+    _need_guarding(t)
+    _guard(t)
+    t.reset()
+    t.equal(_guard(t)[0] >> 7, 0, "toggle bit")
+
+
+def _guarded(t: NodeTester) -> None:
+    _need_guarding(t)
+    t.write(0x100C, 0, 100, 2)
+    t.write(0x100D, 0, 2, 1)
+
+
+@check("guarding.idle", "Life guarding waits for the first remote frame", _GUARDING)
+def _(t: NodeTester) -> None:
+    _guarded(t)
+    since = t.mark()
+    t.wait(0.5)
+    t.equal(t.emergencies(since), [], "EMCY codes")
+
+
+@check("guarding.regular", "Remote frames in time cause no error", _GUARDING)
+def _(t: NodeTester) -> None:
+    _guarded(t)
+    since = t.mark()
+    for _ in range(6):
+        _guard(t)
+        t.wait(0.08)
+    t.equal(t.emergencies(since), [], "EMCY codes")
+
+
+@check("guarding.loss", "No remote frame for the node life time is EMCY 8130h", _GUARDING)
+def _(t: NodeTester) -> None:
+    _guarded(t)
+    begun_s = t.now
+    _guard(t)
+    frame = t.hears(0x080 + t.node_id, 0.5 + t.timing.jitter_s)
+    t.true(frame is not None and frame.data[:2] == b"\x30\x81", "no EMCY 8130h", "EMCY 8130h after 200 ms")
+    assert frame is not None
+    t.near(frame.time_s - begun_s, 0.2, "time to the EMCY")

@@ -1,0 +1,570 @@
+"""Checks of SDO: expedited, segmented and block transfers, and what a server refuses."""
+
+from __future__ import annotations
+
+import struct
+from binascii import crc_hqx
+from collections.abc import Callable
+from typing import Final
+
+from canopen.objectdictionary import datatypes
+
+from hdbridge.conformance.tester import (
+    ABSENT,
+    COMMAND,
+    LENGTH,
+    NMT_START,
+    RANGE,
+    READ_ONLY,
+    WRITE_ONLY,
+    NodeTester,
+    Table,
+    abort,
+    expedited,
+    upload_request,
+)
+
+CHECKS: Final = Table()
+check: Final = CHECKS.check
+_SDO: Final = "CiA 301, 7.2.4"
+_TOGGLE: Final = (0x05030000,)
+_TEXTS: Final = (0x1008, 0x100A, 0x1009)
+_STRINGS: Final = (datatypes.VISIBLE_STRING, datatypes.OCTET_STRING, datatypes.DOMAIN)
+_NOWHERE: Final = 0x1F7F
+"""An index that no device has: reserved for CiA 302 masters."""
+
+
+def _mux(index: int, sub: int) -> bytes:
+    return struct.pack("<HB", index, sub)
+
+
+def _text(t: NodeTester) -> tuple[int, bytes]:
+    """Returns a string of more than four bytes and its index."""
+    for index in _TEXTS:
+        if t.has(index) and len(data := t.upload(index)) > 4:
+            return index, data
+    t.need(False, "no string of more than four bytes (1008h, 1009h, 100Ah)")
+    raise AssertionError
+
+
+def _writable_text(t: NodeTester) -> tuple[int, int]:
+    """Returns index and sub-index of a writable string of the EDS."""
+    for each in t.variables():
+        if each.data_type in _STRINGS and each.access_type in ("rw", "rww", "rwr") and each.index != 0x1F50:
+            return each.index, each.subindex
+    t.need(False, "the EDS names no writable string")
+    raise AssertionError
+
+
+def _segment(t: NodeTester, command: int, data: bytes = b"") -> bytes:
+    return t.answer(bytes((command,)) + data.ljust(7, b"\0"))
+
+
+def _open_upload(t: NodeTester) -> tuple[int, bytes]:
+    """Begins a segmented upload; returns the index and the complete data."""
+    index, data = _text(t)
+    answer = t.answer(upload_request(index))
+    t.equal(answer[0] & 0xE2, 0x40, "command of the response without the size bit")
+    return index, data
+
+
+def _number(t: NodeTester) -> tuple[int, int, int]:
+    """Returns a writable object of two bytes or more: index, sub-index, size."""
+    if t.has(0x1017):
+        return 0x1017, 0, 2
+    index, sub, bits = t.scratch()
+    t.need(bits >= 16, "no writable object of two bytes")
+    return index, sub, bits // 8
+
+
+# ---------------------------------------------------------------- upload
+
+
+def _expedited(index: int, size: int) -> None:
+    @check(f"sdo.upload.{size}", f"{index:04X}h is uploaded expedited, with its size of {size} bytes", _SDO)
+    def _(t: NodeTester) -> None:
+        t.require(index)
+        answer = t.answer(upload_request(index))
+        t.equal(answer[0], 0x43 | (4 - size) << 2, "command")
+        t.equal(answer[1:4], _mux(index, 0), "multiplexer")
+
+
+_expedited(0x1000, 4)
+_expedited(0x1001, 1)
+_expedited(0x1017, 2)
+
+
+@check("sdo.answer.length", "An answer has eight bytes", _SDO)
+def _(t: NodeTester) -> None:
+    t.answer(upload_request(0x1000))
+
+
+@check("sdo.answer.once", "A request has one answer", _SDO)
+def _(t: NodeTester) -> None:
+    since = t.mark()
+    t.answer(upload_request(0x1000))
+    t.wait(0.05)
+    t.equal(len(t.heard(0x580 + t.node_id, since)), 1, "number of answers")
+
+
+@check("sdo.answer.time", "50 uploads in a row are answered in time", _SDO)
+def _(t: NodeTester) -> None:
+    first = t.upload(0x1000)
+    for _ in range(50):
+        t.equal(t.upload(0x1000), first, "1000h")
+
+
+@check("sdo.operational", "SDO works during PDO traffic", _SDO)
+def _(t: NodeTester) -> None:
+    first = t.upload(0x1000)
+    t.nmt(NMT_START)
+    for _ in range(10):
+        t.sync()
+        t.equal(t.upload(0x1000), first, "1000h")
+
+
+@check("sdo.other-node", "Requests to another node are not answered", _SDO)
+def _(t: NodeTester) -> None:
+    since = t.mark()
+    t.send(0x600 + t.node_id % 127 + 1, upload_request(0x1000))
+    t.wait(0.1)
+    t.equal(len(t.heard(0x580 + t.node_id, since)), 0, "number of answers")
+
+
+@check("sdo.extended", "Requests with a 29-bit identifier are not answered", _SDO)
+def _(t: NodeTester) -> None:
+    since = t.mark()
+    t.send_special(0x600 + t.node_id, upload_request(0x1000))
+    t.wait(0.1)
+    t.equal(len(t.heard(0x580 + t.node_id, since)), 0, "number of answers")
+
+
+@check("sdo.short", "A request of fewer than eight bytes disturbs nothing", _SDO)
+def _(t: NodeTester) -> None:
+    t.ask(b"\x40\0\x10", 0.05)
+    t.equal(len(t.upload(0x1000)), 4, "size of 1000h")
+
+
+@check("sdo.upload.segmented", "A long string is uploaded in segments, with its size", _SDO)
+def _(t: NodeTester) -> None:
+    index, data = _text(t)
+    answer = t.answer(upload_request(index))
+    t.equal(answer[0], 0x41, "command")
+    t.equal(struct.unpack_from("<I", answer, 4)[0], len(data), "announced size")
+
+
+@check("sdo.upload.segmented.toggle", "The toggle bit of upload segments alternates from 0", _SDO)
+def _(t: NodeTester) -> None:
+    _, data = _open_upload(t)
+    for place in range((len(data) + 6) // 7):
+        toggle = (place & 1) << 4
+        t.equal(_segment(t, 0x60 | toggle)[0] & 0x10, toggle, "toggle bit")
+
+
+@check("sdo.upload.segmented.last", "Only the last segment has the bit c, and n counts its free bytes", _SDO)
+def _(t: NodeTester) -> None:
+    _, data = _open_upload(t)
+    count = (len(data) + 6) // 7
+    for place in range(count):
+        answer = _segment(t, 0x60 | (place & 1) << 4)
+        last = place == count - 1
+        t.equal(answer[0] & 1, int(last), f"bit c of segment {place + 1} of {count}")
+        t.equal(7 - (answer[0] >> 1 & 7), len(data) - 7 * place if last else 7, "bytes in the segment")
+
+
+@check("sdo.upload.toggle-error", "A wrong toggle bit of an upload is abort 05030000h", _SDO)
+def _(t: NodeTester) -> None:
+    _open_upload(t)
+    t.aborts(b"\x70" + bytes(7), _TOGGLE, "segment with the wrong toggle bit")
+
+
+@check("sdo.upload.after-abort", "After an abort the transfer has ended", _SDO)
+def _(t: NodeTester) -> None:
+    _open_upload(t)
+    _segment(t, 0x70)
+    t.aborts(b"\x60" + bytes(7), COMMAND, "segment after the abort")
+
+
+@check("sdo.upload.no-initiate", "An upload segment without initiation is abort 05040001h", _SDO)
+def _(t: NodeTester) -> None:
+    t.ask(abort(), 0.02)
+    t.aborts(b"\x60" + bytes(7), COMMAND, "segment without initiation")
+
+
+@check("sdo.upload.client-abort", "An abort of the client has no answer and ends the transfer", _SDO)
+def _(t: NodeTester) -> None:
+    index, _ = _open_upload(t)
+    t.equal(t.ask(abort(index, 0), 0.05), None, "answer to the abort")
+    t.aborts(b"\x60" + bytes(7), COMMAND, "segment after the abort")
+
+
+@check("sdo.upload.restart", "A new request is served after a transfer that was not finished", _SDO)
+def _(t: NodeTester) -> None:
+    _open_upload(t)
+    _segment(t, 0x60)
+    answer = t.ask(upload_request(0x1000))
+    if answer is None or answer[0] == 0x80:
+        answer = t.answer(upload_request(0x1000))
+    t.equal(answer[:4], b"\x43" + _mux(0x1000, 0), "response")
+
+
+@check("sdo.upload.abandoned", "A transfer that was abandoned a second ago blocks nothing", _SDO)
+def _(t: NodeTester) -> None:
+    _open_upload(t)
+    t.wait(1.0)
+    answer = t.ask(upload_request(0x1000))
+    if answer is None or answer[0] == 0x80:
+        answer = t.answer(upload_request(0x1000))
+    t.equal(answer[:4], b"\x43" + _mux(0x1000, 0), "response")
+
+
+# ---------------------------------------------------------------- refusals
+
+
+def _refused(name: str, text: str, codes: tuple[int, ...], request: Callable[[NodeTester], bytes]) -> None:
+    @check(f"sdo.abort.{name}", text, _SDO)
+    def _(t: NodeTester) -> None:
+        t.aborts(request(t), codes, "request")
+
+
+def _write_only(t: NodeTester) -> bytes:
+    for each in t.variables():
+        if each.access_type == "wo":
+            return upload_request(each.index, each.subindex)
+    t.need(False, "the EDS names no write-only object")
+    raise AssertionError
+
+
+def _too_long(t: NodeTester) -> bytes:
+    index, sub, size = _number(t)
+    t.need(size < 4, "the writable object has four bytes already")
+    return expedited(index, sub, bytes(4))
+
+
+def _too_short(t: NodeTester) -> bytes:
+    index, sub, size = _number(t)
+    return expedited(index, sub, bytes(size - 1))
+
+
+_refused(
+    "no-object.upload", "Upload of a missing object is abort 06020000h", ABSENT[:1],
+    lambda _: upload_request(_NOWHERE),
+)  # fmt: skip
+_refused(
+    "no-object.download", "Download to a missing object is abort 06020000h", ABSENT[:1],
+    lambda _: expedited(_NOWHERE, 0, b"\0"),
+)  # fmt: skip
+_refused(
+    "no-sub.upload", "Upload of a missing sub-index is abort 06090011h", ABSENT[1:],
+    lambda _: upload_request(0x1018, 200),
+)  # fmt: skip
+_refused(
+    "no-sub.download", "Download to a missing sub-index is abort 06090011h", ABSENT[1:],
+    lambda _: expedited(0x1018, 200, bytes(4)),
+)  # fmt: skip
+_refused(
+    "read-only", "Download to a read-only object is abort 06010002h", READ_ONLY,
+    lambda _: expedited(0x1000, 0, bytes(4)),
+)  # fmt: skip
+_refused(
+    "const", "Download to sub-index 0 of 1018h is abort 06010002h", READ_ONLY,
+    lambda _: expedited(0x1018, 0, b"\x04"),
+)  # fmt: skip
+_refused("write-only", "Upload of a write-only object is abort 06010001h", WRITE_ONLY, _write_only)
+_refused("too-long", "A download of too many bytes is abort 06070010h or 06070012h", LENGTH, _too_long)
+_refused("too-short", "A download of too few bytes is abort 06070010h or 06070013h", LENGTH, _too_short)
+_refused(
+    "command", "A command specifier that does not exist is abort 05040001h", COMMAND,
+    lambda _: b"\xe0\0\x10\0" + bytes(4),
+)  # fmt: skip
+_refused(
+    "long-segmented", "A segmented download of too many bytes is refused at its start", LENGTH,
+    lambda _: b"\x21" + _mux(0x1017, 0) + struct.pack("<I", 9),
+)  # fmt: skip
+
+
+@check("sdo.abort.multiplexer", "An abort names the object", _SDO)
+def _(t: NodeTester) -> None:
+    answer = t.answer(upload_request(_NOWHERE, 3))
+    t.equal(answer[:4], b"\x80" + _mux(_NOWHERE, 3), "command and multiplexer")
+
+
+@check("sdo.abort.value", "A value that was refused is not stored", _SDO)
+def _(t: NodeTester) -> None:
+    index, sub, size = _number(t)
+    before = t.upload(index, sub)
+    t.refuses(expedited(index, sub, b"\x01" * (size - 1)), "download with a byte too few")
+    t.equal(t.upload(index, sub), before, f"{index:04X}h")
+
+
+@check("sdo.abort.next", "A refused request does not disturb the next one", _SDO)
+def _(t: NodeTester) -> None:
+    t.refuses(upload_request(_NOWHERE), "upload of a missing object")
+    t.equal(len(t.upload(0x1000)), 4, "size of 1000h")
+
+
+# ---------------------------------------------------------------- download
+
+
+def _downloads(t: NodeTester, request: Callable[[int, int, bytes], list[bytes]]) -> None:
+    """Writes another value by these requests and compares; restores the old one."""
+    index, sub, size = _number(t)
+    before = t.upload(index, sub)
+    value = ((int.from_bytes(before, "little") + 100) & 0x7FFF).to_bytes(size, "little")
+    for place, each in enumerate(request(index, sub, value)):
+        answer = t.answer(each)
+        t.true(answer[0] != 0x80, f"request {place + 1}: {answer.hex(' ')}", "the download is carried out")
+    found = t.upload(index, sub)
+    t.download(index, sub, before)
+    t.equal(found, value, f"{index:04X}h")
+
+
+@check("sdo.download.expedited", "An expedited download with its size is carried out", _SDO)
+def _(t: NodeTester) -> None:
+    _downloads(t, lambda index, sub, data: [expedited(index, sub, data)])
+
+
+@check("sdo.download.expedited.no-size", "An expedited download without a size is carried out", _SDO)
+def _(t: NodeTester) -> None:
+    _downloads(t, lambda index, sub, data: [b"\x22" + _mux(index, sub) + data.ljust(4, b"\0")])
+
+
+@check("sdo.download.response", "The response to a download is 60h with the multiplexer and zeros", _SDO)
+def _(t: NodeTester) -> None:
+    index, sub, _ = _number(t)
+    answer = t.answer(expedited(index, sub, t.upload(index, sub)))
+    t.equal(answer, b"\x60" + _mux(index, sub) + bytes(4), "response")
+
+
+@check("sdo.download.segmented", "A number may come in a segment", _SDO)
+def _(t: NodeTester) -> None:
+    _downloads(t, _segmented)
+
+
+def _segmented(index: int, sub: int, data: bytes) -> list[bytes]:
+    size = struct.pack("<I", len(data))
+    return [b"\x21" + _mux(index, sub) + size, bytes(((7 - len(data)) << 1 | 1,)) + data.ljust(7, b"\0")]
+
+
+@check("sdo.download.segmented.no-size", "A segmented download without a size is carried out", _SDO)
+def _(t: NodeTester) -> None:
+    _downloads(
+        t, lambda index, sub, data: [b"\x20" + _mux(index, sub) + bytes(4), _segmented(index, sub, data)[1]]
+    )
+
+
+@check("sdo.download.segmented.size", "Segments that do not have the announced size are refused", _SDO)
+def _(t: NodeTester) -> None:
+    index, sub, size = _number(t)
+    t.need(size >= 2, "the writable object has one byte")
+    before = t.upload(index, sub)
+    answer = t.answer(b"\x21" + _mux(index, sub) + struct.pack("<I", size))
+    t.equal(answer[0], 0x60, "response to the initiation")
+    t.refuses(bytes(((7 - size + 1) << 1 | 1,)) + bytes(7), "a byte too few")
+    t.equal(t.upload(index, sub), before, f"{index:04X}h")
+
+
+@check("sdo.download.segmented.toggle-error", "A wrong toggle bit of a download is abort 05030000h", _SDO)
+def _(t: NodeTester) -> None:
+    index, sub, size = _number(t)
+    t.answer(b"\x21" + _mux(index, sub) + struct.pack("<I", size))
+    t.aborts(b"\x1b" + bytes(7), _TOGGLE, "segment with the wrong toggle bit")
+
+
+@check("sdo.download.no-initiate", "A download segment without initiation is abort 05040001h", _SDO)
+def _(t: NodeTester) -> None:
+    t.ask(abort(), 0.02)
+    t.aborts(b"\x01" + bytes(7), COMMAND, "segment without initiation")
+
+
+@check("sdo.download.client-abort", "A download that the client aborts changes nothing", _SDO)
+def _(t: NodeTester) -> None:
+    index, sub, size = _number(t)
+    before = t.upload(index, sub)
+    t.answer(b"\x21" + _mux(index, sub) + struct.pack("<I", size))
+    t.equal(t.ask(abort(index, sub), 0.05), None, "answer to the abort")
+    t.equal(t.upload(index, sub), before, f"{index:04X}h")
+
+
+@check("sdo.download.text", "A string is downloaded in several segments", _SDO)
+def _(t: NodeTester) -> None:
+    index, sub = _writable_text(t)
+    before = t.upload(index, sub)
+    t.download(index, sub, b"conformance test")
+    found = t.upload(index, sub)
+    t.download(index, sub, before or b" ")
+    t.equal(found, b"conformance test", f"{index:04X}h:{sub:02X}")
+
+
+@check("sdo.download.text.toggle", "The toggle bit of download responses alternates from 0", _SDO)
+def _(t: NodeTester) -> None:
+    index, sub = _writable_text(t)
+    before = t.upload(index, sub)
+    t.answer(b"\x21" + _mux(index, sub) + struct.pack("<I", 14))
+    answers = [_segment(t, 0x00, b"ABCDEFG"), _segment(t, 0x11, b"HIJKLMN")]
+    t.download(index, sub, before or b" ")
+    t.equal([answer[0] for answer in answers], [0x20, 0x30], "commands")
+
+
+# ---------------------------------------------------------------- block transfers
+
+
+def _block_upload(t: NodeTester, size: int = 127) -> tuple[bytes, bytes]:
+    """Begins a block upload; returns the response and the object's data."""
+    index, data = _text(t)
+    answer = t.answer(b"\xa4" + _mux(index, 0) + bytes((size, 0, 0, 0)))
+    t.need(answer[0] != 0x80, f"block transfers are refused: abort {answer[:3:-1].hex()}h")
+    t.equal(answer[0] & 0xE1, 0xC0, "command of the response")
+    return answer, data
+
+
+def _segments(t: NodeTester, request: bytes) -> list[bytes]:
+    """Returns the segments of a block that the request starts."""
+    since = t.mark()
+    t.send(0x600 + t.node_id, request)
+    t.wait(0.05)
+    return [frame.data for frame in t.heard(0x580 + t.node_id, since)]
+
+
+@check("sdo.block.upload", "A block upload carries the whole object", _SDO)
+def _(t: NodeTester) -> None:
+    answer, data = _block_upload(t)
+    if answer[0] & 2:
+        t.equal(struct.unpack_from("<I", answer, 4)[0], len(data), "announced size")
+    segments = _segments(t, b"\xa3" + bytes(7))
+    t.equal([each[0] & 0x7F for each in segments], [*range(1, len(segments) + 1)], "sequence numbers")
+    t.equal([each[0] >> 7 for each in segments], [0] * (len(segments) - 1) + [1], "last-segment bits")
+    end = t.answer(bytes((0xA2, len(segments), 127)) + bytes(5))
+    t.equal(end[0] & 0xE3, 0xC1, "command of the end")
+    t.ask(b"\xa1" + bytes(7), 0.02)
+    found = b"".join(each[1:] for each in segments)
+    t.equal(found[: len(found) - (end[0] >> 2 & 7)], data, "data")
+
+
+@check("sdo.block.upload.crc", "The checksum of a block upload is right", _SDO)
+def _(t: NodeTester) -> None:
+    answer, data = _block_upload(t)
+    t.need(answer[0] & 4, "the server has no checksum")
+    segments = _segments(t, b"\xa3" + bytes(7))
+    end = t.answer(bytes((0xA2, len(segments), 127)) + bytes(5))
+    t.ask(b"\xa1" + bytes(7), 0.02)
+    t.equal(struct.unpack_from("<H", end, 1)[0], crc_hqx(data, 0), "checksum")
+
+
+@check("sdo.block.upload.size-1", "Blocks of one segment are possible", _SDO)
+def _(t: NodeTester) -> None:
+    _, data = _block_upload(t, 1)
+    segments = _segments(t, b"\xa3" + bytes(7))
+    t.equal(len(segments), 1, "segments in the first block")
+    t.equal(segments[0][1:], data[:7].ljust(7, b"\0"), "data of the first segment")
+    second = _segments(t, bytes((0xA2, 1, 1)) + bytes(5))
+    t.ask(abort(), 0.02)
+    t.equal(second[0][0] & 0x7F, 1, "sequence number in the second block")
+    t.equal(second[0][1 : 1 + len(data[7:14])], data[7:14], "data of the second block")
+
+
+@check("sdo.block.upload.repeat", "Segments that were not acknowledged are sent again", _SDO)
+def _(t: NodeTester) -> None:
+    _, data = _block_upload(t)
+    _segments(t, b"\xa3" + bytes(7))
+    t.need(len(data) > 7, "the string fits into one segment")
+    again = _segments(t, bytes((0xA2, 1, 127)) + bytes(5))
+    t.ask(abort(), 0.02)
+    t.true(again, "no segments", "those after the first")
+    t.equal(again[0][1 : 1 + len(data[7:14])], data[7:14], "data of the first segment sent again")
+
+
+@check("sdo.block.upload.size-0", "A block size of 0 is abort 05040002h", _SDO)
+def _(t: NodeTester) -> None:
+    index, _ = _text(t)
+    _block_upload(t)
+    t.ask(abort(), 0.02)
+    t.aborts(b"\xa4" + _mux(index, 0) + bytes(4), (0x05040002,), "block size 0")
+
+
+@check("sdo.block.upload.size-128", "A block size of 128 is abort 05040002h", _SDO)
+def _(t: NodeTester) -> None:
+    index, _ = _text(t)
+    _block_upload(t)
+    t.ask(abort(), 0.02)
+    t.aborts(b"\xa4" + _mux(index, 0) + bytes((128, 0, 0, 0)), (0x05040002,), "block size 128")
+
+
+@check(
+    "sdo.block.upload.sequence", "An acknowledgement of segments that were not sent is abort 05040003h", _SDO
+)
+def _(t: NodeTester) -> None:
+    _block_upload(t)
+    segments = _segments(t, b"\xa3" + bytes(7))
+    t.aborts(bytes((0xA2, len(segments) + 1, 127)) + bytes(5), (0x05040003,), "acknowledgement")
+
+
+@check("sdo.block.upload.missing", "Block upload of a missing object is abort 06020000h", _SDO)
+def _(t: NodeTester) -> None:
+    _block_upload(t)
+    t.ask(abort(), 0.02)
+    t.aborts(b"\xa4" + _mux(_NOWHERE, 0) + b"\x7f\0\0\0", ABSENT[:1], "block upload")
+
+
+def _begin_block_download(t: NodeTester, size: int, *, crc: bool) -> tuple[int, int]:
+    index, sub, own = _number(t)
+    answer = t.answer(bytes((0xC2 | crc << 2,)) + _mux(index, sub) + struct.pack("<I", size or own))
+    t.need(answer[0] != 0x80, f"block transfers are refused: abort {answer[:3:-1].hex()}h")
+    t.equal(answer[0] & 0xE3, 0xA0, "command of the response")
+    t.true(1 <= answer[4] <= 127, f"block size {answer[4]}", "1 to 127")
+    return answer[0] >> 2 & 1, own
+
+
+def _block_download(t: NodeTester, *, crc: bool, spoil: int = 0, skipped: bool = False) -> bytes:
+    """Downloads the present value of an object in one block; returns the answer to the end."""
+    index, sub, size = _number(t)
+    data = t.upload(index, sub)
+    server_crc, size = _begin_block_download(t, 0, crc=crc)
+    t.need(server_crc or not spoil, "the server has no checksum")
+    if skipped:
+        answer = t.answer(b"\x82" + data.ljust(7, b"\0"))
+        t.equal((answer[0], answer[1]), (0xA2, 0), "response and number of segments received in order")
+    answer = t.answer(b"\x81" + data.ljust(7, b"\0"))
+    t.equal((answer[0], answer[1]), (0xA2, 1), "response and number of segments received in order")
+    return t.answer(struct.pack("<BH5x", 0xC1 | (7 - size) << 2, (crc_hqx(data, 0) ^ spoil) if crc else 0))
+
+
+@check("sdo.block.download", "A block download is carried out", _SDO)
+def _(t: NodeTester) -> None:
+    t.equal(_block_download(t, crc=True)[0], 0xA1, "command of the end")
+
+
+@check("sdo.block.download.no-crc", "A block download without a checksum is carried out", _SDO)
+def _(t: NodeTester) -> None:
+    t.equal(_block_download(t, crc=False)[0], 0xA1, "command of the end")
+
+
+@check("sdo.block.download.crc", "A wrong checksum is abort 05040004h", _SDO)
+def _(t: NodeTester) -> None:
+    answer = _block_download(t, crc=True, spoil=1)
+    t.equal(answer[:1] + answer[4:], b"\x80" + struct.pack("<I", 0x05040004), "command and abort code")
+
+
+@check("sdo.block.download.sequence", "A segment out of order is not taken and may be sent again", _SDO)
+def _(t: NodeTester) -> None:
+    t.equal(_block_download(t, crc=True, skipped=True)[0], 0xA1, "command of the end")
+
+
+@check("sdo.block.download.read-only", "Block download to a read-only object is abort 06010002h", _SDO)
+def _(t: NodeTester) -> None:
+    _begin_block_download(t, 0, crc=False)
+    t.ask(b"\x81" + bytes(7), 0.05)
+    t.ask(abort(), 0.02)
+    t.aborts(b"\xc2" + _mux(0x1000, 0) + struct.pack("<I", 4), READ_ONLY, "block download")
+
+
+@check("sdo.channel", "1200h names the default identifiers of the SDO server", "CiA 301, object 1200h")
+def _(t: NodeTester) -> None:
+    t.require(0x1200, 1)
+    t.equal([t.read(0x1200, sub) & 0x7FF for sub in (1, 2)], [0x600 + t.node_id, 0x580 + t.node_id], "1200h")
+
+
+@check("sdo.range", "A value outside the range of an object is abort 06090030h to 06090032h", _SDO)
+def _(t: NodeTester) -> None:
+    t.require(0x1800, 2)
+    t.refuses_value(0x1800, 2, b"\xf5", RANGE)

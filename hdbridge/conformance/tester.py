@@ -1,0 +1,652 @@
+"""The tester: frames, SDO, PDO configuration and power states as the checks use them.
+
+Everything is done at the level of frames, because a check must also do what a correct master never does.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from enum import Enum
+from typing import Final, NoReturn
+
+import can
+from canopen.objectdictionary import ObjectDictionary, ODVariable, datatypes
+
+from hdbridge.drive.link import Frame, Link
+from hdbridge.errors import DriveError, HdbridgeError
+
+NMT_START: Final = 1
+NMT_STOP: Final = 2
+NMT_PRE_OPERATIONAL: Final = 128
+NMT_RESET_NODE: Final = 129
+NMT_RESET_COMMUNICATION: Final = 130
+STATES: Final = {0x00: "boot-up", 0x04: "STOPPED", 0x05: "OPERATIONAL", 0x7F: "PRE-OPERATIONAL"}
+PRE_OPERATIONAL: Final = "PRE-OPERATIONAL"
+OPERATIONAL: Final = "OPERATIONAL"
+STOPPED: Final = "STOPPED"
+
+ABSENT: Final = (0x06020000, 0x06090011)
+READ_ONLY: Final = (0x06010002, 0x06010000)
+WRITE_ONLY: Final = (0x06010001, 0x06010000)
+RANGE: Final = (0x06090030, 0x06090031, 0x06090032, 0x06090036)
+LENGTH: Final = (0x06070010, 0x06070012, 0x06070013)
+COMMAND: Final = (0x05040001,)
+
+PDO_INVALID: Final = 1 << 31
+SWITCH_ON_DISABLED: Final = 0x40
+READY_TO_SWITCH_ON: Final = 0x21
+SWITCHED_ON: Final = 0x23
+OPERATION_ENABLED: Final = 0x27
+QUICK_STOP_ACTIVE: Final = 0x07
+FAULT_REACTION_ACTIVE: Final = 0x0F
+FAULT: Final = 0x08
+POWER_STATES: Final = {
+    0x00: "not ready to switch on",
+    SWITCH_ON_DISABLED: "switch on disabled",
+    READY_TO_SWITCH_ON: "ready to switch on",
+    SWITCHED_ON: "switched on",
+    OPERATION_ENABLED: "operation enabled",
+    QUICK_STOP_ACTIVE: "quick stop active",
+    FAULT_REACTION_ACTIVE: "fault reaction active",
+    FAULT: "fault",
+}
+_SIGNED: Final = frozenset(datatypes.SIGNED_TYPES)
+_HEARTBEAT_MS: Final = 40
+_EXCLUDED_FROM_RPDO: Final = (0x6040, 0x6060)
+
+
+class Verdict(Enum):
+    """Outcome of a check."""
+
+    PASS = "pass"
+    FAIL = "fail"
+    NOT_APPLICABLE = "not applicable"
+
+
+class FailedError(Exception):
+    """The node deviates from the standard."""
+
+    def __init__(self, found: str, expected: str) -> None:
+        super().__init__(f"found {found}, expected {expected}")
+        self.found, self.expected = found, expected
+
+
+class NotApplicableError(Exception):
+    """The node lacks an optional object or service that the check needs."""
+
+
+class AbortedError(FailedError):
+    """The node refused an SDO transfer that it should carry out."""
+
+    def __init__(self, what: str, code: int) -> None:
+        super().__init__(f"{what}: abort {code:08X}h", "the transfer is carried out")
+        self.code = code
+
+
+class StoppedError(HdbridgeError):
+    """The user asked for the end of the run."""
+
+    exit_status = 130
+
+
+@dataclass(frozen=True)
+class Check:
+    """One check: what the standard demands, where, and the function that tests it."""
+
+    id: str
+    text: str
+    clause: str
+    function: Callable[[NodeTester], None]
+    moves: bool = False
+    """It may switch power on."""
+    stores: bool = False
+    """It writes to non-volatile memory."""
+
+
+@dataclass(frozen=True)
+class Result:
+    """Outcome of one check."""
+
+    check: Check
+    verdict: Verdict
+    found: str
+    expected: str
+    duration_s: float
+
+
+class Table(list[Check]):
+    """The checks of one subject; `check` adds a function to it."""
+
+    def check(
+        self,
+        name: str,
+        text: str,
+        clause: str,
+        *,
+        moves: bool = False,
+        stores: bool = False,
+    ) -> Callable[[Callable[[NodeTester], None]], Callable[[NodeTester], None]]:
+        """Decorates the function of a check."""
+
+        def add(function: Callable[[NodeTester], None]) -> Callable[[NodeTester], None]:
+            self.append(Check(name, text, clause, function, moves, stores))
+            return function
+
+        return add
+
+
+@dataclass(frozen=True)
+class Timing:
+    """Times of the tests; s."""
+
+    answer_s: float = 0.5
+    """Longest time to an SDO answer or another immediate reaction."""
+    boot_s: float = 10.0
+    """Longest time to the boot-up message, and from there to the first SDO answer."""
+    power_s: float = 10.0
+    """Longest time to a transition of the power state machine, brakes and ramps included."""
+    jitter_s: float = 0.02
+    """Tolerance of a period, in addition to a tenth of it."""
+
+
+class NodeTester:
+    """The master's side of the checks on one node.
+
+    ``travel`` is the distance of test moves in user units; None for 0.02 turns of the motor shaft (608Fh).
+    ``stopped`` is asked while the tester waits; if it returns True, `StoppedError` ends the run.
+    """
+
+    def __init__(
+        self,
+        link: Link,
+        node_id: int,
+        *,
+        od: ObjectDictionary | None = None,
+        travel: int | None = None,
+        timing: Timing | None = None,
+        stopped: Callable[[], bool] = lambda: False,
+    ) -> None:
+        self.link, self.node_id, self.od = link, node_id, od
+        self.timing = timing or Timing()
+        self.log: list[Frame] = []
+        """Every frame received since the start of the present check."""
+        self._travel, self._stopped = travel, stopped
+        self._undo: list[tuple[int, int, bytes]] = []
+        self._existing: dict[tuple[int, int], bool] = {}
+        self._state_watched = False
+        self.start_position: int | None = None
+        """6064h before the first check."""
+        self.powered = False
+        """True if a controlword that may switch power on was sent and not taken back."""
+        self.may_power = False
+        """True while a check with the permission to move runs."""
+
+    # ---------------------------------------------------------------- frames and time
+
+    @property
+    def now(self) -> float:
+        """Time on the link's clock; s."""
+        return self.link.now()
+
+    def send(self, can_id: int, data: bytes = b"") -> None:
+        """Sends a data frame."""
+        self.link.send(can_id, data)
+
+    def send_special(self, can_id: int, data: bytes = b"", *, remote: bool = False) -> None:
+        """Sends a remote frame, or a data frame with a 29-bit identifier."""
+        message = can.Message(
+            arbitration_id=can_id, data=None if remote else data, dlc=1 if remote else len(data),
+            is_remote_frame=remote, is_extended_id=not remote, channel=self.link.mark,
+        )  # fmt: skip
+        self.link.bus.send(message)
+
+    def mark(self) -> int:
+        """Returns the present place in the log; frames that have already arrived are before it."""
+        self._pump(self.now)
+        return len(self.log)
+
+    def wait(self, duration_s: float) -> None:
+        """Receives frames for this time."""
+        self._pump(self.now + duration_s)
+
+    def _pump(self, end_s: float) -> None:
+        while True:
+            if self._stopped():
+                raise StoppedError("the run was ended before its last check")
+            frame = self.link.recv(min(end_s, self.now + 0.25))
+            if frame is not None:
+                self.log.append(frame)
+            elif self.now >= end_s:
+                return
+
+    def heard(self, can_id: int, since: int = 0) -> list[Frame]:
+        """Returns the frames with an identifier that have come since a place in the log."""
+        return [frame for frame in self.log[since:] if frame.can_id == can_id]
+
+    def hears(self, can_id: int, timeout_s: float | None = None, since: int | None = None) -> Frame | None:
+        """Waits for the next frame with an identifier; None if it does not come in time."""
+        place = len(self.log) if since is None else since
+        end_s = self.now + (self.timing.answer_s if timeout_s is None else timeout_s)
+        while True:
+            for frame in self.log[place:]:
+                if frame.can_id == can_id:
+                    return frame
+            place = len(self.log)
+            if self._stopped():
+                raise StoppedError("the run was ended before its last check")
+            if (heard := self.link.recv(min(end_s, self.now + 0.25))) is not None:
+                self.log.append(heard)
+            elif self.now >= end_s:
+                return None
+
+    # ---------------------------------------------------------------- verdicts
+
+    @staticmethod
+    def fail(found: object, expected: object) -> NoReturn:
+        """Ends the check as failed."""
+        raise FailedError(str(found), str(expected))
+
+    @staticmethod
+    def equal(found: object, expected: object, what: str = "") -> None:
+        """Fails unless both are equal; ``what`` names the value."""
+        if found != expected:
+            prefix = f"{what} " if what else ""
+            raise FailedError(f"{prefix}{_text(found)}", f"{prefix}{_text(expected)}")
+
+    @staticmethod
+    def true(condition: object, found: object, expected: object) -> None:
+        """Fails unless the condition holds."""
+        if not condition:
+            raise FailedError(str(found), str(expected))
+
+    @staticmethod
+    def need(condition: object, reason: str) -> None:
+        """Ends the check as not applicable unless the condition holds."""
+        if not condition:
+            raise NotApplicableError(reason)
+
+    def near(self, found_s: float, expected_s: float, what: str) -> None:
+        """Fails unless a period or delay is right within the tolerance."""
+        if abs(found_s - expected_s) > 0.1 * expected_s + self.timing.jitter_s:
+            self.fail(f"{what} {1000 * found_s:.1f} ms", f"{1000 * expected_s:.1f} ms")
+
+    # ---------------------------------------------------------------- NMT
+
+    def nmt(self, command: int, node_id: int | None = None) -> None:
+        """Sends an NMT command, to the node under test by default."""
+        self.send(0x000, bytes((command, self.node_id if node_id is None else node_id)))
+
+    def reset(self, command: int = NMT_RESET_COMMUNICATION) -> Frame:
+        """Resets the node and waits until it has booted and answers SDO; returns the boot-up message."""
+        since = self.mark()
+        self.nmt(command)
+        boot = self.boot_up(since)
+        self._state_watched = False
+        if not self.answers(self.timing.boot_s):
+            self.fail("no SDO answer after the boot-up message", f"one within {self.timing.boot_s:g} s")
+        return boot
+
+    def answers(self, duration_s: float) -> bool:
+        """Returns True once the node answers an SDO request, False if it does not in this time."""
+        deadline_s = self.now + duration_s
+        while self.ask(upload_request(0x1000)) is None:
+            if self.now >= deadline_s:
+                return False
+        return True
+
+    def boot_up(self, since: int) -> Frame:
+        """Waits for the boot-up message."""
+        deadline_s = self.now + self.timing.boot_s
+        frame, place = None, since
+        while frame is None or frame.data[:1] != b"\0":
+            frame = self.hears(0x700 + self.node_id, deadline_s - self.now, place)
+            if frame is None:
+                self.fail("no boot-up message", f"one within {self.timing.boot_s:g} s of the reset")
+            place = self.log.index(frame) + 1
+        return frame
+
+    def watch_state(self) -> None:
+        """Makes the node report its NMT state by heartbeats, or by node guarding if it has none."""
+        if not self._state_watched and self.has(0x1017):
+            self.write(0x1017, 0, _HEARTBEAT_MS, 2)
+            self._state_watched = True
+
+    def state(self) -> str:
+        """Returns the NMT state that the next heartbeat, or the answer to node guarding, reports."""
+        can_id = 0x700 + self.node_id
+        since = self.mark()
+        if not self._state_watched:
+            self.send_special(can_id, remote=True)
+        frame = self.hears(can_id, 4e-3 * _HEARTBEAT_MS + self.timing.answer_s, since)
+        self.need(frame, "the node has neither a heartbeat (1017h) nor node guarding")
+        assert frame is not None
+        value = frame.data[0] & 0x7F if frame.data else -1
+        return STATES.get(value, f"{value:02X}h")
+
+    def enter(self, command: int, state: str) -> None:
+        """Sends an NMT command and checks the state that the node then reports."""
+        self.watch_state()
+        self.nmt(command)
+        self.equal(self.state(), state, "NMT state")
+
+    def sync(self, counter: int | None = None) -> None:
+        """Sends SYNC."""
+        self.send(0x080, b"" if counter is None else bytes((counter,)))
+
+    def emergencies(self, since: int) -> list[int]:
+        """Returns the codes of the EMCY messages since a place in the log."""
+        frames = self.heard(0x080 + self.node_id, since)
+        return [struct.unpack_from("<H", frame.data)[0] for frame in frames if len(frame.data) == 8]
+
+    # ---------------------------------------------------------------- SDO
+
+    def ask(self, request: bytes, timeout_s: float | None = None) -> bytes | None:
+        """Sends an SDO request; returns the answer, or None if there is none in time."""
+        since = self.mark()
+        self.send(0x600 + self.node_id, request)
+        frame = self.hears(0x580 + self.node_id, timeout_s, since)
+        return None if frame is None else frame.data
+
+    def answer(self, request: bytes) -> bytes:
+        """As `ask`; no answer, or one that has not eight bytes, fails the check."""
+        answer = self.ask(request)
+        if answer is None:
+            self.fail(
+                f"no answer to the SDO request {request.hex(' ')}", f"one within {self.timing.answer_s:g} s"
+            )
+        self.equal(len(answer), 8, "length of the SDO answer")
+        return answer
+
+    def aborts(self, request: bytes, codes: tuple[int, ...], what: str) -> None:
+        """Fails unless the request is refused with one of the abort codes."""
+        answer = self.answer(request)
+        expected = f"abort {' or '.join(f'{code:08X}h' for code in codes)}"
+        if answer[0] != 0x80:
+            self.fail(f"{what}: answer {answer.hex(' ')}", expected)
+        code = struct.unpack_from("<I", answer, 4)[0]
+        self.true(code in codes, f"{what}: abort {code:08X}h", expected)
+
+    def refuses_value(self, index: int, sub: int, data: bytes, codes: tuple[int, ...]) -> None:
+        """Fails unless a download is refused with one of the abort codes and the object keeps its value."""
+        before = self.upload(index, sub)
+        what = f"{index:04X}h:{sub:02X} = {int.from_bytes(data, 'little')}"
+        try:
+            self.aborts(expedited(index, sub, data), codes, what)
+            self.equal(self.upload(index, sub), before, f"{index:04X}h:{sub:02X} after the refusal")
+        finally:
+            self._undo.append((index, sub, before))
+
+    def refuses(self, request: bytes, what: str) -> None:
+        """Fails unless the request is refused with any abort code."""
+        answer = self.answer(request)
+        self.true(answer[0] == 0x80, f"{what}: accepted", "an abort")
+
+    def upload(self, index: int, sub: int = 0) -> bytes:
+        """Uploads an object, expedited or segmented; `AbortedError` if the node refuses."""
+        answer = self.answer(_request(0x40, index, sub))
+        self._raise_abort(answer, f"upload of {index:04X}h:{sub:02X}")
+        self.equal(answer[0] >> 5, 2, "command of the upload response")
+        self.equal(answer[1:4], struct.pack("<HB", index, sub), "multiplexer")
+        if answer[0] & 2:
+            return answer[4 : 8 - (answer[0] >> 2 & 3 if answer[0] & 1 else 0)]
+        data, toggle = b"", 0
+        while True:
+            answer = self.answer(bytes((0x60 | toggle,)) + bytes(7))
+            self._raise_abort(answer, f"segment of {index:04X}h:{sub:02X}")
+            self.equal(answer[0] & 0xF0, toggle, "command and toggle bit of the segment")
+            data += answer[1 : 8 - (answer[0] >> 1 & 7)]
+            toggle ^= 0x10
+            if answer[0] & 1:
+                return data
+
+    def download(self, index: int, sub: int, data: bytes) -> None:
+        """Downloads up to four bytes expedited, more in segments; `AbortedError` if the node refuses."""
+        what = f"download to {index:04X}h:{sub:02X}"
+        if len(data) <= 4:
+            self._raise_abort(self.answer(expedited(index, sub, data)), what)
+            return
+        self._raise_abort(self.answer(_request(0x21, index, sub)[:4] + struct.pack("<I", len(data))), what)
+        for place in range(0, len(data), 7):
+            part = data[place : place + 7]
+            command = (place // 7 & 1) << 4 | (7 - len(part)) << 1 | (place + 7 >= len(data))
+            self._raise_abort(self.answer(bytes((command,)) + part.ljust(7, b"\0")), what)
+
+    @staticmethod
+    def _raise_abort(answer: bytes, what: str) -> None:
+        if answer[0] == 0x80:
+            raise AbortedError(what, struct.unpack_from("<I", answer, 4)[0])
+
+    def has(self, index: int, sub: int = 0) -> bool:
+        """Returns True if the node has the object."""
+        if (index, sub) not in self._existing:
+            answer = self.answer(_request(0x40, index, sub))
+            code = struct.unpack_from("<I", answer, 4)[0] if answer[0] == 0x80 else 0
+            self._existing[index, sub] = code not in ABSENT
+            if answer[0] == 0x41:
+                self.ask(abort(index, sub), 0.0)
+        return self._existing[index, sub]
+
+    def require(self, index: int, sub: int = 0) -> None:
+        """Ends the check as not applicable if the node lacks the object."""
+        self.need(self.has(index, sub), f"no object {index:04X}h:{sub:02X}")
+
+    def read(self, index: int, sub: int = 0, *, signed: bool = False) -> int:
+        """Uploads an integer."""
+        return int.from_bytes(self.upload(index, sub), "little", signed=signed)
+
+    def put(self, index: int, sub: int, value: int, size: int) -> None:
+        """Downloads an integer of ``size`` bytes, for good."""
+        self.download(index, sub, pack(value, size))
+
+    def write(self, index: int, sub: int, value: int, size: int) -> None:
+        """Downloads an integer; the value before is restored at the end of the check."""
+        before = self.upload(index, sub)
+        self.put(index, sub, value, size)
+        self._undo.append((index, sub, before))
+
+    # ---------------------------------------------------------------- PDO
+
+    def has_pdo(self, first: int) -> bool:
+        """Returns True if a PDO exists; ``first`` is the index of its communication parameter."""
+        return self.has(first, 1) and self.has(first + 0x200, 0)
+
+    def map_pdo(
+        self,
+        first: int,
+        objects: tuple[tuple[int, int, int], ...],
+        transmission: int,
+        can_id: int | None = None,
+        timers: dict[int, int] | None = None,
+    ) -> int:
+        """Configures a PDO by the procedure of CiA 301; returns its identifier.
+
+        ``objects`` are (index, sub-index, bits); ``timers`` are values of sub-indices 3, 5 or 6.
+        """
+        self.need(self.has_pdo(first), f"no PDO at {first:04X}h")
+        before = self.read(first, 1)
+        own = before & 0x7FF if can_id is None else can_id
+        self.write(first, 1, before | PDO_INVALID, 4)
+        self.write(first + 0x200, 0, 0, 1)
+        for place, (index, sub, bits) in enumerate(objects, start=1):
+            self.write(first + 0x200, place, index << 16 | sub << 8 | bits, 4)
+        self.write(first + 0x200, 0, len(objects), 1)
+        self.write(first, 2, transmission, 1)
+        for sub, value in (timers or {}).items():
+            self.write(first, sub, value, 1 if sub == 6 else 2)
+        self.write(first, 1, before & 0x40000000 | own, 4)
+        return own
+
+    def variables(self) -> Iterator[ODVariable]:
+        """Yields the entries of the EDS; none without one."""
+        for item in (self.od or {}).values():
+            yield from [item] if isinstance(item, ODVariable) else item.subindices.values()
+
+    def scratch(self) -> tuple[int, int, int]:
+        """Returns (index, sub-index, bits) of an object to write, read and map that has no effect."""
+        for index in (0x6081, 0x6083, 0x607A):
+            if self.od is None and self.has(index):
+                return index, 0, 32
+            variable = self.od[index] if self.od is not None and index in self.od else None
+            if isinstance(variable, ODVariable) and variable.pdo_mappable and self.has(index):
+                return index, 0, 32
+        for each in self.variables():
+            if (
+                each.pdo_mappable
+                and each.access_type in ("rw", "rww", "rwr")
+                and each.data_type in datatypes.INTEGER_TYPES
+                and len(each) in (8, 16, 32)
+                and each.index not in _EXCLUDED_FROM_RPDO
+            ):
+                return each.index, each.subindex, len(each)
+        raise NotApplicableError("no object is known that can be written, read and mapped without effect")
+
+    def other_value(self, index: int, sub: int, bits: int) -> int:
+        """Returns a value next to the present one."""
+        now = int.from_bytes(self.upload(index, sub), "little")
+        return now - 1 if now > 1 else now + 1
+
+    # ---------------------------------------------------------------- CiA 402
+
+    def need_402(self) -> None:
+        """Ends the check as not applicable unless the node is a drive of CiA 402."""
+        self.need(self.read(0x1000) & 0xFFFF == 402, "the device profile (1000h) is not CiA 402")
+
+    def control(self, word: int) -> None:
+        """Writes the controlword by SDO. Without permission to move, bit 0 stays off or alone is harmless."""
+        if word & 0x07 == 0x07 and not word & 0x80:
+            if not self.may_power:
+                raise AssertionError("a check without permission to move must not switch power on")
+            self.powered = True
+        self.put(0x6040, 0, word, 2)
+
+    def power_state(self) -> int:
+        """Returns the power state, as the bits of the statusword that define it."""
+        return power_state(self.read(0x6041))
+
+    def reaches(
+        self, state: int, timeout_s: float | None = None, pace: Callable[[], None] | None = None
+    ) -> None:
+        """Waits for a power state; fails if it does not come in time."""
+        deadline_s = self.now + (self.timing.power_s if timeout_s is None else timeout_s)
+        while (found := self.power_state()) != state:
+            if self.now > deadline_s:
+                self.fail(POWER_STATES.get(found, f"{found:02X}h"), POWER_STATES[state])
+            self.wait(0.005)
+
+    def stays(self, state: int, duration_s: float = 0.05) -> None:
+        """Fails if the power state is, or becomes, another one."""
+        end_s = self.now + duration_s
+        while True:
+            found = self.power_state()
+            self.equal(POWER_STATES.get(found, f"{found:02X}h"), POWER_STATES[state], "power state")
+            if self.now >= end_s:
+                return
+            self.wait(0.01)
+
+    def disable(self) -> None:
+        """Leads to SWITCH ON DISABLED, with the reset of a fault if there is one."""
+        self.control(0x00)
+        deadline_s = self.now + self.timing.power_s
+        while (state := self.power_state()) != SWITCH_ON_DISABLED:
+            if state == FAULT:
+                self.control(0x80)
+                self.wait(0.02)
+                self.control(0x00)
+            if self.now > deadline_s:
+                self.fail(POWER_STATES.get(state, f"{state:02X}h"), "switch on disabled")
+            self.wait(0.01)
+        self.powered = False
+
+    @property
+    def travel(self) -> int:
+        """Distance of a test move; user units."""
+        if self._travel is None:
+            turn = self.read(0x608F, 1) // max(self.read(0x608F, 2), 1) if self.has(0x608F, 1) else 5000
+            self._travel = max(turn // 50, 20)
+        return self._travel
+
+    # ---------------------------------------------------------------- around a check
+
+    def prepare(self, *, moves: bool) -> None:
+        """Brings the node to PRE-OPERATIONAL for the next check."""
+        self.log.clear()
+        self.may_power = moves
+        self.nmt(NMT_PRE_OPERATIONAL)
+
+    def tidy(self) -> None:
+        """Undoes what the check has changed; resets the communication if that fails."""
+        self.send(0x600 + self.node_id, abort())  # ends a transfer that the check has left open
+        self.nmt(NMT_PRE_OPERATIONAL)
+        try:
+            if self.powered:
+                self.disable()
+            while self._undo:
+                index, sub, data = self._undo[-1]
+                self.download(index, sub, data)
+                self._undo.pop()
+        except FailedError:
+            self._recover()
+        self._undo.clear()
+        self._state_watched = False
+
+    def _recover(self) -> None:
+        for command in (NMT_RESET_COMMUNICATION, NMT_RESET_NODE):
+            self.nmt(command)
+            self.wait(self.timing.jitter_s)
+            self.nmt(NMT_PRE_OPERATIONAL)
+            if self.answers(self.timing.boot_s):
+                return
+        raise DriveError(
+            f"node {self.node_id}: does not answer any more; expected an SDO answer after NMT reset; "
+            "switch the node off and on, and look at the last check"
+        )
+
+    def abandon(self) -> None:
+        """Ends a check that was broken off: quick stop, power off, and what it has changed is undone."""
+        self._stopped = lambda: False
+        if self.powered:
+            self.send(0x600 + self.node_id, abort())
+            self.send(0x600 + self.node_id, expedited(0x6040, 0, pack(0x02, 2)))
+            self.link.clock.sleep_until(self.now + 0.5)
+        self.tidy()
+
+
+def power_state(statusword: int) -> int:
+    """Returns the bits of a statusword that define the power state (CiA 402)."""
+    masked = statusword & 0x4F
+    return masked if masked in (0x00, SWITCH_ON_DISABLED, FAULT_REACTION_ACTIVE, FAULT) else statusword & 0x6F
+
+
+def pack(value: int, size: int) -> bytes:
+    """Returns the bytes of an integer, signed if it is negative."""
+    return value.to_bytes(size, "little", signed=value < 0)
+
+
+def is_signed(variable: ODVariable) -> bool:
+    """Returns True for a signed integer type."""
+    return variable.data_type in _SIGNED
+
+
+def expedited(index: int, sub: int, data: bytes) -> bytes:
+    """Returns the request of an expedited download."""
+    return struct.pack("<BHB", 0x23 | (4 - len(data)) << 2, index, sub) + data.ljust(4, b"\0")
+
+
+def abort(index: int = 0, sub: int = 0, code: int = 0x08000000) -> bytes:
+    """Returns the abort message of a client."""
+    return struct.pack("<BHBI", 0x80, index, sub, code)
+
+
+def upload_request(index: int, sub: int = 0) -> bytes:
+    """Returns the request of an upload."""
+    return _request(0x40, index, sub)
+
+
+def _request(command: int, index: int, sub: int) -> bytes:
+    return struct.pack("<BHB4x", command, index, sub)
+
+
+def _text(value: object) -> str:
+    return value.hex(" ") if isinstance(value, bytes) else str(value)

@@ -1,0 +1,534 @@
+"""Adaptation of one axis: observations update an estimate, and the model in use follows it within bounds.
+
+A window of observations is complete once the axis has moved enough (`Excitation`). It is rejected as a whole
+if neither wear nor temperature can cause it. Then learning is frozen until the cause ends, and the updates by
+the last windows before it are reverted. Pure: observations contain the time.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from hdbridge.analysis.intervals import difference
+from hdbridge.control.compensation import Inverse
+from hdbridge.daemon.following.estimator import (
+    ZERO_ARCSEC,
+    Change,
+    bounds_arcsec,
+    calibrated_estimator,
+    changes_between,
+    half_widths,
+)
+from hdbridge.daemon.following.measuring import DriftModel, Observation, reversals, turns
+from hdbridge.daemon.following.settings import AdaptationSettings, Mode
+from hdbridge.daemon.following.signs import Partial, partial_fit
+from hdbridge.effects import FloatArray
+from hdbridge.errors import InputError
+from hdbridge.model import TransmissionModel
+
+ONE_WAY_TURNS = 4.0
+"""Multiple of the turns of `Excitation` after which a window without reversals updates the memoryless
+terms."""
+CLEAR_WINDOWS = 3
+"""Consecutive plausible windows that end a freeze."""
+REVERTED_WINDOWS = 3
+"""Number of windows before a fault that are reverted."""
+RATE_INTERVALS = 2.0
+"""Maximum number of intervals for which a pause permits change."""
+LEAST_SHARE = 0.99
+"""Share of the change permitted per interval that is applied however small it is."""
+GATE_SIGMAS = 6.0
+SCATTER_RATIO = 4.0
+"""Ratio of the scatter of standstills to its usual value above which it is noise."""
+SCATTER_WEIGHT = 0.02
+"""Weight of one window in the usual scatter."""
+TREND_FREE = 4
+"""Degrees of freedom required to fit a trend in a window."""
+DRIFT_S = 120.0
+"""Time span in which a drift of the zero is searched."""
+DRIFT_WINDOWS = 6
+"""Minimum number of windows to detect a drift."""
+MAX_DRIFT_WINDOWS = 256
+DRIFT_SIGMAS = 3.0
+
+Entry = Mapping[str, Any]
+"""Line of the history: ``event``, ``axis_time_s`` and further data, all serialisable as JSON."""
+
+
+@dataclass(frozen=True, slots=True)
+class Freeze:
+    """Reason why nothing is learned."""
+
+    reason: str
+    """The reason in words, with figures."""
+    lasting: bool = False
+    """True if it does not end automatically: the zero must be taken again."""
+
+
+@dataclass(frozen=True, slots=True)
+class Proposal:
+    """Proposed model for the compensation."""
+
+    model: TransmissionModel
+    changes: tuple[Change, ...]
+    apply: bool
+    """False if it is only reported (``observe``)."""
+    time_s: float
+    """Axis time."""
+
+
+@dataclass(frozen=True, slots=True)
+class Learned:
+    """State that survives a restart of the service."""
+
+    estimate: tuple[float, ...]
+    covariance: tuple[tuple[float, ...], ...]
+    applied: tuple[float, ...]
+    windows: int
+
+
+class Adaptation:
+    """Adaptation of one axis. Call `take` with its observations in order, from one thread."""
+
+    def __init__(
+        self,
+        whole: DriftModel,
+        settings: AdaptationSettings,
+        sigma_arcsec: float,
+        load_count_arcsec: float,
+        log: Callable[[Entry], None] = lambda _: None,
+        learned: Learned | None = None,
+    ) -> None:
+        """``whole`` is the committed model that the observations refer to; ``sigma_arcsec`` their noise.
+
+        ``learned`` is the state of an earlier adaptation of it. Raises InputError if ``settings`` name a
+        parameter that the model does not have.
+        """
+        self.settings = settings
+        self.mode: Mode = settings.mode
+        self.committed = self.model = whole.model
+        """Committed model, and the one that should be in use: the last one proposed to be applied."""
+        self.freeze_reason: Freeze | None = None
+        self.windows = 0
+        """Number of windows learned from."""
+        self._drift = drift = DriftModel(whole.model, settings.parameters)
+        self._columns = drift.columns_in(whole)
+        self._estimator = calibrated_estimator(drift, settings)
+        self._bounds = bounds_arcsec(drift, settings)
+        self._sigma_arcsec = sigma_arcsec
+        self._log = log
+        self._now_s = 0.0
+        self._nuisances = drift.has_memory.copy()
+        self._nuisances[drift.zero :] = True
+        """Columns that may not be mistaken for a drift: the loop, the zero, the load encoder's disc."""
+        self._plausibility = _Plausibility(settings.zero_rate_arcsec_per_hour, load_count_arcsec)
+        self._window: list[Observation] = []
+        self._zero_arcsec: float | None = None
+        """Zero when it was taken."""
+        self._cleared = 0
+        self._earlier: deque[tuple[FloatArray, FloatArray]] = deque(maxlen=REVERTED_WINDOWS)
+        """Estimates and covariances before each of the last windows."""
+        self._begun_s: float | None = None
+        """Time since which it has learned without a freeze; None before the first window."""
+        self._window_s: float | None = None
+        """End of the last window, used or not."""
+        self._proposed = self._used = np.zeros(drift.zero)
+        """Changes of the coefficients in the last proposed model, applied or not, and in the model in use."""
+        self._changed_s = -math.inf
+        """Time at which a change was last made or considered."""
+        if learned is not None:
+            self._restore(learned)
+
+    def take(self, observations: Sequence[Observation], now_s: float, fault: str = "") -> Proposal | None:
+        """Takes observations in order; returns a proposal when one is due.
+
+        ``fault`` is a reason, such as a fault of the load encoder, why nothing may be learned now.
+        """
+        if self.mode == "off":
+            return None
+        self._now_s = now_s
+        if fault:
+            self.freeze(Freeze(fault))
+        for each in observations:
+            self._window.append(each._replace(row=each.row[self._columns]))
+            if self._complete():
+                window, self._window = self._window, []
+                self._close(window)
+        return self._proposal()
+
+    def set_mode(self, mode: Mode) -> None:
+        """Changes the mode. ``on`` ends a freeze, whatever the load encoder reads."""
+        if mode == "on" and self.freeze_reason is not None:
+            estimator = self._estimator
+            estimator.covariance = estimator.covariance + np.diag(estimator.scale**2)
+            self._free_zero()
+            self._unfreeze("by command")
+        if mode != self.mode:
+            # Changes that were only observed are not applied at once: start from the model in use.
+            self._proposed, self._changed_s = self._used, self._now_s
+            if self.mode == "off":
+                self.forget_window()
+            self._log_event("mode", mode=mode)
+            self.mode = mode
+
+    def revert(self) -> Proposal:
+        """Restores the committed model and only observes from now on, until `set_mode`."""
+        changes = changes_between(self.committed, self.model, self.committed)
+        self._estimator = calibrated_estimator(self._drift, self.settings)
+        self._free_zero()
+        self._unfreeze("begun anew")
+        self._proposed = self._used = np.zeros(self._drift.zero)
+        self.model = self.committed
+        self.mode = "observe"
+        self._log_event("back", changes=_changes_json(changes))
+        return Proposal(self.committed, changes, True, self._now_s)
+
+    def forget_window(self) -> None:
+        """Discards the incomplete window, for example after lost samples."""
+        self._window.clear()
+
+    def invalidate_zero(self) -> None:
+        """Handles a possible change of the drive's zero (homed or off), which ends a lasting freeze."""
+        if self._zero_arcsec is not None or self.freeze_reason is not None:
+            self._free_zero()
+            if self.freeze_reason is not None and self.freeze_reason.lasting:
+                self._unfreeze("the zero was taken again")
+
+    def freeze(self, found: Freeze) -> None:
+        """Stops learning until the cause ends, and reverts the last windows."""
+        self._window.clear()
+        self._cleared = 0
+        before = self.freeze_reason
+        if before is None:
+            if self._earlier:
+                self._estimator.estimate, self._estimator.covariance = self._earlier[0]
+                self._earlier.clear()
+            self._log_event("frozen", reason=found.reason, lasting=found.lasting)
+        if before is None or (found.lasting and not before.lasting):
+            self.freeze_reason = found
+        self._begun_s = None
+
+    @property
+    def estimate_arcsec(self) -> FloatArray:
+        """Estimated changes of the adapted coefficients, within the bounds, (f,)."""
+        return self._estimator.estimate[: self._drift.zero].copy()
+
+    @property
+    def covariance(self) -> FloatArray:
+        """Covariance of the adapted coefficients, (f, f)."""
+        return self._estimator.covariance[: self._drift.zero, : self._drift.zero].copy()
+
+    @property
+    def used_arcsec(self) -> FloatArray:
+        """Changes of the adapted coefficients in the model in use, (f,)."""
+        return self._used.copy()
+
+    @property
+    def zero_moved_arcsec(self) -> float | None:
+        """Change of the zero since it was taken; None before. It is reported, never applied."""
+        return None if self._zero_arcsec is None else self._zero - self._zero_arcsec
+
+    def waiting_reason(self, *, path_known: bool) -> str | None:
+        """Returns the reason why it is frozen or waits; None while it follows or is off."""
+        if self.mode == "off":
+            return None
+        if self.freeze_reason is not None:
+            return self.freeze_reason.reason
+        if not path_known:
+            return "the axis has not yet turned past its loop"
+        return None if self.windows else "not enough motion yet"
+
+    def estimated_changes(self) -> dict[str, float]:
+        """Returns the changes of parameters that the load encoder shows now, before rate limits."""
+        change = self.estimate_arcsec
+        estimated = self._drift.changed(change) if np.any(change) else self.committed
+        changes = changes_between(self.committed, self.committed, estimated)
+        return {each.parameter: difference(each.parameter, each.before, each.after) for each in changes}
+
+    def learned(self) -> Learned:
+        """Returns the state to keep over a restart."""
+        estimator = self._estimator
+        return Learned(
+            tuple(estimator.estimate.tolist()),
+            tuple(tuple(row) for row in estimator.covariance.tolist()),
+            tuple(self._used.tolist()),
+            self.windows,
+        )
+
+    def _restore(self, learned: Learned) -> None:
+        """Continues from an earlier estimate; the zero must be taken again."""
+        estimator = self._estimator
+        estimate, covariance = np.array(learned.estimate), np.array(learned.covariance)
+        applied = np.array(learned.applied)
+        if estimate.shape != estimator.estimate.shape or covariance.shape != estimator.covariance.shape:
+            return
+        if applied.shape != self._used.shape:
+            return
+        estimator.estimate, estimator.covariance = estimate, covariance
+        self.windows = learned.windows
+        self._free_zero()
+        if self.mode == "on":
+            self._proposed = self._used = np.clip(applied, -self._bounds, self._bounds)
+            self.model = self._changed(self._used)
+
+    # ------------------------------------------------------------------ windows
+
+    def _complete(self) -> bool:
+        required, window = self.settings.excitation, self._window
+        turned = turns(window)
+        if len(window) < required.samples or turned < required.turns:
+            return False
+        return reversals(window) >= required.reversals or turned >= ONE_WAY_TURNS * required.turns
+
+    def _close(self, window: list[Observation]) -> None:
+        """Tests a window and learns from it if it is plausible."""
+        rows = np.array([each.row for each in window])
+        observed = np.array([each.error_arcsec for each in window])
+        if self._zero_arcsec is None:
+            self._take_zero(rows, observed)
+        residual = observed - rows @ self._estimator.estimate
+        variance = np.einsum("ij,jk,ik->i", rows, self._estimator.covariance, rows)
+        sigma = np.sqrt(variance + self._sigma_arcsec**2) + self._rate_allowance_arcsec(window, rows)
+        found = self._plausibility.test(window, residual, sigma, rows[:, self._nuisances])
+        self._window_s = window[-1].time_s
+        if found is not None:
+            self.freeze(found)
+            return
+        if self.freeze_reason is not None:
+            self._cleared += not self.freeze_reason.lasting
+            if self._cleared < CLEAR_WINDOWS:
+                return
+            self._unfreeze("the load encoder agrees with the model again")
+        self._learn(window, rows, observed)
+        own_zero = self._zero + float(np.mean(observed - rows @ self._estimator.estimate))
+        found = self._plausibility.follow(window, own_zero) or self._zero_out_of_bound()
+        if found is not None:
+            self.freeze(found)
+
+    def _learn(self, window: list[Observation], rows: FloatArray, observed: FloatArray) -> None:
+        estimator, zero = self._estimator, self._drift.zero
+        self._earlier.append((estimator.estimate, estimator.covariance))
+        one_way = reversals(window) < self.settings.excitation.reversals
+        estimator.update(
+            rows,
+            observed,
+            self._sigma_arcsec,
+            retention=0.5 ** (turns(window) / self.settings.half_life_turns),
+            held=self._drift.has_memory if one_way else None,
+        )
+        estimator.estimate[:zero] = np.clip(estimator.estimate[:zero], -self._bounds, self._bounds)
+        self.windows += 1
+        if self._begun_s is None:
+            self._begun_s = window[0].time_s
+
+    def _rate_allowance_arcsec(self, window: list[Observation], rows: FloatArray) -> FloatArray:
+        """Returns the change that the rates permit during the time without observations, (n,)."""
+        if self._window_s is None:
+            return np.zeros(len(window))
+        gap_h = max(window[0].time_s - self._window_s, 0.0) / 3600.0
+        adapted = np.abs(rows[:, : self._drift.zero]).sum(axis=1)
+        settings = self.settings
+        per_hour = settings.rate_arcsec_per_hour * adapted + settings.zero_rate_arcsec_per_hour
+        return np.asarray(per_hour * gap_h)
+
+    def _unfreeze(self, reason: str) -> None:
+        if self.freeze_reason is not None:
+            self._log_event("thawed", reason=reason)
+        self.freeze_reason = None
+        self._cleared = 0
+        self._begun_s = self._window_s = None
+
+    # ------------------------------------------------------------------ the zero
+
+    @property
+    def _zero(self) -> float:
+        return float(self._estimator.estimate[self._drift.zero])
+
+    def _take_zero(self, rows: FloatArray, observed: FloatArray) -> None:
+        """Takes the zero as the median of a window, so that only the scatter about it is tested."""
+        at = self._drift.zero
+        estimate = self._estimator.estimate.copy()
+        estimate[at] = 0.0
+        estimate[at] = self._zero_arcsec = float(np.median(observed - rows @ estimate))
+        self._estimator.estimate = estimate
+        self._set_zero_sigma(self._sigma_arcsec)
+
+    def _free_zero(self) -> None:
+        """Resets the zero to unknown."""
+        self._set_zero_sigma(ZERO_ARCSEC)
+        self._zero_arcsec = None
+        self._window.clear()
+        self._earlier.clear()
+        self._plausibility.restart()
+
+    def _set_zero_sigma(self, sigma_arcsec: float) -> None:
+        at = self._drift.zero
+        covariance = self._estimator.covariance.copy()
+        covariance[at, :] = covariance[:, at] = 0.0
+        covariance[at, at] = sigma_arcsec**2
+        self._estimator.covariance = covariance
+
+    def _zero_out_of_bound(self) -> Freeze | None:
+        moved, most = self.zero_moved_arcsec, self.settings.zero_bound_arcsec
+        if moved is None or abs(moved) <= most:
+            return None
+        return Freeze(
+            f"the zero has moved by {moved:+.1f} arcsec since it was taken (at most {most:g}): take it again",
+            lasting=True,
+        )
+
+    # ------------------------------------------------------------------ proposals
+
+    def _proposal(self) -> Proposal | None:
+        settings = self.settings
+        if self._begun_s is None or self._window_s is None:
+            return None
+        since_s = max(self._begun_s, self._changed_s)
+        passed_s = min(self._window_s - since_s, RATE_INTERVALS * settings.interval_s)
+        if passed_s < settings.interval_s:
+            return None
+        self._changed_s = self._window_s
+        most = settings.rate_arcsec_per_hour * passed_s / 3600.0
+        step = np.clip(self.estimate_arcsec - self._proposed, -most, most)
+        worth = min(settings.smallest_arcsec, LEAST_SHARE * most)
+        if not len(step) or float(np.max(np.abs(step))) < worth:
+            return None
+        change = self._proposed + step
+        model = self._changed(change)
+        try:
+            Inverse(model)
+        except InputError as error:
+            self._log_event("refused", reason=str(error))
+            return None
+        changes = changes_between(self.committed, self._changed(self._proposed), model)
+        self._proposed = change
+        apply = self.mode == "on"
+        if apply:
+            self._used, self.model = change, model
+        self._log_event("changed" if apply else "would change", changes=_changes_json(changes))
+        return Proposal(model, changes, apply, self._now_s)
+
+    def _changed(self, change: FloatArray) -> TransmissionModel:
+        """Returns the committed model with changed coefficients and their present intervals."""
+        if not np.any(change):
+            return self.committed
+        model = self._drift.changed(change)
+        uncertainty = dict(model.uncertainty)
+        for each in self._drift.terms:
+            effect = model.effects[each.number]
+            own = self._estimator.covariance[each.columns, each.columns]
+            uncertainty[effect.name] = half_widths(effect, own, uncertainty.get(effect.name, {}))
+        provenance = {**model.provenance, "reason": "the committed model, adapted by the load encoder"}
+        return replace(model, uncertainty=uncertainty, provenance=provenance)
+
+    def _log_event(self, event: str, **facts: Any) -> None:
+        self._log({"event": event, "axis_time_s": self._now_s, **facts})
+
+
+def _changes_json(changes: Sequence[Change]) -> dict[str, dict[str, float]]:
+    return {
+        each.parameter: {"committed": each.committed, "before": each.before, "after": each.after}
+        for each in changes
+    }
+
+
+class _Plausibility:
+    """Tests if wear or temperature can explain a window of observations.
+
+    Both are slow, so sudden or inconsistent changes have another cause. `EncoderHealth` judges every sample;
+    the tests here need the estimate. A shift common to all observations, or a zero that moves too fast, does
+    not end automatically (`Freeze.lasting`).
+    """
+
+    def __init__(self, zero_rate_arcsec_per_hour: float, count_arcsec: float) -> None:
+        """Takes the fastest drift of a zero, and one count of the load encoder, a permitted scatter."""
+        self._zero_rate_arcsec_s = zero_rate_arcsec_per_hour / 3600.0
+        self._count_arcsec = count_arcsec
+        self._usual_arcsec: float | None = None
+        """Usual scatter of a standstill."""
+        self._zeros: deque[tuple[float, float]] = deque(maxlen=MAX_DRIFT_WINDOWS)
+
+    def restart(self) -> None:
+        """Forgets the zeros of earlier windows."""
+        self._zeros.clear()
+
+    def test(
+        self,
+        window: Sequence[Observation],
+        residual_arcsec: FloatArray,
+        sigma_arcsec: FloatArray,
+        others: FloatArray,
+    ) -> Freeze | None:
+        """Returns the reason for a freeze, or None for a plausible window.
+
+        ``residual_arcsec`` are the residuals by the present estimate, ``sigma_arcsec`` their permitted
+        standard deviations, both of shape (n,). ``others`` (n, m) are columns that may not be mistaken for a
+        drift: the zero, the loop, the load encoder's disc.
+        """
+        scatter, usual = _scatter_arcsec(window), self._usual_arcsec
+        allowed = math.inf if usual is None else SCATTER_RATIO * max(usual, self._count_arcsec)
+        if scatter is not None and scatter > allowed:
+            return Freeze(
+                f"at rest the load encoder scatters by {scatter:.1f} arcsec, usually by {usual:.1f}: noise"
+            )
+        shift = self._shift(residual_arcsec, GATE_SIGMAS * sigma_arcsec)
+        if shift is not None or len(window) < others.shape[1] + 1 + TREND_FREE:
+            return shift
+        time_s = np.array([each.time_s for each in window])
+        trend = partial_fit(time_s - np.mean(time_s), others, residual_arcsec)
+        return self._too_fast(trend, GATE_SIGMAS, lasting=False)
+
+    def follow(self, window: Sequence[Observation], zero_arcsec: float) -> Freeze | None:
+        """Takes the zero of a plausible window; tests if the last zeros together drift too fast."""
+        scatter = _scatter_arcsec(window)
+        if scatter is not None:
+            usual = self._usual_arcsec
+            self._usual_arcsec = scatter if usual is None else usual + SCATTER_WEIGHT * (scatter - usual)
+        now_s = window[-1].time_s
+        self._zeros.append((now_s, zero_arcsec))
+        while self._zeros[0][0] < now_s - DRIFT_S:
+            self._zeros.popleft()
+        if len(self._zeros) < DRIFT_WINDOWS:
+            return None
+        time_s, zero = np.array(self._zeros).T
+        drift = partial_fit(time_s - now_s, np.ones((len(zero), 1)), zero)
+        return self._too_fast(drift, DRIFT_SIGMAS, lasting=True)
+
+    @staticmethod
+    def _shift(residual_arcsec: FloatArray, gate_arcsec: FloatArray) -> Freeze | None:
+        if np.all(np.abs(residual_arcsec) <= gate_arcsec):
+            return None
+        shift = float(np.median(residual_arcsec))
+        common = np.all(np.abs(residual_arcsec - shift) <= gate_arcsec)
+        if common and abs(shift) > float(np.median(gate_arcsec)):
+            return Freeze(
+                f"the load encoder reads {shift:+.1f} arcsec off all at once, alike in both directions: "
+                "a scale or coupling that slipped, or a lost zero",
+                lasting=True,
+            )
+        worst = float(np.max(np.abs(residual_arcsec)))
+        return Freeze(
+            f"the load is read up to {worst:.1f} arcsec off what the model and its rates allow, not alike "
+            "at all places"
+        )
+
+    def _too_fast(self, slope: Partial, sigmas: float, *, lasting: bool) -> Freeze | None:
+        if abs(slope.value) - sigmas * slope.error <= self._zero_rate_arcsec_s:
+            return None
+        return Freeze(
+            f"the zero moves by {3600.0 * slope.value:+.0f} arcsec per hour, faster than wear and "
+            f"temperature may ({3600.0 * self._zero_rate_arcsec_s:.0f}): the load encoder slips or drifts",
+            lasting=lasting,
+        )
+
+
+def _scatter_arcsec(window: Sequence[Observation]) -> float | None:
+    """Returns the median scatter of a window's standstills; None without any."""
+    scatters = [each.scatter_arcsec for each in window if not math.isnan(each.scatter_arcsec)]
+    return float(np.median(scatters)) if scatters else None

@@ -1,0 +1,188 @@
+"""Following one axis: one pass over its samples, from the health of the load encoder to both verdicts.
+
+    samples -> encoder health -> measuring -> watch (is the model still valid?)
+                                           -> adaptation (what has drifted, and by how much?)
+
+Uses no thread and no clock: samples contain the time. Only the adaptation's files are written.
+"""
+
+from __future__ import annotations
+
+import math
+from datetime import datetime
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+
+from hdbridge.axis import AxisConfig
+from hdbridge.axis.channels import BY_KEY
+from hdbridge.client import messages
+from hdbridge.daemon.following.adaptation import Adaptation, Entry, Proposal
+from hdbridge.daemon.following.health import EncoderHealth, EncoderStatus, held_out_arcsec
+from hdbridge.daemon.following.judging import Raised, Watch, WatchLimits
+from hdbridge.daemon.following.measuring import DriftModel, Measuring
+from hdbridge.daemon.following.settings import AdaptationSettings, Mode
+from hdbridge.daemon.following.signs import DRIVEN, in_states
+from hdbridge.daemon.following.statefile import AdaptationFiles
+from hdbridge.daemon.loop.states import AxisState
+from hdbridge.daemon.memory import NO_FAULT, SampleArray, SampleFlag, joined_samples
+from hdbridge.model import TransmissionModel
+
+SAMPLES_TOGETHER: Final = 25
+"""Minimum number of samples evaluated together: ten evaluations per second at 250 Hz."""
+ZERO_LOST: Final = (AxisState.UNVERIFIED, AxisState.LENT, AxisState.LATCHED)
+"""States after which the drive's zero may have changed."""
+NEEDED: Final = SampleFlag.FRESH | SampleFlag.MEMORY_KNOWN
+SAVE_S: Final = 300.0
+"""Maximum interval in axis time between stores of a changing state."""
+UNIFORM: Final = 12.0**0.5
+"""Range of a uniform distribution, relative to its standard deviation."""
+
+
+class Outcome(NamedTuple):
+    """Results of some samples."""
+
+    raised: list[Raised]
+    proposal: Proposal | None = None
+
+
+class Follower:
+    """Follows one axis and one committed model. Call all methods from one thread."""
+
+    def __init__(
+        self,
+        axis: AxisConfig,
+        model: TransmissionModel,
+        index: int = 0,
+        settings: AdaptationSettings | None = None,
+        limits: WatchLimits | None = None,
+    ) -> None:
+        """``index`` is that of the axis in a sample; nothing is adapted before `adapt`."""
+        self.model = model
+        """Committed model."""
+        self.health = EncoderHealth(axis, model, index)
+        self.adaptation: Adaptation | None = None
+        self.updated: datetime | None = None
+        """Time at which the model in use was last changed."""
+        self._index = index
+        self._settings = settings or AdaptationSettings()
+        self._drift = DriftModel(model)
+        motor_count = axis.motor_encoder.resolution_arcsec / axis.gear.ratio
+        self._load_count = axis.load_encoder.resolution_arcsec
+        self._sigma_arcsec = observation_sigma_arcsec(axis)
+        noise = max(held_out_arcsec(model), motor_count / UNIFORM)
+        self.watch = Watch(axis.name, self._drift, noise, limits)
+        channels = tuple(BY_KEY[key] for key in axis.channels)
+        self._measuring = Measuring(self._drift, self._settings.slow_deg_s, channels)
+        self._waiting: list[SampleArray] = []
+        self._next_cycle: int | None = None
+        self._files: AdaptationFiles | None = None
+        self._entries: list[Entry] = []
+        """Lines of the history that are not written yet."""
+        self._saved_windows = 0
+        self._saved_s = -math.inf
+        self._now_s = 0.0
+
+    def adapt(self, mode: Mode, files: AdaptationFiles | None = None) -> None:
+        """Changes the mode of the adaptation, or starts it, from the state in ``files`` if there is one.
+
+        Raises InputError if the settings name a parameter that the model does not have, OutputError if the
+        files cannot be written.
+        """
+        if self.adaptation is None:
+            settings = self._settings.model_copy(update={"mode": mode})
+            learned = files.load() if files is not None else None
+            self.adaptation = Adaptation(
+                self._drift, settings, self._sigma_arcsec, self._load_count, self._entries.append, learned
+            )
+            self._files = files
+        else:
+            self.adaptation.set_mode(mode)
+            self.save()
+
+    def revert(self) -> Proposal | None:
+        """Restores the committed model and only observes; None without an adaptation."""
+        if self.adaptation is None:
+            return None
+        proposal = self.adaptation.revert()
+        self._applied(proposal)
+        return proposal
+
+    def take(self, samples: SampleArray) -> Outcome:
+        """Takes the next samples of the loop, oldest first; evaluates several batches together."""
+        if len(samples):
+            self._waiting.append(samples)
+        if sum(map(len, self._waiting)) < SAMPLES_TOGETHER:
+            return Outcome([])
+        together, self._waiting = joined_samples(self._waiting), []
+        return self.advance(together, self.health.take(together))
+
+    def advance(self, samples: SampleArray, status: EncoderStatus) -> Outcome:
+        """Measures, judges and adapts with consecutive samples; ``status`` is that of the load encoder."""
+        axis: Any = samples["axes"][:, self._index]
+        cycle, times_s = samples["cycle"], 1e-9 * samples["time_ns"].astype(np.float64)
+        self._now_s = float(times_s[-1])
+        first = self._begin_of_path(axis, cycle)
+        axis, times_s = axis[first:], times_s[first:]
+        stopped = axis["fault"] != NO_FAULT
+        usable = ((axis["flags"] & NEEDED) == NEEDED) & (axis["state"] == AxisState.ENABLED) & ~stopped
+        observations = self._measuring.take(times_s, axis, usable & (status.fault is None))
+        raised = self.watch.take(observations, status, self._now_s)
+        proposal = None
+        if self.adaptation is not None:
+            fault = "the supervision has stopped the axis" if np.any(stopped) else status.reason
+            proposal = self.adaptation.take(observations, self._now_s, fault)
+            if proposal is not None and proposal.apply:
+                self._applied(proposal)
+            elif self._entries or self._now_s - self._saved_s >= SAVE_S:
+                self.save()
+        return Outcome(raised, proposal)
+
+    def state(self) -> messages.AdaptationState:
+        """Returns the state of the adaptation for clients."""
+        adaptation = self.adaptation
+        if adaptation is None:
+            return messages.AdaptationState(mode=messages.AdaptationMode(self._settings.mode))
+        return messages.AdaptationState(
+            mode=messages.AdaptationMode(adaptation.mode),
+            frozen=adaptation.waiting_reason(path_known=self._measuring.known),
+            updated=self.updated,
+            parameters=adaptation.estimated_changes(),
+        )
+
+    def save(self) -> None:
+        """Writes the history, and the state if it has changed."""
+        adaptation, entries = self.adaptation, tuple(self._entries)
+        self._entries.clear()
+        if adaptation is None or not (entries or adaptation.windows != self._saved_windows):
+            return
+        self._saved_s, self._saved_windows = self._now_s, adaptation.windows
+        if self._files is not None:
+            self._files.write(entries, adaptation.learned())
+
+    def _begin_of_path(self, axis: Any, cycle: Any) -> int:
+        """Returns the first row of the path that is not interrupted by lost cycles or lost power."""
+        driven = in_states(axis, DRIVEN)
+        next_cycle = self._next_cycle if self._next_cycle is not None else int(cycle[0])
+        gaps = np.diff(cycle, prepend=next_cycle - 1) != 1
+        self._next_cycle = int(cycle[-1]) + 1
+        interrupted = np.flatnonzero(gaps | ~driven)
+        if self.adaptation is not None and in_states(axis, ZERO_LOST).any():
+            self.adaptation.invalidate_zero()
+        if not len(interrupted):
+            return 0
+        self._measuring.restart()
+        if self.adaptation is not None:
+            self.adaptation.forget_window()
+        last = int(interrupted[-1])
+        return last if driven[last] else last + 1
+
+    def _applied(self, proposal: Proposal) -> None:
+        self.updated = self._files.now() if self._files is not None else None
+        self.save()
+
+
+def observation_sigma_arcsec(axis: AxisConfig) -> float:
+    """Returns the standard deviation of an observation due to quantisation by the encoders' counts."""
+    motor_count = axis.motor_encoder.resolution_arcsec / axis.gear.ratio
+    return math.hypot(motor_count, axis.load_encoder.resolution_arcsec) / UNIFORM

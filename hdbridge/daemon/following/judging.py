@@ -1,0 +1,376 @@
+"""Judging: tests recent observations against the model's confidence intervals, and raises verdicts.
+
+If the model is valid, the observed error minus the predicted one is noise plus the errors of its parameters:
+
+    observed - predicted = columns @ change + zero + trend of the zero + load encoder disc + noise
+
+``change`` has the covariance of the model file's intervals, or of a typical calibration if the file has none
+(as in `analysis.calibrated`). The noise is the model's residual on held-out data, or the motor encoder's
+resolution if that is larger. Three tests use generalised least squares:
+
+* Has a part of the model changed by more than its interval and the errors of this fit allow (chi square)?
+* Has the zero moved since it was learned?
+* Is the residual, with every part free to change, larger than the noise allows (chi square)?
+
+The significance level follows from `WatchLimits.false_alarms_per_day`, divided by the number of tests per
+day. Observations at one place in one direction count as one: averaging more of them does not reduce the part
+of the error that repeats there.
+
+A verdict is raised when its evidence has persisted, and withdrawn when the evidence has been absent for
+longer, so one bad second or move raises nothing. There are no verdicts about the gear during a fault of the
+load encoder.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import Enum
+from typing import Final, NamedTuple
+
+import numpy as np
+from scipy.special import chdtri, ndtri
+
+from hdbridge.analysis.linear import Linearised
+from hdbridge.analysis.scales import Scales
+from hdbridge.daemon.following.estimator import bounds_arcsec, calibrated_estimator, changes_between
+from hdbridge.daemon.following.health import EncoderStatus
+from hdbridge.daemon.following.measuring import DriftModel, Observation, Term
+from hdbridge.daemon.following.settings import AdaptationSettings
+from hdbridge.effects import FloatArray, IntArray
+from hdbridge.model import TransmissionModel
+
+DAY_S: Final = 86_400.0
+MAX_OBSERVATIONS: Final = 600
+"""Maximum number of observations evaluated together."""
+SPARE: Final = 20
+"""Places required in addition to one per column."""
+CLEARLY: Final = 0.8
+"""Share of a limit below which a value is not near it."""
+TREND_ARCSEC: Final = 60.0
+"""Scale of the zero's trend, from the middle of the observations to one end."""
+REPORTED_SHARE: Final = 0.02
+"""Relative change of a parameter above which it is reported."""
+CELL: Final = 0.1
+"""Rounding of the columns; rows that agree after it are one place."""
+
+
+class Verdict(Enum):
+    """Verdict of the watch on an axis."""
+
+    HOLDS = "the model holds"
+    RECALIBRATE = "recalibrate"
+    """Parts of the model have changed as by wear, temperature or ageing; a calibration corrects this."""
+    SOMETHING_CHANGED = "something changed"
+    """No such change explains the measurements; a diagnosis is needed."""
+    ENCODER = "the load encoder is not believed"
+
+
+class Raised(NamedTuple):
+    """A new verdict."""
+
+    time_s: float
+    axis: str
+    verdict: Verdict
+    evidence: str
+    """Evidence in words with figures."""
+
+    @property
+    def text(self) -> str:
+        """Verdict and evidence in words."""
+        return f"{self.verdict.value}: {self.evidence}" if self.evidence else self.verdict.value
+
+
+@dataclass(frozen=True, slots=True)
+class WatchLimits:
+    """Thresholds of the tests, and durations for which evidence is gathered and must persist."""
+
+    false_alarms_per_day: float = 1.0 / 365.0
+    """False alarms per axis with a valid model: one per year."""
+    every_s: float = 10.0
+    """Interval between tests."""
+    window_s: float = 900.0
+    """Maximum age of an observation."""
+    raise_s: float = 60.0
+    """Time for which evidence must persist before a verdict is raised."""
+    withdraw_s: float = 300.0
+    """Time without evidence after which a verdict is withdrawn."""
+    noise: float = 1.5
+    """Noise in operation relative to that of a calibration."""
+    order_arcsec: float = 0.8
+    """Smallest change of the orders that counts, at the load."""
+    loop_arcsec: float = 1.5
+    loop_share: float = 3.0 * Scales().calibrated
+    """Smallest change of a hysteresis loop: the larger of ``loop_arcsec`` and this share of the loop."""
+    zero_arcsec: float = 5.0
+    """Smallest change of the zero that counts: the smallest effect of warming up (`effects.zero_drift`)."""
+    left_arcsec: float = 0.5
+    """Smallest unexplained residual that counts, rms, in addition to the noise."""
+
+
+class Moved(NamedTuple):
+    """A part of the model that has changed."""
+
+    text: str
+    """Description of the change."""
+    wear: bool
+    """True if wear, temperature or ageing can cause such a change; else it has another cause."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Evidence:
+    """Result of the tests over the recent operation of an axis."""
+
+    places: int
+    """Number of distinct places observed."""
+    rms_arcsec: float
+    """Rms difference of measured and predicted error about its zero."""
+    allowed_arcsec: float
+    """Upper limit of that by noise and the model's intervals."""
+    left_arcsec: float
+    """Rms residual with every part of the model free to change."""
+    left_allowed_arcsec: float
+    zero: FloatArray
+    """Zero in arcsec, and the coefficients of the load encoder's disc."""
+    moved: tuple[Moved, ...]
+
+    @property
+    def unexplained(self) -> bool:
+        """True if the residual exceeds what changes of the model's parts explain."""
+        return self.left_arcsec > self.left_allowed_arcsec
+
+    def verdict(self, before: Verdict) -> Verdict:
+        """Returns the verdict; near a limit the one before."""
+        if not self.moved and not self.unexplained:
+            clear = self.left_arcsec < CLEARLY * self.left_allowed_arcsec
+            return Verdict.HOLDS if clear else before
+        wear = not self.unexplained and all(each.wear for each in self.moved)
+        return Verdict.RECALIBRATE if wear else Verdict.SOMETHING_CHANGED
+
+    @property
+    def text(self) -> str:
+        """The result in words with figures."""
+        moved = "; ".join(each.text for each in self.moved) or "no part of the model moved"
+        return (
+            f"{moved}. Over {self.places} places the load is {self.rms_arcsec:.2f} arcsec rms off the model "
+            f"(its intervals and the noise allow {self.allowed_arcsec:.2f}), "
+            f"{self.left_arcsec:.2f} with the model's parts free to move (the noise allows "
+            f"{self.left_allowed_arcsec:.2f})"
+        )
+
+
+class Judge:
+    """Tests one model; ``noise_arcsec`` is the standard deviation of an observation."""
+
+    def __init__(self, drift: DriftModel, noise_arcsec: float, limits: WatchLimits) -> None:
+        self._drift = drift
+        self._limits = limits
+        self._noise = limits.noise * noise_arcsec
+        settings = AdaptationSettings()
+        prior = calibrated_estimator(drift, settings)
+        self._calibrated = prior.covariance
+        for each in drift.terms:
+            if each.effect.name not in drift.model.uncertainty:
+                coefficients = each.effect.coefficients()
+                share = Scales().calibrated * float(np.linalg.norm(coefficients, np.inf))
+                self._calibrated[each.columns, each.columns] = share**2 * np.eye(len(coefficients))
+        self._information = np.append(prior.scale, TREND_ARCSEC) ** -2
+        self._bounds, self._zero_bound = bounds_arcsec(drift, settings), settings.zero_bound_arcsec
+        tests = (len(drift.terms) + 2) * DAY_S / limits.every_s
+        self._alpha = limits.false_alarms_per_day / tests
+        """Probability of a false positive in one test."""
+
+    def judge(self, observations: Sequence[Observation], zero: FloatArray | None) -> Evidence | None:
+        """Tests the observations; returns None if they are too few.
+
+        ``zero`` is `Evidence.zero` from when it was learned; None if it is not known yet.
+        """
+        least = self._drift.count + 1 + SPARE
+        if len(observations) < least:
+            return None
+        rows, observed = _places(observations)
+        count, columns = rows.shape
+        if count < least:
+            return None
+        change, spread = self._fit(rows, observed)
+        free = max(count - columns, 1)
+        left = observed - rows @ change
+        rms, allowed = self._as_calibrated(rows, observed)
+        moved = [self._moved(each, rows, change, spread) for each in self._drift.terms]
+        if zero is not None:
+            moved.append(self._zero_moved(rows, observed, zero))
+        left_allowed = self._noise * float(np.sqrt(chdtri(free, self._alpha) / free))
+        return Evidence(
+            places=count,
+            rms_arcsec=rms,
+            allowed_arcsec=allowed,
+            left_arcsec=float(np.sqrt(left @ left / free)),
+            left_allowed_arcsec=float(np.hypot(left_allowed, self._limits.left_arcsec)),
+            zero=change[self._drift.zero : self._drift.count],
+            moved=tuple(each for each in moved if each is not None),
+        )
+
+    def _fit(
+        self, rows: FloatArray, observed: FloatArray, columns: IntArray | slice = slice(None)
+    ) -> tuple[FloatArray, FloatArray]:
+        """Fits all parts within their possible range; returns the change and its covariance.
+
+        ``columns`` selects the columns that the rows contain.
+        """
+        information = self._information[columns]
+        known = np.column_stack([information, np.zeros(len(information))])
+        fit = Linearised(rows / self._noise, observed / self._noise, known)
+        return fit.directions @ fit.slack, fit.directions @ fit.directions.T
+
+    def _as_calibrated(self, rows: FloatArray, observed: FloatArray) -> tuple[float, float]:
+        """Returns the rms about zero and disc, and its upper limit by the model's intervals."""
+        zero = self._drift.zero
+        nuisance, followed = rows[:, zero:], rows[:, :zero]
+        basis, _ = np.linalg.qr(nuisance)
+        about = observed - basis @ (basis.T @ observed)
+        free = max(len(observed) - nuisance.shape[1], 1)
+        calibrated = self._calibrated[:zero, :zero]
+        allowed = float(np.mean(np.einsum("ij,jk,ik->i", followed, calibrated, followed))) if zero else 0.0
+        share = chdtri(free, self._alpha) / free
+        return float(np.sqrt(about @ about / free)), float(np.sqrt(share * (self._noise**2 + allowed)))
+
+    def _moved(self, term: Term, rows: FloatArray, change: FloatArray, spread: FloatArray) -> Moved | None:
+        """Returns the change of an effect, if it exceeds the effect's interval and this fit's errors."""
+        at, limits = term.columns, self._limits
+        own = change[at]
+        variance = self._calibrated[at, at] + spread[at, at]
+        if float(own @ np.linalg.solve(variance, own)) < chdtri(len(own), self._alpha):
+            return None
+        least = limits.order_arcsec
+        if term.memory:
+            loop = float(np.std(rows[:, at] @ term.effect.coefficients()))
+            least = max(limits.loop_arcsec, limits.loop_share * loop)
+        if float(np.std(rows[:, at] @ own)) < least:
+            return None
+        only = np.zeros(self._drift.zero)
+        only[at] = own
+        changed = self._drift.changed(only)
+        wear = bool(np.all(np.abs(own) <= self._bounds[at]))
+        wear &= not changed.effects[term.number].violations()
+        return Moved(_largest_changes(self._drift.model, changed), wear)
+
+    def _zero_moved(self, rows: FloatArray, observed: FloatArray, before: FloatArray) -> Moved | None:
+        """Returns the change of the zero against the learned one, if significant.
+
+        The disc is fixed as learned, because over part of a turn it is hardly separable from the zero.
+        """
+        zero, disc = self._drift.zero, slice(self._drift.zero + 1, self._drift.count)
+        others = np.delete(np.arange(rows.shape[1]), np.arange(disc.start, disc.stop))
+        change, spread = self._fit(rows[:, others], observed - rows[:, disc] @ before[1:], others)
+        by = float(change[zero] - before[0])
+        error = float(np.sqrt(2.0 * spread[zero, zero]))
+        if abs(by) < max(self._limits.zero_arcsec, -ndtri(0.5 * self._alpha) * error):
+            return None
+        return Moved(f"zero: by {by:+.1f} arcsec", abs(by) <= self._zero_bound)
+
+
+def _largest_changes(before: TransmissionModel, after: TransmissionModel) -> str:
+    """Describes the four largest relative changes of parameters."""
+    changes = changes_between(before, before, after)
+    by = {each: abs(each.after - each.before) / max(abs(each.before), 1e-9) for each in changes}
+    most = [each for each in sorted(changes, key=lambda each: -by[each]) if by[each] > REPORTED_SHARE]
+    return ", ".join(f"{each.parameter} {each.before:.4g} to {each.after:.4g}" for each in most[:4])
+
+
+def _places(observations: Sequence[Observation]) -> tuple[FloatArray, FloatArray]:
+    """Returns columns and mean error of each place; the last column is time from -1 to 1."""
+    rows = np.array([each.row for each in observations])
+    time_s = np.array([each.time_s for each in observations])
+    error = np.array([each.error_arcsec for each in observations])
+    _, place, count = np.unique(np.round(rows / CELL), axis=0, return_inverse=True, return_counts=True)
+    place = place.reshape(-1)
+    middle, half = 0.5 * (time_s[0] + time_s[-1]), 0.5 * float(np.ptp(time_s)) or 1.0
+    rows = np.column_stack([rows, (time_s - middle) / half])
+    means = np.zeros((len(count), rows.shape[1]))
+    np.add.at(means, place, rows)
+    return means / count[:, np.newaxis], np.bincount(place, error) / count
+
+
+class Debounced:
+    """Verdict that changes only when another one has persisted."""
+
+    def __init__(self, limits: WatchLimits) -> None:
+        self._limits = limits
+        self.verdict = Verdict.HOLDS
+        self._other = Verdict.HOLDS
+        self._lasted_s = 0.0
+
+    def take(self, verdict: Verdict, passed_s: float) -> bool:
+        """Takes the present verdict and the time since the last; returns True when it is adopted."""
+        if verdict is self.verdict or verdict is not self._other:
+            self._other, self._lasted_s = verdict, 0.0
+        if verdict is self.verdict:
+            return False
+        self._lasted_s += passed_s
+        needed = self._limits.withdraw_s if verdict is Verdict.HOLDS else self._limits.raise_s
+        if self._lasted_s < needed:
+            return False
+        self.verdict, self._lasted_s = verdict, 0.0
+        return True
+
+
+class Watch:
+    """Verdicts on one axis and its model."""
+
+    def __init__(
+        self, axis: str, drift: DriftModel, noise_arcsec: float, limits: WatchLimits | None = None
+    ) -> None:
+        """``noise_arcsec`` is the standard deviation of an observation."""
+        self.limits = limits or WatchLimits()
+        self.evidence: Evidence | None = None
+        """Last evidence; None until enough observations exist."""
+        self._axis = axis
+        self._calibrated = bool(drift.model.effects)
+        self._judge = Judge(drift, noise_arcsec, self.limits)
+        self._debounced = Debounced(self.limits)
+        self._faulty = False
+        self._observations: deque[Observation] = deque(maxlen=MAX_OBSERVATIONS)
+        self._new = False
+        self._zero: FloatArray | None = None
+        self._judged_s = -self.limits.every_s
+
+    @property
+    def verdict(self) -> Verdict:
+        """Present verdict."""
+        return Verdict.ENCODER if self._faulty else self._debounced.verdict
+
+    def take(self, observations: Sequence[Observation], status: EncoderStatus, now_s: float) -> list[Raised]:
+        """Takes observations and the state of the load encoder; returns new verdicts."""
+        raised: list[Raised] = []
+        if (status.fault is not None) != self._faulty:
+            self._faulty = status.fault is not None
+            self._observations.clear()
+            self._zero = None
+            reason = status.reason or "nothing speaks against the load encoder"
+            raised.append(Raised(now_s, self._axis, self.verdict, reason))
+        self._observations.extend(observations)
+        self._new |= bool(observations)
+        passed_s = now_s - self._judged_s
+        if not 0.0 <= passed_s < self.limits.every_s:
+            self._judged_s = now_s
+            if self._test(now_s, min(passed_s, 2.0 * self.limits.every_s)) and self.evidence is not None:
+                raised.append(Raised(now_s, self._axis, self.verdict, self.evidence.text))
+        return raised
+
+    def _test(self, now_s: float, passed_s: float) -> bool:
+        """Tests the recent observations; returns True if the verdict changes."""
+        recent = self._observations
+        while recent and not 0.0 <= now_s - recent[0].time_s <= self.limits.window_s:
+            recent.popleft()
+        # An axis at rest gives no new evidence, and an uncalibrated one has no model to test.
+        if not self._new or self._faulty or not self._calibrated:
+            return False
+        self._new = False
+        evidence = self._judge.judge(recent, self._zero)
+        if evidence is None:
+            return False
+        self.evidence = evidence
+        if self._zero is None and not evidence.unexplained:
+            self._zero = evidence.zero
+        return self._debounced.take(evidence.verdict(self._debounced.verdict), passed_s)

@@ -1,0 +1,183 @@
+"""The service process: ``python -m hdbridge.daemon.serve FD``, started by the keeper.
+
+It assembles bridge, API, recorder, watch, adaptation and log, and ends them in order. It has one event loop;
+blocking work runs in threads. If it dies, the axes complete the commands they have.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import signal
+import socket
+import sys
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import AsyncExitStack, suppress
+from typing import Final
+
+from hdbridge.daemon.api.metrics import Metrics
+from hdbridge.daemon.api.policy import Policy
+from hdbridge.daemon.api.server import ApiServer, Listener
+from hdbridge.daemon.api.sockets import file_of, unix_socket
+from hdbridge.daemon.following.autodiagnosis import AutoDiagnosis
+from hdbridge.daemon.logs import begin_log
+from hdbridge.daemon.machine import Machine
+from hdbridge.daemon.memory import Cell, Memory
+from hdbridge.daemon.recorder.recorder import FlightRecorder
+from hdbridge.daemon.runtime import runtime_folder
+from hdbridge.daemon.service.bridge import ServiceBridge
+from hdbridge.daemon.service.following import Following
+from hdbridge.daemon.service.journal import Journal
+from hdbridge.daemon.service.observer import Sink
+from hdbridge.daemon.service.recording import Recording
+from hdbridge.daemon.service.timing import RealTiming, SimulatedClock
+from hdbridge.daemon.start import Start, begin_child
+from hdbridge.errors import HdbridgeError
+
+THREADS_PER_AXIS: Final = 2
+"""Threads per axis; its drive may be verified while another of its requests blocks."""
+SPARE_THREADS: Final = 4
+LOOK_S: Final = 1.0
+"""Interval between checks for the socket file."""
+FOLLOW_S: Final = 1.0
+"""Interval between checks for adapted models."""
+LAST_WORDS_S: Final = 35.0
+"""Maximum wait for the control process to bring its axes to rest, so that this is recorded."""
+
+
+def main(arguments: list[str]) -> int:
+    """Serves until SIGTERM; returns the exit status."""
+    try:
+        start = Start.inherited(arguments)
+        begin_child(start, "hdbridge-serve")
+        begin_log(start.log)
+        with Memory.attach(start.memory_fd) as memory:
+            asyncio.run(serve(start, memory))
+    except HdbridgeError as error:
+        print(f"hdbridge: {error}", file=sys.stderr)
+        return error.exit_status
+    return 0
+
+
+async def serve(start: Start, memory: Memory) -> None:
+    """Runs the service until SIGTERM and the end of the control process."""
+    machine = start.machine
+    told = asyncio.Event()
+    asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, told.set)
+    async with AsyncExitStack() as stack:
+        simulated = start.simulation is not None
+        clock = SimulatedClock(lambda: memory.status.loop_count, machine.cycle_s) if simulated else None
+        timing = RealTiming(THREADS_PER_AXIS * len(machine.axes) + SPARE_THREADS, clock)
+        stack.callback(timing.close)
+        bridge = ServiceBridge(
+            machine, memory, timing, simulated=simulated,
+            recordings=lambda port: machine.axis_folder(port.axis, "recordings"),
+        )  # fmt: skip
+        metrics = Metrics()
+        recording = Recording(machine, bridge)
+        stack.callback(recording.close)
+        following = follow(machine, bridge, recording.recorder, stack)
+        sinks: list[Sink] = [Journal([*bridge.axes]), metrics, recording, *following]
+        for sink in sinks:
+            bridge.core.observer.add(sink)
+        await stack.enter_async_context(bridge)
+        server = ApiServer(bridge, listeners(machine, start.api_fds, start.page_token), metrics)
+        async with asyncio.TaskGroup() as group:
+            group.create_task(server.run())
+            group.create_task(_say_when_served(server, memory))
+            beside = [
+                group.create_task(_apply(following)),
+                group.create_task(_keep_socket(start, server, bridge.core.log.note)),
+            ]
+            await told.wait()
+            await _last_words(bridge, memory)
+            for task in beside:
+                task.cancel()
+            server.stop()
+
+
+def follow(
+    machine: Machine, bridge: ServiceBridge, recorder: FlightRecorder | None, stack: AsyncExitStack
+) -> list[Following]:
+    """Follows all axes, each in a thread of its own; with a recorder, bad verdicts are diagnosed."""
+    diagnosis = AutoDiagnosis(recorder.folder) if recorder is not None else None
+    if diagnosis is not None:
+        stack.callback(diagnosis.close)
+    for index, (axis, port) in enumerate(zip(machine.axes, bridge.axes.values(), strict=True)):
+        given = axis.adaptation.folder
+        folder = machine.beside(given) if given is not None else machine.axis_folder(axis, "adaptation")
+        worker = stack.enter_context(ThreadPoolExecutor(1, thread_name_prefix=f"following-{axis.name}"))
+        made = Following(index, port, axis.adaptation, folder, worker, recorder, diagnosis)
+        bridge.following[axis.name] = made
+        stack.callback(made.close)
+    return list(bridge.following.values())
+
+
+async def _apply(following: Sequence[Following]) -> None:
+    """Applies adapted models to the control process."""
+    while True:
+        for each in following:
+            await each.apply()
+        await asyncio.sleep(FOLLOW_S)
+
+
+def listeners(machine: Machine, descriptors: Sequence[int], page_token: str | None = None) -> list[Listener]:
+    """Returns listeners for the keeper's sockets: the Unix socket, and a TCP port for clients or the page."""
+    unix, *others = [socket.socket(fileno=each) for each in descriptors]
+    made = [Listener(unix, Policy())]
+    tcp = machine.api.tcp
+    if page_token is not None:
+        made.append(Listener(others[0], Policy(page_token)))
+    elif tcp is not None:
+        token = machine.beside(tcp.token_file).read_text(encoding="ascii").strip()
+        made.append(Listener(others[0], Policy(token, frozenset(each.lower() for each in tcp.names))))
+    return made
+
+
+async def _keep_socket(start: Start, server: ApiServer, note: Callable[[str], None]) -> None:
+    """Binds the Unix socket again whenever its file is gone; open connections stay."""
+    path, bound, noted = start.socket, start.socket_file, ""
+    while True:
+        found = (0, 0)
+        with suppress(OSError):
+            found = file_of(path)
+        if found == bound:
+            await asyncio.sleep(LOOK_S)
+            continue
+        try:
+            if start.machine.api.socket is None:
+                runtime_folder()
+            listener = unix_socket(path, start.machine.api.group)
+            bound, noted = file_of(path), ""
+        except (HdbridgeError, OSError) as problem:
+            if str(problem) != noted:
+                noted = str(problem)
+                note(f"clients cannot connect: the socket file is gone and cannot be bound again: {problem}")
+            await asyncio.sleep(LOOK_S)
+            continue
+        server.add(Listener(listener, Policy()))
+        note(f"{path}: the socket file was gone; it is bound again")
+
+
+async def _say_when_served(server: ApiServer, memory: Memory) -> None:
+    """Writes this process's id to the shared memory once the server has started; the keeper waits for it."""
+    while not server.started:
+        await asyncio.sleep(0.01)
+    memory.status.set(Cell.SERVICE_PID, os.getpid())
+
+
+async def _last_words(bridge: ServiceBridge, memory: Memory) -> None:
+    """Continues while the axes are brought to rest, so that clients see it and it is recorded."""
+    end_s = asyncio.get_running_loop().time() + LAST_WORDS_S
+    while bridge.core.observer.alive and asyncio.get_running_loop().time() < end_s:
+        try:
+            os.kill(memory.status.loop_pid, 0)
+        except OSError:
+            break
+        await asyncio.sleep(0.05)
+    bridge.core.observer.poll()
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,207 @@
+"""Following in the service: each axis's samples go to a thread of its own; its verdicts and models come back.
+
+The committed model and its version stay in use. The control process compensates with the adapted parameters,
+whatever the scheme. Watch and adaptation restart when another model is committed.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import Callable, Sequence
+from concurrent.futures import Executor, Future
+from pathlib import Path
+from typing import Any, Final, ParamSpec, TypeVar
+
+from hdbridge.client import messages
+from hdbridge.daemon.following.autodiagnosis import AutoDiagnosis
+from hdbridge.daemon.following.follower import Follower, Outcome
+from hdbridge.daemon.following.judging import Raised, Verdict, WatchLimits
+from hdbridge.daemon.following.settings import AdaptationSettings
+from hdbridge.daemon.following.statefile import AdaptationFiles
+from hdbridge.daemon.memory import Event, SampleArray
+from hdbridge.daemon.recorder.recorder import FlightRecorder
+from hdbridge.daemon.service.activity import Kind
+from hdbridge.daemon.service.ports import ServiceAxis
+from hdbridge.errors import HdbridgeError
+from hdbridge.model import TransmissionModel
+
+MAX_BATCHES: Final = 500
+"""Maximum number of batches that wait for the thread: ten seconds. Later ones are dropped."""
+DIAGNOSED: Final = frozenset({Verdict.RECALIBRATE, Verdict.SOMETHING_CHANGED})
+"""Verdicts that start a diagnosis."""
+_log = logging.getLogger(__name__)
+_Params = ParamSpec("_Params")
+_Result = TypeVar("_Result")
+
+
+class Following:
+    """Follows one axis: a sink of the observer that never blocks."""
+
+    def __init__(
+        self,
+        index: int,
+        axis: ServiceAxis,
+        settings: AdaptationSettings,
+        folder: Path,
+        worker: Executor,
+        recorder: FlightRecorder | None = None,
+        diagnosis: AutoDiagnosis | None = None,
+    ) -> None:
+        """``index`` is that of the axis in a sample, ``folder`` contains state and history of its adaptation.
+
+        ``worker`` has one thread. Verdicts are noted in ``recorder``, bad ones start ``diagnosis``.
+        """
+        self.state = messages.AdaptationState(mode=messages.AdaptationMode(settings.mode))
+        """State of the adaptation."""
+        self.advice: list[str] = []
+        """Present verdict of the watch; empty while the model holds."""
+        self._index, self._axis = index, axis
+        self._settings, self._folder = settings, folder
+        self._worker, self._recorder, self._diagnosis = worker, recorder, diagnosis
+        self._model: TransmissionModel | None = None
+        """Committed model that is followed."""
+        self._sent = self._taken = 0
+        self._not_applied = ""
+        # These belong to the worker's thread.
+        self._follower: Follower | None = None
+        self._problem = ""
+
+    def take(self, samples: SampleArray, events: Sequence[Event], lost: int) -> None:
+        """Takes samples from the observer. Lost ones show as a gap in the cycle numbers."""
+        model = self._axis.models.chosen.model
+        if model is not self._model:
+            self._model = model
+            self._do(self._begin, model)
+        if len(samples) and self._sent - self._taken < MAX_BATCHES:
+            self._sent += 1
+            self._do(self._process, samples)
+
+    async def set_mode(self, mode: messages.AdaptationMode) -> None:
+        """Changes the mode of the adaptation."""
+        self._settings = self._settings.model_copy(update={"mode": mode.value})
+        await asyncio.wrap_future(self._do(self._adapt))
+
+    async def revert(self) -> None:
+        """Restores the committed model and switches the adaptation to observation only."""
+        await asyncio.wrap_future(self._do(self._revert))
+        await self.apply()
+
+    async def apply(self) -> None:
+        """Has the control process compensate with the adapted model, if it does not yet.
+
+        Waits for the end of a job, because a job measures with one model.
+        """
+        chosen, follower = self._axis.models.chosen, self._follower
+        if follower is None or follower.adaptation is None or chosen.model is not follower.model:
+            return
+        model = follower.adaptation.model
+        if model.effects == (chosen.adapted or chosen.model).effects or self._axis.motion.busy(Kind.JOB):
+            return
+        try:
+            await self._axis.follow(model)
+        except HdbridgeError as problem:  # not in this state; it is tried again
+            if str(problem) != self._not_applied:
+                _log.warning("adaptation not applied", {"axis": self._axis.name, "why": str(problem)})
+            self._not_applied = str(problem)
+        else:
+            self._not_applied = ""
+            self._do(follower.health.restart)
+            _log.info("adaptation applied", {"axis": self._axis.name})
+
+    def close(self) -> None:
+        """Stores the adaptation's state, after the waiting samples."""
+        self._do(self._save).result()
+
+    def _do(
+        self, function: Callable[_Params, _Result], *args: _Params.args, **kwargs: _Params.kwargs
+    ) -> Future[_Result]:
+        done = self._worker.submit(function, *args, **kwargs)
+        done.add_done_callback(_log_failure)
+        return done
+
+    # ------------------------------------------------------------------ in the worker's thread
+
+    def _begin(self, model: TransmissionModel) -> None:
+        """Follows another committed model."""
+        self._save()
+        self._follower = Follower(self._axis.axis.config, model, self._index, self._settings)
+        self.advice = []
+        self._adapt()
+
+    def _adapt(self) -> None:
+        """Adapts in the mode of the settings."""
+        follower, settings = self._follower, self._settings
+        self._problem = ""
+        if follower is None or (follower.adaptation is None and settings.mode == "off"):
+            pass
+        elif not follower.model.effects:
+            self._problem = "there is no model to follow: calibrate first"
+        else:
+            try:
+                follower.adapt(settings.mode, self._files(follower))
+            except HdbridgeError as problem:
+                self._problem = str(problem)
+                _log.warning("no adaptation", {"axis": self._axis.name, "why": str(problem)})
+        self._publish()
+
+    def _files(self, follower: Follower) -> AdaptationFiles | None:
+        if follower.adaptation is not None:
+            return None
+        return AdaptationFiles(self._folder, self._axis.name, follower.model, self._settings.parameters)
+
+    def _process(self, samples: SampleArray) -> None:
+        try:
+            if self._follower is not None:
+                self._report(self._follower.take(samples), self._follower.model)
+                self._publish()
+        finally:
+            self._taken += 1
+
+    def _revert(self) -> None:
+        proposal = self._follower.revert() if self._follower is not None else None
+        if proposal is not None and self._follower is not None:
+            self._report(Outcome([], proposal), self._follower.model)
+            self._publish()
+
+    def _save(self) -> None:
+        if self._follower is not None:
+            self._follower.save()
+
+    def _publish(self) -> None:
+        follower = self._follower
+        if follower is not None and follower.adaptation is not None:
+            self.state = follower.state()
+        else:
+            mode = messages.AdaptationMode(self._settings.mode)
+            self.state = messages.AdaptationState(mode=mode, frozen=self._problem or None)
+
+    def _report(self, outcome: Outcome, model: TransmissionModel) -> None:
+        """Logs a proposal; notes, logs and diagnoses verdicts."""
+        name, proposal = self._axis.name, outcome.proposal
+        if proposal is not None:
+            changes = {each.parameter: round(each.after, 4) for each in proposal.changes}
+            event = "adaptation" if proposal.apply else "adaptation would change"
+            _log.info(event, {"axis": name, **changes})
+        for raised in outcome.raised:
+            self.advice = [] if raised.verdict is Verdict.HOLDS else [raised.text]
+            self._note("WATCH", raised.text)
+            if self._diagnosis is not None and raised.verdict in DIAGNOSED:
+                self._diagnose(self._diagnosis, raised, model)
+
+    def _diagnose(self, diagnosis: AutoDiagnosis, raised: Raised, model: TransmissionModel) -> None:
+        minutes = WatchLimits().window_s / 60.0
+        diagnosis.start(
+            self._axis.name, model.dump(), minutes, raised.text, lambda text: self._note("DIAGNOSIS", text)
+        )
+
+    def _note(self, kind: str, text: str) -> None:
+        if self._recorder is not None:
+            self._recorder.note(kind, f"{self._axis.name}: {text}")
+        self._axis.core.log.note(text, self._index)
+        _log.warning("watch", {"axis": self._axis.name, "text": text})
+
+
+def _log_failure(done: Future[Any]) -> None:
+    if not done.cancelled() and (problem := done.exception()) is not None:
+        _log.error("following failed; it continues", exc_info=problem)

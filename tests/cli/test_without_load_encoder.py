@@ -1,0 +1,58 @@
+"""An axis whose load encoder was removed after calibration: the motor encoder measures the response."""
+
+import json
+from pathlib import Path
+
+import pytest
+from support.raised import raised_profile
+
+from hdbridge import AxisConfig, Bench, TransmissionModel
+from hdbridge.analysis.response import harmonics
+from hdbridge.procedures.even_speed import EvenSpeed
+from hdbridge.simulated import simulated
+
+REMOVED = {
+    "counts_per_turn: 2880000": "counts_per_turn: 400000",
+    "{index: 0x60E4, subindex: 1": "{index: 0x6064, subindex: 0",
+}
+"""The load encoder's reading is that of the motor, 50 turns to one."""
+
+
+@pytest.fixture
+def blind(tmp_path: Path) -> Path:
+    folder = raised_profile(tmp_path / "blind")
+    text = (folder / "axis.yaml").read_text()
+    for old, new in REMOVED.items():
+        assert old in text
+        text = text.replace(old, new)
+    (folder / "axis.yaml").write_text(text)
+    return folder
+
+
+def ripples(profile: Path, *models: TransmissionModel) -> list[float]:
+    """Ripple of the load at 76 deg/s, arcsec rms; the encoder at the load sees it."""
+    with simulated(AxisConfig.load(profile)) as drive:
+        drive.boot()
+        runs = [Bench(drive, each).run(EvenSpeed((76.0,))).outcome for each in models]
+    return [max(harmonics(each, (1, 2, 4), 50.0).ripple_arcsec for each in both) for both in runs]
+
+
+def test_the_motor_encoder_measures_the_response(hdbridge, blind: Path, tmp_path: Path) -> None:
+    static = TransmissionModel.load(blind / "model.yaml")
+    done = hdbridge("motion", blind, "--simulate", "--propose", "--json", "out.json")
+    assert done.returncode == 0, done.stderr
+    assert "path errors are not measured" in " ".join(done.stdout.split())
+    assert json.loads((tmp_path / "out.json").read_text())["paths"] == []
+    hdbridge("model", "commit", blind)
+    model = TransmissionModel.load(blind / "model.yaml")
+    none, at_rest, filtered = ripples(raised_profile(tmp_path / "seen"), static.only(()), static, model)
+    assert at_rest > 0.5 * none
+    assert filtered < 0.1 * none
+
+
+@pytest.mark.parametrize("command", ["step", "calibrate", "improve"])
+def test_what_needs_an_encoder_at_the_load_is_refused(hdbridge, blind: Path, command: str) -> None:
+    done = hdbridge(command, blind, "--simulate")
+    assert done.returncode == 2
+    assert "axis.yaml:" in done.stderr
+    assert "expected an encoder at the load" in done.stderr

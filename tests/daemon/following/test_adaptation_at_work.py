@@ -1,0 +1,72 @@
+"""A simulated axis whose gear changes while it works, over real frames: followed, and never made worse.
+
+The change of an hour is packed into minutes, with rates and intervals to match; `test_hour` takes the hour.
+"""
+
+from __future__ import annotations
+
+import pytest
+from support.adapting import FAULTS, FLOOR_ARCSEC, at_work, truth_of
+
+from hdbridge.daemon.following.settings import AdaptationSettings
+
+QUICK = AdaptationSettings(mode="on", half_life_turns=5.0, rate_arcsec_per_hour=1200.0, interval_s=4.0)
+CHANGING = truth_of(200.0, growth=0.1, second_order_arcsec=1.5)
+WORKED_S = 110.0
+FAULT_S, FAULTY_UNTIL_S = 30.0, 60.0
+OFFSET, SECOND = 12, slice(2, 4)
+
+
+@pytest.fixture(scope="module")
+def left_alone() -> list[float]:
+    """Three sigma over neighbouring tests without adaptation; the load encoder has no part in that."""
+    with at_work(CHANGING, None) as work:
+        work.until(WORKED_S)
+        return work.three_sigma_arcsec()
+
+
+def test_a_changing_gear_is_followed_within_the_floor(left_alone: list[float]) -> None:
+    with at_work(CHANGING, QUICK) as work:
+        work.until(WORKED_S)
+        adapted = work.three_sigma_arcsec()
+        estimate = work.adaptation.estimate_arcsec
+        events = {each["event"] for each in work.history}
+    assert max(adapted) <= 1.3 * FLOOR_ARCSEC
+    assert left_alone[-1] > 2.0 * FLOOR_ARCSEC
+    share = WORKED_S / 200.0
+    assert estimate[OFFSET] == pytest.approx(share * 4.0, abs=0.8)
+    assert float((estimate[SECOND] ** 2).sum() ** 0.5) == pytest.approx(share * 1.5, abs=0.5)
+    assert events == {"changed"}
+    assert work.encoder_faults == []
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_a_load_encoder_that_fails_freezes_the_adaptation(fault: str, left_alone: list[float]) -> None:
+    with at_work(CHANGING, QUICK) as work:
+        work.until(FAULT_S)
+        work.faults.load_reading = FAULTS[fault](work)
+        begun_s, before = work.time_s, work.adaptation.used_arcsec
+        work.until(FAULTY_UNTIL_S)
+        frozen = [each for each in work.history if each["event"] == "frozen"]
+        adapted = work.three_sigma_arcsec()
+    assert work.adaptation.freeze_reason is not None
+    assert len(frozen) == 1
+    assert begun_s <= frozen[0]["axis_time_s"]
+    assert not [each for each in work.history[work.history.index(frozen[0]) :] if each["event"] == "changed"]
+    # What was learnt of the fault before it was seen is within what the rate allows, and harmless.
+    rate = QUICK.rate_arcsec_per_hour / 3600.0
+    blind_s = frozen[0]["axis_time_s"] - begun_s + 2.0 * QUICK.interval_s
+    assert abs(work.adaptation.used_arcsec - before).max() <= rate * blind_s + 1e-9
+    assert all(on <= 1.05 * off for on, off in zip(adapted, left_alone, strict=False))
+    assert max(adapted) <= 1.3 * FLOOR_ARCSEC
+
+
+@pytest.mark.slow
+def test_an_hour_by_the_default_settings() -> None:
+    with at_work(truth_of(3600.0), AdaptationSettings(mode="on")) as work:
+        work.until(3600.0)
+        adapted = work.three_sigma_arcsec()
+    assert max(adapted) <= 1.3 * FLOOR_ARCSEC
+    assert work.adaptation.estimate_arcsec[OFFSET] == pytest.approx(8.0, abs=0.5)
+    assert {each["event"] for each in work.history} == {"changed"}
+    assert work.encoder_faults == []

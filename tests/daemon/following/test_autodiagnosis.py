@@ -1,0 +1,84 @@
+"""From a verdict to a diagnosis next to the recording, by itself."""
+
+import json
+import shutil
+
+import pytest
+from support.axis_samples import SampleMaker, moves_and_rests
+from support.flight import flight_log
+
+from hdbridge.axis import AxisConfig
+from hdbridge.daemon.following.autodiagnosis import AutoDiagnosis, summary
+from hdbridge.daemon.recorder.flightlog import Batch
+from hdbridge.effects import CATALOGUE
+from hdbridge.model import TransmissionModel
+
+AXIS = AxisConfig.load("profiles/demo")
+
+
+def model_of(second_arcsec):
+    orders = ((2, second_arcsec, -132.1), (4, 12.0, 105.7))
+    series = [{"order": k, "amplitude_arcsec": a, "phase_deg": p} for k, a, p in orders]
+    loop = CATALOGUE["hysteresis"](offset_arcsec=30.0, width_deg=20.0, exponent=1.6)
+    return TransmissionModel(50.0, (CATALOGUE["synchronous"](orders=series), loop))
+
+
+MODEL = model_of(9.0)
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory):
+    """A folder with an unfinished recording of an axis whose second order has grown, and the time of day."""
+    folder = tmp_path_factory.mktemp("recorded")
+    made = SampleMaker(AXIS, MODEL, model_of(17.0)).make(moves_and_rests(100.0, 0.004, 2, 3.0))
+    log, clock = flight_log(folder)
+    for first in range(0, len(made), 250):
+        log.put(Batch(made[first : first + 250]))
+        clock.ns += 10**9
+        log.flush()
+    yield folder, clock.ns
+    log.close()
+
+
+def test_the_last_minutes_are_diagnosed_and_the_result_is_next_to_the_recording(recorded):
+    folder, now_ns = recorded
+    told = []
+    diagnosis = AutoDiagnosis(folder, lambda: now_ns)
+    running = diagnosis.start("demo", MODEL.dump(), 10.0, "recalibrate: because", told.append)
+    assert diagnosis.start("demo", MODEL.dump(), 10.0, "again", told.append) is None
+    running.result()
+    (words,) = told
+    assert words.startswith("diagnosis: motor_encoder_eccentricity ("), words
+    (result,) = (folder / "diagnoses").iterdir()
+    assert str(result) in words
+    found = json.loads((result / "diagnosis.json").read_text())
+    assert [each["cause"] for each in found["findings"]] == ["motor_encoder_eccentricity"]
+    assert (result / "why.txt").read_text() == "recalibrate: because\n"
+    assert (result / "record" / "recording.yaml").exists()
+    assert (result / "diagnosis.html").exists()
+    shutil.rmtree(folder / "diagnoses")
+
+
+def test_what_cannot_be_diagnosed_says_why(recorded):
+    folder, now_ns = recorded
+    told = []
+    diagnosis = AutoDiagnosis(folder, lambda: now_ns)
+    diagnosis.start("nose", MODEL.dump(), 10.0, "", told.append).result()
+    (words,) = told
+    assert "the diagnosis was not made: " in words
+    assert "no axis 'nose'" in words
+
+
+def test_it_ends_when_the_service_does(recorded):
+    folder, now_ns = recorded
+    told = []
+    diagnosis = AutoDiagnosis(folder, lambda: now_ns)
+    diagnosis.start("demo", MODEL.dump(), 10.0, "", told.append)
+    diagnosis.close()
+    assert told == []  # one that goes to its end says what it found
+    assert diagnosis.start("demo", MODEL.dump(), 10.0, "", told.append) is None
+
+
+def test_a_diagnosis_that_names_nothing_says_so():
+    found = {"findings": [], "baseline": {"rms_arcsec": 2.0}, "noise_floor_arcsec": 1.0}
+    assert summary(found).startswith("diagnosis: nothing that it could name; the model is 2.00 arcsec")

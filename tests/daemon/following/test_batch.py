@@ -1,0 +1,66 @@
+"""On one measured record the recursion without forgetting and the identification say the same."""
+
+import numpy as np
+import pytest
+from support.adapting import AXIS, MODEL, Sampler, truth_of
+
+from hdbridge.analysis.identification import FitOptions
+from hdbridge.analysis.identify import fit
+from hdbridge.analysis.linear import solve_symmetric
+from hdbridge.axis import AxisConfig
+from hdbridge.calibration.identification import measured_of
+from hdbridge.control.bench import Bench
+from hdbridge.daemon.following.estimator import Estimator
+from hdbridge.daemon.following.follower import observation_sigma_arcsec
+from hdbridge.daemon.following.measuring import DriftModel, Measuring
+from hdbridge.drive import Drive
+from hdbridge.effects import Start
+from hdbridge.procedures.moves import Settle
+from hdbridge.procedures.stepping import Stepping
+from hdbridge.sim.lockstep import simulated_bench
+
+
+@pytest.fixture(scope="module")
+def run():
+    """A stepping test of a gear whose loop is a tenth higher and whose second order is another."""
+    truth = truth_of(1e-3, growth=0.1, second_order_arcsec=2.0)  # all of it at once
+    with (
+        simulated_bench(truth, AXIS.eds_path, AXIS.drive.node_id, 3) as (bus, clock, _),
+        Drive(bus, AXIS, clock) as drive,
+    ):
+        drive.boot()
+        return Bench(drive, MODEL).run(Stepping(count=40, settle=Settle(minimum_s=0.3)))
+
+
+def test_recursion_equals_the_least_squares_of_the_identification(run):
+    drift = DriftModel(MODEL)
+    samples = Sampler(AXIS, MODEL).samples(run.record)
+    measuring = Measuring(drift, 0.5)
+    times, axis = 1e-9 * samples["time_ns"].astype(float), samples["axes"][:, 0]
+    found = measuring.take(times, axis, np.ones(len(times), dtype=bool))
+    assert len(found) == pytest.approx(80, abs=3)
+    rows, observed = np.array([each.row for each in found]), np.array([each.error_arcsec for each in found])
+
+    wide = np.full(drift.count, 100.0)
+    sigma = observation_sigma_arcsec(AXIS)
+    estimator = Estimator(np.zeros(drift.count), np.diag(wide**2), wide)
+    for part in np.array_split(np.arange(len(found)), 13):
+        estimator.update(rows[part], observed[part], sigma)
+    information = rows.T @ rows / sigma**2 + np.diag(1.0 / wide**2)
+    batch = solve_symmetric(information, rows.T @ observed / sigma**2)
+    assert estimator.estimate == pytest.approx(batch, abs=1e-4)  # which adds a ridge
+
+    model = drift.changed(estimator.estimate[: drift.zero])
+    options = FitOptions(start=Start.FORWARD, highest_order=8, load_orders=0, active=MODEL)
+    identified = fit(measured_of([run]), AXIS.gear.ratio, options)
+    offset = identified.interval("hysteresis", "offset_arcsec")
+    assert offset.value == pytest.approx(44.0, abs=0.5)
+    ours = {each.name: each for each in model.effects}
+    assert ours["hysteresis"].offset_arcsec == pytest.approx(offset.value, abs=max(offset.half_width, 0.3))
+    for order in ours["synchronous"].orders:
+        theirs = identified.interval("synchronous", f"orders[{order.order}].amplitude_arcsec")
+        assert order.amplitude_arcsec == pytest.approx(theirs.value, abs=max(theirs.half_width, 0.3))
+
+
+def test_the_axis_says_how_finely_it_is_measured():
+    assert observation_sigma_arcsec(AxisConfig.load(AXIS.path)) == pytest.approx(0.944, abs=0.001)

@@ -1,0 +1,113 @@
+"""Every kind of motion through the daemon leaves the ripple of the filtered correction."""
+
+from collections.abc import Awaitable, Callable
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from hdbridge.daemon.service.interface import StreamPoint, WayPoint
+from support.raised import measured_response, raised_profile, ripple_arcsec
+from support.service import Service, play, stepped_service, until
+
+from hdbridge import TransmissionModel
+from hdbridge.analysis.response import harmonics
+from hdbridge.control.bench import axis_view, compensation_for
+from hdbridge.daemon.service.activity import Activity, Kind
+from hdbridge.daemon.service.bridge import ServiceBridge
+from hdbridge.daemon.service.rigs import DaemonRig
+from hdbridge.evaluation.stepping import Scheme
+from hdbridge.procedures.even_speed import EvenSpeed
+from hdbridge.procedures.moves import MoveTo
+
+SPEED_DEG_S = 76.0
+FAR_DEG = 140.0
+
+
+@pytest.fixture(scope="module")
+def profile(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Raised limits, and a model with the measured response."""
+    folder = raised_profile(tmp_path_factory.mktemp("raised") / "fast")
+    model = TransmissionModel.load(folder / "model.yaml")
+    replace(model, response=measured_response(folder)).save(folder / "model.yaml")
+    return folder
+
+
+async def goto(bridge: ServiceBridge, token: str) -> None:
+    await bridge.axes["axis1"].move(token, FAR_DEG, SPEED_DEG_S)
+
+
+async def jog(bridge: ServiceBridge, token: str) -> None:
+    axis = bridge.axes["axis1"]
+    await axis.jog(token, SPEED_DEG_S, timeout_s=1.8)
+    await until(bridge, lambda: axis.state().at_rest)
+
+
+async def queue(bridge: ServiceBridge, token: str) -> None:
+    axis = bridge.axes["axis1"]
+    await axis.queue(token, [WayPoint(-5.0), WayPoint(FAR_DEG, SPEED_DEG_S)])
+    await until(bridge, lambda: axis.motion.activity.over != "")
+
+
+async def stream(bridge: ServiceBridge, token: str) -> None:
+    axis = bridge.axes["axis1"]
+    begin_deg = axis.state().load_target_deg
+    path = MoveTo(FAR_DEG, SPEED_DEG_S, acceleration_deg_s2=200.0).path(
+        begin_deg, axis_view(axis.axis.config).limits
+    )
+    times = [0.02 * number for number in range(int(path.duration_s / 0.02) + 2)]
+    async with await axis.stream(token) as port:
+        for time_s in times:
+            await port.put([StreamPoint(time_s, path.at(time_s))])
+
+
+async def coordinated(bridge: ServiceBridge, token: str) -> None:
+    await bridge.coordinated(token, {"axis1": FAR_DEG, "axis2": -20.0}, speed=SPEED_DEG_S / 130.0)
+
+
+async def ripple(
+    service: Service,
+    bridge: ServiceBridge,
+    token: str,
+    motion: Callable[[ServiceBridge, str], Awaitable[None]],
+) -> float:
+    reader = service.daemon.memory.reader()
+    await motion(bridge, token)
+    samples, lost = reader.read()
+    assert lost == 0
+    return ripple_arcsec(samples["axes"][:, 0], SPEED_DEG_S)
+
+
+@pytest.mark.parametrize("motion", [goto, jog, queue, stream, coordinated])
+def test_it_removes_the_ripple(motion, profile: Path, tmp_path: Path) -> None:
+    async def story(service: Service) -> tuple[float, float]:
+        async with service.enabled() as (bridge, token):
+            left = await ripple(service, bridge, token, motion)
+            await bridge.axes["axis1"].compensate(token, Scheme.NONE)
+            await bridge.axes["axis1"].move(token, 0.0)
+            return await ripple(service, bridge, token, goto), left
+
+    with stepped_service(tmp_path, axes=1 + (motion is coordinated), profile=profile) as service:
+        none, left = play(story(service))
+    assert left < 0.1 * none, (none, left)
+
+
+def test_a_job_compensates_with_the_model_it_was_given(profile: Path, tmp_path: Path) -> None:
+    """The active model with another response, or without one, is another model."""
+
+    async def story(service: Service) -> list[float]:
+        model = TransmissionModel.load(service.machine.axes[0].profile.model)
+        async with service.ready() as bridge:
+            axis = bridge.axes["axis1"]
+            activity = Activity(Kind.JOB, "a test")
+            axis.occupy(activity)
+            rig = DaemonRig(axis, activity)
+            found = []
+            for used in (model.only(()), replace(model, response=None), model):
+                outcome = rig.bench(compensation_for(rig.axis, used)).run(EvenSpeed((SPEED_DEG_S,))).outcome
+                found.append(max(harmonics(each, (1, 2, 4), model.ratio).ripple_arcsec for each in outcome))
+            return found
+
+    with stepped_service(tmp_path, profile=profile) as service:
+        none, static, filtered = play(story(service))
+    assert static > 0.5 * none
+    assert filtered < 0.1 * none

@@ -1,0 +1,184 @@
+"""Watch and adaptation behind the service: what is adapted, the control process compensates by."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import AsyncExitStack
+from dataclasses import replace
+from pathlib import Path
+from unittest.mock import MagicMock
+
+import numpy as np
+import pytest
+from support.axis_samples import SampleMaker, moves_and_rests
+from support.service import Service, play, stepped_service, until
+
+from hdbridge.axis import AxisConfig
+from hdbridge.client.messages import AdaptationMode
+from hdbridge.daemon.following.follower import Follower
+from hdbridge.daemon.following.settings import AdaptationSettings
+from hdbridge.daemon.following.statefile import AdaptationFiles
+from hdbridge.daemon.memory import EventKind
+from hdbridge.daemon.serve import follow
+from hdbridge.daemon.service.bridge import ServiceBridge
+from hdbridge.daemon.service.following import Following
+from hdbridge.effects import Hysteresis
+from hdbridge.evaluation.stepping import Scheme
+from hdbridge.model import TransmissionModel
+
+MOVED_ARCSEC = 2.0
+DEMO = Path("profiles/demo/axis.yaml")
+
+
+def learnt(service: Service, folder: Path, settings: AdaptationSettings) -> None:
+    """Leave what an earlier service has learnt: the first coefficient moved, and in use so."""
+    axis = service.machine.axes[0]
+    model = axis.model()
+    files = AdaptationFiles(folder, axis.name, model, settings.parameters)
+    follower = Follower(axis.config, model, settings=settings)
+    follower.adapt("on", files)
+    before = follower.adaptation.learned()
+    estimate, applied = ((MOVED_ARCSEC, *each[1:]) for each in (before.estimate, before.applied))
+    files.write([], replace(before, estimate=estimate, applied=applied, windows=5))
+
+
+def following(bridge: ServiceBridge, settings: AdaptationSettings, folder: Path) -> Following:
+    (axis,) = bridge.axes.values()
+    made = Following(0, axis, settings, folder, ThreadPoolExecutor(1))
+    bridge.core.observer.add(made)
+    bridge.following[axis.name] = made
+    return made
+
+
+def changes(bridge: ServiceBridge) -> int:
+    entries = bridge.core.log.since(0)
+    return sum(each.event is not None and each.event.kind is EventKind.CHANGED for each in entries)
+
+
+def test_what_was_learnt_is_used_again_and_taken_back(tmp_path: Path) -> None:
+    settings = AdaptationSettings(mode="on")
+    folder = tmp_path / "adaptation"
+    with stepped_service(tmp_path) as service:
+        learnt(service, folder, settings)
+
+        async def story() -> None:
+            async with service.ready() as bridge:
+                (axis,) = bridge.axes.values()
+                in_use = axis.models.in_use
+                made = following(bridge, settings, folder)
+                before = changes(bridge)
+                await until(bridge, lambda: bool(made.state.parameters))
+                assert axis.state().adaptation.mode is AdaptationMode.ON
+
+                await made.apply()
+                assert changes(bridge) == before + 1
+                await made.apply()  # it is in use already
+                assert changes(bridge) == before + 1
+                assert axis.models.in_use.model is in_use.model  # by its name, the committed one
+
+                token = bridge.lease.take("test")
+                await bridge.adaptation_back(token, axis.name)
+                assert changes(bridge) == before + 2
+                assert made.state.mode is AdaptationMode.OBSERVE
+                assert not made.state.parameters
+                made.close()
+
+        play(story())
+
+
+def test_an_adaptation_that_is_off_learns_and_writes_nothing(tmp_path: Path) -> None:
+    folder = tmp_path / "adaptation"
+    with stepped_service(tmp_path) as service:
+
+        async def story() -> None:
+            async with service.ready() as bridge:
+                made = following(bridge, AdaptationSettings(), folder)
+                before = changes(bridge)
+                await until(bridge, lambda: bridge.core.observer.cycle > 100)
+                await made.apply()
+                assert made.state.mode is AdaptationMode.OFF
+                assert changes(bridge) == before
+                assert not folder.exists()
+                await made.set_mode(AdaptationMode.OBSERVE)
+                await until(bridge, folder.exists)
+                assert made.state.mode is AdaptationMode.OBSERVE
+                made.close()
+
+        play(story())
+
+
+def test_without_a_model_it_says_what_to_do(tmp_path: Path) -> None:
+    with stepped_service(tmp_path) as service:
+        service.machine.axes[0].profile.model.unlink()
+
+        async def story() -> None:
+            async with service.ready() as bridge:
+                made = following(bridge, AdaptationSettings(mode="on"), tmp_path / "adaptation")
+                await until(bridge, lambda: made.state.frozen is not None)
+                assert made.state.frozen == "there is no model to follow: calibrate first"
+                await made.apply()
+
+        play(story())
+
+
+def test_without_a_place_to_write_it_says_so_and_the_axis_works(tmp_path: Path) -> None:
+    folder = tmp_path / "adaptation"
+    folder.write_text("not a folder")
+    with stepped_service(tmp_path) as service:
+
+        async def story() -> None:
+            async with service.ready() as bridge:
+                made = following(bridge, AdaptationSettings(mode="on"), folder)
+                await until(bridge, lambda: made.state.frozen is not None)
+                assert str(folder) in (made.state.frozen or "")
+
+        play(story())
+
+
+def test_each_axis_is_watched_in_a_thread_of_its_own_that_ends(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    with stepped_service(tmp_path, axes=2) as service, caplog.at_level(logging.ERROR):
+
+        async def story() -> None:
+            async with service.enabled() as (bridge, token), AsyncExitStack() as stack:
+                for each in follow(service.machine, bridge, None, stack):
+                    bridge.core.observer.add(each)
+                first, second = bridge.axes.values()
+                await first.move(token, 5.0)
+                await second.compensate(token, Scheme.SYNCHRONOUS)
+                begun = bridge.core.observer.cycle
+                await until(bridge, lambda: bridge.core.observer.cycle > begun + 500)
+                assert (first.state().advice, second.state().advice) == ([], [])
+
+        play(story())
+    assert caplog.records == []
+    assert not [each for each in threading.enumerate() if each.name.startswith("following")]
+
+
+def test_a_verdict_is_advice_a_note_and_a_diagnosis_until_another_model_is_committed(tmp_path: Path) -> None:
+    config = AxisConfig.from_text(DEMO.read_text().replace("cycle_ms: 4", "cycle_ms: 20"), DEMO)
+    model = TransmissionModel.load("profiles/article/model.yaml")
+    loop = next(each for each in model.effects if isinstance(each, Hysteresis))
+    worn = loop.model_copy(update={"offset_arcsec": 1.4 * loop.offset_arcsec})
+    truth = replace(model, effects=tuple(worn if each is loop else each for each in model.effects))
+    samples = SampleMaker(config, model, truth).make(moves_and_rests(900.0, config.drive.cycle_s))
+    axis, recorder, diagnosis = MagicMock(), MagicMock(), MagicMock()
+    axis.name, axis.axis.config, axis.models.chosen.model = "demo", config, model
+    with ThreadPoolExecutor(1) as worker:
+        made = Following(0, axis, AdaptationSettings(), tmp_path, worker, recorder, diagnosis)
+        for batch in np.array_split(samples, 100):
+            made.take(batch, [], 0)
+        made.close()
+        (advice,) = made.advice
+        assert advice.startswith("recalibrate: hysteresis.offset_arcsec ")
+        recorder.note.assert_called_once_with("WATCH", f"demo: {advice}")
+        axis.core.log.note.assert_called_once_with(advice, 0)
+        assert diagnosis.start.call_args.args[:4] == ("demo", model.dump(), 15.0, advice)
+
+        axis.models.chosen.model = truth
+        made.take(samples[:0], [], 0)
+        made.close()
+        assert made.advice == []

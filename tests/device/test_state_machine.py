@@ -1,0 +1,325 @@
+"""The power state machine, exhaustively: states x controlwords x events, against the table of CiA 402.
+
+The table is the standard's own, by its numbers, with the bit patterns of its commands. Controlwords go out as
+RPDOs, and the state comes back in the statusword of a TPDO.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import can
+import pytest
+from support.ideal_motor import IdealMotor
+
+from hdbridge.device.behaviour import Behaviour
+from hdbridge.device.powerstate import PowerStage
+from hdbridge.sim.lockstep import lockstep_bench
+
+EDS = Path(__file__).parents[2] / "eds" / "hdbridge-402.eds"
+DISABLED, READY, ON, ENABLED, STOPPED, REACTION, FAULT = (
+    "switch on disabled", "ready to switch on", "switched on", "operation enabled", "quick stop active",
+    "fault reaction active", "fault",
+)  # fmt: skip
+STATES = (DISABLED, READY, ON, ENABLED, STOPPED, REACTION, FAULT)
+POWERED = (ENABLED, STOPPED, REACTION)
+STATUS = {
+    "x0xx0000": "not ready to switch on",
+    "x1xx0000": DISABLED,
+    "x01x0001": READY,
+    "x01x0011": ON,
+    "x01x0111": ENABLED,
+    "x00x0111": STOPPED,
+    "x0xx1111": REACTION,
+    "x0xx1000": FAULT,
+}
+"""The statusword of each state: bits 7 to 0."""
+COMMANDS = {
+    "shutdown": "0xxxx110",
+    "switch on": "0xxx0111",  # as a transition from operation enabled: disable operation
+    "enable operation": "0xxx1111",
+    "disable voltage": "0xxxxx0x",
+    "quick stop": "0xxxx01x",
+}
+"""The controlword of each command: bits 7 to 0."""
+TRANSITIONS = {
+    2: (DISABLED, "shutdown", READY),
+    3: (READY, "switch on", ON),
+    4: (ON, "enable operation", ENABLED),
+    5: (ENABLED, "switch on", ON),
+    6: (ON, "shutdown", READY),
+    7: (READY, "disable voltage", DISABLED),
+    8: (ENABLED, "shutdown", READY),
+    9: (ENABLED, "disable voltage", DISABLED),
+    10: (ON, "disable voltage", DISABLED),
+    11: (ENABLED, "quick stop", STOPPED),
+    12: (STOPPED, "disable voltage", DISABLED),
+    16: (STOPPED, "enable operation", ENABLED),
+}
+ALSO = {
+    "3 and 4 in one": (READY, "enable operation", ENABLED),
+    "7 by quick stop": (READY, "quick stop", DISABLED),
+    "10 by quick stop": (ON, "quick stop", DISABLED),
+}
+"""Further transitions that CiA 402 names in the text of the same numbers."""
+
+
+def matches(pattern: str, word: int) -> bool:
+    bits = f"{word & 0xFF:08b}"
+    return all(want in ("x", bit) for want, bit in zip(pattern, bits, strict=True))
+
+
+def state_of(statusword: int) -> str:
+    (found,) = [state for pattern, state in STATUS.items() if matches(pattern, statusword)]
+    return found
+
+
+def expected(state: str, word: int, before: int) -> str:
+    """The state that the standard demands after ``word``, in ``state`` and after the word ``before``."""
+    if state == FAULT:
+        return DISABLED if word & 0x80 and not before & 0x80 else FAULT  # 15
+    found = {
+        after
+        for start, command, after in (*TRANSITIONS.values(), *ALSO.values())
+        if start == state and matches(COMMANDS[command], word)
+    }
+    assert len(found) <= 1
+    return found.pop() if found else state
+
+
+class Slow(PowerStage):
+    """A power stage that takes time, and fails on demand."""
+
+    def __init__(self, takes: int = 0) -> None:
+        self.takes, self.left = takes, 0
+        self.wanted = False
+
+    def switch(self, on: bool) -> None:
+        self.wanted, self.left = on, self.takes
+
+    @property
+    def is_on(self) -> bool:  # asked once a period, and at once
+        self.left -= 1
+        return self.wanted and self.left < 0
+
+    def reset(self) -> None:
+        self.error_code = 0
+
+
+class Slave:
+    """The slave over frames."""
+
+    def __init__(self, bus, clock, node, motor, stage) -> None:
+        self.bus, self.clock, self.node, self.motor, self.stage = bus, clock, node, motor, stage
+        self.word = 0
+        self.statusword = 0
+
+    def send(self, can_id: int, data: bytes) -> None:
+        self.bus.send(can.Message(arbitration_id=can_id, data=data, is_extended_id=False))
+        self.listen()
+
+    def listen(self) -> None:
+        while (message := self.bus.recv(0)) is not None:
+            if message.arbitration_id == 0x181:
+                (self.statusword,) = struct.unpack("<H", message.data)
+
+    def put(self, index: int, sub: int, value: int, size: int) -> None:
+        raw = (value & (1 << 8 * size) - 1).to_bytes(size, "little").ljust(4, b"\0")
+        self.send(0x601, struct.pack("<BHB", 0x23 | (4 - size) << 2, index, sub) + raw)
+
+    def configure(self) -> None:
+        """Controlword and statusword, each in an event-driven PDO."""
+        for communication, word in ((0x1400, 0x60400010), (0x1800, 0x60410010)):
+            base = 0x200 if communication == 0x1400 else 0x180
+            self.put(communication, 1, 0x80000001 | base, 4)
+            self.put(communication + 0x200, 0, 0, 1)
+            self.put(communication + 0x200, 1, word, 4)
+            self.put(communication + 0x200, 0, 1, 1)
+            self.put(communication, 2, 255, 1)
+            self.put(communication, 1, 1 | base, 4)
+        self.put(0x605A, 0, 6, 2)
+        self.put(0x6060, 0, 1, 1)
+        self.send(0, b"\x01\x01")
+
+    def control(self, word: int) -> None:
+        self.word = word
+        self.send(0x201, struct.pack("<H", word))
+
+    def wait(self, seconds: float = 0.012) -> None:
+        self.clock.sleep_until(self.clock.now() + seconds)
+        self.listen()
+
+    @property
+    def state(self) -> str:
+        return state_of(self.statusword)
+
+    def bring(self, state: str) -> None:
+        """Lead to a state, at rest, from any."""
+        if self.state in (REACTION, FAULT):
+            self.wait(0.1)
+            self.control(0x00)
+            self.control(0x80)
+        self.control(0x00)
+        self.wait(0.004)
+        assert self.state == DISABLED, self.state
+        words = {
+            DISABLED: (), READY: (0x06,), ON: (0x06, 0x07), STOPPED: (0x06, 0x07, 0x0F, 0x02),
+        }.get(state, (0x06, 0x07, 0x0F))  # fmt: skip
+        for word in words:
+            self.control(word)
+            if word == 0x0F and self.stage.takes:
+                self.wait(0.004 * (self.stage.takes + 2))
+        if state in (FAULT, REACTION):
+            if state == REACTION:  # in a move, which then ends on a ramp
+                self.put(0x607A, 0, round(self.motor.position) + 1_000_000, 4)
+                self.control(0x1F)
+                self.wait(0.06)
+            self.node.faults.raise_error(0x2310)
+            self.node.poll(self.clock.now())
+            self.listen()
+            if state == FAULT:
+                self.wait(0.02)
+        assert self.state == state, (self.state, state)
+
+
+@contextmanager
+def slave(behaviour: str, takes: int = 0) -> Iterator[Slave]:
+    motor, stage = IdealMotor(1000), Slow(takes)
+    chosen = Behaviour.model_validate({"controlword": behaviour})
+    with lockstep_bench(motor, EDS, behaviour=chosen, stage=stage) as (bus, clock, node):
+        under_test = Slave(bus, clock, node, motor, stage)
+        under_test.configure()
+        yield under_test
+
+
+def test_the_tables_are_those_of_the_standard():
+    """Every statusword belongs to one state or none, and every controlword to one command or none."""
+    for word in range(0x100):
+        assert sum(matches(pattern, word) for pattern in STATUS.values()) <= 1
+        commands = {name for name, pattern in COMMANDS.items() if matches(pattern, word)}
+        assert len(commands) == (0 if word & 0x80 else 1)
+
+
+@pytest.mark.parametrize("behaviour", ["edge", "level"])
+@pytest.mark.parametrize("state", STATES)
+def test_every_controlword_in_every_state(state, behaviour):
+    """All 512 words of bits 0 to 8, and the axis stays where it is."""
+    with slave(behaviour) as node:
+        node.bring(state)
+        for word in range(0x200):
+            place, before = node.motor.position, node.word
+            node.control(word)
+            wanted = expected(state, word, before)
+            assert node.state == wanted, f"{word:03X}h after {before:03X}h in {state}"
+            assert node.motor.position == place
+            if node.state != state or word & 0x0F == 0x0F:
+                node.bring(state)
+
+
+@pytest.mark.parametrize("behaviour", ["edge", "level"])
+def test_a_fault_reset_is_an_edge_after_any_word(behaviour):
+    with slave(behaviour) as node:
+        for before in range(0x200):
+            node.bring(FAULT)
+            node.control(before)
+            state = node.state
+            assert state == expected(FAULT, before, 0x0F)
+            if state != FAULT:
+                continue
+            for word in (before | 0x80, before & ~0x80, before | 0x80):
+                was = node.word
+                node.control(word)
+                assert node.state == expected(state, word, was), f"{word:03X}h after {was:03X}h"
+                state = node.state
+                if state != FAULT:
+                    break
+
+
+@pytest.mark.parametrize("behaviour", ["edge", "level"])
+def test_every_controlword_while_power_is_being_switched_on(behaviour):
+    """The state remains switched on until the power is there."""
+    with slave(behaviour, takes=4) as node:
+        for word in range(0x100):
+            node.bring(ON)
+            node.control(0x0F)
+            assert node.state == ON
+            node.control(word)
+            wanted = expected(ON, word, 0x0F)
+            assert node.state == (ON if wanted == ENABLED else wanted), f"{word:02X}h"
+            node.wait(0.004 * 8)
+            pending = word & 0x80  # no command, so what was asked for is still asked for
+            assert node.state in ({ON, ENABLED} if pending else {wanted}), f"{word:02X}h"
+
+
+EVENTS = {
+    "malfunction": lambda node: node.node.faults.raise_error(0x4310),
+    "failure of the power stage": lambda node: setattr(node.stage, "error_code", 0x3210),
+    "enable input": lambda node: node.node.faults.open_enable_input(),
+    "lost master, 6007h = 0": lambda node: lose(node, 0),
+    "lost master, 6007h = 1": lambda node: lose(node, 1),
+    "lost master, 6007h = 2": lambda node: lose(node, 2),
+    "lost master, 6007h = 3": lambda node: lose(node, 3),
+    "NMT stop": lambda node: node.send(0, b"\x02\x01"),
+    "reset communication": lambda node: node.send(0, b"\x82\x01"),
+    "reset node": lambda node: node.send(0, b"\x81\x01"),
+}
+
+
+def lose(node: Slave, option: int) -> None:
+    node.put(0x6007, 0, option, 2)
+    node.node.faults.lose_master(0x8130)
+
+
+def after(event: str, state: str) -> tuple[str, ...]:
+    """Where CiA 402 and the option codes say that an event leads, once the axis is at rest."""
+    powered = state in POWERED
+    if event == "reset node":
+        return (DISABLED,)
+    if event in ("malfunction", "failure of the power stage"):
+        return (FAULT,)  # 13 and 14
+    if state in (FAULT, REACTION):
+        return (FAULT,)
+    if event == "enable input":
+        return (DISABLED,)
+    option = int(event[-1]) if event[-1].isdigit() else 1
+    if not powered or option == 0:
+        return (state,)
+    if option == 3:
+        return (STOPPED,)
+    return (FAULT if option == 1 else DISABLED,)
+
+
+@pytest.mark.parametrize("behaviour", ["edge", "level"])
+@pytest.mark.parametrize("event", EVENTS)
+@pytest.mark.parametrize("state", STATES)
+def test_every_event_in_every_state_and_then_every_command(state, event, behaviour):
+    """Events lead where the standard says; then each command does what the table demands of that state."""
+    commands = (0x00, 0x02, 0x06, 0x07, 0x0F, 0x8F)
+    with slave(behaviour) as node:
+        for word in commands:
+            node.put(0x6007, 0, 1, 2)
+            node.put(0x605A, 0, 6, 2)
+            node.bring(state)
+            before = node.word
+            EVENTS[event](node)
+            node.wait(0.6 if state == REACTION else 0.1)  # without power the motor coasts
+            node.stage.error_code = 0
+            if event in ("NMT stop", "reset node", "reset communication"):
+                if event != "NMT stop":
+                    node.configure()
+                    before = node.word = 0 if event == "reset node" else before
+                else:
+                    node.send(0, b"\x01\x01")
+                node.wait(0.01)
+            assert node.state in after(event, state), f"{event} in {state}"
+            reached, place = node.state, node.motor.position
+            node.control(word)
+            wanted = expected(reached, word, before)
+            if word == before and wanted != reached and behaviour == "edge":
+                wanted = reached  # a repeated word is no new command
+            assert node.state == wanted, f"{word:02X}h after {event} in {state}"
+            node.wait(0.05)
+            assert node.motor.position == place

@@ -1,0 +1,46 @@
+"""Nodes on the virtual bus for the conformance suite, in simulated time."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from hdbridge.axis import AxisConfig, BusConfig
+from hdbridge.conformance import NodeTester
+from hdbridge.daemon.gateway.ideal import IdealAxis
+from hdbridge.daemon.gateway.objects import eds, nameplate
+from hdbridge.daemon.gateway.slave import BEHAVIOUR
+from hdbridge.daemon.machinefile import GatewaySettings
+from hdbridge.device.node import DriveNode
+from hdbridge.drive.link import Link
+from hdbridge.files.edsfile import shared_eds
+from hdbridge.sim.lockstep import lockstep_bench
+from support.ideal_motor import IdealMotor
+
+ROOT = Path(__file__).parents[2]
+EDS = ROOT / "eds" / "hdbridge-402.eds"
+
+
+@contextmanager
+def simulated_drive(
+    behaviour: Any = None, **options: Any
+) -> Iterator[tuple[NodeTester, DriveNode, IdealMotor]]:
+    """The simulated drive with a motor that is where it should be."""
+    motor = IdealMotor(100_000)
+    with lockstep_bench(motor, EDS, behaviour=behaviour) as (bus, clock, node):
+        yield NodeTester(Link(bus, clock), 1, od=shared_eds(EDS, 1).dictionary, **options), node, motor
+
+
+@contextmanager
+def gateway_slave(folder: Path) -> Iterator[tuple[NodeTester, DriveNode]]:
+    """The slave of a gateway in front of an ideal axis."""
+    axis = AxisConfig.load(ROOT / "profiles" / "article" / "axis.yaml")
+    settings = GatewaySettings(bus=BusConfig(interface="virtual", channel="outer"), nodes={axis.name: 5})
+    path = folder / "gateway.eds"
+    path.write_text(eds(axis, settings), encoding="utf-8")
+    plate, plant = nameplate(axis, settings), IdealAxis(axis.gear.ratio)
+    plant.motor_counts = 1_000_000
+    with lockstep_bench(plant, path, 5, nameplate=plate, behaviour=BEHAVIOUR) as (bus, clock, node):
+        yield NodeTester(Link(bus, clock), 5, od=shared_eds(path, 5).dictionary), node

@@ -1,0 +1,177 @@
+"""Random events on both buses of a gateway, and the laws that hold whatever happens.
+
+The laws look at the control loop's samples and at what the outer master has sent, not at the gateway.
+"""
+
+from __future__ import annotations
+
+import errno
+import struct
+from collections.abc import Sequence
+from contextlib import suppress
+from pathlib import Path
+from random import Random
+from typing import Any
+
+import numpy as np
+
+from hdbridge.daemon.loop.states import AxisState
+from hdbridge.errors import HdbridgeError
+from hdbridge.motion import MotionMode
+from support.gateway import COUNTS_PER_DEG, NODE, GatewayBench, gateway_bench
+from support.service import play
+
+WORDS = (0x00, 0x02, 0x06, 0x07, 0x0F, 0x0F, 0x1F, 0x80, 0x8F, 0x10F)
+HARMLESS = {"word", "walk", "target", "mode", "wait", "frame"}
+
+
+def draw(rng: Random) -> tuple[str, Any]:
+    """A random event: kind and value."""
+    kinds: tuple[tuple[str, Any], ...] = (
+        ("word", rng.choice(WORDS)),
+        ("walk", 0),
+        ("walk", 0),
+        ("target", rng.uniform(-5.0, 5.0)),
+        ("target", rng.choice([-1e5, 401.0, -401.0, 2000.0])),
+        ("mode", rng.choice([0, 1, 6, 7, 8, 8, 3])),
+        ("nmt", rng.choice([1, 1, 2, 128, 129, 130])),
+        ("pause", rng.randint(1, 200)),
+        ("gateway", rng.randint(0, 100)),
+        ("loop", rng.randint(0, 100)),
+        ("drive", rng.choice(["error", "boot-up", "mute"])),
+        ("down", rng.randint(1, 300)),
+        ("force", rng.randint(0, 300)),
+        ("frame", bytes(rng.randint(0, 255) for _ in range(rng.randint(0, 8)))),
+        ("wait", rng.randint(1, 500)),
+    )
+    return rng.choice(kinds)
+
+
+class Laws:
+    """Of one axis."""
+
+    def __init__(self, bench: GatewayBench) -> None:
+        self.bench = bench
+        config = bench.daemon.axes[0].config
+        self.limits, self.period_s = config.limits, bench.daemon.period_s
+        self.reader = bench.daemon.memory.reader()
+        self.disturbed_s = self.asked_s = -1.0
+        """Last event that may stop the axis; last time that the master sent another controlword."""
+        self.word = 0
+        self.following = False
+        self.lowest = self.highest = 0.0
+        self.enabled = 0
+        self.before: tuple[int, float] | None = None
+
+    def look(self) -> None:
+        bench, plc = self.bench, self.bench.plc
+        if plc.controlword != self.word:
+            self.word, self.asked_s = plc.controlword, bench.now_s
+        samples, _ = self.reader.read()
+        target_deg = plc.target / COUNTS_PER_DEG
+        self.lowest, self.highest = min(self.lowest, target_deg), max(self.highest, target_deg)
+        for sample in samples:
+            self._judge(sample["axes"][0], int(sample["cycle"]))
+
+    def _judge(self, axis: np.void, cycle: int) -> None:
+        driven = axis["state"] in (AxisState.ENABLED, AxisState.STOPPING)
+        place = float(axis["load_target_deg"])
+        if not driven:
+            self.before = None
+            self.following = False
+            return
+        limits = self.limits
+        assert limits.position_min_deg <= place <= limits.position_max_deg
+        if self.before is not None and self.before[0] == cycle - 1:
+            assert abs(place - self.before[1]) <= 1.0001 * limits.velocity_deg_s * self.period_s
+        self.before = cycle, place
+        following = axis["mode"] == MotionMode.FOLLOW
+        if following and not self.following:
+            self.enabled += 1
+            assert self.word & 0x8F == 0x0F, "followed without 'enable operation'"
+            assert self.asked_s > self.disturbed_s, "followed without a new controlword"
+            self.lowest = self.highest = place
+        self.following = following
+        # A stop from full speed overshoots by what it needs to brake.
+        slack = limits.velocity_deg_s**2 / (2.0 * limits.acceleration_deg_s2) + limits.velocity_deg_s * 0.15
+        assert self.lowest - slack <= place <= self.highest + slack
+
+
+async def happen(bench: GatewayBench, laws: Laws, kind: str, value) -> None:
+    plc, daemon, drive = bench.plc, bench.daemon, bench.daemon.nodes[0]
+    if kind not in HARMLESS:
+        laws.disturbed_s = bench.now_s
+    if kind == "word":
+        plc.controlword = value
+    elif kind == "walk":
+        for word in (0x00, 0x80, 0x06, 0x07, 0x0F):
+            plc.controlword = word
+            plc.target = plc.position
+            await rest(bench, laws, 0.15)
+    elif kind == "target":
+        plc.target = max(min(plc.position + round(value * COUNTS_PER_DEG), 2**31 - 1), -(2**31))
+    elif kind == "mode":
+        plc.send(0x600 + NODE, struct.pack("<BHBb3x", 0x2F, 0x6060, 0, value))
+    elif kind == "nmt":
+        plc.send(0, bytes((value, NODE)))
+    elif kind == "pause":
+        plc.cycling = False
+        await rest(bench, laws, 1e-3 * value)
+        plc.begin()
+    elif kind == "gateway":
+        daemon.clock.nodes.remove(bench.gateway)
+        await rest(bench, laws, 1e-3 * value)
+        daemon.clock.nodes.append(bench.gateway)
+        bench.restart_gateway()
+        plc.send(0, bytes((1, NODE)))
+    elif kind == "loop":
+        daemon.hang(1e-3 * value)
+        daemon.begin_again()
+    elif kind == "drive":
+        if value == "error":
+            drive.faults.raise_error(0x4310)
+        elif value == "boot-up":
+            drive.faults.boot_up()
+        else:
+            drive.faults.drop_tpdos = 9
+    elif kind == "down":
+        daemon.bus.down = errno.ENETDOWN
+        await rest(bench, laws, 1e-3 * value)
+        daemon.bus.down = None
+    elif kind == "force":
+        token = bench.bridge.lease.take("a person", force=True)
+        await rest(bench, laws, 1e-3 * value)
+        laws.disturbed_s = bench.now_s
+        with suppress(HdbridgeError):
+            bench.bridge.lease.release(token)
+    elif kind == "frame":
+        plc.send(0x200 + NODE, value)
+    elif kind == "wait":
+        await rest(bench, laws, 1e-3 * value)
+    await rest(bench, laws, 0.02)
+
+
+async def rest(bench: GatewayBench, laws: Laws, duration_s: float) -> None:
+    end_s = bench.now_s + duration_s
+    while bench.now_s < end_s:
+        await bench.wait(0.012)
+        laws.look()
+
+
+def play_story(folder: Path, story: Sequence[tuple[str, Any]]) -> None:
+    """Plays events on a gateway with an enabled axis; AssertionError if a law is broken."""
+
+    async def scenario(bench: GatewayBench) -> None:
+        async with bench.service.ready() as bridge:
+            bench.bridge = bridge
+            await bench.configure()
+            await bench.wait(0.5)
+            laws = Laws(bench)
+            bench.plc.begin()
+            await happen(bench, laws, "walk", 0)
+            assert laws.enabled == 1
+            for kind, value in story:
+                await happen(bench, laws, kind, value)
+
+    with gateway_bench(folder) as bench:
+        play(scenario(bench))

@@ -1,0 +1,82 @@
+"""The article's axis with limits at which its servo filters the correction, and its measured response."""
+
+from __future__ import annotations
+
+import re
+import shutil
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+
+from hdbridge import Bench, Drive
+from hdbridge.analysis.response import Trial, harmonics, response_of
+from hdbridge.axis import AxisConfig
+from hdbridge.calibration.motion import limits_of, motor_orders
+from hdbridge.model import TransmissionModel
+from hdbridge.model.response import Response
+from hdbridge.procedures.even_speed import EvenSpeed
+from hdbridge.sim.lockstep import simulated_bench
+
+ARTICLE = Path(__file__).resolve().parents[2] / "profiles" / "article"
+RAISED = {
+    "velocity_deg_s": "130",
+    "acceleration_deg_s2": "300",
+    "following_error_deg": "90.0",
+    "position_min_deg": "-1500",
+    "position_max_deg": "1500",
+    "maximum_arcsec": "600",
+    "slew_arcsec_s": "100000",
+}
+
+RUNS = EvenSpeed((123.5, 104.0, 83.2, 65.0, 49.4, 36.4, 23.4), window_s=0.6)
+
+
+def raised_axis() -> str:
+    """Returns the text of the axis file."""
+    text = (ARTICLE / "axis.yaml").read_text(encoding="utf-8")
+    for key, value in RAISED.items():
+        text, found = re.subn(rf"(?m)^(  {key}: )[-\d.]+", rf"\g<1>{value}", text)
+        assert found == 1, key
+    return text
+
+
+def raised_profile(folder: Path) -> Path:
+    """Copies the article's profile to a new folder, with raised limits."""
+    shutil.copytree(ARTICLE, folder)
+    (folder / "axis.yaml").write_text(raised_axis(), encoding="utf-8")
+    return folder
+
+
+@cache
+def measured_response(profile: Path) -> Response:
+    """Measures the response of a raised profile's axis on a bench, without the trials of a motion test."""
+    axis = AxisConfig.load(profile)
+    model = TransmissionModel.load(profile / "model.yaml")
+    orders = tuple(each.order for each in motor_orders(model))
+    with (
+        simulated_bench(profile / "truth.yaml", axis.eds_path) as (bus, clock, _),
+        Drive(bus, axis, clock) as drive,
+    ):
+        drive.boot()
+        none, static = (
+            tuple(harmonics(each, orders, model.ratio) for each in Bench(drive, used).run(RUNS).outcome)
+            for used in (None, model)
+        )
+    limits = limits_of(axis, model)
+    response = response_of(none, [Trial(static)], orders, model.ratio, axis.drive.cycle_s, limits)
+    assert response is not None
+    return response
+
+
+def ripple_arcsec(samples: np.ndarray, speed_deg_s: float) -> float:
+    """Returns the rms of the load error about a straight line while the target runs at a speed.
+
+    ``samples`` are those of one axis from the daemon's ring.
+    """
+    even = np.flatnonzero(abs(samples["velocity_deg_s"] - speed_deg_s) < 1e-3 * abs(speed_deg_s))
+    even = even[len(even) // 3 :]  # the transient of the ramp
+    assert len(even) > 100
+    error = 3600.0 * (samples["load_position_deg"] - samples["load_target_deg"])[even]
+    line = np.linspace(-1.0, 1.0, len(error))
+    return float(np.std(error - np.polyval(np.polyfit(line, error, 1), line)))

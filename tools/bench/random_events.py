@@ -1,0 +1,61 @@
+"""Random events on the slave of the gateway, or on the whole gateway with both its buses, in simulated time.
+
+    python tools/bench/random_events.py [--stack slave|gateway] [--events 100000] [--seed 1]
+
+After each the laws of the tests must hold: no set-point outside the limits, no motion unasked. Prints what
+was reached, as it comes. A story that breaks a law is printed with its seed; exit status 1.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import tempfile
+from pathlib import Path
+from random import Random
+
+sys.path.append(str(Path(__file__).resolve().parents[2] / "tests"))
+from support.disorder import draw, play_story
+from support.slave_events import play_events
+
+PER_STORY = {"slave": 200, "gateway": 100}
+
+
+def story(stack: str, seed: int) -> None:
+    """Plays one story; AssertionError if it breaks a law."""
+    if stack == "slave":
+        seen = play_events(seed, PER_STORY[stack])
+        for name in TOTAL:
+            TOTAL[name] += getattr(seen, name)
+        return
+    rng = Random(seed)
+    with tempfile.TemporaryDirectory(prefix="events-") as folder:
+        play_story(Path(folder), [draw(rng) for _ in range(PER_STORY[stack])])
+
+
+TOTAL = {"periods": 0, "moved": 0, "enabled": 0}
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--stack", choices=PER_STORY, default="slave")
+    parser.add_argument("--events", type=int, default=100_000)
+    parser.add_argument("--seed", type=int, default=1)
+    options = parser.parse_args()
+    events, broken, seed = 0, 0, options.seed
+    while events < options.events:
+        try:
+            story(options.stack, seed)
+        except AssertionError as error:
+            broken += 1
+            print(f"seed {seed}: {error}", flush=True)
+        events += PER_STORY[options.stack]
+        seed += 1
+        if seed % (50 if options.stack == "slave" else 5) == 0:
+            print(f"{events} events, {broken} stories that broke a law, {TOTAL}", flush=True)
+    print(f"{events} events, {broken} stories that broke a law, {TOTAL}")
+    return 1 if broken else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
