@@ -94,11 +94,15 @@ def weighed(
 
 
 def probability(terms: Mapping[str, float], scales: Scales, prior: float = 0.0) -> float:
-    """Returns the probability from the terms of the formula and the log odds of a prior.
+    """Returns the probability from the terms of the formula and the log odds of a prior."""
+    return updated(sum(each * terms[name] for name, each in coefficients(scales).items()), prior, scales)
+
+
+def updated(score: float, prior: float, scales: Scales) -> float:
+    """Returns the probability from the log odds of the record and of a prior.
 
     A prior does not make a name likely that the record alone does not support.
     """
-    score = sum(each * terms[name] for name, each in coefficients(scales).items())
     alone, most = 1.0 / (1.0 + math.exp(-score)), scales.surest
     if prior and alone < scales.named_from:
         most = 0.5

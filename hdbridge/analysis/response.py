@@ -17,7 +17,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from hdbridge.effects.orders import MotorOrder, OrderSeries
 from hdbridge.errors import InputError
+from hdbridge.model import TransmissionModel
 from hdbridge.model.response import LeadFilter, Response
 from hdbridge.procedures.even_speed import EvenRun
 from hdbridge.units import ARCSEC_PER_DEG, DEG_PER_TURN
@@ -25,6 +27,8 @@ from hdbridge.units import ARCSEC_PER_DEG, DEG_PER_TURN
 ComplexArray = NDArray[np.complex128]
 FloatArray = NDArray[np.float64]
 
+LEAST_ARCSEC = 0.2
+"""Minimum amplitude of the orders that are evaluated."""
 HIGHEST = 0.36
 """Highest frequency that is corrected in full, as a share of the SYNC rate."""
 STOP = 0.46
@@ -118,13 +122,25 @@ def harmonics(run: EvenRun, orders: Sequence[int], ratio: float) -> Harmonics:
 
     InputError if the run is too short.
     """
-    if len(run.samples) < 4 * (2 * len(orders) + 2):
+    if len(run.samples) < samples_needed(orders):
         raise InputError(
             f"a run at {run.speed_deg_s:g} deg/s has only {len(run.samples)} samples at constant speed: "
             "allow more travel in the axis file"
         )
     target = np.array([each.load_target_deg for each in run.samples])
     error = ARCSEC_PER_DEG * (np.array([each.load_position_deg for each in run.samples]) - target)
+    return harmonics_of(run.speed_deg_s, target, error, orders, ratio)
+
+
+def samples_needed(orders: Sequence[int]) -> int:
+    """Returns the minimum number of samples of a run for these orders."""
+    return 4 * (2 * len(orders) + 2)
+
+
+def harmonics_of(
+    speed_deg_s: float, target: FloatArray, error: FloatArray, orders: Sequence[int], ratio: float
+) -> Harmonics:
+    """Fits orders to an error in arcsec over the load target in degrees, both of shape (n,)."""
     line = np.linspace(-1.0, 1.0, len(target))
     angle = np.radians(ratio * target)[:, None] * np.array(orders, dtype=float)
     design = np.column_stack([np.ones_like(line), line, np.cos(angle), -np.sin(angle)])
@@ -135,12 +151,23 @@ def harmonics(run: EvenRun, orders: Sequence[int], ratio: float) -> Harmonics:
     count = len(orders)
     straight = error - np.polyval(np.polyfit(line, error, 1), line)
     return Harmonics(
-        run.speed_deg_s,
+        speed_deg_s,
         solution[2 : 2 + count] + 1j * solution[2 + count :],
         np.hypot(spread[2 : 2 + count], spread[2 + count :]) / math.sqrt(2.0),
         float(solution[0]),
         float(straight.std()),
     )
+
+
+def motor_orders(model: TransmissionModel) -> list[MotorOrder]:
+    """Returns the motor orders that the model corrects, by number, from `LEAST_ARCSEC` up."""
+    series = [
+        each
+        for each in model.effects
+        if isinstance(each, OrderSeries) and each.is_compensable() and each.turns_per_motor_turn() == 1.0
+    ]
+    found = {order.order: order for each in series for order in each.orders}
+    return [found[number] for number in sorted(found) if found[number].amplitude_arcsec >= LEAST_ARCSEC]
 
 
 @dataclass(frozen=True, slots=True)
@@ -291,10 +318,45 @@ def difference(one: Response, other: Response) -> float:
 
 def agree(one: Response, other: Response) -> bool:
     """Returns False if the following lag or the response differs beyond its noise."""
-    lag_ms = max(abs(one.following_lag_ms), abs(other.following_lag_ms))
-    if abs(one.following_lag_ms - other.following_lag_ms) > max(DIFFERENT_LAG * lag_ms, LAG_NOISE_MS):
-        return False
-    return difference(one, other) < DIFFERENT
+    return lags_agree(one.following_lag_ms, other.following_lag_ms) and difference(one, other) < DIFFERENT
+
+
+def lags_agree(one_ms: float, other_ms: float) -> bool:
+    """Returns False if two following lags differ beyond their noise."""
+    return abs(one_ms - other_ms) <= max(DIFFERENT_LAG * max(abs(one_ms), abs(other_ms)), LAG_NOISE_MS)
+
+
+class Left(NamedTuple):
+    """Orders that the filtered correction leaves in a run, against those that the stored response allows."""
+
+    square: float
+    """Sum of the squares of their amplitudes, less the noise; arcsec^2."""
+    allowed: float
+    """The same for a response that is as different as `DIFFERENT`, filter error and intervals included."""
+
+
+def left_by_filter(
+    stored: Response, run: Harmonics, orders: Sequence[int], amplitudes_arcsec: Sequence[float], ratio: float
+) -> Left:
+    """Returns what the filtered correction leaves of the corrected orders in a run.
+
+    ``run`` is that of the load angle predicted from the motor encoder, so that a change of the gear does not
+    show; ``amplitudes_arcsec`` are those of the model. Orders beyond the known range count nothing.
+    """
+    hertz = order_hz(orders, run.speed_deg_s, ratio)
+    known = np.array(stored.frequency_hz)
+    values, _ = _at(stored, known)
+    late = np.exp(-2j * math.pi * known * stored.following_lag_ms / 1000.0)
+    own = abs(1.0 - gain(stored.filter, known, stored.cycle_ms / 1000.0) * values / late)
+    share = (
+        DIFFERENT**2 + np.interp(hertz, known, own) ** 2 + np.interp(hertz, known, stored.uncertainty) ** 2
+    )
+    corrected = hertz <= stored.known_to_hz
+    noise = 2.0 * run.deviations**2
+    return Left(
+        float(np.sum((abs(run.amplitudes) ** 2 - noise)[corrected])),
+        float(np.sum((np.array(amplitudes_arcsec) ** 2 * share)[corrected])),
+    )
 
 
 def _at(response: Response, hertz: FloatArray) -> tuple[ComplexArray, FloatArray]:

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from hdbridge.analysis.response import (
+    LEAST_ARCSEC,
     STOP,
     Harmonics,
     Limits,
@@ -19,6 +20,7 @@ from hdbridge.analysis.response import (
     following_lag_s,
     gain,
     harmonics,
+    motor_orders,
     order_hz,
     response_of,
 )
@@ -30,7 +32,6 @@ from hdbridge.control.rig import Rig, bench_on
 from hdbridge.drive.drive import Drive
 from hdbridge.drive.gains import changed_gains, read_gains
 from hdbridge.effects import InertialWindup, Motion, Synchronous
-from hdbridge.effects.orders import MotorOrder, OrderSeries
 from hdbridge.errors import InputError
 from hdbridge.model import TransmissionModel
 from hdbridge.model.response import Response
@@ -39,8 +40,6 @@ from hdbridge.procedures.path_test import PathRun, PathTest
 from hdbridge.procedures.rehearsal import rehearse
 from hdbridge.units import ARCSEC_PER_DEG
 
-LEAST_ARCSEC = 0.2
-"""Minimum amplitude of the orders that are evaluated."""
 CHANCE = 1.05
 """Factor by which a ripple must be larger to count as larger."""
 FADED = 0.5
@@ -461,17 +460,6 @@ class _Runner:
 def wind_up_of(model: TransmissionModel) -> InertialWindup | None:
     """Returns the wind-up of the load in acceleration that a model has."""
     return next((each for each in model.effects if isinstance(each, InertialWindup)), None)
-
-
-def motor_orders(model: TransmissionModel) -> list[MotorOrder]:
-    """Returns the motor orders that the model corrects, by number, from `LEAST_ARCSEC` up."""
-    series = [
-        each
-        for each in model.effects
-        if isinstance(each, OrderSeries) and each.is_compensable() and each.turns_per_motor_turn() == 1.0
-    ]
-    found = {order.order: order for each in series for order in each.orders}
-    return [found[number] for number in sorted(found) if found[number].amplitude_arcsec >= LEAST_ARCSEC]
 
 
 def predicted_run(run: EvenRun, model: TransmissionModel) -> EvenRun:

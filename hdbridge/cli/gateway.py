@@ -13,6 +13,8 @@ from hdbridge.cli.options import JsonOption, MachineArgument, console, notes, wr
 from hdbridge.errors import DriveError, InputError
 
 if TYPE_CHECKING:
+    from canopen.objectdictionary import ObjectDictionary
+
     from hdbridge.axis import AxisConfig
     from hdbridge.daemon.machinefile import GatewaySettings
     from hdbridge.drive.link import Frame
@@ -106,16 +108,11 @@ def doctor(
 
     Exit status 4 when the master made a mistake, or nothing of the axis was heard.
     """
-    from hdbridge.daemon.gateway.objects import eds as text_of
     from hdbridge.daemon.gateway.trace import Trace
-    from hdbridge.files.edsfile import read_eds
 
     config, settings = gateway_axis(machine, axis)
     node_id = settings.nodes[config.name]
-    with TemporaryDirectory(prefix="hdbridge-gateway-") as folder:
-        path = Path(folder) / "gateway.eds"
-        path.write_text(text_of(config, settings), encoding="utf-8")
-        trace = Trace(node_id, read_eds(path, node_id).dictionary)
+    trace = Trace(node_id, eds_of(config, settings))
     rows: list[dict[str, Any]] = []
     begun_s: float | None = None
     frames = _logged(log) if log is not None else _heard(settings, duration_s)
@@ -143,6 +140,17 @@ def doctor(
             f"node {node_id}: {trace.mistakes.total()} mistakes of the other master; most often: "
             f"{trace.mistakes.most_common(1)[0][0]}"
         )
+
+
+def eds_of(axis: AxisConfig, settings: GatewaySettings) -> ObjectDictionary:
+    """The object dictionary of a gateway axis, read from its EDS as another master does."""
+    from hdbridge.daemon.gateway.objects import eds as text_of
+    from hdbridge.files.edsfile import read_eds
+
+    with TemporaryDirectory(prefix="hdbridge-gateway-") as folder:
+        path = Path(folder) / "gateway.eds"
+        path.write_text(text_of(axis, settings), encoding="utf-8")
+        return read_eds(path, settings.nodes[axis.name]).dictionary
 
 
 def _heard(settings: GatewaySettings, duration_s: float) -> Iterator[Frame]:

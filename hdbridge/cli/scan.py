@@ -70,6 +70,7 @@ def scan(
 
     Exit status 4 when no node was found, or when PROFILE's drive is not among them.
     """
+    from hdbridge.axis import BusConfig
     from hdbridge.bringup.match import compare
     from hdbridge.bringup.scan import scan_bus
     from hdbridge.drive.link import Link
@@ -81,7 +82,8 @@ def scan(
     elif simulate or interface is None or channel is None:
         raise InputError("scan needs a bus: give a PROFILE, or --interface and --channel (socketcan, can0)")
     else:
-        opened = bare_bus(interface, channel, bitrate_bps, force=force)
+        named = BusConfig(interface=interface, channel=channel, bitrate_bps=bitrate_bps)
+        opened = bare_bus(named, force=force)
     with opened as (bus, clock), progress_bar() as bar:
         link = Link(bus, clock)
         task = bar.add_task("asking nodes", total=1.0)

@@ -213,17 +213,13 @@ def simulated_by(files: Profile, truth: Path | None) -> Path:
 
 
 @contextmanager
-def bare_bus(
-    interface: str, channel: str, bitrate_bps: int | None, *, force: bool
-) -> Iterator[tuple[can.BusABC, Clock]]:
-    """Yields a bus without an axis file, and the monotonic clock.
+def bare_bus(settings: BusConfig, *, force: bool) -> Iterator[tuple[can.BusABC, Clock]]:
+    """Yields a bus that is not an axis's, and the monotonic clock.
 
     With ``force``, the bus is opened even if another process on this computer masters it.
     """
-    from hdbridge.axis import BusConfig
     from hdbridge.drive.link import check_interface, open_bus
 
-    check_interface(interface, "--interface")
-    settings = BusConfig(interface=interface, channel=channel, bitrate_bps=bitrate_bps)
+    check_interface(settings.interface, "--interface")
     with open_bus(settings, shared=force) as bus:
         yield bus, MonotonicClock()

@@ -136,6 +136,14 @@ def test_a_recording_of_which_recording_yaml_is_missing_is_not_complete():
     assert list(recordings_among(["s3://b/recording.yaml", "s3://b/r.csv"])) == ["s3://b"]
 
 
+def test_a_name_with_brackets_is_a_name_in_a_manifest(tmp_path):
+    (tmp_path / "a[1].csv").write_text("time_s\n")
+    (tmp_path / "m.csv").write_text("path,joint\na[1].csv,A\nmissing.csv,A\n")
+    here, missing = find_sources([], tmp_path / "m.csv")
+    assert here.stamp
+    assert missing.stamp is None
+
+
 def test_a_file_that_grows_waits_until_it_does_not(place, here):
     dataset = Dataset(place.parent / "out")
     whole = (place / "a.csv.gz").read_bytes()

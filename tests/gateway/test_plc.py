@@ -11,6 +11,7 @@ from support.gateway import COUNTS_PER_DEG, NODE, GatewayBench, gateway_bench
 from support.service import play
 
 from hdbridge.daemon.memory import CommandKind
+from hdbridge.motion import MotionMode
 
 STATE, ENABLED, FAULT, OFF = 0x6F, 0x27, 0x08, 0x40
 
@@ -419,6 +420,44 @@ def test_power_that_the_inner_drive_refuses_is_a_fault_until_it_is_reset(tmp_pat
         assert set(plc.emergencies) <= {0xFF02, 0xFF00}
         assert plc.emergencies
         await reset(bench)
+
+    scene(tmp_path, scenario)
+
+
+def nmt_stop(bench):
+    bench.plc.send(0, bytes((2, NODE)))
+
+
+def disable_voltage(bench):
+    bench.plc.controlword = 0x00
+
+
+def lost_sync(bench):
+    bench.plc.cycling = False
+
+
+def client_by_force(bench):
+    bench.bridge.lease.take("a person", force=True)
+
+
+@pytest.mark.parametrize("withdraw", [nmt_stop, disable_voltage, lost_sync, client_by_force])
+def test_a_request_for_power_that_is_withdrawn_meanwhile_is_not_followed(tmp_path, withdraw):
+    async def scenario(bench):
+        plc = bench.plc
+        plc.begin()
+        for word, bits in ((0x06, 0x21), (0x07, 0x23)):
+            plc.controlword = word
+            await bench.until(lambda bits=bits: plc.statusword & STATE == bits)
+        reader = bench.daemon.memory.reader()
+        plc.controlword = 0x0F
+        await bench.until(lambda: bench.daemon.states[0].name == "ENABLING")
+        withdraw(bench)
+        await bench.wait(1.0)
+        samples, _ = reader.read()
+        assert not any(samples["axes"][:, 0]["mode"] == MotionMode.FOLLOW)
+        await stands(bench)
+        if withdraw is not client_by_force:  # who has it now, and at rest
+            assert bench.daemon.states[0].name == "DISABLED"
 
     scene(tmp_path, scenario)
 

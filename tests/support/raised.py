@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 
 from hdbridge import Bench, Drive
-from hdbridge.analysis.response import Trial, harmonics, response_of
+from hdbridge.analysis.response import Trial, harmonics, motor_orders, response_of
 from hdbridge.axis import AxisConfig
-from hdbridge.calibration.motion import limits_of, motor_orders
+from hdbridge.calibration.motion import limits_of
 from hdbridge.model import TransmissionModel
 from hdbridge.model.response import Response
 from hdbridge.procedures.even_speed import EvenSpeed

@@ -1,12 +1,11 @@
 """Figures of a fleet: how right it is, what its prior brings, what the engine costs.
 
 .venv/bin/python tools/bench/fleet.py score FLEET OUT [--limit ARCSEC]
-.venv/bin/python tools/bench/fleet.py prior FLEET OUT [--most 12]
+.venv/bin/python tools/bench/fleet.py prior FLEET OUT
 .venv/bin/python tools/bench/fleet.py ratios [--samples 32000] [--tasks 6]
 
-FLEET is a folder of `hdbridge fleet simulate`, OUT the result of a run over it; `prior` needs a FLEET of
-another seed than the one of OUT. All figures are of processor time, so
-they hold on a computer that others use too.
+FLEET is a folder of `hdbridge fleet simulate`, OUT the result of a run over it. The ratios are of
+processor time, so they hold on a computer that others use too.
 """
 
 from __future__ import annotations
@@ -17,29 +16,31 @@ import os
 import sys
 import tempfile
 import time
-from dataclasses import replace
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import psutil
+from scipy.special import logit
 
 sys.path.insert(0, str(Path(__file__).parent))
 sys.path.insert(0, str(Path(__file__).parents[2] / "tests"))
 from diagnose import record
 from support import plant
 
-from hdbridge.analysis.diagnosis import diagnose
-from hdbridge.calibration import fit
+from hdbridge.analysis.findings import Parameter
+from hdbridge.analysis.probability import Prior, updated
+from hdbridge.analysis.scales import Scales
 from hdbridge.fleet import engine
 from hdbridge.fleet.dataset import Dataset
-from hdbridge.fleet.diagnosing import read
-from hdbridge.fleet.prior import read_prior
+from hdbridge.fleet.prior import joint_prior, prior_rows
 from hdbridge.fleet.simulate import YEAR_HOURS, peak_at_0_hours_arcsec
-from hdbridge.fleet.sources import Source, read_manifest
-from hdbridge.fleet.summary import summarise
+from hdbridge.fleet.sources import Source
+from hdbridge.fleet.summary import own_recordings, summarise
 from hdbridge.records.record import Record
 
+FOLDS = 5
 DETECTABLE = 2
 """Recordings in which a cause must exceed the limit of detection before a joint can be listed for it."""
 
@@ -113,57 +114,62 @@ def _detectable(joint: dict[str, Any], rows: list[dict[str, Any]]) -> bool:
     return count >= DETECTABLE
 
 
-def prior(fleet: Path, out: Path, most: int) -> None:
-    """Diagnoses the last recordings of fresh joints with and without the fleet's prior; prints the gain."""
+def prior(fleet: Path, out: Path) -> None:
+    """Weighs the names of each joint's recordings by a prior from the other joints; counts right and wrong.
 
-    answers = json.loads((fleet / "answers.json").read_text())
-    joints = {each["name"]: each for each in answers["joints"]}
-    sources: dict[str, list[Any]] = {}
-    for each in read_manifest(fleet / "manifest.csv").values():
-        sources.setdefault(each.joint or "", []).append(each)
-    totals = {name: {"right": 0, "wrong": 0, "missed": 0} for name in ("without", "with")}
-    ratios: list[float] = []
-    done = 0
-    for name, own in sorted(sources.items()):
-        if name in answers["swapped"] or joints[name]["turned_at"] is not None:
+    Recordings are not fitted again without the names that fall away, as `diagnose --prior` does.
+    """
+    rows = [row for row in Dataset(out).recordings() if row["joint"]]
+    truth = {each["name"]: each for each in json.loads((fleet / "answers.json").read_text())["joints"]}
+    own = own_recordings(rows)[0]
+    scales = Scales()
+    counts = {each: Counter() for each in ("without", "with")}
+    widths: list[float] = []
+    for fold in range(FOLDS):
+        out_of = set(list(own)[fold::FOLDS])
+        known = prior_rows([row for row in rows if row["joint"] not in out_of])
+        groups = {row["group"] for row in known if row["attribute"] == "batch"}
+        for name in out_of:
+            batch = own[name][-1]["batch"]
+            of_joint = joint_prior(known, {"batch": batch} if batch in groups else {})
+            for row in own[name]:
+                _count(row, truth[name]["cause"], of_joint, scales, counts, widths)
+    recordings = sum(map(len, own.values()))
+    print(f"{recordings} recordings of {len(own)} joints, with the prior of the other joints, {FOLDS} folds")
+    for each, found in counts.items():
+        print(
+            f"  {each}: names right {found['right']}, wrong {found['wrong']}; causes missed {found['missed']}"
+        )
+    if widths:
+        narrower = np.mean(np.array(widths) < 0.95)
+        print(
+            f"  {len(widths)} intervals of right causes: width with over without, median "
+            f"{np.median(widths):.2f}; {narrower:.0%} narrower by 5 % or more"
+        )
+
+
+def _count(
+    row: Any, true: str | None, prior: Prior, scales: Scales, counts: dict[str, Any], widths: list[float]
+) -> None:
+    """Counts the names of one recording, and the widths of the intervals of the right cause."""
+    right = dict.fromkeys(counts, False)
+    for each in row["findings"]:
+        if each["cause"] == "unexplained":
             continue
-        own.sort(key=lambda each: each.order)
-        try:
-            model = fit(read(own[0]), ratio=own[0].ratio).model
-            recording = replace(read(own[-1]), ratio=own[-1].ratio)
-        except Exception as problem:  # damaged on purpose
-            print(f"{name}: left out: {problem}")
-            continue
-        known = read_prior(out / "fleet.parquet", {"batch": joints[name]["batch"]})
-        results = {"without": diagnose(recording, model), "with": diagnose(recording, model, prior=known)}
-        true = joints[name]["cause"]
-        for kind, result in results.items():
-            named = [each for each in result.findings if each.cause != "unexplained"]
-            hits = [true in (each.cause, *each.aliases) for each in named]
-            totals[kind]["right"] += any(hits)
-            totals[kind]["wrong"] += len(hits) - sum(hits)
-            totals[kind]["missed"] += bool(true) and not any(hits)
-        ratios += _widths(results["without"], results["with"])
-        done += 1
-        names = {kind: [each.cause for each in result.findings] for kind, result in results.items()}
-        print(f"{name} ({true}): {names['without']} -> {names['with']}", flush=True)
-        if done >= most:
-            break
-    print(f"{done} fresh joints, last recording: {totals}")
-    if ratios:
-        print(f"width of {len(ratios)} intervals, with over without: median {np.median(ratios):.2f}, "
-              f"{np.mean(np.array(ratios) < 0.99):.0%} narrower")  # fmt: skip
-
-
-def _widths(without: Any, with_prior: Any) -> list[float]:
-    found = {each.cause: each for each in with_prior.findings}
-    return [
-        (other.high - other.low) / (own.high - own.low)
-        for each in without.findings
-        if each.cause in found
-        for name, own in each.parameters.items()
-        if (other := found[each.cause].parameters.get(name)) and 0.0 < own.high - own.low < np.inf
-    ]
+        score = float(logit(each["probability"]))
+        with_prior = updated(score, prior.log_odds(each["cause"], scales), scales)
+        hit = true in (each["cause"], *(each["aliases"] or ()))
+        for kind, probability in (("without", each["probability"]), ("with", with_prior)):
+            if probability >= scales.named_from:
+                counts[kind]["right" if hit else "wrong"] += 1
+                right[kind] |= hit
+        for one in each["parameters"] if hit else ():
+            if (each["cause"], one["name"]) in prior.ranges and 0.0 < one["high"] - one["low"] < np.inf:
+                given = Parameter(one["value"], one["unit"], one["low"], one["high"])
+                found = given.combined(*prior.ranges[each["cause"], one["name"]])
+                widths.append((found.high - found.low) / (given.high - given.low))
+    for kind, hit in right.items():
+        counts[kind]["missed"] += bool(true) and not hit
 
 
 def ratios(samples: int, tasks: int) -> None:
@@ -241,7 +247,6 @@ def main() -> None:
         each.add_argument("fleet", type=Path)
         each.add_argument("out", type=Path)
     kinds.choices["score"].add_argument("--limit", type=float, default=10.0)
-    kinds.choices["prior"].add_argument("--most", type=int, default=12)
     engine = kinds.add_parser("ratios")
     engine.add_argument("--samples", type=int, default=32_000)
     engine.add_argument("--tasks", type=int, default=6)
@@ -249,7 +254,7 @@ def main() -> None:
     if given.kind == "score":
         score(given.fleet, given.out, given.limit)
     elif given.kind == "prior":
-        prior(given.fleet, given.out, given.most)
+        prior(given.fleet, given.out)
     else:
         ratios(given.samples, given.tasks)
 

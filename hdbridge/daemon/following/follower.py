@@ -19,8 +19,9 @@ from hdbridge.axis.channels import BY_KEY
 from hdbridge.client import messages
 from hdbridge.daemon.following.adaptation import Adaptation, Entry, Proposal
 from hdbridge.daemon.following.health import DRIVEN, EncoderHealth, EncoderStatus, held_out_arcsec, in_states
-from hdbridge.daemon.following.judging import Raised, Watch
+from hdbridge.daemon.following.judging import Raised, Verdict, Watch
 from hdbridge.daemon.following.measuring import DriftModel, Measuring
+from hdbridge.daemon.following.servo import ServoWatch
 from hdbridge.daemon.following.settings import AdaptationSettings, Mode
 from hdbridge.daemon.following.statefile import AdaptationFiles
 from hdbridge.daemon.loop.states import AxisState
@@ -45,6 +46,10 @@ class Outcome(NamedTuple):
     proposal: Proposal | None = None
 
 
+NOTHING: Final = Outcome([])
+"""Outcome of samples that are not evaluated yet."""
+
+
 class Follower:
     """Follows one axis and one committed model. Call all methods from one thread."""
 
@@ -62,7 +67,7 @@ class Follower:
         self.adaptation: Adaptation | None = None
         self.updated: datetime | None = None
         """Time at which the model in use was last changed."""
-        self._index = index
+        self._axis, self._index = axis.name, index
         self._settings = settings or AdaptationSettings()
         self._drift = DriftModel(model)
         motor_count = axis.motor_encoder.resolution_arcsec / axis.gear.ratio
@@ -71,6 +76,7 @@ class Follower:
         noise = max(held_out_arcsec(model), motor_count / UNIFORM)
         self.watch = Watch(axis.name, self._drift, noise)
         channels = tuple(BY_KEY[key] for key in axis.channels)
+        self._servo = ServoWatch(axis, model)
         self._measuring = Measuring(self._drift, self._settings.slow_deg_s, channels)
         self._waiting: list[SampleArray] = []
         self._next_cycle: int | None = None
@@ -111,7 +117,7 @@ class Follower:
         if len(samples):
             self._waiting.append(samples)
         if sum(map(len, self._waiting)) < SAMPLES_TOGETHER:
-            return Outcome([])
+            return NOTHING
         together, self._waiting = joined_samples(self._waiting), []
         return self.advance(together, self.health.take(together))
 
@@ -120,12 +126,17 @@ class Follower:
         axis: Any = samples["axes"][:, self._index]
         cycle, times_s = samples["cycle"], 1e-9 * samples["time_ns"].astype(np.float64)
         self._now_s = float(times_s[-1])
+        joined = self._next_cycle in {None, int(cycle[0])} and int(cycle[-1] - cycle[0]) == len(cycle) - 1
+        servo = self._servo.take(axis, joined=joined)
         first = self._begin_of_path(axis, cycle)
         axis, times_s = axis[first:], times_s[first:]
         stopped = axis["fault"] != NO_FAULT
         usable = ((axis["flags"] & NEEDED) == NEEDED) & (axis["state"] == AxisState.ENABLED) & ~stopped
         observations = self._measuring.take(times_s, axis, usable & (status.fault is None))
         raised = self.watch.take(observations, status, self._now_s)
+        if servo is not None:
+            verdict = Verdict.RETUNED if self._servo.retuned else self.watch.verdict
+            raised.append(Raised(self._now_s, self._axis, verdict, servo))
         proposal = None
         if self.adaptation is not None:
             fault = "the supervision has stopped the axis" if np.any(stopped) else status.reason

@@ -38,7 +38,7 @@ from numpy.typing import NDArray
 from hdbridge.analysis.linear import orthonormal
 from hdbridge.analysis.readings import jitter_deg
 from hdbridge.axis import AxisConfig
-from hdbridge.daemon.following.estimator import partial_fit
+from hdbridge.daemon.following.estimator import Partial, partial_fit
 from hdbridge.daemon.loop.states import AxisState
 from hdbridge.daemon.memory import SampleArray, SampleFlag, joined_samples
 from hdbridge.effects import BoolArray, FloatArray
@@ -91,6 +91,26 @@ STEP_S = 180.0
 """Time span, up to now, in which a step of the zero is searched."""
 UNTESTED_ARCSEC = 3.0
 """Assumed residual of a model without a held-out result."""
+SIGMAS = 8.0
+"""Standard deviations of noise that no reading exceeds: probability 1e-15."""
+NOISE_RATIO = 4.0
+"""Ratio of jitter to its usual value; normal is 1, a damaged track gives 10."""
+SPIKES = 3
+"""Readings that jump there and back within ten seconds; so many are not chance."""
+FROZEN_ARCSEC = 120.0
+"""Load travel within which the reading must change; more than any backlash."""
+FROZEN_COUNTS = 20.0
+"""Minimum of the same, in counts of the load encoder."""
+ZERO_RATE_ARCSEC_MIN = 3.0
+"""Drift rate of the zero. Warming up moves it by 5 to 60 arcsec in 10 to 60 minutes, typically by 1 per
+minute (`effects.zero_drift`).
+"""
+MAX_ZERO_ARCSEC = 60.0
+"""Total drift of the zero."""
+RECOVERED_S = 10.0
+"""Time for which a reading must be good before a fault ends."""
+STANDING_DEG_S = 1e-6
+"""Speed of the load target below which it is at rest."""
 
 Residuals = NDArray[np.void]
 """Samples of one axis with the dtype `RESIDUAL`, shape (n,)."""
@@ -154,7 +174,7 @@ class Jump(NamedTuple):
     allowed_arcsec: float
 
 
-def find_jump(found: Residuals, noise_arcsec: float, count_arcsec: float, sigmas: float) -> Jump | None:
+def find_jump(found: Residuals, noise_arcsec: float, count_arcsec: float) -> Jump | None:
     """Returns the first step of the residual that neither noise nor motion nor model can cause.
 
     ``noise_arcsec`` is the standard deviation of one reading, ``count_arcsec`` a motor encoder count at the
@@ -167,7 +187,7 @@ def find_jump(found: Residuals, noise_arcsec: float, count_arcsec: float, sigmas
     step = middle[SIDE:] - middle[:-SIDE]
     turned = _ranges(span, found["motor_deg"])
     allowed = (
-        sigmas * noise_arcsec * MEDIAN_ERROR * np.sqrt(2.0 / SIDE)
+        SIGMAS * noise_arcsec * MEDIAN_ERROR * np.sqrt(2.0 / SIDE)
         + count_arcsec
         + _motion_arcsec(found, span)
         + UNMODELLED_ARCSEC * np.minimum(turned / UNMODELLED_DEG, 1.0)
@@ -183,13 +203,13 @@ def find_jump(found: Residuals, noise_arcsec: float, count_arcsec: float, sigmas
     return Jump(row + SIDE, float(step[row]), float(allowed[row]))
 
 
-def misread(found: Residuals, noise_arcsec: float, count_arcsec: float, sigmas: float) -> int:
+def misread(found: Residuals, noise_arcsec: float, count_arcsec: float) -> int:
     """Returns the number of samples that jump away and return with the next one or two."""
     if len(found) < SIDE:
         return 0
     middle = slice(SIDE // 2, len(found) - SIDE // 2)
     away = np.abs(found["residual_arcsec"][middle] - _median(found["residual_arcsec"]))
-    allowed = sigmas * noise_arcsec + count_arcsec + _motion_arcsec(found, SIDE)
+    allowed = SIGMAS * noise_arcsec + count_arcsec + _motion_arcsec(found, SIDE)
     return int(np.count_nonzero((away > allowed) & np.all(_windows(found["usable"], SIDE), axis=0)))
 
 
@@ -236,40 +256,27 @@ def _motion_arcsec(found: Residuals, width: int) -> FloatArray:
     return PREDICTED_SHARE * predicted + SHAKE_S * ARCSEC_PER_DEG * speed
 
 
-class Trend(NamedTuple):
-    """Trend of the residual's zero, corrected for direction and speed of motion."""
-
-    rate_arcsec_min: float
-    error_arcsec_min: float
-    zero_arcsec: float
-    """Zero in the middle of the time span."""
-
-
-class Step(NamedTuple):
-    """Step of the residual's zero between two blocks."""
-
-    time_s: float
-    by_arcsec: float
-    error_arcsec: float
-
-
 def trend(
     time_s: FloatArray, residual_arcsec: FloatArray, direction: FloatArray, velocity_deg_s: FloatArray
-) -> Trend | None:
-    """Fits a trend to block means; returns None if it is not separable from the motion."""
+) -> tuple[Partial, float] | None:
+    """Fits a trend to block means, corrected for direction and speed of motion.
+
+    Returns the rate in arcsec per minute and the zero in the middle of the time span; None if they are not
+    separable from the motion.
+    """
     minutes = (time_s - float(np.mean(time_s))) / 60.0
     plain = _motion_columns(direction, velocity_deg_s)
     rate = partial_fit(minutes, plain, residual_arcsec)
     zero = partial_fit(plain[:, 0], np.column_stack([minutes, plain[:, 1:]]), residual_arcsec)
     if math.isinf(rate.error) or math.isinf(zero.error):
         return None
-    return Trend(rate.value, rate.error, zero.value)
+    return rate, zero.value
 
 
 def find_step(
     time_s: FloatArray, residual_arcsec: FloatArray, direction: FloatArray, velocity_deg_s: FloatArray
-) -> Step | None:
-    """Returns the step in the block means, if a step fits far better than a trend."""
+) -> tuple[float, Partial] | None:
+    """Returns time and size of a step of the zero in block means, if it fits far better than a trend."""
     plain = _motion_columns(direction, velocity_deg_s)
     basis = orthonormal(plain)
     rest = residual_arcsec - basis @ (basis.T @ residual_arcsec)
@@ -290,7 +297,7 @@ def find_step(
         return None
     if step.mean_square > STEP_BETTER * slope.mean_square:
         return None
-    return Step(float(time_s[row]), step.value, step.error)
+    return float(time_s[row]), step
 
 
 def _motion_columns(direction: FloatArray, velocity_deg_s: FloatArray) -> FloatArray:
@@ -313,28 +320,6 @@ class EncoderFault(Enum):
 
 
 LATCHED = frozenset({EncoderFault.JUMPED, EncoderFault.DRIFTING})
-
-
-SIGMAS = 8.0
-"""Standard deviations of noise that no reading exceeds: probability 1e-15."""
-NOISE_RATIO = 4.0
-"""Ratio of jitter to its usual value; normal is 1, a damaged track gives 10."""
-SPIKES = 3
-"""Readings that jump there and back within ten seconds; so many are not chance."""
-FROZEN_ARCSEC = 120.0
-"""Load travel within which the reading must change; more than any backlash."""
-FROZEN_COUNTS = 20.0
-"""Minimum of the same, in counts of the load encoder."""
-ZERO_RATE_ARCSEC_MIN = 3.0
-"""Drift rate of the zero. Warming up moves it by 5 to 60 arcsec in 10 to 60 minutes, typically by 1 per
-minute (`effects.zero_drift`).
-"""
-MAX_ZERO_ARCSEC = 60.0
-"""Total drift of the zero."""
-RECOVERED_S = 10.0
-"""Time for which a reading must be good before a fault ends."""
-STANDING_DEG_S = 1e-6
-"""Speed of the load target below which it is at rest."""
 
 
 class EncoderStatus(NamedTuple):
@@ -465,10 +450,9 @@ class EncoderHealth:
 
     def _judge_steps(self, found: Residuals) -> None:
         noise = max(self._usual(standing=bool(np.all(_standing(found)))), local_noise_arcsec(found))
-        jump = find_jump(found, noise, self._count_arcsec, SIGMAS)
-        if (
-            jump is not None and self.status.fault is not EncoderFault.FROZEN
-        ):  # a frozen reading ends with a jump
+        jump = find_jump(found, noise, self._count_arcsec)
+        # A frozen reading ends with a jump.
+        if jump is not None and self.status.fault is not EncoderFault.FROZEN:
             moved = float(np.ptp(found["motor_deg"][jump.row - SIDE : jump.row + SIDE])) / self._ratio
             self._raise(
                 EncoderFault.JUMPED,
@@ -477,7 +461,7 @@ class EncoderHealth:
                 f"at most {jump.allowed_arcsec:.1f})",
             )
         # Excludes the samples that the next batch repeats.
-        wild = misread(found[SIDE:], noise, self._count_arcsec, SIGMAS)
+        wild = misread(found[SIDE:], noise, self._count_arcsec)
         self._spikes.extend([self._now_s] * wild)
         while self._spikes and self._spikes[0] < self._now_s - 10.0:
             self._spikes.popleft()
@@ -538,16 +522,16 @@ class EncoderHealth:
             return
         zero.new = 0
         blocks = np.array(zero.blocks, dtype=np.float64)
-        found = [trend(*blocks[-last:].T) for last in (len(blocks), TREND_BLOCKS)]
-        step = find_step(*blocks[blocks[:, 0] > blocks[-1, 0] - STEP_S].T)
-        if step is not None:
+        found = find_step(*blocks[blocks[:, 0] > blocks[-1, 0] - STEP_S].T)
+        if found is not None:
+            time_s, step = found
             self._raise(
                 EncoderFault.JUMPED,
-                f"its zero stepped by {step.by_arcsec:+.1f} arcsec (standard error {step.error_arcsec:.2f}) "
-                f"near {step.time_s:.1f} s; a gear's does not step",
+                f"its zero stepped by {step.value:+.1f} arcsec (standard error {step.error:.2f}) near "
+                f"{time_s:.1f} s; a gear's does not step",
             )
-        elif found[0] is not None and found[1] is not None:
-            self._judge_trend(found[0], found[1], np.ptp(blocks[:, 0]))
+        else:
+            self._judge_trend(blocks)
 
     def _direction(self, speed_deg_s: float) -> float:
         """Returns the direction of the present motion, or at rest that of the last one."""
@@ -555,24 +539,26 @@ class EncoderHealth:
             return float(np.sign(speed_deg_s))
         return self._zero.blocks[-1][2]
 
-    def _judge_trend(self, slow: Trend, fast: Trend, span_s: float) -> None:
+    def _judge_trend(self, blocks: FloatArray) -> None:
         zero = self._zero
-        if zero.reference_arcsec is None:
-            zero.reference_arcsec = slow.zero_arcsec
-        away = fast.zero_arcsec - zero.reference_arcsec
-        found = max(slow, fast, key=lambda each: abs(each.rate_arcsec_min) / each.error_arcsec_min)
-        runs = abs(found.rate_arcsec_min) > max(ZERO_RATE_ARCSEC_MIN, SIGMAS * found.error_arcsec_min)
-        # One bad move can affect two evaluations; only a drift affects a third.
-        zero.suspicions = zero.suspicions + 1 if runs or abs(away) > MAX_ZERO_ARCSEC else 0
-        if zero.suspicions < 3:
+        slow, fast = (trend(*blocks[-last:].T) for last in (len(blocks), TREND_BLOCKS))
+        if slow is None or fast is None:
             return
-        self._raise(
-            EncoderFault.DRIFTING,
-            f"its zero moves by {found.rate_arcsec_min:+.2f} arcsec a minute (standard error "
-            f"{found.error_arcsec_min:.2f}, in the last {span_s / 60.0:.1f} min), {away:+.1f} arcsec since "
-            f"it was verified; a gear's moves by at most {ZERO_RATE_ARCSEC_MIN:g} a minute and "
-            f"{MAX_ZERO_ARCSEC:g} in all",
-        )
+        if zero.reference_arcsec is None:
+            zero.reference_arcsec = slow[1]
+        away = fast[1] - zero.reference_arcsec
+        rate = max(slow[0], fast[0], key=lambda each: abs(each.value) / each.error)
+        drifts = abs(rate.value) > max(ZERO_RATE_ARCSEC_MIN, SIGMAS * rate.error)
+        # One bad move can affect two evaluations; only a drift affects a third.
+        zero.suspicions = zero.suspicions + 1 if drifts or abs(away) > MAX_ZERO_ARCSEC else 0
+        if zero.suspicions >= 3:
+            minutes = float(np.ptp(blocks[:, 0])) / 60.0
+            self._raise(
+                EncoderFault.DRIFTING,
+                f"its zero moves by {rate.value:+.2f} arcsec a minute (standard error {rate.error:.2f}, in "
+                f"the last {minutes:.1f} min), {away:+.1f} arcsec since it was verified; a gear's moves by "
+                f"at most {ZERO_RATE_ARCSEC_MIN:g} a minute and {MAX_ZERO_ARCSEC:g} in all",
+            )
 
 
 def _standing(found: Residuals) -> BoolArray:

@@ -86,6 +86,8 @@ class Verdict(Enum):
     SOMETHING_CHANGED = "something changed"
     """No such change explains the measurements; a diagnosis is needed."""
     ENCODER = "the load encoder is not believed"
+    RETUNED = "measure the response in motion again"
+    """The servo does not answer as when it was measured, so the correction in motion is wrong."""
 
 
 class Raised(NamedTuple):

@@ -66,7 +66,7 @@ class ServiceAxis:
         self.commissioning = Commissioning(axis.config, core.memory, core.timing.clock)
         self.models = AxisModels(axis, core.memory.settings[index])
         self.is_prepared = False
-        """True if all SDO that precedes power is done, and no other SDO since."""
+        """True if all SDO work that precedes power is done, and no SDO transfer has followed."""
         self.motion = AxisMotion(self.link, axis.config.limits)
         self.following: Following | None = None
         """Watch and adaptation."""

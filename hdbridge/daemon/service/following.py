@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, Final, ParamSpec, TypeVar
 
 from hdbridge.client import messages
-from hdbridge.daemon.following.follower import Follower, Outcome
+from hdbridge.daemon.following.follower import NOTHING, Follower, Outcome
 from hdbridge.daemon.following.judging import WINDOW_S, Raised, Verdict
 from hdbridge.daemon.following.settings import AdaptationSettings
 from hdbridge.daemon.following.statefile import AdaptationFiles
@@ -152,8 +152,9 @@ class Following:
 
     def _process(self, samples: SampleArray) -> None:
         try:
-            if self._follower is not None:
-                self._report(self._follower.take(samples), self._follower.model)
+            follower = self._follower
+            if follower is not None and (outcome := follower.take(samples)) is not NOTHING:
+                self._report(outcome, follower.model)
                 self._publish()
         finally:
             self._taken += 1

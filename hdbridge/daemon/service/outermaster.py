@@ -87,6 +87,10 @@ class OuterMaster:
     async def _enable(self, axis: ServiceAxis, cells: OuterCells, series: int) -> None:
         try:
             await axis.enable(self._token)
+            if not self.holds() or cells[OuterCell.WANTED] != series:  # withdrawn while power was switched on
+                cells[OuterCell.REFUSED] = series
+                await axis.disable(self._token)
+                return
             await axis.link.do(CommandKind.FOLLOW, a=self._patience_s, j=series)
         except HdbridgeError:
             cells[OuterCell.REFUSED] = series

@@ -39,9 +39,10 @@ def started(folder: Path, *arguments: object) -> Iterator[subprocess.Popen[str]]
         process.communicate()
 
 
-@pytest.fixture
-def daemon(tmp_path: Path) -> Iterator[Daemon]:
+@pytest.fixture(scope="module")
+def daemon(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Daemon]:
     """A daemon on a bus of this computer that several processes share, with a simulated drive on it."""
+    tmp_path = tmp_path_factory.mktemp("lending")
     channel = f"239.74.{random.randrange(256)}.{random.randrange(1, 255)}"
     source = bundled_profile("article")
     for each in source.iterdir():
@@ -67,13 +68,18 @@ def until_off(daemon: Daemon) -> None:
     )  # fmt: skip
 
 
+def until_taken_back(daemon: Daemon, loops: int) -> None:
+    daemon.until(lambda: len(daemon.pids("control")) == loops + 1, "the bus is taken back")
+    until_off(daemon)
+
+
 def until_borrowed(daemon: Daemon, pid: int) -> None:
     bus = (daemon.state() or {})["bus"]
     until(lambda: InterfaceLock(bus["interface"], bus["channel"]).holder == pid, lambda: str(daemon.state()))
 
 
 def test_a_command_borrows_the_bus_and_the_axis_comes_back_disabled(daemon: Daemon) -> None:
-    folder = daemon.folder
+    folder, loops = daemon.folder, len(daemon.pids("control"))
     with started(folder, "sdo", "get", folder, "1000h", "--json", "-") as refused:
         _, error = refused.communicate()
         assert refused.returncode == 3
@@ -83,13 +89,12 @@ def test_a_command_borrows_the_bus_and_the_axis_comes_back_disabled(daemon: Daem
         assert command.returncode == 0, error
         assert json.loads(output)["value"] == 0x20192
         assert "lends the bus to this command" in error
-    daemon.until(lambda: len(daemon.pids("control")) == 2, "the bus is taken back")
-    until_off(daemon)
+    until_taken_back(daemon, loops)
     assert (daemon.state() or {})["bus"]["lent_to"] is None
 
 
 def test_others_see_who_has_the_bus_and_can_stop_it(daemon: Daemon) -> None:
-    folder = daemon.folder
+    folder, loops = daemon.folder, len(daemon.pids("control"))
     with started(folder, *LISTENING, folder) as borrower:
         until_borrowed(daemon, borrower.pid)
         state = daemon.state() or {}
@@ -99,18 +104,17 @@ def test_others_see_who_has_the_bus_and_can_stop_it(daemon: Daemon) -> None:
         refused = daemon.client.post("/axes/article/enable", headers={"X-Lease": lease})
         assert refused.status_code == 409
         assert "the bus is lent to process" in refused.text
+        daemon.client.delete("/lease", headers={"X-Lease": lease})
         stop = daemon.client.post("/quick-stop")
         assert "it was asked to stop its axis and to end" in stop.text
         assert borrower.wait() != 0
-    daemon.until(lambda: len(daemon.pids("control")) == 2, "the bus is taken back")
-    until_off(daemon)
+    until_taken_back(daemon, loops)
 
 
 def test_a_killed_borrower_leaves_a_disabled_axis(daemon: Daemon) -> None:
-    folder = daemon.folder
+    folder, loops = daemon.folder, len(daemon.pids("control"))
     with started(folder, *LISTENING, folder) as borrower:
         until_borrowed(daemon, borrower.pid)
         borrower.send_signal(signal.SIGKILL)
         borrower.wait()
-        daemon.until(lambda: len(daemon.pids("control")) == 2, "the bus is taken back")
-        until_off(daemon)
+        until_taken_back(daemon, loops)

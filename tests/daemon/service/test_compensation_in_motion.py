@@ -5,7 +5,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from hdbridge.daemon.service.interface import StreamPoint, WayPoint
 from support.raised import measured_response, raised_profile, ripple_arcsec
 from support.service import Service, play, stepped_service, until
 
@@ -14,7 +13,9 @@ from hdbridge.analysis.response import harmonics
 from hdbridge.control.bench import axis_view, compensation_for
 from hdbridge.daemon.service.activity import Activity, Kind
 from hdbridge.daemon.service.bridge import ServiceBridge
+from hdbridge.daemon.service.moves import WayPoint
 from hdbridge.daemon.service.rigs import DaemonRig
+from hdbridge.daemon.service.streams import StreamPoint
 from hdbridge.evaluation.stepping import Scheme
 from hdbridge.procedures.even_speed import EvenSpeed
 from hdbridge.procedures.moves import MoveTo
