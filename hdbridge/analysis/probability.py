@@ -11,9 +11,11 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
-from hdbridge.analysis.acceptance import Gate
 from hdbridge.analysis.findings import Finding
 from hdbridge.analysis.scales import Scales
+
+UNPROVEN = 0.5
+"""Highest probability of a cause that does not predict data that were held out."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,7 +43,8 @@ def coefficients(scales: Scales) -> dict[str, float]:
 
 def features(finding: Finding, largest: float, context: Context, scales: Scales) -> dict[str, float]:
     """Returns the terms of the formula by name; ``largest`` is the chi square of the largest finding."""
-    gate = finding.gate or Gate(finding.robust, scales.robust)
+    gate = finding.gate
+    assert gate is not None, "only an unexplained residual has no gate"
     return {
         "constant": 1.0,
         "strength": math.log(min(max(gate.robust, 1e-9) / gate.needed, scales.strong)),
@@ -57,7 +60,7 @@ def weighed(findings: Sequence[Finding], context: Context, scales: Scales) -> li
     largest = max((each.robust for each in findings), default=0.0)
     terms = [features(each, largest, context, scales) for each in findings]
     return [
-        replace(each, probability=probability(own, scales), terms=own)
+        replace(each, probability=min(probability(own, scales), 1.0 if each.gains else UNPROVEN), terms=own)
         for each, own in zip(findings, terms, strict=True)
     ]
 
