@@ -156,11 +156,11 @@ class Search:
         }
         toll = {each: self.scales.penalty * len(fitted.places(each)) + self.scales.enter for each in gains}
         place = min(gains, key=lambda each: gains[each] - toll[each])
-        small = self.peak(fitted, place) < self.scales.floor_arcsec
+        small = self.peak(fitted, place) < self.estimator.floor_arcsec
         # The error of a large effect's law resembles a small effect of the same kind.
         alike = [each for each in gains if each != place and effects[each].name == effects[place].name]
         share = effects[place].inexact * max((gains[each] for each in alike), default=0.0)
-        needed = max(toll[place], self.scales.leftover * max(gains.values()), share)
+        needed = max(toll[place], share)
         return None if gains[place] > needed and not small else (place, "")
 
     def _lacking(self, fitted: Fitted, place: int) -> Fitted:
@@ -189,8 +189,9 @@ class Search:
                 trial = self._with(fitted, score)
                 toll = self.scales.penalty * max(trial.free() - fitted.free(), 1) + self.scales.enter
                 net = self._gain(fitted, trial, cause) - toll
-                none = net <= 0.0 or self._too_small(trial, cause)
-                reason = "" if none else self._refusal(trial, cause)
+                none = net <= 0.0
+                small = "" if none or not self._too_small(trial, cause) else "too small to act on"
+                reason = "" if none else small or self._refusal(trial, cause)
                 if reason:
                     self.refusals[cause] = reason
                 if none or reason:
@@ -210,7 +211,7 @@ class Search:
 
     def _too_small(self, trial: Fitted, cause: str) -> bool:
         """Returns True if the last effect of this name is below the floor of practical relevance."""
-        return self.peak(trial, _last(trial, cause)) < self.scales.floor_arcsec
+        return self.peak(trial, _last(trial, cause)) < self.estimator.floor_arcsec
 
     def _refusal(self, trial: Fitted, cause: str, as_alias: bool = False) -> str:
         """Returns the reason to reject the last effect of this name, or an empty string.
@@ -273,12 +274,7 @@ class Search:
         A candidate with more parameters may gain more only after its shapes are fitted.
         """
         passed = {each.name for each in fitted.hypothesis.effects if each.usual == 1} | {left_out}
-        scores = [
-            each
-            for each in scores
-            if each.effect.name not in passed
-            and not (each.effect.waves() and each.share < self.scales.wave_share_left)
-        ]
+        scores = [each for each in scores if each.effect.name not in passed]
         net = {id(each): each.gain - self.scales.penalty * each.freedom for each in scores}
         best: dict[tuple[str, int], Score] = {}
         for each in sorted(scores, key=lambda each: -net[id(each)]):
