@@ -285,8 +285,9 @@ def _described(row: Mapping[str, Any], manifest: Path, number: int) -> Source:
     if "path" not in values:
         raise InputError(f"{manifest}:{number}: path: found nothing; expected the path of a recording")
     for name in ("path", "model"):
-        if name in values and "://" not in values[name]:
-            values[name] = str(folder / values[name])
+        if name in values:
+            remote = "://" in values[name]
+            values[name] = values[name].rstrip("/") if remote else os.path.abspath(folder / values[name])  # noqa: PTH100
     source = Source(**values)
     if source.axis and source.path.endswith(BUS_LOGS) and (folder / source.axis).exists():
         source = replace(source, axis=str(folder / source.axis))
