@@ -1,11 +1,7 @@
-"""Residuals between a recording and its replay, by channel, which a fit minimises.
+"""Residuals between a recording and its replay, by channel; their noise, their scales, and what they say.
 
 The replay has no noise, unrounded encoders and torque, and loops that close on a much finer encoder, so the
 residuals are smooth in the plant's parameters. The scale of each channel accounts for rounding and noise.
-
-Parallel replays in worker processes.
-
-Noise of a recording: the reference for a twin's residuals, and the noise of its load encoder.
 """
 
 from __future__ import annotations
@@ -463,9 +459,6 @@ def _residuals(truth: Truth, seed: Seed, place: int) -> dict[str, FloatArray]:
     assert _data is not None
     return residuals(_data[place], truth, seed)
 
-
-# ----------------------------------------------------------------
-# Noise of a recording: the reference for a twin's residuals, and the noise of its load encoder.
 
 # ----------------------------------------------------------------
 # Likelihood of a rounded reading under an unrounded simulation.

@@ -1,18 +1,12 @@
-"""Result of `fit_twin`: the simulated drive's parameters, their intervals, and the residuals.
+"""The twin of an axis: makes it from recordings, judges it, and keeps it as a file.
 
-Verdict on a twin, from its residuals in each channel on held-out legs. Pure.
-
-A fit assumes that the simulated drive can behave like the axis. The residuals show if that is so. Only a twin
-that explains every channel has the values of the axis. Any other twin replays the motion, and its values are
-those of a different drive with similar motion.
-
-The twin of an axis as a file: a truth file with provenance, stored like a model.
+A fit assumes that the simulated drive can behave like the axis. The residuals on held-out legs show if that
+is so. Only a twin that explains every channel has the values of the axis. Any other twin replays the motion,
+and its values are those of a different drive with similar motion.
 
 profiles/NAME/twin.yaml           the active twin, which `hdbridge simulate` and `--simulate` use
               pending-twin.yaml   proposed by `hdbridge twin`, not yet committed
               twin-history/       each version that was ever active, and the log
-
-Makes a twin from recordings: fit, causes by which the start was wrong, inseparable sets, residuals.
 """
 
 from __future__ import annotations
@@ -242,9 +236,6 @@ def better(before: Comparison, after: Comparison) -> Gain:
         return Gain(False, f"{where} it is no nearer to the axis than the simulation was")
     return Gain(True, f"{where} the differences from the axis are {100.0 * gain:.0f} % smaller in the mean")
 
-
-# ----------------------------------------------------------------
-# The twin of an axis as a file: a truth file with provenance, stored like a model.
 
 # ----------------------------------------------------------------
 # Difference of two twins by parameter. Pure.
