@@ -31,7 +31,7 @@ class Context:
 
 @dataclass(frozen=True, slots=True)
 class Prior:
-    """What other joints say of a cause before this record is seen (`hdbridge.fleet.prior`)."""
+    """Prior odds of a cause from other joints, before this record is seen (`hdbridge.fleet.prior`)."""
 
     right: Mapping[str, float]
     """Probability, by cause, that a name of it is right in a joint of this group."""

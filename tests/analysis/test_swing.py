@@ -41,7 +41,7 @@ def test_the_load_follows_its_base_as_the_equation_says(frequency_hz: float, dam
 
 
 def test_a_steady_acceleration_winds_the_load_up() -> None:
-    """By J / K times the acceleration: 1 / (2 pi f)^2."""
+    """Wind-up J / K per acceleration: 1 / (2 pi f)^2."""
     time_s = np.arange(2000) * 1e-3
     found = swing(0.5 * 3600.0 * 100.0 * time_s**2, time_s, [slice(0, 2000)], 40.0, 0.2)
     assert found.does_arcsec[1500] == pytest.approx(-360_000.0 / (math.tau * 40.0) ** 2, rel=1e-3)

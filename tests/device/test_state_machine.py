@@ -293,7 +293,7 @@ def lose(node: Slave, option: int) -> None:
 
 
 def after(event: str, state: str) -> tuple[str, ...]:
-    """Where CiA 402 and the option codes say that an event leads, once the axis is at rest."""
+    """State that CiA 402 and the option codes give after an event, once the axis is at rest."""
     powered = state in POWERED
     if event == "reset node":
         return (DISABLED,)

@@ -48,7 +48,7 @@ def draw(rng: Random) -> tuple[str, Any]:
 
 
 class Laws:
-    """Of one axis."""
+    """Requests to one axis."""
 
     def __init__(self, bench: GatewayBench) -> None:
         self.bench = bench

@@ -67,7 +67,7 @@ class WatchedMotor(IdealMotor):
 
 
 class Laws:
-    """What the master has asked for, from its frames alone."""
+    """Requests of the master, from its frames alone."""
 
     def __init__(self) -> None:
         self.home = 0.0

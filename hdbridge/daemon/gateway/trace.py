@@ -69,7 +69,7 @@ class Line:
     time_s: float
     text: str
     advice: str = ""
-    """What the master should do instead; empty if it has done nothing wrong."""
+    """Advice to the author of the master; empty if the master has done nothing wrong."""
 
 
 class Trace:
@@ -97,7 +97,7 @@ class Trace:
         self._heartbeat_s: dict[int, float] = {}
         self._told: set[str] = set()
         self.mistakes: Counter[str] = Counter()
-        """How often which advice was given."""
+        """Counts of each advice."""
         self._begun_s: float | None = None
         self._lines: list[Line] = []
 

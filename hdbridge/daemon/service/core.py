@@ -1,4 +1,4 @@
-"""What all parts of the service share: control process, event log, samples, clock and lease."""
+"""Parts that the whole service shares: control process, event log, samples, clock and lease."""
 
 from __future__ import annotations
 
