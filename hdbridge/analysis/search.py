@@ -17,7 +17,18 @@ from hdbridge.analysis.acceptance import all_pieces_seen, evident, gate
 from hdbridge.analysis.hypothesis import Estimator, Fitted, Hypothesis
 from hdbridge.analysis.linear import orthonormal, unknown
 from hdbridge.analysis.screening import Score, Screen, candidates, filtered, proposed, score_of
-from hdbridge.effects import CATALOGUE, Channel, Effect, Motion, Part, Sought, Start, aliases_of, in_place
+from hdbridge.effects import (
+    CATALOGUE,
+    Channel,
+    Effect,
+    FloatArray,
+    Motion,
+    Part,
+    Sought,
+    Start,
+    aliases_of,
+    in_place,
+)
 from hdbridge.units import DEG_PER_TURN
 
 MOST = 6
@@ -435,48 +446,47 @@ def waves_alike(estimator: Estimator, effects: Sequence[Effect], start: Start) -
     compared with one in time of the frequency that it has at the usual speed: at one speed they are the same.
     """
     data, most = estimator.data, estimator.scales.in_step
-    effects = [each for each in effects if _is_wave(each)]
+    effects = [each for each in effects if each.waves()]
     if not effects:
         return
     angle = effects[0].coordinate(data.motion, data.ratio).name
+
+    def span(near: Sequence[Effect]) -> FloatArray:
+        return orthonormal(np.hstack([estimator.columns(each, start) for each in near]))
+
+    def alike(effect: Effect, seen: FloatArray) -> bool:
+        does = estimator.columns(effect, start) @ effect.coefficients()
+        does -= np.mean(does)
+        return float(np.sum((does @ seen) ** 2)) > most * float(does @ does)
+
     for name in aliases_of(effects[0].name):
         kind = CATALOGUE.get(name)
-        own = [] if kind is None else in_time(kind, effects, data.motion) or [*kind.proposals(data, ())]
-        near = [each for each in own if _is_wave(each) and each.part is not Part.LOOP]
-        if not near:
+        if kind is not None and kind.sought is Sought.TONE:
+            if any(alike(each, span(at)) for each in effects if (at := in_time(kind, each, data.motion))):
+                yield name
             continue
-        if near[0].coordinate(data.motion, data.ratio).name == angle:
+        own = [] if kind is None else [*kind.proposals(data, ())]
+        near = [each for each in own if each.waves() and each.part is not Part.LOOP]
+        if near and near[0].coordinate(data.motion, data.ratio).name == angle:
             orders = {turns for each in near for turns, _, _ in each.waves()}
             if any(_share_in(each, orders) > most for each in effects):
                 yield name
-            continue
-        columns = [estimator.columns(each, start) for each in near]
-        if near[0].sought is effects[0].sought is None:
-            columns = [np.hstack(columns)]  # several orders are one effect, several tones are not
-        spans = [orthonormal(each - np.mean(each, axis=0)) for each in columns]
-        for each in effects:
-            does = estimator.columns(each, start) @ each.coefficients()
-            does -= np.mean(does)
-            if any(float(np.sum((span.T @ does) ** 2)) > most * float(does @ does) for span in spans):
+        elif near:
+            seen = span(near)
+            if any(alike(each, seen) for each in effects):
                 yield name
-                break
 
 
-def _is_wave(effect: Effect) -> bool:
-    return bool(effect.waves()) or effect.sought is Sought.TONE
-
-
-def in_time(kind: type[Effect], effects: Sequence[Effect], motion: Motion) -> list[Effect]:
-    """Returns tones of a ``kind`` at the frequencies that waves over an angle have at the median speed."""
+def in_time(kind: type[Effect], effect: Effect, motion: Motion) -> list[Effect]:
+    """Returns tones of a ``kind`` at the frequencies that an effect's waves have at the median speed."""
     speed = motion.motor_speed_deg_s
-    if kind.sought is not Sought.TONE or speed is None or not np.any(speed):
+    if speed is None or not np.any(speed):
         return []
     example = kind.candidate(1.0)
     turns_s = float(np.median(np.abs(speed[speed != 0.0]))) / DEG_PER_TURN
     return [
         example.fitted(example.coefficients(), {kind.shape[0].name: turns * turns_s})
-        for each in effects
-        for turns, _, _ in each.waves()
+        for turns, _, _ in effect.waves()
     ]
 
 
