@@ -9,14 +9,15 @@ Prints a row for each node: checks, passed, failed, not applicable.
 from __future__ import annotations
 
 import argparse
-import asyncio
 import logging
 import sys
 import tempfile
 from collections import Counter
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
+from threading import Semaphore
 from typing import Any
 
 import can
@@ -32,21 +33,41 @@ from hdbridge.conformance import Check, NodeTester, Result, Verdict, checks, run
 from hdbridge.drive.link import Link
 from hdbridge.files.edsfile import read_eds
 
-STEP_S = 0.004
-
 
 class SteppedBus(VirtualBus):
-    """The outer bus as a thread sees it that waits while the event loop of the bench turns."""
+    """The outer bus of a tester in a thread that runs only while the clock of the bench polls it."""
 
     def __init__(self, bench: GatewayBench) -> None:
         super().__init__(bench.channel)
-        self._bench, self._loop = bench, asyncio.get_running_loop()
+        self._bench, self._wake_s = bench, 0.0
+        self._turn, self._back = Semaphore(0), Semaphore(0)
+        self.is_done = False
+
+    def next_event_s(self) -> float:
+        return self._wake_s
+
+    def poll(self, now_s: float) -> None:
+        if not self.is_done and (now_s >= self._wake_s or not self.queue.empty()):
+            self._turn.release()
+            self._back.acquire()
 
     def recv(self, timeout: float | None = None) -> can.Message | None:
         end_s = self._bench.now_s + (timeout or 0.0)
         while (message := super().recv(0)) is None and self._bench.now_s < end_s:
-            asyncio.run_coroutine_threadsafe(self._bench.wait(STEP_S), self._loop).result()
+            self._wake_s = end_s
+            self._back.release()
+            self._turn.acquire()
         return message
+
+    def run(self, wanted: list[Check], path: Path) -> list[Result]:
+        """The tester's thread."""
+        self._turn.acquire()
+        try:
+            od = read_eds(path, NODE).dictionary
+            return run(NodeTester(Link(self, self._bench.daemon.clock), NODE, od=od), wanted)
+        finally:
+            self._wake_s, self.is_done = float("inf"), True
+            self._back.release()
 
 
 def whole_gateway(wanted: list[Check], folder: Path) -> list[Result]:
@@ -55,13 +76,15 @@ def whole_gateway(wanted: list[Check], folder: Path) -> list[Result]:
 
     async def scenario(bench: GatewayBench) -> None:
         async with bench.service.ready():
-            bench.daemon.clock.nodes.remove(bench.plc)
             await bench.wait(1.0)
             (path,) = folder.glob("*.eds")
-            with SteppedBus(bench) as bus:
-                od = read_eds(path, NODE).dictionary
-                tester = NodeTester(Link(bus, bench.daemon.clock), NODE, od=od)
-                found.extend(await asyncio.to_thread(run, tester, wanted))
+            nodes = bench.daemon.clock.nodes
+            with SteppedBus(bench) as bus, ThreadPoolExecutor() as threads:
+                tested = threads.submit(bus.run, wanted, path)
+                nodes[nodes.index(bench.plc)] = bus
+                while not bus.is_done:
+                    await bench.wait(0.01)
+                found.extend(tested.result())
 
     with gateway_bench(folder) as bench:
         play(scenario(bench))
