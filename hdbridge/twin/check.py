@@ -215,11 +215,11 @@ KNOWN_WARMTH = "temperature"
 """Parameter of `OWN` that is known if both twin and recording have the temperature."""
 GROWN = 1.5
 """Ratio of two misfits above which an axis has changed; smaller ones come from noise and different legs."""
-MOST = 0.5
-"""Minimum share of the growth, in squares, that a cause named by ratio explains: most of it. A servo that is
-not the axis's is off by a share of every change, so a small rest is not required."""
-SECOND = 0.25
-"""Minimum share of the whole growth that a second cause explains; less may be what the servo is off by."""
+EXPLAINED = 0.25
+"""Minimum share of the growth, in squares, that a cause named by ratio explains. A servo that is not the
+axis's is off by a share of every change, so the cause is not required to explain all of it."""
+REST = 0.5
+"""Minimum share that a second cause explains of what the first has left: most of it."""
 MOST_NAMED = 2
 """Maximum number of causes named by ratio."""
 NOTICEABLE = 2.5
@@ -359,7 +359,7 @@ def _by_ratio(
             if each != cause and not told_apart(near, fit.vector - near, legs)
         ]
         explained = left - _excess(now_grown)
-        if rivals or explained < max(MOST * left, SECOND * _excess(grown) if named else 0.0):
+        if rivals or explained < max(EXPLAINED * _excess(grown), REST * left if named else 0.0):
             break
         named, best, left, now = [*named, cause], fits[cause], _excess(now_grown), now_grown
         if max(now.values()) <= GROWN:
