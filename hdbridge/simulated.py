@@ -6,10 +6,10 @@ with simulated(axis) as drive:          # a real one: open_bus(axis.bus) as bus,
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from hdbridge.axis import AxisConfig
@@ -17,22 +17,28 @@ if TYPE_CHECKING:
 
 
 @contextmanager
-def simulated(axis: AxisConfig, truth: Path | str | None = None, seed: int = 0) -> Iterator[Drive]:
+def simulated(
+    axis: AxisConfig, truth: Path | str | None = None, seed: int = 0, **changed: Mapping[str, Any]
+) -> Iterator[Drive]:
     """Yields the drive of an axis, simulated in this process and faster than real time; not booted yet.
 
     ``truth`` describes the axis (docs/ci.md); the default is the ``twin.yaml`` next to the axis file,
-    or else the ``truth.yaml``. The same truth and seed give the same frames, bit for bit. Raises `InputError`
-    if there is no truth, or it is wrong.
+    or else the ``truth.yaml``. ``changed`` are keys of its sections that differ, such as
+    ``gear={"backlash_arcsec": 10}``. The same truth and seed give the same frames, bit for bit. Raises
+    `InputError` if there is no truth, or it is wrong.
     """
     # Loaded here, because a master of a real drive needs no simulation.
     from hdbridge.drive import Drive  # noqa: PLC0415
     from hdbridge.files.profile import Profile  # noqa: PLC0415
     from hdbridge.sim.lockstep import simulated_bench  # noqa: PLC0415
+    from hdbridge.sim.truth import Truth  # noqa: PLC0415
 
     known = Path(truth) if truth is not None else Profile.find(str(axis.path)).simulated
     source = axis.load_encoder.source.address
     with (
-        simulated_bench(known, axis.eds_path, axis.drive.node_id, seed, load_object=source) as (
+        simulated_bench(
+            Truth.load(known).changed(**changed), axis.eds_path, axis.drive.node_id, seed, load_object=source
+        ) as (
             bus,
             clock,
             _,

@@ -33,6 +33,7 @@ from hdbridge.procedures.plan import Plan
 from hdbridge.sim.lockstep import simulated_bench
 
 DEMO = Path(__file__).parents[1] / "profiles" / "demo"
+ARCSEC_PER_RAD = 180.0 * 3600.0 / np.pi
 DATE = datetime(2026, 1, 1, tzinfo=UTC)
 
 
@@ -60,8 +61,11 @@ class Outcome(NamedTuple):
     cpu_s: float
 
 
-def draw(seed: int) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Draws axis file and truth file of a random axis; motor, servo and frequencies are the demo's."""
+def draw(seed: int, presliding_arcsec: float = 0.0) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Draws axis file and truth file of a random axis; motor, servo and frequencies are the demo's.
+
+    With ``presliding_arcsec``, most of the loop is friction at the load that yields before it slips.
+    """
     rng = np.random.default_rng(seed)
     axis, truth = (yaml.safe_load((DEMO / name).read_text()) for name in ("axis.yaml", "truth.yaml"))
     ratio = float(rng.integers(60, 321)) / 2.0
@@ -104,12 +108,21 @@ def draw(seed: int) -> tuple[dict[str, Any], dict[str, Any]]:
             "start_arcsec": float(rng.uniform(-offset, offset)),
         },
     )
+    if presliding_arcsec:
+        gear = truth["gear"]
+        gear["hysteresis"].update(offset_arcsec=4.0, start_arcsec=0.0)
+        whole_nm = presliding_arcsec * gear["stiffness_nm_per_rad"] / ARCSEC_PER_RAD
+        travel_deg = float(rng.uniform(5.0, 40.0)) / ratio
+        truth["load"]["presliding"] = [
+            {"limit_nm": whole_nm * part, "travel_deg": travel_deg * stretch}
+            for part, stretch in ((0.3, 0.1), (0.3, 0.3), (0.2, 0.6), (0.2, 1.0))
+        ]
     return axis, truth
 
 
-def one(job: tuple[int, str, Path | None]) -> Outcome:
-    seed, plan, kept = job
-    axis_data, truth = draw(seed)
+def one(job: tuple[int, str, Path | None, float]) -> Outcome:
+    seed, plan, kept, presliding_arcsec = job
+    axis_data, truth = draw(seed, presliding_arcsec)
     with tempfile.TemporaryDirectory() as name:
         folder = kept / f"axis-{seed}" if kept else Path(name)
         folder.mkdir(parents=True, exist_ok=True)
@@ -209,9 +222,16 @@ def main() -> None:
     parser.add_argument("--first", type=int, default=1, help="seed of the first axis")
     parser.add_argument("--plan", default="quick")
     parser.add_argument("--workers", type=int, default=1)
+    parser.add_argument(
+        "--presliding",
+        type=float,
+        default=0.0,
+        help="arcsec of friction at the load that yields before it slips",
+    )
     parser.add_argument("--keep", type=Path, help="folder for the axes' files and recordings")
     options = parser.parse_args()
-    jobs = [(seed, options.plan, options.keep) for seed in range(options.first, options.first + options.axes)]
+    further = options.plan, options.keep, options.presliding
+    jobs = [(seed, *further) for seed in range(options.first, options.first + options.axes)]
     print(HEAD)
     print(
         "worst: largest amplitude error over its tolerance (0.15 arcsec or 2 %); !: outside its 95 % interval"

@@ -137,10 +137,10 @@ def fault_table() -> str:
 
 def translation_table() -> str:
     """Returns the place of each effect of the catalogue in a truth file."""
-    lines = ["| effect | | place in the truth file |", "|---|---|---|"]
-    for name, effect in CATALOGUE.items():
+    lines = ["| effect | place in the truth file |", "|---|---|"]
+    for name in CATALOGUE:
         places = re.sub(r"[a-z_]+\.[a-z0-9_.]+", lambda place: f"`{place[0]}`", TRANSLATED[name].counterpart)
-        lines.append(f"| `{name}` | {effect.about.title} | {places} |")
+        lines.append(f"| `{name}` | {places} |")
     return "\n".join(lines) + "\n"
 
 

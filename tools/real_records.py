@@ -29,7 +29,7 @@ from hdbridge.records.record import Record, concatenate
 from hdbridge.records.recording import Recording
 from hdbridge.sim.truth import Truth
 from hdbridge.twin.compare import Comparison, compare
-from hdbridge.twin.replay import replay_directly
+from hdbridge.twin.replay import replay
 from hdbridge.twin.translate import translate
 from hdbridge.twin.twin import Twin, fit_twin
 
@@ -131,7 +131,7 @@ def twin_of_others(recordings: Sequence[Recording], out: int) -> tuple[Twin, dic
 
 def held_against(recording: Recording, truth: Truth) -> Comparison:
     """Compares a recording with its replay."""
-    simulated = replay_directly(recording, joint_axis(), truth)
+    simulated = replay(recording, joint_axis(), truth)
     return compare(recording.record, simulated, (), NOTHING.ratio)
 
 
@@ -174,18 +174,46 @@ def _print(found: Diagnosis) -> None:
 
 
 def _leave_one_out(records: list[Record]) -> None:
-    before, after = [], []
+    before = [float(np.std(record.transmission_error_arcsec(NOTHING.ratio))) for record in records]
+    after, regression = left_out(records), regressed(records)
+    for record, one, other in zip(records, before, after, strict=True):
+        print(f"  left out {record.source}: {one:.2f} -> {other:.2f} arcsec rms")
+    print(f"  together: {_rms(before):.2f} -> {_rms(after):.2f}, by regression {_rms(regression):.2f}")
+
+
+def left_out(records: Sequence[Record]) -> list[float]:
+    """Returns the error of each record that a diagnosis of the others leaves, about its mean; rms, arcsec."""
+    left = []
     for out in records:
-        found = diagnose(
-            concatenate([each for each in records if each is not out]), NOTHING, independent_zeros=True
-        )
-        before.append(diagnose(out, NOTHING).baseline.rms_arcsec)
-        after.append(diagnose(out, found.model).baseline.rms_arcsec)
-        causes = ", ".join(each.cause for each in found.findings)
-        print(f"  left out {out.source}: {before[-1]:.2f} -> {after[-1]:.2f} arcsec rms, named {causes}")
-    print(
-        f"  together: {np.sqrt(np.mean(np.square(before))):.2f} -> {np.sqrt(np.mean(np.square(after))):.2f}"
-    )
+        others = concatenate([each for each in records if each is not out])
+        model = diagnose(others, NOTHING, independent_zeros=True).model
+        error = out.transmission_error_arcsec(NOTHING.ratio) - model.predict(out.motion(), Start.VIRGIN)
+        left.append(float(np.std(error)))
+    return left
+
+
+def regressed(records: Sequence[Record]) -> list[float]:
+    """Returns the same by least squares: orders 1 and 2 of the motor, its speed, and the load torque."""
+    columns, errors = [], []
+    for record in records:
+        motor = record.motor_position_deg
+        waves = [part(np.radians(order * motor)) for order in (1, 2) for part in (np.cos, np.sin)]
+        parts = np.column_stack([*waves, np.gradient(motor, record.time_s), record.columns["load_torque_nm"]])
+        error = record.transmission_error_arcsec(NOTHING.ratio)
+        columns.append(parts - np.mean(parts, axis=0))
+        errors.append(error - np.mean(error))
+    left = []
+    for out in range(len(records)):
+        others = [each for each in range(len(records)) if each != out]
+        fitted = np.linalg.lstsq(
+            np.vstack([columns[each] for each in others]), np.concatenate([errors[each] for each in others])
+        )[0]
+        left.append(float(np.std(errors[out] - columns[out] @ fitted)))
+    return left
+
+
+def _rms(values: Sequence[float]) -> float:
+    return math.sqrt(sum(each**2 for each in values) / len(values))
 
 
 def _damper(folder: Path, name: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

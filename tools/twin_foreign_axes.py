@@ -41,7 +41,7 @@ from hdbridge.twin.compare import compare
 from hdbridge.twin.fit import FIT_S, in_best_structure, start_of
 from hdbridge.twin.misfit import Replays, coarse, prepare
 from hdbridge.twin.parameters import default_truth
-from hdbridge.twin.replay import replay_directly
+from hdbridge.twin.replay import replay
 from hdbridge.twin.twin import fit_twin, judge
 
 
@@ -90,7 +90,7 @@ def servo_only(recording: Recording, axis: AxisConfig, begun: Truth, workers: in
 
 def shares(other: Recording, axis: AxisConfig, truth: Truth, seed: int) -> str:
     """Returns errors of following error and torque on the other motion, per cent of the signal."""
-    again = replay_directly(other, axis, without_noise(truth), seed)
+    again = replay(other, axis, without_noise(truth), seed)
     told = compare(other.record, again, other.segments, axis.gear.ratio)
     return ", ".join(
         f"{name.split('_')[0]} {100.0 * row.share:.1f} %"

@@ -240,6 +240,30 @@ def held_out(
     return replace(result, text=f"{words} {against}: {figures} on {over} left out")
 
 
+def gain_of_law(before: tuple[State, Solution], after: tuple[State, Solution]) -> Gain:
+    """Compares two laws by what a fit to the other folds leaves of each, with the nuisances refitted."""
+    design = before[0].design
+    fold, over = folds(design)
+    blocks, stretch = (
+        design.blocks,
+        design.blocks.chain if over == RECORDINGS else clusters(design.blocks, STRETCHES),
+    )
+    squares = [blocks.count * _left_out(state, solution, fold) ** 2 for state, solution in (before, after)]
+    return Gain(over, int(np.max(fold)) + 1, *sums(np.stack([blocks.count, *squares], axis=1), stretch).T)
+
+
+def _left_out(state: State, solution: Solution, fold: IntArray) -> FloatArray:
+    """Returns the residual of each block (b,), arcsec, from a fit without its fold."""
+    blocks, left = state.design.blocks, solution.residual.copy()
+    fit = Linearised(solution.jacobian, solution.residual, solution.known)
+    steps = steps_without(fit, fold, lambda rows: Precision(state.noise, blocks.picked(rows)))
+    for number, step in enumerate(steps):
+        out = fold == number
+        lost = ~np.isin(blocks.zero, blocks.zero[~out])
+        left[out] = about_zeros(fit.residual - fit.columns @ step, blocks.zero, blocks.count * lost)[out]
+    return left
+
+
 def folds(design: Design) -> tuple[IntArray, str]:
     """Assigns each block to a fold; returns the folds (b,) and a description of what is left out.
 

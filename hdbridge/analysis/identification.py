@@ -21,7 +21,17 @@ from hdbridge.analysis.orders import Family, Line, Order, Selection, System, sel
 from hdbridge.analysis.prepared import ON_THE_WAY, Measured, Samples, observe
 from hdbridge.analysis.readings import median_deviation
 from hdbridge.analysis.separable import Separable, Solution
-from hdbridge.effects import USUAL_LOOP, BoolArray, Effect, FloatArray, Start, is_ripple, ripple
+from hdbridge.effects import (
+    CATALOGUE,
+    USUAL_LOOP,
+    BoolArray,
+    Effect,
+    FloatArray,
+    Start,
+    in_place,
+    is_ripple,
+    ripple,
+)
 from hdbridge.effects.path import branches
 from hdbridge.errors import InputError
 from hdbridge.model import TransmissionModel
@@ -350,9 +360,10 @@ class FitOptions:
     """Model to compare with, and source of shapes that the data cannot determine."""
 
     def prototype(self, effect: Effect) -> Effect:
-        """Returns the active model's effect of the same name, else the effect itself."""
-        active = self.active.effects if self.active else ()
-        return next((each for each in active if each.name == effect.name), effect)
+        """Returns an effect of this kind with the parameters of the active model, else of the options."""
+        known = (*(self.active.effects if self.active else ()), *self.effects)
+        laws = (law for each in known for law in (each, *in_place(each, CATALOGUE.values())))
+        return next((law for law in laws if law.name == effect.name), effect)
 
 
 # Start of the fit: the best point of a grid over all shapes.

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from hdbridge.analysis.blocks import Design, harmonics, make_blocks
-from hdbridge.analysis.conclude import conclude, covariance, of_effect
+from hdbridge.analysis.conclude import conclude, covariance, gain_of_law, of_effect
 from hdbridge.analysis.identification import (
     LINEAR_ONLY,
     FitOptions,
@@ -35,7 +35,7 @@ from hdbridge.analysis.nuisances import (
 from hdbridge.analysis.orders import System
 from hdbridge.analysis.prepared import Measured, Samples
 from hdbridge.analysis.separable import Solution
-from hdbridge.effects import Effect, FloatArray, Start
+from hdbridge.effects import CATALOGUE, Effect, FloatArray, Start, in_place
 from hdbridge.errors import InputError
 from hdbridge.units import ARCSEC_PER_DEG
 
@@ -84,7 +84,7 @@ def fit(measured: Measured, ratio: float, options: FitOptions | None = None) -> 
             f"only {usable} of {len(samples)} samples were used: what is fast or accelerates is left out"
         )
     state = _prepare(samples, options, warnings)
-    state, solution, system = _settle(_search(state, warnings))
+    state, solution, system = _with_best_law(*_settle(_search(state, warnings)))
     solution, cov = _hold_what_is_unknown(state, solution, warnings)
     return conclude(state, solution, cov, system, warnings)
 
@@ -201,6 +201,22 @@ def _settle(state: State) -> tuple[State, Solution, System]:
     return state, solution, system
 
 
+def _with_best_law(state: State, solution: Solution, system: System) -> tuple[State, Solution, System]:
+    """Exchanges a law for an alternative that clearly better predicts what was left out of the fit."""
+    for effect in state.effects:
+        for law in in_place(effect, CATALOGUE.values()):
+            effects = tuple(law if each is effect else each for each in state.effects)
+            trial = state._replace(effects=effects, design=state.design.blurred(effects))
+            found = searched(trial.under(trial.precision(), trial.columns()), trial.model())
+            if any(each.violations() for each in found.effects):
+                continue
+            gain = gain_of_law((state, solution), (trial, found))
+            least = state.options.smallest_arcsec
+            if gain.sure and gain.before_arcsec**2 - gain.after_arcsec**2 > least**2:
+                return _settle(trial.after(found))
+    return state, solution, system
+
+
 def _value(solution: Solution, nuisance: str) -> float:
     """Returns the value of a nuisance; 0 if it is not fitted."""
     names = [each.name for each in solution.columns[: len(solution.nuisances)]]
@@ -223,7 +239,7 @@ def _hold_what_is_unknown(
                 "interval, or the law is not this gear's"
             )
         if unknown:
-            prototype = options.prototype(next(each for each in options.effects if each.name == effect.name))
+            prototype = options.prototype(effect)
             shape = {each.name: float(getattr(prototype, each.name)) for each in effect.shape}
             effects[index] = effect.fitted(effect.coefficients(), shape)
             names = [each.parameter for each in unknown]

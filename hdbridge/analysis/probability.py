@@ -11,9 +11,11 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
-from hdbridge.analysis.acceptance import Gate
 from hdbridge.analysis.findings import Finding
 from hdbridge.analysis.scales import Scales
+
+UNPROVEN = 0.5
+"""Highest probability of a cause that does not predict data that were held out."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,7 +31,7 @@ class Context:
 
 @dataclass(frozen=True, slots=True)
 class Prior:
-    """What other joints say of a cause before this record is seen (`hdbridge.fleet.prior`)."""
+    """Prior odds of a cause from other joints, before this record is seen (`hdbridge.fleet.prior`)."""
 
     right: Mapping[str, float]
     """Probability, by cause, that a name of it is right in a joint of this group."""
@@ -68,7 +70,8 @@ def coefficients(scales: Scales) -> dict[str, float]:
 
 def features(finding: Finding, largest: float, context: Context, scales: Scales) -> dict[str, float]:
     """Returns the terms of the formula by name; ``largest`` is the chi square of the largest finding."""
-    gate = finding.gate or Gate(finding.robust, scales.robust)
+    gate = finding.gate
+    assert gate is not None, "only an unexplained residual has no gate"
     return {
         "constant": 1.0,
         "strength": math.log(min(max(gate.robust, 1e-9) / gate.needed, scales.strong)),
@@ -88,17 +91,22 @@ def weighed(
     for each in findings:
         terms = features(each, largest, context, scales)
         more = prior.log_odds(each.cause, scales) if prior else 0.0
-        found = replace(each, probability=probability(terms, scales, more), terms=terms)
+        likely = min(probability(terms, scales, more), 1.0 if each.gains else UNPROVEN)
+        found = replace(each, probability=likely, terms=terms)
         weighed.append(prior.narrowed(found) if prior else found)
     return weighed
 
 
 def probability(terms: Mapping[str, float], scales: Scales, prior: float = 0.0) -> float:
-    """Returns the probability from the terms of the formula and the log odds of a prior.
+    """Returns the probability from the terms of the formula and the log odds of a prior."""
+    return updated(sum(each * terms[name] for name, each in coefficients(scales).items()), prior, scales)
+
+
+def updated(score: float, prior: float, scales: Scales) -> float:
+    """Returns the probability from the log odds of the record and of a prior.
 
     A prior does not make a name likely that the record alone does not support.
     """
-    score = sum(each * terms[name] for name, each in coefficients(scales).items())
     alone, most = 1.0 / (1.0 + math.exp(-score)), scales.surest
     if prior and alone < scales.named_from:
         most = 0.5

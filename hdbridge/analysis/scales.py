@@ -39,9 +39,6 @@ class Scales:
     robust: float = _scale(
         25.0, "chi square of block sums", 0.0, "five standard deviations in independent stretches"
     )
-    robust_more: float = _scale(
-        6.0, "chi square of block sums per further parameter", 0.0, "95 % of chi square of two"
-    )
 
     # Termination and revision of the search.
     few: float = _scale(3.0, "causes", math.inf, "more mean something that is none of them")
@@ -52,14 +49,12 @@ class Scales:
         math.inf,
         "the fourth partial of a sawtooth leaves 0.78 of what the first three leave",
     )
-    leftover: float = _scale(2e-5, "share of the largest one's chi square", 0.0, "error of a linearisation")
     extrapolated: float = _scale(
         2.0,
         "largest piece over what is seen",
         math.inf,
         "pieces that cancel, an order on an arc",
     )
-    wave_share_left: float = _scale(0.03, "share of a wave's squares", 0.0, "the others explain the rest")
     bend: float = _scale(
         0.6, "share by which a slope may differ along the way", math.inf, "a slope is one, or is none"
     )

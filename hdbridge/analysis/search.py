@@ -17,7 +17,18 @@ from hdbridge.analysis.acceptance import all_pieces_seen, evident, gate
 from hdbridge.analysis.hypothesis import Estimator, Fitted, Hypothesis
 from hdbridge.analysis.linear import orthonormal, unknown
 from hdbridge.analysis.screening import Score, Screen, candidates, filtered, proposed, score_of
-from hdbridge.effects import CATALOGUE, Channel, Effect, Motion, Part, Sought, Start, aliases_of, in_place
+from hdbridge.effects import (
+    CATALOGUE,
+    Channel,
+    Effect,
+    FloatArray,
+    Motion,
+    Part,
+    Sought,
+    Start,
+    aliases_of,
+    in_place,
+)
 from hdbridge.units import DEG_PER_TURN
 
 MOST = 6
@@ -156,11 +167,11 @@ class Search:
         }
         toll = {each: self.scales.penalty * len(fitted.places(each)) + self.scales.enter for each in gains}
         place = min(gains, key=lambda each: gains[each] - toll[each])
-        small = self.peak(fitted, place) < self.scales.floor_arcsec
+        small = self.peak(fitted, place) < self.estimator.floor_arcsec
         # The error of a large effect's law resembles a small effect of the same kind.
         alike = [each for each in gains if each != place and effects[each].name == effects[place].name]
         share = effects[place].inexact * max((gains[each] for each in alike), default=0.0)
-        needed = max(toll[place], self.scales.leftover * max(gains.values()), share)
+        needed = max(toll[place], share)
         return None if gains[place] > needed and not small else (place, "")
 
     def _lacking(self, fitted: Fitted, place: int) -> Fitted:
@@ -189,8 +200,9 @@ class Search:
                 trial = self._with(fitted, score)
                 toll = self.scales.penalty * max(trial.free() - fitted.free(), 1) + self.scales.enter
                 net = self._gain(fitted, trial, cause) - toll
-                none = net <= 0.0 or self._too_small(trial, cause)
-                reason = "" if none else self._refusal(trial, cause)
+                none = net <= 0.0
+                small = "" if none or not self._too_small(trial, cause) else "too small to act on"
+                reason = "" if none else small or self._refusal(trial, cause)
                 if reason:
                     self.refusals[cause] = reason
                 if none or reason:
@@ -210,7 +222,7 @@ class Search:
 
     def _too_small(self, trial: Fitted, cause: str) -> bool:
         """Returns True if the last effect of this name is below the floor of practical relevance."""
-        return self.peak(trial, _last(trial, cause)) < self.scales.floor_arcsec
+        return self.peak(trial, _last(trial, cause)) < self.estimator.floor_arcsec
 
     def _refusal(self, trial: Fitted, cause: str, as_alias: bool = False) -> str:
         """Returns the reason to reject the last effect of this name, or an empty string.
@@ -273,12 +285,7 @@ class Search:
         A candidate with more parameters may gain more only after its shapes are fitted.
         """
         passed = {each.name for each in fitted.hypothesis.effects if each.usual == 1} | {left_out}
-        scores = [
-            each
-            for each in scores
-            if each.effect.name not in passed
-            and not (each.effect.waves() and each.share < self.scales.wave_share_left)
-        ]
+        scores = [each for each in scores if each.effect.name not in passed]
         net = {id(each): each.gain - self.scales.penalty * each.freedom for each in scores}
         best: dict[tuple[str, int], Score] = {}
         for each in sorted(scores, key=lambda each: -net[id(each)]):
@@ -439,48 +446,47 @@ def waves_alike(estimator: Estimator, effects: Sequence[Effect], start: Start) -
     compared with one in time of the frequency that it has at the usual speed: at one speed they are the same.
     """
     data, most = estimator.data, estimator.scales.in_step
-    effects = [each for each in effects if _is_wave(each)]
+    effects = [each for each in effects if each.waves()]
     if not effects:
         return
     angle = effects[0].coordinate(data.motion, data.ratio).name
+
+    def span(near: Sequence[Effect]) -> FloatArray:
+        return orthonormal(np.hstack([estimator.columns(each, start) for each in near]))
+
+    def alike(effect: Effect, seen: FloatArray) -> bool:
+        does = estimator.columns(effect, start) @ effect.coefficients()
+        does -= np.mean(does)
+        return float(np.sum((does @ seen) ** 2)) > most * float(does @ does)
+
     for name in aliases_of(effects[0].name):
         kind = CATALOGUE.get(name)
-        own = [] if kind is None else in_time(kind, effects, data.motion) or [*kind.proposals(data, ())]
-        near = [each for each in own if _is_wave(each) and each.part is not Part.LOOP]
-        if not near:
+        if kind is not None and kind.sought is Sought.TONE:
+            if any(alike(each, span(at)) for each in effects if (at := in_time(kind, each, data.motion))):
+                yield name
             continue
-        if near[0].coordinate(data.motion, data.ratio).name == angle:
+        own = [] if kind is None else [*kind.proposals(data, ())]
+        near = [each for each in own if each.waves() and each.part is not Part.LOOP]
+        if near and near[0].coordinate(data.motion, data.ratio).name == angle:
             orders = {turns for each in near for turns, _, _ in each.waves()}
             if any(_share_in(each, orders) > most for each in effects):
                 yield name
-            continue
-        columns = [estimator.columns(each, start) for each in near]
-        if near[0].sought is effects[0].sought is None:
-            columns = [np.hstack(columns)]  # several orders are one effect, several tones are not
-        spans = [orthonormal(each - np.mean(each, axis=0)) for each in columns]
-        for each in effects:
-            does = estimator.columns(each, start) @ each.coefficients()
-            does -= np.mean(does)
-            if any(float(np.sum((span.T @ does) ** 2)) > most * float(does @ does) for span in spans):
+        elif near:
+            seen = span(near)
+            if any(alike(each, seen) for each in effects):
                 yield name
-                break
 
 
-def _is_wave(effect: Effect) -> bool:
-    return bool(effect.waves()) or effect.sought is Sought.TONE
-
-
-def in_time(kind: type[Effect], effects: Sequence[Effect], motion: Motion) -> list[Effect]:
-    """Returns tones of a ``kind`` at the frequencies that waves over an angle have at the median speed."""
+def in_time(kind: type[Effect], effect: Effect, motion: Motion) -> list[Effect]:
+    """Returns tones of a ``kind`` at the frequencies that an effect's waves have at the median speed."""
     speed = motion.motor_speed_deg_s
-    if kind.sought is not Sought.TONE or speed is None or not np.any(speed):
+    if speed is None or not np.any(speed):
         return []
     example = kind.candidate(1.0)
     turns_s = float(np.median(np.abs(speed[speed != 0.0]))) / DEG_PER_TURN
     return [
         example.fitted(example.coefficients(), {kind.shape[0].name: turns * turns_s})
-        for each in effects
-        for turns, _, _ in each.waves()
+        for turns, _, _ in effect.waves()
     ]
 
 

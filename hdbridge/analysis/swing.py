@@ -129,8 +129,9 @@ def allowed_for(estimator: Estimator, fitted: Fitted, found: Swing | None) -> Ob
         size = estimator.at_points(each**2)[moving]
         about = (size - np.mean(size)) if len(size) else size
         share = max(float(about @ square) / max(float(about @ about), 1e-300), 0.0)
-        if share > 1.0:
+        if share > 1.0 and each is shaken:
             continue  # more than any ordinary axis has
+        share = min(share, 1.0)
         square = square - share * size
         unknown += share * each**2
     unknown = np.sqrt(unknown)

@@ -10,6 +10,7 @@ import typer
 from rich.table import Table
 
 from hdbridge.cli.options import (
+    BorrowOption,
     ForceOption,
     JsonOption,
     SeedOption,
@@ -36,7 +37,9 @@ def conform(
     profile: Annotated[
         str | None,
         typer.Argument(
-            metavar="PROFILE", help="Axis whose drive is checked. Without it: --channel, --node and --eds."
+            metavar="PROFILE",
+            help="Axis whose drive is checked, or machine whose gateway is. Without it: --channel, --node "
+            "and --eds.",
         ),
     ] = None,
     interface: Annotated[
@@ -58,6 +61,9 @@ def conform(
         typer.Option(
             "--eds", metavar="FILE", help="EDS of the node, which is compared with it; else the axis file's."
         ),
+    ] = None,
+    axis: Annotated[
+        str | None, typer.Option("--axis", help="Which axis, if the gateway has several.", show_default=False)
     ] = None,
     motion: Annotated[
         bool,
@@ -89,6 +95,7 @@ def conform(
     truth: TruthOption = None,
     seed: SeedOption = 0,
     force: ForceOption = False,
+    borrow: BorrowOption = False,
     json_file: JsonOption = None,
 ) -> None:
     """Check a node against CiA 301 and CiA 402: NMT, SDO, PDO, SYNC, EMCY, its EDS, the drive profile.
@@ -101,9 +108,12 @@ def conform(
 
     Exit status 4 when a check failed, or when the node does not answer or is not without power.
     """  # fmt: skip
+    from hdbridge.axis import BusConfig
+    from hdbridge.cli.gateway import eds_of, gateway_axis
     from hdbridge.cli.interrupt import deferred_interrupt
     from hdbridge.conformance import NodeTester, checks, run
     from hdbridge.conformance.tester import StoppedError, Timing
+    from hdbridge.daemon.machine import machine_file
     from hdbridge.drive.link import Link
     from hdbridge.drive.manners import Ear, listening_s
     from hdbridge.files.edsfile import read_eds
@@ -115,17 +125,22 @@ def conform(
         )
         _print_list(wanted)
         return
-    axis = None
-    if profile is not None:
-        session = Session(profile, simulate, truth, seed, interface, channel, force)
-        axis, opened = session.axis, session.connected()
-        node_id, eds = node_id or axis.drive.node_id, eds or axis.eds_path
+    od = None
+    if profile is not None and machine_file(profile) is not None:
+        config, settings = gateway_axis(profile, axis)
+        opened, node_id = bare_bus(settings.bus, force=force), settings.nodes[config.name]
+        od = eds_of(config, settings) if eds is None else None
+    elif profile is not None:
+        session = Session(profile, simulate, truth, seed, interface, channel, force, borrow)
+        config, opened = session.axis, session.connected()
+        node_id, eds = node_id or config.drive.node_id, eds or config.eds_path
     elif simulate or channel is None or node_id is None:
         raise InputError("conform needs a node: give a PROFILE, or --channel (can0) and --node")
     else:
-        opened = bare_bus(interface or "socketcan", channel, bitrate_bps, force=force)
+        named = BusConfig(interface=interface or "socketcan", channel=channel, bitrate_bps=bitrate_bps)
+        opened = bare_bus(named, force=force)
     assert node_id is not None
-    od = None if eds is None else read_eds(eds, node_id).dictionary
+    od = od if eds is None else read_eds(eds, node_id).dictionary
     with deferred_interrupt() as interrupted, opened as (bus, clock), progress_bar() as bar:
         link = Link(bus, clock)
         task = bar.add_task(f"{len(wanted)} checks", total=len(wanted))

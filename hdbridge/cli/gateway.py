@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated
+from collections.abc import Iterator
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from hdbridge.cli.options import MachineArgument, notes
-from hdbridge.errors import InputError
+from hdbridge.cli.options import JsonOption, MachineArgument, console, notes, write_json
+from hdbridge.errors import DriveError, InputError
 
 if TYPE_CHECKING:
+    from canopen.objectdictionary import ObjectDictionary
+
     from hdbridge.axis import AxisConfig
     from hdbridge.daemon.machinefile import GatewaySettings
+    from hdbridge.drive.link import Frame
 
 
 def register(app: typer.Typer) -> None:
@@ -23,6 +29,7 @@ def register(app: typer.Typer) -> None:
     )
     group.command("eds")(eds)
     group.command("simulate")(simulate)
+    group.command("doctor")(doctor)
     app.add_typer(group, name="gateway")
 
 
@@ -54,9 +61,6 @@ def simulate(
     It has the bus, node id and objects of the gateway, and its load is where it was asked for. It needs no
     daemon and no other drive, so it serves the tests of another master's program.
     """
-    from pathlib import Path
-    from tempfile import TemporaryDirectory
-
     from hdbridge.cli.interrupt import deferred_interrupt
     from hdbridge.clock import MonotonicClock
     from hdbridge.daemon.gateway.ideal import IdealAxis
@@ -81,6 +85,99 @@ def simulate(
         notes.print(f"ideal drive: node {node_id} on {bus.channel_info}; Ctrl-C ends it")
         end = float("inf") if duration_s is None else clock.now() + duration_s
         run(bus, node, clock, lambda: interrupted() or clock.now() >= end)
+
+
+def doctor(
+    machine: MachineArgument,
+    axis: AxisOption = None,
+    duration_s: Annotated[
+        float,
+        typer.Option("--duration", min=0.1, max=86_400.0, help="Seconds to listen; Ctrl-C ends sooner."),
+    ] = 10.0,
+    log: Annotated[
+        Path | None,
+        typer.Option(
+            "--log", metavar="FILE", help="Read a bus log (.log, .asc, .blf, .trc, .mf4) instead of the bus."
+        ),
+    ] = None,
+    json_file: JsonOption = None,
+) -> None:
+    """Listen to the other master: what it has configured, what it does, and what it gets wrong, with reasons.
+
+    It sends nothing, so it may run next to the daemon. A mistake is followed by what to do instead.
+
+    Exit status 4 when the master made a mistake, or nothing of the axis was heard.
+    """
+    from hdbridge.daemon.gateway.trace import Trace
+
+    config, settings = gateway_axis(machine, axis)
+    node_id = settings.nodes[config.name]
+    trace = Trace(node_id, eds_of(config, settings))
+    rows: list[dict[str, Any]] = []
+    begun_s: float | None = None
+    frames = _logged(log) if log is not None else _heard(settings, duration_s)
+    for frame in frames:
+        begun_s = frame.time_s if begun_s is None else begun_s
+        for line in trace.take(frame):
+            at_s = line.time_s - begun_s
+            rows.append({"time_s": round(at_s, 6), "text": line.text, "advice": line.advice})
+            console.print(f"{at_s:10.4f}  {line.text}", markup=False, soft_wrap=True)
+            if line.advice:
+                console.print(f"{'':10}  > {line.advice}", style="bold", markup=False, soft_wrap=True)
+    configured = trace.configured()
+    for text in configured:
+        console.print(f"configured  {text}", markup=False, soft_wrap=True)
+    write_json(
+        json_file,
+        {"schema": "hdbridge.gateway-doctor/1", "node_id": node_id, "configured": configured, "trace": rows},
+    )
+    if begun_s is None:
+        raise DriveError(
+            f"node {node_id}: nothing was heard on the outer bus; expected the other master's frames"
+        )
+    if trace.mistakes:
+        raise DriveError(
+            f"node {node_id}: {trace.mistakes.total()} mistakes of the other master; most often: "
+            f"{trace.mistakes.most_common(1)[0][0]}"
+        )
+
+
+def eds_of(axis: AxisConfig, settings: GatewaySettings) -> ObjectDictionary:
+    """The object dictionary of a gateway axis, read from its EDS as another master does."""
+    from hdbridge.daemon.gateway.objects import eds as text_of
+    from hdbridge.files.edsfile import read_eds
+
+    with TemporaryDirectory(prefix="hdbridge-gateway-") as folder:
+        path = Path(folder) / "gateway.eds"
+        path.write_text(text_of(axis, settings), encoding="utf-8")
+        return read_eds(path, settings.nodes[axis.name]).dictionary
+
+
+def _heard(settings: GatewaySettings, duration_s: float) -> Iterator[Frame]:
+    """Yields the frames on the outer bus."""
+    from hdbridge.cli.interrupt import deferred_interrupt
+    from hdbridge.clock import MonotonicClock
+    from hdbridge.drive.link import Link, open_bus
+
+    with deferred_interrupt() as interrupted, open_bus(settings.bus, shared=True) as bus:
+        link = Link(bus, MonotonicClock())
+        notes.print(f"listening on {link.name} for {duration_s:g} s")
+        end_s = link.now() + duration_s
+        while not interrupted() and (now_s := link.now()) < end_s:
+            if (frame := link.recv(min(end_s, now_s + 0.2))) is not None:
+                yield frame
+
+
+def _logged(path: Path) -> Iterator[Frame]:
+    """Yields the frames of a bus log; InputError if it cannot be read."""
+    from hdbridge.control.buslog import messages
+    from hdbridge.drive.link import Frame
+
+    cut_off: list[str] = []
+    for message in messages(path, cut_off):
+        yield Frame(message.arbitration_id, bytes(message.data), message.timestamp)
+    for problem in cut_off:
+        notes.print(f"{path}: {problem}", markup=False, soft_wrap=True)
 
 
 def gateway_axis(machine: str, name: str | None) -> tuple[AxisConfig, GatewaySettings]:

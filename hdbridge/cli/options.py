@@ -80,6 +80,14 @@ ForceOption = Annotated[
     bool,
     typer.Option("--force", help="Send even if another master is heard on the bus or holds its lock."),
 ]
+BorrowOption = Annotated[
+    bool,
+    typer.Option(
+        "--borrow",
+        help="Borrow the bus from the daemon that holds it. Its axes are stopped and switched off, and it "
+        "takes the bus back when this command ends.",
+    ),
+]
 ColumnsOption = Annotated[
     list[str] | None,
     typer.Option(

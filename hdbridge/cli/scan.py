@@ -8,6 +8,7 @@ import typer
 
 from hdbridge.bringup import ASK_TIMEOUT_S, LISTEN_S
 from hdbridge.cli.options import (
+    BorrowOption,
     ChannelOption,
     ForceOption,
     InterfaceOption,
@@ -44,6 +45,7 @@ def scan(
     interface: InterfaceOption = None,
     channel: ChannelOption = None,
     force: ForceOption = False,
+    borrow: BorrowOption = False,
     bitrate_bps: Annotated[
         int | None,
         typer.Option("--bitrate", min=10_000, max=1_000_000, help="Bit rate, where the interface sets it."),
@@ -68,18 +70,20 @@ def scan(
 
     Exit status 4 when no node was found, or when PROFILE's drive is not among them.
     """
+    from hdbridge.axis import BusConfig
     from hdbridge.bringup.match import compare
     from hdbridge.bringup.scan import scan_bus
     from hdbridge.drive.link import Link
 
     axis = None
     if profile is not None:
-        session = Session(profile, simulate, truth, seed, interface, channel, force)
+        session = Session(profile, simulate, truth, seed, interface, channel, force, borrow)
         axis, opened = session.axis, session.connected()
     elif simulate or interface is None or channel is None:
         raise InputError("scan needs a bus: give a PROFILE, or --interface and --channel (socketcan, can0)")
     else:
-        opened = bare_bus(interface, channel, bitrate_bps, force=force)
+        named = BusConfig(interface=interface, channel=channel, bitrate_bps=bitrate_bps)
+        opened = bare_bus(named, force=force)
     with opened as (bus, clock), progress_bar() as bar:
         link = Link(bus, clock)
         task = bar.add_task("asking nodes", total=1.0)

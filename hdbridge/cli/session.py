@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import cached_property, wraps
 from pathlib import Path
@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, Concatenate, ParamSpec, get_type_hints
 
 from hdbridge.cli.interrupt import deferred_interrupt
 from hdbridge.cli.options import (
+    BorrowOption,
     ChannelOption,
     ForceOption,
     InterfaceOption,
@@ -22,13 +23,13 @@ from hdbridge.cli.options import (
     notes,
 )
 from hdbridge.clock import Clock, MonotonicClock
-from hdbridge.errors import InputError
+from hdbridge.errors import DaemonError, InputError
 from hdbridge.files.profile import Profile
 
 if TYPE_CHECKING:
     import can
 
-    from hdbridge.axis import AxisConfig
+    from hdbridge.axis import AxisConfig, BusConfig
     from hdbridge.drive.drive import Drive
 
 P = ParamSpec("P")
@@ -48,9 +49,12 @@ class Session:
     interface: InterfaceOption = None
     channel: ChannelOption = None
     force: ForceOption = False
+    borrow: BorrowOption = False
 
     def __post_init__(self) -> None:
         check_bus_options(self.interface, self.channel, simulate=self.simulate)
+        if self.borrow and (self.simulate or self.force):
+            raise InputError("--borrow takes the bus from a daemon: leave out --simulate and --force")
 
     @cached_property
     def files(self) -> Profile:
@@ -92,6 +96,8 @@ class Session:
                 "expected the interface of the bus (socketcan), or give --simulate, which puts a simulated "
                 "drive there"
             )
+        if self.borrow:
+            _borrow(axis.bus)
         wanted, bus_of = axis.realtime, open_bus(axis.bus, shared=self.force)
         with prepare_realtime(wanted.priority, wanted.cpus) as conditions, bus_of as bus:
             notes.print(f"this process: {conditions}")
@@ -169,6 +175,35 @@ def load_axis(
     return axis.on_bus(**changes) if changes else axis
 
 
+def _borrow(bus: BusConfig) -> None:
+    """Makes the daemon that holds a bus release it; does nothing if no program holds the bus.
+
+    Raises `BusInUseError` if the holder is not a daemon that this user may ask.
+    """
+    from hdbridge.client import Client
+    from hdbridge.client.address import running
+    from hdbridge.drive.interfacelock import InterfaceLock
+
+    if not InterfaceLock(bus.interface, bus.channel).holder:
+        return
+    for address in running():
+        with suppress(DaemonError), Client(address.socket, name="hdbridge --borrow") as client:
+            machine = client.state()
+            if (machine.bus.interface, machine.bus.channel) == (bus.interface, str(bus.channel)):
+                break
+    else:
+        return  # opening the bus names its holder
+    names = ", ".join(each.name for each in machine.axes)
+    with Client(address.socket, name="hdbridge --borrow") as client:
+        client.lend_bus()
+    notes.print(
+        f"the daemon of machine '{machine.name}' has stopped its axes ({names}) and lends the bus to this "
+        "command; they come back disabled",
+        markup=False,
+        soft_wrap=True,
+    )
+
+
 def simulated_by(files: Profile, truth: Path | None) -> Path:
     """Returns the file that describes the simulated axis; prints a note if it is the axis's twin."""
     plant = truth or files.simulated
@@ -178,17 +213,13 @@ def simulated_by(files: Profile, truth: Path | None) -> Path:
 
 
 @contextmanager
-def bare_bus(
-    interface: str, channel: str, bitrate_bps: int | None, *, force: bool
-) -> Iterator[tuple[can.BusABC, Clock]]:
-    """Yields a bus without an axis file, and the monotonic clock.
+def bare_bus(settings: BusConfig, *, force: bool) -> Iterator[tuple[can.BusABC, Clock]]:
+    """Yields a bus that is not an axis's, and the monotonic clock.
 
     With ``force``, the bus is opened even if another process on this computer masters it.
     """
-    from hdbridge.axis import BusConfig
     from hdbridge.drive.link import check_interface, open_bus
 
-    check_interface(interface, "--interface")
-    settings = BusConfig(interface=interface, channel=channel, bitrate_bps=bitrate_bps)
+    check_interface(settings.interface, "--interface")
     with open_bus(settings, shared=force) as bus:
         yield bus, MonotonicClock()

@@ -113,10 +113,10 @@ def _compared(
 ) -> TwinReport:
     from hdbridge.report.twin import TwinReport
     from hdbridge.twin.compare import compare
-    from hdbridge.twin.replay import legs_of, replay_directly
+    from hdbridge.twin.replay import legs_of, replay
 
     notes.print("the recording's commands run through the simulated drive ...")
-    simulated = replay_directly(recording, axis, begun.truth)
+    simulated = replay(recording, axis, begun.truth)
     found = compare(recording.record, simulated, legs_of(recording), axis.gear.ratio)
     return TwinReport(axis.name, found, translated=begun.rows, facts=facts)
 

@@ -73,6 +73,11 @@ def find(
     )
 
 
+def running(environment: Mapping[str, str] = os.environ) -> list[Address]:
+    """Returns the addresses of all daemons of this computer that this user may ask."""
+    return [Address(socket=each) for each in _sockets(environment)]
+
+
 def session_folder(environment: Mapping[str, str] = os.environ) -> Path:
     """Returns the folder of this user's daemon sockets; it need not exist."""
     session = environment.get("XDG_RUNTIME_DIR")

@@ -90,6 +90,10 @@ class MachineCalls:
         return Call("GET", "/events", messages.Events, query={"since": since})
 
     @staticmethod
+    def lend_bus() -> Call[messages.MachineState]:
+        return Call("POST", "/bus/lend", messages.MachineState, moving=True, waits=True)
+
+    @staticmethod
     def mark(text: str) -> Call[messages.Events]:
         return Call("POST", "/mark", messages.Events, given(messages.Mark, text=text))
 

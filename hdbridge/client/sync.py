@@ -111,6 +111,13 @@ class Client:
         """Quick-stops all axes and latches the stops until a reset. Requires no lease."""
         return self.do(MachineCalls.quick_stop_all())
 
+    def lend_bus(self) -> MachineState:
+        """Stops all axes and makes the daemon release its bus to another program of its computer.
+
+        That program has ten seconds to open the bus. The daemon takes the bus back when it is closed.
+        """
+        return self.do(MachineCalls.lend_bus())
+
     def coordinated(
         self, targets_deg: Mapping[str, float], *, speed: float = 1.0, wait: bool = True
     ) -> MachineState:

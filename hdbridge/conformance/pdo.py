@@ -335,7 +335,7 @@ def _event(kind: int) -> None:
     @check(f"tpdo.event.{kind}", f"Transmission type {kind}: a change is sent at once", _PDO)
     def _(t: NodeTester) -> None:
         index, sub, bits = t.scratch()
-        can_id = t.map_pdo(_TPDO, ((index, sub, bits),), kind)
+        can_id = t.map_pdo(_TPDO, ((index, sub, bits),), kind, timers=_off(t, 5))
         _start(t)
         t.wait(0.05)
         since = t.mark()

@@ -100,9 +100,9 @@ class Check:
     clause: str
     function: Callable[[NodeTester], None]
     moves: bool = False
-    """It may switch power on."""
+    """The check may switch power on."""
     stores: bool = False
-    """It writes to non-volatile memory."""
+    """The check writes to non-volatile memory."""
 
 
 @dataclass(frozen=True)

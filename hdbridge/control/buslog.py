@@ -64,7 +64,7 @@ def import_log(
     buses: dict[str, _Bus] = {}
     heard: Counter[int] = Counter()
     cut_off: list[str] = []
-    for message in _messages(path, cut_off):
+    for message in messages(path, cut_off):
         name = str(message.channel)
         if channel is not None and name != channel:
             continue
@@ -87,7 +87,7 @@ def import_log(
     return replace(recording, notes={**recording.notes, "cut_off": cut_off[0]}) if cut_off else recording
 
 
-def _messages(path: Path, cut_off: list[str]) -> Iterator[can.Message]:
+def messages(path: Path, cut_off: list[str]) -> Iterator[can.Message]:
     """Yields the data frames with 11-bit identifiers; ``cut_off`` receives the damage that ends it early."""
     packed = path.suffix.lower() == ".gz"
     suffix = (path.with_suffix("") if packed else path).suffix.lower()

@@ -9,14 +9,12 @@ import sys
 from contextlib import ExitStack
 
 from hdbridge.daemon.api.sockets import file_of, tcp_socket, unix_socket
-from hdbridge.daemon.keeper import SIMULATED, Keeper, Times
+from hdbridge.daemon.keeper import SIMULATED, Keeper, Notifier, Times
 from hdbridge.daemon.logs import LogSettings, begin_log
 from hdbridge.daemon.machine import Machine
 from hdbridge.daemon.memory import Memory
-from hdbridge.daemon.notify import Notifier
-from hdbridge.daemon.runtime import runtime_folder, socket_path
-from hdbridge.daemon.start import Simulation, Start
-from hdbridge.drive.interfacelock import interface_lock
+from hdbridge.daemon.start import Simulation, Start, runtime_folder
+from hdbridge.drive.interfacelock import InterfaceLock
 
 
 def hold(
@@ -38,10 +36,11 @@ def hold(
     begin_log(log)
     folder = runtime_folder()
     with ExitStack() as stack:
+        lock = None
         if simulation is None and not force:
-            stack.enter_context(interface_lock(machine.bus.interface, machine.bus.channel))
+            lock = stack.enter_context(InterfaceLock(machine.bus.interface, machine.bus.channel))
         given = machine.api.socket
-        path = socket_path(machine.name, folder, machine.beside(given) if given is not None else None)
+        path = machine.beside(given) if given is not None else folder / f"{machine.name}.sock"
         listeners = [stack.enter_context(unix_socket(path, machine.api.group))]
         stack.callback(path.unlink, missing_ok=True)
         if (tcp := machine.api.tcp) is not None:
@@ -58,7 +57,7 @@ def hold(
             socket_file=file_of(path), page_token=token, log=log,
         )  # fmt: skip
         times = Times() if simulation is None else SIMULATED
-        return Keeper(start, memory, listeners, Notifier.of_environment(), times=times).run()
+        return Keeper(start, memory, listeners, Notifier.of_environment(), times=times, lock=lock).run()
 
 
 def _tell_page(listener: socket.socket, token: str | None) -> None:

@@ -11,6 +11,11 @@ It holds what must outlive a child: the shared memory, the listening sockets, th
     service, hung     kills it after `Times.service_hung_s`
     gateway           as the service; its axes brake and lose power because their set-points end
 
+The bus can be lent to another program of this computer. On the service's request the control process stops
+its axes and ends, and the keeper releases the lock of the interface. The program that acquires the lock has
+the bus. When the lock is free again, the keeper acquires it and starts a control process, whose axes come up
+disabled.
+
 If a child cannot start (the bus cannot be opened, a folder cannot be written), the daemon ends with that
 child's exit status.
 """
@@ -22,19 +27,20 @@ import os
 import selectors
 import signal
 import socket
+import subprocess
+import sys
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from collections import deque
+from collections.abc import Iterator, MutableMapping, Sequence
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
 from types import FrameType
-from typing import Final
+from typing import Final, Self
 
-from hdbridge.daemon.child import Child
 from hdbridge.daemon.memory import Cell, Memory
-from hdbridge.daemon.notify import Notifier
-from hdbridge.daemon.patience import BackOff, Budget, Pulse
 from hdbridge.daemon.start import Start
-from hdbridge.errors import HdbridgeError
+from hdbridge.drive.interfacelock import InterfaceLock
+from hdbridge.errors import BusInUseError, HdbridgeError
 
 _log = logging.getLogger(__name__)
 TICK_S: Final = 0.25
@@ -43,6 +49,8 @@ _ERRORS: Final = range(2, 16)
 """Exit statuses of an `HdbridgeError`. The child has reported the error, and a restart would only repeat
 it."""
 _FIRST_ATTEMPTS: Final = 3
+PATIENCE_S: Final = 1.0
+"""Maximum wait for a manager whose queue is full, for messages that it must not miss."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,6 +84,160 @@ SIMULATED: Final = Times(begin_s=600.0, gateway_hung_s=120.0, stop_s=300.0, serv
 """Time-outs with simulated drives, long enough for a busy computer."""
 
 
+class Child:
+    """A child process, from its start to its end."""
+
+    def __init__(self, program: Sequence[str], start_fd: int, handed: Sequence[int], now_s: float) -> None:
+        """Runs ``program`` in this interpreter, with the number of ``start_fd`` as its argument.
+
+        It also inherits the descriptors in ``handed``. It has its own session, so that signals of the
+        terminal reach only the keeper.
+        """
+        self.started_s = now_s
+        self._process = subprocess.Popen(
+            [sys.executable, "-P", *program, str(start_fd)],
+            pass_fds=(start_fd, *handed),
+            stdin=subprocess.DEVNULL,
+            start_new_session=True,
+        )
+        self.pid = self._process.pid
+        self.pidfd = os.pidfd_open(self.pid)
+        """Descriptor that becomes readable when the process has ended."""
+
+    @property
+    def ended(self) -> int | None:
+        """Exit status, negative after a signal; None while it runs."""
+        return self._process.poll()
+
+    @property
+    def how(self) -> str:
+        """Exit status or signal in words."""
+        status = self.ended
+        if status is None:
+            return "runs"
+        if status >= 0:
+            return f"exit status {status}"
+        with suppress(ValueError):
+            return f"ended by {signal.Signals(-status).name}"
+        return f"ended by signal {-status}"
+
+    def send(self, number: signal.Signals) -> None:
+        """Sends a signal, unless the process has ended; its id cannot be reused before `ended` is called."""
+        self._process.send_signal(number)
+
+    def close(self) -> None:
+        """Kills the process if it still runs, and closes the descriptor."""
+        if self.ended is None:
+            self._process.kill()
+            self._process.wait()
+        os.close(self.pidfd)
+
+
+class Budget:
+    """Maximum number of events within a sliding time window."""
+
+    def __init__(self, most: int, window_s: float) -> None:
+        self._most, self._window_s = most, window_s
+        self._times: deque[float] = deque()
+
+    def spend(self, now_s: float) -> bool:
+        """Counts an event; returns False if the window's budget is used up."""
+        while self._times and now_s - self._times[0] >= self._window_s:
+            self._times.popleft()
+        if len(self._times) >= self._most:
+            return False
+        self._times.append(now_s)
+        return True
+
+
+class BackOff:
+    """Delays that double with each failure up to a maximum; a long life resets them."""
+
+    def __init__(self, first_s: float, longest_s: float, well_after_s: float) -> None:
+        self._first_s, self._longest_s, self._well_after_s = first_s, longest_s, well_after_s
+        self._next_s = first_s
+
+    def delay_s(self, lived_s: float) -> float:
+        """Returns the delay before the restart of a process that ran for ``lived_s``."""
+        if lived_s >= self._well_after_s:
+            self._next_s = self._first_s
+        delay_s, self._next_s = self._next_s, min(2.0 * self._next_s, self._longest_s)
+        return delay_s
+
+
+class Heartbeat:
+    """Hang detection by a counter, measured in looks without an advance.
+
+    It does not use time, so a monitor that was itself suspended blames nobody else.
+    """
+
+    def __init__(self) -> None:
+        self._last = 0
+        self.misses = 0
+        """Consecutive looks without an advance."""
+        self.begun = False
+        """True if the counter has advanced since the restart."""
+
+    def look(self, value: int) -> bool:
+        """Returns True if the counter has advanced since the last look."""
+        advanced = value != self._last
+        self._last = value
+        self.misses = 0 if advanced else self.misses + 1
+        self.begun = self.begun or advanced
+        return advanced
+
+    def restart(self, value: int) -> None:
+        """Starts again with a restarted process, whose counter has this value."""
+        self._last, self.misses, self.begun = value, 0, False
+
+
+class Notifier:
+    """Notifies the service manager, if there is one. It never fails."""
+
+    def __init__(self, address: str | None = None, watchdog_s: float | None = None) -> None:
+        """``address`` is the manager's socket; one that begins with @ is abstract."""
+        self.watchdog_s = watchdog_s
+        """Watchdog time-out of the manager; None without a watchdog."""
+        self._address = "\0" + address[1:] if address and address.startswith("@") else address
+        self._status = ""
+
+    @classmethod
+    def of_environment(cls, environment: MutableMapping[str, str] = os.environ) -> Self:
+        """Returns the notifier of the environment, and removes it there so that children do not notify."""
+        address = environment.pop("NOTIFY_SOCKET", None)
+        period_us = environment.pop("WATCHDOG_USEC", "")
+        meant = environment.pop("WATCHDOG_PID", str(os.getpid())) == str(os.getpid())
+        return cls(address, int(period_us) / 1e6 if period_us.isdigit() and meant else None)
+
+    def ready(self) -> None:
+        """Reports that the daemon is ready."""
+        self._tell("READY=1", PATIENCE_S)
+
+    def alive(self) -> None:
+        """Reports a sign of life to the watchdog."""
+        if self.watchdog_s is not None:
+            self._tell("WATCHDOG=1")
+
+    def stopping(self) -> None:
+        """Reports that the daemon is stopping."""
+        self._tell("STOPPING=1", PATIENCE_S)
+
+    def status(self, words: str) -> None:
+        """Sets the line in ``systemctl status``, if it has changed."""
+        if words != self._status and self._tell(f"STATUS={words}"):
+            self._status = words
+
+    def _tell(self, line: str, patience_s: float = 0.0) -> bool:
+        """Returns True if the manager took the message; waits at most ``patience_s`` for it."""
+        if self._address is None:
+            return True
+        with suppress(OSError), socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as sender:
+            sender.settimeout(patience_s)
+            sender.sendto(line.encode(), self._address)
+            return True
+        return False
+
+
 @dataclass(slots=True)
 class _Helper:
     """A process in addition to the control process; restarted after increasing delays, whatever ended it."""
@@ -90,8 +252,40 @@ class _Helper:
     hung_s: float
     child: Child | None = None
     due_s: float | None = None
-    pulse: Pulse = field(default_factory=Pulse)
+    heartbeat: Heartbeat = field(default_factory=Heartbeat)
     back_off: BackOff = field(default_factory=lambda: BackOff(0.5, 30.0, 60.0))
+
+
+class Loan:
+    """A loan of the bus to another program: asked for, then begun, and over when the lock is free again."""
+
+    COLLECTED_S: Final = 10.0
+    """Time for the borrower to acquire the lock."""
+
+    def __init__(self, lock: InterfaceLock) -> None:
+        self._lock = lock
+        self.asked_s: float | None = None
+        self._begun_s = 0.0
+        self._collected = False
+
+    def begin(self, now_s: float) -> None:
+        """Releases the lock."""
+        self._begun_s, self._collected = now_s, False
+        self._lock.release()
+
+    def is_over(self, now_s: float) -> bool:
+        """Acquires the lock if the borrower is done, or has not come; returns True if it is acquired."""
+        if self._lock.holder:
+            self._collected = True
+            return False
+        if not self._collected and now_s - self._begun_s < self.COLLECTED_S:
+            return False
+        try:
+            self._lock.acquire()
+        except BusInUseError:
+            return False
+        self.asked_s = None
+        return True
 
 
 class Keeper:
@@ -105,12 +299,15 @@ class Keeper:
         notifier: Notifier,
         programs: Programs = Programs(),
         times: Times = Times(),
+        lock: InterfaceLock | None = None,
     ) -> None:
+        """``lock`` is the lock of the interface, which is held; None for a bus that cannot be lent."""
         self._start, self._memory, self._listeners = start, memory, listeners
         self._notifier, self._programs, self._times = notifier, programs, times
         self._budget = Budget(start.machine.limits.restarts_per_minute, 60.0)
-        self._turns = Pulse()
+        self._turns = Heartbeat()
         self._control: Child | None = None
+        self._loan = Loan(lock) if lock is not None else None
         api = tuple(each.fileno() for each in listeners)
         self._helpers = [
             _Helper(
@@ -168,6 +365,8 @@ class Keeper:
         if self._stopping_since_s is not None:
             self._go_on_stopping(now_s)
             return
+        if self._loan is not None:
+            self._lend(self._loan, now_s)
         for helper in self._helpers:
             if helper.due_s is not None and now_s >= helper.due_s:
                 self._start_helper(helper, now_s)
@@ -183,7 +382,7 @@ class Keeper:
         helper.due_s = None
         self._memory.status.set(helper.alive, 0)
         helper.child = self._started(helper.program, helper.name, helper.listening, now_s)
-        helper.pulse.restart(0)
+        helper.heartbeat.restart(0)
 
     def _started(self, program: Sequence[str], name: str, listening: tuple[int, ...], now_s: float) -> Child:
         fd = self._start.hand_over(restarts=self._restarts[name], api_fds=listening)
@@ -206,6 +405,11 @@ class Keeper:
         self._control = None
         if self._stopping_since_s is not None:
             self._status = self._status or max(status, 0)
+            return
+        if self._loan is not None and self._loan.asked_s is not None:
+            self._loan.begin(now_s)
+            self._memory.status.set(Cell.BUS_LENT, 1)
+            _log.info("the bus is lent", {"how": how})
             return
         _log.error("control process died", {"how": how, "lived_s": round(now_s - child.started_s, 1)})
         known = status if status in _ERRORS else HdbridgeError.exit_status
@@ -233,6 +437,23 @@ class Keeper:
         else:
             helper.due_s = now_s + helper.back_off.delay_s(lived_s)
 
+    def _lend(self, loan: Loan, now_s: float) -> None:
+        """Ends the control process if the bus is wanted; starts another one when the bus is free again."""
+        status = self._memory.status
+        if loan.asked_s is None:
+            if status.get(Cell.BUS_WANTED) and self._control is not None:
+                loan.asked_s = now_s
+                status.set(Cell.STOP_ASKED, 1)
+        elif self._control is not None:
+            if now_s - loan.asked_s > self._times.stop_s:
+                _log.error("the axes do not come to rest", {"after_s": self._times.stop_s})
+                self._control.send(signal.SIGKILL)
+        elif loan.is_over(now_s):
+            _log.info("the bus is taken back")
+            for cell in (Cell.BUS_LENT, Cell.STOP_ASKED):
+                status.set(cell, 0)
+            self._start_control(now_s)
+
     def _look_after(self, now_s: float) -> None:
         """Kills hung children; reports readiness, sign of life and status to the service manager."""
         status = self._memory.status
@@ -240,13 +461,14 @@ class Keeper:
         self._kill_hung(self._control, self._turns, self._times.hung_s)
         serving = True
         for helper in self._helpers:
-            helper.pulse.look(status.get(helper.alive))
-            self._kill_hung(helper.child, helper.pulse, helper.hung_s)
+            helper.heartbeat.look(status.get(helper.alive))
+            self._kill_hung(helper.child, helper.heartbeat, helper.hung_s)
             serving &= helper.child is not None and status.get(helper.begun) == helper.child.pid
         if not self._ready and self._turns.begun and serving:
             self._ready = True
             self._notifier.ready()
             _log.info("ready", self._facts())
+        running |= bool(status.get(Cell.BUS_LENT))
         if running and now_s - self._fed_s >= (self._notifier.watchdog_s or 0.0) / 4.0:
             self._fed_s = now_s
             self._notifier.alive()
@@ -255,9 +477,11 @@ class Keeper:
         words = f"holds {axes}" if self._ready else "begins"
         self._notifier.status(f"{words}; {restarts}" if restarts else words)
 
-    def _kill_hung(self, child: Child | None, pulse: Pulse, limit_s: float) -> None:
-        if child is not None and pulse.misses * TICK_S >= (limit_s if pulse.begun else self._times.begin_s):
-            _log.error("process hangs", {"pid": child.pid, "for_s": pulse.misses * TICK_S})
+    def _kill_hung(self, child: Child | None, heartbeat: Heartbeat, limit_s: float) -> None:
+        if child is not None and heartbeat.misses * TICK_S >= (
+            limit_s if heartbeat.begun else self._times.begin_s
+        ):
+            _log.error("process hangs", {"pid": child.pid, "for_s": heartbeat.misses * TICK_S})
             child.send(signal.SIGKILL)
 
     def _facts(self) -> dict[str, object]:

@@ -20,19 +20,18 @@ from hdbridge.daemon.api.metrics import Metrics
 from hdbridge.daemon.api.policy import Policy
 from hdbridge.daemon.api.server import ApiServer, Listener
 from hdbridge.daemon.api.sockets import file_of, unix_socket
-from hdbridge.daemon.following.autodiagnosis import AutoDiagnosis
 from hdbridge.daemon.logs import begin_log
 from hdbridge.daemon.machine import Machine
 from hdbridge.daemon.memory import Cell, Memory
+from hdbridge.daemon.recorder.autodiagnosis import AutoDiagnosis
 from hdbridge.daemon.recorder.recorder import FlightRecorder
-from hdbridge.daemon.runtime import runtime_folder
 from hdbridge.daemon.service.bridge import ServiceBridge
 from hdbridge.daemon.service.following import Following
 from hdbridge.daemon.service.journal import Journal
 from hdbridge.daemon.service.observer import Sink
 from hdbridge.daemon.service.recording import Recording
 from hdbridge.daemon.service.timing import RealTiming, SimulatedClock
-from hdbridge.daemon.start import Start, begin_child
+from hdbridge.daemon.start import Start, begin_child, runtime_folder
 from hdbridge.errors import HdbridgeError
 
 THREADS_PER_AXIS: Final = 2
@@ -71,7 +70,7 @@ async def serve(start: Start, memory: Memory) -> None:
         timing = RealTiming(THREADS_PER_AXIS * len(machine.axes) + SPARE_THREADS, clock)
         stack.callback(timing.close)
         bridge = ServiceBridge(
-            machine, memory, timing, simulated=simulated,
+            machine, memory, timing, simulated=simulated, forced=start.force,
             recordings=lambda port: machine.axis_folder(port.axis, "recordings"),
         )  # fmt: skip
         metrics = Metrics()
@@ -104,14 +103,16 @@ def follow(
     diagnosis = AutoDiagnosis(recorder.folder) if recorder is not None else None
     if diagnosis is not None:
         stack.callback(diagnosis.close)
+    following: list[Following] = []
     for index, (axis, port) in enumerate(zip(machine.axes, bridge.axes.values(), strict=True)):
         given = axis.adaptation.folder
         folder = machine.beside(given) if given is not None else machine.axis_folder(axis, "adaptation")
         worker = stack.enter_context(ThreadPoolExecutor(1, thread_name_prefix=f"following-{axis.name}"))
         made = Following(index, port, axis.adaptation, folder, worker, recorder, diagnosis)
-        bridge.following[axis.name] = made
+        port.following = made
+        following.append(made)
         stack.callback(made.close)
-    return list(bridge.following.values())
+    return following
 
 
 async def _apply(following: Sequence[Following]) -> None:

@@ -1,4 +1,4 @@
-"""Start data that the keeper passes to its children, and the first steps of each child.
+"""Start data that the keeper passes to its children, the first steps of each child, the runtime folder.
 
 A child is a fresh interpreter, not a fork: it inherits only descriptors. One of them contains the pickled
 start data, in memory that no other process can open. So all processes, including restarted ones, use the same
@@ -11,11 +11,14 @@ import ctypes
 import os
 import pickle
 import signal
+import stat
 import sys
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, Self
 
+from hdbridge.client.address import session_folder
 from hdbridge.daemon.logs import LogSettings
 from hdbridge.errors import InputError
 
@@ -94,3 +97,27 @@ def begin_child(start: Start, name: str) -> None:
         signal.signal(each, signal.SIG_IGN)
     if os.getppid() != start.keeper:  # the keeper died before prctl took effect
         sys.exit(0)
+
+
+def runtime_folder(environment: Mapping[str, str] = os.environ) -> Path:
+    """Returns the folder of the socket, created if necessary; raises InputError if others can access it.
+
+    It is the service manager's, else the session's (``$XDG_RUNTIME_DIR/hdbridge``), else one of this user
+    under ``/tmp``.
+    """
+    given = environment.get("RUNTIME_DIRECTORY", "").split(":")[0]
+    if given:
+        return Path(given)  # the service manager has made it, with the mode that its unit asks for
+    folder = session_folder(environment)
+    try:
+        folder.mkdir(mode=0o700, exist_ok=True)
+        found = folder.lstat()
+    except OSError as problem:
+        raise InputError(
+            f"{folder}: cannot be made: {problem.strerror}; it holds the daemon's socket, see XDG_RUNTIME_DIR"
+        ) from None
+    if not stat.S_ISDIR(found.st_mode) or found.st_uid != os.geteuid() or found.st_mode & 0o077:
+        raise InputError(
+            f"{folder}: is not a folder of this user alone (mode 700); remove it, or set XDG_RUNTIME_DIR"
+        )
+    return folder

@@ -364,11 +364,10 @@ class Firmware:
     def connection_lost(self, code: int) -> None:
         """Reacts to the loss of the master as 6007h says; ``code`` is the EMCY code of the loss."""
         option = self._dictionary.value(0x6007)
-        if option and self._awaits_power:
-            self._power_off(self.state)  # the request came from the master that is lost
-        if option == 1 and self.state in POWERED:
+        is_powered = self.state in POWERED or self._awaits_power
+        if option == 1 and is_powered:
             self.fault(code)
-        elif option == 2 and self.state in POWERED:
+        elif (option == 2 and is_powered) or (option == 3 and self._awaits_power):
             self._cut()
         elif option == 3 and self.state is State.OPERATION_ENABLED:
             self._stopped_itself = True

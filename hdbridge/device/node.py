@@ -138,14 +138,19 @@ class DriveNode:
         self._enter(Nmt.PRE_OPERATIONAL)
 
     def _take_period(self) -> None:
-        value = self.dictionary.value
-        mantissa = value(0x60C2, 1)
-        self._period_s = (mantissa or 1) / 10.0 ** -value(0x60C2, 2)
+        self._period_s = self._own_period_s()
         self._measures_period = (
-            mantissa == 0 or (0x60C2, 1) not in self.dictionary or self.behaviour.measures_period
+            self.dictionary.value(0x60C2, 1) == 0
+            or (0x60C2, 1) not in self.dictionary
+            or self.behaviour.measures_period
         )
         self._sync = SyncClock(self._period_s)
         self._sync_due_s = _NEVER
+
+    def _own_period_s(self) -> float:
+        """Returns the period in 60C2h; s."""
+        value = self.dictionary.value
+        return (value(0x60C2, 1) or 1) / 10.0 ** -value(0x60C2, 2)
 
     @property
     def has_sync(self) -> bool:
@@ -464,8 +469,13 @@ class DriveNode:
             self._enter(state)
 
     def _lose_sync(self) -> None:
-        """Discards pending set-points when SYNC is overdue, and stops an axis that follows the bus."""
+        """Discards pending set-points when SYNC is overdue, and stops an axis that follows the bus.
+
+        The period is that of 60C2h again, because an axis that runs on its own clock needs one shorter than
+        sparse SYNCs may have measured.
+        """
         self._sync_due_s = _NEVER
+        self._period_s = self._own_period_s()
         for rpdo in self._sync_rpdos:
             rpdo.pending = None
         if self.firmware.follows_the_bus:

@@ -5,10 +5,9 @@ from __future__ import annotations
 import os
 import re
 import tempfile
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from pathlib import Path
-from typing import Final
+from typing import Final, Self
 from urllib.parse import quote, unquote
 
 from hdbridge.errors import BusError, BusInUseError
@@ -25,32 +24,56 @@ _IN_ONE_PROCESS: Final = frozenset({"virtual"})
 """python-can interfaces that do not reach beyond their process."""
 
 
-@contextmanager
-def interface_lock(interface: str, channel: object, folder: Path | None = None) -> Iterator[None]:
-    """Holds the lock of an interface; raises `BusInUseError` if another process on this computer holds it.
+class InterfaceLock:
+    """Lock of a CAN interface on this computer. Entered or acquired by one holder, until it is released.
 
     The lock file is never removed, because the next two processes could then each get a lock. ``folder`` is
     its location, by default one that all users of the computer share.
     """
-    if fcntl is None or interface in _IN_ONE_PROCESS:
-        yield
-        return
-    path = (folder or _folder()) / f"hdbridge-{quote(f'{interface}-{channel}', safe='')}.lock"
-    handle = _open(path)
-    try:
+
+    def __init__(self, interface: str, channel: object, folder: Path | None = None) -> None:
+        self._name = f"{interface}:{channel}"
+        self._path: Path | None = None
+        if fcntl is not None and interface not in _IN_ONE_PROCESS:
+            self._path = (folder or _folder()) / f"hdbridge-{quote(f'{interface}-{channel}', safe='')}.lock"
+        self._handle: int | None = None
+
+    @property
+    def holder(self) -> int:
+        """Process id of the holder; 0 if the lock is free, or if the system does not show its holder."""
+        return _holder(self._path) if self._path is not None and self._path.exists() else 0
+
+    def acquire(self) -> None:
+        """Acquires the lock; raises `BusInUseError` if another process on this computer holds it."""
+        if self._path is None or self._handle is not None:
+            return
+        handle = _open(self._path)
         try:
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
-            number = _holder(path)
+            os.close(handle)
+            number = self.holder
             end = f"end it with 'kill {number}'" if number else "end it"
             raise BusInUseError(
-                f"{interface}:{channel}: another hdbridge on this machine masters it "
-                f"({process_words(number) if number else 'it'} holds {path}); ask it with 'hdbridge ctl' if "
-                f"it is a daemon, or {end} (--force, in the library shared=True, opens the bus anyway)"
+                f"{self._name}: another hdbridge on this machine masters it "
+                f"({process_words(number) if number else 'it'} holds {self._path}); if it is a daemon, ask "
+                f"it with 'hdbridge ctl' or borrow its bus with --borrow, else {end} (--force, in the "
+                "library shared=True, opens the bus anyway)"
             ) from None
-        yield
-    finally:
-        os.close(handle)
+        self._handle = handle
+
+    def release(self) -> None:
+        """Releases the lock if it is held."""
+        if self._handle is not None:
+            os.close(self._handle)
+            self._handle = None
+
+    def __enter__(self) -> Self:
+        self.acquire()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.release()
 
 
 def holders(folder: Path | None = None) -> dict[int, str]:

@@ -22,7 +22,7 @@ import can
 
 from hdbridge.canframe import DataFrame
 from hdbridge.clock import Clock
-from hdbridge.drive.interfacelock import interface_lock
+from hdbridge.drive.interfacelock import InterfaceLock
 from hdbridge.errors import BusError, InputError
 from hdbridge.files.expectation import nearest
 
@@ -278,7 +278,7 @@ def open_bus(settings: BusSettings, *, shared: bool = False) -> Iterator[can.Bus
     two masters on one bus stop each other's axes. ``shared`` skips this check, for programs that are not a
     master and for an explicit override. python-can's configuration files in the home folder are ignored.
     """
-    lock = nullcontext() if shared else interface_lock(settings.interface, settings.channel)
+    lock = nullcontext() if shared else InterfaceLock(settings.interface, settings.channel)
     with lock, _opened(settings) as bus:
         yield bus
 

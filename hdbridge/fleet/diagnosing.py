@@ -46,7 +46,7 @@ class Model:
     where: str = ""
     reason: str = ""
     sha256: str | None = None
-    """Of the model without its provenance."""
+    """Hash of the model without its provenance."""
 
 
 @cache

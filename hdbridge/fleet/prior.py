@@ -114,6 +114,11 @@ def read_prior(path: Path, of: Mapping[str, str]) -> Prior:
             close = nearest(group, known)
             hint = f" (did you mean {close}?)" if close else ""
             raise InputError(f"{path}: no {attribute} '{group}'{hint}; expected {', '.join(known) or 'none'}")
+    return joint_prior(rows, of)
+
+
+def joint_prior(rows: Sequence[Mapping[str, Any]], of: Mapping[str, str]) -> Prior:
+    """Returns the prior of a joint ``of`` these groups, by attribute, from `prior_rows`."""
     right: dict[str, float] = {}
     words: dict[str, str] = {}
     ranges: dict[tuple[str, str], tuple[float, float]] = {}

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import gzip
 import json
+import math
 import shutil
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
@@ -23,6 +24,7 @@ from hdbridge.records.record import Record
 from hdbridge.sim.exercise import Exercise
 from hdbridge.sim.machine import Machine
 from hdbridge.sim.truth import Truth
+from hdbridge.units import ARCSEC_PER_DEG
 
 YEAR_HOURS: Final = 8000.0
 BEGIN: Final = datetime(2026, 1, 5, 6, 0, tzinfo=UTC)
@@ -35,6 +37,9 @@ ODD: Final = 0.1
 """Share of joints whose orders are unusually large from the beginning."""
 EVERYDAY: Final = 0.015
 """Relative standard deviation of orders and loop between recordings of a healthy joint."""
+FRICTION_NM: Final = 0.3
+"""Friction of the load of a joint with backlash."""
+STIFFNESS_NM_PER_RAD: Final = 45_000.0
 
 
 @dataclass
@@ -69,7 +74,7 @@ def _load_order(data: dict[str, Any], size: float) -> None:
 
 def _backlash(data: dict[str, Any], size: float) -> None:
     data["gear"]["backlash_arcsec"] = 2.0 * size
-    data["load"]["coulomb_nm"] = 0.3
+    data["load"]["coulomb_nm"] = FRICTION_NM  # without friction the load follows through the gap
 
 
 def _flexspline(data: dict[str, Any], size: float) -> None:
@@ -82,6 +87,17 @@ def _motor_order(data: dict[str, Any], size: float) -> None:
 
 def _loop(data: dict[str, Any], size: float) -> None:
     data["gear"]["hysteresis"]["offset_arcsec"] += size
+
+
+def peak_at_0_hours_arcsec(cause: str, arcsec_per_1000_hours: float, first_hours: float) -> float:
+    """Returns the peak at 0 hours of the straight line that a diagnosis sees.
+
+    A model that is fitted to the first recording contains that recording's motor orders and loop: they count
+    from there. The friction of a load with backlash winds the gear up, which looks the same as the gap.
+    """
+    if cause in {"motor_order", "hysteresis_parameters"}:
+        return -arcsec_per_1000_hours * first_hours / 1000.0
+    return math.degrees(FRICTION_NM / STIFFNESS_NM_PER_RAD) * ARCSEC_PER_DEG if cause == "backlash" else 0.0
 
 
 CAUSES: Final[Mapping[str, Callable[[dict[str, Any], float], None]]] = {
@@ -182,7 +198,7 @@ def _truth(joint: Joint, number: int, base: Mapping[str, Any], rng: Random) -> T
     data = json.loads(json.dumps(base))
     data["substep_ms"] = 1.0
     data["motor"]["encoder"].update(counts_per_turn=65536, interpolation=16)
-    data["gear"].update(stiffness_nm_per_rad=45_000.0, damping_nm_s_per_rad=40.0)
+    data["gear"].update(stiffness_nm_per_rad=STIFFNESS_NM_PER_RAD, damping_nm_s_per_rad=40.0)
     data["servo"]["load_feedforward"]["frequency_hz"] = 65.0
     turned = joint.turned_at is not None and number >= joint.turned_at
     data["gear"]["motor_orders"] = [

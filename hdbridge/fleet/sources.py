@@ -156,14 +156,13 @@ def _recordings(files: Mapping[str, str], described: Collection[str]) -> dict[st
     return {path: "\n".join(f"{each} {files[each]}" for each in own) for path, own in found.items()}
 
 
-def _marks_of(paths: Iterable[str]) -> dict[str, str]:
+def _marks_of(paths: Collection[str]) -> dict[str, str]:
     """Returns the marks of the recordings that a manifest names; a missing one has none."""
-    places = {path if "://" not in path else posixpath.dirname(path) for path in paths}
     files: dict[str, str] = {}
-    for place in places:
+    for place in {posixpath.dirname(path) if "://" in path else path for path in paths}:
         with suppress(InputError):  # the worker that reads the recording reports the error
-            files |= _listing(place)
-    return _recordings(files, paths if isinstance(paths, Collection) else set(paths))
+            files |= _listing(place) if "://" in place else dict(_local(Path(place)))
+    return _recordings(files, paths)
 
 
 def _listing(place: str) -> dict[str, str]:
@@ -286,8 +285,9 @@ def _described(row: Mapping[str, Any], manifest: Path, number: int) -> Source:
     if "path" not in values:
         raise InputError(f"{manifest}:{number}: path: found nothing; expected the path of a recording")
     for name in ("path", "model"):
-        if name in values and "://" not in values[name]:
-            values[name] = str(folder / values[name])
+        if name in values:
+            remote = "://" in values[name]
+            values[name] = values[name].rstrip("/") if remote else os.path.abspath(folder / values[name])  # noqa: PTH100
     source = Source(**values)
     if source.axis and source.path.endswith(BUS_LOGS) and (folder / source.axis).exists():
         source = replace(source, axis=str(folder / source.axis))

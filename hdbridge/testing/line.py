@@ -17,7 +17,7 @@ import can
 from hdbridge.axis.config import BusConfig
 from hdbridge.clock import Clock, MonotonicClock
 from hdbridge.device.run import run
-from hdbridge.drive.interfacelock import interface_lock
+from hdbridge.drive.interfacelock import InterfaceLock
 from hdbridge.drive.link import open_bus
 from hdbridge.errors import BusInUseError, HdbridgeError, InputError
 from hdbridge.testing.port import INTERFACE, Port, StallingClock
@@ -153,7 +153,7 @@ def _turn(choice: BusChoice) -> Iterator[None]:
     with ExitStack() as stack:
         while True:
             try:
-                stack.enter_context(interface_lock(f"testing-{choice.interface}", choice.channel, folder))
+                stack.enter_context(InterfaceLock(f"testing-{choice.interface}", choice.channel, folder))
                 break
             except BusInUseError:
                 if time.monotonic() > end_s:

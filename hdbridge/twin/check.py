@@ -216,7 +216,10 @@ KNOWN_WARMTH = "temperature"
 GROWN = 1.5
 """Ratio of two misfits above which an axis has changed; smaller ones come from noise and different legs."""
 EXPLAINED = 0.25
-"""Maximum share of the growth, in squares, that may remain after a cause is named by ratio."""
+"""Minimum share of the growth, in squares, that a cause named by ratio explains. A servo that is not the
+axis's is off by a share of every change, so the cause is not required to explain all of it."""
+REST = 0.5
+"""Minimum share that a second cause explains of what the first has left: most of it."""
 MOST_NAMED = 2
 """Maximum number of causes named by ratio."""
 NOTICEABLE = 2.5
@@ -355,7 +358,8 @@ def _by_ratio(
             for each, fit in fits.items()
             if each != cause and not told_apart(near, fit.vector - near, legs)
         ]
-        if rivals or _excess(now_grown) > EXPLAINED * left:
+        explained = left - _excess(now_grown)
+        if rivals or explained < max(EXPLAINED * _excess(grown), REST * left if named else 0.0):
             break
         named, best, left, now = [*named, cause], fits[cause], _excess(now_grown), now_grown
         if max(now.values()) <= GROWN:

@@ -14,6 +14,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from hdbridge.analysis.readings import third_deviation
 from hdbridge.effects import Channel, FloatArray
 from hdbridge.errors import InputError
 from hdbridge.records.record import Record
@@ -366,21 +367,20 @@ def _of_signal(
 
 
 def noise_of(values: FloatArray, which: Rows, parts: Sequence[slice]) -> float:
-    """Estimates the rms noise of a signal from third differences; at least that of its resolution.
+    """Estimates the noise of a signal from third differences; at least that of its resolution.
 
-    Motion that is smooth over four samples does not contribute. A resolution q makes a noise of q / sqrt(12).
+    Motion that is smooth over four samples does not contribute, and the median ignores rows where it is not
+    smooth (a jerk, a reversal). A resolution q makes a noise of q / sqrt(12).
     """
-    squares = count = 0.0
-    resolution = math.inf
+    thirds, resolution = [], math.inf
     for part in parts:
-        third = np.diff(values[part], 3)
         inside = which[part]
         changes = np.diff(values[part])[inside[1:] & inside[:-1]]
         resolution = min(resolution, least_change(changes, values))
         whole = inside[3:] & inside[2:-1] & inside[1:-2] & inside[:-3]
-        squares += float(np.sum(third[whole] ** 2))
-        count += float(np.count_nonzero(whole))
-    spread = math.sqrt(squares / count / 20.0) if count else 0.0
+        thirds.append(np.diff(values[part], 3)[whole])
+    third = np.concatenate(thirds)
+    spread = third_deviation(third) if len(third) >= LEAST_SAMPLES else 0.0
     return max(spread, resolution / math.sqrt(12.0) if math.isfinite(resolution) else 0.0)
 
 

@@ -1,32 +1,9 @@
-"""Start values of a fit: linear regressions on the recordings, without replays.
-
-For any spring and loops, the motor's torque is the sum of its inertia times its acceleration, the load's
-divided by the ratio, Coulomb friction times the sign of the speed, and viscous friction times the speed. The
-load's acceleration comes from its own encoder, because it does not follow the command near its resonance. The
-motor inertia is in the regression but not used: the motor accelerates in the first milliseconds after a new
-demand, and the torque is recorded at the end of the cycle. The following error at constant speed is the speed
-times the age of the demand. The highest torque, if held for several rows, may be the drive's limit.
-
-Conversion of the gear's elastic loop between the plant's hysteresis laws.
-
-A calibration's model has one law, whose shape may differ from the gear's. Its offset is then biased, because
-the data include partial loops as well as whole ones.
-
-Least squares over replays: fits the plant's parameters from a start to a minimum of the misfit.
+"""Fits the plant's parameters to recordings: regressions first, then least squares over replays.
 
 The residuals of following error, torque and load angle are scaled by each channel's own deviation; a weak
-prior about the start holds parameters that the motion does not show. The misfit has long, narrow and curved
-valleys, because filter, dead time and feed-forwards compensate for each other. Steps with several dampings
-are therefore tried, at several lengths along a path that curves with the valley. The covariance allows for
-residuals correlated within a leg (sandwich estimator), because model errors are not white noise.
-
-Servo structures: fits for drives with loops other than those that a fit assumes first.
-
-The simulated servo is put together from blocks (`hdbridge.sim.servo`). Each fit starts at several bandwidths,
-with and without a torque feed-forward, because a servo far from the start is a minimum of its own. Blocks are
-then added one at a time, and kept if they reduce what is left of legs that the fit has not seen.
-
-Fitting the plant's parameters to recordings: regressions first, then least squares over replays.
+prior about the start holds parameters that the motion does not show. The misfit has several minima, so a fit
+has several starts. The covariance allows for residuals correlated within a leg, because model errors are not
+white noise.
 """
 
 from __future__ import annotations
@@ -94,7 +71,15 @@ from hdbridge.twin.replay import MOVING_DEG_S
 from hdbridge.units import ARCSEC_PER_DEG
 
 # ----------------------------------------------------------------
-# Start values of a fit: linear regressions on the recordings, without replays.
+# Start values: linear regressions on the recordings, without replays.
+#
+# For any spring and loops, the motor's torque is the sum of its inertia times its acceleration, the load's
+# divided by the ratio, Coulomb friction times the sign of the speed, and viscous friction times the speed.
+# The load's acceleration comes from its own encoder, because it does not follow the command near its
+# resonance. The motor inertia is in the regression but not used: the motor accelerates in the first
+# milliseconds after a new demand, and the torque is recorded at the end of the cycle. The following error
+# at constant speed is the speed times the age of the demand. The highest torque, if held for several rows,
+# may be the drive's limit.
 
 SMOOTHED_S = 0.03
 """Averaging time of all signals: without it, quantised angles give no usable acceleration."""
@@ -275,7 +260,8 @@ def _slope(
 
 
 # ----------------------------------------------------------------
-# Conversion of the gear's elastic loop between the plant's hysteresis laws.
+# Conversion of the gear's elastic loop between the plant's hysteresis laws: a calibration's model has one
+# law, whose shape may differ from the gear's.
 
 LOOP: Final = ("loop offset", "loop width", "loop yield", "loop exponent")
 """Parameters of the laws; no law has all of them."""
@@ -349,9 +335,6 @@ def _width_deg(loop: Hysteresis) -> float:
 def _with_loop(truth: Truth, loop: Hysteresis) -> Truth:
     return truth.model_copy(update={"gear": truth.gear.model_copy(update={"hysteresis": loop})})
 
-
-# ----------------------------------------------------------------
-# Least squares over replays: fits the plant's parameters from a start to a minimum of the misfit.
 
 # ----------------------------------------------------------------
 # Uncertainty of the coordinates: information from the slopes, and a jackknife over legs.
@@ -723,7 +706,9 @@ def _softening(values: FloatArray) -> FloatArray:
 
 
 # ----------------------------------------------------------------
-# Servo structures: fits for drives with loops other than those that a fit assumes first.
+# Servo structures: the simulated servo is put together from blocks (`hdbridge.sim.servo`). A servo far from
+# the start is a minimum of its own. Blocks are added one at a time, and kept if they reduce what is left of
+# legs that the fit has not seen.
 
 BANDWIDTHS: Final = ((25.0, 100.0), (80.0, 300.0), (200.0, 800.0))
 """Position gain, 1/s, and velocity gain over the whole inertia, rad/s: a geared axis with a soft load, an
@@ -881,9 +866,6 @@ def more_blocks(best: Fitted) -> Iterator[tuple[str, Fitting]]:
         with_friction = with_values(truth, {"friction feed-forward": 0.3 * truth.motor.coulomb_nm})
         yield "friction", begun_at(with_friction, (*best.parameters, BY_NAME["friction feed-forward"]))
 
-
-# ----------------------------------------------------------------
-# Fitting the plant's parameters to recordings: regressions first, then least squares over replays.
 
 # ----------------------------------------------------------------
 # Places at which a fit may have another minimum.

@@ -1,11 +1,7 @@
-"""Residuals between a recording and its replay, by channel, which a fit minimises.
+"""Residuals between a recording and its replay, by channel; their noise, their scales, and what they say.
 
 The replay has no noise, unrounded encoders and torque, and loops that close on a much finer encoder, so the
 residuals are smooth in the plant's parameters. The scale of each channel accounts for rounding and noise.
-
-Parallel replays in worker processes.
-
-Noise of a recording: the reference for a twin's residuals, and the noise of its load encoder.
 """
 
 from __future__ import annotations
@@ -20,7 +16,7 @@ from concurrent.futures import ProcessPoolExecutor
 from copy import copy
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
-from itertools import repeat
+from itertools import pairwise, repeat
 from typing import Any, Final, Literal, Self
 
 import numpy as np
@@ -28,13 +24,13 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 from scipy.special import log_ndtr, ndtr
 
-from hdbridge.analysis.readings import median_deviation, third_deviation
+from hdbridge.analysis.readings import median_deviation
 from hdbridge.axis import AxisConfig
 from hdbridge.effects import FloatArray
 from hdbridge.records.record import Record
 from hdbridge.records.recording import Recording, Segment
 from hdbridge.sim.truth import Truth
-from hdbridge.twin.compare import rms
+from hdbridge.twin.compare import noise_of, rms
 from hdbridge.twin.parameters import FOLLOWING, LOAD, TORQUE, with_load_encoder
 from hdbridge.twin.replay import (
     RINGING_S,
@@ -465,9 +461,6 @@ def _residuals(truth: Truth, seed: Seed, place: int) -> dict[str, FloatArray]:
 
 
 # ----------------------------------------------------------------
-# Noise of a recording: the reference for a twin's residuals, and the noise of its load encoder.
-
-# ----------------------------------------------------------------
 # Likelihood of a rounded reading under an unrounded simulation.
 
 FINE = 1e-3
@@ -648,26 +641,20 @@ def scales(data: Data, found: Mapping[str, FloatArray], loops: Loops | None = No
 # ----------------------------------------------------------------
 
 ARCSEC_PER_TURN = 360.0 * ARCSEC_PER_DEG
-LEAST_ROWS = 8
 
 
 def noise_in_motion(data: Data) -> dict[str, float]:
-    """Estimates the noise in motion by channel, in its unit, from third differences; at least the rounding.
+    """Estimates the noise in motion by channel, in its unit (`compare.noise_of`); at least the rounding.
 
-    At rest, count and torque stay constant, which is no reference for a simulation in motion. Motion that is
-    smooth over four rows vanishes in third differences, and the median ignores rows where it is not smooth (a
-    jerk, a reversal).
+    At rest, count and torque stay constant, which is no reference for a simulation in motion.
     """
-    floor = noise_floor(data)
+    floor, ends = noise_floor(data), np.cumsum([len(each.rest) for each in data.pieces]).tolist()
+    parts = [slice(first, end) for first, end in pairwise([0, *ends])]
+    moving = np.concatenate([each.rest for each in data.pieces]) == 0.0
     found = {}
     for name in CHANNELS:
-        rows = []
-        for piece in data.pieces:
-            moving = piece.rest == 0.0
-            whole = moving[3:] & moving[2:-1] & moving[1:-2] & moving[:-3]
-            rows.append(np.diff(piece.measured[name], 3)[whole])
-        third = np.concatenate(rows)
-        found[name] = max(floor[name], third_deviation(third) if len(third) >= LEAST_ROWS else 0.0)
+        values = np.concatenate([each.measured[name] for each in data.pieces])
+        found[name] = max(floor[name], noise_of(values, moving, parts))
     return found
 
 

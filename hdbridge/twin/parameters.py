@@ -1,12 +1,7 @@
-"""Parameters of the simulated drive that a fit may change.
+"""Parameters of the simulated drive that a fit may change, and their usual values.
 
 Each has a path in the truth file. Positive parameters are fitted by their logarithm, so that half and double
 are equally far; delays and parameters that may be zero are fitted directly.
-
-Default plant from the axis file alone: the twin before any measurement.
-
-Each value that is not in the axis file is a usual one for servo axes of this kind, in proportion to the
-values in it. These are the start values of a fit, and remain unless a measurement contradicts them.
 """
 
 from __future__ import annotations

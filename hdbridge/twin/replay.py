@@ -1,19 +1,9 @@
-"""Stretches: pieces of long recordings that a fit replays separately, and their unknown rows. Pure.
-
-Commands of a part of a recording, on the grid of its own cycle, preceded by an approach.
+"""Replays a recording's commands through a simulated drive, without bus and master.
 
 The state before a recording is unknown, so the replay switches the drive on at its angle zero and moves to
 the first command at the axis's limits; so does each part that does not follow another one. If the recording
-begins with the drive holding the axis, its torque sets the integrals of the loops; a recorded temperature
-sets the axis's.
-Between parts that follow each other the drive is switched off, as on the bench, and the load continues to
-ring.
-
-Replays a recording's commands through a simulated drive, over real frames or directly.
-
-Both give the same numbers. The frames show what a master sees of a twin; direct replays are fast enough for
-the hundreds that a fit needs. Over frames the drive knows nothing else: neither an external torque on the
-load nor the torque that held the axis before.
+begins with the drive holding the axis, its torque sets the integrals of the loops. Between parts that follow
+each other the drive is switched off, as on the bench, and the load continues to ring.
 
 External influences are part of a recording like its commands: a recorded torque on the load acts on the
 simulated load in place of its own weight, and the recorded temperature sets its initial temperature.
@@ -33,21 +23,15 @@ from ruckig import InputParameter, Result, Ruckig, Trajectory
 
 from hdbridge.axis import AxisConfig
 from hdbridge.axis.channels import BY_KEY
-from hdbridge.control.bench import Bench
-from hdbridge.drive.drive import Drive
 from hdbridge.effects import Channel, FloatArray
 from hdbridge.errors import InputError
-from hdbridge.procedures.moves import AxisView, MotionLimits, Path, Sample, Steps
 from hdbridge.records.record import Record, concatenate
 from hdbridge.records.recording import Recording, Segment
-from hdbridge.sim.lockstep import simulated_bench
 from hdbridge.sim.machine import Cycles, Machine
 from hdbridge.sim.truth import Truth
 
 # ----------------------------------------------------------------
-# Stretches: pieces of long recordings that a fit replays separately, and their unknown rows. Pure.
-
-# ----------------------------------------------------------------
+# Stretches: pieces of long recordings that a fit replays separately.
 
 STRETCH_S = 10.0
 """Length of a stretch: long against its unknown beginning (60 motor degrees, ringing)."""
@@ -410,10 +394,7 @@ def doubts(recording: Recording, axis: AxisConfig) -> tuple[str, ...]:
 
 
 # ----------------------------------------------------------------
-# Replays a recording's commands through a simulated drive, over real frames or directly.
-
-LATENCY_CYCLES = 4
-"""Maximum delay until a command appears as the demand; cycles."""
+# Replays.
 
 
 @dataclass(frozen=True, eq=False)
@@ -429,35 +410,10 @@ class Traces:
 
 
 def replay(recording: Recording, axis: AxisConfig, truth: Truth, seed: int = 0) -> Record:
-    """Replays the recording's commands over real frames, and returns the simulated drive's record.
+    """Replays the recording's commands, and returns the simulated drive's record with its rows and times.
 
-    It has the rows and times of the recording. InputError if the recording has no command or exceeds the
-    limits of the axis file; SafetyStop if the simulated drive's following error exceeds the axis file's.
-    """
-    records = []
-    for rows in continuous(recording.record):
-        part = recording.record.rows(rows.start, rows.stop)
-        commands = commands_of(part, axis, truth)
-        bench_axis = at_cycle(axis, commands.cycle_s)
-        with (
-            simulated_bench(
-                as_warm(truth, commands),
-                axis.eds_path,
-                axis.drive.node_id,
-                seed,
-                load_object=axis.load_encoder.source.address,
-            ) as (bus, clock, _),
-            Drive(bus, bench_axis, clock) as drive,
-        ):
-            drive.boot()
-            records += _benched(Bench(drive), commands, axis)
-    return records[0] if len(records) == 1 else concatenate(records)
-
-
-def replay_directly(recording: Recording, axis: AxisConfig, truth: Truth, seed: int = 0) -> Record:
-    """Replays as `replay` does, without bus and master; the load encoder's noise is another draw.
-
-    The drive's supervision and speed limits are not applied.
+    It gives the numbers that a bench reads over frames; supervision and speed limits are not applied.
+    InputError if the recording has no command.
     """
     records = []
     for rows in continuous(recording.record):
@@ -524,23 +480,6 @@ def _substeps(cycles: int, cycle_s: float, dt_s: float) -> tuple[int, ...]:
     return tuple(found)
 
 
-def _benched(bench: Bench, commands: Commands, axis: AxisConfig) -> list[Record]:
-    """Runs the commands on the bench; returns one record for each period in which the drive is on."""
-    load_deg = _degrees(commands.counts, axis) / axis.gear.ratio
-    starts = [0, *(each.stop + ON_BEFORE for each in commands.off)]
-    ends = [*(each.start for each in commands.off), len(load_deg)]
-    found = []
-    for start, end in zip(starts, ends, strict=True):
-        # In the first cycles after switching on, the drive has no commands.
-        path = load_deg[start + (OFF_AFTER if start else 0) : end]
-        if end == len(load_deg):
-            path = np.append(path, np.full(LATENCY_CYCLES, load_deg[-1]))
-        measured = bench.run(_Again(path, commands.cycle_s)).record
-        if end > commands.lead:
-            found.append(_at_rows(measured, slice(start, end), commands, axis))
-    return found
-
-
 def _told(
     machine: Machine,
     demand: list[float],
@@ -589,70 +528,6 @@ def _weightless(truth: Truth) -> Truth:
         return truth
     upright = truth.load_.model_copy(update={"gravity": mass.model_copy(update={"tilt_deg": 90.0})})
     return truth.model_copy(update={"load_": upright})
-
-
-def at_cycle(axis: AxisConfig, cycle_s: float) -> AxisConfig:
-    """Returns the axis with another SYNC period."""
-    if cycle_s == axis.drive.cycle_s:
-        return axis
-    cycle_ms = round(1e3 * cycle_s, 1)
-    heartbeat_ms = max(axis.drive.heartbeat_ms, math.ceil(2 * cycle_ms))
-    drive = axis.drive.model_copy(update={"cycle_ms": cycle_ms, "heartbeat_ms": heartbeat_ms})
-    return axis.model_copy(update={"drive": drive})
-
-
-class _Again:
-    """Procedure that repeats recorded commands, one for each cycle."""
-
-    def __init__(self, load_deg: FloatArray, cycle_s: float) -> None:
-        self._leg = _Leg(load_deg, cycle_s, "replay")
-
-    def moves(self, axis: AxisView) -> Steps[None]:
-        """Yields the commands as one leg."""
-        yield self._leg
-
-
-class _Leg:
-    """Leg of recorded commands, one for each cycle."""
-
-    def __init__(self, load_deg: FloatArray, cycle_s: float, kind: str) -> None:
-        self.kind = kind
-        self._load_deg: list[float] = load_deg.tolist()
-        self._cycle_s = cycle_s
-
-    def path(self, start_deg: float, limits: MotionLimits) -> Path:
-        """Returns the recorded commands as the path, without applying the limits."""
-        points, cycle_s, last = self._load_deg, self._cycle_s, len(self._load_deg) - 1
-
-        def at(time_s: float) -> float:
-            return points[min(round(time_s / cycle_s), last)]
-
-        return Path((last - 0.5) * cycle_s, at, min(points), max(points))
-
-    def ended(self, samples: Sequence[Sample]) -> bool:
-        """Returns True: the leg ends with its last command."""
-        return True
-
-
-def _at_rows(measured: Record, on: slice, commands: Commands, axis: AxisConfig) -> Record:
-    """Interpolates a bench run of some cycles at the rows of the recording in these cycles."""
-    cycles = commands.row_cycles + commands.lead
-    inside = (cycles >= on.start) & (cycles < on.stop)
-    first = max(on.start, commands.lead)
-    wanted = np.array(commands.counts[first : math.ceil(cycles[inside][-1]) + 1], dtype=np.float64)
-    target = measured.motor_target_deg
-    assert target is not None  # the bench records it
-    demand = np.round(axis.motor_encoder.counts(1.0) * target)[first - on.start :]
-    off = [
-        float(np.sum(np.abs(demand[late:][: len(wanted)] - wanted)))
-        for late in range(min(LATENCY_CYCLES, len(demand) - len(wanted)) + 1)
-    ]
-    begin = first - on.start + int(np.argmin(off))
-    columns = {
-        name: _between(column[begin:][: len(wanted)], cycles[inside] - first)
-        for name, column in measured.columns.items()
-    }
-    return Record(columns | {"time_s": commands.time_s[inside]})
 
 
 def _between(column: FloatArray, cycles: FloatArray) -> FloatArray:

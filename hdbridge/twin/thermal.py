@@ -29,7 +29,7 @@ from hdbridge.twin.fit import Fitted, sandwich
 from hdbridge.twin.misfit import held_out_legs
 from hdbridge.twin.naming import FALSE_ALARM, Finding, finding
 from hdbridge.twin.parameters import BY_NAME, Parameter, coordinates
-from hdbridge.twin.replay import continuous, replay_directly
+from hdbridge.twin.replay import continuous, replay
 
 TEMPERATURE: Final = "temperature"
 """Channel in which these constants show."""
@@ -310,7 +310,7 @@ def _losses(recording: Recording, axis: AxisConfig, truth: Truth) -> _Losses:
                 "ambient_swing_k": 0.0,
             }
         )
-        record = replay_directly(recording, axis, truth.model_copy(update={"temperature": heat}))
+        record = replay(recording, axis, truth.model_copy(update={"temperature": heat}))
         warm_c, time_s = record.columns[Channel.TEMPERATURE.value], record.time_s
         above_k = 0.5 * (warm_c[1:] + warm_c[:-1]) - heat.ambient_c
         cooled_j = np.append(0.0, np.cumsum(above_k * np.diff(time_s)))

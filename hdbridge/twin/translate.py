@@ -1,6 +1,4 @@
-"""Draft of a truth file, written effect by effect.
-
-Translates an axis file and a model to a truth file: each effect to the simulated plant's own physics.
+"""Translates an axis file and a model to a truth file: each effect to the simulated plant's own physics.
 
 A model describes the error of the load; the plant has parts that cause it. `TABLE` has one row with that part
 for each effect of the catalogue, and a translation reports for each effect of a model if it was translated in
@@ -172,9 +170,6 @@ class Draft:
 SHORTEST_MS = 0.0625
 """Shortest time step; a whole fraction of a millisecond."""
 
-
-# ----------------------------------------------------------------
-# Translates an axis file and a model to a truth file: each effect to the simulated plant's own physics.
 
 # ----------------------------------------------------------------
 # The branch of an elastic loop as parallel slip elements.

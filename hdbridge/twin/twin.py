@@ -1,18 +1,12 @@
-"""Result of `fit_twin`: the simulated drive's parameters, their intervals, and the residuals.
+"""The twin of an axis: makes it from recordings, judges it, and keeps it as a file.
 
-Verdict on a twin, from its residuals in each channel on held-out legs. Pure.
-
-A fit assumes that the simulated drive can behave like the axis. The residuals show if that is so. Only a twin
-that explains every channel has the values of the axis. Any other twin replays the motion, and its values are
-those of a different drive with similar motion.
-
-The twin of an axis as a file: a truth file with provenance, stored like a model.
+A fit assumes that the simulated drive can behave like the axis. The residuals on held-out legs show if that
+is so. Only a twin that explains every channel has the values of the axis. Any other twin replays the motion,
+and its values are those of a different drive with similar motion.
 
 profiles/NAME/twin.yaml           the active twin, which `hdbridge simulate` and `--simulate` use
               pending-twin.yaml   proposed by `hdbridge twin`, not yet committed
               twin-history/       each version that was ever active, and the log
-
-Makes a twin from recordings: fit, causes by which the start was wrong, inseparable sets, residuals.
 """
 
 from __future__ import annotations
@@ -63,7 +57,7 @@ from hdbridge.twin.misfit import (
 )
 from hdbridge.twin.naming import Alike, Finding, alike, name_causes
 from hdbridge.twin.parameters import LOAD, default_truth, with_sections
-from hdbridge.twin.replay import legs_of, replay_directly
+from hdbridge.twin.replay import legs_of, replay
 from hdbridge.twin.response import with_response
 from hdbridge.twin.thermal import with_warmth
 from hdbridge.units import figure
@@ -244,9 +238,6 @@ def better(before: Comparison, after: Comparison) -> Gain:
 
 
 # ----------------------------------------------------------------
-# The twin of an axis as a file: a truth file with provenance, stored like a model.
-
-# ----------------------------------------------------------------
 # Difference of two twins by parameter. Pure.
 
 SECTIONS = ("motor", "servo", "gear", "load", "temperature")
@@ -423,7 +414,7 @@ def fit_twin(
 def _compared(whole: Recording, axis: AxisConfig, truth: Truth) -> Comparison:
     """Compares a recording with one simulation by kind of leg, and on the held-out legs."""
     held = [each.model_copy(update={"kind": HELD_OUT}) for each in held_out_legs(whole)]
-    simulated = replay_directly(whole, axis, truth)
+    simulated = replay(whole, axis, truth)
     return compare(whole.record, simulated, [*legs_of(whole), *held], axis.gear.ratio)
 
 

@@ -144,20 +144,30 @@ def test_a_jog_of_some_time_is_repeated_and_ends_in_a_stop(client, api):
     assert api.bridge.stopped == [("joint-1", "stop")]
 
 
+def once_queued(axis, act):
+    """Starts a thread that acts once moves wait in the queue."""
+
+    def run():
+        while not axis.queued:
+            time.sleep(0.001)
+        act()
+
+    thread = threading.Thread(target=run)
+    thread.start()
+    return thread
+
+
 def test_a_queue_is_waited_for_until_nothing_waits(client, api):
     axis = api.bridge.axes["joint-1"]
-    reached = threading.Timer(0.3, axis.queued.clear)
-    reached.start()
+    reached = once_queued(axis, axis.queued.clear)
     client.axis("joint-1").queue([1.0, 2.0])
     reached.join()
     assert axis.queued == []
 
 
 def test_a_stop_ends_the_waiting_with_its_reason(client, api):
-    stopping = threading.Timer(
-        0.2, setattr, (api.bridge.axes["joint-1"], "at", messages.ControlState.QUICK_STOPPED)
-    )
-    stopping.start()
+    axis = api.bridge.axes["joint-1"]
+    stopping = once_queued(axis, lambda: setattr(axis, "at", messages.ControlState.QUICK_STOPPED))
     with pytest.raises(SafetyStop, match="a TPDO is missing; check the cable"):
         client.axis("joint-1").queue([1.0, 2.0])
     stopping.join()

@@ -20,7 +20,7 @@ from support.daemon import PROFILE, SteppedDaemon, article_axes, stepped_daemon
 from support.daemonlaws import Laws
 
 from hdbridge.daemon.loop.states import AxisState
-from hdbridge.daemon.memory import CommandKind, Knot, MailboxFullError
+from hdbridge.daemon.memory import CommandKind, Knot, MailboxFullError, RelayedFrame
 from hdbridge.drive.objects import Mode
 from hdbridge.errors import HdbridgeError
 from hdbridge.evaluation.stepping import Scheme
@@ -275,7 +275,7 @@ class Disorder(RuleBasedStateMachine):
         # A node that the service has set up otherwise is none of the loop's laws; restarts and reads are.
         if 0x600 <= can_id < 0x680 and data and data[0] >> 5 not in (2, 3, 4):
             data = b"\x40" + data[1:]
-        self.daemon.memory.outgoing.put(0, can_id, data)
+        self.daemon.memory.outgoing.add(RelayedFrame(0, can_id, data))
         self.go(number)
 
     # ---------------------------------------------------------------- a bus on which anything happens

@@ -14,12 +14,10 @@ from pathlib import Path
 
 import pytest
 
+from hdbridge.daemon.keeper import BackOff, Budget, Notifier
 from hdbridge.daemon.logs import LogSettings, RateLimit, begin_log, log_once
 from hdbridge.daemon.machine import Machine
-from hdbridge.daemon.notify import Notifier
-from hdbridge.daemon.patience import BackOff, Budget
-from hdbridge.daemon.runtime import runtime_folder, socket_path
-from hdbridge.daemon.start import Start
+from hdbridge.daemon.start import Start, runtime_folder
 from hdbridge.errors import InputError
 
 _log = logging.getLogger("hdbridge.test")
@@ -34,8 +32,6 @@ def test_the_service_manager_s_folder_comes_first(tmp_path: Path) -> None:
     assert folder == tmp_path / "hdbridge"
     assert stat.S_IMODE(folder.stat().st_mode) == 0o700
     assert runtime_folder(session) == folder
-    assert socket_path("cell", folder) == folder / "cell.sock"
-    assert socket_path("cell", folder, tmp_path / "own.sock") == tmp_path / "own.sock"
 
 
 def test_a_folder_that_others_could_use_is_refused(tmp_path: Path) -> None:

@@ -254,6 +254,25 @@ def test_every_controlword_while_power_is_being_switched_on(behaviour):
             assert node.state in ({ON, ENABLED} if pending else {wanted}), f"{word:02X}h"
 
 
+@pytest.mark.parametrize("behaviour", ["edge", "level"])
+@pytest.mark.parametrize(
+    ("option", "state"),
+    [(0, ENABLED), (1, FAULT), (2, DISABLED), (3, DISABLED)],
+    ids=str,
+)
+def test_a_master_that_is_lost_while_power_is_being_switched_on(option, state, behaviour):
+    """Its request ends with it, and the same controlword from a master that returns is no new one."""
+    with slave(behaviour, takes=4) as node:
+        node.bring(ON)
+        node.control(0x0F)
+        lose(node, option)
+        node.wait(0.004)
+        for _ in range(20):
+            node.control(0x0F)
+            node.wait(0.004)
+        assert node.state == state
+
+
 EVENTS = {
     "malfunction": lambda node: node.node.faults.raise_error(0x4310),
     "failure of the power stage": lambda node: setattr(node.stage, "error_code", 0x3210),
@@ -274,7 +293,7 @@ def lose(node: Slave, option: int) -> None:
 
 
 def after(event: str, state: str) -> tuple[str, ...]:
-    """Where CiA 402 and the option codes say that an event leads, once the axis is at rest."""
+    """State that CiA 402 and the option codes give after an event, once the axis is at rest."""
     powered = state in POWERED
     if event == "reset node":
         return (DISABLED,)

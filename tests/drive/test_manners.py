@@ -18,7 +18,7 @@ import pytest
 
 from hdbridge.axis import AxisConfig
 from hdbridge.drive.drive import Drive
-from hdbridge.drive.interfacelock import holders, interface_lock
+from hdbridge.drive.interfacelock import InterfaceLock, holders
 from hdbridge.drive.link import open_bus
 from hdbridge.errors import BusError, BusInUseError
 from hdbridge.files.bundled import bundled_profile
@@ -117,7 +117,7 @@ def test_it_listens_once_and_not_on_a_bus_of_its_own() -> None:
 
 
 def test_one_master_per_interface_on_a_machine(tmp_path: Path) -> None:
-    with interface_lock("socketcan", "can0", tmp_path):
+    with InterfaceLock("socketcan", "can0", tmp_path):
         user, number = pwd.getpwuid(os.getuid()).pw_name, os.getpid()
         other = (
             "socketcan:can0: another hdbridge on this machine masters it "
@@ -125,18 +125,18 @@ def test_one_master_per_interface_on_a_machine(tmp_path: Path) -> None:
         )
         with (
             pytest.raises(BusInUseError, match=other),
-            interface_lock("socketcan", "can0", tmp_path),
+            InterfaceLock("socketcan", "can0", tmp_path),
         ):
             pass
-        with interface_lock("socketcan", "can1", tmp_path), interface_lock("slcan", "/dev/ttyUSB0", tmp_path):
+        with InterfaceLock("socketcan", "can1", tmp_path), InterfaceLock("slcan", "/dev/ttyUSB0", tmp_path):
             pass
-    with interface_lock("socketcan", "can0", tmp_path):
+    with InterfaceLock("socketcan", "can0", tmp_path):
         pass
 
 
 def test_who_holds_an_interface_is_found_without_knowing_which(tmp_path):
     assert holders(tmp_path) == {}
-    with interface_lock("socketcan", "can0", tmp_path), interface_lock("slcan", "/dev/ttyUSB0", tmp_path):
+    with InterfaceLock("socketcan", "can0", tmp_path), InterfaceLock("slcan", "/dev/ttyUSB0", tmp_path):
         (tmp_path / "hdbridge-socketcan-can7.lock").touch()  # of one that has ended
         (tmp_path / "another.lock").touch()
         found = holders(tmp_path)
@@ -146,25 +146,25 @@ def test_who_holds_an_interface_is_found_without_knowing_which(tmp_path):
 
 
 def test_the_virtual_bus_needs_no_lock(tmp_path: Path) -> None:
-    with interface_lock("virtual", "x", tmp_path), interface_lock("virtual", "x", tmp_path):
+    with InterfaceLock("virtual", "x", tmp_path), InterfaceLock("virtual", "x", tmp_path):
         assert not list(tmp_path.iterdir())
 
 
 def test_the_lock_goes_with_its_process(tmp_path: Path) -> None:
     program = (
         "import sys, time; from pathlib import Path\n"
-        "from hdbridge.drive.interfacelock import interface_lock\n"
-        "with interface_lock('socketcan', 'can0', Path(sys.argv[1])):\n"
+        "from hdbridge.drive.interfacelock import InterfaceLock\n"
+        "with InterfaceLock('socketcan', 'can0', Path(sys.argv[1])):\n"
         "    print('held', flush=True); time.sleep(60)"
     )
     with subprocess.Popen([sys.executable, "-c", program, tmp_path], stdout=subprocess.PIPE) as holder:
         assert holder.stdout is not None
         assert holder.stdout.readline() == b"held\n"
-        with pytest.raises(BusInUseError), interface_lock("socketcan", "can0", tmp_path):
+        with pytest.raises(BusInUseError), InterfaceLock("socketcan", "can0", tmp_path):
             pass
         holder.kill()
         holder.wait()
-        with interface_lock("socketcan", "can0", tmp_path):
+        with InterfaceLock("socketcan", "can0", tmp_path):
             pass
 
 
@@ -172,7 +172,7 @@ def test_a_lock_that_cannot_be_opened_is_said(tmp_path: Path) -> None:
     (tmp_path / "hdbridge-socketcan-can0.lock").symlink_to(tmp_path / "elsewhere")
     with (
         pytest.raises(BusError, match="lock of the CAN interface"),
-        interface_lock("socketcan", "can0", tmp_path),
+        InterfaceLock("socketcan", "can0", tmp_path),
     ):
         pass
 
@@ -181,7 +181,7 @@ def test_opening_a_bus_takes_the_lock(monkeypatch: pytest.MonkeyPatch, tmp_path:
     """The kind of interface does not matter: it is not opened before the lock is held."""
     monkeypatch.setattr("hdbridge.drive.interfacelock._folder", lambda: tmp_path)
     settings = AXIS.on_bus(interface="socketcan", channel="absent0").bus
-    with interface_lock("socketcan", "absent0"):
+    with InterfaceLock("socketcan", "absent0"):
         with pytest.raises(BusInUseError), open_bus(settings):
             pass
         with pytest.raises(BusError, match="cannot open it"), open_bus(settings, shared=True):

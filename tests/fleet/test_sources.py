@@ -41,6 +41,16 @@ def test_a_manifest_describes_what_is_found_and_adds_what_is_not(tmp_path):
     assert found["J2"].axis == "article"
 
 
+def test_a_manifest_in_another_folder_describes_what_is_found(tmp_path):
+    (tmp_path / "in").mkdir()
+    (tmp_path / "about").mkdir()
+    (tmp_path / "in" / "a.csv").write_bytes(b"")
+    (tmp_path / "about" / "m.csv").write_text("path,joint\n../in/a.csv,J1\n")
+    (found,) = find_sources([str(tmp_path / "in")], tmp_path / "about" / "m.csv")
+    assert (found.joint, found.path) == ("J1", str(tmp_path / "in" / "a.csv"))
+    assert found.stamp
+
+
 def test_a_manifest_may_be_parquet(tmp_path):
     table = pa.table({"path": ["a.csv", "b.csv"], "joint": ["J1", None], "ratio": [50.0, 100.0]})
     pq.write_table(table, tmp_path / "m.parquet")

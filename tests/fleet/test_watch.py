@@ -6,9 +6,11 @@ import shutil
 import signal
 import subprocess
 import sys
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
+from distributed import Client, LocalCluster
 from support.command import run_here
 from support.fleet import MODEL, record
 
@@ -30,22 +32,11 @@ class Here:
         read = diagnosing.read
         monkeypatch.setattr(diagnosing, "read", lambda source: self.read.append(source.path) or read(source))
 
+    @contextmanager
     def client(self):
-        from distributed import Client, LocalCluster
-
-        class Both:
-            def __enter__(self):
-                self.cluster = LocalCluster(
-                    n_workers=1, threads_per_worker=1, processes=False, dashboard_address=None
-                )
-                self.client = Client(self.cluster, set_as_default=False)
-                return self.client
-
-            def __exit__(self, *_):
-                self.client.close()
-                self.cluster.close()
-
-        return Both()
+        options = {"n_workers": 1, "threads_per_worker": 1, "processes": False, "dashboard_address": None}
+        with LocalCluster(**options) as cluster, Client(cluster, set_as_default=False) as client:
+            yield client
 
 
 @pytest.fixture
@@ -143,6 +134,14 @@ def test_a_recording_of_which_recording_yaml_is_missing_is_not_complete():
     ]
     assert list(recordings_among(files)) == ["in/z", "a.csv"]
     assert list(recordings_among(["s3://b/recording.yaml", "s3://b/r.csv"])) == ["s3://b"]
+
+
+def test_a_name_with_brackets_is_a_name_in_a_manifest(tmp_path):
+    (tmp_path / "a[1].csv").write_text("time_s\n")
+    (tmp_path / "m.csv").write_text("path,joint\na[1].csv,A\nmissing.csv,A\n")
+    here, missing = find_sources([], tmp_path / "m.csv")
+    assert here.stamp
+    assert missing.stamp is None
 
 
 def test_a_file_that_grows_waits_until_it_does_not(place, here):

@@ -11,6 +11,7 @@ from support.gateway import COUNTS_PER_DEG, NODE, GatewayBench, gateway_bench
 from support.service import play
 
 from hdbridge.daemon.memory import CommandKind
+from hdbridge.motion import MotionMode
 
 STATE, ENABLED, FAULT, OFF = 0x6F, 0x27, 0x08, 0x40
 
@@ -421,3 +422,96 @@ def test_power_that_the_inner_drive_refuses_is_a_fault_until_it_is_reset(tmp_pat
         await reset(bench)
 
     scene(tmp_path, scenario)
+
+
+def nmt_stop(bench):
+    bench.plc.send(0, bytes((2, NODE)))
+
+
+def disable_voltage(bench):
+    bench.plc.controlword = 0x00
+
+
+def lost_sync(bench):
+    bench.plc.cycling = False
+
+
+def client_by_force(bench):
+    bench.bridge.lease.take("a person", force=True)
+
+
+@pytest.mark.parametrize("withdraw", [nmt_stop, disable_voltage, lost_sync, client_by_force])
+def test_a_request_for_power_that_is_withdrawn_meanwhile_is_not_followed(tmp_path, withdraw):
+    async def scenario(bench):
+        plc = bench.plc
+        plc.begin()
+        for word, bits in ((0x06, 0x21), (0x07, 0x23)):
+            plc.controlword = word
+            await bench.until(lambda bits=bits: plc.statusword & STATE == bits)
+        reader = bench.daemon.memory.reader()
+        plc.controlword = 0x0F
+        await bench.until(lambda: bench.daemon.states[0].name == "ENABLING")
+        withdraw(bench)
+        await bench.wait(1.0)
+        samples, _ = reader.read()
+        assert not any(samples["axes"][:, 0]["mode"] == MotionMode.FOLLOW)
+        await stands(bench)
+        if withdraw is not client_by_force:  # who has it now, and at rest
+            assert bench.daemon.states[0].name == "DISABLED"
+
+    scene(tmp_path, scenario)
+
+
+async def both_enabled(bench):
+    """Two axes, one node each, one SYNC: each is configured and enabled by its own master."""
+    for plc in reversed(bench.plcs):
+        bench.plc = plc
+        await bench.configure()
+    for plc in bench.plcs:
+        plc.begin()
+    for plc in bench.plcs:
+        bench.plc = plc
+        await bench.enable()
+        await swing(bench)
+
+
+def load_of(bench, axis):
+    return float(bench.daemon.nodes[axis].firmware.motion.machine.load_reading) / 2_880_000 * 360.0
+
+
+def test_each_axis_is_a_node_of_its_own_and_follows_its_own_targets(tmp_path):
+    async def scenario(bench):
+        await both_enabled(bench)
+        first, second = bench.plcs
+        second.plan = lambda cycle: second.target  # stands
+        place, swung = load_of(bench, 1), []
+        for _ in range(40):
+            await bench.wait(0.05)
+            swung.append(load_of(bench, 0))
+            assert abs(load_of(bench, 1) - place) < 0.02
+        assert max(swung) - min(swung) > 1.9
+        assert [plc.statusword & STATE for plc in bench.plcs] == [ENABLED, ENABLED]
+        assert (first.emergencies, second.emergencies) == ([], [])
+
+    scene(tmp_path, scenario, axes=2)
+
+
+def test_a_fault_of_one_axis_leaves_the_other_in_motion(tmp_path):
+    async def scenario(bench):
+        await both_enabled(bench)
+        first, second = bench.plcs
+        bench.daemon.nodes[1].faults.raise_error(0x4310)
+        await bench.until(lambda: second.statusword & 0x4F == FAULT, 1.0)
+        assert second.emergencies == [0xFF00]
+        swung = []
+        for _ in range(40):
+            await bench.wait(0.05)
+            swung.append(load_of(bench, 0))
+        assert max(swung) - min(swung) > 1.9
+        assert first.statusword & STATE == ENABLED
+        assert first.emergencies == []
+        second.send(0, bytes((2, second.node)))  # NMT stop of one node is not that of the other
+        await bench.wait(0.2)
+        assert first.statusword & STATE == ENABLED
+
+    scene(tmp_path, scenario, axes=2)

@@ -171,3 +171,14 @@ def test_where_a_twin_s_values_come_from_is_kept_and_changes_nothing() -> None:
     assert twin.model_copy(update={"intervals": {}, "provenance": {}}) == Truth.load(ARTICLE)
     with pytest.raises(InputError, match="expected lower, upper"):
         Truth.from_text(ARTICLE.read_text() + "\nintervals: {gear.ratio: [51, 49]}\n")
+
+
+def test_a_fault_is_put_in_by_keys_of_a_section() -> None:
+    truth = Truth.load(ARTICLE)
+    assert truth.changed() is truth
+    worn = truth.changed(gear={"backlash_arcsec": 12.0}, load={"coulomb_nm": 0.5})
+    assert (worn.gear.backlash_arcsec, worn.load_.coulomb_nm) == (12.0, 0.5)
+    assert worn.gear.model_copy(update={"backlash_arcsec": 0.0}) == truth.gear
+    for wrong in ({"gear": {"backlash": 12.0}}, {"gears": {}}, {"gear": {"ratio": -1.0}}):
+        with pytest.raises(InputError, match="changed truth"):
+            truth.changed(**wrong)

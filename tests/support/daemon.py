@@ -24,7 +24,7 @@ from hdbridge.control.buscycle import BusCycle
 from hdbridge.daemon.loop.controller import Controller
 from hdbridge.daemon.loop.follower import AxisSetup
 from hdbridge.daemon.loop.states import AxisState
-from hdbridge.daemon.memory import CommandKind, Event, EventKind, Knot, Memory
+from hdbridge.daemon.memory import CommandKind, Event, EventKind, Knot, Memory, RelayedFrame
 from hdbridge.daemon.setting import CompensationSetting
 from hdbridge.device.node import DriveNode
 from hdbridge.drive.drive import Drive
@@ -95,7 +95,7 @@ class SteppedRelay(can.BusABC):
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
         if msg.arbitration_id >= 0x700:
             return  # the loop sends the master's heartbeat
-        self._daemon.memory.outgoing.put(0, msg.arbitration_id, bytes(msg.data))
+        self._daemon.memory.outgoing.add(RelayedFrame(0, msg.arbitration_id, bytes(msg.data)))
 
     def recv(self, timeout: float | None = None) -> can.Message | None:
         clock = self._daemon.clock

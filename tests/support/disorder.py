@@ -48,7 +48,7 @@ def draw(rng: Random) -> tuple[str, Any]:
 
 
 class Laws:
-    """Of one axis."""
+    """Requests to one axis."""
 
     def __init__(self, bench: GatewayBench) -> None:
         self.bench = bench
@@ -99,7 +99,10 @@ class Laws:
 
 async def happen(bench: GatewayBench, laws: Laws, kind: str, value) -> None:
     plc, daemon, drive = bench.plc, bench.daemon, bench.daemon.nodes[0]
-    if kind not in HARMLESS:
+    (node,) = bench.gateway.nodes.values()
+    needs_sync = node.dictionary.value(0x6061) in (7, 8)
+    harmless = kind in HARMLESS or (kind, value) == ("nmt", 1) or (kind == "pause" and not needs_sync)
+    if not harmless and kind != "gateway":
         laws.disturbed_s = bench.now_s
     if kind == "word":
         plc.controlword = value
@@ -123,6 +126,7 @@ async def happen(bench: GatewayBench, laws: Laws, kind: str, value) -> None:
         await rest(bench, laws, 1e-3 * value)
         daemon.clock.nodes.append(bench.gateway)
         bench.restart_gateway()
+        laws.disturbed_s = bench.now_s  # until then the loop cannot know
         plc.send(0, bytes((1, NODE)))
     elif kind == "loop":
         daemon.hang(1e-3 * value)

@@ -16,6 +16,7 @@ import numpy as np
 
 from hdbridge.client import messages
 from hdbridge.daemon.memory import sample_dtype
+from hdbridge.daemon.service.commissioning import HomingRun
 from hdbridge.daemon.service.lease import Lease
 from hdbridge.daemon.service.moves import WayPoint
 from hdbridge.daemon.service.observer import Batch
@@ -76,6 +77,15 @@ class FakeAxis:
         if not -180 <= target_deg <= 180:
             raise InputError(f"found {target_deg:g} deg; expected from -180 to 180 deg")
 
+    async def switch_load_loop(self, holder: str, *, on: bool) -> None:
+        self._moved(holder, "load loop", on)
+
+    async def adapt(self, holder: str, mode: messages.AdaptationMode) -> None:
+        self._moved(holder, "adapt", mode.value)
+
+    async def revert_adaptation(self, holder: str) -> None:
+        self._moved(holder, "adaptation back")
+
     async def enable(self, holder: str) -> None:
         self._moved(holder, "enable")
         self.at = messages.ControlState.ENABLED
@@ -95,8 +105,8 @@ class FakeAxis:
         self._moved(holder, "reset")
         self.at = messages.ControlState.DISABLED
 
-    async def home(self, holder: str, method: int, *given: Any, **more: Any) -> float:
-        self._moved(holder, "home", method)
+    async def home(self, holder: str, run: HomingRun) -> float:
+        self._moved(holder, "home", run.method)
         return 0.0
 
     async def move(
@@ -301,12 +311,3 @@ class FakeBridge:
         self.told.append(
             messages.Event(sequence=number, kind=messages.EventKind.NOTE, date=BEGAN, cycle=1234, text=text)
         )
-
-    async def load_loop(self, holder: str, axis: str, on: bool) -> None:
-        self.axes[axis]._moved(holder, "load loop", on)
-
-    async def adapt(self, holder: str, axis: str, mode: messages.AdaptationMode) -> None:
-        self.axes[axis]._moved(holder, "adapt", mode.value)
-
-    async def adaptation_back(self, holder: str, axis: str) -> None:
-        self.axes[axis]._moved(holder, "adaptation back")

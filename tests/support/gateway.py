@@ -30,8 +30,19 @@ class Plc:
     SYNC. What came by the TPDO of that SYNC is in ``seen``: time, statusword, position.
     """
 
-    def __init__(self, channel: str, clock: Any, period_s: float = 0.004, drift_ppm: float = 0.0) -> None:
+    def __init__(
+        self,
+        channel: str,
+        clock: Any,
+        period_s: float = 0.004,
+        drift_ppm: float = 0.0,
+        node: int = NODE,
+        *,
+        syncs: bool = True,
+    ) -> None:
+        """``syncs``: it is the one that produces SYNC."""
         self.bus = VirtualBus(channel)
+        self.node, self._syncs = node, syncs
         self._clock = clock
         self.period_s = period_s * (1.0 + 1e-6 * drift_ppm)
         self.controlword = 0
@@ -63,13 +74,13 @@ class Plc:
     def listen(self) -> None:
         while (message := self.bus.recv(0)) is not None:
             data = bytes(message.data)
-            if message.arbitration_id == 0x180 + NODE and len(data) >= 6:
+            if message.arbitration_id == 0x180 + self.node and len(data) >= 6:
                 self.statusword, self.position = struct.unpack("<Hi", data[:6])
-            elif message.arbitration_id == 0x080 + NODE:
+            elif message.arbitration_id == 0x080 + self.node:
                 self.emergencies.append(struct.unpack_from("<H", data)[0])
-            elif message.arbitration_id == 0x580 + NODE:
+            elif message.arbitration_id == 0x580 + self.node:
                 self._answers.append(data)
-            elif message.arbitration_id == 0x700 + NODE:
+            elif message.arbitration_id == 0x700 + self.node:
                 self.heartbeats.append(data[0])
 
     def _turn(self, now_s: float) -> None:
@@ -77,8 +88,9 @@ class Plc:
         if planned is not None:
             self.target = planned
         if self.sends_targets:
-            self.send(0x200 + NODE, struct.pack("<Hi", self.controlword, self.target))
-        self.send(0x080)
+            self.send(0x200 + self.node, struct.pack("<Hi", self.controlword, self.target))
+        if self._syncs:
+            self.send(0x080)
         self.seen.append((now_s, self.statusword, self.position, self.target))
         self.cycle += 1
 
@@ -98,12 +110,19 @@ class Plc:
 class GatewayBench:
     """Everything between the outer master and the simulated drive."""
 
-    def __init__(self, service: Service, channel: str, gateway: Callable[[], Gateway], plc: Plc) -> None:
-        self.service, self.daemon, self.plc = service, service.daemon, plc
+    def __init__(
+        self, service: Service, channel: str, gateway: Callable[[], Gateway], plcs: list[Plc]
+    ) -> None:
+        self.service, self.daemon, self.plcs = service, service.daemon, plcs
+        self.plc = plcs[0]
+        """The master of the axis that the methods are about."""
         self.channel = channel
         self._made = gateway
         self.gateway = gateway()
-        self.daemon.clock.nodes += [plc, self.gateway]  # in this order: a frame arrives when it is sent
+        self.daemon.clock.nodes += [
+            *reversed(plcs),
+            self.gateway,
+        ]  # in this order: a frame arrives when it is sent
 
     def restart_gateway(self) -> None:
         """The process was killed, and another takes its place."""
@@ -131,14 +150,15 @@ class GatewayBench:
         return self.daemon.clock.now()
 
     async def sdo(self, request: bytes) -> bytes:
-        self.plc.listen()
-        self.plc._answers.clear()
-        self.plc.send(0x600 + NODE, request)
+        plc = self.plc
+        plc.listen()
+        plc._answers.clear()
+        plc.send(0x600 + plc.node, request)
         found: list[bytes] = []
 
         def answered() -> bool:
-            self.plc.listen()
-            if (answer := self.plc.take_answer()) is not None:
+            plc.listen()
+            if (answer := plc.take_answer()) is not None:
                 found.append(answer)
             return bool(found)
 
@@ -163,15 +183,15 @@ class GatewayBench:
             (0x1400, 0x200, (0x60400010, 0x607A0020)),
             (0x1800, 0x180, (0x60410010, 0x60640020)),
         ):
-            await self.write(first, 1, 0x8000_0000 | cob + NODE, 4)
+            await self.write(first, 1, 0x8000_0000 | cob + plc.node, 4)
             await self.write(first + 0x200, 0, 0, 1)
             for sub, word in enumerate(words, start=1):
                 await self.write(first + 0x200, sub, word, 4)
             await self.write(first + 0x200, 0, len(words), 1)
             await self.write(first, 2, 1, 1)
-            await self.write(first, 1, cob + NODE, 4)
+            await self.write(first, 1, cob + plc.node, 4)
         await self.write(0x6060, 0, mode, 1)
-        plc.send(0, bytes((1, NODE)))
+        plc.send(0, bytes((1, plc.node)))
         plc.target = await self.read(0x6064, signed=True)
 
     async def enable(self) -> float:
@@ -202,7 +222,8 @@ def gateway_bench(
         service = stack.enter_context(stepped_service(folder, **options))
         clock = service.daemon.clock
         bus = BusConfig(interface="virtual", channel=channel)
-        settings = GatewaySettings(bus=bus, nodes={service.machine.axes[0].name: NODE})
+        nodes = {axis.name: NODE + place for place, axis in enumerate(service.machine.axes)}
+        settings = GatewaySettings(bus=bus, nodes=nodes)
         service.machine = replace(service.machine, gateway=settings)
         configs = [axis.config for axis in service.machine.axes]
 
@@ -216,6 +237,7 @@ def gateway_bench(
         def gateway() -> Gateway:
             return Gateway(outer, configs, settings, service.daemon.memory, clock, eds_of)
 
-        plc = Plc(channel, clock, period_s, drift_ppm)
-        stack.callback(plc.bus.shutdown)
-        yield GatewayBench(service, channel, gateway, plc)
+        plcs = [Plc(channel, clock, period_s, drift_ppm, node, syncs=node == NODE) for node in nodes.values()]
+        for plc in plcs:
+            stack.callback(plc.bus.shutdown)
+        yield GatewayBench(service, channel, gateway, plcs)

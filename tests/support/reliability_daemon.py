@@ -13,7 +13,7 @@ from hdbridge.control.compensation import Compensation, CompensationLimits
 from hdbridge.daemon.loop.follower import AxisSetup
 from hdbridge.daemon.loop.states import AxisState
 from hdbridge.daemon.memory import CommandKind, EventKind
-from hdbridge.daemon.service.ports import ServiceAxis
+from hdbridge.daemon.service.axis import ServiceAxis
 from hdbridge.drive.supervision import Reaction
 from hdbridge.effects import Moment
 from hdbridge.errors import RefusedError

@@ -67,7 +67,7 @@ class WatchedMotor(IdealMotor):
 
 
 class Laws:
-    """What the master has asked for, from its frames alone."""
+    """Requests of the master, from its frames alone."""
 
     def __init__(self) -> None:
         self.home = 0.0
@@ -114,7 +114,7 @@ class Laws:
             assert asked or braking, f"motion in mode {self.mode} without a target"
             before = max(LOW - (start - self.home), (start - self.home) - HIGH, 0.0)
             outside = max(LOW - (end - self.home), (end - self.home) - HIGH, 0.0)
-            assert outside <= max(before, 1.0) or braking, f"{end:.0f} counts"
+            assert outside <= before + 1.0 or braking, f"{end:.0f} counts"
         self.velocity = speed
 
 

@@ -20,7 +20,7 @@ from hdbridge.twin.compare import FOLLOWING_ERROR, LOAD_ERROR, compare
 from hdbridge.twin.fit import solve
 from hdbridge.twin.misfit import Replays, prepare, remembers, residuals, scales
 from hdbridge.twin.parameters import BY_NAME, FOLLOWING, LOAD, TORQUE, coordinates, with_values
-from hdbridge.twin.replay import replay_directly
+from hdbridge.twin.replay import replay
 
 DEMO = Path(__file__).parents[2] / "profiles" / "demo"
 AXIS = AxisConfig.load(DEMO)
@@ -68,7 +68,7 @@ def test_a_count_is_no_other_zero() -> None:
 
 def test_nor_is_it_in_a_comparison() -> None:
     for recording in (recorded(), told_by_another_zero()):
-        simulated = replay_directly(recording, AXIS, TRUTH)
+        simulated = replay(recording, AXIS, TRUTH)
         row = compare(recording.record, simulated, (), 50.0).row(FOLLOWING_ERROR)
         assert row is not None
         assert row.difference < 0.1, "motor degrees: two counts"
@@ -88,7 +88,7 @@ def test_a_wrong_spring_or_load_stays_in_the_load_error(name: str, factor: float
         "load inertia": TRUTH.load_.inertia_kg_m2,
     }[name]
     wrong = with_values(TRUTH, {name: factor * value})
-    simulated = replay_directly(recorded(), AXIS, wrong)
+    simulated = replay(recorded(), AXIS, wrong)
     row = compare(recorded().record, simulated, (), 50.0).row(LOAD_ERROR)
     assert row is not None
     assert left(wrong)[LOAD] > 0.7 * row.difference

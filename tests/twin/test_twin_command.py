@@ -24,7 +24,7 @@ from hdbridge.twin.compare import compare
 from hdbridge.twin.misfit import Left
 from hdbridge.twin.naming import Finding, Moved
 from hdbridge.twin.parameters import with_values
-from hdbridge.twin.replay import replay_directly
+from hdbridge.twin.replay import replay
 from hdbridge.twin.twin import KeptTwin, Twin, impossible
 
 DEMO = Path(__file__).parents[2] / "profiles" / "demo"
@@ -63,7 +63,7 @@ def trips(truth: Truth, folder: Path) -> Path:
     led = record_of(truth, lead)
     legs = tuple(Segment(kind="step", start_s=a, end_s=b) for a, b in pairwise(ends))
     # A drive is told whole counts; what it was led by here has fractions of them.
-    record = replay_directly(Recording(led, legs, axis="demo", ratio=50.0), AxisConfig.load(DEMO), truth)
+    record = replay(Recording(led, legs, axis="demo", ratio=50.0), AxisConfig.load(DEMO), truth)
     Recording(record, legs, axis="demo", ratio=50.0).save(folder)
     return folder
 
@@ -171,7 +171,7 @@ def fitted(truth: Truth, values: str = "axis", times_noise: float = 2.5) -> Call
     def fit_twin(recordings: Any, axis: AxisConfig, start: Truth, progress: Any) -> Twin:
         (recording,) = recordings
         before, after = (
-            compare(recording.record, replay_directly(recording, axis, each), recording.segments, 50.0)
+            compare(recording.record, replay(recording, axis, each), recording.segments, 50.0)
             for each in (start, truth)
         )
         moved = Moved("Coulomb friction", "Nm", start.motor.coulomb_nm, truth.motor.coulomb_nm, 0.033, 0.035)

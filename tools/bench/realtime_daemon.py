@@ -47,7 +47,7 @@ from hdbridge.control.realtime import prepare_realtime
 from hdbridge.daemon.loop.controller import Controller
 from hdbridge.daemon.loop.follower import AxisSetup
 from hdbridge.daemon.loop.states import AxisState
-from hdbridge.daemon.memory import CommandKind, EventKind, Knot, Memory
+from hdbridge.daemon.memory import CommandKind, EventKind, Knot, Memory, RelayedFrame
 from hdbridge.daemon.setting import CompensationSetting
 from hdbridge.drive.link import Link
 from hdbridge.evaluation.stepping import Scheme
@@ -178,7 +178,7 @@ def serve(fd: int, axes: int) -> int:
             for axis, each in enumerate(clients):
                 if now >= due[axis]:
                     due[axis] = now + next(each.steps)
-            memory.outgoing.put(time.monotonic_ns(), 0x601 + polls % axes, SDO_UPLOAD)
+            memory.outgoing.add(RelayedFrame(time.monotonic_ns(), 0x601 + polls % axes, SDO_UPLOAD))
             polls += 1
     print(json.dumps({**seen, "refused": seen["refused"][:10]}), flush=True)
     return 0

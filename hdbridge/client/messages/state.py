@@ -152,6 +152,7 @@ class BusState(Report):
     interface: str = Field(examples=["socketcan"])
     channel: str = Field(examples=["can0"])
     up: bool
+    lent_to: str | None = Field(None, description="program that has borrowed the bus; the axes are disabled")
     load: float | None = Field(None, description="share of the bus's time that is in use", examples=[0.31])
 
 

@@ -99,7 +99,7 @@ def daemon_of(connected: socket.socket) -> int:
     """Returns the process id of the daemon at the other end of a Unix socket: that of its keeper."""
     peer = peer_of(connected)
     assert peer is not None
-    if "hdbridge.daemon.service" not in command_line(peer.pid):
+    if "hdbridge.daemon.serve" not in command_line(peer.pid):
         return peer.pid
     return int(Path(f"/proc/{peer.pid}/stat").read_text(encoding="utf-8").rpartition(")")[2].split()[1])
 

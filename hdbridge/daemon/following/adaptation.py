@@ -20,14 +20,15 @@ from hdbridge.control.compensation import Inverse
 from hdbridge.daemon.following.estimator import (
     ZERO_ARCSEC,
     Change,
+    Partial,
     bounds_arcsec,
     calibrated_estimator,
     changes_between,
     half_widths,
+    partial_fit,
 )
 from hdbridge.daemon.following.measuring import DriftModel, Observation, reversals, turns
 from hdbridge.daemon.following.settings import AdaptationSettings, Mode
-from hdbridge.daemon.following.signs import Partial, partial_fit
 from hdbridge.effects import FloatArray
 from hdbridge.errors import InputError
 from hdbridge.model import TransmissionModel

@@ -17,12 +17,12 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from hdbridge.analysis.intervals import NORMAL_95, Interval, leaves, nested_half_widths, slopes
-from hdbridge.analysis.linear import Column
+from hdbridge.analysis.linear import SEEN, Column, orthonormal
 from hdbridge.daemon.following.measuring import DriftModel
 from hdbridge.daemon.following.settings import AdaptationSettings
 from hdbridge.effects import BoolArray, Effect, FloatArray
@@ -43,6 +43,8 @@ LEAST_ARCSEC = 1e-3
 STEP_ARCSEC = 1e-4
 """Step of a coefficient for the derivatives of parameters."""
 SIGMAS_AT_BOUND = 3.0
+MAX_CORRELATION = 0.95
+"""Largest correlation of neighbouring residuals that a standard error allows for."""
 
 
 @dataclass(slots=True)
@@ -180,3 +182,29 @@ def changes_between(
         for name, value in new.items()
         if value != old.get(name, 0.0)
     )
+
+
+class Partial(NamedTuple):
+    """Coefficient of one column in a least-squares fit with others."""
+
+    value: float
+    error: float
+    """Standard error, allowing for coloured noise; infinite if the column is not separable."""
+    mean_square: float
+    """Mean square of the residual."""
+
+
+def partial_fit(column: FloatArray, others: FloatArray, values: FloatArray) -> Partial:
+    """Fits values (n,) with a column (n,) and others (n, m)."""
+    basis = orthonormal(others)
+    own = column - basis @ (basis.T @ column)
+    rest = values - basis @ (basis.T @ values)
+    square, free = float(own @ own), len(values) - basis.shape[1] - 1
+    if free < 1 or square <= SEEN * float(column @ column):
+        return Partial(0.0, math.inf, math.inf)
+    value = float(own @ rest) / square
+    left = rest - value * own
+    mean_square = float(left @ left) / free + 1e-12
+    correlation = min(max(float(left[1:] @ left[:-1]) / (free * mean_square), 0.0), MAX_CORRELATION)
+    error = math.sqrt(mean_square / square * (1.0 + correlation) / (1.0 - correlation))
+    return Partial(value, error, mean_square)

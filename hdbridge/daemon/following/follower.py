@@ -18,12 +18,11 @@ from hdbridge.axis import AxisConfig
 from hdbridge.axis.channels import BY_KEY
 from hdbridge.client import messages
 from hdbridge.daemon.following.adaptation import Adaptation, Entry, Proposal
-from hdbridge.daemon.following.health import EncoderHealth, EncoderStatus, held_out_arcsec
-from hdbridge.daemon.following.judging import Raised, Verdict, Watch, WatchLimits
+from hdbridge.daemon.following.health import DRIVEN, EncoderHealth, EncoderStatus, held_out_arcsec, in_states
+from hdbridge.daemon.following.judging import Raised, Verdict, Watch
 from hdbridge.daemon.following.measuring import DriftModel, Measuring
 from hdbridge.daemon.following.servo import ServoWatch
 from hdbridge.daemon.following.settings import AdaptationSettings, Mode
-from hdbridge.daemon.following.signs import DRIVEN, in_states
 from hdbridge.daemon.following.statefile import AdaptationFiles
 from hdbridge.daemon.loop.states import AxisState
 from hdbridge.daemon.memory import NO_FAULT, SampleArray, SampleFlag, joined_samples
@@ -47,6 +46,10 @@ class Outcome(NamedTuple):
     proposal: Proposal | None = None
 
 
+NOTHING: Final = Outcome([])
+"""Outcome of samples that are not evaluated yet."""
+
+
 class Follower:
     """Follows one axis and one committed model. Call all methods from one thread."""
 
@@ -56,7 +59,6 @@ class Follower:
         model: TransmissionModel,
         index: int = 0,
         settings: AdaptationSettings | None = None,
-        limits: WatchLimits | None = None,
     ) -> None:
         """``index`` is that of the axis in a sample; nothing is adapted before `adapt`."""
         self.model = model
@@ -72,7 +74,7 @@ class Follower:
         self._load_count = axis.load_encoder.resolution_arcsec
         self._sigma_arcsec = observation_sigma_arcsec(axis)
         noise = max(held_out_arcsec(model), motor_count / UNIFORM)
-        self.watch = Watch(axis.name, self._drift, noise, limits)
+        self.watch = Watch(axis.name, self._drift, noise)
         channels = tuple(BY_KEY[key] for key in axis.channels)
         self._servo = ServoWatch(axis, model)
         self._measuring = Measuring(self._drift, self._settings.slow_deg_s, channels)
@@ -115,7 +117,7 @@ class Follower:
         if len(samples):
             self._waiting.append(samples)
         if sum(map(len, self._waiting)) < SAMPLES_TOGETHER:
-            return Outcome([])
+            return NOTHING
         together, self._waiting = joined_samples(self._waiting), []
         return self.advance(together, self.health.take(together))
 

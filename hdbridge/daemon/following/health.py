@@ -1,11 +1,17 @@
 """Health of the load encoder: detects its own faults and distinguishes them from wear of the gear.
 
-Four faults are detected, each by a sign that a gear cannot produce (`signs`):
+Four faults are detected, each by a sign that a gear cannot produce:
 
 * frozen: the reading does not change at all while the motor turns;
 * jumped: the residual steps although motor, speed and predicted error do not;
 * noisy: the jitter of a reading is several times its usual value, or readings jump there and back;
 * drifting: the zero moves faster or farther than warming up can move it.
+
+The signs are in the residual: measured minus predicted transmission error. A gear's error depends on its
+motor: it does not jump while the motor hardly moves, does not stay constant while the motor turns, does not
+become noisier within a second, and does not drift while the axis rests. The prediction in a sample is that at
+the motor angle *issued* in its cycle. The encoders are read at its SYNC, when the motor still lags, so the
+prediction is taken from an earlier time, by the mean lag.
 
 Jumps, drifts and noise in motion are judged only with a calibrated model, because without its prediction the
 gear's own error looks the same. The other signs are judged on every axis.
@@ -21,33 +27,49 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from enum import Enum
-from typing import NamedTuple
+from typing import Any, Final, NamedTuple, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
+from hdbridge.analysis.linear import orthonormal
 from hdbridge.analysis.readings import jitter_deg
 from hdbridge.axis import AxisConfig
-from hdbridge.daemon.following.signs import (
-    SIDE,
-    Residuals,
-    Trend,
-    find_jump,
-    find_step,
-    in_states,
-    local_noise_arcsec,
-    misread,
-    residuals,
-    stuck_arcsec,
-    trend,
-)
+from hdbridge.daemon.following.estimator import Partial, partial_fit
 from hdbridge.daemon.loop.states import AxisState
-from hdbridge.daemon.memory import SampleArray, joined_samples
-from hdbridge.effects import BoolArray
+from hdbridge.daemon.memory import SampleArray, SampleFlag, joined_samples
+from hdbridge.effects import BoolArray, FloatArray
 from hdbridge.model import TransmissionModel
 from hdbridge.units import ARCSEC_PER_DEG
 
+DRIVEN: Final = (AxisState.ENABLED, AxisState.STOPPING)
+"""States in which the motor follows the issued targets."""
+LONGEST_LAG_S: Final = 0.05
+"""Largest lag of a motor that follows."""
+SIDE = 5
+"""Samples on either side of a jump; their median ignores two misread ones."""
+MEDIAN_ERROR = 1.25
+"""Standard deviation of a median of few values, relative to that of their mean."""
+PREDICTED_SHARE = 0.5
+"""Share of the predicted change within a window that may appear too early or too late."""
+UNMODELLED_ARCSEC = 20.0
+UNMODELLED_DEG = 36.0
+"""Largest unmodelled change of the gear's error over this or a longer motor travel: an order of 10 per turn
+with an amplitude of 10 arcsec (`effects.motor_order` is at most 3).
+"""
+SHAKE_S = 0.002
+"""Time by which a speed change may show in the error, through wind-up and skew between the encoders."""
+MEDIAN_DIFFERENCE = 1.0 / (0.6745 * np.sqrt(2.0))
+"""Standard deviation of Gaussian values, relative to the median difference of neighbours."""
+STEP_ARCSEC = 6.0
+STEP_SIGMAS = 8.0
+STEP_BLOCKS = 20
+"""Minimum number of blocks on either side of a step of the zero."""
+STEP_BETTER = 0.6
+"""Largest ratio of the mean squares left by a step and by a trend."""
 ZERO_UNKNOWN = (AxisState.UNVERIFIED, AxisState.LENT)
 """States after which the encoders' zeros may have changed."""
 TAIL = 64
@@ -69,6 +91,223 @@ STEP_S = 180.0
 """Time span, up to now, in which a step of the zero is searched."""
 UNTESTED_ARCSEC = 3.0
 """Assumed residual of a model without a held-out result."""
+SIGMAS = 8.0
+"""Standard deviations of noise that no reading exceeds: probability 1e-15."""
+NOISE_RATIO = 4.0
+"""Ratio of jitter to its usual value; normal is 1, a damaged track gives 10."""
+SPIKES = 3
+"""Readings that jump there and back within ten seconds; so many are not chance."""
+FROZEN_ARCSEC = 120.0
+"""Load travel within which the reading must change; more than any backlash."""
+FROZEN_COUNTS = 20.0
+"""Minimum of the same, in counts of the load encoder."""
+ZERO_RATE_ARCSEC_MIN = 3.0
+"""Drift rate of the zero. Warming up moves it by 5 to 60 arcsec in 10 to 60 minutes, typically by 1 per
+minute (`effects.zero_drift`).
+"""
+MAX_ZERO_ARCSEC = 60.0
+"""Total drift of the zero."""
+RECOVERED_S = 10.0
+"""Time for which a reading must be good before a fault ends."""
+STANDING_DEG_S = 1e-6
+"""Speed of the load target below which it is at rest."""
+
+Residuals = NDArray[np.void]
+"""Samples of one axis with the dtype `RESIDUAL`, shape (n,)."""
+RESIDUAL: Final = np.dtype([
+    ("cycle", np.int64),
+    ("time_s", np.float64),
+    ("motor_deg", np.float64),
+    ("load_deg", np.float64),
+    ("velocity_deg_s", np.float64),  # of the load target
+    ("predicted_arcsec", np.float64),  # at the motor's actual position
+    ("residual_arcsec", np.float64),  # includes the difference of the encoders' zeros
+    ("fresh", np.bool_),
+    ("usable", np.bool_),  # fresh, driven, hysteresis state known, no model change under way
+])  # fmt: skip
+
+
+def residuals(samples: SampleArray, index: int, ratio: float, period_s: float) -> Residuals:
+    """Returns the residuals of the axis at ``index`` in consecutive samples; ``ratio`` is the gear ratio."""
+    axis: Any = samples["axes"][:, index]
+    found = np.empty(len(samples), RESIDUAL)
+    found["cycle"] = samples["cycle"]
+    found["time_s"] = time_s = samples["cycle"] * period_s
+    found["motor_deg"] = motor = axis["motor_position_deg"]
+    found["load_deg"] = load = axis["load_position_deg"]
+    found["velocity_deg_s"] = velocity = axis["velocity_deg_s"]
+    predicted: FloatArray = axis["predicted_arcsec"]
+    found["fresh"] = axis["flags"] & SampleFlag.FRESH
+    needed = SampleFlag.FRESH | SampleFlag.MEMORY_KNOWN
+    usable = (axis["flags"] & (needed | SampleFlag.CHANGING)) == needed
+    usable &= in_states(axis, DRIVEN) & np.isfinite(predicted)
+    found["usable"] = usable
+    lag_s = _lag_s((axis["issued_deg"] - motor)[usable], ratio * velocity[usable])
+    if lag_s and len(samples) > 1:
+        predicted = np.asarray(np.interp(time_s - lag_s, time_s, predicted), dtype=np.float64)
+    found["predicted_arcsec"] = predicted
+    found["residual_arcsec"] = (load - motor / ratio) * ARCSEC_PER_DEG - predicted
+    return found
+
+
+def in_states(axis: NDArray[Any], states: Sequence[AxisState]) -> BoolArray:
+    """Returns a mask of the samples of `AXIS_SAMPLE` in one of these states, shape (n,)."""
+    found = axis["state"] == states[0]
+    for each in states[1:]:
+        found |= axis["state"] == each
+    return np.asarray(found)
+
+
+def _lag_s(behind_deg: FloatArray, speed_deg_s: FloatArray) -> float:
+    """Returns the lag of the motor behind the issued target in seconds, by least squares."""
+    square = float(speed_deg_s @ speed_deg_s)
+    if not square or not np.all(np.isfinite(behind_deg)):
+        return 0.0
+    return min(max(float(speed_deg_s @ behind_deg) / square, 0.0), LONGEST_LAG_S)
+
+
+class Jump(NamedTuple):
+    """A step of the residual."""
+
+    row: int
+    by_arcsec: float
+    allowed_arcsec: float
+
+
+def find_jump(found: Residuals, noise_arcsec: float, count_arcsec: float) -> Jump | None:
+    """Returns the first step of the residual that neither noise nor motion nor model can cause.
+
+    ``noise_arcsec`` is the standard deviation of one reading, ``count_arcsec`` a motor encoder count at the
+    load.
+    """
+    span = 2 * SIDE
+    if len(found) < span:
+        return None
+    middle = _median(found["residual_arcsec"])
+    step = middle[SIDE:] - middle[:-SIDE]
+    turned = _ranges(span, found["motor_deg"])
+    allowed = (
+        SIGMAS * noise_arcsec * MEDIAN_ERROR * np.sqrt(2.0 / SIDE)
+        + count_arcsec
+        + _motion_arcsec(found, span)
+        + UNMODELLED_ARCSEC * np.minimum(turned / UNMODELLED_DEG, 1.0)
+    )
+    together = np.all(_windows(found["usable"], span), axis=0)
+    together &= found["cycle"][span - 1 :] - found["cycle"][: len(together)] < 2 * span
+    rows = np.flatnonzero(together & (np.abs(step) > allowed))
+    if not len(rows):
+        return None
+    # Several windows contain the step; the one centred on it shows it best.
+    near = rows[rows < rows[0] + span]
+    row = int(near[np.argmax(np.abs(step[near]))])
+    return Jump(row + SIDE, float(step[row]), float(allowed[row]))
+
+
+def misread(found: Residuals, noise_arcsec: float, count_arcsec: float) -> int:
+    """Returns the number of samples that jump away and return with the next one or two."""
+    if len(found) < SIDE:
+        return 0
+    middle = slice(SIDE // 2, len(found) - SIDE // 2)
+    away = np.abs(found["residual_arcsec"][middle] - _median(found["residual_arcsec"]))
+    allowed = SIGMAS * noise_arcsec + count_arcsec + _motion_arcsec(found, SIDE)
+    return int(np.count_nonzero((away > allowed) & np.all(_windows(found["usable"], SIDE), axis=0)))
+
+
+def local_noise_arcsec(found: Residuals) -> float:
+    """Returns the standard deviation of one reading, by the median difference of neighbours."""
+    steps = np.abs(found["residual_arcsec"][1:] - found["residual_arcsec"][:-1])
+    return float(MEDIAN_DIFFERENCE * np.median(steps)) if len(steps) else 0.0
+
+
+def stuck_arcsec(load_deg: FloatArray, motor_deg: FloatArray, ratio: float) -> tuple[int, float]:
+    """Returns the last row at which the load reading changed (0 if none), and the motor travel since.
+
+    The travel is in arcsec at the load.
+    """
+    changed = np.flatnonzero(np.diff(load_deg) != 0.0)
+    since = int(changed[-1]) + 1 if len(changed) else 0
+    travel = np.max(np.abs(motor_deg[since:] - motor_deg[since])) / ratio * ARCSEC_PER_DEG
+    return since, float(travel)
+
+
+_Any = TypeVar("_Any", np.bool_, np.float64)
+
+
+def _windows(values: NDArray[_Any], width: int) -> NDArray[_Any]:
+    """Returns a copy of all windows, shape (width, windows); faster than a view of short batches."""
+    rows = np.arange(width)[:, None] + np.arange(len(values) - width + 1)
+    return np.asarray(values[rows])
+
+
+def _median(values: FloatArray) -> FloatArray:
+    """Returns the median of each window of `SIDE` samples."""
+    return np.asarray(np.sort(_windows(values, SIDE), axis=0)[SIDE // 2])
+
+
+def _ranges(width: int, values: FloatArray) -> FloatArray:
+    """Returns the range of the values in each window."""
+    windows = _windows(values, width)
+    return np.asarray(windows.max(axis=0) - windows.min(axis=0))
+
+
+def _motion_arcsec(found: Residuals, width: int) -> FloatArray:
+    """Returns the change of the residual that motion permits in each window."""
+    predicted, speed = _ranges(width, found["predicted_arcsec"]), _ranges(width, found["velocity_deg_s"])
+    return PREDICTED_SHARE * predicted + SHAKE_S * ARCSEC_PER_DEG * speed
+
+
+def trend(
+    time_s: FloatArray, residual_arcsec: FloatArray, direction: FloatArray, velocity_deg_s: FloatArray
+) -> tuple[Partial, float] | None:
+    """Fits a trend to block means, corrected for direction and speed of motion.
+
+    Returns the rate in arcsec per minute and the zero in the middle of the time span; None if they are not
+    separable from the motion.
+    """
+    minutes = (time_s - float(np.mean(time_s))) / 60.0
+    plain = _motion_columns(direction, velocity_deg_s)
+    rate = partial_fit(minutes, plain, residual_arcsec)
+    zero = partial_fit(plain[:, 0], np.column_stack([minutes, plain[:, 1:]]), residual_arcsec)
+    if math.isinf(rate.error) or math.isinf(zero.error):
+        return None
+    return rate, zero.value
+
+
+def find_step(
+    time_s: FloatArray, residual_arcsec: FloatArray, direction: FloatArray, velocity_deg_s: FloatArray
+) -> tuple[float, Partial] | None:
+    """Returns time and size of a step of the zero in block means, if it fits far better than a trend."""
+    plain = _motion_columns(direction, velocity_deg_s)
+    basis = orthonormal(plain)
+    rest = residual_arcsec - basis @ (basis.T @ residual_arcsec)
+    count = len(rest)
+    after = np.arange(1, count)
+    mean_step = np.cumsum(rest[::-1])[::-1][1:] / (count - after) - np.cumsum(rest)[:-1] / after
+    near = slice(STEP_BLOCKS, count - STEP_BLOCKS)
+    likely = np.abs(mean_step * np.sqrt(after * (count - after) / count))[near]
+    if not len(likely):
+        return None
+    row = int(np.argmax(likely)) + STEP_BLOCKS + 1
+    # Both fits include a trend, because a ramp that begins or ends is not a step.
+    minutes = (time_s - time_s[0]) / 60.0
+    stepped = (np.arange(count) >= row).astype(np.float64)
+    step = partial_fit(stepped, np.column_stack([minutes, plain]), residual_arcsec)
+    slope = partial_fit(minutes, plain, residual_arcsec)
+    if abs(step.value) < max(STEP_ARCSEC, STEP_SIGMAS * step.error):
+        return None
+    if step.mean_square > STEP_BETTER * slope.mean_square:
+        return None
+    return float(time_s[row]), step
+
+
+def _motion_columns(direction: FloatArray, velocity_deg_s: FloatArray) -> FloatArray:
+    """Returns a constant, the direction and the speed, (n, 1 to 3)."""
+    columns = [np.ones(len(direction))]
+    for each in (direction, velocity_deg_s):
+        size = float(np.ptp(each))
+        if size:
+            columns.append(each / size)
+    return np.column_stack(columns)
 
 
 class EncoderFault(Enum):
@@ -83,39 +322,11 @@ class EncoderFault(Enum):
 LATCHED = frozenset({EncoderFault.JUMPED, EncoderFault.DRIFTING})
 
 
-STANDING_DEG_S = 1e-6
-"""Speed of the load target below which it is at rest."""
-
-
 class EncoderStatus(NamedTuple):
     """State of the load encoder: its fault if any, and the reason in words, with figures."""
 
     fault: EncoderFault | None = None
     reason: str = ""
-
-
-@dataclass(frozen=True, slots=True)
-class HealthLimits:
-    """Thresholds beyond which the load encoder has a fault."""
-
-    sigmas: float = 8.0
-    """Standard deviations of noise that no reading exceeds: probability 1e-15."""
-    noise_ratio: float = 4.0
-    """Ratio of jitter to its usual value; normal is 1, a damaged track gives 10."""
-    spikes: int = 3
-    """Readings that jump there and back within ten seconds; so many are not chance."""
-    frozen_arcsec: float = 120.0
-    """Load travel within which the reading must change; more than any backlash."""
-    frozen_counts: float = 20.0
-    """Minimum of the same, in counts of the load encoder."""
-    zero_rate_arcsec_min: float = 3.0
-    """Drift rate of the zero. Warming up moves it by 5 to 60 arcsec in 10 to 60 minutes, typically by 1 per
-    minute (`effects.zero_drift`).
-    """
-    zero_arcsec: float = 60.0
-    """Total drift of the zero."""
-    recovered_s: float = 10.0
-    """Time for which a reading must be good before a fault ends."""
 
 
 @dataclass(slots=True)
@@ -135,11 +346,8 @@ class _Zero:
 class EncoderHealth:
     """Monitors the load encoder of one axis in the loop's samples."""
 
-    def __init__(
-        self, axis: AxisConfig, model: TransmissionModel, index: int = 0, limits: HealthLimits | None = None
-    ) -> None:
+    def __init__(self, axis: AxisConfig, model: TransmissionModel, index: int = 0) -> None:
         """``index`` is that of the axis in a sample, ``model`` predicts the samples' errors."""
-        self.limits = limits or HealthLimits()
         self.status = EncoderStatus()
         """State after the last samples taken."""
         self._index = index
@@ -194,7 +402,7 @@ class EncoderHealth:
             self._judge_steps(found[max(old - 2 * SIDE + 1, 0) :])
         self._gather(found[old:])
         passing = self.status.fault is not None and self.status.fault not in LATCHED
-        if passing and self._now_s - self._bad_s >= self.limits.recovered_s:
+        if passing and self._now_s - self._bad_s >= RECOVERED_S:
             self.status = EncoderStatus()
         return self.status
 
@@ -231,7 +439,7 @@ class EncoderHealth:
             load, motor = np.append(held[0], load), np.append(held[1], motor)
         since, gone = stuck_arcsec(load, motor, self._ratio)
         self._held = (float(load[since]), float(motor[since]))
-        allowed = max(self.limits.frozen_arcsec, self.limits.frozen_counts * self._load_count_arcsec)
+        allowed = max(FROZEN_ARCSEC, FROZEN_COUNTS * self._load_count_arcsec)
         if gone > allowed:
             self._raise(
                 EncoderFault.FROZEN,
@@ -242,10 +450,9 @@ class EncoderHealth:
 
     def _judge_steps(self, found: Residuals) -> None:
         noise = max(self._usual(standing=bool(np.all(_standing(found)))), local_noise_arcsec(found))
-        jump = find_jump(found, noise, self._count_arcsec, self.limits.sigmas)
-        if (
-            jump is not None and self.status.fault is not EncoderFault.FROZEN
-        ):  # a frozen reading ends with a jump
+        jump = find_jump(found, noise, self._count_arcsec)
+        # A frozen reading ends with a jump.
+        if jump is not None and self.status.fault is not EncoderFault.FROZEN:
             moved = float(np.ptp(found["motor_deg"][jump.row - SIDE : jump.row + SIDE])) / self._ratio
             self._raise(
                 EncoderFault.JUMPED,
@@ -254,11 +461,11 @@ class EncoderHealth:
                 f"at most {jump.allowed_arcsec:.1f})",
             )
         # Excludes the samples that the next batch repeats.
-        wild = misread(found[SIDE:], noise, self._count_arcsec, self.limits.sigmas)
+        wild = misread(found[SIDE:], noise, self._count_arcsec)
         self._spikes.extend([self._now_s] * wild)
         while self._spikes and self._spikes[0] < self._now_s - 10.0:
             self._spikes.popleft()
-        if len(self._spikes) >= self.limits.spikes:
+        if len(self._spikes) >= SPIKES:
             self._raise(
                 EncoderFault.NOISY, f"{len(self._spikes)} readings of the last 10 s jumped there and back"
             )
@@ -287,13 +494,13 @@ class EncoderHealth:
         # The load's own motion is slow or predicted; noise is in both differences.
         jitter = min(jitter_deg(block["load_deg"]) * ARCSEC_PER_DEG, jitter_deg(block["residual_arcsec"]))
         usual = self._usual(standing=standing)
-        noisy = jitter > self.limits.noise_ratio * usual
+        noisy = jitter > NOISE_RATIO * usual
         self._noisy_blocks = self._noisy_blocks + 1 if noisy else 0
         if self._noisy_blocks >= NOISY_BLOCKS:
             self._raise(
                 EncoderFault.NOISY,
                 f"its readings jitter by {jitter:.2f} arcsec {'at rest' if standing else 'in motion'}, "
-                f"usually by {usual:.2f} (at most {self.limits.noise_ratio:g} times as much is allowed)",
+                f"usually by {usual:.2f} (at most {NOISE_RATIO:g} times as much is allowed)",
             )
         elif not noisy and self.status.fault is None:
             self._learn(jitter, standing=standing)
@@ -315,16 +522,16 @@ class EncoderHealth:
             return
         zero.new = 0
         blocks = np.array(zero.blocks, dtype=np.float64)
-        found = [trend(*blocks[-last:].T) for last in (len(blocks), TREND_BLOCKS)]
-        step = find_step(*blocks[blocks[:, 0] > blocks[-1, 0] - STEP_S].T)
-        if step is not None:
+        found = find_step(*blocks[blocks[:, 0] > blocks[-1, 0] - STEP_S].T)
+        if found is not None:
+            time_s, step = found
             self._raise(
                 EncoderFault.JUMPED,
-                f"its zero stepped by {step.by_arcsec:+.1f} arcsec (standard error {step.error_arcsec:.2f}) "
-                f"near {step.time_s:.1f} s; a gear's does not step",
+                f"its zero stepped by {step.value:+.1f} arcsec (standard error {step.error:.2f}) near "
+                f"{time_s:.1f} s; a gear's does not step",
             )
-        elif found[0] is not None and found[1] is not None:
-            self._judge_trend(found[0], found[1], np.ptp(blocks[:, 0]))
+        else:
+            self._judge_trend(blocks)
 
     def _direction(self, speed_deg_s: float) -> float:
         """Returns the direction of the present motion, or at rest that of the last one."""
@@ -332,26 +539,26 @@ class EncoderHealth:
             return float(np.sign(speed_deg_s))
         return self._zero.blocks[-1][2]
 
-    def _judge_trend(self, slow: Trend, fast: Trend, span_s: float) -> None:
-        zero, limits = self._zero, self.limits
-        if zero.reference_arcsec is None:
-            zero.reference_arcsec = slow.zero_arcsec
-        away = fast.zero_arcsec - zero.reference_arcsec
-        found = max(slow, fast, key=lambda each: abs(each.rate_arcsec_min) / each.error_arcsec_min)
-        runs = abs(found.rate_arcsec_min) > max(
-            limits.zero_rate_arcsec_min, limits.sigmas * found.error_arcsec_min
-        )
-        # One bad move can affect two evaluations; only a drift affects a third.
-        zero.suspicions = zero.suspicions + 1 if runs or abs(away) > limits.zero_arcsec else 0
-        if zero.suspicions < 3:
+    def _judge_trend(self, blocks: FloatArray) -> None:
+        zero = self._zero
+        slow, fast = (trend(*blocks[-last:].T) for last in (len(blocks), TREND_BLOCKS))
+        if slow is None or fast is None:
             return
-        self._raise(
-            EncoderFault.DRIFTING,
-            f"its zero moves by {found.rate_arcsec_min:+.2f} arcsec a minute (standard error "
-            f"{found.error_arcsec_min:.2f}, in the last {span_s / 60.0:.1f} min), {away:+.1f} arcsec since "
-            f"it was verified; a gear's moves by at most {limits.zero_rate_arcsec_min:g} a minute and "
-            f"{limits.zero_arcsec:g} in all",
-        )
+        if zero.reference_arcsec is None:
+            zero.reference_arcsec = slow[1]
+        away = fast[1] - zero.reference_arcsec
+        rate = max(slow[0], fast[0], key=lambda each: abs(each.value) / each.error)
+        drifts = abs(rate.value) > max(ZERO_RATE_ARCSEC_MIN, SIGMAS * rate.error)
+        # One bad move can affect two evaluations; only a drift affects a third.
+        zero.suspicions = zero.suspicions + 1 if drifts or abs(away) > MAX_ZERO_ARCSEC else 0
+        if zero.suspicions >= 3:
+            minutes = float(np.ptp(blocks[:, 0])) / 60.0
+            self._raise(
+                EncoderFault.DRIFTING,
+                f"its zero moves by {rate.value:+.2f} arcsec a minute (standard error {rate.error:.2f}, in "
+                f"the last {minutes:.1f} min), {away:+.1f} arcsec since it was verified; a gear's moves by "
+                f"at most {ZERO_RATE_ARCSEC_MIN:g} a minute and {MAX_ZERO_ARCSEC:g} in all",
+            )
 
 
 def _standing(found: Residuals) -> BoolArray:

@@ -12,7 +12,7 @@ resolution if that is larger. Three tests use generalised least squares:
 * Has the zero moved since it was learned?
 * Is the residual, with every part free to change, larger than the noise allows (chi square)?
 
-The significance level follows from `WatchLimits.false_alarms_per_day`, divided by the number of tests per
+The significance level follows from `FALSE_ALARMS_PER_DAY`, divided by the number of tests per
 day. Observations at one place in one direction count as one: averaging more of them does not reduce the part
 of the error that repeats there.
 
@@ -42,6 +42,27 @@ from hdbridge.effects import FloatArray, IntArray
 from hdbridge.model import TransmissionModel
 
 DAY_S: Final = 86_400.0
+FALSE_ALARMS_PER_DAY: Final = 1.0 / 365.0
+"""False alarms per axis with a valid model: one per year."""
+EVERY_S: Final = 10.0
+"""Interval between tests."""
+WINDOW_S: Final = 900.0
+"""Maximum age of an observation."""
+RAISE_S: Final = 60.0
+"""Time for which evidence must persist before a verdict is raised."""
+WITHDRAW_S: Final = 300.0
+"""Time without evidence after which a verdict is withdrawn."""
+NOISE_RATIO: Final = 1.5
+"""Noise in operation relative to that of a calibration."""
+ORDER_ARCSEC: Final = 0.8
+"""Smallest change of the orders that counts, at the load."""
+LOOP_ARCSEC: Final = 1.5
+LOOP_SHARE: Final = 3.0 * Scales().calibrated
+"""Smallest change of a hysteresis loop: the larger of `LOOP_ARCSEC` and this share of the loop."""
+ZERO_ARCSEC: Final = 5.0
+"""Smallest change of the zero that counts: the smallest effect of warming up (`effects.zero_drift`)."""
+LEFT_ARCSEC: Final = 0.5
+"""Smallest unexplained residual that counts, rms, in addition to the noise."""
 MAX_OBSERVATIONS: Final = 600
 """Maximum number of observations evaluated together."""
 SPARE: Final = 20
@@ -82,33 +103,6 @@ class Raised(NamedTuple):
     def text(self) -> str:
         """Verdict and evidence in words."""
         return f"{self.verdict.value}: {self.evidence}" if self.evidence else self.verdict.value
-
-
-@dataclass(frozen=True, slots=True)
-class WatchLimits:
-    """Thresholds of the tests, and durations for which evidence is gathered and must persist."""
-
-    false_alarms_per_day: float = 1.0 / 365.0
-    """False alarms per axis with a valid model: one per year."""
-    every_s: float = 10.0
-    """Interval between tests."""
-    window_s: float = 900.0
-    """Maximum age of an observation."""
-    raise_s: float = 60.0
-    """Time for which evidence must persist before a verdict is raised."""
-    withdraw_s: float = 300.0
-    """Time without evidence after which a verdict is withdrawn."""
-    noise: float = 1.5
-    """Noise in operation relative to that of a calibration."""
-    order_arcsec: float = 0.8
-    """Smallest change of the orders that counts, at the load."""
-    loop_arcsec: float = 1.5
-    loop_share: float = 3.0 * Scales().calibrated
-    """Smallest change of a hysteresis loop: the larger of ``loop_arcsec`` and this share of the loop."""
-    zero_arcsec: float = 5.0
-    """Smallest change of the zero that counts: the smallest effect of warming up (`effects.zero_drift`)."""
-    left_arcsec: float = 0.5
-    """Smallest unexplained residual that counts, rms, in addition to the noise."""
 
 
 class Moved(NamedTuple):
@@ -165,10 +159,9 @@ class Evidence:
 class Judge:
     """Tests one model; ``noise_arcsec`` is the standard deviation of an observation."""
 
-    def __init__(self, drift: DriftModel, noise_arcsec: float, limits: WatchLimits) -> None:
+    def __init__(self, drift: DriftModel, noise_arcsec: float) -> None:
         self._drift = drift
-        self._limits = limits
-        self._noise = limits.noise * noise_arcsec
+        self._noise = NOISE_RATIO * noise_arcsec
         settings = AdaptationSettings()
         prior = calibrated_estimator(drift, settings)
         self._calibrated = prior.covariance
@@ -179,8 +172,8 @@ class Judge:
                 self._calibrated[each.columns, each.columns] = share**2 * np.eye(len(coefficients))
         self._information = np.append(prior.scale, TREND_ARCSEC) ** -2
         self._bounds, self._zero_bound = bounds_arcsec(drift, settings), settings.zero_bound_arcsec
-        tests = (len(drift.terms) + 2) * DAY_S / limits.every_s
-        self._alpha = limits.false_alarms_per_day / tests
+        tests = (len(drift.terms) + 2) * DAY_S / EVERY_S
+        self._alpha = FALSE_ALARMS_PER_DAY / tests
         """Probability of a false positive in one test."""
 
     def judge(self, observations: Sequence[Observation], zero: FloatArray | None) -> Evidence | None:
@@ -208,7 +201,7 @@ class Judge:
             rms_arcsec=rms,
             allowed_arcsec=allowed,
             left_arcsec=float(np.sqrt(left @ left / free)),
-            left_allowed_arcsec=float(np.hypot(left_allowed, self._limits.left_arcsec)),
+            left_allowed_arcsec=float(np.hypot(left_allowed, LEFT_ARCSEC)),
             zero=change[self._drift.zero : self._drift.count],
             moved=tuple(each for each in moved if each is not None),
         )
@@ -239,15 +232,15 @@ class Judge:
 
     def _moved(self, term: Term, rows: FloatArray, change: FloatArray, spread: FloatArray) -> Moved | None:
         """Returns the change of an effect, if it exceeds the effect's interval and this fit's errors."""
-        at, limits = term.columns, self._limits
+        at = term.columns
         own = change[at]
         variance = self._calibrated[at, at] + spread[at, at]
         if float(own @ np.linalg.solve(variance, own)) < chdtri(len(own), self._alpha):
             return None
-        least = limits.order_arcsec
+        least = ORDER_ARCSEC
         if term.memory:
             loop = float(np.std(rows[:, at] @ term.effect.coefficients()))
-            least = max(limits.loop_arcsec, limits.loop_share * loop)
+            least = max(LOOP_ARCSEC, LOOP_SHARE * loop)
         if float(np.std(rows[:, at] @ own)) < least:
             return None
         only = np.zeros(self._drift.zero)
@@ -267,7 +260,7 @@ class Judge:
         change, spread = self._fit(rows[:, others], observed - rows[:, disc] @ before[1:], others)
         by = float(change[zero] - before[0])
         error = float(np.sqrt(2.0 * spread[zero, zero]))
-        if abs(by) < max(self._limits.zero_arcsec, -ndtri(0.5 * self._alpha) * error):
+        if abs(by) < max(ZERO_ARCSEC, -ndtri(0.5 * self._alpha) * error):
             return None
         return Moved(f"zero: by {by:+.1f} arcsec", abs(by) <= self._zero_bound)
 
@@ -297,8 +290,7 @@ def _places(observations: Sequence[Observation]) -> tuple[FloatArray, FloatArray
 class Debounced:
     """Verdict that changes only when another one has persisted."""
 
-    def __init__(self, limits: WatchLimits) -> None:
-        self._limits = limits
+    def __init__(self) -> None:
         self.verdict = Verdict.HOLDS
         self._other = Verdict.HOLDS
         self._lasted_s = 0.0
@@ -310,7 +302,7 @@ class Debounced:
         if verdict is self.verdict:
             return False
         self._lasted_s += passed_s
-        needed = self._limits.withdraw_s if verdict is Verdict.HOLDS else self._limits.raise_s
+        needed = WITHDRAW_S if verdict is Verdict.HOLDS else RAISE_S
         if self._lasted_s < needed:
             return False
         self.verdict, self._lasted_s = verdict, 0.0
@@ -320,22 +312,19 @@ class Debounced:
 class Watch:
     """Verdicts on one axis and its model."""
 
-    def __init__(
-        self, axis: str, drift: DriftModel, noise_arcsec: float, limits: WatchLimits | None = None
-    ) -> None:
+    def __init__(self, axis: str, drift: DriftModel, noise_arcsec: float) -> None:
         """``noise_arcsec`` is the standard deviation of an observation."""
-        self.limits = limits or WatchLimits()
         self.evidence: Evidence | None = None
         """Last evidence; None until enough observations exist."""
         self._axis = axis
         self._calibrated = bool(drift.model.effects)
-        self._judge = Judge(drift, noise_arcsec, self.limits)
-        self._debounced = Debounced(self.limits)
+        self._judge = Judge(drift, noise_arcsec)
+        self._debounced = Debounced()
         self._faulty = False
         self._observations: deque[Observation] = deque(maxlen=MAX_OBSERVATIONS)
         self._new = False
         self._zero: FloatArray | None = None
-        self._judged_s = -self.limits.every_s
+        self._judged_s = -EVERY_S
 
     @property
     def verdict(self) -> Verdict:
@@ -354,16 +343,16 @@ class Watch:
         self._observations.extend(observations)
         self._new |= bool(observations)
         passed_s = now_s - self._judged_s
-        if not 0.0 <= passed_s < self.limits.every_s:
+        if not 0.0 <= passed_s < EVERY_S:
             self._judged_s = now_s
-            if self._test(now_s, min(passed_s, 2.0 * self.limits.every_s)) and self.evidence is not None:
+            if self._test(now_s, min(passed_s, 2.0 * EVERY_S)) and self.evidence is not None:
                 raised.append(Raised(now_s, self._axis, self.verdict, self.evidence.text))
         return raised
 
     def _test(self, now_s: float, passed_s: float) -> bool:
         """Tests the recent observations; returns True if the verdict changes."""
         recent = self._observations
-        while recent and not 0.0 <= now_s - recent[0].time_s <= self.limits.window_s:
+        while recent and not 0.0 <= now_s - recent[0].time_s <= WINDOW_S:
             recent.popleft()
         # An axis at rest gives no new evidence, and an uncalibrated one has no model to test.
         if not self._new or self._faulty or not self._calibrated:

@@ -18,8 +18,8 @@ from hdbridge.daemon.loop.follower import AxisSetup, Follower
 from hdbridge.daemon.loop.knotfeed import KnotFeed
 from hdbridge.daemon.loop.outerfeed import OuterFeed
 from hdbridge.daemon.loop.states import AxisState, Cause, Happening, refusal, target_of
-from hdbridge.daemon.memory.knots import KnotQueue
-from hdbridge.daemon.memory.layout import NO_FAULT, Command, CommandKind, EventKind
+from hdbridge.daemon.memory.channels import Queue
+from hdbridge.daemon.memory.layout import NO_FAULT, Command, CommandKind, EventKind, Knot
 from hdbridge.daemon.memory.setting import SettingSlot
 from hdbridge.daemon.setting import CompensationSetting
 from hdbridge.drive.feedback import Feedback
@@ -41,10 +41,10 @@ class AxisLoop:
         self,
         index: int,
         setup: AxisSetup,
-        knots: KnotQueue,
+        knots: Queue[Knot],
         slot: SettingSlot,
         tell: Tell,
-        followed: KnotQueue,
+        followed: Queue[Knot],
         due_s: Callable[[], float],
     ) -> None:
         """``followed`` has the gateway's set-points; ``due_s`` returns when the present turn was due."""

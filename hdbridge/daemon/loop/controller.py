@@ -17,7 +17,7 @@ from hdbridge.daemon.loop.axisloop import AxisLoop
 from hdbridge.daemon.loop.follower import AxisSetup
 from hdbridge.daemon.loop.relay import incoming_ids, nodes_of, why_refused
 from hdbridge.daemon.loop.states import AxisState, label
-from hdbridge.daemon.memory import Command, CommandKind, EventKind, Memory
+from hdbridge.daemon.memory import Command, CommandKind, Event, EventKind, Memory, RelayedFrame
 from hdbridge.drive.link import Frame, Link
 from hdbridge.drive.states import State
 from hdbridge.errors import BusError, HdbridgeError, InputError
@@ -140,7 +140,8 @@ class Controller:
         text: str = "",
     ) -> None:
         cycle = self.cycle
-        self.memory.events.tell(cycle.count, round(1e9 * cycle.woke_s), axis, kind, id, code, text)
+        time_ns = round(1e9 * cycle.woke_s)
+        self.memory.events.append(Event(0, cycle.count, time_ns, axis, kind, id, code, text))
 
     # ---------------------------------------------------------------- commands
 
@@ -201,7 +202,7 @@ class Controller:
 
     def _pass_in(self, frame: Frame) -> None:
         if frame.can_id in self._wanted:
-            self.memory.incoming.put(round(1e9 * frame.time_s), frame.can_id, frame.data)
+            self.memory.incoming.append(RelayedFrame(round(1e9 * frame.time_s), frame.can_id, frame.data))
 
     def _pass_out(self) -> tuple[int, bytes] | None:
         frame = self.memory.outgoing.take()

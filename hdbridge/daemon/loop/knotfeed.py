@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from typing import Final
 
-from hdbridge.daemon.memory.knots import KnotQueue
+from hdbridge.daemon.memory.channels import Queue
+from hdbridge.daemon.memory.layout import Knot
 from hdbridge.errors import InputError
 from hdbridge.motion import SetPoint
 
@@ -23,7 +24,7 @@ class KnotFeed:
 
     __slots__ = ("_ending", "_following", "_knots", "_set_point", "_stream")
 
-    def __init__(self, knots: KnotQueue, set_point: SetPoint) -> None:
+    def __init__(self, knots: Queue[Knot], set_point: SetPoint) -> None:
         self._knots, self._set_point = knots, set_point
         self._stream = 0
         """Number of the present stream, or of the last one."""

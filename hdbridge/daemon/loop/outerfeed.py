@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 from typing import Final
 
-from hdbridge.daemon.memory.knots import KnotQueue
+from hdbridge.daemon.memory.channels import Queue
+from hdbridge.daemon.memory.layout import Knot
 
 KNOTS_A_TURN: Final = 64
 LONGEST_SPACING_S: Final = 0.05
@@ -22,7 +23,7 @@ class OuterFeed:
 
     __slots__ = ("_before", "_knots", "_last", "_patience_s", "_series")
 
-    def __init__(self, knots: KnotQueue) -> None:
+    def __init__(self, knots: Queue[Knot]) -> None:
         self._knots = knots
         self._series = 0
         self._patience_s = 0.0

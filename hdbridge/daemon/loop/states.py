@@ -156,7 +156,7 @@ def mermaid() -> str:
 
 
 def table() -> str:
-    """Returns the commands accepted in each state as a Markdown table, for docs/daemon-internals.md."""
+    """Returns the commands accepted in each state as a Markdown table, for docs/architecture.md."""
     lines = ["| state | commands that it takes |", "|---|---|"]
     for state in AxisState:
         kinds = [kind.name for kind in CommandKind if target_of(state, kind) is not None]

@@ -1,7 +1,6 @@
 """Shared memory of control and service process: rings, mailbox, relay. Lock-free."""
 
-from hdbridge.daemon.memory.events import EventReader
-from hdbridge.daemon.memory.frames import IncomingReader, RelayedFrame
+from hdbridge.daemon.memory.channels import MailboxFullError, Queue, RingReader
 from hdbridge.daemon.memory.layout import (
     AXIS_SAMPLE,
     NO_FAULT,
@@ -12,10 +11,10 @@ from hdbridge.daemon.memory.layout import (
     EventKind,
     Knot,
     OuterCell,
+    RelayedFrame,
     SampleFlag,
     sample_dtype,
 )
-from hdbridge.daemon.memory.mailbox import MailboxFullError
 from hdbridge.daemon.memory.memory import Memory
 from hdbridge.daemon.memory.samples import SampleArray, SampleReader, joined_samples
 from hdbridge.daemon.memory.status import Cell, OuterCells
@@ -29,14 +28,14 @@ __all__ = [
     "CommandKind",
     "Event",
     "EventKind",
-    "EventReader",
-    "IncomingReader",
     "Knot",
     "MailboxFullError",
     "Memory",
     "OuterCell",
     "OuterCells",
+    "Queue",
     "RelayedFrame",
+    "RingReader",
     "SampleArray",
     "SampleFlag",
     "SampleReader",

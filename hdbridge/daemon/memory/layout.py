@@ -141,10 +141,10 @@ class Event(NamedTuple):
     axis: int
     """Index of the axis; -1 is the machine."""
     kind: EventKind
-    id: int
+    id: int = 0
     """Id of the command that it answers; 0 for none."""
-    code: int
-    text: str
+    code: int = 0
+    text: str = ""
 
 
 class Command(NamedTuple):
@@ -153,13 +153,22 @@ class Command(NamedTuple):
     id: int
     kind: int
     axis: int
-    a: float
-    b: float
-    c: float
-    d: float
-    i: int
-    j: int
-    k: int
+    a: float = 0.0
+    b: float = 0.0
+    c: float = 0.0
+    d: float = 0.0
+    i: int = 0
+    j: int = 0
+    k: int = 0
+
+
+class RelayedFrame(NamedTuple):
+    """A data frame with an 11-bit identifier, from the service's SDO to the loop's bus or back."""
+
+    time_ns: int
+    """Time of reception or queuing, on the loop's clock."""
+    can_id: int
+    data: bytes
 
 
 class Knot(NamedTuple):

@@ -4,11 +4,17 @@ from __future__ import annotations
 
 from typing import Self
 
-from hdbridge.daemon.memory.events import EventReader, EventWriter
-from hdbridge.daemon.memory.frames import IncomingReader, IncomingWriter, Outgoing
-from hdbridge.daemon.memory.knots import KnotQueue
-from hdbridge.daemon.memory.layout import AXES_AT_MOST, Layout
-from hdbridge.daemon.memory.mailbox import Mailbox
+from hdbridge.daemon.memory.channels import (
+    COMMANDS,
+    EVENTS,
+    FRAMES,
+    KNOTS,
+    Mailbox,
+    Queue,
+    Ring,
+    RingReader,
+)
+from hdbridge.daemon.memory.layout import AXES_AT_MOST, Event, Layout, RelayedFrame
 from hdbridge.daemon.memory.region import ORDERED, Region
 from hdbridge.daemon.memory.samples import SampleReader, SampleWriter
 from hdbridge.daemon.memory.setting import SettingSlot
@@ -25,21 +31,20 @@ class Memory:
     and shares ``outer`` with the service.
     """
 
-    def __init__(self, region: Region, layout: Layout, period_ns: int, *, checked: bool) -> None:
+    def __init__(self, region: Region, layout: Layout, period_ns: int) -> None:
         """Use `create` or `attach` instead."""
         self._region = region
         self._layout = layout
-        self._checked = checked
         self.axes = layout.axes
         self.period_ns = period_ns
-        self.samples = SampleWriter(region, layout, checked=checked)
-        self.events = EventWriter(region, layout, checked=checked)
-        self.incoming = IncomingWriter(region, layout, checked=checked)
-        self.outgoing = Outgoing(region, layout, checked=checked)
-        self.commands = Mailbox(region, layout, checked=checked)
-        self.knots = tuple(KnotQueue(region, place, checked=checked) for place in layout.knots)
+        self.samples = SampleWriter(region, layout)
+        self.events = Ring(region, layout.events, EVENTS)
+        self.incoming = Ring(region, layout.incoming, FRAMES)
+        self.outgoing = Queue(region, layout.outgoing, FRAMES)
+        self.commands = Mailbox(region, layout.commands, COMMANDS)
+        self.knots = tuple(Queue(region, place, KNOTS) for place in layout.knots)
         self.settings = tuple(SettingSlot(region, place) for place in layout.settings)
-        self.followed = tuple(KnotQueue(region, place, checked=checked) for place in layout.followed)
+        self.followed = tuple(Queue(region, place, KNOTS) for place in layout.followed)
         self.outer = tuple(OuterCells(region, place) for place in layout.outer)
         self.status = Status(region)
 
@@ -52,7 +57,7 @@ class Memory:
                 f"{axes} axes at {period_s} s: expected 1 to {AXES_AT_MOST} axes, a period above 0"
             )
         layout = Layout.of(axes)
-        return cls(Region.create(layout, period_ns, checked=checked), layout, period_ns, checked=checked)
+        return cls(Region.create(layout, period_ns, checked=checked), layout, period_ns)
 
     @classmethod
     def attach(cls, fd: int) -> Self:
@@ -60,8 +65,7 @@ class Memory:
 
         Raises InputError if it is not shared memory of this version of hdbridge.
         """
-        region, layout, period_ns, checked = Region.attach(fd)
-        return cls(region, layout, period_ns, checked=checked)
+        return cls(*Region.attach(fd))
 
     @property
     def fd(self) -> int:
@@ -75,15 +79,15 @@ class Memory:
 
     def reader(self) -> SampleReader:
         """Returns a reader of the samples from now on."""
-        return SampleReader(self._region, self._layout, checked=self._checked)
+        return SampleReader(self._region, self._layout)
 
-    def event_reader(self) -> EventReader:
+    def event_reader(self) -> RingReader[Event]:
         """Returns a reader of the events from now on."""
-        return EventReader(self._region, self._layout, checked=self._checked)
+        return RingReader(self._region, self._layout.events, EVENTS)
 
-    def incoming_reader(self) -> IncomingReader:
+    def incoming_reader(self) -> RingReader[RelayedFrame]:
         """Returns a reader of relayed frames from now on."""
-        return IncomingReader(self._region, self._layout, checked=self._checked)
+        return RingReader(self._region, self._layout.incoming, FRAMES)
 
     def close(self) -> None:
         """Unmaps the memory, which is freed when all processes have done so."""

@@ -24,9 +24,11 @@ ORDERED: Final = platform.machine().lower() in _STRONGLY_ORDERED
 class Region:
     """A mapped region of shared memory with an identifying header."""
 
-    def __init__(self, fd: int, size: int) -> None:
+    def __init__(self, fd: int, size: int, *, checked: bool) -> None:
         self.fd = fd
         """Descriptor to pass to another process."""
+        self.checked = checked
+        """True if slots have checksums."""
         self._map = mmap.mmap(fd, size)
         self.view = memoryview(self._map)
         self._cells = self.view.cast("q")
@@ -38,7 +40,7 @@ class Region:
         try:
             os.ftruncate(fd, layout.total)
             fcntl.fcntl(fd, fcntl.F_ADD_SEALS, fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW | fcntl.F_SEAL_SEAL)
-            region = cls(fd, layout.total)
+            region = cls(fd, layout.total, checked=checked)
         except OSError:
             os.close(fd)
             raise
@@ -48,8 +50,8 @@ class Region:
         return region
 
     @classmethod
-    def attach(cls, fd: int) -> tuple[Region, Layout, int, bool]:
-        """Attaches to another process's memory; returns it, its layout, the period in ns and ``checked``.
+    def attach(cls, fd: int) -> tuple[Region, Layout, int]:
+        """Attaches to another process's memory; returns it, its layout and the period in ns.
 
         Raises `InputError` if the descriptor is not hdbridge's memory, or of another version.
         """
@@ -77,7 +79,7 @@ class Region:
                 f"descriptor {fd}: shared memory of {size} bytes, expected {layout.total} for {axes} axes: "
                 "another release of hdbridge has made it; restart the whole daemon"
             )
-        return cls(fd, size), layout, period_ns, bool(checked)
+        return cls(fd, size, checked=bool(checked)), layout, period_ns
 
     def cells(self, offset: int, count: int) -> memoryview:
         """Returns ``count`` aligned int64 cells, which are read and written atomically."""

@@ -10,6 +10,7 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
+from hdbridge.daemon.memory.channels import RETRIES
 from hdbridge.daemon.memory.layout import (
     LINE,
     SAMPLES_KEPT,
@@ -20,7 +21,6 @@ from hdbridge.daemon.memory.layout import (
     slot_dtype,
 )
 from hdbridge.daemon.memory.region import Region
-from hdbridge.daemon.memory.rings import RETRIES
 
 SampleArray = npt.NDArray[np.void]
 """Samples with the dtype `sample_dtype`, shape (n,)."""
@@ -38,7 +38,7 @@ class SampleWriter:
 
     __slots__ = ("_buffer", "_checked", "_head", "_offset", "_pack_into", "_sequence", "_size")
 
-    def __init__(self, region: Region, layout: Layout, *, checked: bool) -> None:
+    def __init__(self, region: Region, layout: Layout) -> None:
         packed = sample_struct(layout.axes)
         assert packed.size == layout.samples.slot_bytes == slot_dtype(layout.axes).itemsize
         self._buffer = region.view
@@ -46,7 +46,7 @@ class SampleWriter:
         self._pack_into = packed.pack_into
         self._head = region.cells(self._offset - 2 * LINE, 1)
         self._sequence: int = self._head[0]
-        self._checked = checked
+        self._checked = region.checked
 
     def write(
         self,
@@ -84,13 +84,13 @@ class SampleWriter:
 class SampleReader:
     """Reads the samples since it was created or since its last `read`."""
 
-    def __init__(self, region: Region, layout: Layout, *, checked: bool) -> None:
+    def __init__(self, region: Region, layout: Layout) -> None:
         self._slots: npt.NDArray[Any] = np.frombuffer(
             region.view, slot_dtype(layout.axes), SAMPLES_KEPT, layout.samples.offset
         )
         self._dtype = sample_dtype(layout.axes)
         self._head = region.cells(layout.samples.offset - 2 * LINE, 1)
-        self._checked = checked
+        self._checked = region.checked
         self._next: int = self._head[0] + 1
 
     def read(self) -> tuple[SampleArray, int]:

@@ -23,6 +23,10 @@ class Cell(IntEnum):
     STOP_ASKED = 6
     GATEWAY_TIME_NS = 7
     GATEWAY_PID = 8
+    BUS_WANTED = 9
+    """Service: 1 while it waits for the bus to be released to another program."""
+    BUS_LENT = 10
+    """Keeper: 1 while the interface is released to another program and no control process runs."""
 
 
 _LOOP_COUNT: Final = Cell.LOOP_COUNT * _STRIDE

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Final, Unpack
 from hdbridge.daemon.loop.states import AxisState
 from hdbridge.daemon.memory import CommandKind, Event, EventKind, SampleFlag
 from hdbridge.daemon.service.activity import Activity
-from hdbridge.daemon.service.dispatch import ANSWER_S, Arguments
+from hdbridge.daemon.service.core import ANSWER_S, Arguments
 from hdbridge.daemon.service.reports import stop_hint
 from hdbridge.daemon.service.timing import POLL_S
 from hdbridge.drive.states import State
@@ -68,8 +68,8 @@ class AxisLink:
     async def do(
         self, kind: CommandKind, within_s: float = ANSWER_S, **arguments: Unpack[Arguments]
     ) -> Event:
-        """Runs `Dispatcher.do`, then waits until the newest sample is later than the answer."""
-        answer = await self.core.dispatch.do(kind, self.index, within_s, **arguments)
+        """Runs `Core.do`, then waits until the newest sample is later than the answer."""
+        answer = await self.core.do(kind, self.index, within_s, **arguments)
         observer = self.core.observer
         await self.until(lambda: observer.cycle > answer.cycle, ANSWER_S)
         return answer

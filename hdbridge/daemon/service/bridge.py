@@ -31,23 +31,21 @@ from typing import TYPE_CHECKING, Any, Final, Self
 from hdbridge.client import messages
 from hdbridge.daemon.memory import Cell, CommandKind, EventKind
 from hdbridge.daemon.service import reports
+from hdbridge.daemon.service.axis import UNKNOWN, ServiceAxis
 from hdbridge.daemon.service.coordination import run_together
-from hdbridge.daemon.service.core import Core
-from hdbridge.daemon.service.dispatch import ANSWER_S
+from hdbridge.daemon.service.core import ANSWER_S, Core
 from hdbridge.daemon.service.eventlog import Entry
 from hdbridge.daemon.service.jobs import JobBook, Runner, in_own_process
+from hdbridge.daemon.service.lending import Lending
 from hdbridge.daemon.service.observer import PERIOD_S, Subscription
 from hdbridge.daemon.service.outermaster import OuterMaster
-from hdbridge.daemon.service.ports import ServiceAxis
-from hdbridge.daemon.service.power import UNKNOWN
 from hdbridge.daemon.service.reports import LATCHED
 from hdbridge.daemon.service.timing import Timing
-from hdbridge.errors import HdbridgeError, InputError
+from hdbridge.errors import HdbridgeError, InputError, RefusedError
 
 if TYPE_CHECKING:
     from hdbridge.daemon.machine import Machine
     from hdbridge.daemon.memory import Memory
-    from hdbridge.daemon.service.following import Following
     from hdbridge.daemon.service.lease import Lease
 
 VERIFY_AGAIN_S: Final = (0.0, 1.0, 2.0, 5.0, 10.0)
@@ -70,17 +68,23 @@ class ServiceBridge:
         recordings: Callable[[ServiceAxis], Path] = lambda axis: axis.axis.profile.folder / "recordings",
         runner: Runner = in_own_process,
         simulated: bool = False,
+        forced: bool = False,
     ) -> None:
-        """``recordings`` returns the folder for recordings of an axis's jobs; ``runner`` runs a job."""
+        """``recordings`` returns the folder for recordings of an axis's jobs; ``runner`` runs a job.
+
+        ``forced`` says that the daemon does not hold the lock of its interface.
+        """
         self.machine = machine
-        self.core = Core.of(memory, timing, machine.lease_s)
+        self.core = Core(memory, timing, machine.lease_s)
+        against = "the daemon was started with --force and does not hold the interface" if forced else ""
+        if simulated:
+            against = "its axes are simulated; a command has a simulated axis of its own with --simulate"
+        self.lending = Lending(self.core, machine.bus, against)
         self.book = JobBook(self.core, recordings, runner)
         self.axes: dict[str, ServiceAxis] = {
             axis.name: ServiceAxis(index, axis, self.core, self.book.begin, self.axis_state)
             for index, axis in enumerate(machine.axes)
         }
-        self.following: dict[str, Following] = {}
-        """Watch and adaptation by axis name."""
         self.recorder: Callable[[], messages.RecorderState] = lambda: messages.RecorderState(on=False)
         self.marks: list[Callable[[str], None]] = []
         """Receivers of remarks, such as the recorder."""
@@ -251,6 +255,7 @@ class ServiceBridge:
                 interface=self.machine.bus.interface,
                 channel=str(self.machine.bus.channel),
                 up=self._bus_up,
+                lent_to=self.lending.borrower,
                 load=float(head["bus_load"]) if head is not None else None,
             ),
             cycle=messages.CycleState(
@@ -271,14 +276,11 @@ class ServiceBridge:
     def axis_state(self, name: str) -> messages.AxisState:
         """Returns the state of one axis in the newest cycle."""
         self._look()
-        following = self.following.get(name)
         return reports.axis_state(
             self._axis(name),
             self._stopped.get(name),
             self._loop_doubts.get(name, "the reason is in the log of an earlier service"),
             self.book.of_axis(name),
-            following.state if following is not None else messages.AdaptationState(),
-            following.advice if following is not None else (),
             self._outer(name),
         )
 
@@ -293,7 +295,9 @@ class ServiceBridge:
     def _warnings(self) -> list[str]:
         core = self.core
         warnings = []
-        if not core.observer.alive:
+        if (borrower := self.lending.borrower) is not None:
+            warnings.append(f"the bus is lent to {borrower}; the axes come back disabled when it ends")
+        elif not core.observer.alive:
             warnings.append(
                 "the control process does not turn: it hangs or is gone, and is started again by itself"
             )
@@ -334,7 +338,16 @@ class ServiceBridge:
         """Quick-stops all axes. Requires no lease."""
         for axis in self.axes.values():
             axis.give_up("it was stopped by a quick stop")
-        await self.core.dispatch.do(CommandKind.QUICK_STOP)
+        await self.core.do(CommandKind.QUICK_STOP)
+
+    async def lend_bus(self, holder: str) -> None:
+        """Stops the axes, switches them off and releases the bus to another program of this computer."""
+        self.core.lease.check(holder)
+        if running := [each.id for each in self.book.all() if each.state is messages.JobState.RUNNING]:
+            raise RefusedError(
+                f"the bus cannot be lent: {', '.join(running)} has not ended; wait, or cancel it"
+            )
+        await self.lending.lend()
 
     async def coordinated(
         self, holder: str, moves: Mapping[str, float], speed: float = 1.0, wait: bool = True
@@ -356,34 +369,11 @@ class ServiceBridge:
         for hear in self.marks:
             hear(text)
 
-    async def load_loop(self, holder: str, axis: str, on: bool) -> None:
-        """Switches an axis's load loop on or off; raises InputError if it has none."""
-        await self._axis(axis).switch_load_loop(holder, on=on)
-
-    async def adapt(self, holder: str, axis: str, mode: messages.AdaptationMode) -> None:
-        """Sets the adaptation mode of an axis."""
-        self.core.lease.check(holder)
-        await self._following(axis).set_mode(mode)
-
-    async def adaptation_back(self, holder: str, axis: str) -> None:
-        """Discards the adapted parameters of an axis and restores its model as it was activated."""
-        self.core.lease.check(holder)
-        await self._following(axis).revert()
-
     def _axis(self, name: str) -> ServiceAxis:
         axis = self.axes.get(name)
         if axis is None:
             raise InputError(f"there is no axis '{name}'; expected one of: {', '.join(self.axes)}")
         return axis
-
-    def _following(self, name: str) -> Following:
-        self._axis(name)
-        following = self.following.get(name)
-        if following is None:
-            raise InputError(
-                f"{name}: nothing adapts on this axis; give it an adaptation in the machine file"
-            )
-        return following
 
     def _start(self, coroutine: Coroutine[Any, Any, None]) -> None:
         task = asyncio.get_running_loop().create_task(coroutine)

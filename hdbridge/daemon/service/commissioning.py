@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, NamedTuple
 from hdbridge.axis import AxisConfig, Identity
 from hdbridge.clock import Clock
 from hdbridge.daemon.memory import Memory
-from hdbridge.daemon.service.dispatch import Arguments
+from hdbridge.daemon.service.core import Arguments
 from hdbridge.daemon.service.relaybus import RelayBus
 from hdbridge.drive.drive import Drive, Positions
 from hdbridge.drive.states import State

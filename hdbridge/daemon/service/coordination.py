@@ -14,7 +14,7 @@ from hdbridge.errors import HdbridgeError
 from hdbridge.motion import coordinated
 
 if TYPE_CHECKING:
-    from hdbridge.daemon.service.ports import ServiceAxis
+    from hdbridge.daemon.service.axis import ServiceAxis
 
 STREAM_TIMEOUT_S: Final = 5.0
 ROOM_POLL_S: Final = 0.05

@@ -1,43 +1,101 @@
-"""Objects that all parts of the service share."""
+"""Parts that the whole service shares: control process, event log, samples, clock and lease."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass, field
+from collections.abc import Callable
 from itertools import count
+from typing import Final, TypedDict, Unpack
 
-from hdbridge.daemon.memory import Memory
-from hdbridge.daemon.service.dispatch import Dispatcher
+from hdbridge.daemon.memory import CommandKind, Event, EventKind, Memory
 from hdbridge.daemon.service.eventlog import EventLog
 from hdbridge.daemon.service.lease import Lease
 from hdbridge.daemon.service.observer import Observer
-from hdbridge.daemon.service.timing import Timing
+from hdbridge.daemon.service.timing import POLL_S, Timing
+from hdbridge.errors import DaemonError, RefusedError
+
+ANSWER_S: Final = 5.0
+"""Time-out of an answer. The control process normally answers within a few cycles, but ENABLE and DISABLE
+only when they are complete.
+"""
 
 
-@dataclass(frozen=True)
+class Arguments(TypedDict, total=False):
+    """Fields of a `Command`; `CommandKind` documents their meaning."""
+
+    a: float
+    b: float
+    c: float
+    d: float
+    i: int
+    j: int
+    k: int
+
+
 class Core:
-    """Access to the control process, the clock and the lease."""
+    """Access to the control process, the clock and the lease. Commands may be sent from any thread."""
 
-    memory: Memory
-    log: EventLog
-    dispatch: Dispatcher
-    observer: Observer
-    timing: Timing
-    lease: Lease
-    _streams: Iterator[int] = field(init=False)
-
-    def __post_init__(self) -> None:
-        """Numbers streams from the present time, so that those of an earlier service differ."""
-        object.__setattr__(self, "_streams", count(int(1000.0 * self.timing.clock.now()) + 1))
-
-    @classmethod
-    def of(cls, memory: Memory, timing: Timing, lease_s: float) -> Core:
-        """Builds all parts for a machine's shared memory."""
-        log = EventLog(memory.event_reader())
-        dispatch = Dispatcher(memory, log, timing)
-        observer = Observer(memory, log, timing.clock)
-        return cls(memory, log, dispatch, observer, timing, Lease(lease_s, timing.clock.now))
+    def __init__(self, memory: Memory, timing: Timing, lease_s: float) -> None:
+        """``lease_s`` is the time-out of the lease."""
+        self.memory = memory
+        self.timing = timing
+        self.log = EventLog(memory.event_reader())
+        self.observer = Observer(memory, self.log, timing.clock)
+        self.lease = Lease(lease_s, timing.clock.now)
+        self.refuse: Callable[[CommandKind], None] = lambda _: None
+        """Raises RefusedError if the control process cannot take a command, because the bus is lent."""
+        # From the present time on, so that the streams of an earlier service have other numbers.
+        self._streams = count(int(1000.0 * timing.clock.now()) + 1)
 
     def next_stream(self) -> int:
         """Returns an unused stream number."""
         return next(self._streams)
+
+    async def do(
+        self, kind: CommandKind, axis: int = -1, within_s: float = ANSWER_S, **arguments: Unpack[Arguments]
+    ) -> Event:
+        """Posts a command and returns the event that reports that it was carried out or has begun.
+
+        Raises RefusedError with the control process's reason if nothing was done, and DaemonError if it
+        does not answer within ``within_s``.
+        """
+        self.refuse(kind)
+        loop_pid = self.memory.status.loop_pid
+        command_id = self.memory.commands.post(kind, axis, **arguments)
+        deadline_s = self.timing.clock.now() + within_s
+        while (answer := self._answer(command_id)) is None:
+            self._check(kind, loop_pid, deadline_s, within_s)
+            await self.timing.sleep(POLL_S)
+        return answer
+
+    def do_now(
+        self, kind: CommandKind, axis: int = -1, within_s: float = ANSWER_S, **arguments: Unpack[Arguments]
+    ) -> Event:
+        """Does the same as `do`, for blocking code."""
+        self.refuse(kind)
+        clock = self.timing.clock
+        loop_pid = self.memory.status.loop_pid
+        command_id = self.memory.commands.post(kind, axis, **arguments)
+        deadline_s = clock.now() + within_s
+        while (answer := self._answer(command_id)) is None:
+            self._check(kind, loop_pid, deadline_s, within_s)
+            clock.sleep_until(clock.now() + POLL_S)
+        return answer
+
+    def _answer(self, command_id: int) -> Event | None:
+        self.log.poll()
+        answer = self.log.answer(command_id)
+        if answer is not None and answer.kind is EventKind.REFUSED:
+            raise RefusedError(answer.text)
+        return answer
+
+    def _check(self, kind: CommandKind, loop_pid: int, deadline_s: float, within_s: float) -> None:
+        if self.memory.status.loop_pid != loop_pid:
+            raise DaemonError(
+                f"the control process died before it answered {kind.name}; another one has taken its place, "
+                "with every axis disabled"
+            )
+        if self.timing.clock.now() >= deadline_s:
+            raise DaemonError(
+                f"the control process did not answer {kind.name} within {within_s:g} s: it hangs or is gone; "
+                "it is started again by itself, with every axis disabled"
+            )

@@ -13,7 +13,7 @@ from collections.abc import Callable
 from datetime import UTC, datetime
 from typing import NamedTuple
 
-from hdbridge.daemon.memory import Event, EventKind, EventReader
+from hdbridge.daemon.memory import Event, EventKind, RingReader
 from hdbridge.motion import MotionMode
 
 KEPT = 4096
@@ -38,7 +38,9 @@ class Entry(NamedTuple):
 class EventLog:
     """The newest `KEPT` entries, and the answers to the newest commands."""
 
-    def __init__(self, reader: EventReader, now: Callable[[], datetime] = lambda: datetime.now(UTC)) -> None:
+    def __init__(
+        self, reader: RingReader[Event], now: Callable[[], datetime] = lambda: datetime.now(UTC)
+    ) -> None:
         """``now`` returns the date of an entry."""
         self._reader = reader
         self._date = now

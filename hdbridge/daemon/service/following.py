@@ -14,15 +14,15 @@ from pathlib import Path
 from typing import Any, Final, ParamSpec, TypeVar
 
 from hdbridge.client import messages
-from hdbridge.daemon.following.autodiagnosis import AutoDiagnosis
-from hdbridge.daemon.following.follower import Follower, Outcome
-from hdbridge.daemon.following.judging import Raised, Verdict, WatchLimits
+from hdbridge.daemon.following.follower import NOTHING, Follower, Outcome
+from hdbridge.daemon.following.judging import WINDOW_S, Raised, Verdict
 from hdbridge.daemon.following.settings import AdaptationSettings
 from hdbridge.daemon.following.statefile import AdaptationFiles
 from hdbridge.daemon.memory import Event, SampleArray
+from hdbridge.daemon.recorder.autodiagnosis import AutoDiagnosis
 from hdbridge.daemon.recorder.recorder import FlightRecorder
 from hdbridge.daemon.service.activity import Kind
-from hdbridge.daemon.service.ports import ServiceAxis
+from hdbridge.daemon.service.axis import ServiceAxis
 from hdbridge.errors import HdbridgeError
 from hdbridge.model import TransmissionModel
 
@@ -152,8 +152,9 @@ class Following:
 
     def _process(self, samples: SampleArray) -> None:
         try:
-            if self._follower is not None:
-                self._report(self._follower.take(samples), self._follower.model)
+            follower = self._follower
+            if follower is not None and (outcome := follower.take(samples)) is not NOTHING:
+                self._report(outcome, follower.model)
                 self._publish()
         finally:
             self._taken += 1
@@ -190,7 +191,7 @@ class Following:
                 self._diagnose(self._diagnosis, raised, model)
 
     def _diagnose(self, diagnosis: AutoDiagnosis, raised: Raised, model: TransmissionModel) -> None:
-        minutes = WatchLimits().window_s / 60.0
+        minutes = WINDOW_S / 60.0
         diagnosis.start(
             self._axis.name, model.dump(), minutes, raised.text, lambda text: self._note("DIAGNOSIS", text)
         )

@@ -26,8 +26,8 @@ from hdbridge.daemon.service.rigs import DaemonRig
 from hdbridge.errors import HdbridgeError, InputError
 
 if TYPE_CHECKING:
+    from hdbridge.daemon.service.axis import ServiceAxis
     from hdbridge.daemon.service.core import Core
-    from hdbridge.daemon.service.ports import ServiceAxis
 
 JOBS_KEPT: Final = 100
 _log = logging.getLogger(__name__)

@@ -18,11 +18,13 @@ from hdbridge.motion import MotionMode
 
 if TYPE_CHECKING:
     from hdbridge.daemon.machinefile import GatewaySettings
+    from hdbridge.daemon.service.axis import ServiceAxis
     from hdbridge.daemon.service.core import Core
-    from hdbridge.daemon.service.ports import ServiceAxis
 
 _OWN: Final = frozenset({AxisState.ENABLING, AxisState.ENABLED})
 _STOPPED: Final = frozenset({AxisState.UNVERIFIED, AxisState.QUICK_STOPPED, AxisState.LATCHED})
+SETTLES_S: Final = 2.0
+"""Longest time for an axis to brake and lose its power before a reset or the next enable."""
 PREPARE_AGAIN_S: Final = 2.0
 """Pause after a drive could not be prepared."""
 
@@ -72,7 +74,7 @@ class OuterMaster:
                     and timing.clock.now() >= prepare_s
                     and axis.link.state is AxisState.DISABLED
                     and axis.link.power is State.SWITCH_ON_DISABLED
-                    and not axis.power.is_prepared
+                    and not axis.is_prepared
                 ):
                     prepare_s = timing.clock.now() + PREPARE_AGAIN_S
                     await axis.prepare()
@@ -85,8 +87,20 @@ class OuterMaster:
         return axis.link.state in _OWN and granted != 0 and cells[OuterCell.WANTED] != granted
 
     async def _enable(self, axis: ServiceAxis, cells: OuterCells, series: int) -> None:
+        link = axis.link
         try:
+            # A master may enable again while the axis still brakes from the last time.
+            await link.until(
+                lambda: (
+                    link.state is not AxisState.STOPPING and link.power is not State.NOT_READY_TO_SWITCH_ON
+                ),
+                SETTLES_S,
+            )
             await axis.enable(self._token)
+            if not self.holds() or cells[OuterCell.WANTED] != series:  # withdrawn while power was switched on
+                cells[OuterCell.REFUSED] = series
+                await axis.disable(self._token)
+                return
             await axis.link.do(CommandKind.FOLLOW, a=self._patience_s, j=series)
         except HdbridgeError:
             cells[OuterCell.REFUSED] = series
@@ -98,7 +112,7 @@ class OuterMaster:
         try:
             if holds:
                 link = axis.link
-                await link.until(lambda: link.state is not AxisState.STOPPING, 2.0)
+                await link.until(lambda: link.state is not AxisState.STOPPING, SETTLES_S)
                 if link.state in _STOPPED or link.power is State.FAULT:
                     await axis.reset(self._token)
         finally:

@@ -270,7 +270,7 @@ class DaemonBench:
             knot = next(knots, None)
             if knot is None:
                 break
-            queue.put([knot])
+            queue.add(knot)
         return knots
 
     def _keep(self, count: int) -> None:

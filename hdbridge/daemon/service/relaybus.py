@@ -15,7 +15,7 @@ from typing import Any, Final
 import can
 
 from hdbridge.clock import Clock
-from hdbridge.daemon.memory import Memory, RelayedFrame
+from hdbridge.daemon.memory import Cell, Memory, RelayedFrame
 from hdbridge.drive import objects
 from hdbridge.errors import DaemonError
 
@@ -37,6 +37,7 @@ class RelayBus(can.BusABC):
         super().__init__(channel=name)
         self.channel_info = name
         self._clock = clock
+        self._status = memory.status
         self._outgoing = memory.outgoing
         self._incoming = memory.incoming_reader()
         self._nodes = nodes
@@ -55,6 +56,8 @@ class RelayBus(can.BusABC):
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
         """Sends a frame. Drops the master's heartbeat, which the control process sends."""
+        if self._status.get(Cell.BUS_LENT):
+            raise DaemonError("the bus is lent to another program: nothing is sent until it is returned")
         can_id = msg.arbitration_id
         function, node = can_id & _FUNCTION, can_id & _NODE
         if function == objects.COB_HEARTBEAT:
@@ -63,7 +66,7 @@ class RelayBus(can.BusABC):
         nmt = can_id == objects.COB_NMT and len(msg.data) == 2 and msg.data[1] in self._nodes
         if not (to_node or nmt):
             raise can.CanOperationError(f"{can_id:03X}h is not for the service to send")
-        if not self._outgoing.put(int(1e9 * self._clock.now()), can_id, bytes(msg.data)):
+        if not self._outgoing.add(RelayedFrame(int(1e9 * self._clock.now()), can_id, bytes(msg.data))):
             raise can.CanOperationError("the control process takes no frames: it hangs or is gone")
 
     def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:

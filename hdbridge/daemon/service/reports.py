@@ -22,8 +22,8 @@ if TYPE_CHECKING:
 
     from hdbridge.axis import AxisConfig
     from hdbridge.daemon.memory import OuterCells
+    from hdbridge.daemon.service.axis import ServiceAxis
     from hdbridge.daemon.service.lease import Lease
-    from hdbridge.daemon.service.ports import ServiceAxis
     from hdbridge.daemon.setting import CompensationSetting
 
 FAULTS: Final = tuple(Fault)
@@ -162,8 +162,6 @@ def axis_state(
     stopped: Entry | None,
     loop_doubt: str,
     job: messages.Job | None,
-    adaptation: messages.AdaptationState,
-    advice: Sequence[str],
     outer: messages.OuterState | None = None,
 ) -> messages.AxisState:
     """Returns the state of an axis.
@@ -217,9 +215,9 @@ def axis_state(
             correction_arcsec=link.value("loop_arcsec"),
             doubt=loop_doubt if flags & SampleFlag.LOOP_DOUBTED else None,
         ),
-        adaptation=adaptation,
+        adaptation=axis.following.state if axis.following else messages.AdaptationState(),
         outer=outer,
-        advice=list(advice),
+        advice=list(axis.following.advice) if axis.following else [],
         queued=axis.motion.queued,
         job=job,
     )

@@ -13,18 +13,17 @@ from hdbridge.axis import AxisConfig, Identity
 from hdbridge.control.bench import compensation_for
 from hdbridge.control.compensation import Compensation
 from hdbridge.daemon.loop.states import AxisState
-from hdbridge.daemon.memory import CommandKind, Event, EventKind, SampleReader
-from hdbridge.daemon.memory.knots import KnotQueue
+from hdbridge.daemon.memory import CommandKind, Event, EventKind, Knot, Queue, SampleReader
 from hdbridge.daemon.service.activity import Activity
-from hdbridge.daemon.service.dispatch import ANSWER_S, Arguments
-from hdbridge.daemon.service.power import POWER_S
+from hdbridge.daemon.service.axis import POWER_S
+from hdbridge.daemon.service.core import ANSWER_S, Arguments
 from hdbridge.daemon.service.procedures import DaemonBench
 from hdbridge.daemon.service.reports import stop_hint
 from hdbridge.errors import DaemonError, HdbridgeError, SafetyStop
 from hdbridge.model import TransmissionModel
 
 if TYPE_CHECKING:
-    from hdbridge.daemon.service.ports import ServiceAxis
+    from hdbridge.daemon.service.axis import ServiceAxis
 
 STOP_WORDS_S: Final = 3.0
 """Time in which the control process reports the reason for a stop, once the axis is at rest."""
@@ -40,7 +39,7 @@ class DaemonRig:
         self.core = axis.core
         self.index = axis.link.index
         self.period_s = axis.core.memory.period_s
-        self.knots: KnotQueue = axis.core.memory.knots[self.index]
+        self.knots: Queue[Knot] = axis.core.memory.knots[self.index]
         self._reader: SampleReader = axis.core.memory.reader()
         self._newest: tuple[int, dict[str, float]] | None = None
         self._turns, self._turned_s = -1, axis.core.timing.clock.now()
@@ -73,8 +72,8 @@ class DaemonRig:
         return compensation_for(self.axis, TransmissionModel(self.axis.gear.ratio))
 
     def command(self, kind: CommandKind, within_s: float = ANSWER_S, **arguments: Unpack[Arguments]) -> Event:
-        """Runs `Dispatcher.do_now` for this axis."""
-        return self.core.dispatch.do_now(kind, self.index, within_s, **arguments)
+        """Runs `Core.do_now` for this axis."""
+        return self.core.do_now(kind, self.index, within_s, **arguments)
 
     def enable(self, compensation: Compensation) -> None:
         """Switches power on, at rest, with the compensation reset to the present position."""

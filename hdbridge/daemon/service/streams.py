@@ -116,7 +116,7 @@ def _slope(one: StreamPoint, other: StreamPoint) -> float:
 
 
 class ServiceStream:
-    """An open stream; `interface.StreamPort` documents each method."""
+    """An open stream of set-points. An asynchronous context manager: the stream ends with the block."""
 
     def __init__(self, link: AxisLink, activity: Activity, timeout_s: float) -> None:
         """The stream belongs to ``activity`` and ends with it."""
@@ -141,7 +141,7 @@ class ServiceStream:
         return max(self._last_s - run_s, 0.0)
 
     async def put(self, points: Sequence[StreamPoint]) -> None:
-        """Sends set-points; waits while the buffer is full."""
+        """Hands over set-points; waits while the buffer is full. Raises if the stream has ended."""
         self._check_open()
         if self._knots is None:
             await self._link.until(lambda: True, 0.0)

@@ -8,9 +8,11 @@ Other modules of this package define the sections.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal, Self
 
+import yaml
 from pydantic import Field, model_validator
 
 from hdbridge.device.behaviour import Behaviour
@@ -90,6 +92,13 @@ class Truth(Part):
     def from_text(cls, text: str, path: Path | str = "truth.yaml") -> Self:
         """Reads a truth file's text; ``path`` names it in error messages."""
         return document_from_text(text, path).validate(cls)
+
+    def changed(self, **sections: Mapping[str, Any]) -> Self:
+        """Returns a truth that differs in some keys of these sections; InputError if it would be wrong."""
+        data = self.model_dump(mode="json", by_alias=True, exclude_unset=True)
+        for name, keys in sections.items():
+            data[name] = {**data.get(name, {}), **keys}
+        return self.from_text(yaml.safe_dump(data, sort_keys=False), "changed truth") if sections else self
 
     @property
     def substep_s(self) -> float:

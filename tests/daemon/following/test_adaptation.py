@@ -57,7 +57,7 @@ class Axis:
 
     @property
     def waiting(self) -> str | None:
-        """What clients read."""
+        """State as clients read it."""
         return self.follower.state().frozen
 
     @property

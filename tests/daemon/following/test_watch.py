@@ -9,7 +9,7 @@ from support.axis_samples import SampleMaker, moves_and_rests
 
 from hdbridge.axis import AxisConfig
 from hdbridge.daemon.following.follower import Follower
-from hdbridge.daemon.following.judging import Debounced, Verdict, WatchLimits
+from hdbridge.daemon.following.judging import Debounced, Verdict
 from hdbridge.effects import CATALOGUE
 from hdbridge.model import TransmissionModel
 
@@ -164,7 +164,7 @@ def test_lost_cycles_leave_the_path_unknown_until_it_is_known_again():
 
 
 def test_a_verdict_lasts_before_it_is_raised_and_longer_before_it_is_withdrawn():
-    steady = Debounced(WatchLimits(raise_s=60.0, withdraw_s=300.0))
+    steady = Debounced()
     assert not any(steady.take(Verdict.RECALIBRATE, 10.0) for _ in range(5))
     assert not steady.take(Verdict.HOLDS, 10.0)
     assert [steady.take(Verdict.RECALIBRATE, 10.0) for _ in range(7)] == [False] * 5 + [True, False]

@@ -8,7 +8,7 @@ import tracemalloc
 
 from support.daemon import SteppedDaemon
 
-from hdbridge.daemon.memory import CommandKind
+from hdbridge.daemon.memory import CommandKind, RelayedFrame
 
 TURNS = 240
 
@@ -24,7 +24,7 @@ def work(daemon: SteppedDaemon) -> None:
             case 20:
                 daemon.post(CommandKind.MOVE, 0, a=math.inf)
             case 30:
-                daemon.memory.outgoing.put(0, 0x201, b"")
+                daemon.memory.outgoing.add(RelayedFrame(0, 0x201, b""))
                 daemon.samples.read()
         daemon.turn()
     daemon.events.clear()

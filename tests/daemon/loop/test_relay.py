@@ -7,7 +7,7 @@ from support.daemon import SteppedDaemon
 
 from hdbridge.daemon.loop.relay import MAY_MOVE, incoming_ids, why_refused
 from hdbridge.daemon.loop.states import AxisState
-from hdbridge.daemon.memory import EventKind
+from hdbridge.daemon.memory import EventKind, RelayedFrame
 
 UPLOAD, DOWNLOAD = bytes([0x40, 0x64, 0x60, 0, 0, 0, 0, 0]), bytes([0x2B, 0x40, 0x60, 0, 0x0F, 0, 0, 0])
 READS = [UPLOAD, bytes([0x60, *bytes(7)]), bytes([0x80, *bytes(7)]), bytes([0xA0, *bytes(7)])]
@@ -75,8 +75,8 @@ def test_a_write_in_motion_is_dropped_and_told(enabled: SteppedDaemon) -> None:
     enabled.move(20.0)
     sent: list[int] = []
     enabled.bus.spy = lambda can_id, _: sent.append(can_id)
-    enabled.memory.outgoing.put(0, 0x601, DOWNLOAD)
-    enabled.memory.outgoing.put(0, 0x000, b"\x81\x01")
+    enabled.memory.outgoing.add(RelayedFrame(0, 0x601, DOWNLOAD))
+    enabled.memory.outgoing.add(RelayedFrame(0, 0x000, b"\x81\x01"))
     enabled.run(0.5)
     assert not {0x601, 0x000} & set(sent)
     assert "disable it first" in enabled.told(EventKind.REFUSED)[-1].text
@@ -87,7 +87,7 @@ def test_at_most_one_frame_a_turn(daemon: SteppedDaemon) -> None:
     sent: list[int] = []
     daemon.bus.spy = lambda can_id, _: sent.append(can_id)
     for _ in range(10):
-        daemon.memory.outgoing.put(0, 0x601, UPLOAD)
+        daemon.memory.outgoing.add(RelayedFrame(0, 0x601, UPLOAD))
     for count in range(1, 11):
         daemon.turn()
         assert sent.count(0x601) == count

@@ -16,7 +16,7 @@ from support.reliability_daemon import ENABLE_OPERATION, RPDO, DaemonBench, daem
 from support.service import play, until
 
 from hdbridge.daemon.loop.states import AxisState
-from hdbridge.daemon.memory import CommandKind, EventKind, Knot, MailboxFullError
+from hdbridge.daemon.memory import CommandKind, EventKind, Knot, MailboxFullError, RelayedFrame
 from hdbridge.daemon.recorder.recorder import FlightRecorder
 from hdbridge.device.node import DriveNode
 from hdbridge.drive.states import State
@@ -214,7 +214,7 @@ def test_the_service_cannot_write_restart_or_command_a_moving_drive(moving: Daem
     sent: list[tuple[int, bytes]] = []
     daemon.bus.spy = lambda can_id, data: sent.append((can_id, data))
     for can_id, data in frames:
-        daemon.memory.outgoing.put(0, can_id, data)
+        daemon.memory.outgoing.add(RelayedFrame(0, can_id, data))
     daemon.run(0.1)
     passed = set(frames[:3]) & set(sent)
     assert not passed

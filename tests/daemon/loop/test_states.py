@@ -75,7 +75,7 @@ def test_the_diagram_names_every_state_and_the_way_to_power() -> None:
 
 
 def test_the_page_has_what_the_table_says() -> None:
-    page = Path(__file__).resolve().parents[3] / "docs" / "daemon-internals.md"
+    page = Path(__file__).resolve().parents[3] / "docs" / "architecture.md"
     text = page.read_text(encoding="utf-8")
     assert mermaid() in text
     assert table() in text

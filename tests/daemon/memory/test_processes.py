@@ -11,13 +11,13 @@ import time
 import numpy as np
 import pytest
 
-from hdbridge.daemon.memory import Cell, CommandKind, EventKind, Memory
+from hdbridge.daemon.memory import Cell, CommandKind, Event, EventKind, Memory
 from hdbridge.daemon.memory.layout import HEADER, KNOT_SLOTS, VERSION, Layout
 from hdbridge.errors import InputError
 
 HAMMER = """
 import sys
-from hdbridge.daemon.memory import EventKind, Memory
+from hdbridge.daemon.memory import Event, EventKind, Memory
 memory = Memory.attach(int(sys.argv[1]))
 cycle = 0
 while True:
@@ -25,7 +25,7 @@ while True:
     # Every number of a sample is the same: a torn one shows.
     memory.samples.write(cycle, cycle, 0.0, 0.0, 0.0, 0, (0, 0, 0, 0, 0, 0, *(float(cycle),) * 13))
     if cycle % 16 == 0:
-        memory.events.tell(cycle, cycle, 0, EventKind.DONE, cycle, 0, str(cycle))
+        memory.events.append(Event(0, cycle, cycle, 0, EventKind.DONE, cycle, 0, str(cycle)))
 """
 OTHER_END = """
 import os, signal, sys
@@ -54,16 +54,16 @@ def test_no_sample_is_torn_however_fast_the_writer_is(checked: bool) -> None:
                 assert process.poll() is None
                 samples, missed = samples_of.read()
                 lost += missed
-                seen += len(samples)
                 if len(samples):
                     cycles = samples["cycle"]
                     axis = samples["axes"][:, 0]
                     assert (cycles == samples["sequence"]).all()
                     for name in ("load_target_deg", "weight", "issued_deg"):
                         assert (axis[name] == cycles).all()
-                    assert cycles[0] == last + missed + 1
+                    assert cycles[0] == seen + lost + 1
                     assert (np.diff(cycles) == 1).all()
                     last = int(cycles[-1])
+                seen += len(samples)
                 events, missed = events_of.read()
                 told += len(events)
                 for event in events:
@@ -107,7 +107,7 @@ def test_a_loop_that_takes_the_place_of_a_killed_one_goes_on_with_the_numbers() 
         events.read()
         with Memory.attach(os.dup(memory.fd)) as successor:
             successor.samples.write(-1, 0, 0.0, 0.0, 0.0, 0, (0,) * 6 + (0.0,) * 13)
-            successor.events.tell(0, 0, -1, EventKind.BUS_UP)
+            successor.events.append(Event(0, 0, 0, -1, EventKind.BUS_UP))
         after, lost = reader.read()
         assert lost == 0
         assert after["cycle"].tolist() == [-1]

@@ -7,7 +7,7 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
 
-from hdbridge.daemon.memory import CommandKind, EventKind, Knot, MailboxFullError, Memory
+from hdbridge.daemon.memory import CommandKind, Event, EventKind, Knot, MailboxFullError, Memory, RelayedFrame
 from hdbridge.daemon.memory.layout import (
     COMMAND_SLOTS,
     EVENTS_KEPT,
@@ -51,7 +51,7 @@ def test_a_loop_that_begins_can_throw_away_what_was_meant_for_another(memory: Me
 
 def test_an_event_arrives_with_its_words(memory: Memory) -> None:
     reader = memory.event_reader()
-    memory.events.tell(7, 28_000_000, 1, EventKind.REFUSED, 99, 3, "outside -400 .. 400°")
+    memory.events.append(Event(0, 7, 28_000_000, 1, EventKind.REFUSED, 99, 3, "outside -400 .. 400°"))
     (event,), lost = reader.read()
     assert lost == 0
     assert event == (1, 7, 28_000_000, 1, EventKind.REFUSED, 99, 3, "outside -400 .. 400°")
@@ -61,7 +61,7 @@ def test_an_event_arrives_with_its_words(memory: Memory) -> None:
 @pytest.mark.parametrize("before", ["", "x"])
 def test_a_long_text_is_cut_between_two_characters(memory: Memory, before: str) -> None:
     reader = memory.event_reader()
-    memory.events.tell(0, 0, -1, EventKind.FAULT, text=before + "°" * 400)
+    memory.events.append(Event(0, 0, 0, -1, EventKind.FAULT, text=before + "°" * 400))
     (event,), _ = reader.read()
     assert event.text == before + "°" * ((400 - len(before)) // 2)
 
@@ -69,7 +69,7 @@ def test_a_long_text_is_cut_between_two_characters(memory: Memory, before: str) 
 def test_events_that_nobody_read_are_counted(memory: Memory) -> None:
     reader = memory.event_reader()
     for cycle in range(EVENTS_KEPT + 10):
-        memory.events.tell(cycle, 0, -1, EventKind.DONE)
+        memory.events.append(Event(0, cycle, 0, -1, EventKind.DONE))
     events, lost = reader.read()
     assert lost == 11  # one more: the slot that may be under way
     assert [each.cycle for each in events] == list(range(11, EVENTS_KEPT + 10))
@@ -77,21 +77,21 @@ def test_events_that_nobody_read_are_counted(memory: Memory) -> None:
 
 def test_frames_in_and_out(memory: Memory) -> None:
     one, other = memory.incoming_reader(), memory.incoming_reader()
-    memory.incoming.put(5, 0x581, bytes(range(8)))
-    memory.incoming.put(6, 0x701, b"\x05")
+    memory.incoming.append(RelayedFrame(5, 0x581, bytes(range(8))))
+    memory.incoming.append(RelayedFrame(6, 0x701, b"\x05"))
     for reader in (one, other):
         frames, lost = reader.read()
         assert lost == 0
         assert frames == [(5, 0x581, bytes(range(8))), (6, 0x701, b"\x05")]
     for _ in range(INCOMING_KEPT + 1):
-        memory.incoming.put(7, 0x701, b"")
+        memory.incoming.append(RelayedFrame(7, 0x701, b""))
     assert one.read()[1] == 2
 
     for count in range(OUTGOING_SLOTS):
-        assert memory.outgoing.put(count, 0x601, b"\x40")
-    assert not memory.outgoing.put(0, 0x601, b"\x40")
+        assert memory.outgoing.add(RelayedFrame(count, 0x601, b"\x40"))
+    assert not memory.outgoing.add(RelayedFrame(0, 0x601, b"\x40"))
     assert memory.outgoing.take() == (0, 0x601, b"\x40")
-    assert memory.outgoing.put(0, 0x602, b"")
+    assert memory.outgoing.add(RelayedFrame(0, 0x602, b""))
     memory.outgoing.clear()
     assert memory.outgoing.take() is None
 

@@ -1,6 +1,7 @@
 """Stands in for a child of the keeper: ``control`` counts turns, the others say that they live.
 
 HDBRIDGE_TEST_CONTROL, HDBRIDGE_TEST_SERVICE in the environment are an exit status with which it ends at once.
+SIGUSR1 makes the service ask for the bus.
 """
 
 from __future__ import annotations
@@ -25,7 +26,9 @@ def main(kind: str, *arguments: str) -> int:
     if status := os.environ.get(f"HDBRIDGE_TEST_{kind.upper()}"):
         return int(status)
     told = []
+    wanted = []
     signal.signal(signal.SIGTERM, lambda *_: told.append("term"))
+    signal.signal(signal.SIGUSR1, lambda *_: wanted.append(1))
     with Memory.attach(start.memory_fd) as memory:
         status = memory.status
         time.sleep(0.05)
@@ -36,6 +39,12 @@ def main(kind: str, *arguments: str) -> int:
             if kind == "control":
                 status.set(Cell.LOOP_COUNT, status.loop_count + 1)
             else:
+                if wanted:
+                    status.set(Cell.BUS_WANTED, 1)
+                    if status.get(Cell.BUS_LENT):
+                        wanted.clear()
+                        status.set(Cell.BUS_WANTED, 0)
+                        say("bus is lent")
                 alive = Cell.SERVICE_TIME_NS if kind == "service" else Cell.GATEWAY_TIME_NS
                 status.set(alive, time.monotonic_ns())
             time.sleep(0.02)

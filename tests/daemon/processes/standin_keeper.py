@@ -7,11 +7,11 @@ import sys
 from pathlib import Path
 from types import SimpleNamespace
 
-from hdbridge.daemon.keeper import Keeper, Programs, Times
+from hdbridge.daemon.keeper import Keeper, Notifier, Programs, Times
 from hdbridge.daemon.logs import LogSettings, begin_log
 from hdbridge.daemon.memory import Memory
-from hdbridge.daemon.notify import Notifier
 from hdbridge.daemon.start import Start
+from hdbridge.drive.interfacelock import InterfaceLock
 
 STANDIN = str(Path(__file__).with_name("standin.py"))
 CYCLE_S = 0.004
@@ -26,9 +26,11 @@ if __name__ == "__main__":
         gateway=True if "HDBRIDGE_TEST_WITH_GATEWAY" in os.environ else None,
     )
     programs = Programs((STANDIN, "control"), (STANDIN, "service"), (STANDIN, "gateway"))
+    lock = InterfaceLock("socketcan", "can0", Path(os.environ["HDBRIDGE_TEST_LOCKS"]))
+    lock.acquire()
     with Memory.create(1, CYCLE_S) as memory:
         keeper = Keeper(
             Start(machine, memory.fd, os.getpid()), memory, (), Notifier.of_environment(), programs,
-            Times(hung_s=3.0, service_hung_s=4.0, gateway_hung_s=4.0),
+            Times(hung_s=3.0, service_hung_s=4.0, gateway_hung_s=4.0), lock,
         )  # fmt: skip
         sys.exit(keeper.run())

@@ -24,7 +24,10 @@ class Kept:
     def __init__(self, folder: Path, **environment: str) -> None:
         self.manager = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
         self.manager.bind(str(folder / "notify"))
-        told = {"NOTIFY_SOCKET": str(folder / "notify"), "WATCHDOG_USEC": "1000000", **environment}
+        told = {
+            "NOTIFY_SOCKET": str(folder / "notify"), "WATCHDOG_USEC": "1000000",
+            "HDBRIDGE_TEST_LOCKS": str(folder), **environment,
+        }  # fmt: skip
         self.process = subprocess.Popen(
             [sys.executable, str(PROGRAM)], env={**os.environ, **told},
             stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
@@ -139,6 +142,58 @@ def test_who_dies_or_hangs_is_replaced_and_the_other_goes_on(keeper: Callable[..
     kept.process.kill()
     kept.until(lambda: all(gone(pid) for pid in last), "the children end with their keeper")
     kept.until(lambda: set(kept.said[-2:]) == {"control ends", "service ends"}, "they end in order")
+
+
+BORROWER = """
+import sys, time
+from pathlib import Path
+from hdbridge.drive.interfacelock import InterfaceLock
+with InterfaceLock("socketcan", "can0", Path(sys.argv[1])):
+    print("has it", flush=True)
+    time.sleep(600)
+"""
+
+
+def test_a_lent_bus_comes_back_however_its_borrower_ends(keeper: Callable[..., Kept], tmp_path: Path) -> None:
+    """The borrower is killed; the service is killed meanwhile, too. Nothing runs on the bus beside it."""
+    kept = keeper()
+    kept.until_told("READY=1")
+    os.kill(kept.until_begun("service"), signal.SIGUSR1)
+    kept.until(lambda: "bus is lent" in kept.said, "the bus is lent")
+    assert kept.said.index("control ends") < kept.said.index("bus is lent")
+    with subprocess.Popen(
+        [sys.executable, "-c", BORROWER, str(tmp_path)], stdout=subprocess.PIPE, text=True
+    ) as borrower:
+        assert borrower.stdout is not None
+        assert borrower.stdout.readline() == "has it\n"
+        os.kill(kept.until_begun("service"), signal.SIGKILL)
+        kept.until_begun("service", times=2)
+        assert len(kept.pids("control")) == 1
+        borrower.kill()
+    kept.until_begun("control", times=2)
+    assert kept.names().count("control process died") == 0
+    kept.process.send_signal(signal.SIGTERM)
+    assert kept.until_ended() == 0
+
+
+def test_a_lent_bus_that_nobody_opens_comes_back(keeper: Callable[..., Kept]) -> None:
+    kept = keeper()
+    kept.until_told("READY=1")
+    os.kill(kept.until_begun("service"), signal.SIGUSR1)
+    kept.until_begun("control", times=2)
+    assert [name for name in kept.names() if "bus" in str(name)] == [
+        "the bus is lent",
+        "the bus is taken back",
+    ]
+
+
+def test_a_daemon_ends_while_its_bus_is_lent(keeper: Callable[..., Kept]) -> None:
+    kept = keeper()
+    kept.until_told("READY=1")
+    os.kill(kept.until_begun("service"), signal.SIGUSR1)
+    kept.until(lambda: "bus is lent" in kept.said, "the bus is lent")
+    kept.process.send_signal(signal.SIGTERM)
+    assert kept.until_ended() == 0
 
 
 def test_a_gateway_that_dies_or_hangs_is_replaced_and_the_others_go_on(keeper: Callable[..., Kept]) -> None:

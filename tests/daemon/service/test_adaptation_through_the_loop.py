@@ -54,7 +54,7 @@ async def adapting(service: Service) -> AsyncIterator[tuple[ServiceBridge, str, 
 def begin(service: Service, bridge: ServiceBridge) -> Following:
     axis = service.machine.axes[0]
     made = Following(0, bridge.axes["axis1"], axis.adaptation, axis.profile.folder / "adaptation", AtOnce())
-    bridge.following["axis1"] = made
+    bridge.axes["axis1"].following = made
     bridge.core.observer.add(made)
     return made
 
@@ -107,7 +107,7 @@ def test_the_model_in_the_loop_follows_and_goes_back(service: Service) -> None:
             assert state.updated is not None
             assert state.parameters["hysteresis.offset_arcsec"] == pytest.approx(4.0, abs=1.0)
 
-            await bridge.adaptation_back(token, "axis1")
+            await bridge.axes["axis1"].revert_adaptation(token)
             assert offset_arcsec(bridge) == 40.0
             await work(bridge, token, 20, seed=1)
             assert offset_arcsec(bridge) == 40.0

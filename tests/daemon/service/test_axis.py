@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 from support.service import Service, play, stepped_service, until
 
+from hdbridge.daemon.service.commissioning import HomingRun
 from hdbridge.errors import InputError, LeaseError, RefusedError
 
 
@@ -68,7 +69,7 @@ def test_what_cannot_be_is_refused_in_the_loops_words(service: Service) -> None:
             with pytest.raises(InputError, match="position limits"):
                 await axis.move(token, 1e6)
             with pytest.raises(RefusedError, match="disable it first"):
-                await axis.home(token, 35)
+                await axis.home(token, HomingRun(35))
             with pytest.raises(RefusedError, match="disable it first"):
                 await axis.sdo_write(token, "6081h", "100")
             assert axis.state().at_rest

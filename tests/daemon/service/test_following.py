@@ -48,7 +48,7 @@ def following(bridge: ServiceBridge, settings: AdaptationSettings, folder: Path)
     (axis,) = bridge.axes.values()
     made = Following(0, axis, settings, folder, ThreadPoolExecutor(1))
     bridge.core.observer.add(made)
-    bridge.following[axis.name] = made
+    axis.following = made
     return made
 
 
@@ -79,7 +79,7 @@ def test_what_was_learnt_is_used_again_and_taken_back(tmp_path: Path) -> None:
                 assert axis.models.in_use.model is in_use.model  # by its name, the committed one
 
                 token = bridge.lease.take("test")
-                await bridge.adaptation_back(token, axis.name)
+                await axis.revert_adaptation(token)
                 assert changes(bridge) == before + 2
                 assert made.state.mode is AdaptationMode.OBSERVE
                 assert not made.state.parameters

@@ -10,7 +10,7 @@ from support.service import Service, play, stepped_service
 from hdbridge import AxisConfig, Bench, TransmissionModel
 from hdbridge.control.bench import compensation_for
 from hdbridge.daemon.service.activity import Activity, Kind
-from hdbridge.daemon.service.ports import ServiceAxis
+from hdbridge.daemon.service.axis import ServiceAxis
 from hdbridge.daemon.service.procedures import knots_of, streamed_view
 from hdbridge.daemon.service.rigs import DaemonRig
 from hdbridge.errors import InputError

@@ -17,6 +17,7 @@ from hdbridge.daemon.api.routes.parts import (
     stopped,
 )
 from hdbridge.daemon.service.bridge import ServiceBridge
+from hdbridge.daemon.service.commissioning import HomingRun
 from hdbridge.daemon.service.moves import WayPoint
 from hdbridge.evaluation.stepping import Scheme
 
@@ -81,7 +82,7 @@ def _add_motion(routes: APIRouter, bridge: ServiceBridge) -> None:
     ) -> messages.AxisState:
         """Home by a method of the drive, disabled before and after."""
         found = port(bridge, axis)
-        await kept(bridge, holder, request, found.home(holder, **home.model_dump()))
+        await kept(bridge, holder, request, found.home(holder, HomingRun(**home.model_dump())))
         return found.state()
 
     @routes.post("/move", tags=["Move"], responses=refusals(MOVING))
@@ -140,21 +141,21 @@ def _add_compensation(routes: APIRouter, bridge: ServiceBridge) -> None:
     ) -> messages.AxisState:
         """Switch the load loop, a slow integral of the measured error, on or off."""
         found = port(bridge, axis)
-        await bridge.load_loop(holder, axis, loop.on)
+        await found.switch_load_loop(holder, on=loop.on)
         return found.state()
 
     @routes.post("/adaptation", tags=["Compensate"], responses=refusals(MOVING))
     async def adapt(axis: AxisName, adapt: messages.Adapt, holder: Holder = "") -> messages.AxisState:
         """Set the adaptation mode: apply changes of parameters, only report them, or neither."""
         found = port(bridge, axis)
-        await bridge.adapt(holder, axis, adapt.mode)
+        await found.adapt(holder, adapt.mode)
         return found.state()
 
     @routes.delete("/adaptation", tags=["Compensate"], responses=refusals(MOVING))
     async def take_adaptation_back(axis: AxisName, holder: Holder = "") -> messages.AxisState:
         """Discard the changes by the adaptation since the model was activated."""
         found = port(bridge, axis)
-        await bridge.adaptation_back(holder, axis)
+        await found.revert_adaptation(holder)
         return found.state()
 
 

@@ -111,6 +111,16 @@ def _add_motion(routes: APIRouter, bridge: ServiceBridge) -> None:
         await kept(bridge, holder, request, motion)
         return bridge.state()
 
+    @routes.post("/bus/lend", tags=["Move"], responses=refusals(MOVING))
+    async def lend_bus(request: Request, holder: Holder = "") -> messages.MachineState:
+        """Stop all axes, switch them off, and release the bus to another program of the daemon's computer.
+
+        Answers when the interface is free. The program has ten seconds to open it, and the daemon takes the
+        bus back when the program has closed it or ended. The axes come back disabled.
+        """
+        await kept(bridge, holder, request, bridge.lend_bus(holder))
+        return bridge.state()
+
 
 def _add_jobs(routes: APIRouter, bridge: ServiceBridge) -> None:
     def job(id_: str) -> messages.Job:

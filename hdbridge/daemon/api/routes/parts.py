@@ -10,8 +10,8 @@ from fastapi import Header, Path, Request
 
 from hdbridge.client.messages import ControlState, Problem
 from hdbridge.daemon.api.problems import UnknownError
+from hdbridge.daemon.service.axis import ServiceAxis
 from hdbridge.daemon.service.bridge import ServiceBridge
-from hdbridge.daemon.service.ports import ServiceAxis
 from hdbridge.errors import LeaseError
 
 T = TypeVar("T")

@@ -8,7 +8,7 @@ from support.axis_samples import SampleMaker, moves_and_rests
 from support.flight import flight_log
 
 from hdbridge.axis import AxisConfig
-from hdbridge.daemon.following.autodiagnosis import AutoDiagnosis, summary
+from hdbridge.daemon.recorder.autodiagnosis import AutoDiagnosis, summary
 from hdbridge.daemon.recorder.flightlog import Batch
 from hdbridge.effects import CATALOGUE
 from hdbridge.model import TransmissionModel

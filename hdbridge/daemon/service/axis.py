@@ -1,4 +1,9 @@
-"""One axis, for clients: checks who may ask, and delegates the work to its parts."""
+"""One axis, for clients: power, motion, compensation and objects of the drive.
+
+The drive is booted and verified by SDO before the control process sends it anything. It is prepared by SDO
+each time before power is switched on, and verified again after it restarted or the bus was down. An axis is
+never enabled automatically.
+"""
 
 from __future__ import annotations
 
@@ -14,24 +19,31 @@ from hdbridge.daemon.memory import CommandKind, EventKind
 from hdbridge.daemon.service.activity import Activity, Kind
 from hdbridge.daemon.service.axislink import AxisLink
 from hdbridge.daemon.service.commissioning import Commissioning, HomingRun
+from hdbridge.daemon.service.core import ANSWER_S
 from hdbridge.daemon.service.models import AxisModels
 from hdbridge.daemon.service.moves import AxisMotion, WayPoint
-from hdbridge.daemon.service.power import UNKNOWN, AxisPower
 from hdbridge.daemon.service.reports import job_words
 from hdbridge.daemon.service.streams import ServiceStream
+from hdbridge.drive.states import State
 from hdbridge.drive.values import Object, Value
-from hdbridge.errors import HdbridgeError, RefusedError
+from hdbridge.errors import DriveError, HdbridgeError, InputError, RefusedError
 from hdbridge.evaluation.stepping import Scheme
 from hdbridge.motion import MotionMode
 
 if TYPE_CHECKING:
     from hdbridge.daemon.machine import Axis
     from hdbridge.daemon.service.core import Core
+    from hdbridge.daemon.service.following import Following
     from hdbridge.daemon.setting import CompensationSetting
     from hdbridge.model import TransmissionModel
 
 CHANGE_S: Final = 120.0
 """Time in which another compensation is faded in, however slow its ramp."""
+POWER_S: Final = 20.0
+"""Time-out for ENABLE and DISABLE, braking included."""
+FAULT_RESET_S: Final = 2.0
+UNKNOWN: Final = frozenset({AxisState.UNVERIFIED, AxisState.LATCHED})
+"""States in which the drive must be verified before any other request."""
 _POWERED: Final = frozenset({AxisState.ENABLING, AxisState.ENABLED, AxisState.STOPPING})
 
 
@@ -53,10 +65,14 @@ class ServiceAxis:
         self.link = AxisLink(core, index, axis.config)
         self.commissioning = Commissioning(axis.config, core.memory, core.timing.clock)
         self.models = AxisModels(axis, core.memory.settings[index])
-        self.power = AxisPower(self.link, self.commissioning, self.models.check_drive)
+        self.is_prepared = False
+        """True if all SDO work that precedes power is done, and no SDO transfer has followed."""
         self.motion = AxisMotion(self.link, axis.config.limits)
+        self.following: Following | None = None
+        """Watch and adaptation."""
         self._begin_job = begin_job
         self._report = report
+        self._work = core.timing.work
         self._changing = asyncio.Lock()
         self._job_runs = False
         self._doing = ""
@@ -110,26 +126,46 @@ class ServiceAxis:
         async with self._alone("the axis is being enabled"):
             self.motion.replace(None, "the axis was enabled anew")
             await self.settle()
-            await self.power.enable()
+            link = self.link
+            if link.state is AxisState.ENABLED:
+                return
+            if link.state is AxisState.UNVERIFIED:
+                await self._verify()
+            self.models.check_drive(self.commissioning.identity)
+            if link.state is not AxisState.DISABLED:
+                await link.do(CommandKind.ENABLE)  # refused, with the reason
+            if self.is_prepared:
+                self.is_prepared = False
+                seeds = link.seeds()
+            else:
+                seeds = (await self._work(self.commissioning.prepare)).arguments()
+            try:
+                await link.do(CommandKind.ENABLE, POWER_S, **seeds)
+            except HdbridgeError:
+                await self._rest()
+                raise
 
     async def prepare(self) -> None:
-        """Make the drive ready by SDO for the next `enable`."""
+        """Prepares the drive by SDO, so that the next `enable` needs none. Raises as `enable` does."""
         self.check_free()
         async with self._drive:
             if self.link.state is AxisState.DISABLED:
-                await self.power.prepare()
+                self.models.check_drive(self.commissioning.identity)
+                await self._work(self.commissioning.prepare)
+                self.is_prepared = True
 
     async def disable(self, holder: str) -> None:
         """Brakes to rest, then switches power off. Cancels the axis's job."""
         self.core.lease.check(holder)
         self.motion.replace(None, "the axis was disabled")
         async with self._alone("the axis is being disabled"):
-            await self.power.disable()
+            await self.link.do(CommandKind.DISABLE, POWER_S)
+            await self._rest()
 
     def give_up(self, why: str) -> None:
-        """Ends the present activity and interrupts SDO requests to the drive."""
+        """Ends the present activity and interrupts SDO requests to the drive; a homing axis stops."""
         self.motion.replace(None, why)
-        self.power.interrupt(f"{self.name}: {why}")
+        self.commissioning.interrupt(f"{self.name}: {why}")
 
     async def quick_stop(self) -> None:
         """Quick-stops the axis and latches the stop until `reset`. Requires no lease."""
@@ -146,38 +182,74 @@ class ServiceAxis:
         self.check_may(holder)
         async with self._alone("the axis is being reset"):
             self.motion.replace(None, "the axis was reset")
-            await self.power.reset()
+            link = self.link
+            if link.state in UNKNOWN:
+                await self._verify(clear_fault=True)
+            elif link.state is AxisState.QUICK_STOPPED:
+                await link.do(CommandKind.RESET)
+                stopping = {AxisState.STOPPING, AxisState.QUICK_STOPPED}
+                await link.until(lambda: link.state not in stopping, POWER_S)
+            if link.state is AxisState.DISABLED and link.power is State.FAULT:
+                await link.do(CommandKind.DRIVE_FAULT_RESET)
+                if not await link.until(lambda: link.power is not State.FAULT, FAULT_RESET_S):
+                    raise DriveError(
+                        f"{self.name}: the drive's fault stays after a reset; remove its cause (see 603Fh "
+                        f"and the drive's manual), then reset it again: hdbridge ctl reset {self.name}"
+                    )
+            await self._rest()
 
     async def take_over(self) -> None:
-        """Takes over the axis from an earlier service process."""
+        """Takes over the axis from an earlier service process; stops a drive that was lent to it."""
+        link = self.link
         async with self._drive:
-            await self.power.take_over()
+            await link.until(lambda: self.core.observer.newest is not None, ANSWER_S)
+            if link.state is AxisState.LENT:
+                await self._work(self.commissioning.abandon_homing)
+                await link.do(CommandKind.RELEASE)
+            if link.state not in UNKNOWN:
+                await self._work(self.commissioning.take_over)
 
     async def verify(self) -> None:
         """Boots and verifies the drive if it is not verified; the axis is disabled afterwards."""
         async with self._drive:
             if self.link.state not in UNKNOWN:
                 return
-            await self.power.verify()
+            await self._verify()
         self.core.log.note("the drive was verified; the axis is disabled", self.link.index)
 
-    async def home(
-        self,
-        holder: str,
-        method: int,
-        switch_velocity_deg_s: float | None = None,
-        zero_velocity_deg_s: float | None = None,
-        acceleration_deg_s2: float | None = None,
-        offset_deg: float = 0.0,
-        timeout_s: float = 60.0,
-    ) -> float:
+    async def home(self, holder: str, run: HomingRun) -> float:
         """Homes by a method of 6098h, disabled before and after; returns the load angle afterwards."""
         self.check_may(holder)
-        run = HomingRun(
-            method, switch_velocity_deg_s, zero_velocity_deg_s, acceleration_deg_s2, offset_deg, timeout_s
-        )
         async with self._alone("the axis is being homed"):
-            return await self.power.home(run)
+            self.is_prepared = False
+            await self.link.do(CommandKind.LEND)
+            try:
+                positions, seeds = await self._work(self.commissioning.home, run)
+            except BaseException:
+                # The position may be lost, so the drive must be verified again.
+                with suppress(HdbridgeError):
+                    await self.link.do(CommandKind.RELEASE)
+                raise
+            await self.link.do(CommandKind.UNLEND, **seeds.arguments())
+            return positions.load_deg
+
+    async def _verify(self, *, clear_fault: bool = False) -> None:
+        """Boots and verifies the drive, then lets the control process communicate with it."""
+        self.is_prepared = False
+        seeds = await self._work(self.commissioning.verify)
+        if clear_fault:
+            await self._work(self.commissioning.clear_fault)
+            seeds = await self._work(self.commissioning.seeds)
+        if self.link.state is AxisState.LATCHED:
+            await self.link.do(CommandKind.RESET, i=1)
+        await self.link.do(CommandKind.VERIFIED, **seeds.arguments())
+
+    async def _rest(self) -> None:
+        """Ends the drive's monitoring of the master if power is off."""
+        self.is_prepared = False
+        if self.link.state is AxisState.DISABLED and self.link.power is not State.FAULT:
+            with suppress(HdbridgeError):  # monitoring is set up again each time power is switched on
+                await self._work(self.commissioning.rest)
 
     # ---------------------------------------------------------------- motion
 
@@ -244,7 +316,7 @@ class ServiceAxis:
         """Selects the part of the model that compensates; fades it in, also during motion."""
         self.check_may(holder)
         async with self._changing:
-            await self._use(await self.core.timing.work(self.models.with_scheme, scheme))
+            await self._use(await self._work(self.models.with_scheme, scheme))
 
     async def activate_model(self, holder: str, version: int | Literal["pending", "active"]) -> None:
         """Activates a model of the profile and uses it: a version, ``pending`` or ``active``.
@@ -254,9 +326,9 @@ class ServiceAxis:
         self.check_may(holder)
         identity = self.commissioning.identity
         async with self._changing:
-            await self._use(await self.core.timing.work(self.models.found, version, identity))
+            await self._use(await self._work(self.models.found, version, identity))
             date = datetime.now(UTC)
-            await self.core.timing.work(self.models.activate, version, identity, date)
+            await self._work(self.models.activate, version, identity, date)
             await self._use(self.models.chosen)
 
     @property
@@ -273,13 +345,29 @@ class ServiceAxis:
     async def follow(self, model: TransmissionModel) -> None:
         """Compensates with the adapted parameters of the chosen model, which keeps its version."""
         async with self._changing:
-            await self._use(await self.core.timing.work(self.models.moved, model))
+            await self._use(await self._work(self.models.moved, model))
 
     async def switch_load_loop(self, holder: str, *, on: bool) -> None:
         """Switches the load loop on or off."""
         self.check_may(holder)
         async with self._changing:
             await self._use(self.models.with_load_loop(on))
+
+    async def adapt(self, holder: str, mode: messages.AdaptationMode) -> None:
+        """Sets how the model's parameters follow the load encoder."""
+        await self._followed(holder).set_mode(mode)
+
+    async def revert_adaptation(self, holder: str) -> None:
+        """Discards the adapted parameters and restores the model as it was activated."""
+        await self._followed(holder).revert()
+
+    def _followed(self, holder: str) -> Following:
+        self.core.lease.check(holder)
+        if self.following is None:
+            raise InputError(
+                f"{self.name}: nothing adapts on this axis; give it an adaptation in the machine file"
+            )
+        return self.following
 
     async def _use(self, setting: CompensationSetting) -> None:
         """Sends a setting to the control process and waits until it is in effect."""
@@ -297,7 +385,7 @@ class ServiceAxis:
 
     async def sdo_read(self, object_: str) -> tuple[Object, Value]:
         """Reads an object of the drive by its number (``6064h``, ``0x1018:4``) or EDS name."""
-        return await self.core.timing.work(self.commissioning.read, object_)
+        return await self._work(self.commissioning.read, object_)
 
     async def sdo_write(self, holder: str, object_: str, value: str) -> Object:
         """Writes an object of the drive, given as text; refused while the axis is enabled."""
@@ -306,7 +394,7 @@ class ServiceAxis:
             raise RefusedError(
                 f"{self.name}: no object is written while the axis is enabled; disable it first"
             )
-        return await self.core.timing.work(self.commissioning.write, object_, value)
+        return await self._work(self.commissioning.write, object_, value)
 
     async def job(
         self, holder: str, kind: messages.JobKind, options: Mapping[str, Any] | None = None

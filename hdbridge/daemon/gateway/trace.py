@@ -1,0 +1,434 @@
+"""The other master as the outer bus shows it: what it has configured, what it does, and what it gets wrong.
+
+Pure: frames in, lines out. It sends nothing, so it may look at a bus in operation or at a bus log.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass
+from statistics import median
+from typing import Final
+
+from canopen.objectdictionary import ObjectDictionary, ODVariable
+from canopen.sdo.exceptions import SdoAbortedError
+
+from hdbridge.drive.dictionary import find
+from hdbridge.drive.emergencies import error_name
+from hdbridge.drive.link import Frame
+from hdbridge.drive.unwrap import wrap_int32
+
+_MULTIPLEXER: Final = struct.Struct("<BHB")
+_STATES: Final = {
+    0x40: "switch on disabled",
+    0x21: "ready to switch on",
+    0x23: "switched on",
+    0x27: "operation enabled",
+    0x07: "quick stop active",
+    0x0F: "fault reaction active",
+    0x08: "fault",
+    0x00: "not ready to switch on",
+}
+_NMT: Final = {
+    1: "start",
+    2: "stop",
+    128: "enter pre-operational",
+    129: "reset node",
+    130: "reset communication",
+}
+_NMT_STATES: Final = {0x04: "STOPPED", 0x05: "OPERATIONAL", 0x7F: "PRE-OPERATIONAL"}
+_CYCLIC: Final = (7, 8)
+_INVALID: Final = 1 << 31
+_LATE: Final = 1.5
+"""A SYNC interval of more than so many periods is a missing SYNC; the gateway stops the axis after four."""
+_QUIET_S: Final = 1.0
+"""Time without SYNC or heartbeat after which a master that should send them is at fault."""
+_PDO_ADVICE: Final = (
+    "to change a PDO: set bit 31 of its identifier, set the number of mapped objects to 0, write the entries "
+    "and their number, then the identifier without bit 31"
+)
+_ADVICE: Final = {
+    0x0601_0002: "the object is read-only",
+    0x0602_0000: "the gateway does not have the object: use the EDS of 'hdbridge gateway eds'",
+    0x0604_0041: "the object cannot be mapped to this PDO; see PDOMapping and AccessType in the EDS",
+    0x0604_0042: "a PDO has at most eight bytes",
+    0x0607_0010: "the length does not fit the type in the EDS",
+    0x0607_0012: "the length does not fit the type in the EDS",
+    0x0607_0013: "the length does not fit the type in the EDS",
+    0x0609_0011: "the gateway does not have the sub-index: use the EDS of 'hdbridge gateway eds'",
+    0x0800_0022: "not in this state: disable the drive first",
+}
+
+
+@dataclass(frozen=True)
+class Line:
+    """One line of the trace."""
+
+    time_s: float
+    text: str
+    advice: str = ""
+    """Advice to the author of the master; empty if the master has done nothing wrong."""
+
+
+class Trace:
+    """The trace of one node. ``od`` is the dictionary of its EDS."""
+
+    def __init__(self, node_id: int, od: ObjectDictionary) -> None:
+        self._node, self._od = node_id, od
+        self._values = {
+            (each.index, each.subindex): each.default
+            for each in _variables(od)
+            if isinstance(each.default, int)
+        }
+        self.written: dict[tuple[int, int], int] = {}
+        """Parameters that the master has written, in the order of the first write."""
+        self._pending: tuple[int, int, bytes | None] | None = None
+        self._nmt: int | None = None
+        self._state: int | None = None
+        self._word: int | None = None
+        self._reset_since_s: float | None = None
+        self._targets: list[int] = []
+        self._position: int | None = None
+        self._intervals_s: list[float] = []
+        self._sync_s: float | None = None
+        self._rpdos_since_sync = 0
+        self._heartbeat_s: dict[int, float] = {}
+        self._told: set[str] = set()
+        self.mistakes: Counter[str] = Counter()
+        """Counts of each advice."""
+        self._begun_s: float | None = None
+        self._lines: list[Line] = []
+
+    # ---------------------------------------------------------------- frames
+
+    def take(self, frame: Frame) -> list[Line]:
+        """Takes a frame; returns the lines that it gives."""
+        self._lines = []
+        if self._begun_s is None:
+            self._begun_s = frame.time_s
+        can_id, data, node = frame.can_id, frame.data, self._node
+        if can_id == 0x000 and len(data) >= 2 and data[1] in (0, node):
+            self._say(frame.time_s, f"NMT {_NMT.get(data[0], f'command {data[0]}')}")
+        elif can_id == self._value(0x1005) & 0x7FF:
+            self._on_sync(frame.time_s)
+        elif can_id == 0x700 + node and data:
+            self._on_own_heartbeat(frame.time_s, data[0])
+        elif can_id & 0x780 == 0x700:
+            self._heartbeat_s[can_id & 0x7F] = frame.time_s
+        elif can_id == 0x600 + node and len(data) == 8:
+            self._on_request(data)
+        elif can_id == 0x580 + node and len(data) == 8:
+            self._on_answer(frame.time_s, data)
+        elif can_id == self._value(0x1014) & 0x7FF and len(data) == 8:
+            code = int.from_bytes(data[:2], "little")
+            self._say(frame.time_s, f"EMCY {code:04X}h: {error_name(code)}" if code else "EMCY: error reset")
+        else:
+            self._on_pdo(frame)
+        self._watch(frame.time_s)
+        return self._lines
+
+    def _say(self, time_s: float, text: str, advice: str = "") -> None:
+        self._lines.append(Line(time_s, text, advice))
+        if advice:
+            self.mistakes[advice] += 1
+
+    def _say_once(self, time_s: float, key: str, text: str, advice: str) -> None:
+        """Reports a mistake that lasts once, until `_over`."""
+        if key not in self._told:
+            self._told.add(key)
+            self._say(time_s, text, advice)
+
+    def _over(self, key: str) -> None:
+        self._told.discard(key)
+
+    # ---------------------------------------------------------------- SDO
+
+    def _on_request(self, data: bytes) -> None:
+        command, index, sub = _MULTIPLEXER.unpack_from(data)
+        if command >> 5 == 1:
+            size = 4 - (command >> 2 & 3) if command & 1 else 4
+            self._pending = index, sub, data[4 : 4 + size] if command & 2 else None
+        elif command >> 5 == 2:
+            self._pending = index, sub, None
+
+    def _on_answer(self, time_s: float, data: bytes) -> None:
+        command, index, sub = _MULTIPLEXER.unpack_from(data)
+        pending, self._pending = self._pending, None
+        if command == 0x80:
+            self._on_abort(time_s, index, sub, int.from_bytes(data[4:], "little"), pending)
+        elif command == 0x60 and pending is not None and pending[2] is not None:
+            self._on_written(time_s, index, sub, pending[2])
+        elif command & 0xE2 == 0x42:
+            raw = data[4 : 8 - (command >> 2 & 3 if command & 1 else 0)]
+            self._on_value(time_s, index, int.from_bytes(raw, "little"), sub)
+
+    def _on_abort(
+        self, time_s: float, index: int, sub: int, code: int, pending: tuple[int, int, bytes | None] | None
+    ) -> None:
+        what = self._name(index, sub)
+        if pending is not None and pending[2] is not None:
+            what += f" = {self._number(index, sub, pending[2])}"
+        advice = _ADVICE.get(code, "the value is not possible; see the limits in the EDS")
+        if 0x1400 <= index <= 0x1BFF and code in (0x0800_0022, 0x0609_0030, 0x0601_0000):
+            advice = _PDO_ADVICE
+        elif index == 0x6060:
+            modes = [str(bit + 1) for bit in range(32) if self._value(0x6502) >> bit & 1]
+            advice = f"the modes are {', '.join(modes)} (6502h)"
+        elif (
+            0x0609_0030 <= code <= 0x0609_0032
+            and (variable := find(self._od, index, sub)) is not None
+            and (variable.min, variable.max) != (None, None)
+        ):
+            advice = f"expected {variable.min} to {variable.max}"
+        text = SdoAbortedError.CODES.get(code, "manufacturer-specific")
+        self._say(time_s, f"{what}: refused with {code:08X}h ({text})", advice)
+
+    def _on_written(self, time_s: float, index: int, sub: int, raw: bytes) -> None:
+        value = self._number(index, sub, raw)
+        if index == 0x6040:
+            self._on_controlword(time_s, value & 0xFFFF)
+            return
+        if index == 0x607A:
+            self._on_target(time_s, value)
+            return
+        self._values[index, sub] = self.written[index, sub] = value
+        shown = f"{value & 0xFFFFFFFF:08X}h" if 0x1000 <= index <= 0x1FFF and len(raw) == 4 else str(value)
+        self._say(time_s, f"{self._name(index, sub)} = {shown}")
+
+    def _on_value(self, time_s: float, index: int, value: int, sub: int) -> None:
+        if index == 0x6041:
+            self._on_statusword(time_s, value)
+        elif (index, sub) in ((0x6064, 0), (0x6502, 0)):
+            self._values[index, sub] = value
+            if index == 0x6064:
+                self._position = wrap_int32(value)
+
+    # ---------------------------------------------------------------- PDO and SYNC
+
+    def _mapping(self, index: int) -> list[tuple[int, int, int]]:
+        words = (self._value(index, place) for place in range(1, self._value(index, 0) + 1))
+        return [(word >> 16, word >> 8 & 0xFF, (word & 0xFF) // 8) for word in words]
+
+    def _on_pdo(self, frame: Frame) -> None:
+        for first, receives in ((0x1400, True), (0x1800, False)):
+            for index in range(first, first + 4):
+                word = self._value(index, 1)
+                if word & 0x7FF == frame.can_id and word and not word & _INVALID:
+                    self._decode(frame, index, receives=receives)
+                    return
+
+    def _decode(self, frame: Frame, index: int, *, receives: bool) -> None:
+        mapping = self._mapping(index + 0x200)
+        length = sum(size for *_, size in mapping)
+        if receives:
+            self._rpdos_since_sync += 1
+            if len(frame.data) != length:
+                key = f"length of {frame.can_id:03X}h"
+                self._say_once(
+                    frame.time_s, key, f"RPDO {frame.can_id:03X}h has {len(frame.data)} bytes",
+                    f"{length} bytes are mapped in {index + 0x200:04X}h",
+                )  # fmt: skip
+                return
+            if self._nmt not in (None, 0x05):
+                state = _NMT_STATES.get(self._nmt or 0, "reset")
+                self._say_once(
+                    frame.time_s, "early", f"RPDO {frame.can_id:03X}h in {state}",
+                    "RPDOs count in OPERATIONAL only: NMT start first",
+                )  # fmt: skip
+        place = 0
+        for index_, sub, size in mapping:
+            value = int.from_bytes(frame.data[place : place + size], "little")
+            place += size
+            if index_ == 0x6040:
+                self._on_controlword(frame.time_s, value)
+            elif index_ == 0x607A:
+                self._on_target(frame.time_s, wrap_int32(value))
+            else:
+                self._on_value(frame.time_s, index_, value, sub)
+
+    def _on_sync(self, time_s: float) -> None:
+        before_s, self._sync_s = self._sync_s, time_s
+        self._over("no SYNC")
+        if before_s is None:
+            return
+        interval_s = time_s - before_s
+        usual_s = self.period_s
+        self._intervals_s = [*self._intervals_s[-999:], interval_s]
+        if usual_s is not None and interval_s > _LATE * usual_s and len(self._intervals_s) > 10:
+            self._say(
+                time_s, f"SYNC after {1000 * interval_s:.1f} ms, usually {1000 * usual_s:.2f} ms",
+                "SYNC must be periodic: four periods without it stop the axis in a cyclic mode (8700h)",
+            )  # fmt: skip
+        if self._enabled_cyclic and not self._rpdos_since_sync:
+            self._say_once(
+                time_s, "no RPDO", "SYNC without an RPDO while enabled in a cyclic mode",
+                "send a target before every SYNC; without one the axis stops at the last",
+            )  # fmt: skip
+        elif self._rpdos_since_sync:
+            self._over("no RPDO")
+        self._rpdos_since_sync = 0
+
+    @property
+    def period_s(self) -> float | None:
+        """Median interval of SYNC; None before the third."""
+        return median(self._intervals_s) if len(self._intervals_s) > 1 else None
+
+    @property
+    def jitter_s(self) -> float:
+        """Largest deviation of an interval of SYNC from the median."""
+        period_s = self.period_s or 0.0
+        return max((abs(each - period_s) for each in self._intervals_s), default=0.0)
+
+    # ---------------------------------------------------------------- the drive
+
+    @property
+    def _enabled_cyclic(self) -> bool:
+        return self._state == 0x27 and self._value(0x6060) in _CYCLIC
+
+    def _on_controlword(self, time_s: float, word: int) -> None:
+        before, self._word = self._word, word
+        if word & 0x80 and self._state == 0x08:
+            self._reset_since_s = self._reset_since_s or time_s
+            if before is not None and before & 0x80 and time_s - self._reset_since_s > 0.2:
+                self._say_once(
+                    time_s, "reset", f"controlword {word:04X}h: fault reset held, still in fault",
+                    "bit 7 acts by its rising edge: take it back to 0 before the next attempt",
+                )  # fmt: skip
+        else:
+            self._reset_since_s = None
+            self._over("reset")
+        if word == before:
+            return
+        advice = ""
+        if word & 0x8F == 0x0F and self._state == 0x40:
+            advice = "no transition from switch on disabled: send 0006h, wait, then 0007h, then 000Fh"
+        elif word & 0x8F in (0x06, 0x07, 0x0F) and self._state == 0x08:
+            advice = "the drive is in fault: an edge of bit 7 resets it"
+        elif word & 0x8F == 0x0F and self._state in (0x21, 0x23) and self._value(0x6060) in _CYCLIC:
+            advice = self._start_advice()
+        self._say(time_s, f"controlword {word:04X}h: {_command(word)}", advice)
+
+    def _start_advice(self) -> str:
+        if not self._targets or self._position is None:
+            return ""
+        off = self._targets[-1] - self._position
+        if abs(off) <= self._value(0x6065):
+            return ""
+        return f"the target is {off} increments from 6064h: set it to the actual position before enabling"
+
+    def _on_statusword(self, time_s: float, word: int) -> None:
+        masked = word & 0x4F
+        state = masked if masked in (0x00, 0x40, 0x0F, 0x08) else word & 0x6F
+        if state != self._state:
+            self._say(time_s, f"statusword {word:04X}h: {_STATES.get(state, 'no state of CiA 402')}")
+            self._state = state
+            self._targets = self._targets[-1:]
+
+    def _on_target(self, time_s: float, target: int) -> None:
+        low, high = self._value(0x607D, 1), self._value(0x607D, 2)
+        if low < high and not low <= target <= high:
+            self._say_once(
+                time_s, "limit", f"607Ah = {target}", f"the software limits (607Dh) are {low} to {high}"
+            )
+        else:
+            self._over("limit")
+        if self._enabled_cyclic and self._targets and (period_s := self.period_s):
+            speed = abs(target - self._targets[-1]) / period_s
+            fastest = self._value(0x607F)
+            if fastest and speed > 1.01 * fastest:
+                step = target - self._targets[-1]
+                self._say_once(
+                    time_s, "speed", f"607Ah moved by {step} in one SYNC: {speed:.0f} inc/s",
+                    f"the axis is not faster than 607Fh = {fastest} inc/s; it lags behind such targets",
+                )  # fmt: skip
+            else:
+                self._over("speed")
+        self._targets = [target]
+
+    def _on_own_heartbeat(self, time_s: float, state: int) -> None:
+        if state == 0:
+            self._values = {
+                (each.index, each.subindex): each.default
+                for each in _variables(self._od)
+                if isinstance(each.default, int)
+            }
+            self.written.clear()
+            self._say(time_s, "boot-up: parameters that were not saved (1010h) are those of the EDS")
+        elif state & 0x7F != self._nmt:
+            self._say(time_s, f"NMT state {_NMT_STATES.get(state & 0x7F, f'{state:02X}h')}")
+        self._nmt = state & 0x7F or 0x7F
+
+    def _watch(self, time_s: float) -> None:
+        """Looks for what should come and does not."""
+        assert self._begun_s is not None
+        heard_s = self._sync_s if self._sync_s is not None else self._begun_s
+        if self._enabled_cyclic and time_s - heard_s > _QUIET_S:
+            self._say_once(
+                time_s, "no SYNC", f"no SYNC for {_QUIET_S:g} s while enabled in a cyclic mode",
+                "cyclic modes need SYNC; 1005h has its identifier",
+            )  # fmt: skip
+        word = self.written.get((0x1016, 1), 0)
+        watched, wanted_s = word >> 16 & 0x7F, 1e-3 * (word & 0xFFFF)
+        beat_s = self._heartbeat_s.get(watched, self._begun_s)
+        if watched and wanted_s and time_s - beat_s > max(_QUIET_S, wanted_s):
+            self._say_once(
+                time_s, "heartbeat",
+                f"1016h:01 expects node {watched} every {1000 * wanted_s:.0f} ms; none is heard",
+                "let the master send its heartbeat, or write 0 to 1016h:01",
+            )  # fmt: skip
+        else:
+            self._over("heartbeat")
+
+    # ---------------------------------------------------------------- names and values
+
+    def configured(self) -> list[str]:
+        """Returns what the master has configured, one line each."""
+        lines = [f"{self._name(index, sub)} = {value}" for (index, sub), value in self.written.items()]
+        period_s = self.period_s
+        if period_s is not None:
+            lines.append(f"SYNC every {1000 * period_s:.3f} ms, at most {1000 * self.jitter_s:.3f} ms off")
+            set_s = self._value(0x60C2, 1) * 10.0 ** self._value(0x60C2, 2)
+            if (0x60C2, 1) in self.written and abs(set_s - period_s) > 0.1 * period_s:
+                lines.append(
+                    f"60C2h is {1000 * set_s:g} ms; the gateway takes the period from SYNC, others do not"
+                )
+        return lines
+
+    def _value(self, index: int, sub: int = 0) -> int:
+        return self._values.get((index, sub), 0)
+
+    def _name(self, index: int, sub: int) -> str:
+        variable = find(self._od, index, sub)
+        return f"{index:04X}h:{sub:02X}" + (f" '{variable.qualname}'" if variable is not None else "")
+
+    def _number(self, index: int, sub: int, raw: bytes) -> int:
+        variable = find(self._od, index, sub)
+        signed = variable is not None and variable.data_type in (0x02, 0x03, 0x04)
+        size = len(variable) // 8 if variable is not None and variable.data_type in range(2, 8) else len(raw)
+        return int.from_bytes(raw[:size], "little", signed=signed)
+
+
+def _command(word: int) -> str:
+    if word & 0x80:
+        return "fault reset"
+    if not word & 0x02:
+        name = "disable voltage"
+    elif not word & 0x04:
+        name = "quick stop"
+    elif not word & 0x01:
+        name = "shutdown"
+    else:
+        name = "enable operation" if word & 0x08 else "switch on"
+    extra = [
+        text
+        for bit, text in ((0x10, "bit 4"), (0x20, "bit 5"), (0x40, "bit 6"), (0x100, "halt"))
+        if word & bit
+    ]
+    return ", ".join([name, *extra])
+
+
+def _variables(od: ObjectDictionary) -> Iterator[ODVariable]:
+    for item in od.values():
+        yield from [item] if isinstance(item, ODVariable) else item.subindices.values()

@@ -1,0 +1,267 @@
+"""Channels for one producer and one consumer, without locks that a dying process could hold.
+
+A *ring* never waits: new slots overwrite the oldest, and a slow reader gets the number it lost. A *queue* is
+bounded: it refuses its producer when full. In both, a producer fills the slot and then advances the counter
+in one aligned store.
+
+No reader gets a torn slot. It copies the slot and then checks that the producer did not overwrite it
+meanwhile. A slot begins and ends with its sequence number. On processors that may reorder stores it also has
+a checksum. `Format` converts between items and slots.
+"""
+
+from __future__ import annotations
+
+import struct
+import threading
+import zlib
+from collections.abc import Callable, Iterable
+from typing import Any, Final, Generic, NamedTuple, TypeVar
+
+from hdbridge.daemon.memory.layout import (
+    COMMAND,
+    COMMAND_SLOTS,
+    EVENT,
+    FRAME,
+    KNOT,
+    LINE,
+    TAIL_BYTES,
+    TEXT_BYTES,
+    Command,
+    CommandKind,
+    Event,
+    EventKind,
+    Knot,
+    Place,
+    RelayedFrame,
+)
+from hdbridge.daemon.memory.region import Region
+from hdbridge.errors import HdbridgeError
+
+RETRIES: Final = 3
+"""Attempts to copy a slot before a reader counts it as lost."""
+MISSES: Final = 100
+"""Times that a consumer finds the next slot of a queue incomplete before it skips it."""
+_CHECK: Final = struct.Struct("@I")
+_KINDS: Final = {int(kind): kind for kind in EventKind}
+
+T = TypeVar("T")
+
+
+class Format(NamedTuple, Generic[T]):
+    """Conversion of items to the values of a slot and back, by sequence number and values."""
+
+    struct: struct.Struct
+    pack: Callable[[T], tuple[Any, ...]]
+    unpack: Callable[[int, tuple[Any, ...]], T]
+
+
+def _pack_event(event: Event) -> tuple[Any, ...]:
+    text = event.text.encode("utf-8", "replace")[:TEXT_BYTES]
+    return (*event[1:-1], len(text), text)
+
+
+def _unpack_event(sequence: int, values: tuple[Any, ...]) -> Event:
+    cycle, time_ns, axis, kind, id_, code, length, text = values
+    # Truncation may have split the last character.
+    text = text[:length].decode("utf-8", "ignore")
+    return Event(sequence, cycle, time_ns, axis, _KINDS[kind], id_, code, text)
+
+
+EVENTS: Final[Format[Event]] = Format(EVENT, _pack_event, _unpack_event)
+"""Events; a long text is truncated."""
+FRAMES: Final[Format[RelayedFrame]] = Format(
+    FRAME,
+    lambda frame: (frame.time_ns, frame.can_id, len(frame.data), frame.data),
+    lambda _, values: RelayedFrame(values[0], values[1], values[3][: values[2]]),
+)
+COMMANDS: Final[Format[Command]] = Format(
+    COMMAND, lambda command: command[1:], lambda sequence, values: Command(sequence, *values)
+)
+KNOTS: Final[Format[Knot]] = Format(KNOT, lambda knot: knot, lambda _, values: Knot(*values))
+
+
+class _Slots(Generic[T]):
+    """Slots of one section and its two counters, each in its own cache line."""
+
+    __slots__ = (
+        "_buffer",
+        "_checked",
+        "_head",
+        "_offset",
+        "_pack",
+        "_size",
+        "_slots",
+        "_struct",
+        "_tail",
+        "_unpack",
+    )
+
+    def __init__(self, region: Region, place: Place, form: Format[T]) -> None:
+        assert form.struct.size == place.slot_bytes
+        self._buffer = region.view
+        self._checked = region.checked
+        self._offset, self._slots, self._size = place
+        self._struct, self._pack, self._unpack = form
+        self._head = region.cells(place.offset - 2 * LINE, 1)
+        self._tail = region.cells(place.offset - LINE, 1)
+
+    def _fill(self, sequence: int, item: T) -> None:
+        """Writes a slot, with its checksum if enabled."""
+        at = self._offset + sequence % self._slots * self._size
+        self._struct.pack_into(self._buffer, at, sequence, *self._pack(item), 0, sequence)
+        if self._checked:
+            end = at + self._size - TAIL_BYTES
+            _CHECK.pack_into(self._buffer, end, zlib.crc32(self._buffer[at:end]))
+
+    def _copy(self, sequence: int) -> tuple[Any, ...] | None:
+        """Returns the values of a slot; None if its number differs or it is incomplete.
+
+        In a ring they may be torn, unless the slot is not overwritten afterwards either.
+        """
+        at = self._offset + sequence % self._slots * self._size
+        data = bytes(self._buffer[at : at + self._size])
+        values = self._struct.unpack(data)
+        if values[0] != sequence or values[-1] != sequence:
+            return None
+        if self._checked and values[-2] != zlib.crc32(data[:-TAIL_BYTES]):
+            return None
+        return values[1:-2]
+
+
+class Ring(_Slots[T]):
+    """The producer's end of a ring; `RingReader` is a consumer's."""
+
+    __slots__ = ("_sequence",)
+
+    def __init__(self, region: Region, place: Place, form: Format[T]) -> None:
+        super().__init__(region, place, form)
+        self._sequence: int = self._head[0]
+
+    def append(self, item: T) -> None:
+        """Adds an item."""
+        sequence = self._sequence + 1
+        self._fill(sequence, item)
+        self._head[0] = self._sequence = sequence
+
+
+class RingReader(_Slots[T]):
+    """Reads the items appended since it was created."""
+
+    __slots__ = ("_next",)
+
+    def __init__(self, region: Region, place: Place, form: Format[T]) -> None:
+        super().__init__(region, place, form)
+        self._next = self._head[0] + 1
+
+    def read(self) -> tuple[list[T], int]:
+        """Returns the new items, oldest first, and the number lost."""
+        found: list[T] = []
+        lost = 0
+        end = self._head[0]
+        while self._next <= end:
+            # The slot being written may replace the oldest.
+            oldest = self._head[0] + 2 - self._slots
+            if self._next < oldest:
+                lost += oldest - self._next
+                self._next = oldest
+                continue
+            values = next((each for _ in range(RETRIES) if (each := self._copy(self._next))), None)
+            if self._next < self._head[0] + 2 - self._slots:
+                continue  # overwritten meanwhile: counted above
+            if values is None:
+                lost += 1
+            else:
+                found.append(self._unpack(self._next, values))
+            self._next += 1
+        return found, lost
+
+
+class Queue(_Slots[T]):
+    """Bounded queue with both ends; each process uses one of them."""
+
+    __slots__ = ("_misses", "_producing")
+
+    def __init__(self, region: Region, place: Place, form: Format[T]) -> None:
+        super().__init__(region, place, form)
+        self._misses = 0
+        self._producing = threading.Lock()  # between threads of the producer; the loop only consumes
+
+    def __len__(self) -> int:
+        return int(self._head[0] - self._tail[0])
+
+    @property
+    def free(self) -> int:
+        """Free places in the queue."""
+        return self._slots - len(self)
+
+    def add(self, item: T) -> int:
+        """Adds an item, at the producer's end; returns its sequence number, or 0 if the queue is full."""
+        with self._producing:
+            sequence: int = self._head[0] + 1
+            if sequence - self._tail[0] > self._slots:
+                return 0
+            self._fill(sequence, item)
+            self._head[0] = sequence
+            return sequence
+
+    def put(self, items: Iterable[T]) -> int:
+        """Adds items in order while there is space; returns the number added."""
+        added = 0
+        for item in items:
+            if not self.add(item):
+                break
+            added += 1
+        return added
+
+    def peek(self) -> T | None:
+        """Returns the next item, at the consumer's end; None if there is none (yet)."""
+        sequence: int = self._tail[0] + 1
+        if sequence > self._head[0]:
+            return None
+        values = self._copy(sequence)
+        if values is None:
+            # Not completely visible yet. If it stays so, it must not block the slots behind it.
+            self._misses += 1
+            if self._misses >= MISSES:
+                self.drop()
+            return None
+        return self._unpack(sequence, values)
+
+    def drop(self) -> None:
+        """Removes the item that `peek` returned."""
+        self._misses = 0
+        self._tail[0] += 1
+
+    def take(self) -> T | None:
+        """Removes and returns the next item; None if there is none."""
+        item = self.peek()
+        if item is not None:
+            self.drop()
+        return item
+
+    def clear(self) -> None:
+        """Discards waiting items, at the consumer's end; they were meant for an earlier loop."""
+        self._tail[0] = self._head[0]
+
+
+class MailboxFullError(HdbridgeError):
+    """The command was not posted, because the loop has not taken the waiting ones."""
+
+
+class Mailbox(Queue[Command]):
+    """Commands from the service to the loop; bounded, so that a faulty service cannot flood the loop."""
+
+    __slots__ = ()
+
+    def post(self, kind: CommandKind, axis: int = -1, *numbers: float, **fields: float) -> int:
+        """Posts a command with the fields a to k; returns its id, used in the loop's events.
+
+        Raises `MailboxFullError` if the queue is full.
+        """
+        id_ = self.add(Command(0, kind, axis, *numbers, **fields))  # type: ignore[arg-type]
+        if not id_:
+            raise MailboxFullError(
+                f"the control loop has not taken the {COMMAND_SLOTS} commands that wait; it hangs or is "
+                "gone: see the state of the daemon"
+            )
+        return id_

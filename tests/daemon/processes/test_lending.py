@@ -1,0 +1,120 @@
+"""A bus that the daemon lends to a command, on a drive in another process."""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+import yaml
+from support.running import Daemon, running
+
+from hdbridge.drive.interfacelock import InterfaceLock
+from hdbridge.files.bundled import bundled_profile
+from tests.support.patience import until
+
+LISTENING = ("scan", "--listen", 600, "--borrow")
+"""A command that has the bus for ten minutes and needs no real time."""
+
+
+@contextmanager
+def started(folder: Path, *arguments: object) -> Iterator[subprocess.Popen[str]]:
+    """Runs ``hdbridge`` beside the daemon, with the daemon's runtime folder."""
+    environment = {**os.environ, "XDG_RUNTIME_DIR": str(folder), "XDG_STATE_HOME": str(folder)}
+    process = subprocess.Popen(
+        [sys.executable, "-m", "hdbridge", *map(str, arguments)],
+        env=environment, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    try:
+        yield process
+    finally:
+        process.kill()
+        process.communicate()
+
+
+@pytest.fixture(scope="module")
+def daemon(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Daemon]:
+    """A daemon on a bus of this computer that several processes share, with a simulated drive on it."""
+    tmp_path = tmp_path_factory.mktemp("lending")
+    channel = f"239.74.{random.randrange(256)}.{random.randrange(1, 255)}"
+    source = bundled_profile("article")
+    for each in source.iterdir():
+        if each.is_file():
+            (tmp_path / each.name).write_bytes(each.read_bytes())
+    path = tmp_path / "axis.yaml"
+    axis = yaml.safe_load(path.read_text())
+    axis["bus"] = {"interface": "udp_multicast", "channel": channel, "options": {"hop_limit": 0}}
+    path.write_text(yaml.safe_dump(axis))
+    with started(tmp_path, "simulate", tmp_path), running(tmp_path, tmp_path, name="article") as daemon:
+        daemon.until_told("READY=1")
+        until_off(daemon)
+        yield daemon
+
+
+def until_off(daemon: Daemon) -> None:
+    """Waits until the loop turns without power. A busy machine may have stopped the axis for lost frames."""
+    off = {"unverified", "disabled", "quick-stopped", "latched"}
+    daemon.until(
+        lambda: (found := daemon.state())
+        and found["cycle"]["alive"] and found["bus"]["lent_to"] is None and found["axes"][0]["state"] in off,
+        "the axis is off",
+    )  # fmt: skip
+
+
+def until_taken_back(daemon: Daemon, loops: int) -> None:
+    daemon.until(lambda: len(daemon.pids("control")) == loops + 1, "the bus is taken back")
+    until_off(daemon)
+
+
+def until_borrowed(daemon: Daemon, pid: int) -> None:
+    bus = (daemon.state() or {})["bus"]
+    until(lambda: InterfaceLock(bus["interface"], bus["channel"]).holder == pid, lambda: str(daemon.state()))
+
+
+def test_a_command_borrows_the_bus_and_the_axis_comes_back_disabled(daemon: Daemon) -> None:
+    folder, loops = daemon.folder, len(daemon.pids("control"))
+    with started(folder, "sdo", "get", folder, "1000h", "--json", "-") as refused:
+        _, error = refused.communicate()
+        assert refused.returncode == 3
+        assert "--borrow" in error
+    with started(folder, "sdo", "get", folder, "1000h", "--borrow", "--json", "-") as command:
+        output, error = command.communicate()
+        assert command.returncode == 0, error
+        assert json.loads(output)["value"] == 0x20192
+        assert "lends the bus to this command" in error
+    until_taken_back(daemon, loops)
+    assert (daemon.state() or {})["bus"]["lent_to"] is None
+
+
+def test_others_see_who_has_the_bus_and_can_stop_it(daemon: Daemon) -> None:
+    folder, loops = daemon.folder, len(daemon.pids("control"))
+    with started(folder, *LISTENING, folder) as borrower:
+        until_borrowed(daemon, borrower.pid)
+        state = daemon.state() or {}
+        assert f"process {borrower.pid} of " in state["bus"]["lent_to"]
+        assert f"the bus is lent to process {borrower.pid}" in state["warnings"][0]
+        lease = daemon.client.post("/lease", json={"client": "test", "force": True}).json()["token"]
+        refused = daemon.client.post("/axes/article/enable", headers={"X-Lease": lease})
+        assert refused.status_code == 409
+        assert "the bus is lent to process" in refused.text
+        daemon.client.delete("/lease", headers={"X-Lease": lease})
+        stop = daemon.client.post("/quick-stop")
+        assert "it was asked to stop its axis and to end" in stop.text
+        assert borrower.wait() != 0
+    until_taken_back(daemon, loops)
+
+
+def test_a_killed_borrower_leaves_a_disabled_axis(daemon: Daemon) -> None:
+    folder, loops = daemon.folder, len(daemon.pids("control"))
+    with started(folder, *LISTENING, folder) as borrower:
+        until_borrowed(daemon, borrower.pid)
+        borrower.send_signal(signal.SIGKILL)
+        borrower.wait()
+        until_taken_back(daemon, loops)
