@@ -229,12 +229,12 @@ class MotionTest:
                 each["name"],
                 PathError(**each["none"]),
                 PathError(**each["static"]),
-                *(PathError(**each[name]) if each[name] else None for name in ("filtered", "wind_up")),
+                *(PathError(**each[name]) if each.get(name) else None for name in ("filtered", "wind_up")),
             )
             for each in data.get("paths", ())
         )
         response = Response.model_validate(data["response"]) if data["response"] else None
-        wind_up = InertialWindup.model_validate(data["wind_up"]) if data["wind_up"] else None
+        wind_up = InertialWindup.model_validate(data["wind_up"]) if data.get("wind_up") else None
         return cls(ripples, response, tuple(map(str, data["remarks"])), paths, wind_up)
 
 

@@ -42,12 +42,12 @@ class PathError:
     name: str
     path_arcsec: float
     """Rms over the path."""
-    delayed_arcsec: float
-    """Rms over the path, wind-up and the servo's error in acceleration included."""
     rest_arcsec: float
     """Mean error at rest after it."""
     settle_s: float
     """Time from the end of the path until the load has settled."""
+    delayed_arcsec: float = 0.0
+    """Rms over the path, wind-up and the servo's error in acceleration included; 0 in older files."""
 
 
 def path_errors(variants: Sequence[Sequence[PathRun]], ratio: float, lag_s: float) -> list[list[PathError]]:
@@ -116,7 +116,7 @@ def _judged(run: PathRun, error_arcsec: FloatArray, lag_s: float) -> PathError:
     moving = np.flatnonzero(abs(error - mean) > SETTLED_ARCSEC)
     settle_s = float(time[moving[-1]] - run.samples[-1].time_s) if moving.size else 0.0
     path, late = (float(np.sqrt(np.mean(each[run.skipped :] ** 2))) for each in (error_arcsec, delayed))
-    return PathError(run.name, path, late, mean, max(settle_s, 0.0))
+    return PathError(run.name, path, mean, max(settle_s, 0.0), late)
 
 
 def _servo_columns(run: PathRun) -> FloatArray:

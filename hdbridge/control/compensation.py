@@ -29,7 +29,7 @@ from dataclasses import dataclass, replace
 
 from hdbridge.control.prefilter import Prefilter
 from hdbridge.effects import Channel, Effect, Moment, Start, Tracker, compensable, fall_bound
-from hdbridge.effects.base import MEASURED, Memoryless
+from hdbridge.effects.base import MEASURED, Level, Memoryless
 from hdbridge.errors import InputError
 from hdbridge.model import ModelTracker, TransmissionModel
 from hdbridge.model.response import LeadFilter, Response
@@ -79,8 +79,9 @@ class Inverse:
     """Inverse of the model, from the state that `advance` has left."""
 
     __slots__ = (
-        "_before_deg", "_error", "_fall", "_forward", "_known", "_motor_deg", "_peeked", "_rise", "_slope",
-        "_standing", "_stateful", "_timeless", "_tracker", "_turns", "faded", "memory_deg", "needs",
+        "_before_deg", "_error", "_fall", "_forward", "_known", "_moment", "_motor_deg", "_offset",
+        "_offsets", "_peeked", "_rise", "_slope", "_standing", "_stateful", "_timeless", "_tracker", "_turns",
+        "faded", "memory_deg", "needs",
     )  # fmt: skip
 
     def __init__(self, model: TransmissionModel, start: Start = Start.VIRGIN) -> None:
@@ -98,6 +99,12 @@ class Inverse:
             if sensed := each.needs() & LOSABLE:
                 trackers[place] = faded = _Faded(trackers[place], sensed)
                 self.faded.append(faded)
+        # The same at every motor angle, as wind-up is: evaluated once per cycle instead of in each solution.
+        level = [isinstance(each, Level) for each in trackers]
+        self._offsets = [each for each, is_level in zip(trackers, level, strict=True) if is_level]
+        self._enter(_NOWHERE)
+        trackers = [each for each, is_level in zip(trackers, level, strict=True) if not is_level]
+        stateful = [keeps for keeps, is_level in zip(stateful, level, strict=True) if not is_level]
         self._tracker: Tracker = trackers[0] if len(trackers) == 1 else ModelTracker(trackers)
         self._stateful = [each for each, keeps in zip(trackers, stateful, strict=True) if keeps]
         if self._fall > _STEEPEST_FALL * self._slope:
@@ -112,10 +119,11 @@ class Inverse:
         """Angle, error and moment of the last solution of `solve`."""
         self._standing = False
         """True if advancing to the same angle again changes nothing."""
-        # Without channels the error at rest does not change, so it is not evaluated again.
         self.needs = frozenset[Channel]().union(*(each.needs() for each in model.effects))
         """Channels that the effects need."""
-        self._timeless = not self.needs
+        # Without channels the error at rest does not change, so it is not evaluated again.
+        bent = (each for each, is_level in zip(model.effects, level, strict=True) if not is_level)
+        self._timeless = not any(each.needs() for each in bent)
         self.memory_deg = self._tracker.memory_deg
         """Motor travel in one direction after which the state no longer depends on the start."""
         self._forward: bool | None = None
@@ -128,7 +136,7 @@ class Inverse:
     @property
     def error_arcsec(self) -> float:
         """Model's error at the last motor target."""
-        return self._error
+        return self._error + self._offset
 
     @property
     def path_deg(self) -> list[float]:
@@ -142,7 +150,21 @@ class Inverse:
 
     def error_at(self, motor_deg: float, moment: Moment = _NOWHERE) -> float:
         """Returns the model's error at a motor angle ahead, arcsec; the state does not change."""
-        return self._tracker.peek(motor_deg, moment)
+        return self._tracker.peek(motor_deg, moment) + (
+            self._offset if moment is self._moment else self._level(moment)
+        )
+
+    def _level(self, moment: Moment) -> float:
+        """Returns the part of the error that is the same at every motor angle, arcsec."""
+        total = 0.0
+        for each in self._offsets:
+            total += each.peek(0.0, moment)
+        return total
+
+    def _enter(self, moment: Moment) -> None:
+        """Evaluates that part for a new cycle."""
+        self._moment = moment
+        self._offset = self._level(moment)
 
     def begin(self, motor_deg: float, moment: Moment = _NOWHERE) -> None:
         """Starts at this motor angle, with an unknown past."""
@@ -154,8 +176,10 @@ class Inverse:
 
     def advance(self, motor_deg: float, moment: Moment = _NOWHERE) -> float:
         """Advances the state to an issued command; returns the model's error there, arcsec."""
+        if self._offsets and moment is not self._moment:
+            self._enter(moment)
         if self._standing and motor_deg == self._motor_deg:
-            return self._error
+            return self._error + self._offset
         peeked = self._peeked
         if peeked is not None and peeked[0] == motor_deg and peeked[2] is moment:
             # The error is known, so only effects with a state need to advance.
@@ -175,7 +199,7 @@ class Inverse:
         self._motor_deg = motor_deg
         self._error = error
         self._standing = self._timeless
-        return error
+        return error + self._offset
 
     def _turn(self, forward: bool) -> None:
         """Notes a reversal at the present angle."""
@@ -192,7 +216,9 @@ class Inverse:
         """
         peek, slope, last = self._tracker.peek, self._slope, self._motor_deg
         self._peeked = None
-        goal = ARCSEC_PER_DEG * load_deg
+        if self._offsets and moment is not self._moment:
+            self._enter(moment)
+        goal = ARCSEC_PER_DEG * load_deg - weight * self._offset
         here = self._error if self._timeless else peek(last, moment)
         gap = goal - slope * last - weight * here
         if abs(gap) <= _TOLERANCE_ARCSEC:

@@ -52,7 +52,7 @@ from hdbridge.effects.motion import (
     readings,
 )
 from hdbridge.effects.observations import Observations
-from hdbridge.effects.tracker import Memoryless, Tracker
+from hdbridge.effects.tracker import Level, Memoryless, Tracker
 from hdbridge.strictness import Strict
 
 __all__ = [
@@ -69,6 +69,7 @@ __all__ = [
     "Experiment",
     "FloatArray",
     "IntArray",
+    "Level",
     "Linear",
     "Memoryless",
     "Moment",

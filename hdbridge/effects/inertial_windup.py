@@ -14,8 +14,8 @@ from hdbridge.effects.base import (
     Compensable,
     Effect,
     FloatArray,
+    Level,
     Linear,
-    Memoryless,
     Moment,
     Motion,
     Observations,
@@ -98,7 +98,7 @@ class InertialWindup(Linear):
         return 0.0
 
 
-class _Tracker(Memoryless):
+class _Tracker(Level):
     __slots__ = ("_gain", "_limit")
 
     def __init__(self, gain: float, limit: float) -> None:

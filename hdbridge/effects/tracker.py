@@ -43,3 +43,9 @@ class Memoryless(Tracker):
     def advance(self, motor_deg: float, moment: Moment) -> float:
         """Returns the same as `peek`."""
         return self.peek(motor_deg, moment)
+
+
+class Level(Memoryless):
+    """Base class of trackers whose error is the same at every motor angle: the moment alone decides."""
+
+    __slots__ = ()

@@ -15,8 +15,8 @@ from hdbridge.effects.base import (
     Compensable,
     Effect,
     FloatArray,
+    Level,
     Linear,
-    Memoryless,
     Moment,
     Motion,
     Observations,
@@ -136,7 +136,7 @@ class VelocityWindup(Linear):
         return 0.0
 
 
-class _Tracker(Memoryless):
+class _Tracker(Level):
     __slots__ = ("_coulomb", "_limit", "_shear", "_viscous")
 
     def __init__(self, effect: VelocityWindup) -> None:

@@ -23,6 +23,7 @@ from hdbridge.effects import (
     readings,
     unmet,
 )
+from hdbridge.effects.base import Level
 from hdbridge.errors import InputError
 
 NAMES = sorted(CATALOGUE)
@@ -99,8 +100,9 @@ def batch_equals_on_line_and_peeking_changes_nothing(effect, motion, start, prob
     told = []
     for angle, now in zip(motion.motor_deg, moments(motion), strict=True):
         for probe in probes:
-            tracker.peek(probe, now)
+            elsewhere = tracker.peek(probe, now)
         asked = tracker.peek(float(angle), now)
+        assert not isinstance(tracker, Level) or not probes or elsewhere == asked
         told.append(tracker.advance(float(angle), now))
         assert told[-1] == asked == twin.advance(float(angle), now)
     np.testing.assert_allclose(effect.predict(motion, start), np.array(told), **CLOSE)
