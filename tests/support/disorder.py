@@ -101,7 +101,8 @@ async def happen(bench: GatewayBench, laws: Laws, kind: str, value) -> None:
     plc, daemon, drive = bench.plc, bench.daemon, bench.daemon.nodes[0]
     (node,) = bench.gateway.nodes.values()
     needs_sync = node.dictionary.value(0x6061) in (7, 8)
-    harmless = kind in HARMLESS or (kind, value) == ("nmt", 1) or (kind == "pause" and not needs_sync)
+    leaves_cycle = kind == "pause" or (kind, value) == ("nmt", 128)
+    harmless = kind in HARMLESS or (kind, value) == ("nmt", 1) or (leaves_cycle and not needs_sync)
     if not harmless and kind != "gateway":
         laws.disturbed_s = bench.now_s
     if kind == "word":

@@ -1,0 +1,38 @@
+"""The conformance suite over a real CAN interface, on the gateway's ideal drive in another process."""
+
+import json
+import subprocess
+import sys
+
+MACHINE = """
+schema: hdbridge.machine/1
+name: between
+axes:
+  - profile: article
+gateway:
+  bus: {{interface: socketcan, channel: {channel}}}
+  nodes: {{article: 5}}
+"""
+CHECKS = ("nmt.ignores", "sdo.abort", "sdo.block", "tpdo.sync", "rpdo", "guarding.toggle", "402.transition")
+
+
+def test_conform_checks_a_drive_in_another_process(interface, tmp_path):
+    machine, result = tmp_path / "machine.yaml", tmp_path / "result.json"
+    machine.write_text(MACHINE.format(channel=interface), encoding="utf-8")
+    hdbridge = [sys.executable, "-m", "hdbridge"]
+    only = [each for name in CHECKS for each in ("--only", name)]
+    conform = [*hdbridge, "conform", str(machine), "--motion", "--json", str(result), *only]
+    with subprocess.Popen(
+        [*hdbridge, "gateway", "simulate", str(machine)], stderr=subprocess.PIPE, text=True
+    ) as drive:
+        try:
+            assert "ideal drive: node 5" in drive.stderr.readline()
+            done = subprocess.run(conform, capture_output=True, text=True, check=False)
+        finally:
+            drive.terminate()
+    found = {each["id"]: each for each in json.loads(result.read_text())["checks"]}
+    wrong = {name: each["found"] for name, each in found.items() if each["result"] == "fail"}
+    assert wrong == {}, done.stderr
+    assert done.returncode == 0
+    # Remote frames and 29-bit identifiers, as the kernel carries them.
+    assert found["guarding.toggle"]["result"] == found["nmt.ignores.extended"]["result"] == "pass"
