@@ -18,6 +18,7 @@ import numpy as np
 from scipy.special import chdtrc
 
 from hdbridge.analysis.intervals import NORMAL_95
+from hdbridge.analysis.readings import median_deviation
 from hdbridge.axis import AxisConfig
 from hdbridge.effects import FloatArray
 from hdbridge.errors import InputError
@@ -55,14 +56,19 @@ def growth(
     """Returns, by channel, the rms residual relative to that of the same kinds of leg in the twin's own fit.
 
     A kind that the twin has not seen is compared with the largest of the others; ``noise`` is the minimum of
-    each reference.
+    each reference. A row counts as no more than `STRAY` times the typical residual of its leg, because single
+    rows may be readings that are wrong, but a whole leg is not.
     """
     was, found = scales_by_kind(data, known, noise), {}
     for name, counts in counted(data).items():
         inside = counts > 0.0
         if inside.any():
             scale = was[name][inside]
-            now = np.minimum(np.abs(residuals[name][inside]), STRAY * scale)
+            now, legs = np.abs(residuals[name][inside]), data.leg[inside]
+            typical = np.zeros_like(now)
+            for leg in np.unique(legs):
+                typical[legs == leg] = median_deviation(now[legs == leg])
+            now = np.minimum(now, STRAY * np.maximum(scale, typical))
             found[name] = math.sqrt(float(np.sum(now**2)) / float(np.sum(scale**2)))
     return found
 

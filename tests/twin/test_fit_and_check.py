@@ -20,7 +20,7 @@ from hdbridge.procedures.stepping import Stepping
 from hdbridge.records.recording import Recording
 from hdbridge.sim.lockstep import simulated_bench
 from hdbridge.sim.truth import Truth
-from hdbridge.twin.check import Check, check
+from hdbridge.twin.check import Check, check, growth, scales_by_kind
 from hdbridge.twin.fit import read_off, solve
 from hdbridge.twin.misfit import (
     CHANNELS,
@@ -235,6 +235,21 @@ def test_more_misfit_than_when_the_twin_was_made_is_never_nothing(twin_of: Calla
     assert told.growth_before["motor torque"] > 1.5
     assert "Nothing has changed" not in told.sentence
     assert "motor torque" in told.sentence
+
+
+def test_growth_follows_a_change_of_any_size_and_not_a_single_reading() -> None:
+    with Replays(prepare(recorded(), AXIS, TRUTH), 1) as replays:
+        data = replays.data
+    noise, rng = noise_in_motion(data), np.random.default_rng(3)
+    scale = scales_by_kind(data, {}, noise)
+    white = {name: each * rng.standard_normal(len(each)) for name, each in scale.items()}
+    for factor in (1.0, 3.0, 30.0):
+        found = growth(data, {name: factor * each for name, each in white.items()}, {}, noise)
+        assert found == pytest.approx(dict.fromkeys(found, factor), rel=0.1)
+    stray = {name: each.copy() for name, each in white.items()}
+    for each in stray.values():
+        each[len(each) // 2] *= 1e3
+    assert max(growth(data, stray, {}, noise).values()) < 1.1
 
 
 def test_a_twin_that_leaves_all_of_a_signal_shows_no_change() -> None:
