@@ -48,14 +48,14 @@ def findings(
                 change = (
                     _loop(search, fitted, precise, usual[0], given, spread)
                     if same
-                    else _another_law(search, plain, precise, place, given, spread)
+                    else _another_law(search, fitted, precise, place, given, spread)
                 )
         elif given.part is Part.ORDERS:
             change = _orders(estimator, precise, usual, given, spread) if usual else None
         else:
             change = _freed(search, fitted, precise, place, given, spread)
         if change is not None:
-            result.append(_finding(search, plain, place, given, change))
+            result.append(_finding(search, plain, fitted, place, given, change))
     return [each for each in result if each is not None]
 
 
@@ -69,25 +69,32 @@ class _Change(NamedTuple):
     left_alone: bool = False
 
 
-def _finding(search: Search, fitted: Fitted, place: int, given: Effect, change: _Change) -> Finding | None:
+def _finding(
+    search: Search, fitted: Fitted, loose: Fitted, place: int, given: Effect, change: _Change
+) -> Finding | None:
     """Judges a change as any other cause: by evidence that is robust and by its gain on held-out data.
 
-    Both compare the fit with one that has the part as ``given``. None if the evidence is not enough.
+    Both compare a fit with one that has the part as ``given``. The evidence is that of the ``loose`` fit,
+    which may have a loop of free form, unlike a model. None if the evidence is not enough.
     """
     estimator, name = search.estimator, change.effect.name
-    now = fitted.hypothesis.effects[place]
-    if type(now) is type(given):
-        without = search.with_given(fitted, place, given)
-    else:
-        without = estimator.fit(fitted.hypothesis.instead(place, type(given)(**now.parameters())))
-    gate = gate_of_change(estimator, fitted, without)
+
+    def as_given(fit: Fitted) -> Fitted:
+        now = fit.hypothesis.effects[place]
+        if type(now) is type(given):
+            return search.with_given(fit, place, given)
+        return estimator.fit(fit.hypothesis.instead(place, type(given)(**change.effect.parameters())))
+
+    as_it_was = as_given(loose)
+    gate = gate_of_change(estimator, loose, as_it_was)
     if gate.reason:
         search.refusals[name] = gate.reason
         return None
+    without = as_given(fitted)
     return Finding(
         name, UNWEIGHED, change.aliases, change.parameters, held_out(estimator, fitted, without),
         next_experiment(name, change.aliases), change.peak_arcsec,
-        robust=without.chi_square - fitted.chi_square, taken_arcsec=change.taken_arcsec,
+        robust=as_it_was.chi_square - loose.chi_square, taken_arcsec=change.taken_arcsec,
         left_alone=change.left_alone, within=True, note=change.note, effect=change.effect, gate=gate,
     )  # fmt: skip
 

@@ -38,7 +38,7 @@ from hdbridge.analysis.search import (
     waves_alike,
     with_measured,
 )
-from hdbridge.analysis.swing import allowed_for, ordinary
+from hdbridge.analysis.swing import ORDINARY_HZ, allowed_for, seen_swing
 from hdbridge.analysis.unexplained import (
     LESS,
     Rest,
@@ -97,8 +97,11 @@ def diagnose(
     )
     search = _search(data, model, scales or Scales())
     begun = search.begun()
-    swing = ordinary(search.estimator, begun)
-    search = _search(allowed_for(search.estimator, begun, swing), model, search.scales)
+    swing = seen_swing(search.estimator, begun)
+    if swing is not None and swing.frequency_hz <= ORDINARY_HZ:
+        swing = None  # softer than is ordinary: a cause to be found
+    elif (less := allowed_for(search.estimator, begun, swing)) is not data:
+        search = _search(less, model, search.scales)
     estimator = search.estimator
     first = unfitted(estimator, model.effects)
     held = beyond_limit(model.effects, data.full.motion)
@@ -380,6 +383,8 @@ class _Judge:
             note = f"the loop has another shape than either law: {left.arcsec:.2g} arcsec rms are left"
             told = replace(loops[0], note=note, lives_in=lives)
             return [told if each is loops[0] else each for each in findings]
+        if size < self.estimator.floor_arcsec:
+            return findings
         largest = max((each.peak_arcsec for each in findings), default=0.0)
         return [*findings, unknown] if largest > size else [unknown, *findings]
 

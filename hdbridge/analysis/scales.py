@@ -55,6 +55,7 @@ class Scales:
         math.inf,
         "pieces that cancel, an order on an arc",
     )
+    wave_share_left: float = _scale(0.03, "share of a wave's squares", 0.0, "the others explain the rest")
     bend: float = _scale(
         0.6, "share by which a slope may differ along the way", math.inf, "a slope is one, or is none"
     )

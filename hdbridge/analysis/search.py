@@ -285,7 +285,12 @@ class Search:
         A candidate with more parameters may gain more only after its shapes are fitted.
         """
         passed = {each.name for each in fitted.hypothesis.effects if each.usual == 1} | {left_out}
-        scores = [each for each in scores if each.effect.name not in passed]
+        scores = [
+            each
+            for each in scores
+            if each.effect.name not in passed
+            and not (each.effect.waves() and each.share < self.scales.wave_share_left)
+        ]
         net = {id(each): each.gain - self.scales.penalty * each.freedom for each in scores}
         best: dict[tuple[str, int], Score] = {}
         for each in sorted(scores, key=lambda each: -net[id(each)]):

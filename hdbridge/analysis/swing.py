@@ -86,8 +86,8 @@ def swing(
     return Swing(frequency_hz, damping, state[::2], np.hypot(state[::2], state[1::2]))
 
 
-def ordinary(estimator: Estimator, fitted: Fitted) -> Swing | None:
-    """Fits the swing to the residual of a fit; None if nothing of it is seen, or if it is not ordinary."""
+def seen_swing(estimator: Estimator, fitted: Fitted) -> Swing | None:
+    """Fits the swing to the residual of a fit; None if nothing of it is seen."""
     full, start = estimator.data.full, fitted.hypothesis.start
     error = sum(each.predict(full.motion, start) for each in fitted.hypothesis.effects)
     base = ARCSEC_PER_DEG / full.ratio * full.motor_deg + error
@@ -105,9 +105,11 @@ def ordinary(estimator: Estimator, fitted: Fitted) -> Swing | None:
         near = product((1.0 / factor, 1.0, factor), (1.0 / factor**2, 1.0, factor**2))
         trials = (tried(here.frequency_hz * f, min(here.damping * z, 0.7)) for f, z in near)
         best = min((best, *trials), key=lambda each: each[0])
-    scales = estimator.scales
-    seen = float(np.sum(fitted.residual**2)) - best[0] > scales.enter + 2.0 * scales.penalty
-    return best[1] if seen and best[1].frequency_hz > ORDINARY_HZ else None
+    scales, whole = estimator.scales, float(np.sum(fitted.residual**2))
+    seen = whole - best[0] > scales.enter + 2.0 * scales.penalty
+    # Of what a model lacks otherwise, a swing may take a part.
+    clear = best[0] < scales.large * len(residual) or best[0] < 0.5 * whole
+    return best[1] if seen and clear else None
 
 
 def allowed_for(estimator: Estimator, fitted: Fitted, found: Swing | None) -> Observed:
@@ -125,6 +127,10 @@ def allowed_for(estimator: Estimator, fitted: Fitted, found: Swing | None) -> Ob
         full = replace(full, error_arcsec=full.error_arcsec - found.does_arcsec)
     moving = (data.points.speed_deg_s != 0.0)[estimator.index]
     square, unknown = left[moving] ** 2, np.zeros(len(full))
+    size = estimator.at_points(sizes[-1])[moving]
+    quiet = size <= np.median(size) if len(size) else moving[moving]
+    if len(size) and float(np.mean((square * weight[moving] ** 2)[quiet])) > estimator.scales.large:
+        sizes = []  # the model lacks more than dynamics, and its residual says nothing about them
     for each in sizes:
         size = estimator.at_points(each**2)[moving]
         about = (size - np.mean(size)) if len(size) else size
@@ -134,6 +140,8 @@ def allowed_for(estimator: Estimator, fitted: Fitted, found: Swing | None) -> Ob
         share = min(share, 1.0)
         square = square - share * size
         unknown += share * each**2
+    if found is None and not np.any(unknown):
+        return data
     unknown = np.sqrt(unknown)
     most = max(estimator.scales.floor_arcsec, 2.0 * float(np.min(full.sigma_arcsec)))
     usable = full.usable & (unknown <= most)
