@@ -23,10 +23,10 @@ from hdbridge.analysis.prepared import LEAST_SETTLED, Observed, averaged
 from hdbridge.effects import FloatArray
 from hdbridge.units import ARCSEC_PER_DEG
 
-ORDINARY_HZ = 25.0
+ORDINARY_HZ = 30.0
 """Lowest natural frequency of a load that is ordinary. The demo axis has 42 Hz; of the axes that tools/blind
-draws, 19 to 650 Hz, one in a hundred is softer."""
-HERTZ = tuple(float(each) for each in np.geomspace(ORDINARY_HZ, 16.0 * ORDINARY_HZ, 17))
+draws, 20 to 640 Hz, one in thirty is softer."""
+HERTZ = tuple(float(each) for each in np.geomspace(0.4 * ORDINARY_HZ, 16.0 * ORDINARY_HZ, 23))
 DAMPING = (0.05, 0.1, 0.2, 0.4)
 """Natural frequencies and damping ratios that are tried, before a refinement."""
 
