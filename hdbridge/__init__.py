@@ -15,8 +15,9 @@ from typing import TYPE_CHECKING, Any, Final
 if TYPE_CHECKING:
     from hdbridge.analysis.diagnosis import diagnose
     from hdbridge.axis import AxisConfig
-    from hdbridge.calibration import fit
+    from hdbridge.axis.model import TransmissionModel
     from hdbridge.client import AsyncClient, Client
+    from hdbridge.commissioning.calibration import fit
     from hdbridge.control.bench import Bench
     from hdbridge.control.compensation import Compensation, Inverse
     from hdbridge.drive import Drive, open_bus
@@ -35,9 +36,8 @@ if TYPE_CHECKING:
         SdoError,
         TransitionError,
     )
-    from hdbridge.model import TransmissionModel
-    from hdbridge.procedures.stepping import Stepping
-    from hdbridge.procedures.trajectory import Trajectory
+    from hdbridge.motion.procedures.stepping import Stepping
+    from hdbridge.motion.procedures.trajectory import Trajectory
     from hdbridge.records.record import Record
     from hdbridge.records.recording import Recording
     from hdbridge.simulated import simulated
@@ -87,11 +87,11 @@ _MODULES: Final = MappingProxyType(
         "Inverse": "control.compensation",
         "Record": "records.record",
         "Recording": "records.recording",
-        "Stepping": "procedures.stepping",
-        "Trajectory": "procedures.trajectory",
-        "TransmissionModel": "model",
+        "Stepping": "motion.procedures.stepping",
+        "Trajectory": "motion.procedures.trajectory",
+        "TransmissionModel": "axis.model",
         "diagnose": "analysis.diagnosis",
-        "fit": "calibration",
+        "fit": "commissioning.calibration",
         "open_bus": "drive",
         "simulated": "simulated",
     }

@@ -32,7 +32,7 @@ from whatif import WhatIf
 
 from hdbridge.analysis.diagnosis import diagnose
 from hdbridge.analysis.scales import Scales
-from hdbridge.model import TransmissionModel
+from hdbridge.axis.model import TransmissionModel
 from hdbridge.records.record import Record
 
 PLAN = plant.Plan(rate_hz=14.0, scale=0.2, load_turns=1.05, steps=14)

@@ -23,13 +23,13 @@ import numpy as np
 from scipy.optimize import brentq
 
 from hdbridge.axis import AxisConfig
+from hdbridge.axis.effects import Hysteresis, HysteresisMemory, Moment, Motion, Start, Tracker
+from hdbridge.axis.model import TransmissionModel
+from hdbridge.commissioning.evaluation.comparison import compare_schemes
+from hdbridge.commissioning.evaluation.stepping import Scheme, quantisation_floor_arcsec
 from hdbridge.drive.drive import Drive
-from hdbridge.effects import Hysteresis, HysteresisMemory, Moment, Motion, Start, Tracker
-from hdbridge.evaluation.comparison import compare_schemes
-from hdbridge.evaluation.stepping import Scheme, quantisation_floor_arcsec
 from hdbridge.files.bundled import bundled_profile
-from hdbridge.model import TransmissionModel
-from hdbridge.procedures.stepping import Stepping
+from hdbridge.motion.procedures.stepping import Stepping
 from hdbridge.sim.lockstep import simulated_bench
 
 RATIO, MOTOR_COUNTS, LOAD_COUNTS = 50.0, 8000, 2_880_000

@@ -27,9 +27,9 @@ import numpy as np
 import yaml
 
 from hdbridge.axis import AxisConfig
-from hdbridge.calibration import Calibration, calibrate, start_journal
+from hdbridge.commissioning.calibration import Calibration, calibrate, start_journal
 from hdbridge.drive.drive import Drive
-from hdbridge.procedures.plan import Plan
+from hdbridge.motion.procedures.plan import Plan
 from hdbridge.sim.lockstep import simulated_bench
 
 DEMO = Path(__file__).parents[1] / "profiles" / "demo"

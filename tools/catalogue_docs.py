@@ -12,13 +12,13 @@ from typing import Any, get_args, get_origin
 
 from pydantic import BaseModel
 
-from hdbridge.effects import CATALOGUE, Effect, aliases_of
+from hdbridge.axis.effects import CATALOGUE, Effect, aliases_of
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "causes.md"
 
 _INTRODUCTION = """# Causes of transmission error
 
-<!-- Written by tools/catalogue_docs.py from hdbridge/effects; do not edit. -->
+<!-- Written by tools/catalogue_docs.py from hdbridge/axis/effects; do not edit. -->
 
 The catalogue: how each cause shows in a record, and what to do about it. The names are those of findings and
 of the model file's `effects`. The error is how far the load is ahead of motor angle / N, in arcsec at the

@@ -20,17 +20,17 @@ from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 
 from hdbridge.axis import AxisConfig
+from hdbridge.axis.effects import CATALOGUE
+from hdbridge.axis.model.file import ModelFile
+from hdbridge.axis.model.store import LogFile
 from hdbridge.daemon.machinefile import MachineFile
 from hdbridge.device.behaviour import Behaviour
 from hdbridge.drive.supervision import TABLE, Fault, Reaction
-from hdbridge.effects import CATALOGUE
 from hdbridge.files.expectation import Field, field_at, key_of, type_words
 from hdbridge.fleet.dataset import COLUMNS as FLEET_COLUMNS
 from hdbridge.fleet.dataset import NESTED
 from hdbridge.fleet.sources import MANIFEST
-from hdbridge.model.file import ModelFile
-from hdbridge.model.store import LogFile
-from hdbridge.procedures.plan import (
+from hdbridge.motion.procedures.plan import (
     Plan,
     ReversalsEntry,
     SinesEntry,

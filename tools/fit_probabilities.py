@@ -30,7 +30,7 @@ from hdbridge.analysis.diagnosis import diagnose
 from hdbridge.analysis.findings import Diagnosis
 from hdbridge.analysis.probability import coefficients
 from hdbridge.analysis.scales import Scales
-from hdbridge.model import TransmissionModel
+from hdbridge.axis.model import TransmissionModel
 from hdbridge.records.recording import Recording
 
 RIDGE = 1.0

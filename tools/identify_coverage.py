@@ -25,8 +25,8 @@ from identify_records import draw, plan, record, recording
 
 from hdbridge.analysis.identification import FitOptions
 from hdbridge.analysis.identify import fit
-from hdbridge.calibration import measured_of
-from hdbridge.effects import Start
+from hdbridge.axis.effects import Start
+from hdbridge.commissioning.calibration import measured_of
 
 TOLERANCE = {"offset_arcsec": 0.01, "width_deg": 0.04}
 

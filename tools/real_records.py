@@ -23,8 +23,8 @@ from hdbridge.analysis.driving import CHATTER_COUNTS, steadied
 from hdbridge.analysis.findings import Diagnosis
 from hdbridge.analysis.readings import reading_of
 from hdbridge.axis import AxisConfig
-from hdbridge.effects import Hysteresis, HysteresisMemory, Motion, Start
-from hdbridge.model import TransmissionModel
+from hdbridge.axis.effects import Hysteresis, HysteresisMemory, Motion, Start
+from hdbridge.axis.model import TransmissionModel
 from hdbridge.records.record import Record, concatenate
 from hdbridge.records.recording import Recording
 from hdbridge.sim.truth import Truth

@@ -22,12 +22,12 @@ import yaml
 from twin_random_axes import bench, draw
 
 from hdbridge.axis import AxisConfig
-from hdbridge.calibration import Calibration, calibrate, start_journal
+from hdbridge.axis.effects import Hysteresis, HysteresisMemory, Synchronous
+from hdbridge.axis.model import TransmissionModel
+from hdbridge.commissioning.calibration import Calibration, calibrate, start_journal
 from hdbridge.drive.drive import Drive
-from hdbridge.effects import Hysteresis, HysteresisMemory, Synchronous
 from hdbridge.errors import SafetyStop
-from hdbridge.model import TransmissionModel
-from hdbridge.procedures.plan import Plan
+from hdbridge.motion.procedures.plan import Plan
 from hdbridge.sim.lockstep import simulated_bench
 from hdbridge.sim.truth import Truth
 from hdbridge.twin.translate import translate

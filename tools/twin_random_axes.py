@@ -36,7 +36,7 @@ from hdbridge.axis import AxisConfig
 from hdbridge.control.bench import Bench
 from hdbridge.drive.drive import Drive
 from hdbridge.errors import SafetyStop
-from hdbridge.procedures.plan import Plan
+from hdbridge.motion.procedures.plan import Plan
 from hdbridge.records.recording import Recording
 from hdbridge.sim.lockstep import simulated_bench
 from hdbridge.sim.truth import Truth

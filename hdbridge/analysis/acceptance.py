@@ -13,7 +13,7 @@ import numpy as np
 
 from hdbridge.analysis.hypothesis import Estimator, Fitted, Hypothesis
 from hdbridge.analysis.linear import Linearised, of_length, sandwich, side_by_side, solve_symmetric
-from hdbridge.effects import BoolArray, Effect, FloatArray
+from hdbridge.axis.effects import BoolArray, Effect, FloatArray
 
 BLOCKS_S = (1.0, 5.0, 20.0)
 """Block lengths; wandering noise and warming are correlated over less than one of them."""

@@ -16,9 +16,9 @@ import numpy as np
 from hdbridge.analysis.linear import side_by_side
 from hdbridge.analysis.prepared import Samples
 from hdbridge.analysis.regressors import Regressors
-from hdbridge.effects import BoolArray, Effect, FloatArray, IntArray, Start
-from hdbridge.effects.base import Memoryless
-from hdbridge.effects.path import branches
+from hdbridge.axis.effects import BoolArray, Effect, FloatArray, IntArray, Start
+from hdbridge.axis.effects.base import Memoryless
+from hdbridge.axis.effects.path import branches
 from hdbridge.units import ARCSEC_PER_DEG
 
 TARGET_BLOCKS = 30_000

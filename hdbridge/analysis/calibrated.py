@@ -20,7 +20,7 @@ from hdbridge.analysis.intervals import NORMAL_95
 from hdbridge.analysis.linear import Prior
 from hdbridge.analysis.scales import Scales
 from hdbridge.analysis.separable import on_scale, shape_value
-from hdbridge.effects import Effect, FloatArray
+from hdbridge.axis.effects import Effect, FloatArray
 
 EXACT: Final = 1e-3
 """Share of such a deviation that is practically zero."""

@@ -12,8 +12,8 @@ from hdbridge.analysis.driving import settling
 from hdbridge.analysis.identification import GENTLE_DEG_S2
 from hdbridge.analysis.prepared import Observed, Samples
 from hdbridge.analysis.scales import Scales
-from hdbridge.effects import CATALOGUE, Channel, Effect
-from hdbridge.effects.carried import loop_of
+from hdbridge.axis.effects import CATALOGUE, Channel, Effect
+from hdbridge.axis.effects.carried import loop_of
 from hdbridge.units import DEG_PER_TURN
 
 SAMPLES_PER_WIDTH: Final = 4

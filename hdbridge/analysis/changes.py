@@ -21,8 +21,8 @@ from hdbridge.analysis.linear import Column
 from hdbridge.analysis.parameters import named_parameters, parameters_of
 from hdbridge.analysis.search import Search, together
 from hdbridge.analysis.unexplained import near_reversals
-from hdbridge.effects import CATALOGUE, Effect, FloatArray, Part, Start
-from hdbridge.model import TransmissionModel
+from hdbridge.axis.effects import CATALOGUE, Effect, FloatArray, Part, Start
+from hdbridge.axis.model import TransmissionModel
 
 
 def findings(

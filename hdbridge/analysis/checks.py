@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from hdbridge.analysis.cuts import SLOWEST_S, observed
-from hdbridge.effects import FloatArray
+from hdbridge.axis.effects import FloatArray
 from hdbridge.errors import InputError
 from hdbridge.records.columns import CHANNELS, UNITS, Unit, option
 from hdbridge.records.record import REQUIRED, Record

@@ -44,8 +44,8 @@ from hdbridge.analysis.noise import NoiseModel, Precision
 from hdbridge.analysis.nuisances import DELAY, TEXTS, UNITS, delay_column, is_turn
 from hdbridge.analysis.orders import Family, Line, Order, System, spectrum
 from hdbridge.analysis.separable import Solution
-from hdbridge.effects import FloatArray, IntArray, Part
-from hdbridge.model import TransmissionModel
+from hdbridge.axis.effects import FloatArray, IntArray, Part
+from hdbridge.axis.model import TransmissionModel
 from hdbridge.units import ARCSEC_PER_DEG, DEG_PER_TURN
 
 CLUSTERS = 100

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 
 from hdbridge.analysis.readings import coarse, spread
-from hdbridge.effects import FloatArray
+from hdbridge.axis.effects import FloatArray
 from hdbridge.records.record import Record
 from hdbridge.units import ARCSEC_PER_DEG
 

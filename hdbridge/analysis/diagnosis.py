@@ -50,11 +50,11 @@ from hdbridge.analysis.unexplained import (
     rest,
     unfitted,
 )
-from hdbridge.effects import Channel, Effect, FloatArray, Part, Start, unmet
-from hdbridge.effects.base import missing_error
-from hdbridge.effects.kinematics import direction_of
-from hdbridge.effects.torque import beyond_limit
-from hdbridge.model import TransmissionModel
+from hdbridge.axis.effects import Channel, Effect, FloatArray, Part, Start, unmet
+from hdbridge.axis.effects.base import missing_error
+from hdbridge.axis.effects.kinematics import direction_of
+from hdbridge.axis.effects.torque import beyond_limit
+from hdbridge.axis.model import TransmissionModel
 from hdbridge.records.given import Given, agreed_ratio, by_name
 from hdbridge.records.record import Record
 from hdbridge.records.recording import Recording

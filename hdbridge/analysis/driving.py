@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter1d
 
 from hdbridge.analysis.readings import Reading, quantum_deg, reading_of, third_deviation
-from hdbridge.effects import FloatArray
+from hdbridge.axis.effects import FloatArray
 
 REVERSAL_DEG = 0.3
 """Minimum travel on either side of a reversal, motor degrees: less than the narrowest loop considered

@@ -10,8 +10,8 @@ import numpy as np
 
 from hdbridge.analysis.hypothesis import Estimator, Fitted
 from hdbridge.analysis.intervals import intervals_of, nested_half_widths
-from hdbridge.effects import Effect, FloatArray, Part, conflicts, extended, in_place
-from hdbridge.model import TransmissionModel
+from hdbridge.axis.effects import Effect, FloatArray, Part, conflicts, extended, in_place
+from hdbridge.axis.model import TransmissionModel
 
 
 def as_named(estimator: Estimator, fitted: Fitted, given: Sequence[Effect], named: Container[str]) -> Fitted:

@@ -1,7 +1,7 @@
 """Findings and diagnosis as plain values, and the next experiment in words.
 
 Experiments come from the causes' descriptions and include those that need a person (move a mass, re-clock
-an encoder). Automatic ones: `hdbridge.improvement.experiments`.
+an encoder). Automatic ones: `hdbridge.commissioning.improvement.experiments`.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ from hdbridge.analysis.intervals import NORMAL_95
 from hdbridge.analysis.prepared import means
 from hdbridge.analysis.scales import Scales
 from hdbridge.analysis.views import ResidualViews, coordinates
-from hdbridge.effects import CATALOGUE, Effect, FloatArray, IntArray, Motion, Start
-from hdbridge.effects.kinematics import direction_of
-from hdbridge.model import TransmissionModel
+from hdbridge.axis.effects import CATALOGUE, Effect, FloatArray, IntArray, Motion, Start
+from hdbridge.axis.effects.kinematics import direction_of
+from hdbridge.axis.model import TransmissionModel
 
 _UNEXPLAINED: Final = {
     "load angle": "two slow load turns both ways, then again with the load encoder re-clocked by 90 deg",

@@ -10,7 +10,7 @@ import numpy as np
 from hdbridge.analysis.hypothesis import Estimator, Fitted
 from hdbridge.analysis.linear import counted, of_number, steps_without
 from hdbridge.analysis.noise import White
-from hdbridge.effects import FloatArray
+from hdbridge.axis.effects import FloatArray
 
 SURE = 2.0
 """Minimum significance of a gain, standard errors."""

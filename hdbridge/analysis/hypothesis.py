@@ -22,9 +22,9 @@ from hdbridge.analysis.prepared import Observed
 from hdbridge.analysis.regressors import Regressors
 from hdbridge.analysis.scales import Scales
 from hdbridge.analysis.separable import Separable, Solution, unit
-from hdbridge.effects import Channel, Effect, FloatArray, IntArray, Motion, Moves, Part, Start
-from hdbridge.effects.path import branches
-from hdbridge.effects.play import stop
+from hdbridge.axis.effects import Channel, Effect, FloatArray, IntArray, Motion, Moves, Part, Start
+from hdbridge.axis.effects.path import branches
+from hdbridge.axis.effects.play import stop
 from hdbridge.units import ARCSEC_PER_DEG
 
 ENOUGH = Effort(steps=8, converged=0.5, roughly=2e-5)

@@ -16,11 +16,11 @@ from hdbridge.analysis.orders import NOT_APART
 from hdbridge.analysis.prepared import gather
 from hdbridge.analysis.screening import SHARE_LEFT, candidates
 from hdbridge.analysis.search import lookalikes, waves_alike
-from hdbridge.effects import CATALOGUE, Effect, FloatArray, Motion, Part, Sought, Start, causes
-from hdbridge.model import TransmissionModel
-from hdbridge.procedures.moves import AxisView, MotionLimits
-from hdbridge.procedures.plan import Plan
-from hdbridge.procedures.rehearsal import legs_of
+from hdbridge.axis.effects import CATALOGUE, Effect, FloatArray, Motion, Part, Sought, Start, causes
+from hdbridge.axis.model import TransmissionModel
+from hdbridge.motion.procedures.moves import AxisView, MotionLimits
+from hdbridge.motion.procedures.plan import Plan
+from hdbridge.motion.procedures.rehearsal import legs_of
 from hdbridge.records.record import Record
 from hdbridge.records.recording import Segment
 from hdbridge.units import ARCSEC_PER_DEG

@@ -21,7 +21,7 @@ from hdbridge.analysis.orders import Family, Line, Order, Selection, System, sel
 from hdbridge.analysis.prepared import ON_THE_WAY, Measured, Samples, observe
 from hdbridge.analysis.readings import median_deviation
 from hdbridge.analysis.separable import Separable, Solution
-from hdbridge.effects import (
+from hdbridge.axis.effects import (
     CATALOGUE,
     USUAL_LOOP,
     BoolArray,
@@ -32,9 +32,9 @@ from hdbridge.effects import (
     is_ripple,
     ripple,
 )
-from hdbridge.effects.path import branches
+from hdbridge.axis.effects.path import branches
+from hdbridge.axis.model import TransmissionModel
 from hdbridge.errors import InputError
-from hdbridge.model import TransmissionModel
 from hdbridge.units import ARCSEC_PER_DEG, DEG_PER_TURN
 
 WORTH = 0.01

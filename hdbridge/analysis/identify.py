@@ -35,7 +35,7 @@ from hdbridge.analysis.nuisances import (
 from hdbridge.analysis.orders import System
 from hdbridge.analysis.prepared import Measured, Samples
 from hdbridge.analysis.separable import Solution
-from hdbridge.effects import CATALOGUE, Effect, FloatArray, Start, in_place
+from hdbridge.axis.effects import CATALOGUE, Effect, FloatArray, Start, in_place
 from hdbridge.errors import InputError
 from hdbridge.units import ARCSEC_PER_DEG
 

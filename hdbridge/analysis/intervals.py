@@ -12,7 +12,7 @@ import numpy as np
 
 from hdbridge.analysis.linear import Column
 from hdbridge.analysis.separable import shape_value
-from hdbridge.effects import Effect, FloatArray
+from hdbridge.axis.effects import Effect, FloatArray
 
 NORMAL_95 = 1.959964
 

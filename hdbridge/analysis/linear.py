@@ -14,8 +14,8 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from scipy.linalg.lapack import dposv
 
-from hdbridge.effects import BoolArray, Effect, FloatArray, IntArray
-from hdbridge.effects.described import Moves
+from hdbridge.axis.effects import BoolArray, Effect, FloatArray, IntArray
+from hdbridge.axis.effects.described import Moves
 
 NOTHING = 1e-20
 """Information below which a column counts as unseen."""

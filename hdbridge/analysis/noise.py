@@ -18,7 +18,7 @@ from scipy.linalg import cho_solve_banded, cholesky_banded
 from scipy.optimize import minimize
 
 from hdbridge.analysis.blocks import Blocks
-from hdbridge.effects import BoolArray, FloatArray, IntArray
+from hdbridge.axis.effects import BoolArray, FloatArray, IntArray
 
 PIECES = 16
 PIECE_BLOCKS = 250

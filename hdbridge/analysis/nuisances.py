@@ -20,7 +20,7 @@ import numpy as np
 
 from hdbridge.analysis.blocks import AVERAGED_COUNTS_S, LOCKED_COUNTS, Design
 from hdbridge.analysis.linear import Nuisances, Prior, solve_symmetric, unknown
-from hdbridge.effects import Effect, FloatArray, IntArray
+from hdbridge.axis.effects import Effect, FloatArray, IntArray
 from hdbridge.units import ARCSEC_PER_DEG
 
 DELAY = "delay_ms"

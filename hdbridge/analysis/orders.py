@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from hdbridge.analysis.linear import seen_directions, solve_symmetric
-from hdbridge.effects import FloatArray
+from hdbridge.axis.effects import FloatArray
 
 NOT_APART = 0.95
 """Canonical correlation above which two orders, or two causes, are not separable in a record."""

@@ -24,7 +24,7 @@ from hdbridge.analysis.linear import FOUND, Column, Effort, of_length, sandwich,
 from hdbridge.analysis.screening import proposed
 from hdbridge.analysis.search import lookalikes
 from hdbridge.analysis.separable import shape_value
-from hdbridge.effects import CATALOGUE, Effect, FloatArray, IntArray, Moves, aliases_of
+from hdbridge.axis.effects import CATALOGUE, Effect, FloatArray, IntArray, Moves, aliases_of
 from hdbridge.units import unit_of
 
 

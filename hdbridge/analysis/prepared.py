@@ -20,7 +20,7 @@ import numpy as np
 from hdbridge.analysis.cuts import observed
 from hdbridge.analysis.driving import kinematics, reading_of_all, reversals, settling
 from hdbridge.analysis.readings import Reading, quantum_deg, third_deviation
-from hdbridge.effects import BoolArray, FloatArray, IntArray, Motion, Start
+from hdbridge.axis.effects import BoolArray, FloatArray, IntArray, Motion, Start
 from hdbridge.errors import InputError
 from hdbridge.records.record import OPTIONAL, REQUIRED, Record
 from hdbridge.records.recording import Segment

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hdbridge.effects import FloatArray
+from hdbridge.axis.effects import FloatArray
 
 SMALLEST_COUNT_DEG = 1e-5
 ROUNDED_DEG = 1e-6

@@ -9,7 +9,7 @@ import numpy as np
 
 from hdbridge.analysis.linear import side_by_side
 from hdbridge.analysis.separable import unit
-from hdbridge.effects import Channel, Effect, FloatArray, Motion, Start
+from hdbridge.axis.effects import Channel, Effect, FloatArray, Motion, Start
 
 KEPT = 64
 """Size of the cache of columns, which are large."""

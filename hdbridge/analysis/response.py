@@ -17,11 +17,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from hdbridge.effects.orders import MotorOrder, OrderSeries
+from hdbridge.axis.effects.orders import MotorOrder, OrderSeries
+from hdbridge.axis.model import TransmissionModel
+from hdbridge.axis.model.response import LeadFilter, Response
 from hdbridge.errors import InputError
-from hdbridge.model import TransmissionModel
-from hdbridge.model.response import LeadFilter, Response
-from hdbridge.procedures.even_speed import EvenRun
+from hdbridge.motion.procedures.even_speed import EvenRun
 from hdbridge.units import ARCSEC_PER_DEG, DEG_PER_TURN
 
 ComplexArray = NDArray[np.complex128]

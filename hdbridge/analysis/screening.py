@@ -16,8 +16,8 @@ import numpy as np
 from hdbridge.analysis.hypothesis import Estimator, Fitted
 from hdbridge.analysis.readings import median_deviation
 from hdbridge.analysis.separable import shape_value
-from hdbridge.effects import CATALOGUE, Effect, FloatArray, Observations, Sought, Start, causes, unmet
-from hdbridge.effects.orders import HIGHEST_MOTOR_ORDER
+from hdbridge.axis.effects import CATALOGUE, Effect, FloatArray, Observations, Sought, Start, causes, unmet
+from hdbridge.axis.effects.orders import HIGHEST_MOTOR_ORDER
 from hdbridge.units import DEG_PER_TURN
 
 SHARE_LEFT = 1e-4

@@ -17,7 +17,7 @@ from hdbridge.analysis.acceptance import all_pieces_seen, evident, gate
 from hdbridge.analysis.hypothesis import Estimator, Fitted, Hypothesis
 from hdbridge.analysis.linear import orthonormal, unknown
 from hdbridge.analysis.screening import Score, Screen, candidates, filtered, proposed, score_of
-from hdbridge.effects import (
+from hdbridge.axis.effects import (
     CATALOGUE,
     Channel,
     Effect,

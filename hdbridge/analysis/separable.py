@@ -14,9 +14,9 @@ from itertools import chain
 import numpy as np
 
 from hdbridge.analysis.linear import FREE, Column, Columns, Effort, Terms, side_by_side, solve_symmetric
-from hdbridge.effects import BoolArray, Effect, FloatArray, refreshed
-from hdbridge.effects.base import Shape
-from hdbridge.effects.described import Moves
+from hdbridge.axis.effects import BoolArray, Effect, FloatArray, refreshed
+from hdbridge.axis.effects.base import Shape
+from hdbridge.axis.effects.described import Moves
 
 LOGARITHM = 0.7
 RANGE = 0.15

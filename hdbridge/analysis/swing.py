@@ -20,7 +20,7 @@ from hdbridge.analysis.driving import SETTLE_S
 from hdbridge.analysis.hypothesis import Estimator, Fitted
 from hdbridge.analysis.linear import about_zeros
 from hdbridge.analysis.prepared import LEAST_SETTLED, Observed, averaged
-from hdbridge.effects import FloatArray
+from hdbridge.axis.effects import FloatArray
 from hdbridge.units import ARCSEC_PER_DEG
 
 ORDINARY_HZ = 30.0

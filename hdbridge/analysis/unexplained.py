@@ -22,9 +22,9 @@ from hdbridge.analysis.hypothesis import Estimator, Fitted, Hypothesis
 from hdbridge.analysis.linear import Linearised, of_length
 from hdbridge.analysis.scales import Scales
 from hdbridge.analysis.views import coordinates, folds, predicted
-from hdbridge.effects import BoolArray, Effect, FloatArray, Part
-from hdbridge.effects.coordinate import since_reversal
-from hdbridge.effects.kinematics import direction_of
+from hdbridge.axis.effects import BoolArray, Effect, FloatArray, Part
+from hdbridge.axis.effects.coordinate import since_reversal
+from hdbridge.axis.effects.kinematics import direction_of
 
 BINS = {"load angle": (72, 360, 1800), "position": (72, 360, 1800), "time": (25,)}
 """Number of bins per coordinate. Those of angles suit a wide bump, a narrow one and waves of the motor

@@ -15,10 +15,10 @@ import numpy as np
 
 from hdbridge.analysis.gain import FOLDS, STRETCHES
 from hdbridge.analysis.linear import of_number
-from hdbridge.effects import MEASURED, FloatArray, IntArray, Motion
-from hdbridge.effects import coordinate as over
-from hdbridge.effects.coordinate import Coordinate
-from hdbridge.effects.kinematics import direction_of
+from hdbridge.axis.effects import MEASURED, FloatArray, IntArray, Motion
+from hdbridge.axis.effects import coordinate as over
+from hdbridge.axis.effects.coordinate import Coordinate
+from hdbridge.axis.effects.kinematics import direction_of
 
 COARSE: Final = 16
 """Number of time bins, few enough that each has several stretches."""

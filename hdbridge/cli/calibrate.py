@@ -23,7 +23,7 @@ from hdbridge.files.outputs import Kind
 from hdbridge.files.profile import Profile
 
 if TYPE_CHECKING:
-    from hdbridge.calibration import Calibration
+    from hdbridge.commissioning.calibration import Calibration
 
 
 def register(app: typer.Typer) -> None:
@@ -47,10 +47,10 @@ def command(
     Ctrl-C stops the axis, and --resume continues. The model is pending until `hdbridge model commit PROFILE`.
     A model that does not improve on held-out data is not offered.
     """
-    from hdbridge.calibration import calibrate
-    from hdbridge.calibration.motion import motion_test_s
-    from hdbridge.calibration.validation import validation_s
     from hdbridge.cli.measuring import Measurement, phases
+    from hdbridge.commissioning.calibration import calibrate
+    from hdbridge.commissioning.calibration.motion import motion_test_s
+    from hdbridge.commissioning.calibration.validation import validation_s
 
     files, axis = session.files, session.axis
     work = Measurement.asked(axis, plan, out, resume)

@@ -13,8 +13,8 @@ from hdbridge.cli.options import console, print_table, write_result
 from hdbridge.files.profile import Profile
 
 if TYPE_CHECKING:
-    from hdbridge.calibration import Calibration, Stepped, Validation
-    from hdbridge.calibration.result import Offer
+    from hdbridge.commissioning.calibration import Calibration, Stepped, Validation
+    from hdbridge.commissioning.calibration.result import Offer
 
 TAKEN_OFF = 0.95
 """Terms fitted in addition to the model (a delay, load orders) are reported if they reduce the residual to
@@ -24,7 +24,7 @@ this share or less.
 
 def print_calibration(result: Calibration) -> None:
     """Prints parameters with intervals, held-out figures, undetermined parameters and the stepping test."""
-    from hdbridge.model.difference import diff
+    from hdbridge.axis.model.difference import diff
     from hdbridge.units import figure, unit_of, with_interval
 
     fit = result.fit

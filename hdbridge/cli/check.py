@@ -100,13 +100,13 @@ class _Report:
     """Content of one axis's files, for reports."""
 
     def __init__(self, axis: AxisConfig, model: Path | None) -> None:
+        from hdbridge.axis.model import TransmissionModel
+        from hdbridge.commissioning.evaluation.stepping import quantisation_floor_arcsec
         from hdbridge.control.bench import compensation_for
         from hdbridge.control.caps import cap_remark
         from hdbridge.drive.bootplan import left_to_drive, plan, sent_along
         from hdbridge.drive.layout import layouts
-        from hdbridge.evaluation.stepping import quantisation_floor_arcsec
         from hdbridge.files.edsfile import shared_eds
-        from hdbridge.model import TransmissionModel
 
         plan(axis)
         floor = quantisation_floor_arcsec(axis.motor_encoder.counts_per_turn, axis.gear.ratio)

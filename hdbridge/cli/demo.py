@@ -13,7 +13,7 @@ from hdbridge.files.atomic import make_folder, new_folder
 from hdbridge.files.outputs import Kind
 
 if TYPE_CHECKING:
-    from hdbridge.evaluation.comparison import Comparison
+    from hdbridge.commissioning.evaluation.comparison import Comparison
 
 
 def register(app: typer.Typer) -> None:
@@ -36,9 +36,9 @@ def demo(
     in a SYNC-driven loop; the load encoder shows the positioning error. It takes half a minute to two. Table,
     JSON, records and a page go to FOLDER.
     """
+    from hdbridge.axis.model import TransmissionModel
     from hdbridge.cli.step import print_result, run_comparison, write_page
-    from hdbridge.model import TransmissionModel
-    from hdbridge.procedures.stepping import Stepping
+    from hdbridge.motion.procedures.stepping import Stepping
 
     session = Session("article", simulate=True, seed=seed)
     files, axis = session.files, session.axis

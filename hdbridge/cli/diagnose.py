@@ -111,8 +111,8 @@ def run(
     """
     from hdbridge.analysis.diagnosis import diagnose
     from hdbridge.analysis.identifiability import plan_report
-    from hdbridge.model import TransmissionModel
-    from hdbridge.procedures.plan import Plan
+    from hdbridge.axis.model import TransmissionModel
+    from hdbridge.motion.procedures.plan import Plan
     from hdbridge.records.recording import Recording
     from hdbridge.report.diagnosis import diagnosis_page
     from hdbridge.report.page import render

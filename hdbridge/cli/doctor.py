@@ -6,8 +6,6 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from hdbridge.bringup import TORQUE_PERCENT
-from hdbridge.bringup.checks import Outcome
 from hdbridge.cli.interrupt import deferred_interrupt
 from hdbridge.cli.options import (
     JsonOption,
@@ -16,11 +14,13 @@ from hdbridge.cli.options import (
     write_json,
 )
 from hdbridge.cli.session import Session, on_axis
+from hdbridge.commissioning.bringup import TORQUE_PERCENT
+from hdbridge.commissioning.bringup.checks import Outcome
 from hdbridge.errors import DriveError
 
 if TYPE_CHECKING:
-    from hdbridge.bringup.checks import Row
-    from hdbridge.bringup.context import BringUpContext
+    from hdbridge.commissioning.bringup.checks import Row
+    from hdbridge.commissioning.bringup.context import BringUpContext
 
 _MARKS = {
     Outcome.PASS: "[green]pass[/green]        ",
@@ -78,10 +78,10 @@ def doctor(
     failure is a file, 3 when it is the bus. This is not a safety function: the emergency stop must be in
     hardware.
     """
-    from hdbridge.bringup.checks import run_checks
-    from hdbridge.bringup.context import BringUpContext
-    from hdbridge.bringup.doctor import CHECKS
     from hdbridge.cli.servo import SERVO
+    from hdbridge.commissioning.bringup.checks import run_checks
+    from hdbridge.commissioning.bringup.context import BringUpContext
+    from hdbridge.commissioning.bringup.doctor import CHECKS
 
     files = session.files
     refused: list[str] = []

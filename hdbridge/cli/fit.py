@@ -75,9 +75,9 @@ def command(
     A model that is worse on held-out data than the one given by --model, or than none, is not written.
     """
     from hdbridge.axis import AxisConfig
-    from hdbridge.calibration import fit
+    from hdbridge.axis.model import TransmissionModel
     from hdbridge.cli.calibration_output import print_calibration, print_page, write_calibration_page
-    from hdbridge.model import TransmissionModel
+    from hdbridge.commissioning.calibration import fit
 
     config = AxisConfig.load(Profile.find(axis).axis) if axis else None
     loaded = load_recordings(records, columns, units, unwrap)

@@ -198,9 +198,9 @@ class _Fleet:
         memory: str,
     ) -> _Fleet:
         """Checks the options; InputError names the wrong one."""
+        from hdbridge.axis.model import TransmissionModel
         from hdbridge.fleet.dataset import Dataset
         from hdbridge.fleet.engine import Cluster
-        from hdbridge.model import TransmissionModel
 
         need_extra("a fleet needs", _EXTRA, "fleet")
         if out is None:

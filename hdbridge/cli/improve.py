@@ -29,8 +29,8 @@ from hdbridge.files.outputs import Kind
 from hdbridge.files.profile import Profile
 
 if TYPE_CHECKING:
-    from hdbridge.improvement import Improvement
-    from hdbridge.model import TransmissionModel
+    from hdbridge.axis.model import TransmissionModel
+    from hdbridge.commissioning.improvement import Improvement
 
 LEFT_OF_FLOOR = 1.5
 """Ratio of a stepping test to its floor above which a further cause is suspected."""
@@ -80,8 +80,8 @@ def command(
     does not improve positioning. The model is used after `hdbridge model commit PROFILE`.
     """
     from hdbridge.cli.measuring import Measurement, phases
-    from hdbridge.improvement import Source, improve
-    from hdbridge.improvement.trial import trial_s
+    from hdbridge.commissioning.improvement import Source, improve
+    from hdbridge.commissioning.improvement.trial import trial_s
 
     files, axis = session.files, session.axis
     active = _active(files)
@@ -115,7 +115,6 @@ def report(
     result: Improvement, folder: Path, files: Profile, json_file: Path | None, html_file: Path | None
 ) -> None:
     """Writes and prints the result and the next steps."""
-    from hdbridge.calibration.validation import worse_ways
     from hdbridge.cli.calibration_output import (
         print_next,
         print_page,
@@ -124,6 +123,7 @@ def report(
         print_worse,
     )
     from hdbridge.cli.diagnose import print_diagnosis
+    from hdbridge.commissioning.calibration.validation import worse_ways
 
     page = html_file or (folder / "report.html" if folder.is_dir() else None)
     write_json(json_file, result.as_dict())
@@ -182,7 +182,7 @@ def write_page(path: Path, result: Improvement) -> None:
 
 
 def _active(files: Profile) -> TransmissionModel:
-    from hdbridge.model import TransmissionModel
+    from hdbridge.axis.model import TransmissionModel
 
     if not files.model.exists():
         raise InputError(

@@ -41,8 +41,8 @@ def command(
     The axis moves as in a calibration, within the limits of its axis file and without compensation. No model
     is fitted or changed. Ctrl-C stops the axis, and --resume continues.
     """
-    from hdbridge.calibration import measure
     from hdbridge.cli.measuring import Measurement, phases
+    from hdbridge.commissioning.calibration import measure
 
     files, axis = session.files, session.axis
     work = Measurement.asked(axis, plan, out, resume)

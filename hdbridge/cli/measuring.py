@@ -18,10 +18,10 @@ from hdbridge.files.atomic import make_folder, new_folder
 
 if TYPE_CHECKING:
     from hdbridge.axis import AxisConfig
-    from hdbridge.calibration import Journal
     from hdbridge.cli.session import Session
+    from hdbridge.commissioning.calibration import Journal
     from hdbridge.drive.drive import Drive
-    from hdbridge.procedures.plan import Plan
+    from hdbridge.motion.procedures.plan import Plan
 
 PlanOption = Annotated[
     str,
@@ -57,9 +57,9 @@ class Measurement:
 
         Also creates the folder, so that an unwritable location is refused before a drive is connected.
         """
-        from hdbridge.calibration import Journal
-        from hdbridge.calibration.measure import outlook
-        from hdbridge.procedures.plan import Plan
+        from hdbridge.commissioning.calibration import Journal
+        from hdbridge.commissioning.calibration.measure import outlook
+        from hdbridge.motion.procedures.plan import Plan
 
         date = datetime.now().astimezone()
         if resume is None:
@@ -75,7 +75,7 @@ class Measurement:
 
     def announce(self, after: str = "") -> None:
         """Prints what is left of the plan and its duration; ``after`` describes what follows."""
-        from hdbridge.calibration.measure import outlook
+        from hdbridge.commissioning.calibration.measure import outlook
 
         done = self.journal.done if self.journal else ()
         left = outlook(self.plan, self.axis, done)
@@ -90,7 +90,7 @@ class Measurement:
 
     def begun(self, drive: Drive, simulated_seed: int | None) -> Journal:
         """Returns the journal to continue, else a new one for this booted drive."""
-        from hdbridge.calibration import start_journal
+        from hdbridge.commissioning.calibration import start_journal
 
         if self.journal is not None:
             return self.journal
@@ -100,7 +100,7 @@ class Measurement:
     @contextmanager
     def booted(self, session: Session) -> Iterator[tuple[Drive, Callable[[], bool]]]:
         """Yields the booted drive, and locks the axis against other measurements."""
-        from hdbridge.model.store import measuring
+        from hdbridge.axis.model.store import measuring
 
         with _kept_in(self.folder), measuring(session.files.axis), session.booted() as ready:
             yield ready

@@ -11,13 +11,13 @@ import typer
 from rich.markup import escape
 from rich.table import Table
 
+from hdbridge.axis.model import TransmissionModel
+from hdbridge.axis.model.difference import Difference, diff
+from hdbridge.axis.model.store import ACTIVE, MODELS, PENDING, Store, Version
 from hdbridge.cli.options import JsonOption, ProfileArgument, console, print_table, write_json
 from hdbridge.errors import InputError
 from hdbridge.files.profile import Profile
 from hdbridge.files.yamlfile import read_yaml
-from hdbridge.model import TransmissionModel
-from hdbridge.model.difference import Difference, diff
-from hdbridge.model.store import ACTIVE, MODELS, PENDING, Store, Version
 from hdbridge.units import figure, with_interval
 
 ReasonOption = Annotated[str, typer.Option("--reason", help="Why, for the log.")]

@@ -23,7 +23,7 @@ from hdbridge.cli.session import Session, on_axis
 from hdbridge.errors import InputError
 
 if TYPE_CHECKING:
-    from hdbridge.calibration.motion import MotionTest
+    from hdbridge.commissioning.calibration.motion import MotionTest
 
 
 def register(app: typer.Typer) -> None:
@@ -52,10 +52,10 @@ def motion(
 
     Measures the response of the axis to a correction in motion, and compensates for it.
     """
-    from hdbridge.calibration.motion import motion_test, motion_test_s
+    from hdbridge.axis.model import TransmissionModel
+    from hdbridge.axis.model.store import propose as keep
     from hdbridge.cli.measuring import phases
-    from hdbridge.model import TransmissionModel
-    from hdbridge.model.store import propose as keep
+    from hdbridge.commissioning.calibration.motion import motion_test, motion_test_s
 
     files, axis = session.files, session.axis
     chosen = compensating_model(files, session.profile, model)

@@ -25,9 +25,9 @@ from hdbridge.errors import HdbridgeError, InputError
 from hdbridge.files.profile import Profile
 
 if TYPE_CHECKING:
+    from hdbridge.axis.model import TransmissionModel
     from hdbridge.drive.drive import Drive
-    from hdbridge.model import TransmissionModel
-    from hdbridge.procedures.stepping import Standing
+    from hdbridge.motion.procedures.stepping import Standing
 
 KEPT_S = 60.0
 """Duration of the samples kept while the axis holds; s."""
@@ -72,8 +72,8 @@ def move(
     ends the command in good order. Power is then switched off: a suspended load needs a brake.
     """
     from hdbridge.control.bench import Bench, axis_view, compensation_for
-    from hdbridge.procedures.rehearsal import rehearse
-    from hdbridge.procedures.waypoints import Hold, WayPoints
+    from hdbridge.motion.procedures.rehearsal import rehearse
+    from hdbridge.motion.procedures.waypoints import Hold, WayPoints
 
     files, axis = session.files, session.axis
     if not relative:  # refused before anything is connected
@@ -119,7 +119,7 @@ def _tell_where_it_stands(drive: Drive) -> None:
 
 def _model(files: Profile, given: Path | None, ratio: float, *, compensated: bool) -> TransmissionModel:
     """Returns the compensating model; one without effects if there is none or none is wanted."""
-    from hdbridge.model import TransmissionModel
+    from hdbridge.axis.model import TransmissionModel
 
     if not compensated:
         if given is not None:

@@ -13,7 +13,7 @@ from hdbridge.clock import MonotonicClock
 from hdbridge.errors import DriveError, InputError
 
 if TYPE_CHECKING:
-    from hdbridge.bringup.scan import Node
+    from hdbridge.commissioning.bringup.scan import Node
 
 
 class Source(Enum):
@@ -57,7 +57,7 @@ def new(
     Nothing is moved. An existing folder with files in it is refused.
     """
     from hdbridge.axis import AxisConfig
-    from hdbridge.bringup.newprofile import copy_bundled
+    from hdbridge.commissioning.bringup.newprofile import copy_bundled
 
     if source is Source.SCAN:
         written = _scanned(name, interface, channel, bitrate_bps, node_id, eds)
@@ -86,8 +86,8 @@ def _scanned(
     eds: Path | None,
 ) -> list[Path]:
     from hdbridge.axis import BusConfig
-    from hdbridge.bringup.newprofile import write_scanned
-    from hdbridge.bringup.scan import scan_bus
+    from hdbridge.commissioning.bringup.newprofile import write_scanned
+    from hdbridge.commissioning.bringup.scan import scan_bus
     from hdbridge.drive.link import Link, open_bus
 
     if interface is None or channel is None:

@@ -23,8 +23,8 @@ def command(
     html_file: HtmlOption = None,
 ) -> None:
     """Fit a recording again and report the result; needs no axis and moves nothing."""
-    from hdbridge.calibration import concluded
     from hdbridge.cli.calibration_output import print_calibration, print_page, write_calibration_page
+    from hdbridge.commissioning.calibration import concluded
 
     result = concluded(recording)
     page = html_file or recording / "report.html"

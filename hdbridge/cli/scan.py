@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from hdbridge.bringup import ASK_TIMEOUT_S, LISTEN_S
 from hdbridge.cli.options import (
     BorrowOption,
     ChannelOption,
@@ -22,11 +21,12 @@ from hdbridge.cli.options import (
     write_json,
 )
 from hdbridge.cli.session import Session, bare_bus
+from hdbridge.commissioning.bringup import ASK_TIMEOUT_S, LISTEN_S
 from hdbridge.errors import DriveError, InputError
 
 if TYPE_CHECKING:
     from hdbridge.axis import AxisConfig
-    from hdbridge.bringup.scan import Node, Scan
+    from hdbridge.commissioning.bringup.scan import Node, Scan
 
 
 def register(app: typer.Typer) -> None:
@@ -71,8 +71,8 @@ def scan(
     Exit status 4 when no node was found, or when PROFILE's drive is not among them.
     """
     from hdbridge.axis import BusConfig
-    from hdbridge.bringup.match import compare
-    from hdbridge.bringup.scan import scan_bus
+    from hdbridge.commissioning.bringup.match import compare
+    from hdbridge.commissioning.bringup.scan import scan_bus
     from hdbridge.drive.link import Link
 
     axis = None
@@ -106,7 +106,7 @@ def scan(
 
 
 def _print(name: str, found: Scan) -> None:
-    from hdbridge.bringup.match import axis_lines
+    from hdbridge.commissioning.bringup.match import axis_lines
 
     count = len(found.nodes)
     console.print(f"{name}: {count} node{'' if count == 1 else 's'}", soft_wrap=True)
@@ -156,7 +156,7 @@ def _judge(name: str, found: Scan, axis: AxisConfig | None, matches: bool) -> No
 
 
 def _as_dict(name: str, found: Scan) -> dict[str, Any]:
-    from hdbridge.bringup.match import axis_lines
+    from hdbridge.commissioning.bringup.match import axis_lines
 
     return {
         "schema": "hdbridge.scan/1",

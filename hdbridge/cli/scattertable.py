@@ -10,7 +10,7 @@ from rich.table import Table
 from hdbridge.cli.options import print_table
 
 if TYPE_CHECKING:
-    from hdbridge.evaluation.stepping import Scatter
+    from hdbridge.commissioning.evaluation.stepping import Scatter
 
 
 def print_scatter(

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import Final
 
-from hdbridge.bringup.checks import Check, Verdict, failed, not_possible, passed
-from hdbridge.bringup.context import BringUpContext
-from hdbridge.calibration.motion import servo_check
-from hdbridge.model import TransmissionModel
+from hdbridge.axis.model import TransmissionModel
+from hdbridge.commissioning.bringup.checks import Check, Verdict, failed, not_possible, passed
+from hdbridge.commissioning.bringup.context import BringUpContext
+from hdbridge.commissioning.calibration.motion import servo_check
 
 
 def as_measured(context: BringUpContext) -> Verdict:

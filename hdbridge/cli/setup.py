@@ -198,7 +198,7 @@ class _Setup:
         """Compares the new model with the previous one and makes it the active one."""
         if self._is_done("commit"):
             return
-        from hdbridge.model.store import MODELS, PENDING
+        from hdbridge.axis.model.store import MODELS, PENDING
 
         if PENDING not in {each.name for each in MODELS.log(self._folder)}:
             recording = self._folder / RECORDING

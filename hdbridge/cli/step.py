@@ -22,17 +22,17 @@ from hdbridge.cli.options import (
     write_result,
 )
 from hdbridge.cli.session import Session, on_axis
+from hdbridge.commissioning.evaluation.stepping import Scheme
 from hdbridge.errors import InputError
-from hdbridge.evaluation.stepping import Scheme
 from hdbridge.files.atomic import make_folder
 from hdbridge.files.outputs import Kind, writing
 
 if TYPE_CHECKING:
     from hdbridge.axis import AxisConfig
+    from hdbridge.axis.model import TransmissionModel
+    from hdbridge.commissioning.evaluation.comparison import Comparison
     from hdbridge.control.bench import Run
-    from hdbridge.evaluation.comparison import Comparison
-    from hdbridge.model import TransmissionModel
-    from hdbridge.procedures.stepping import Stepping, SteppingOutcome
+    from hdbridge.motion.procedures.stepping import Stepping, SteppingOutcome
     from hdbridge.records.record import Record
 
 
@@ -68,10 +68,10 @@ def step(
 
     Uses the article's four schemes, and the whole model if it has more than their two parts.
     """
+    from hdbridge.axis.model import TransmissionModel
     from hdbridge.control.bench import axis_view
-    from hdbridge.model import TransmissionModel
-    from hdbridge.procedures.rehearsal import rehearse
-    from hdbridge.procedures.stepping import Stepping
+    from hdbridge.motion.procedures.rehearsal import rehearse
+    from hdbridge.motion.procedures.stepping import Stepping
 
     files, axis = session.files, session.axis
     stepping = Stepping(count=count, step_deg=step_deg, start_deg=start_deg)
@@ -110,9 +110,9 @@ def run_comparison(
 
     ``tell`` receives the result, also of an interrupted test: then that of the completed schemes.
     """
+    from hdbridge.commissioning.evaluation.comparison import compare_schemes
     from hdbridge.control.bench import compensation_for
     from hdbridge.control.caps import cap_remark
-    from hdbridge.evaluation.comparison import compare_schemes
 
     axis = session.axis
     offered = Scheme.offered_by(model)
@@ -179,7 +179,7 @@ def _told_when_stopped(
     axis: AxisConfig, done: dict[Scheme, Run[SteppingOutcome]], tell: Callable[[Comparison], None]
 ) -> Iterator[None]:
     """Reports the results of the completed schemes if a test is interrupted."""
-    from hdbridge.evaluation.comparison import Comparison
+    from hdbridge.commissioning.evaluation.comparison import Comparison
 
     try:
         yield

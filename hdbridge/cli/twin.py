@@ -132,7 +132,7 @@ def _learned(
     """Fits, and keeps the twin as pending if it is better on held-out legs."""
     from datetime import datetime
 
-    from hdbridge.model.store import measuring
+    from hdbridge.axis.model.store import measuring
     from hdbridge.report.page import Command, Status
     from hdbridge.report.twin import TwinReport
     from hdbridge.twin.twin import TWINS, KeptTwin, fit_twin, judge
@@ -265,7 +265,7 @@ def _beginning(files: Profile, axis: AxisConfig, truth: Path | None, *, afresh: 
     """Returns the initial simulation: the profile's plant, with the transmission error of the
     active model.
     """
-    from hdbridge.model import TransmissionModel
+    from hdbridge.axis.model import TransmissionModel
     from hdbridge.sim.truth import Truth
     from hdbridge.twin.translate import translate
 

@@ -16,6 +16,8 @@ import numpy as np
 
 from hdbridge.axis import AxisConfig
 from hdbridge.axis.channels import BY_KEY
+from hdbridge.axis.effects import Channel, Moment, Observer, compensable, unmet
+from hdbridge.axis.model import TransmissionModel
 from hdbridge.control.compensation import Compensation, CompensationLimits
 from hdbridge.control.cycle import Cycle, Feedback
 from hdbridge.control.realtime import resumed_realtime
@@ -28,11 +30,9 @@ from hdbridge.drive.objects import TORQUE_ACTUAL
 from hdbridge.drive.states import State
 from hdbridge.drive.supervision import Supervision
 from hdbridge.drive.switching import ENABLE_TIMEOUT_S, STANDING, STOP_TIMEOUT_S, until_enabled
-from hdbridge.effects import Channel, Moment, Observer, compensable, unmet
 from hdbridge.errors import DriveError, HdbridgeError, InputError, SafetyStop
-from hdbridge.model import TransmissionModel
-from hdbridge.procedures.moves import AxisView, MotionLimits, Move, Path, Procedure, Sample
-from hdbridge.procedures.rehearsal import Rehearsal, rehearse
+from hdbridge.motion.procedures.moves import AxisView, MotionLimits, Move, Path, Procedure, Sample
+from hdbridge.motion.procedures.rehearsal import Rehearsal, rehearse
 from hdbridge.records.record import Record
 from hdbridge.records.recording import Recording, Segment, versions_here
 

@@ -31,7 +31,7 @@ from hdbridge.drive.pdo import PdoCodec, PdoLengthError
 from hdbridge.drive.states import State
 from hdbridge.errors import InputError
 from hdbridge.files.expectation import one_line
-from hdbridge.procedures.moves import Sample
+from hdbridge.motion.procedures.moves import Sample
 from hdbridge.records.record import Record, concatenate
 from hdbridge.records.recording import GAP_CYCLES, PART_SAMPLES, Recording
 

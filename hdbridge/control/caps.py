@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 
 from hdbridge.axis import AxisConfig
-from hdbridge.effects import Motion, compensable
-from hdbridge.effects.base import MEASURED
-from hdbridge.model import TransmissionModel
+from hdbridge.axis.effects import Motion, compensable
+from hdbridge.axis.effects.base import MEASURED
+from hdbridge.axis.model import TransmissionModel
 
 _POINTS = 20_000
 """Maximum number of points per direction: every second motor degree over 800 load degrees at a ratio of

@@ -27,12 +27,12 @@ import math
 from collections import deque
 from dataclasses import dataclass, replace
 
+from hdbridge.axis.effects import Channel, Effect, Moment, Start, Tracker, compensable, fall_bound
+from hdbridge.axis.effects.base import MEASURED, Level, Memoryless
+from hdbridge.axis.model import ModelTracker, TransmissionModel
+from hdbridge.axis.model.response import LeadFilter, Response
 from hdbridge.control.prefilter import Prefilter
-from hdbridge.effects import Channel, Effect, Moment, Start, Tracker, compensable, fall_bound
-from hdbridge.effects.base import MEASURED, Level, Memoryless
 from hdbridge.errors import InputError
-from hdbridge.model import ModelTracker, TransmissionModel
-from hdbridge.model.response import LeadFilter, Response
 from hdbridge.units import ARCSEC_PER_DEG
 
 _TOLERANCE_ARCSEC = 5e-7

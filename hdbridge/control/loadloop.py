@@ -23,9 +23,9 @@ from __future__ import annotations
 import math
 from typing import Final
 
-from hdbridge.effects import Moment, Start
+from hdbridge.axis.effects import Moment, Start
+from hdbridge.axis.model import TransmissionModel
 from hdbridge.errors import InputError
-from hdbridge.model import TransmissionModel
 
 SETTLED_S: Final = 0.3
 """Settling time of the load: time at rest before the loop acts."""

@@ -13,8 +13,8 @@ from collections.abc import Callable
 from itertools import repeat
 from operator import mul
 
-from hdbridge.effects import Channel, Moment
-from hdbridge.model.response import LeadFilter
+from hdbridge.axis.effects import Channel, Moment
+from hdbridge.axis.model.response import LeadFilter
 
 _VARYING = frozenset({Channel.SPEED, Channel.LOAD_ANGLE})
 

@@ -14,7 +14,7 @@ from hdbridge.control.bench import Bench, Run
 from hdbridge.control.compensation import Compensation
 from hdbridge.control.survived import Survived
 from hdbridge.drive.drive import Drive
-from hdbridge.procedures.moves import Procedure
+from hdbridge.motion.procedures.moves import Procedure
 from hdbridge.records.record import Record
 from hdbridge.records.recording import Segment
 

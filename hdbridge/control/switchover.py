@@ -12,10 +12,10 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 
+from hdbridge.axis.effects import Channel, Moment
+from hdbridge.axis.model import TransmissionModel
 from hdbridge.control.compensation import Compensation
-from hdbridge.effects import Channel, Moment
 from hdbridge.errors import InputError
-from hdbridge.model import TransmissionModel
 from hdbridge.units import ARCSEC_PER_DEG
 
 _NOWHERE = Moment()

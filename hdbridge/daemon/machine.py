@@ -13,6 +13,8 @@ from pathlib import Path
 from typing import Self
 
 from hdbridge.axis import AxisConfig, BusConfig, RealtimeConfig
+from hdbridge.axis.model import TransmissionModel
+from hdbridge.commissioning.evaluation.stepping import Scheme
 from hdbridge.control.bench import compensation_for
 from hdbridge.daemon.following.settings import AdaptationSettings
 from hdbridge.daemon.machinechecks import (
@@ -34,11 +36,9 @@ from hdbridge.daemon.machinefile import (
 from hdbridge.daemon.recorder.settings import RecorderSettings
 from hdbridge.drive import plan
 from hdbridge.errors import InputError
-from hdbridge.evaluation.stepping import Scheme
 from hdbridge.files.bundled import bundled_folder
 from hdbridge.files.profile import Profile
 from hdbridge.files.yamlfile import Document, read_yaml
-from hdbridge.model import TransmissionModel
 
 
 def machine_file(text: str) -> Path | None:

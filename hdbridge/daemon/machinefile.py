@@ -13,10 +13,10 @@ from typing import Annotated, Literal
 from pydantic import Field
 
 from hdbridge.axis import BusConfig, RealtimeConfig
+from hdbridge.commissioning.evaluation.stepping import Scheme
 from hdbridge.daemon.following.settings import AdaptationSettings, Mode
 from hdbridge.daemon.memory.layout import AXES_AT_MOST
 from hdbridge.daemon.recorder.settings import RecorderSettings
-from hdbridge.evaluation.stepping import Scheme
 from hdbridge.strictness import Strict
 
 NAME = r"^[A-Za-z0-9][A-Za-z0-9._-]*$"

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Self
 
+from hdbridge.axis.model import TransmissionModel
+from hdbridge.commissioning.evaluation.stepping import Scheme
 from hdbridge.control.bench import compensation_for
 from hdbridge.control.compensation import Compensation
 from hdbridge.errors import InputError
-from hdbridge.evaluation.stepping import Scheme
-from hdbridge.model import TransmissionModel
 
 if TYPE_CHECKING:
     from hdbridge.axis import AxisConfig

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from hdbridge import __version__
-from hdbridge.effects import FloatArray
+from hdbridge.axis.effects import FloatArray
 from hdbridge.errors import HdbridgeError, InputError
 from hdbridge.files.expectation import one_line
 from hdbridge.fleet.sources import BUS_LOGS, NotFetchedError, Source, fetched
@@ -52,7 +52,7 @@ class Model:
 @cache
 def model_in(text: str, where: str) -> Model:
     """Checks the text of a model file; an invalid one returns a `Model` with the reason."""
-    from hdbridge.model import TransmissionModel
+    from hdbridge.axis.model import TransmissionModel
 
     try:
         document = TransmissionModel.from_text(text, where).document()
@@ -64,7 +64,7 @@ def model_in(text: str, where: str) -> Model:
 
 def fitted(sources: Sequence[Source], where: str) -> Model:
     """Fits the model of a joint to the first usable one of its recordings."""
-    from hdbridge.calibration import fit
+    from hdbridge.commissioning.calibration import fit
 
     reasons = []
     for source in sources:
@@ -122,7 +122,7 @@ def diagnosed(source: Source, model: Model, known: str = "") -> Row:
         row["date"] = row["date"] or recording.date
         if model.reason:
             raise InputError(model.reason)
-        from hdbridge.model import TransmissionModel
+        from hdbridge.axis.model import TransmissionModel
 
         used = TransmissionModel.from_text(model.text, model.where or "model.yaml")
         ratio = source.ratio or recording.ratio or used.ratio

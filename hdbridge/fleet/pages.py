@@ -38,7 +38,7 @@ def write_page(folder: Path, row: Row) -> None:
     InputError if recording or model are not there any more.
     """
     from hdbridge.analysis.diagnosis import diagnose
-    from hdbridge.model import TransmissionModel
+    from hdbridge.axis.model import TransmissionModel
     from hdbridge.report.diagnosis import diagnosis_page
     from hdbridge.report.page import render
 

@@ -17,7 +17,7 @@ from scipy.special import expit, logit
 
 from hdbridge.analysis.intervals import NORMAL_95
 from hdbridge.analysis.probability import Prior
-from hdbridge.effects import CATALOGUE
+from hdbridge.axis.effects import CATALOGUE
 from hdbridge.errors import InputError
 from hdbridge.files.atomic import write_atomically
 from hdbridge.files.expectation import nearest

@@ -19,7 +19,7 @@ from scipy.special import betaln, chdtri, expit, logsumexp, ndtr, ndtri
 
 from hdbridge.analysis.intervals import NORMAL_95
 from hdbridge.analysis.readings import median_deviation
-from hdbridge.effects import FloatArray, IntArray
+from hdbridge.axis.effects import FloatArray, IntArray
 
 Complexes = NDArray[np.complex128]
 OUTLIERS_FROM: Final = 8

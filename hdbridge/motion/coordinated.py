@@ -21,11 +21,11 @@ from typing import NamedTuple
 import numpy as np
 from ruckig import InputParameter, Ruckig, RuckigError, Synchronization, Trajectory
 
-from hdbridge.effects import FloatArray
+from hdbridge.axis.effects import FloatArray
 from hdbridge.errors import InputError
 from hdbridge.motion.generator import SHARES, SOLVED
+from hdbridge.motion.procedures.moves import MotionLimits
 from hdbridge.motion.stream import ACCELERATION_MARGIN
-from hdbridge.procedures.moves import MotionLimits
 
 _STRAIGHT = 1e-9
 """Maximum difference of two unit direction vectors that count as equal."""

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 from ruckig import ControlInterface, InputParameter, Result, Ruckig, RuckigError, Trajectory
 
-from hdbridge.procedures.moves import MotionLimits
+from hdbridge.motion.procedures.moves import MotionLimits
 
 SOLVED = frozenset({Result.Working, Result.Finished})
 SHARES = (1.0, 1.0 - 1e-6)

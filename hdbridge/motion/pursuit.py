@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from hdbridge.motion.generator import Bounds, Kinematics
-from hdbridge.procedures.moves import MotionLimits
+from hdbridge.motion.procedures.moves import MotionLimits
 
 _ROUNDING = 1e-6
 

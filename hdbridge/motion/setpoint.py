@@ -15,9 +15,9 @@ import math
 from hdbridge.errors import InputError
 from hdbridge.motion.generator import Bounds, Generator, Kinematics, Plan
 from hdbridge.motion.modes import MotionMode
+from hdbridge.motion.procedures.moves import MotionLimits
 from hdbridge.motion.pursuit import Pursuit
 from hdbridge.motion.stream import Cubic, Stream
-from hdbridge.procedures.moves import MotionLimits
 
 MOST_TIMEOUT_S = 60.0
 """Maximum time-out of a dead man's control; s."""

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 from hdbridge.errors import InputError
 from hdbridge.motion.generator import Bounds, Kinematics
-from hdbridge.procedures.moves import MotionLimits
+from hdbridge.motion.procedures.moves import MotionLimits
 
 MOST_KNOTS = 8192
 """Maximum number of waiting knots; a further one is refused."""

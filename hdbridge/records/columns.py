@@ -16,8 +16,8 @@ from typing import Final, NamedTuple, Self
 
 import numpy as np
 
-from hdbridge.effects import FloatArray
-from hdbridge.effects.base import MEASURED
+from hdbridge.axis.effects import FloatArray
+from hdbridge.axis.effects.base import MEASURED
 from hdbridge.errors import InputError
 from hdbridge.files.csvfile import Column, CsvFile
 from hdbridge.files.expectation import nearest, one_line

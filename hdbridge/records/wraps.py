@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 
-from hdbridge.effects import FloatArray
+from hdbridge.axis.effects import FloatArray
 from hdbridge.records.columns import Unit
 from hdbridge.units import ARCSEC_PER_DEG, DEG_PER_TURN
 

@@ -7,8 +7,8 @@ from typing import Final
 
 import numpy as np
 
-from hdbridge.effects import BoolArray, FloatArray, IntArray
-from hdbridge.effects.coordinate import Coordinate
+from hdbridge.axis.effects import BoolArray, FloatArray, IntArray
+from hdbridge.axis.effects.coordinate import Coordinate
 
 LEAST_IN_BIN: Final = 3
 """Minimum number of points per bin; emptier bins are not shown."""

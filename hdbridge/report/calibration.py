@@ -11,9 +11,9 @@ import numpy as np
 
 from hdbridge import __version__
 from hdbridge.analysis.identification import Traces
-from hdbridge.calibration import Calibration
-from hdbridge.effects import FloatArray
-from hdbridge.model.difference import diff
+from hdbridge.axis.effects import FloatArray
+from hdbridge.axis.model.difference import diff
+from hdbridge.commissioning.calibration import Calibration
 from hdbridge.report.motion import motion_sections
 from hdbridge.report.page import (
     Block,

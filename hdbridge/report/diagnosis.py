@@ -9,9 +9,9 @@ from hdbridge import __version__
 from hdbridge.analysis.capability import certainty
 from hdbridge.analysis.findings import UNEXPLAINED, Diagnosis, Finding
 from hdbridge.analysis.views import ResidualViews
-from hdbridge.calibration.result import Offer
-from hdbridge.calibration.validation import Validation
-from hdbridge.effects import CATALOGUE
+from hdbridge.axis.effects import CATALOGUE
+from hdbridge.commissioning.calibration.result import Offer
+from hdbridge.commissioning.calibration.validation import Validation
 from hdbridge.report.page import Block, Command, Facts, Grid, Heading, Page, Section, Status, Table
 from hdbridge.report.partial_residuals import partial_residual
 from hdbridge.report.residuals import beside_charts, partial_residual_chart, residual_charts

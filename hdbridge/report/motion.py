@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 
 from hdbridge import __version__
-from hdbridge.calibration.motion import MotionTest, Ripple
-from hdbridge.model.response import Response
+from hdbridge.axis.model.response import Response
+from hdbridge.commissioning.calibration.motion import MotionTest, Ripple
 from hdbridge.report.page import Chart, Grid, Mark, Page, Section, Series, Table
 
 

@@ -22,7 +22,7 @@ import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined, Template
 from markupsafe import Markup
 
-from hdbridge.effects import FloatArray
+from hdbridge.axis.effects import FloatArray
 
 POINTS_MAXIMUM: Final = 4000
 """Maximum points of one series in a page; longer ones are thinned to keep a page below a megabyte."""

@@ -14,9 +14,9 @@ import numpy as np
 
 from hdbridge.analysis.findings import Diagnosis, Finding, Traces
 from hdbridge.analysis.views import coordinates
-from hdbridge.effects import CATALOGUE, BoolArray, Effect, FloatArray, Part
-from hdbridge.effects.coordinate import Coordinate, time
-from hdbridge.model import TransmissionModel
+from hdbridge.axis.effects import CATALOGUE, BoolArray, Effect, FloatArray, Part
+from hdbridge.axis.effects.coordinate import Coordinate, time
+from hdbridge.axis.model import TransmissionModel
 
 LEAST_POINTS: Final = 200
 """Minimum number of points that show a finding alone; with fewer, all points are drawn."""

@@ -10,8 +10,8 @@ import numpy as np
 
 from hdbridge.analysis.findings import Traces
 from hdbridge.analysis.views import ResidualViews
-from hdbridge.effects import BoolArray, FloatArray
-from hdbridge.effects.coordinate import Coordinate, Spacing
+from hdbridge.axis.effects import BoolArray, FloatArray
+from hdbridge.axis.effects.coordinate import Coordinate, Spacing
 from hdbridge.report.bins import binned
 from hdbridge.report.page import Chart, Mark, Series, histogram, sampled, thinned
 from hdbridge.report.partial_residuals import PartialResidual, Strength

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from typing import Final
 
 from hdbridge import __version__
-from hdbridge.evaluation.stepping import Scheme, SchemeResult
+from hdbridge.commissioning.evaluation.stepping import Scheme, SchemeResult
 from hdbridge.report.page import (
     Chart,
     Facts,

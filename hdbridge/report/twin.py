@@ -12,7 +12,7 @@ from typing import Final
 import numpy as np
 
 from hdbridge import __version__
-from hdbridge.effects import FloatArray
+from hdbridge.axis.effects import FloatArray
 from hdbridge.report.page import (
     Block,
     Chart,

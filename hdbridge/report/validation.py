@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Final
 
-from hdbridge.calibration.validation import Validation
+from hdbridge.commissioning.calibration.validation import Validation
 from hdbridge.report.page import Block, Chart, Grid, Heading, Mark, Section, Series, Table, histogram
 from hdbridge.report.words import SCATTER, SIGMA
 

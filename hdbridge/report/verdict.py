@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from hdbridge.calibration.result import Offer
+from hdbridge.commissioning.calibration.result import Offer
 from hdbridge.report.page import Command, Status
 
 

@@ -20,7 +20,7 @@ from scipy.special import chdtrc
 from hdbridge.analysis.intervals import NORMAL_95
 from hdbridge.analysis.readings import median_deviation
 from hdbridge.axis import AxisConfig
-from hdbridge.effects import FloatArray
+from hdbridge.axis.effects import FloatArray
 from hdbridge.errors import InputError
 from hdbridge.records.recording import Recording
 from hdbridge.sim.truth import Truth

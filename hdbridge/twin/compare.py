@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hdbridge.analysis.readings import third_deviation
-from hdbridge.effects import Channel, FloatArray
+from hdbridge.axis.effects import Channel, FloatArray
 from hdbridge.errors import InputError
 from hdbridge.records.record import Record
 from hdbridge.records.recording import Segment

@@ -23,7 +23,7 @@ from scipy.optimize import brentq, least_squares
 from hdbridge.analysis.intervals import NORMAL_95
 from hdbridge.analysis.linear import counted as numbered
 from hdbridge.analysis.linear import sums
-from hdbridge.effects import FloatArray
+from hdbridge.axis.effects import FloatArray
 from hdbridge.sim.hysteresis_laws import law_of
 from hdbridge.sim.truth import Truth
 from hdbridge.sim.truth.hysteresis import Hysteresis, MaxwellSlip

@@ -26,7 +26,7 @@ from scipy.special import log_ndtr, ndtr
 
 from hdbridge.analysis.readings import median_deviation
 from hdbridge.axis import AxisConfig
-from hdbridge.effects import FloatArray
+from hdbridge.axis.effects import FloatArray
 from hdbridge.records.record import Record
 from hdbridge.records.recording import Recording, Segment
 from hdbridge.sim.truth import Truth

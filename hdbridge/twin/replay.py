@@ -23,7 +23,7 @@ from ruckig import InputParameter, Result, Ruckig, Trajectory
 
 from hdbridge.axis import AxisConfig
 from hdbridge.axis.channels import BY_KEY
-from hdbridge.effects import Channel, FloatArray
+from hdbridge.axis.effects import Channel, FloatArray
 from hdbridge.errors import InputError
 from hdbridge.records.record import Record, concatenate
 from hdbridge.records.recording import Recording, Segment

@@ -16,7 +16,7 @@ from typing import Final
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
-from hdbridge.effects import FloatArray
+from hdbridge.axis.effects import FloatArray
 from hdbridge.sim.truth import Truth
 from hdbridge.sim.truth.motor import TrueResponse
 from hdbridge.twin.fit import Fitted

@@ -21,7 +21,7 @@ from scipy.special import chdtrc
 
 from hdbridge.analysis.intervals import NORMAL_95
 from hdbridge.axis import AxisConfig
-from hdbridge.effects import Channel, FloatArray
+from hdbridge.axis.effects import Channel, FloatArray
 from hdbridge.records.recording import Recording
 from hdbridge.sim.truth import Truth
 from hdbridge.twin.compare import least_change

@@ -21,7 +21,7 @@ import numpy as np
 from pydantic import ValidationError
 
 from hdbridge.axis import AxisConfig
-from hdbridge.effects import (
+from hdbridge.axis.effects import (
     CATALOGUE,
     AmplitudeDrift,
     Backlash,
@@ -51,12 +51,12 @@ from hdbridge.effects import (
     Wear,
     ZeroDrift,
 )
-from hdbridge.effects.base import FloatArray
-from hdbridge.effects.direction_phase import STEEPEST
-from hdbridge.effects.elastic_loop import rise
-from hdbridge.effects.warmth import Warmed
+from hdbridge.axis.effects.base import FloatArray
+from hdbridge.axis.effects.direction_phase import STEEPEST
+from hdbridge.axis.effects.elastic_loop import rise
+from hdbridge.axis.effects.warmth import Warmed
+from hdbridge.axis.model import TransmissionModel
 from hdbridge.errors import InputError
-from hdbridge.model import TransmissionModel
 from hdbridge.sim.truth import Truth
 from hdbridge.sim.truth.resonance import Resonance
 from hdbridge.twin.parameters import RESOLVED, default_truth

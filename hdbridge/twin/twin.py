@@ -18,13 +18,13 @@ from pathlib import Path
 from typing import Any, Final, Self
 
 from hdbridge.axis import AxisConfig, Identity
+from hdbridge.axis.model.binding import binding, check_binding
+from hdbridge.axis.model.difference import Difference, flat
+from hdbridge.axis.model.file import Provenance
+from hdbridge.axis.model.store import Store
 from hdbridge.errors import InputError
 from hdbridge.files.profile import TWIN_NAME
 from hdbridge.files.yamlfile import Hex, Line, dump_yaml, write_atomically
-from hdbridge.model.binding import binding, check_binding
-from hdbridge.model.difference import Difference, flat
-from hdbridge.model.file import Provenance
-from hdbridge.model.store import Store
 from hdbridge.records.record import WRONG_RATIO
 from hdbridge.records.recording import Recording, versions_here
 from hdbridge.sim.truth import Truth

@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from hdbridge.commissioning.evaluation.accuracy import axis_accuracy
 from hdbridge.errors import InputError
-from hdbridge.evaluation.accuracy import axis_accuracy
 
 # Two targets, two runs each way; standard deviations of a pair are |difference| / sqrt(2).
 #              target 0           target 90

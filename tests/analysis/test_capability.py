@@ -11,11 +11,11 @@ from hypothesis import strategies as st
 
 from hdbridge.analysis.capability import Capability, certainty
 from hdbridge.analysis.identifiability import examined
-from hdbridge.effects import CATALOGUE, Channel, Motion, causes
-from hdbridge.effects.hysteresis import Hysteresis
-from hdbridge.effects.orders import MotorOrder
-from hdbridge.effects.synchronous import Synchronous
-from hdbridge.model import TransmissionModel
+from hdbridge.axis.effects import CATALOGUE, Channel, Motion, causes
+from hdbridge.axis.effects.hysteresis import Hysteresis
+from hdbridge.axis.effects.orders import MotorOrder
+from hdbridge.axis.effects.synchronous import Synchronous
+from hdbridge.axis.model import TransmissionModel
 from hdbridge.records.record import Record
 
 RATIO = 50.0

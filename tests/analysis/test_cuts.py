@@ -7,8 +7,8 @@ import pytest
 
 from hdbridge.analysis.cuts import observed
 from hdbridge.analysis.diagnosis import diagnose
-from hdbridge.calibration import identify
-from hdbridge.model import TransmissionModel
+from hdbridge.axis.model import TransmissionModel
+from hdbridge.commissioning.calibration import identify
 from hdbridge.records.record import Record, concatenate
 from hdbridge.records.recording import Recording
 

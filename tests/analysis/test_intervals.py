@@ -9,7 +9,7 @@ import pytest
 
 from hdbridge.analysis.intervals import half_widths, leaves
 from hdbridge.analysis.linear import Column
-from hdbridge.effects import MotorOrder, Synchronous
+from hdbridge.axis.effects import MotorOrder, Synchronous
 
 DRAWS = 4000
 COLUMNS = (Column(0, "0"), Column(0, "1"))

@@ -9,15 +9,16 @@ from pathlib import Path
 import pytest
 
 import hdbridge
-from hdbridge.effects import CATALOGUE
+from hdbridge.axis.effects import CATALOGUE
 
-ROOMS = ("analysis",)
-FILES = sorted(path for room in ROOMS for path in (Path(hdbridge.__path__[0]) / room).glob("*.py"))
+EFFECTS = "hdbridge.axis.effects"
+
+FILES = sorted((Path(hdbridge.__path__[0]) / "analysis").glob("*.py"))
 CLASSES = {kind.__name__ for kind in CATALOGUE.values()} | {
     base.__name__
     for kind in CATALOGUE.values()
     for base in kind.__mro__
-    if base.__module__.startswith("hdbridge.effects.") and base.__module__ != "hdbridge.effects.base"
+    if base.__module__.startswith(f"{EFFECTS}.") and base.__module__ != f"{EFFECTS}.base"
 }
 
 

@@ -17,8 +17,8 @@ from hdbridge.analysis.linear import Effort, Terms
 from hdbridge.analysis.noise import NoiseModel, Precision
 from hdbridge.analysis.nuisances import nuisances_of
 from hdbridge.analysis.separable import Separable
-from hdbridge.effects import Channel, Effect, FloatArray, Hysteresis, Start, Synchronous
-from hdbridge.effects.orders import MotorOrder
+from hdbridge.axis.effects import Channel, Effect, FloatArray, Hysteresis, Start, Synchronous
+from hdbridge.axis.effects.orders import MotorOrder
 from hdbridge.records.record import Record
 
 RATIO = plant.RATIO

@@ -11,7 +11,7 @@ from scipy.optimize import least_squares
 from hdbridge.analysis.linear import FREE, Nuisances, Prior, Terms
 from hdbridge.analysis.noise import White
 from hdbridge.analysis.separable import Separable
-from hdbridge.effects import (
+from hdbridge.axis.effects import (
     Creep,
     DirectionPhase,
     Effect,
@@ -21,8 +21,8 @@ from hdbridge.effects import (
     Start,
     Synchronous,
 )
-from hdbridge.effects.creep import Relaxation
-from hdbridge.effects.orders import MotorOrder
+from hdbridge.axis.effects.creep import Relaxation
+from hdbridge.axis.effects.orders import MotorOrder
 
 TIME_S = np.arange(0.0, 120.0, 0.05)
 MOTION = Motion(400.0 * np.sin(0.11 * TIME_S) + 60.0 * np.sin(0.9 * TIME_S), TIME_S)

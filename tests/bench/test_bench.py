@@ -6,17 +6,17 @@ import numpy as np
 import pytest
 
 from hdbridge.axis import AxisConfig
+from hdbridge.axis.model import TransmissionModel
+from hdbridge.commissioning.evaluation.comparison import compare_schemes
+from hdbridge.commissioning.evaluation.stepping import Scheme
 from hdbridge.control.bench import Bench, compensation_for
 from hdbridge.drive import State
 from hdbridge.drive.drive import Drive
 from hdbridge.drive.supervision import Fault
 from hdbridge.errors import InputError, SafetyStop
-from hdbridge.evaluation.comparison import compare_schemes
-from hdbridge.evaluation.stepping import Scheme
-from hdbridge.model import TransmissionModel
-from hdbridge.procedures.moves import Dwell, MoveTo
-from hdbridge.procedures.sine import Sines
-from hdbridge.procedures.stepping import Stepping
+from hdbridge.motion.procedures.moves import Dwell, MoveTo
+from hdbridge.motion.procedures.sine import Sines
+from hdbridge.motion.procedures.stepping import Stepping
 from hdbridge.sim.lockstep import simulated_bench
 
 PROFILE = Path(__file__).parents[2] / "profiles" / "article"

@@ -9,15 +9,15 @@ import pytest
 from support.two_channels import CHANNELS, resumes, stops
 
 from hdbridge.axis import AxisConfig
+from hdbridge.axis.effects import AmplitudeDrift, Compliance, TorqueModulation
+from hdbridge.axis.model import TransmissionModel
+from hdbridge.commissioning.evaluation.stepping import SchemeResult, quantisation_floor_arcsec
 from hdbridge.control.bench import Bench, compensation_for
 from hdbridge.drive.drive import Drive
 from hdbridge.drive.supervision import Fault
-from hdbridge.effects import AmplitudeDrift, Compliance, TorqueModulation
 from hdbridge.errors import DriveError, InputError, SdoError
-from hdbridge.evaluation.stepping import SchemeResult, quantisation_floor_arcsec
-from hdbridge.model import TransmissionModel
-from hdbridge.procedures.moves import Dwell, MoveTo
-from hdbridge.procedures.stepping import Stepping
+from hdbridge.motion.procedures.moves import Dwell, MoveTo
+from hdbridge.motion.procedures.stepping import Stepping
 from hdbridge.sim.lockstep import simulated_bench
 from hdbridge.sim.truth import Truth
 

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from hdbridge.axis import AxisConfig
+from hdbridge.axis.effects import Hysteresis
+from hdbridge.axis.model import TransmissionModel
 from hdbridge.control.bench import Bench
 from hdbridge.control.compensation import Compensation, CompensationLimits
 from hdbridge.control.loadloop import LoadLoop
 from hdbridge.drive.drive import Drive
-from hdbridge.effects import Hysteresis
-from hdbridge.model import TransmissionModel
-from hdbridge.procedures.moves import Dwell, MoveTo
+from hdbridge.motion.procedures.moves import Dwell, MoveTo
 from hdbridge.sim.lockstep import simulated_bench
 
 PROFILE = Path(__file__).parents[2] / "profiles" / "article"

@@ -19,12 +19,12 @@ from hdbridge.axis import AxisConfig
 from hdbridge.axis.channels import BY_KEY
 from hdbridge.control.bench import Bench, compensation_for
 from hdbridge.drive.drive import Drive
-from hdbridge.effects import Channel
-from hdbridge.effects.base import Compensable, Linear, Memoryless, SLOT
+from hdbridge.axis.effects import Channel
+from hdbridge.axis.effects.base import Compensable, Linear, Memoryless, SLOT
 from hdbridge.errors import InputError
 from hdbridge.files.bundled import bundled_profile
-from hdbridge.model import TransmissionModel
-from hdbridge.procedures.stepping import Stepping
+from hdbridge.axis.model import TransmissionModel
+from hdbridge.motion.procedures.stepping import Stepping
 from hdbridge.records.record import Record
 from hdbridge.sim.lockstep import simulated_bench
 from hdbridge.sim.truth import Truth

@@ -12,10 +12,10 @@ import can
 import pytest
 
 from hdbridge.axis import AxisConfig
-from hdbridge.bringup.checks import Row, Verdict, run_checks
-from hdbridge.bringup.context import BringUpContext
-from hdbridge.bringup.doctor import CHECKS
 from hdbridge.clock import Clock
+from hdbridge.commissioning.bringup.checks import Row, Verdict, run_checks
+from hdbridge.commissioning.bringup.context import BringUpContext
+from hdbridge.commissioning.bringup.doctor import CHECKS
 from hdbridge.device.node import DriveNode
 from hdbridge.files.bundled import bundled_profile
 from hdbridge.sim.lockstep import lockstep_bench, nameplate_of

@@ -3,7 +3,7 @@
 import re
 from pathlib import Path
 
-from hdbridge.bringup.doctor import CHECKS
+from hdbridge.commissioning.bringup.doctor import CHECKS
 
 PAGE = Path(__file__).parents[2] / "docs" / "bring-up.md"
 

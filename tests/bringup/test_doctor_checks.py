@@ -9,12 +9,12 @@ from typing import Any
 
 import pytest
 
-from hdbridge.bringup.checks import Outcome, Verdict
-from hdbridge.bringup.doctor import CHECKS
+from hdbridge.axis.model import TransmissionModel
+from hdbridge.axis.model.response import LeadFilter, Response
+from hdbridge.commissioning.bringup.checks import Outcome, Verdict
+from hdbridge.commissioning.bringup.doctor import CHECKS
 from hdbridge.device.node import DriveNode
 from hdbridge.drive.states import State, decode
-from hdbridge.model import TransmissionModel
-from hdbridge.model.response import LeadFilter, Response
 
 PASS, FAIL, NOT_POSSIBLE = Outcome.PASS, Outcome.FAIL, Outcome.NOT_POSSIBLE
 

@@ -9,8 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hdbridge.axis import AxisConfig
-from hdbridge.bringup.checks import Check, Outcome, failed, passed, run_checks
-from hdbridge.bringup.judge import (
+from hdbridge.commissioning.bringup.checks import Check, Outcome, failed, passed, run_checks
+from hdbridge.commissioning.bringup.judge import (
     judge_following,
     judge_hold,
     judge_nudge,
@@ -19,8 +19,8 @@ from hdbridge.bringup.judge import (
     judge_stop,
     judge_torque,
 )
-from hdbridge.bringup.scale import LOAD_COUNTS, MOTOR_COUNTS, RATIO, Turned, accuse, judge_turn
-from hdbridge.bringup.slow import plan_travel
+from hdbridge.commissioning.bringup.scale import LOAD_COUNTS, MOTOR_COUNTS, RATIO, Turned, accuse, judge_turn
+from hdbridge.commissioning.bringup.slow import plan_travel
 from hdbridge.errors import DriveError
 from hdbridge.files.bundled import bundled_profile
 

@@ -10,8 +10,8 @@ import can
 import pytest
 
 from hdbridge.axis import AxisConfig
-from hdbridge.bringup.match import axis_lines, compare
-from hdbridge.bringup.scan import Node, Scan, scan_bus
+from hdbridge.commissioning.bringup.match import axis_lines, compare
+from hdbridge.commissioning.bringup.scan import Node, Scan, scan_bus
 from hdbridge.device.node import DriveNode
 from hdbridge.drive import objects
 from hdbridge.drive.link import Link

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import yaml
 
-from hdbridge.model import TransmissionModel
+from hdbridge.axis.model import TransmissionModel
 from hdbridge.records.recording import Recording
 
 

@@ -6,9 +6,9 @@ import yaml
 from support.two_channels import CHANNELS, resumes, stops
 
 from hdbridge.axis import AxisConfig
-from hdbridge.calibration import measure, start_journal
+from hdbridge.commissioning.calibration import measure, start_journal
 from hdbridge.drive.drive import Drive
-from hdbridge.procedures.plan import Plan
+from hdbridge.motion.procedures.plan import Plan
 from hdbridge.sim.lockstep import simulated_bench
 from hdbridge.sim.truth import Truth
 

@@ -1,6 +1,6 @@
 """A calibration whose plan has the test in motion: the response is measured, kept, and carried over."""
 
-from hdbridge.model import TransmissionModel
+from hdbridge.axis.model import TransmissionModel
 
 
 def test_the_response_is_measured_kept_reported_and_carried_over(cell):

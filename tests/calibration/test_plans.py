@@ -5,14 +5,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hdbridge.analysis.identifiability import plan_report
-from hdbridge.effects import Hysteresis
+from hdbridge.axis.effects import Hysteresis
+from hdbridge.axis.model import TransmissionModel
 from hdbridge.errors import InputError
 from hdbridge.files.yamlfile import document_from_text
-from hdbridge.model import TransmissionModel
-from hdbridge.procedures.moves import AxisView, MotionLimits, MoveTo, Sample
-from hdbridge.procedures.plan import Plan
-from hdbridge.procedures.rehearsal import rehearse
-from hdbridge.procedures.sweep import Sweep
+from hdbridge.motion.procedures.moves import AxisView, MotionLimits, MoveTo, Sample
+from hdbridge.motion.procedures.plan import Plan
+from hdbridge.motion.procedures.rehearsal import rehearse
+from hdbridge.motion.procedures.sweep import Sweep
 
 WIDE = MotionLimits(-400.0, 400.0, 20.0, 200.0, 4000.0)
 

@@ -6,8 +6,8 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from hdbridge.effects import Hysteresis, Motion, MotorOrder, Start, Synchronous
-from hdbridge.model import TransmissionModel
+from hdbridge.axis.effects import Hysteresis, Motion, MotorOrder, Start, Synchronous
+from hdbridge.axis.model import TransmissionModel
 
 RATIO = 50.0
 GEAR = TransmissionModel(

@@ -6,8 +6,8 @@ import signal
 
 import pytest
 
-from hdbridge.procedures.moves import Settle
-from hdbridge.procedures.waypoints import Hold
+from hdbridge.motion.procedures.moves import Settle
+from hdbridge.motion.procedures.waypoints import Hold
 
 
 def stands(path):

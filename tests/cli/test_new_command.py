@@ -3,8 +3,8 @@
 import pytest
 
 from hdbridge.axis import AxisConfig, BusConfig
-from hdbridge.bringup.newprofile import axis_text
-from hdbridge.bringup.scan import scan_bus
+from hdbridge.commissioning.bringup.newprofile import axis_text
+from hdbridge.commissioning.bringup.scan import scan_bus
 from hdbridge.drive import Link
 from hdbridge.errors import InputError
 from hdbridge.files.bundled import bundled_profile

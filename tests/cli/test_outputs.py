@@ -14,10 +14,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from hdbridge.axis.model import TransmissionModel
 from hdbridge.cli import PANELS, load
 from hdbridge.errors import InputError
 from hdbridge.files.outputs import Kind, Output, check_outputs
-from hdbridge.model import TransmissionModel
 
 RECORD = "time_s,motor_position_deg,load_position_deg\n" + "".join(
     f"{0.01 * n},{n},{n / 50}\n" for n in range(200)

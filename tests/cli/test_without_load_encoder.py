@@ -8,7 +8,7 @@ from support.raised import raised_profile
 
 from hdbridge import AxisConfig, Bench, TransmissionModel
 from hdbridge.analysis.response import harmonics
-from hdbridge.procedures.even_speed import EvenSpeed
+from hdbridge.motion.procedures.even_speed import EvenSpeed
 from hdbridge.simulated import simulated
 
 REMOVED = {

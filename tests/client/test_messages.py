@@ -12,8 +12,8 @@ from hdbridge import errors
 from hdbridge.client import messages
 from hdbridge.client.messages.problem import STATUS
 from hdbridge.client.messages.values import Request
+from hdbridge.commissioning.evaluation.stepping import Scheme
 from hdbridge.drive.states import State
-from hdbridge.evaluation.stepping import Scheme
 
 REQUESTS = [each for each in vars(messages).values() if isinstance(each, type) and issubclass(each, Request)]
 RAISED = [

@@ -5,8 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from hdbridge.control.compensation import LOSABLE, Compensation, CompensationLimits, Inverse
-from hdbridge.effects import (
+from hdbridge.axis.effects import (
     CATALOGUE,
     Channel,
     Compliance,
@@ -17,7 +16,8 @@ from hdbridge.effects import (
     extended,
     readings,
 )
-from hdbridge.model import TransmissionModel
+from hdbridge.axis.model import TransmissionModel
+from hdbridge.control.compensation import LOSABLE, Compensation, CompensationLimits, Inverse
 
 PERIOD = 0.004
 BASE = extended((CATALOGUE["synchronous"].candidate(50.0),), CATALOGUE["hysteresis"].candidate(50.0))

@@ -7,8 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hdbridge.control.compensation import Compensation, CompensationLimits, Inverse
-from hdbridge.effects import (
+from hdbridge.axis.effects import (
     CATALOGUE,
     Backlash,
     Hysteresis,
@@ -19,9 +18,10 @@ from hdbridge.effects import (
     Synchronous,
     Wear,
 )
-from hdbridge.effects.elastic_loop import rise_at
+from hdbridge.axis.effects.elastic_loop import rise_at
+from hdbridge.axis.model import TransmissionModel
+from hdbridge.control.compensation import Compensation, CompensationLimits, Inverse
 from hdbridge.errors import InputError
-from hdbridge.model import TransmissionModel
 
 NOW = Moment()
 PERIOD = 0.004

@@ -6,14 +6,14 @@ from pathlib import Path
 import pytest
 
 from hdbridge.axis import AxisConfig, Identity
+from hdbridge.axis.effects import Synchronous
+from hdbridge.axis.model import TransmissionModel
 from hdbridge.control.bench import Bench, compensation_for
 from hdbridge.control.caps import cap_remark
 from hdbridge.control.compensation import Compensation, CompensationLimits
 from hdbridge.drive.drive import Drive
-from hdbridge.effects import Synchronous
 from hdbridge.errors import InputError
-from hdbridge.model import TransmissionModel
-from hdbridge.procedures.stepping import Stepping
+from hdbridge.motion.procedures.stepping import Stepping
 from hdbridge.sim.lockstep import simulated_bench
 from hdbridge.sim.truth import Truth
 

@@ -8,10 +8,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from hdbridge.axis.effects import Hysteresis, HysteresisMemory
+from hdbridge.axis.model import TransmissionModel
 from hdbridge.control.loadloop import LoadLoop, loop_width_arcsec
-from hdbridge.effects import Hysteresis, HysteresisMemory
 from hdbridge.errors import InputError
-from hdbridge.model import TransmissionModel
 
 PERIOD_S = 0.004
 MAXIMUM, SLEW = 40.0, 100.0

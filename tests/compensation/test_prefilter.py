@@ -9,12 +9,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hdbridge.analysis.response import gain
+from hdbridge.axis.effects import Hysteresis, MotorOrder, Synchronous
+from hdbridge.axis.model import TransmissionModel
+from hdbridge.axis.model.response import LeadFilter, Response
 from hdbridge.control.compensation import Compensation, CompensationLimits
 from hdbridge.control.switchover import Correction
-from hdbridge.effects import Hysteresis, MotorOrder, Synchronous
 from hdbridge.errors import InputError
-from hdbridge.model import TransmissionModel
-from hdbridge.model.response import LeadFilter, Response
 
 PERIOD = 0.004
 WIDE = CompensationLimits(maximum_arcsec=1000.0, slew_arcsec_s=1e6, ramp_s=0.2)

@@ -9,10 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hdbridge.axis import AxisConfig
-from hdbridge.control.bench import compensation_for
-from hdbridge.control.compensation import Compensation, CompensationLimits
-from hdbridge.control.switchover import Correction
-from hdbridge.effects import (
+from hdbridge.axis.effects import (
     Backlash,
     Channel,
     Creep,
@@ -24,9 +21,12 @@ from hdbridge.effects import (
     Relaxation,
     Synchronous,
 )
+from hdbridge.axis.model import TransmissionModel
+from hdbridge.commissioning.evaluation.stepping import Scheme
+from hdbridge.control.bench import compensation_for
+from hdbridge.control.compensation import Compensation, CompensationLimits
+from hdbridge.control.switchover import Correction
 from hdbridge.errors import InputError
-from hdbridge.evaluation.stepping import Scheme
-from hdbridge.model import TransmissionModel
 
 PROFILES = Path(__file__).parents[2] / "profiles"
 PERIOD = 0.004

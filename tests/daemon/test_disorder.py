@@ -19,12 +19,12 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, precondition,
 from support.daemon import PROFILE, SteppedDaemon, article_axes, stepped_daemon
 from support.daemonlaws import Laws
 
+from hdbridge.axis.model import TransmissionModel
+from hdbridge.commissioning.evaluation.stepping import Scheme
 from hdbridge.daemon.loop.states import AxisState
 from hdbridge.daemon.memory import CommandKind, Knot, MailboxFullError, RelayedFrame
 from hdbridge.drive.objects import Mode
 from hdbridge.errors import HdbridgeError
-from hdbridge.evaluation.stepping import Scheme
-from hdbridge.model import TransmissionModel
 
 K = CommandKind
 TRAVEL_DEG = 3.0

@@ -9,9 +9,9 @@ from pathlib import Path
 
 import pytest
 
+from hdbridge.commissioning.evaluation.stepping import Scheme
 from hdbridge.daemon.machine import Machine, machine_file
 from hdbridge.errors import InputError
-from hdbridge.evaluation.stepping import Scheme
 from hdbridge.files.bundled import bundled_folder, bundled_profile
 
 GOOD = """\

@@ -14,7 +14,7 @@ from hdbridge.analysis.diagnosis import diagnose
 from hdbridge.analysis.findings import Diagnosis
 from hdbridge.analysis.intervals import NORMAL_95
 from hdbridge.analysis.scales import Scales
-from hdbridge.model import TransmissionModel
+from hdbridge.axis.model import TransmissionModel
 from hdbridge.records.record import Record
 
 SPRING_ARCSEC_PER_NM = 1.5

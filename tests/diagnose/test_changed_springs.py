@@ -10,7 +10,7 @@ import pytest
 from support.springs import with_spring
 
 from hdbridge.analysis.diagnosis import diagnose
-from hdbridge.model import TransmissionModel
+from hdbridge.axis.model import TransmissionModel
 from hdbridge.records.record import Record
 
 Columns = Callable[..., dict[str, Any]]

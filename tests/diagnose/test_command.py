@@ -11,9 +11,9 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner
 
+from hdbridge.axis.model import TransmissionModel
 from hdbridge.cli import app
 from hdbridge.errors import InputError
-from hdbridge.model import TransmissionModel
 from hdbridge.records.record import Record
 
 RUN = CliRunner()

@@ -10,8 +10,8 @@ import pytest
 
 from hdbridge.analysis.diagnosis import diagnose
 from hdbridge.analysis.findings import Diagnosis
+from hdbridge.axis.model import TransmissionModel
 from hdbridge.errors import InputError
-from hdbridge.model import TransmissionModel
 from hdbridge.records.record import Record
 
 Diagnosed = Callable[..., Diagnosis]

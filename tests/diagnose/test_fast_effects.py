@@ -14,7 +14,7 @@ from support.filters import filtered
 from hdbridge.analysis.diagnosis import diagnose
 from hdbridge.analysis.findings import Diagnosis
 from hdbridge.analysis.prepared import between_lines, noise_arcsec
-from hdbridge.model import TransmissionModel
+from hdbridge.axis.model import TransmissionModel
 from hdbridge.records.record import Record, concatenate
 
 NOISE_ARCSEC = 0.35

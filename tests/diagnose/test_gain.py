@@ -15,10 +15,10 @@ from hdbridge.analysis.gain import Gain, held_out
 from hdbridge.analysis.hypothesis import Estimator, Hypothesis
 from hdbridge.analysis.prepared import gather
 from hdbridge.analysis.probability import Context, weighed
-from hdbridge.effects import Start, Synchronous, VelocityWindup
-from hdbridge.effects.orders import orders_from
-from hdbridge.improvement import extension_of
-from hdbridge.model import TransmissionModel
+from hdbridge.axis.effects import Start, Synchronous, VelocityWindup
+from hdbridge.axis.effects.orders import orders_from
+from hdbridge.axis.model import TransmissionModel
+from hdbridge.commissioning.improvement import extension_of
 from hdbridge.records.record import Record
 
 Diagnosed = Callable[..., Diagnosis]

@@ -13,13 +13,13 @@ from hypothesis import strategies as st
 
 from hdbridge.analysis.diagnosis import diagnose
 from hdbridge.analysis.identifiability import examined
-from hdbridge.effects import Motion, Start
-from hdbridge.effects.hysteresis import Hysteresis
-from hdbridge.effects.orders import MotorOrder
-from hdbridge.effects.ratio_error import RatioError
-from hdbridge.effects.subdivisional_error import SubdivisionalError
-from hdbridge.effects.synchronous import Synchronous
-from hdbridge.model import TransmissionModel
+from hdbridge.axis.effects import Motion, Start
+from hdbridge.axis.effects.hysteresis import Hysteresis
+from hdbridge.axis.effects.orders import MotorOrder
+from hdbridge.axis.effects.ratio_error import RatioError
+from hdbridge.axis.effects.subdivisional_error import SubdivisionalError
+from hdbridge.axis.effects.synchronous import Synchronous
+from hdbridge.axis.model import TransmissionModel
 from hdbridge.records.record import Record
 
 RATIO = 50.0

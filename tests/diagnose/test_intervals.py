@@ -18,9 +18,9 @@ from hdbridge.analysis.intervals import NORMAL_95
 from hdbridge.analysis.linear import Column
 from hdbridge.analysis.parameters import covariance, named_parameters, parameters_of, precisely
 from hdbridge.analysis.prepared import gather
-from hdbridge.effects import FlexsplineOrders, LoadOrders, RatioError, Start, VelocityWindup
-from hdbridge.effects.orders import MotorOrder
-from hdbridge.model import TransmissionModel
+from hdbridge.axis.effects import FlexsplineOrders, LoadOrders, RatioError, Start, VelocityWindup
+from hdbridge.axis.effects.orders import MotorOrder
+from hdbridge.axis.model import TransmissionModel
 from hdbridge.records.record import Record
 
 Columns = Callable[..., dict[str, Any]]

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from hdbridge.analysis.diagnosis import diagnose
-from hdbridge.effects import Synchronous
-from hdbridge.effects.orders import MotorOrder
-from hdbridge.model import TransmissionModel
+from hdbridge.axis.effects import Synchronous
+from hdbridge.axis.effects.orders import MotorOrder
+from hdbridge.axis.model import TransmissionModel
 from hdbridge.records.record import Record
 
 ORDERS = ((2, 9.0, -132.0), (8, 2.0, 124.0), (24, 2.0, 30.0))

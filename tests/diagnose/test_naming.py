@@ -17,8 +17,8 @@ from hdbridge.analysis.findings import Diagnosis, Finding
 from hdbridge.analysis.gain import Gain
 from hdbridge.analysis.probability import Context, weighed
 from hdbridge.analysis.scales import Scales
-from hdbridge.effects import Hysteresis
-from hdbridge.model import TransmissionModel
+from hdbridge.axis.effects import Hysteresis
+from hdbridge.axis.model import TransmissionModel
 from hdbridge.records.record import Record
 
 Diagnosed = Callable[..., Diagnosis]

@@ -10,7 +10,7 @@ import pytest
 
 from hdbridge.analysis.diagnosis import diagnose
 from hdbridge.analysis.findings import Diagnosis
-from hdbridge.model import TransmissionModel
+from hdbridge.axis.model import TransmissionModel
 from hdbridge.records.record import Record
 
 

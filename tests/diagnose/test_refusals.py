@@ -9,7 +9,7 @@ import pytest
 
 from hdbridge.analysis.diagnosis import diagnose
 from hdbridge.analysis.findings import Diagnosis
-from hdbridge.effects import (
+from hdbridge.axis.effects import (
     CATALOGUE,
     ChannelSkew,
     CountLoss,
@@ -19,7 +19,7 @@ from hdbridge.effects import (
     MotorOrders,
     VelocityWindup,
 )
-from hdbridge.model import TransmissionModel
+from hdbridge.axis.model import TransmissionModel
 from hdbridge.records.record import Record
 
 

@@ -8,9 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hdbridge.analysis.views import ResidualViews, folds, predicted
-from hdbridge.effects import Motion
-from hdbridge.effects import coordinate as over
-from hdbridge.effects.coordinate import SMALLEST_TIME_S, SMALLEST_WAY_DEG, Coordinate, Spacing
+from hdbridge.axis.effects import Motion
+from hdbridge.axis.effects import coordinate as over
+from hdbridge.axis.effects.coordinate import SMALLEST_TIME_S, SMALLEST_WAY_DEG, Coordinate, Spacing
 from hdbridge.report.bins import binned
 
 COUNT = 8000

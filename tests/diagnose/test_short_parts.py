@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from hdbridge.analysis.diagnosis import diagnose
-from hdbridge.model import TransmissionModel
+from hdbridge.axis.model import TransmissionModel
 from hdbridge.records.record import Record, concatenate
 
 

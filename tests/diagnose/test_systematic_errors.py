@@ -19,7 +19,7 @@ from hdbridge.analysis.findings import Diagnosis, Parameter
 from hdbridge.analysis.hypothesis import Estimator, Hypothesis
 from hdbridge.analysis.parameters import covariance, parameters_of, precisely
 from hdbridge.analysis.prepared import gather
-from hdbridge.effects import (
+from hdbridge.axis.effects import (
     ChannelSkew,
     Creep,
     Effect,
@@ -29,9 +29,9 @@ from hdbridge.effects import (
     Start,
     VelocityWindup,
 )
-from hdbridge.effects.creep import Relaxation
-from hdbridge.effects.orders import orders_from
-from hdbridge.model import TransmissionModel
+from hdbridge.axis.effects.creep import Relaxation
+from hdbridge.axis.effects.orders import orders_from
+from hdbridge.axis.model import TransmissionModel
 from hdbridge.records.record import Record
 
 Columns = Callable[..., dict[str, Any]]

@@ -1,6 +1,6 @@
 """Look-alikes are so in both directions."""
 
-from hdbridge.effects import CATALOGUE, aliases_of
+from hdbridge.axis.effects import CATALOGUE, aliases_of
 
 
 def test_a_look_alike_looks_alike_from_both_sides():

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from hdbridge.effects import (
+from hdbridge.axis.effects import (
     Hysteresis,
     HysteresisMemory,
     Moment,

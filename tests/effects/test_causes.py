@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from hdbridge.effects import (
+from hdbridge.axis.effects import (
     AmplitudeDrift,
     Backlash,
     Channel,

@@ -2,7 +2,7 @@
 
 import catalogue_docs
 
-from hdbridge.effects import CATALOGUE
+from hdbridge.axis.effects import CATALOGUE
 
 
 def test_the_page_of_causes_is_up_to_date():

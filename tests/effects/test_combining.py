@@ -5,8 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from hdbridge.control.compensation import Inverse
-from hdbridge.effects import (
+from hdbridge.axis.effects import (
     CATALOGUE,
     SLOT,
     AmplitudeDrift,
@@ -34,7 +33,8 @@ from hdbridge.effects import (
     readings,
     refreshed,
 )
-from hdbridge.model import TransmissionModel
+from hdbridge.axis.model import TransmissionModel
+from hdbridge.control.compensation import Inverse
 
 RATIO = 50.0
 BASE = (CATALOGUE["synchronous"].candidate(RATIO), CATALOGUE["hysteresis"].candidate(RATIO))

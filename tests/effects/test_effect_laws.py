@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from pydantic import BaseModel
 from support.effect_examples import EXAMPLES, motions, starts
 
-from hdbridge.effects import (
+from hdbridge.axis.effects import (
     CATALOGUE,
     MEASURED,
     Channel,
@@ -23,7 +23,7 @@ from hdbridge.effects import (
     readings,
     unmet,
 )
-from hdbridge.effects.base import Level
+from hdbridge.axis.effects.base import Level
 from hdbridge.errors import InputError
 
 NAMES = sorted(CATALOGUE)

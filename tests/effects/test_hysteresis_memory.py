@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hdbridge.effects import Hysteresis, HysteresisMemory, Moment, Motion, Start
-from hdbridge.effects.elastic_loop import rise
+from hdbridge.axis.effects import Hysteresis, HysteresisMemory, Moment, Motion, Start
+from hdbridge.axis.effects.elastic_loop import rise
 
 GEAR = {"offset_arcsec": 40.0, "width_deg": 20.0, "exponent": 1.6}
 PLAIN, MEMORY = Hysteresis(**GEAR), HysteresisMemory(**GEAR)

@@ -16,11 +16,11 @@ import support.plant as plant
 from hdbridge.analysis.diagnosis import diagnose
 from hdbridge.analysis.findings import Diagnosis
 from hdbridge.analysis.identifiability import plan_report
+from hdbridge.axis.effects import CATALOGUE, Effect, Moment, Start, causes, register, withdraw
+from hdbridge.axis.model import TransmissionModel
 from hdbridge.control.compensation import Inverse
-from hdbridge.effects import CATALOGUE, Effect, Moment, Start, causes, register, withdraw
 from hdbridge.errors import InputError
-from hdbridge.model import TransmissionModel
-from hdbridge.procedures.plan import Plan
+from hdbridge.motion.procedures.plan import Plan
 from hdbridge.records.record import Record
 from hdbridge.report.diagnosis import diagnosis_page
 from hdbridge.report.page import render

@@ -9,11 +9,11 @@ from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 from hdbridge.axis import AxisConfig
+from hdbridge.axis.model import TransmissionModel
 from hdbridge.errors import InputError
 from hdbridge.files.bundled import bundled_folder
 from hdbridge.files.edsfile import read_eds
 from hdbridge.files.yamlfile import load_yaml
-from hdbridge.model import TransmissionModel
 from hdbridge.records.record import Record
 from hdbridge.records.recording import RecordingFile
 

@@ -6,8 +6,8 @@ import file_reference
 import pytest
 
 from hdbridge.axis import AxisConfig
+from hdbridge.axis.model import TransmissionModel
 from hdbridge.files.bundled import bundled_profile
-from hdbridge.model import TransmissionModel
 
 
 @pytest.fixture(scope="module")

@@ -10,11 +10,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hdbridge.axis import AxisConfig, Identity
-from hdbridge.effects import CATALOGUE, Hysteresis, Motion, MotorOrder, Start, Synchronous
+from hdbridge.axis.effects import CATALOGUE, Hysteresis, Motion, MotorOrder, Start, Synchronous
+from hdbridge.axis.model import TransmissionModel
 from hdbridge.errors import InputError
 from hdbridge.files.bundled import bundled_profile
 from hdbridge.files.expectation import expected_words, field_at
-from hdbridge.model import TransmissionModel
 
 GOOD = """\
 schema: hdbridge.model/1

@@ -14,11 +14,11 @@ from hypothesis import strategies as st
 from support.meanwhile import before_each
 
 from hdbridge.axis import Identity
-from hdbridge.effects import Hysteresis, MotorOrder, Synchronous
+from hdbridge.axis.effects import Hysteresis, MotorOrder, Synchronous
+from hdbridge.axis.model import TransmissionModel, store
+from hdbridge.axis.model.difference import Difference, diff
+from hdbridge.axis.model.store import Activation
 from hdbridge.errors import InputError
-from hdbridge.model import TransmissionModel, store
-from hdbridge.model.difference import Difference, diff
-from hdbridge.model.store import Activation
 
 AXIS = """\
 schema: hdbridge.axis/1
@@ -244,9 +244,9 @@ WORKER = """
 import sys
 from datetime import UTC, datetime
 from pathlib import Path
-from hdbridge.model import store
-from hdbridge.effects import Hysteresis
-from hdbridge.model import TransmissionModel
+from hdbridge.axis.model import store
+from hdbridge.axis.effects import Hysteresis
+from hdbridge.axis.model import TransmissionModel
 profile, first = Path(sys.argv[1]), int(sys.argv[2])
 for offset in range(first, 3600):
     loop = Hysteresis(offset_arcsec=offset, width_deg=20, exponent=1.6)

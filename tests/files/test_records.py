@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hdbridge.effects import Channel
+from hdbridge.axis.effects import Channel
 from hdbridge.errors import InputError
 from hdbridge.records.record import OPTIONAL, REQUIRED, Record, concatenate
 

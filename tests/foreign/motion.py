@@ -34,14 +34,14 @@ from support.raised import ARTICLE, raised_axis
 from hdbridge import Bench, Drive
 from hdbridge.analysis.response import Harmonics, harmonics, order_hz
 from hdbridge.axis import AxisConfig
-from hdbridge.calibration import calibrate, start_journal
-from hdbridge.calibration.motion import motion_test
+from hdbridge.axis.effects import MotorOrder, Synchronous
+from hdbridge.axis.model import TransmissionModel
+from hdbridge.commissioning.calibration import calibrate, start_journal
+from hdbridge.commissioning.calibration.motion import motion_test
 from hdbridge.control.bench import compensation_for
-from hdbridge.effects import MotorOrder, Synchronous
 from hdbridge.errors import HdbridgeError
-from hdbridge.model import TransmissionModel
-from hdbridge.procedures.even_speed import EvenSpeed
-from hdbridge.procedures.plan import Plan
+from hdbridge.motion.procedures.even_speed import EvenSpeed
+from hdbridge.motion.procedures.plan import Plan
 from hdbridge.sim.lockstep import simulated_bench
 
 SHARES = (0.04, 0.1, 0.2, 0.32, 0.45, 0.58, 0.71, 0.84, 1.0)

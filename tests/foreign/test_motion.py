@@ -9,9 +9,9 @@ from foreign.servos import STRUCTURES
 
 from hdbridge import Drive
 from hdbridge.analysis.response import HIGHEST
-from hdbridge.calibration.motion import motion_test
-from hdbridge.effects import MotorOrder, Synchronous
-from hdbridge.model import TransmissionModel
+from hdbridge.axis.effects import MotorOrder, Synchronous
+from hdbridge.axis.model import TransmissionModel
+from hdbridge.commissioning.calibration.motion import motion_test
 
 # A third of the SYNC rate is reached by order 4 at these speeds, and later by the others.
 SEEDS = {"pi_notch": 3, "piv": 3, "observed": 0, "state_feedback": 0}

@@ -33,15 +33,15 @@ from support.hidden_bench import (
 )
 from typer.testing import CliRunner
 
+from hdbridge.axis.effects import CATALOGUE
+from hdbridge.axis.model import TransmissionModel
 from hdbridge.cli import app
-from hdbridge.effects import CATALOGUE
-from hdbridge.improvement.extension import extension_of
-from hdbridge.model import TransmissionModel
-from hdbridge.procedures.moves import Procedure, Settle
-from hdbridge.procedures.sine import Sines
-from hdbridge.procedures.standstill import Precondition
-from hdbridge.procedures.stepping import Stepping
-from hdbridge.procedures.sweep import Sweep
+from hdbridge.commissioning.improvement.extension import extension_of
+from hdbridge.motion.procedures.moves import Procedure, Settle
+from hdbridge.motion.procedures.sine import Sines
+from hdbridge.motion.procedures.standstill import Precondition
+from hdbridge.motion.procedures.stepping import Stepping
+from hdbridge.motion.procedures.sweep import Sweep
 from hdbridge.records.recording import Recording
 from hdbridge.sim.lockstep import nameplate_of
 from hdbridge.sim.truth import Truth

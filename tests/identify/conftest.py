@@ -9,7 +9,7 @@ import pytest
 from support.legs import Leg, fit
 
 from hdbridge.analysis.identification import FitOptions, FitResult
-from hdbridge.effects import Start
+from hdbridge.axis.effects import Start
 
 RATE_HZ = 50.0
 

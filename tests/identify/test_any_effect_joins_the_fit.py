@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from support.legs import fit
 
-from hdbridge.effects import Cause, Channel, Effect, FloatArray, Moment, Motion, Shape, Start
-from hdbridge.effects.base import Memoryless
+from hdbridge.axis.effects import Cause, Channel, Effect, FloatArray, Moment, Motion, Shape, Start
+from hdbridge.axis.effects.base import Memoryless
 
 
 class Settling(Effect):

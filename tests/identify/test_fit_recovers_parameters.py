@@ -7,8 +7,8 @@ import pytest
 from support.legs import Leg, fit
 
 from hdbridge.analysis.identification import FitOptions
-from hdbridge.effects import Hysteresis, MotorOrder, Start, Synchronous
-from hdbridge.model import TransmissionModel
+from hdbridge.axis.effects import Hysteresis, MotorOrder, Start, Synchronous
+from hdbridge.axis.model import TransmissionModel
 
 
 def off(result, effect, parameter, true):

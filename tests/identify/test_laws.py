@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from support.legs import fit
 
-from hdbridge.effects import Hysteresis, HysteresisMemory
-from hdbridge.model import TransmissionModel
+from hdbridge.axis.effects import Hysteresis, HysteresisMemory
+from hdbridge.axis.model import TransmissionModel
 
 SLIP = ((0.3, 2.0), (0.3, 6.0), (0.2, 12.0), (0.2, 20.0))
 """Share of the loop and travel to its limit, motor degrees, of springs with sliders in parallel."""

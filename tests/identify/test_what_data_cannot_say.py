@@ -7,7 +7,7 @@ import pytest
 from support.legs import Leg, fit
 
 from hdbridge.analysis.identification import FitOptions
-from hdbridge.effects import Hysteresis
+from hdbridge.axis.effects import Hysteresis
 from hdbridge.errors import InputError
 
 

@@ -6,11 +6,11 @@ import pytest
 
 from hdbridge.analysis.findings import Finding
 from hdbridge.axis import AxisConfig
+from hdbridge.axis.model import TransmissionModel
+from hdbridge.commissioning.improvement import choose, untold
+from hdbridge.commissioning.improvement.experiments import machine_for_unexplained, machine_plans
 from hdbridge.control.bench import axis_view
-from hdbridge.improvement import choose, untold
-from hdbridge.improvement.experiments import machine_for_unexplained, machine_plans
-from hdbridge.model import TransmissionModel
-from hdbridge.procedures.plan import Plan
+from hdbridge.motion.procedures.plan import Plan
 
 PROFILE = "profiles/article"
 

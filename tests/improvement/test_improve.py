@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from hdbridge.model import TransmissionModel
+from hdbridge.axis.model import TransmissionModel
 from hdbridge.records.recording import Recording
 
 

@@ -9,9 +9,9 @@ import pytest
 import yaml
 from support.patience import until
 
-from hdbridge.calibration.validation import Floor, Stepped, Validation
-from hdbridge.improvement import Trial
-from hdbridge.procedures.stepping import Standing, SteppingOutcome
+from hdbridge.commissioning.calibration.validation import Floor, Stepped, Validation
+from hdbridge.commissioning.improvement import Trial
+from hdbridge.motion.procedures.stepping import Standing, SteppingOutcome
 from hdbridge.report.validation import stepping_sections
 
 

@@ -5,9 +5,9 @@ from pathlib import Path
 import pytest
 
 from hdbridge import AxisConfig, Bench, TransmissionModel, simulated
-from hdbridge.procedures.chain import Chain
-from hdbridge.procedures.sine import Sines
-from hdbridge.procedures.sweep import Sweep
+from hdbridge.motion.procedures.chain import Chain
+from hdbridge.motion.procedures.sine import Sines
+from hdbridge.motion.procedures.sweep import Sweep
 
 PROFILE = Path(__file__).parents[2] / "profiles" / "article"
 

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hdbridge.motion import MotionMode, SetPoint
-from hdbridge.procedures.moves import MotionLimits
+from hdbridge.motion.procedures.moves import MotionLimits
 
 PERIOD_S = 0.004
 LIMITS = MotionLimits(

@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 
 from hdbridge.errors import InputError
 from hdbridge.motion import MotionMode, SetPoint, coordinated
+from hdbridge.motion.procedures.moves import MotionLimits
 from hdbridge.motion.stream import MOST_KNOTS
-from hdbridge.procedures.moves import MotionLimits
 
 LIMITS = MotionLimits(-90.0, 120.0, 60.0, 200.0, 4000.0)
 PERIOD_S = 0.004

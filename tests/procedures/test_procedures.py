@@ -8,14 +8,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hdbridge.errors import InputError
-from hdbridge.procedures.moves import AxisView, Dwell, MotionLimits, MoveTo, Sample, Settle, Sine
-from hdbridge.procedures.rehearsal import rehearse
-from hdbridge.procedures.reversals import Reversals
-from hdbridge.procedures.sine import Sines
-from hdbridge.procedures.small_steps import SmallSteps
-from hdbridge.procedures.standstill import Precondition, Standstill
-from hdbridge.procedures.stepping import Stepping
-from hdbridge.procedures.sweep import Sweep
+from hdbridge.motion.procedures.moves import AxisView, Dwell, MotionLimits, MoveTo, Sample, Settle, Sine
+from hdbridge.motion.procedures.rehearsal import rehearse
+from hdbridge.motion.procedures.reversals import Reversals
+from hdbridge.motion.procedures.sine import Sines
+from hdbridge.motion.procedures.small_steps import SmallSteps
+from hdbridge.motion.procedures.standstill import Precondition, Standstill
+from hdbridge.motion.procedures.stepping import Stepping
+from hdbridge.motion.procedures.sweep import Sweep
 
 LIMITS = MotionLimits(-400.0, 400.0, 20.0, 200.0, 4000.0)
 AXIS = AxisView(50.0, LIMITS)

@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from hdbridge import Bench, InputError, Trajectory, TransmissionModel, simulated
 from hdbridge.axis import AxisConfig
 from hdbridge.files.bundled import bundled_profile
-from hdbridge.procedures.moves import AxisView, MotionLimits
-from hdbridge.procedures.rehearsal import rehearse
+from hdbridge.motion.procedures.moves import AxisView, MotionLimits
+from hdbridge.motion.procedures.rehearsal import rehearse
 
 AXIS = AxisView(50.0, MotionLimits(-90.0, 90.0, 20.0, 200.0, 4000.0))
 

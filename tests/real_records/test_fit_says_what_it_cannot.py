@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from hdbridge.axis.model import TransmissionModel
 from hdbridge.cli import app
 from hdbridge.errors import InputError
-from hdbridge.model import TransmissionModel
 from hdbridge.records.record import Record
 
 

@@ -17,10 +17,10 @@ from typer.testing import CliRunner
 
 from hdbridge.analysis.diagnosis import diagnose
 from hdbridge.analysis.findings import Diagnosis
+from hdbridge.axis.effects import FloatArray, Hysteresis, HysteresisMemory, Motion, Start
+from hdbridge.axis.model import TransmissionModel
 from hdbridge.cli import app
-from hdbridge.effects import FloatArray, Hysteresis, HysteresisMemory, Motion, Start
 from hdbridge.errors import InputError
-from hdbridge.model import TransmissionModel
 from hdbridge.records.record import Record, concatenate
 
 BESIDE = Path(__file__).parents[3] / "shared" / "data"

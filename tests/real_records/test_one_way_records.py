@@ -9,10 +9,10 @@ from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 from hdbridge.analysis.diagnosis import diagnose
-from hdbridge.effects import Hysteresis, HysteresisMemory, Synchronous
-from hdbridge.effects.orders import MotorOrder
+from hdbridge.axis.effects import Hysteresis, HysteresisMemory, Synchronous
+from hdbridge.axis.effects.orders import MotorOrder
+from hdbridge.axis.model import TransmissionModel
 from hdbridge.errors import InputError
-from hdbridge.model import TransmissionModel
 from hdbridge.records.record import Record
 
 ORDERS = ((1, 4.9, -126.8), (2, 9.33, -132.1), (3, 2.09, -96.2), (4, 12.21, 105.7), (6, 3.18, -127.0))

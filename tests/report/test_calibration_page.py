@@ -21,11 +21,11 @@ from hdbridge.analysis.identification import (
 from hdbridge.analysis.intervals import Interval
 from hdbridge.analysis.noise import NoiseModel
 from hdbridge.analysis.orders import Line, Order
-from hdbridge.calibration import Calibration, Offer
-from hdbridge.calibration.validation import Floor, Stepped, Validation
-from hdbridge.effects import Hysteresis, MotorOrder, Synchronous
-from hdbridge.evaluation.stepping import Scatter
-from hdbridge.model import TransmissionModel
+from hdbridge.axis.effects import Hysteresis, MotorOrder, Synchronous
+from hdbridge.axis.model import TransmissionModel
+from hdbridge.commissioning.calibration import Calibration, Offer
+from hdbridge.commissioning.calibration.validation import Floor, Stepped, Validation
+from hdbridge.commissioning.evaluation.stepping import Scatter
 from hdbridge.report.calibration import calibration_page
 from hdbridge.report.page import render
 

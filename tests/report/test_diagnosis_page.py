@@ -13,9 +13,7 @@ import pytest
 from hdbridge.analysis.capability import Capability
 from hdbridge.analysis.findings import Diagnosis, Figures, Finding, Identifiability, Parameter, Traces
 from hdbridge.analysis.gain import Gain
-from hdbridge.calibration.result import Offer
-from hdbridge.calibration.validation import Floor, Stepped, Validation
-from hdbridge.effects import (
+from hdbridge.axis.effects import (
     CATALOGUE,
     Channel,
     CountLoss,
@@ -30,8 +28,10 @@ from hdbridge.effects import (
     causes,
     extended,
 )
-from hdbridge.evaluation.stepping import Scatter
-from hdbridge.model import TransmissionModel
+from hdbridge.axis.model import TransmissionModel
+from hdbridge.commissioning.calibration.result import Offer
+from hdbridge.commissioning.calibration.validation import Floor, Stepped, Validation
+from hdbridge.commissioning.evaluation.stepping import Scatter
 from hdbridge.report.diagnosis import diagnosis_page
 from hdbridge.report.page import render
 

@@ -11,8 +11,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hdbridge.evaluation.stepping import Scheme, SchemeResult
-from hdbridge.procedures.stepping import Standing, SteppingOutcome
+from hdbridge.commissioning.evaluation.stepping import Scheme, SchemeResult
+from hdbridge.motion.procedures.stepping import Standing, SteppingOutcome
 from hdbridge.report.page import (
     Chart,
     Facts,

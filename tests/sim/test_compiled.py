@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from hdbridge.axis import AxisConfig
 from hdbridge.control.bench import Bench
 from hdbridge.drive.drive import Drive
-from hdbridge.procedures.stepping import Stepping
+from hdbridge.motion.procedures.stepping import Stepping
 from hdbridge.sim import fast
 from hdbridge.sim.axis import Axis
 from hdbridge.sim.lockstep import simulated_bench

@@ -23,13 +23,13 @@ import pytest
 
 from hdbridge import TransmissionModel
 from hdbridge.axis import AxisConfig
-from hdbridge.calibration.path import path_errors
 from hdbridge.client import Client
 from hdbridge.client.axis import Axis
+from hdbridge.commissioning.calibration.path import path_errors
 from hdbridge.control.bench import axis_view
 from hdbridge.errors import HdbridgeError
-from hdbridge.procedures.moves import MoveTo, Sample
-from hdbridge.procedures.path_test import PathRun
+from hdbridge.motion.procedures.moves import MoveTo, Sample
+from hdbridge.motion.procedures.path_test import PathRun
 from tests.support import patience
 from tests.support.daemon_bench import OURS, Cable
 from tests.support.raised import measured_response, raised_profile, ripple_arcsec

@@ -14,6 +14,9 @@ import numpy as np
 import yaml
 
 from hdbridge.axis import AxisConfig
+from hdbridge.axis.effects import Moment, Motion, Start
+from hdbridge.axis.model import TransmissionModel
+from hdbridge.commissioning.evaluation.stepping import Scatter, quantisation_floor_arcsec
 from hdbridge.control.bench import Bench
 from hdbridge.daemon.following.adaptation import Adaptation, Entry, Learned
 from hdbridge.daemon.following.follower import Follower
@@ -23,10 +26,7 @@ from hdbridge.daemon.loop.states import AxisState
 from hdbridge.daemon.memory import AXIS_SAMPLE, NO_FAULT, SampleArray, SampleFlag, sample_dtype
 from hdbridge.device.node import DriveNode
 from hdbridge.drive import Drive
-from hdbridge.effects import Moment, Motion, Start
-from hdbridge.evaluation.stepping import Scatter, quantisation_floor_arcsec
-from hdbridge.model import TransmissionModel
-from hdbridge.procedures.stepping import Stepping
+from hdbridge.motion.procedures.stepping import Stepping
 from hdbridge.records.record import Record
 from hdbridge.sim.lockstep import simulated_bench
 from hdbridge.sim.truth import Truth

@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hdbridge.axis import AxisConfig
+from hdbridge.axis.effects import Motion
+from hdbridge.axis.model import TransmissionModel
 from hdbridge.daemon.memory import NO_FAULT, SampleFlag, sample_dtype
-from hdbridge.effects import Motion
-from hdbridge.model import TransmissionModel
 
 ENABLED, HOLD, GOTO = 3, 0, 1
 OPERATION_ENABLED = 4

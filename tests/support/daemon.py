@@ -19,6 +19,8 @@ import can
 from can.interfaces.virtual import VirtualBus
 
 from hdbridge.axis import AxisConfig
+from hdbridge.axis.model import TransmissionModel
+from hdbridge.commissioning.evaluation.stepping import Scheme
 from hdbridge.control.bench import compensation_for
 from hdbridge.control.buscycle import BusCycle
 from hdbridge.daemon.loop.controller import Controller
@@ -29,8 +31,6 @@ from hdbridge.daemon.setting import CompensationSetting
 from hdbridge.device.node import DriveNode
 from hdbridge.drive.drive import Drive
 from hdbridge.drive.link import Link
-from hdbridge.evaluation.stepping import Scheme
-from hdbridge.model import TransmissionModel
 from hdbridge.sim.lockstep import LockstepBus, SimulatedAxis, VirtualClock, simulated_benches
 from hdbridge.sim.truth import Truth
 from support.characters import FRIENDLY, Character

@@ -3,7 +3,7 @@
 import numpy as np
 from hypothesis import strategies as st
 
-from hdbridge.effects import (
+from hdbridge.axis.effects import (
     CATALOGUE,
     AmplitudeDrift,
     Backlash,

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from hdbridge.client import messages
+from hdbridge.commissioning.evaluation.stepping import Scheme
 from hdbridge.daemon.memory import sample_dtype
 from hdbridge.daemon.service.commissioning import HomingRun
 from hdbridge.daemon.service.lease import Lease
@@ -24,7 +25,6 @@ from hdbridge.daemon.service.streams import StreamPoint
 from hdbridge.drive.objects import IntegerType
 from hdbridge.drive.values import Object, Value
 from hdbridge.errors import InputError, RefusedError
-from hdbridge.evaluation.stepping import Scheme
 
 BEGAN = datetime(2025, 1, 31, 12, 0, tzinfo=UTC)
 LIMITS = messages.Limits(

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from hdbridge.effects import Motion
-from hdbridge.model import TransmissionModel
+from hdbridge.axis.effects import Motion
+from hdbridge.axis.model import TransmissionModel
 from hdbridge.records.record import Record
 
 MODEL = """schema: hdbridge.model/1

@@ -20,14 +20,14 @@ from typing import Any
 from hdbridge.analysis.diagnosis import diagnose
 from hdbridge.analysis.findings import Diagnosis
 from hdbridge.axis import AxisConfig
+from hdbridge.axis.model import TransmissionModel
+from hdbridge.commissioning.evaluation.stepping import SchemeResult, quantisation_floor_arcsec
 from hdbridge.control.bench import Bench, axis_view, compensation_for
 from hdbridge.drive.drive import Drive
-from hdbridge.evaluation.stepping import SchemeResult, quantisation_floor_arcsec
-from hdbridge.model import TransmissionModel
-from hdbridge.procedures.chain import Chain
-from hdbridge.procedures.moves import AxisView, Dwell, MoveTo, Procedure, Steps
-from hdbridge.procedures.rehearsal import rehearse
-from hdbridge.procedures.stepping import Stepping
+from hdbridge.motion.procedures.chain import Chain
+from hdbridge.motion.procedures.moves import AxisView, Dwell, MoveTo, Procedure, Steps
+from hdbridge.motion.procedures.rehearsal import rehearse
+from hdbridge.motion.procedures.stepping import Stepping
 from hdbridge.records.recording import Recording
 from hdbridge.sim.lockstep import simulated_bench
 from hdbridge.sim.truth import Truth

@@ -12,10 +12,10 @@ import numpy as np
 from hdbridge import Bench, Drive
 from hdbridge.analysis.response import Trial, harmonics, motor_orders, response_of
 from hdbridge.axis import AxisConfig
-from hdbridge.calibration.motion import limits_of
-from hdbridge.model import TransmissionModel
-from hdbridge.model.response import Response
-from hdbridge.procedures.even_speed import EvenSpeed
+from hdbridge.axis.model import TransmissionModel
+from hdbridge.axis.model.response import Response
+from hdbridge.commissioning.calibration.motion import limits_of
+from hdbridge.motion.procedures.even_speed import EvenSpeed
 from hdbridge.sim.lockstep import simulated_bench
 
 ARTICLE = Path(__file__).resolve().parents[2] / "profiles" / "article"

@@ -9,13 +9,13 @@ from dataclasses import replace
 from pathlib import Path
 
 from hdbridge.axis import AxisConfig
+from hdbridge.axis.effects import Moment
 from hdbridge.control.compensation import Compensation, CompensationLimits
 from hdbridge.daemon.loop.follower import AxisSetup
 from hdbridge.daemon.loop.states import AxisState
 from hdbridge.daemon.memory import CommandKind, EventKind
 from hdbridge.daemon.service.axis import ServiceAxis
 from hdbridge.drive.supervision import Reaction
-from hdbridge.effects import Moment
 from hdbridge.errors import RefusedError
 from hdbridge.units import DEG_PER_TURN
 from support.characters import FRIENDLY, Character

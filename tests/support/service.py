@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any, ParamSpec, TypeVar
 
 from hdbridge.axis import AxisConfig
+from hdbridge.axis.model import TransmissionModel
 from hdbridge.clock import Clock
 from hdbridge.daemon.machine import Axis, Machine
 from hdbridge.daemon.service.bridge import ServiceBridge
@@ -19,7 +20,6 @@ from hdbridge.daemon.service.joborder import Told, Work
 from hdbridge.daemon.service.jobwork import run
 from hdbridge.daemon.service.rigs import DaemonRig
 from hdbridge.files.profile import Profile
-from hdbridge.model import TransmissionModel
 from support.characters import FRIENDLY, Character
 from support.daemon import PROFILE, SteppedDaemon, stepped_daemon
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from hdbridge.model import TransmissionModel
+from hdbridge.axis.model import TransmissionModel
 
 
 def with_spring(model: TransmissionModel, compliance: float) -> TransmissionModel:

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from hdbridge.model import TransmissionModel
+from hdbridge.axis.model import TransmissionModel
 from hdbridge.records.record import Record
 from support import plant
 

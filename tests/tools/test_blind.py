@@ -204,7 +204,7 @@ def test_work_stays_within_the_limits_of_its_axis(kind: str, seed: int) -> None:
     import random
 
     from hdbridge.control.bench import axis_view
-    from hdbridge.procedures.rehearsal import rehearse
+    from hdbridge.motion.procedures.rehearsal import rehearse
 
     rng = random.Random(f"{kind} {seed}")
     view = axis_view(AxisConfig.load(bundled_profile("article")))

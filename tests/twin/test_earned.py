@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from hdbridge.axis import AxisConfig
+from hdbridge.axis.effects import FloatArray
 from hdbridge.control.bench import Bench
 from hdbridge.drive.drive import Drive
-from hdbridge.effects import FloatArray
-from hdbridge.procedures.stepping import Stepping
+from hdbridge.motion.procedures.stepping import Stepping
 from hdbridge.records.record import Record
 from hdbridge.records.recording import Recording
 from hdbridge.sim.lockstep import simulated_bench

@@ -16,7 +16,7 @@ from hdbridge.axis.channels import ChannelSource, Temperature
 from hdbridge.control.bench import Bench
 from hdbridge.drive.drive import Drive
 from hdbridge.errors import InputError
-from hdbridge.procedures.stepping import Stepping
+from hdbridge.motion.procedures.stepping import Stepping
 from hdbridge.records.recording import Recording
 from hdbridge.sim.lockstep import simulated_bench
 from hdbridge.sim.truth import Truth

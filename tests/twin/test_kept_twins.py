@@ -11,9 +11,9 @@ import pytest
 from support.command import run_here
 
 from hdbridge.axis import AxisConfig, Identity
+from hdbridge.axis.model import store
 from hdbridge.errors import InputError
 from hdbridge.files.profile import Profile
-from hdbridge.model import store
 from hdbridge.sim.truth import Truth
 from hdbridge.simulated import simulated
 from hdbridge.twin.twin import TWINS, KeptTwin, diff

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from hdbridge.effects import FloatArray
+from hdbridge.axis.effects import FloatArray
 from hdbridge.sim.truth import Truth
 from hdbridge.twin.fit import fitted_rows, legs_of_rows, solve
 from hdbridge.twin.misfit import Scales

@@ -11,7 +11,7 @@ import pytest
 from hdbridge.axis import AxisConfig
 from hdbridge.control.bench import Bench
 from hdbridge.drive.drive import Drive
-from hdbridge.procedures.stepping import Stepping
+from hdbridge.motion.procedures.stepping import Stepping
 from hdbridge.records.record import Record
 from hdbridge.records.recording import Recording
 from hdbridge.sim.lockstep import simulated_bench

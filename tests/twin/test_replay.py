@@ -15,8 +15,8 @@ from hdbridge.axis.channels import ChannelSource, Temperature
 from hdbridge.control.bench import Bench, axis_view
 from hdbridge.drive.drive import Drive
 from hdbridge.errors import InputError
-from hdbridge.procedures.moves import MoveTo
-from hdbridge.procedures.stepping import Stepping
+from hdbridge.motion.procedures.moves import MoveTo
+from hdbridge.motion.procedures.stepping import Stepping
 from hdbridge.records.record import Record
 from hdbridge.records.recording import Recording
 from hdbridge.sim.lockstep import simulated_bench

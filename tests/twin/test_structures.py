@@ -15,7 +15,7 @@ from foreign.mechanics import BoucWen
 from hdbridge.axis import AxisConfig
 from hdbridge.control.bench import Bench
 from hdbridge.drive.drive import Drive
-from hdbridge.procedures.plan import Plan
+from hdbridge.motion.procedures.plan import Plan
 from hdbridge.records.recording import Recording
 from hdbridge.sim.truth import Truth
 from hdbridge.twin.compare import compare

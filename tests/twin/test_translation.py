@@ -15,7 +15,7 @@ from support.effect_examples import EXAMPLES
 from support.exercised import record_of
 
 from hdbridge.axis import AxisConfig
-from hdbridge.effects import (
+from hdbridge.axis.effects import (
     CATALOGUE,
     AmplitudeDrift,
     Backlash,
@@ -48,8 +48,8 @@ from hdbridge.effects import (
     Wear,
     ZeroDrift,
 )
+from hdbridge.axis.model import TransmissionModel
 from hdbridge.errors import InputError
-from hdbridge.model import TransmissionModel
 from hdbridge.records.record import Record
 from hdbridge.sim import fast
 from hdbridge.sim.exercise import Exercise

@@ -14,9 +14,9 @@ from support.command import run_here
 from support.exercised import record_of
 
 from hdbridge.axis import AxisConfig
-from hdbridge.effects import Hysteresis, MotorOrder, Synchronous
+from hdbridge.axis.effects import Hysteresis, MotorOrder, Synchronous
+from hdbridge.axis.model import TransmissionModel
 from hdbridge.files.csvfile import write_columns
-from hdbridge.model import TransmissionModel
 from hdbridge.records.recording import Recording, Segment
 from hdbridge.sim.exercise import Exercise
 from hdbridge.sim.truth import Truth

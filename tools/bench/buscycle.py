@@ -33,6 +33,7 @@ from typing import Any
 from cycle import PROFILE, AnsweringBus, LoopbackSocket, NeverSleeping, Variants, block_us, loopback_bus
 
 from hdbridge.axis import AxisConfig
+from hdbridge.axis.model import TransmissionModel
 from hdbridge.clock import Clock
 from hdbridge.control.compensation import Compensation, CompensationLimits
 from hdbridge.drive.feedback import Feedback
@@ -41,7 +42,6 @@ from hdbridge.drive.link import Link
 from hdbridge.drive.states import State
 from hdbridge.drive.supervision import Supervision
 from hdbridge.errors import SafetyStop
-from hdbridge.model import TransmissionModel
 
 AXES = (1, 2, 4, 6)
 HELD, COMPENSATED = "held", "compensated"

@@ -46,6 +46,9 @@ from can.interfaces.socketcan.socketcan import build_can_frame
 from can.interfaces.virtual import VirtualBus
 
 from hdbridge.axis import AxisConfig
+from hdbridge.axis.effects import InertialWindup, Observer
+from hdbridge.axis.model import TransmissionModel
+from hdbridge.axis.model.response import LeadFilter, Response
 from hdbridge.clock import Clock
 from hdbridge.control.compensation import Compensation, CompensationLimits
 from hdbridge.control.cycle import Cycle, Feedback
@@ -53,10 +56,7 @@ from hdbridge.drive.image import ProcessImage
 from hdbridge.drive.link import Link
 from hdbridge.drive.states import State
 from hdbridge.drive.supervision import Supervision
-from hdbridge.effects import InertialWindup, Observer
 from hdbridge.errors import SafetyStop
-from hdbridge.model import TransmissionModel
-from hdbridge.model.response import LeadFilter, Response
 
 PROFILE = Path(__file__).resolve().parents[2] / "profiles" / "article"
 STATUS_ENABLED = 0x1237

@@ -42,13 +42,13 @@ from daemon_realtime import RealClock
 from rundaemon import CONTROL, SERVICE, Clients, Cost, RunningDaemon, running
 
 from hdbridge.axis import AxisConfig
+from hdbridge.axis.model import TransmissionModel
 from hdbridge.client import Client
 from hdbridge.control.realtime import prepare_realtime
 from hdbridge.daemon.memory import Memory
 from hdbridge.drive.drive import Drive
 from hdbridge.errors import HdbridgeError
 from hdbridge.files.profile import Profile
-from hdbridge.model import TransmissionModel
 from hdbridge.sim.lockstep import SimulatedAxis, simulated_benches
 
 HERE: Final = Path(__file__).resolve().parent

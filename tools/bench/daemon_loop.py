@@ -33,6 +33,8 @@ from can.interfaces.virtual import VirtualBus
 from cycle import PROFILE, NeverSleeping, answers, block_us
 
 from hdbridge.axis import AxisConfig
+from hdbridge.axis.effects import Moment, Observer
+from hdbridge.axis.model import TransmissionModel
 from hdbridge.clock import Clock
 from hdbridge.control.bench import axis_view, compensation_for
 from hdbridge.control.buscycle import BusCycle
@@ -47,9 +49,7 @@ from hdbridge.drive.image import ProcessImage
 from hdbridge.drive.link import Link
 from hdbridge.drive.states import State
 from hdbridge.drive.supervision import Supervision
-from hdbridge.effects import Moment, Observer
 from hdbridge.errors import SafetyStop
-from hdbridge.model import TransmissionModel
 from hdbridge.motion import SetPoint
 
 GOAL = 1.3

@@ -19,7 +19,7 @@ sys.path.insert(0, str(Path(__file__).parents[2] / "tests"))
 from support import plant
 
 from hdbridge.analysis.diagnosis import diagnose
-from hdbridge.model import TransmissionModel
+from hdbridge.axis.model import TransmissionModel
 from hdbridge.records.record import Record
 
 HIDDEN = {"backlash": {"gap": 6.0}, "load_order": {"orders": [(1, 5.0, 30.0)]}}

@@ -10,7 +10,7 @@ import timeit
 
 import numpy as np
 
-from hdbridge.effects import CATALOGUE, Channel, Moment, Motion, Start
+from hdbridge.axis.effects import CATALOGUE, Channel, Moment, Motion, Start
 
 RATIO = 50.0
 

@@ -20,8 +20,8 @@ from identify_records import Truth, plan, record, recording
 
 from hdbridge.analysis.identification import FitOptions
 from hdbridge.analysis.identify import fit
-from hdbridge.calibration import measured_of
-from hdbridge.effects import Start
+from hdbridge.axis.effects import Start
+from hdbridge.commissioning.calibration import measured_of
 from hdbridge.records.recording import Recording
 
 

@@ -23,6 +23,7 @@ from contextlib import ExitStack
 import can
 
 from hdbridge.axis import AxisConfig
+from hdbridge.axis.model import TransmissionModel
 from hdbridge.canframe import DataFrame
 from hdbridge.control.bench import compensation_for
 from hdbridge.control.cycle import Cycle, Feedback
@@ -32,8 +33,7 @@ from hdbridge.drive.objects import Mode
 from hdbridge.drive.supervision import Supervision
 from hdbridge.drive.switching import until_enabled
 from hdbridge.files.bundled import bundled_profile
-from hdbridge.model import TransmissionModel
-from hdbridge.procedures.moves import Sample
+from hdbridge.motion.procedures.moves import Sample
 from hdbridge.sim import fast
 from hdbridge.sim.lockstep import LockstepBus, VirtualClock, lockstep_bench, nameplate_of, simulated_bench
 from hdbridge.sim.truth import Truth

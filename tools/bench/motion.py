@@ -17,14 +17,14 @@ from collections.abc import Callable
 from pathlib import Path
 
 from hdbridge.axis import AxisConfig
+from hdbridge.axis.effects import Moment
+from hdbridge.axis.model import TransmissionModel
 from hdbridge.control.bench import compensation_for
 from hdbridge.control.compensation import Compensation, CompensationLimits
 from hdbridge.control.loadloop import LoadLoop
 from hdbridge.control.switchover import Correction
-from hdbridge.effects import Moment
-from hdbridge.model import TransmissionModel
 from hdbridge.motion import SetPoint
-from hdbridge.procedures.moves import MotionLimits
+from hdbridge.motion.procedures.moves import MotionLimits
 
 PROFILES = Path(__file__).resolve().parents[2] / "profiles"
 LIMITS = MotionLimits(-3600.0, 3600.0, 60.0, 200.0, 4000.0)

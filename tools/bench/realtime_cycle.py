@@ -31,8 +31,8 @@ from buscycle import COMPENSATED, Axes
 from cycle import PROFILE, Variants, answering_kernel
 
 from hdbridge.axis import AxisConfig
+from hdbridge.axis.model import TransmissionModel
 from hdbridge.control.realtime import prepare_realtime
-from hdbridge.model import TransmissionModel
 
 WARM_UP = 50
 AXES = 6

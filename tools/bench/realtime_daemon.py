@@ -41,6 +41,8 @@ from daemon_loop import bench_cycle
 from realtime_cycle import WARM_UP, Figures, Waking, table
 
 from hdbridge.axis import AxisConfig
+from hdbridge.axis.model import TransmissionModel
+from hdbridge.commissioning.evaluation.stepping import Scheme
 from hdbridge.control.bench import compensation_for
 from hdbridge.control.buscycle import BusCycle
 from hdbridge.control.realtime import prepare_realtime
@@ -50,8 +52,6 @@ from hdbridge.daemon.loop.states import AxisState
 from hdbridge.daemon.memory import CommandKind, EventKind, Knot, Memory, RelayedFrame
 from hdbridge.daemon.setting import CompensationSetting
 from hdbridge.drive.link import Link
-from hdbridge.evaluation.stepping import Scheme
-from hdbridge.model import TransmissionModel
 
 VARIANTS = {"bench": (1, 1.0), "one": (1, 1.0), "six": (6, 4.0)}
 """Axes, and the cycle in milliseconds."""

@@ -22,6 +22,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from hdbridge.axis import AxisConfig
+from hdbridge.axis.model import TransmissionModel
 from hdbridge.clock import MonotonicClock
 from hdbridge.control.compensation import Compensation, CompensationLimits
 from hdbridge.control.cycle import LATE, Cycle, Feedback
@@ -33,7 +34,6 @@ from hdbridge.drive.objects import Mode
 from hdbridge.drive.states import State
 from hdbridge.drive.supervision import Fault, Supervision
 from hdbridge.errors import HdbridgeError, SafetyStop
-from hdbridge.model import TransmissionModel
 
 PROFILE = Path(__file__).resolve().parents[2] / "profiles" / "article"
 SWING_DEG = 2.0

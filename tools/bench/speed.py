@@ -17,12 +17,12 @@ from itertools import pairwise
 
 from hdbridge.axis import AxisConfig, LoadTorque, Temperature
 from hdbridge.axis.channels import ChannelSource
+from hdbridge.axis.effects import Compliance, extended
+from hdbridge.axis.model import TransmissionModel
 from hdbridge.control.bench import Bench, compensation_for
 from hdbridge.drive.drive import Drive
-from hdbridge.effects import Compliance, extended
 from hdbridge.files.bundled import bundled_profile
-from hdbridge.model import TransmissionModel
-from hdbridge.procedures.stepping import Stepping
+from hdbridge.motion.procedures.stepping import Stepping
 from hdbridge.sim import fast
 from hdbridge.sim.lockstep import simulated_bench
 from hdbridge.sim.machine import Machine

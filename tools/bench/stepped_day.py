@@ -35,6 +35,7 @@ from accounts import Accounts
 sys.path.append(str(Path(__file__).resolve().parents[2] / "tests"))
 from support.service import Service, stepped_service
 
+from hdbridge.commissioning.evaluation.stepping import Scheme
 from hdbridge.daemon.api.metrics import Metrics
 from hdbridge.daemon.following.settings import AdaptationSettings
 from hdbridge.daemon.memory import Event, EventKind, SampleArray
@@ -49,7 +50,6 @@ from hdbridge.daemon.service.journal import Journal
 from hdbridge.daemon.service.moves import WayPoint
 from hdbridge.daemon.service.streams import StreamPoint
 from hdbridge.errors import HdbridgeError
-from hdbridge.evaluation.stepping import Scheme
 
 RECORDER: Final = RecorderSettings(size_mb=8, file_mb=2, file_s=60, kept_mb=4, before_s=10, after_s=5)
 """A small ring, so that it is full within minutes."""

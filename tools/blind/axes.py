@@ -20,11 +20,11 @@ from support.hidden.elastic import remembering
 from support.hidden.site import ARCSEC_PER_RAD, ARCSEC_PER_TURN
 
 from hdbridge.axis import AxisConfig
-from hdbridge.calibration.measure import outlook
+from hdbridge.commissioning.calibration.measure import outlook
 from hdbridge.control.bench import axis_view
 from hdbridge.files.bundled import bundled_profile
-from hdbridge.procedures.moves import MoveTo
-from hdbridge.procedures.plan import Plan
+from hdbridge.motion.procedures.moves import MoveTo
+from hdbridge.motion.procedures.plan import Plan
 from hdbridge.sim.hysteresis_laws import law_of
 from hdbridge.sim.machine import Machine
 from hdbridge.sim.truth import RollingFriction, Truth

@@ -26,9 +26,9 @@ from support.hidden import CAUSES, UNKNOWN, Hidden, Run, hide, hide_all
 from support.hidden.site import ARCSEC_PER_RAD, ARCSEC_PER_TURN
 
 from hdbridge import InputError
-from hdbridge.calibration.measure import outlook
+from hdbridge.commissioning.calibration.measure import outlook
 from hdbridge.control.bench import axis_view
-from hdbridge.procedures.plan import Plan
+from hdbridge.motion.procedures.plan import Plan
 from hdbridge.records.record import Record, concatenate
 from hdbridge.records.recording import Recording, Segment
 from hdbridge.sim.exercise import Readings

@@ -22,14 +22,14 @@ from numpy.typing import NDArray
 
 from hdbridge import InputError, TransmissionModel, fit
 from hdbridge.axis import AxisConfig
-from hdbridge.calibration import measure, start_journal
+from hdbridge.axis.effects import Moment
+from hdbridge.commissioning.calibration import measure, start_journal
 from hdbridge.control.bench import Run, axis_view, compensation_for, record_of, walk
 from hdbridge.control.compensation import Compensation
-from hdbridge.effects import Moment
-from hdbridge.procedures.moves import Move, Procedure, Sample, Settle
-from hdbridge.procedures.moves import Path as Way
-from hdbridge.procedures.plan import Plan
-from hdbridge.procedures.rehearsal import rehearse
+from hdbridge.motion.procedures.moves import Move, Procedure, Sample, Settle
+from hdbridge.motion.procedures.moves import Path as Way
+from hdbridge.motion.procedures.plan import Plan
+from hdbridge.motion.procedures.rehearsal import rehearse
 from hdbridge.records.record import Record
 from hdbridge.records.recording import Segment
 from hdbridge.sim.machine import Machine

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hdbridge.procedures.moves import AxisView, Dwell, MotionLimits, Move, MoveTo, Path, Sample, Steps
+from hdbridge.motion.procedures.moves import AxisView, Dwell, MotionLimits, Move, MoveTo, Path, Sample, Steps
 
 KINDS = ("moves", "steps", "pick and place", "stream", "daemon")
 LONGEST_S = 600.0

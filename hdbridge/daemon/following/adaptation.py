@@ -16,6 +16,8 @@ from typing import Any
 import numpy as np
 
 from hdbridge.analysis.intervals import difference
+from hdbridge.axis.effects import FloatArray
+from hdbridge.axis.model import TransmissionModel
 from hdbridge.control.compensation import Inverse
 from hdbridge.daemon.following.estimator import (
     ZERO_ARCSEC,
@@ -29,9 +31,7 @@ from hdbridge.daemon.following.estimator import (
 )
 from hdbridge.daemon.following.measuring import DriftModel, Observation, reversals, turns
 from hdbridge.daemon.following.settings import AdaptationSettings, Mode
-from hdbridge.effects import FloatArray
 from hdbridge.errors import InputError
-from hdbridge.model import TransmissionModel
 
 ONE_WAY_TURNS = 4.0
 """Multiple of the turns of `Excitation` after which a window without reversals updates the memoryless

@@ -23,10 +23,10 @@ import numpy as np
 
 from hdbridge.analysis.intervals import NORMAL_95, Interval, leaves, nested_half_widths, slopes
 from hdbridge.analysis.linear import SEEN, Column, orthonormal
+from hdbridge.axis.effects import BoolArray, Effect, FloatArray
+from hdbridge.axis.model import TransmissionModel
 from hdbridge.daemon.following.measuring import DriftModel
 from hdbridge.daemon.following.settings import AdaptationSettings
-from hdbridge.effects import BoolArray, Effect, FloatArray
-from hdbridge.model import TransmissionModel
 
 EXCITED = 1.0
 """Information of a batch along a direction, in units of 1 / scale^2, above which the direction is excited."""

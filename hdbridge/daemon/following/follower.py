@@ -16,6 +16,7 @@ import numpy as np
 
 from hdbridge.axis import AxisConfig
 from hdbridge.axis.channels import BY_KEY
+from hdbridge.axis.model import TransmissionModel
 from hdbridge.client import messages
 from hdbridge.daemon.following.adaptation import Adaptation, Entry, Proposal
 from hdbridge.daemon.following.health import DRIVEN, EncoderHealth, EncoderStatus, held_out_arcsec, in_states
@@ -26,7 +27,6 @@ from hdbridge.daemon.following.settings import AdaptationSettings, Mode
 from hdbridge.daemon.following.statefile import AdaptationFiles
 from hdbridge.daemon.loop.states import AxisState
 from hdbridge.daemon.memory import NO_FAULT, SampleArray, SampleFlag, joined_samples
-from hdbridge.model import TransmissionModel
 
 SAMPLES_TOGETHER: Final = 25
 """Minimum number of samples evaluated together: ten evaluations per second at 250 Hz."""

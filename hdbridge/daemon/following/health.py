@@ -38,11 +38,11 @@ from numpy.typing import NDArray
 from hdbridge.analysis.linear import orthonormal
 from hdbridge.analysis.readings import jitter_deg
 from hdbridge.axis import AxisConfig
+from hdbridge.axis.effects import BoolArray, FloatArray
+from hdbridge.axis.model import TransmissionModel
 from hdbridge.daemon.following.estimator import Partial, partial_fit
 from hdbridge.daemon.loop.states import AxisState
 from hdbridge.daemon.memory import SampleArray, SampleFlag, joined_samples
-from hdbridge.effects import BoolArray, FloatArray
-from hdbridge.model import TransmissionModel
 from hdbridge.units import ARCSEC_PER_DEG
 
 DRIVEN: Final = (AxisState.ENABLED, AxisState.STOPPING)

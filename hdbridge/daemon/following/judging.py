@@ -34,12 +34,12 @@ from scipy.special import chdtri, ndtri
 
 from hdbridge.analysis.linear import Linearised
 from hdbridge.analysis.scales import Scales
+from hdbridge.axis.effects import FloatArray, IntArray
+from hdbridge.axis.model import TransmissionModel
 from hdbridge.daemon.following.estimator import bounds_arcsec, calibrated_estimator, changes_between
 from hdbridge.daemon.following.health import EncoderStatus
 from hdbridge.daemon.following.measuring import DriftModel, Observation, Term
 from hdbridge.daemon.following.settings import AdaptationSettings
-from hdbridge.effects import FloatArray, IntArray
-from hdbridge.model import TransmissionModel
 
 DAY_S: Final = 86_400.0
 FALSE_ALARMS_PER_DAY: Final = 1.0 / 365.0

@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from hdbridge.effects import (
+from hdbridge.axis.effects import (
     BoolArray,
     Channel,
     Effect,
@@ -33,12 +33,12 @@ from hdbridge.effects import (
     readings,
     refreshed,
 )
-from hdbridge.effects.base import Memoryless
-from hdbridge.effects.kinematics import Observer
-from hdbridge.effects.orders import cosines_and_sines
+from hdbridge.axis.effects.base import Memoryless
+from hdbridge.axis.effects.kinematics import Observer
+from hdbridge.axis.effects.orders import cosines_and_sines
+from hdbridge.axis.model import TransmissionModel
 from hdbridge.errors import InputError
 from hdbridge.files.expectation import nearest
-from hdbridge.model import TransmissionModel
 from hdbridge.units import ARCSEC_PER_DEG, DEG_PER_TURN
 
 LOAD_ORDERS = (1, 2)

@@ -22,9 +22,9 @@ from hdbridge.analysis.response import (
     samples_needed,
 )
 from hdbridge.axis import AxisConfig
+from hdbridge.axis.model import TransmissionModel
 from hdbridge.daemon.loop.states import AxisState
 from hdbridge.daemon.memory import SampleFlag
-from hdbridge.model import TransmissionModel
 from hdbridge.units import ARCSEC_PER_DEG, DEG_PER_TURN
 
 EVEN: Final = 1e-3

@@ -18,10 +18,10 @@ from typing import Literal
 
 from pydantic import Field, ValidationError
 
+from hdbridge.axis.model import TransmissionModel
 from hdbridge.daemon.following.adaptation import Entry, Learned
 from hdbridge.errors import OutputError
 from hdbridge.files.atomic import make_folder, write_atomically
-from hdbridge.model import TransmissionModel
 from hdbridge.strictness import Strict
 
 SCHEMA = "hdbridge.adaptation/1"

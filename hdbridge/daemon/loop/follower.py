@@ -12,6 +12,8 @@ from dataclasses import dataclass
 from typing import Final
 
 from hdbridge.axis import AxisConfig
+from hdbridge.axis.effects import Moment, Observer
+from hdbridge.commissioning.evaluation.stepping import Scheme
 from hdbridge.control.bench import axis_view
 from hdbridge.control.compensation import Compensation
 from hdbridge.control.loadloop import LoadLoop
@@ -21,9 +23,7 @@ from hdbridge.daemon.machinefile import LoadLoopSettings
 from hdbridge.daemon.setting import CompensationSetting
 from hdbridge.drive.feedback import Feedback
 from hdbridge.drive.image import ProcessImage
-from hdbridge.effects import Moment, Observer
 from hdbridge.errors import InputError
-from hdbridge.evaluation.stepping import Scheme
 from hdbridge.motion import SetPoint
 from hdbridge.units import ARCSEC_PER_DEG
 

@@ -15,6 +15,7 @@ from contextlib import contextmanager, nullcontext
 from types import FrameType
 from typing import Final
 
+from hdbridge.axis.model import TransmissionModel
 from hdbridge.clock import Clock, MonotonicClock
 from hdbridge.control.bench import compensation_for
 from hdbridge.control.buscycle import BusCycle
@@ -28,7 +29,6 @@ from hdbridge.daemon.memory import Cell, Memory
 from hdbridge.daemon.start import Simulation, Start, begin_child
 from hdbridge.drive.link import Link
 from hdbridge.errors import HdbridgeError
-from hdbridge.model import TransmissionModel
 
 AT_ONCE: Final = 2
 """Value of ``STOP_ASKED`` that requests an end by quick stop."""

@@ -14,6 +14,7 @@ from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any, Final, Literal
 
 from hdbridge.client import messages
+from hdbridge.commissioning.evaluation.stepping import Scheme
 from hdbridge.daemon.loop.states import AxisState
 from hdbridge.daemon.memory import CommandKind, EventKind
 from hdbridge.daemon.service.activity import Activity, Kind
@@ -27,15 +28,14 @@ from hdbridge.daemon.service.streams import ServiceStream
 from hdbridge.drive.states import State
 from hdbridge.drive.values import Object, Value
 from hdbridge.errors import DriveError, HdbridgeError, InputError, RefusedError
-from hdbridge.evaluation.stepping import Scheme
 from hdbridge.motion import MotionMode
 
 if TYPE_CHECKING:
+    from hdbridge.axis.model import TransmissionModel
     from hdbridge.daemon.machine import Axis
     from hdbridge.daemon.service.core import Core
     from hdbridge.daemon.service.following import Following
     from hdbridge.daemon.setting import CompensationSetting
-    from hdbridge.model import TransmissionModel
 
 CHANGE_S: Final = 120.0
 """Time in which another compensation is faded in, however slow its ramp."""

@@ -13,6 +13,7 @@ from concurrent.futures import Executor, Future
 from pathlib import Path
 from typing import Any, Final, ParamSpec, TypeVar
 
+from hdbridge.axis.model import TransmissionModel
 from hdbridge.client import messages
 from hdbridge.daemon.following.follower import NOTHING, Follower, Outcome
 from hdbridge.daemon.following.judging import WINDOW_S, Raised, Verdict
@@ -24,7 +25,6 @@ from hdbridge.daemon.recorder.recorder import FlightRecorder
 from hdbridge.daemon.service.activity import Kind
 from hdbridge.daemon.service.axis import ServiceAxis
 from hdbridge.errors import HdbridgeError
-from hdbridge.model import TransmissionModel
 
 MAX_BATCHES: Final = 500
 """Maximum number of batches that wait for the thread: ten seconds. Later ones are dropped."""

@@ -15,8 +15,8 @@ from pydantic import BaseModel, ConfigDict, Field, StringConstraints, Validation
 
 from hdbridge.axis import AxisConfig
 from hdbridge.client.messages import JobKind
+from hdbridge.commissioning.evaluation.stepping import Scheme
 from hdbridge.errors import InputError
-from hdbridge.evaluation.stepping import Scheme
 from hdbridge.files.profile import Profile
 
 _Name = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$", max_length=100)]

@@ -24,7 +24,7 @@ from hdbridge.control.rig import Rig
 from hdbridge.control.survived import Survived
 from hdbridge.daemon.service.joborder import Told, Work
 from hdbridge.errors import DaemonError
-from hdbridge.procedures.moves import Procedure
+from hdbridge.motion.procedures.moves import Procedure
 from hdbridge.records.record import REQUIRED, Record
 from hdbridge.records.recording import Segment
 

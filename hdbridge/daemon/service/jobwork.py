@@ -9,21 +9,21 @@ import json
 from pathlib import Path
 from typing import Any, Final
 
-from hdbridge.calibration import Journal, calibrate, start_journal
-from hdbridge.calibration.measure import outlook
-from hdbridge.calibration.validation import validation_s
+from hdbridge.axis.model import TransmissionModel, store
+from hdbridge.commissioning.calibration import Journal, calibrate, start_journal
+from hdbridge.commissioning.calibration.measure import outlook
+from hdbridge.commissioning.calibration.validation import validation_s
+from hdbridge.commissioning.evaluation.comparison import compare_schemes
+from hdbridge.commissioning.evaluation.stepping import Scheme
+from hdbridge.commissioning.improvement import Source, improve
+from hdbridge.commissioning.improvement.trial import trial_s
 from hdbridge.control.bench import Run
 from hdbridge.control.rig import Rig
 from hdbridge.daemon.service.joborder import CalibrateOptions, ImproveOptions, StepOptions, Told, Work
 from hdbridge.errors import InputError
-from hdbridge.evaluation.comparison import compare_schemes
-from hdbridge.evaluation.stepping import Scheme
 from hdbridge.files.atomic import make_folder, new_folder, write_atomically
-from hdbridge.improvement import Source, improve
-from hdbridge.improvement.trial import trial_s
-from hdbridge.model import TransmissionModel, store
-from hdbridge.procedures.plan import Plan
-from hdbridge.procedures.stepping import Stepping, SteppingOutcome
+from hdbridge.motion.procedures.plan import Plan
+from hdbridge.motion.procedures.stepping import Stepping, SteppingOutcome
 from hdbridge.records.record import Record
 from hdbridge.report.calibration import calibration_page
 from hdbridge.report.diagnosis import diagnosis_page

@@ -13,10 +13,10 @@ from datetime import datetime
 from typing import TYPE_CHECKING, Literal
 
 from hdbridge.axis import Identity
+from hdbridge.axis.model import TransmissionModel, store
+from hdbridge.commissioning.evaluation.stepping import Scheme
 from hdbridge.daemon.setting import CompensationSetting
 from hdbridge.errors import InputError
-from hdbridge.evaluation.stepping import Scheme
-from hdbridge.model import TransmissionModel, store
 
 if TYPE_CHECKING:
     from hdbridge.daemon.machine import Axis

@@ -23,9 +23,9 @@ from hdbridge.daemon.loop.states import AxisState
 from hdbridge.daemon.memory import CommandKind, Event, EventKind, Knot, SampleArray, SampleFlag, SampleReader
 from hdbridge.daemon.service.reports import fault_of
 from hdbridge.errors import DaemonError, RefusedError, SafetyStop
+from hdbridge.motion.procedures.moves import AxisView, MotionLimits, Move, Path, Procedure, Sample
+from hdbridge.motion.procedures.rehearsal import rehearse
 from hdbridge.motion.stream import BEGIN_DEG, Cubic
-from hdbridge.procedures.moves import AxisView, MotionLimits, Move, Path, Procedure, Sample
-from hdbridge.procedures.rehearsal import rehearse
 from hdbridge.records.record import Record
 from hdbridge.records.recording import Segment, versions_here
 

@@ -10,6 +10,7 @@ from contextlib import suppress
 from typing import TYPE_CHECKING, Final, Unpack
 
 from hdbridge.axis import AxisConfig, Identity
+from hdbridge.axis.model import TransmissionModel
 from hdbridge.control.bench import compensation_for
 from hdbridge.control.compensation import Compensation
 from hdbridge.daemon.loop.states import AxisState
@@ -20,7 +21,6 @@ from hdbridge.daemon.service.core import ANSWER_S, Arguments
 from hdbridge.daemon.service.procedures import DaemonBench
 from hdbridge.daemon.service.reports import stop_hint
 from hdbridge.errors import DaemonError, HdbridgeError, SafetyStop
-from hdbridge.model import TransmissionModel
 
 if TYPE_CHECKING:
     from hdbridge.daemon.service.axis import ServiceAxis

@@ -8,15 +8,15 @@ from hdbridge.analysis.identification import FitOptions
 from hdbridge.analysis.identify import fit
 from hdbridge.analysis.linear import solve_symmetric
 from hdbridge.axis import AxisConfig
-from hdbridge.calibration.identification import measured_of
+from hdbridge.axis.effects import Start
+from hdbridge.commissioning.calibration.identification import measured_of
 from hdbridge.control.bench import Bench
 from hdbridge.daemon.following.estimator import Estimator
 from hdbridge.daemon.following.follower import observation_sigma_arcsec
 from hdbridge.daemon.following.measuring import DriftModel, Measuring
 from hdbridge.drive import Drive
-from hdbridge.effects import Start
-from hdbridge.procedures.moves import Settle
-from hdbridge.procedures.stepping import Stepping
+from hdbridge.motion.procedures.moves import Settle
+from hdbridge.motion.procedures.stepping import Stepping
 from hdbridge.sim.lockstep import simulated_bench
 
 

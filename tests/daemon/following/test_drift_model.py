@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from support.adapting import MODEL, wandering, work
 
+from hdbridge.axis.effects import CATALOGUE, Moment, Motion, Start
 from hdbridge.daemon.following.measuring import DriftColumns, DriftModel
-from hdbridge.effects import CATALOGUE, Moment, Motion, Start
 from hdbridge.errors import InputError
 
 

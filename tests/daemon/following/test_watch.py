@@ -8,10 +8,10 @@ import pytest
 from support.axis_samples import SampleMaker, moves_and_rests
 
 from hdbridge.axis import AxisConfig
+from hdbridge.axis.effects import CATALOGUE
+from hdbridge.axis.model import TransmissionModel
 from hdbridge.daemon.following.follower import Follower
 from hdbridge.daemon.following.judging import Debounced, Verdict
-from hdbridge.effects import CATALOGUE
-from hdbridge.model import TransmissionModel
 
 DEMO = Path("profiles/demo/axis.yaml")
 AXIS = AxisConfig.from_text(DEMO.read_text().replace("cycle_ms: 4", "cycle_ms: 20"), DEMO)

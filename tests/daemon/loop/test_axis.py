@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 from support.daemon import PROFILE, SteppedDaemon, article_axes, stepped_daemon
 
+from hdbridge.axis.model import TransmissionModel
+from hdbridge.commissioning.evaluation.stepping import Scheme
 from hdbridge.control.bench import compensation_for
 from hdbridge.daemon.loop.follower import AxisSetup
 from hdbridge.daemon.loop.states import AxisState
 from hdbridge.daemon.machinefile import LoadLoopSettings
 from hdbridge.daemon.memory import CommandKind, EventKind, Knot, SampleFlag
 from hdbridge.drive.states import State
-from hdbridge.evaluation.stepping import Scheme
-from hdbridge.model import TransmissionModel
 from hdbridge.motion import MotionMode
 
 S, K, E = AxisState, CommandKind, EventKind

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from support.daemon import PROFILE, article_axes, stepped_daemon
 
+from hdbridge.axis.model import TransmissionModel
+from hdbridge.axis.model.response import LeadFilter, Response
 from hdbridge.daemon.memory import CommandKind
-from hdbridge.model import TransmissionModel
-from hdbridge.model.response import LeadFilter, Response
 
 AXIS = article_axes()[0]
 SPEED_DEG_S = 18.0

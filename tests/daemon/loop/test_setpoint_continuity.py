@@ -13,11 +13,11 @@ from hypothesis import strategies as st
 from support.characters import CHARACTERS, Character
 from support.daemon import PROFILE, SteppedDaemon, article_axes, stepped_daemon
 
+from hdbridge.axis.model import TransmissionModel
 from hdbridge.daemon.loop.states import AxisState
 from hdbridge.daemon.memory import CommandKind
 from hdbridge.device.faults import Faults
 from hdbridge.errors import HdbridgeError
-from hdbridge.model import TransmissionModel
 from hdbridge.sim.truth import Truth
 
 COUNTS_PER_TURN = 1 << 20

@@ -8,10 +8,10 @@ from support.axis_samples import SampleMaker, moves_and_rests
 from support.flight import flight_log
 
 from hdbridge.axis import AxisConfig
+from hdbridge.axis.effects import CATALOGUE
+from hdbridge.axis.model import TransmissionModel
 from hdbridge.daemon.recorder.autodiagnosis import AutoDiagnosis, summary
 from hdbridge.daemon.recorder.flightlog import Batch
-from hdbridge.effects import CATALOGUE
-from hdbridge.model import TransmissionModel
 
 AXIS = AxisConfig.load("profiles/demo")
 

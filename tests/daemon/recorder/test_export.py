@@ -10,11 +10,11 @@ from support.command import run_here
 from support.flight import START_NS, about, event, flight_log, samples
 
 from hdbridge.axis import AxisConfig
+from hdbridge.axis.model import TransmissionModel
 from hdbridge.daemon.recorder.export import exported, last_model
 from hdbridge.daemon.recorder.flightlog import Batch, ModelUse
 from hdbridge.daemon.recorder.reading import flight_files, read
 from hdbridge.errors import InputError
-from hdbridge.model import TransmissionModel
 from hdbridge.records.recording import Recording
 
 AXIS = AxisConfig.load("profiles/demo")

@@ -13,13 +13,13 @@ import yaml
 from support.adapting import truth_of
 from support.service import Service, play, stepped_service, until
 
+from hdbridge.axis.effects import Hysteresis
 from hdbridge.client import messages
+from hdbridge.commissioning.evaluation.stepping import Scheme
 from hdbridge.daemon.following.settings import AdaptationSettings
 from hdbridge.daemon.memory import EventKind
 from hdbridge.daemon.service.bridge import ServiceBridge
 from hdbridge.daemon.service.following import Following
-from hdbridge.effects import Hysteresis
-from hdbridge.evaluation.stepping import Scheme
 
 QUICK = AdaptationSettings(mode="on", interval_s=3.0, rate_arcsec_per_hour=7200.0, half_life_turns=10.0)
 

@@ -10,15 +10,15 @@ from support.service import Service, play, stepped_service, until
 
 from hdbridge import TransmissionModel
 from hdbridge.analysis.response import harmonics
+from hdbridge.commissioning.evaluation.stepping import Scheme
 from hdbridge.control.bench import axis_view, compensation_for
 from hdbridge.daemon.service.activity import Activity, Kind
 from hdbridge.daemon.service.bridge import ServiceBridge
 from hdbridge.daemon.service.moves import WayPoint
 from hdbridge.daemon.service.rigs import DaemonRig
 from hdbridge.daemon.service.streams import StreamPoint
-from hdbridge.evaluation.stepping import Scheme
-from hdbridge.procedures.even_speed import EvenSpeed
-from hdbridge.procedures.moves import MoveTo
+from hdbridge.motion.procedures.even_speed import EvenSpeed
+from hdbridge.motion.procedures.moves import MoveTo
 
 SPEED_DEG_S = 76.0
 FAR_DEG = 140.0

@@ -16,7 +16,10 @@ from support.axis_samples import SampleMaker, moves_and_rests
 from support.service import Service, play, stepped_service, until
 
 from hdbridge.axis import AxisConfig
+from hdbridge.axis.effects import Hysteresis
+from hdbridge.axis.model import TransmissionModel
 from hdbridge.client.messages import AdaptationMode
+from hdbridge.commissioning.evaluation.stepping import Scheme
 from hdbridge.daemon.following.follower import Follower
 from hdbridge.daemon.following.settings import AdaptationSettings
 from hdbridge.daemon.following.statefile import AdaptationFiles
@@ -24,9 +27,6 @@ from hdbridge.daemon.memory import EventKind
 from hdbridge.daemon.serve import follow
 from hdbridge.daemon.service.bridge import ServiceBridge
 from hdbridge.daemon.service.following import Following
-from hdbridge.effects import Hysteresis
-from hdbridge.evaluation.stepping import Scheme
-from hdbridge.model import TransmissionModel
 
 MOVED_ARCSEC = 2.0
 DEMO = Path("profiles/demo/axis.yaml")

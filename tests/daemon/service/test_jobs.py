@@ -6,11 +6,11 @@ from pathlib import Path
 import pytest
 from support.service import Service, play, stepped_service, until
 
+from hdbridge.axis.model import TransmissionModel, store
 from hdbridge.client.messages import Job, JobKind
 from hdbridge.daemon.service.bridge import ServiceBridge
 from hdbridge.daemon.service.jobs import in_own_process
 from hdbridge.errors import InputError, LeaseError, RefusedError
-from hdbridge.model import TransmissionModel, store
 from hdbridge.records.recording import Recording
 
 SHORT = """\

@@ -11,17 +11,17 @@ from hypothesis import strategies as st
 from support.effect_examples import EXAMPLES
 from support.service import Service, play, stepped_service, until
 
+from hdbridge.axis.effects import Hysteresis
+from hdbridge.axis.model import TransmissionModel, store
 from hdbridge.client.messages import JobKind
+from hdbridge.commissioning.evaluation.stepping import Scheme
 from hdbridge.control.bench import compensation_for
 from hdbridge.control.switchover import Correction
 from hdbridge.daemon.machinefile import LoadLoopSettings
 from hdbridge.daemon.memory import Cell
 from hdbridge.daemon.service.bridge import ServiceBridge
 from hdbridge.daemon.setting import CompensationSetting
-from hdbridge.effects import Hysteresis
 from hdbridge.errors import DaemonError, InputError, RefusedError
-from hdbridge.evaluation.stepping import Scheme
-from hdbridge.model import TransmissionModel, store
 
 NOW = datetime(2026, 3, 1, tzinfo=UTC)
 

@@ -8,17 +8,17 @@ from support.daemon import PROFILE
 from support.service import Service, play, stepped_service
 
 from hdbridge import AxisConfig, Bench, TransmissionModel
+from hdbridge.commissioning.evaluation.stepping import SchemeResult
 from hdbridge.control.bench import compensation_for
 from hdbridge.daemon.service.activity import Activity, Kind
 from hdbridge.daemon.service.axis import ServiceAxis
 from hdbridge.daemon.service.procedures import knots_of, streamed_view
 from hdbridge.daemon.service.rigs import DaemonRig
 from hdbridge.errors import InputError
-from hdbridge.evaluation.stepping import SchemeResult
 from hdbridge.motion.generator import Bounds
+from hdbridge.motion.procedures.moves import Dwell, MoveTo, Sine
+from hdbridge.motion.procedures.stepping import Stepping
 from hdbridge.motion.stream import Stream
-from hdbridge.procedures.moves import Dwell, MoveTo, Sine
-from hdbridge.procedures.stepping import Stepping
 from hdbridge.simulated import simulated
 
 SMALL = Stepping(count=12, step_deg=43.56)

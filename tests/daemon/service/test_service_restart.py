@@ -5,10 +5,10 @@ from pathlib import Path
 import pytest
 from support.service import Service, play, stepped_service, until
 
+from hdbridge.commissioning.evaluation.stepping import Scheme
 from hdbridge.daemon.loop.states import AxisState
 from hdbridge.daemon.memory import Cell, CommandKind
 from hdbridge.errors import LeaseError
-from hdbridge.evaluation.stepping import Scheme
 
 
 @pytest.fixture

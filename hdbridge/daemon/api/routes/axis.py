@@ -5,6 +5,7 @@ from __future__ import annotations
 from fastapi import APIRouter, Request
 
 from hdbridge.client import messages
+from hdbridge.commissioning.evaluation.stepping import Scheme
 from hdbridge.daemon.api.routes.parts import (
     LOOKING,
     MOVING,
@@ -19,7 +20,6 @@ from hdbridge.daemon.api.routes.parts import (
 from hdbridge.daemon.service.bridge import ServiceBridge
 from hdbridge.daemon.service.commissioning import HomingRun
 from hdbridge.daemon.service.moves import WayPoint
-from hdbridge.evaluation.stepping import Scheme
 
 
 def axis_routes(bridge: ServiceBridge) -> APIRouter:

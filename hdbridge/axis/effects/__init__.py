@@ -1,0 +1,196 @@
+"""Catalogue of causes: one cause of transmission error per file, looked up by name."""
+
+from hdbridge.axis.effects.amplitude_drift import AmplitudeDrift
+from hdbridge.axis.effects.backlash import Backlash
+from hdbridge.axis.effects.base import (
+    MEASURED,
+    SLOT,
+    BoolArray,
+    Cause,
+    Channel,
+    Compensable,
+    Effect,
+    Experiment,
+    FloatArray,
+    IntArray,
+    Moment,
+    Motion,
+    Moves,
+    Observations,
+    Part,
+    Shape,
+    Sought,
+    Start,
+    Tracker,
+    readings,
+    unmet,
+)
+from hdbridge.axis.effects.basic import BASIC, USUAL_LOOP, is_ripple, ripple
+from hdbridge.axis.effects.carried import Loop, loop_of, orders_of
+from hdbridge.axis.effects.channel_skew import ChannelSkew
+from hdbridge.axis.effects.combine import compensable, conflicts, extended, fall_bound, in_place, refreshed
+from hdbridge.axis.effects.compliance import Compliance
+from hdbridge.axis.effects.count_loss import CountLoss, Step
+from hdbridge.axis.effects.creep import Creep, Relaxation
+from hdbridge.axis.effects.direction_phase import DirectionPhase
+from hdbridge.axis.effects.flexspline_order import FlexsplineOrders
+from hdbridge.axis.effects.hysteresis import Hysteresis
+from hdbridge.axis.effects.hysteresis_memory import HysteresisMemory
+from hdbridge.axis.effects.hysteresis_parameters import HysteresisParameters
+from hdbridge.axis.effects.inertial_windup import InertialWindup
+from hdbridge.axis.effects.kinematics import Observer, moments
+from hdbridge.axis.effects.load_order import LoadOrders
+from hdbridge.axis.effects.local_defect import LocalDefect
+from hdbridge.axis.effects.motor_encoder_eccentricity import MotorEncoderEccentricity
+from hdbridge.axis.effects.motor_order import MotorOrders
+from hdbridge.axis.effects.orders import MotorOrder
+from hdbridge.axis.effects.rate_dependence import RateDependence
+from hdbridge.axis.effects.ratio_error import RatioError
+from hdbridge.axis.effects.subdivisional_error import SubdivisionalError
+from hdbridge.axis.effects.synchronous import Synchronous
+from hdbridge.axis.effects.torque import TorqueGrowth
+from hdbridge.axis.effects.torque_modulation import TorqueModulation
+from hdbridge.axis.effects.velocity_windup import VelocityWindup
+from hdbridge.axis.effects.vibration import Vibration
+from hdbridge.axis.effects.wear import Wear
+from hdbridge.axis.effects.zero_drift import ZeroDrift
+from hdbridge.errors import InputError
+
+CATALOGUE: dict[str, type[Effect]] = {
+    each.name: each
+    for each in (
+        Synchronous,
+        Hysteresis,
+        MotorOrders,
+        MotorEncoderEccentricity,
+        LoadOrders,
+        FlexsplineOrders,
+        DirectionPhase,
+        TorqueModulation,
+        Compliance,
+        InertialWindup,
+        VelocityWindup,
+        ChannelSkew,
+        Backlash,
+        HysteresisMemory,
+        HysteresisParameters,
+        RateDependence,
+        SubdivisionalError,
+        ZeroDrift,
+        AmplitudeDrift,
+        Wear,
+        Creep,
+        RatioError,
+        CountLoss,
+        Vibration,
+        LocalDefect,
+    )
+}
+"""All effects by canonical name."""
+
+
+def causes() -> tuple[str, ...]:
+    """Returns the names of the causes that a diagnosis can find in addition to the two basic parts of a
+    model.
+    """
+    return tuple(name for name in CATALOGUE if name not in BASIC)
+
+
+def register(kind: type[Effect]) -> type[Effect]:
+    """Adds a kind of effect to the catalogue of this process; a decorator for custom effects.
+
+    Model files may then contain it, fits and compensation use it, and a diagnosis can find it. Raises
+    `InputError` if another kind has the same name.
+    """
+    if CATALOGUE.get(kind.name, kind) is not kind:
+        raise InputError(
+            f"an effect '{kind.name}' is in the catalogue already ({CATALOGUE[kind.name].__module__}); "
+            "give yours another name"
+        )
+    CATALOGUE[kind.name] = kind
+    return kind
+
+
+def withdraw(kind: type[Effect]) -> None:
+    """Removes a kind of effect from the catalogue."""
+    CATALOGUE.pop(kind.name, None)
+
+
+def aliases_of(name: str) -> tuple[str, ...]:
+    """Returns the causes that can be confused with this one, by either's declaration, in catalogue order."""
+    own = CATALOGUE[name].about.aliases if name in CATALOGUE else ()
+    return tuple(other for other, kind in CATALOGUE.items() if other in own or name in kind.about.aliases)
+
+
+__all__ = [
+    "BASIC",
+    "CATALOGUE",
+    "MEASURED",
+    "SLOT",
+    "USUAL_LOOP",
+    "AmplitudeDrift",
+    "Backlash",
+    "BoolArray",
+    "Cause",
+    "Channel",
+    "ChannelSkew",
+    "Compensable",
+    "Compliance",
+    "CountLoss",
+    "Creep",
+    "DirectionPhase",
+    "Effect",
+    "Experiment",
+    "FlexsplineOrders",
+    "FloatArray",
+    "Hysteresis",
+    "HysteresisMemory",
+    "HysteresisParameters",
+    "InertialWindup",
+    "IntArray",
+    "LoadOrders",
+    "LocalDefect",
+    "Loop",
+    "Moment",
+    "Motion",
+    "MotorEncoderEccentricity",
+    "MotorOrder",
+    "MotorOrders",
+    "Moves",
+    "Observations",
+    "Observer",
+    "Part",
+    "RateDependence",
+    "RatioError",
+    "Relaxation",
+    "Shape",
+    "Sought",
+    "Start",
+    "Step",
+    "SubdivisionalError",
+    "Synchronous",
+    "TorqueGrowth",
+    "TorqueModulation",
+    "Tracker",
+    "VelocityWindup",
+    "Vibration",
+    "Wear",
+    "ZeroDrift",
+    "aliases_of",
+    "causes",
+    "compensable",
+    "conflicts",
+    "extended",
+    "fall_bound",
+    "in_place",
+    "is_ripple",
+    "loop_of",
+    "moments",
+    "orders_of",
+    "readings",
+    "refreshed",
+    "register",
+    "ripple",
+    "unmet",
+    "withdraw",
+]

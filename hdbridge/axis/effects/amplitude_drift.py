@@ -1,0 +1,213 @@
+"""Temperature dependence of ripple and friction."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Annotated, Any, ClassVar
+
+import numpy as np
+from pydantic import Field
+
+from hdbridge.axis.effects.base import (
+    Cause,
+    Channel,
+    Compensable,
+    Effect,
+    FloatArray,
+    Linear,
+    Moment,
+    Motion,
+    Observations,
+    Part,
+    Start,
+    Tracker,
+)
+from hdbridge.axis.effects.carried import Loop, growth_of, has_loop, has_orders, loop_of, orders_of
+from hdbridge.axis.effects.motor_order import MotorOrders
+from hdbridge.axis.effects.orders import RAD_PER_DEG, Orders, OrderTracker, phasors, ripple
+from hdbridge.axis.effects.reference import REACH_K, Told, nearest
+from hdbridge.axis.effects.torque import TorqueGrowth
+from hdbridge.axis.effects.warmth import Warmed, WarmthState
+
+
+class AmplitudeDrift(Linear, Warmed):
+    """w (ripple S(theta_M) + friction H): the model's ripple and loop change with the gear's warmth w.
+
+    Growth of the ripple with torque is the same warm or cold: the torque-dependent part is scaled as well.
+    """
+
+    name: ClassVar[str] = "amplitude_drift"
+    about: ClassVar[Cause] = Cause(
+        title="ripple and friction change with temperature",
+        subject="drift",
+        equation="w (ripple S + friction H), S the model's orders (times 1 + growth tau where they grow with "
+        "torque), H its loop, w the gear's warmth as in zero_drift",
+        signature="the ripple within a motor turn, or the height of the loop, follows the temperature",
+        consequence="a compensation measured warm is wrong in the cold morning",
+        remedy="warm up before work; calibrate at working temperature; compensate it with a temperature "
+        "sensor",
+        experiment="the same sweeps both ways cold, while it soaks, and warm, at one load",
+        aliases=("torque_modulation", "wear", "hysteresis_parameters"),
+        source="first-order dependence on temperature with a first-order lag",
+        size="10-30 % over the warm-up",
+    )
+    compensable: ClassVar[Compensable] = Compensable(
+        True, "where the temperature is recorded on line; driven by time alone only after a start from cold"
+    )
+    carries: ClassVar[Mapping[Part, str]] = {
+        Part.ORDERS: "orders",
+        Part.LOOP: "loop",
+        Part.GROWTH: "under_load",
+    }
+    linear: ClassVar[tuple[str, ...]] = ("ripple_percent_per_k", "friction_percent_per_k")
+    typical: ClassVar[Mapping[str, Any]] = {
+        "ripple_percent_per_k": 0.5,
+        "friction_percent_per_k": -0.5,
+        "tau_s": 1800.0,
+    }
+    """Growth of 0.5 % per kelvin, with a falling loop."""
+
+    orders: Orders
+    loop: Annotated[Loop, Field(description="the model's loop")]
+    under_load: Annotated[
+        TorqueGrowth | None, Field(description="growth of the model's orders with torque (torque_modulation)")
+    ] = None
+    ripple_percent_per_k: Annotated[
+        float, Field(ge=-10, le=10, description="growth of the orders per kelvin")
+    ]
+    friction_percent_per_k: Annotated[
+        float, Field(ge=-10, le=10, description="growth of the loop per kelvin")
+    ]
+
+    @classmethod
+    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[AmplitudeDrift]:
+        """Yields effects driven by temperature if it changes, else by time."""
+        if has_orders(base) and has_loop(base):
+            for driven_by, tau_s in cls.lags(observations):
+                yield cls(
+                    orders=orders_of(base), loop=loop_of(base), ripple_percent_per_k=1.0,
+                    friction_percent_per_k=1.0, tau_s=tau_s, driven_by=driven_by,
+                )  # fmt: skip
+
+    def scales(self) -> tuple[Part, Effect]:
+        """Returns loop or ripple, whichever changes more."""
+        ripple = math.sqrt(0.5 * sum(each.amplitude_arcsec**2 for each in self.orders))
+        friction = abs(self.friction_percent_per_k * self.loop.offset_arcsec)
+        if abs(self.ripple_percent_per_k) * ripple <= friction:
+            return Part.LOOP, self.loop.law()
+        return Part.ORDERS, MotorOrders(orders=self.orders)
+
+    def retold(
+        self, now: Sequence[Effect], given: Sequence[Effect], observations: Observations
+    ) -> tuple[Effect, ...] | None:
+        """Re-expresses the drift at the reference temperature that brings the rest of the model nearest to
+        ``given``.
+        """
+        temperature = observations.motion.measured.get(Channel.TEMPERATURE)
+        if temperature is None or self.driven_by != "temperature":
+            return None
+        coldest, hottest = float(np.min(temperature)) - REACH_K, float(np.max(temperature)) + REACH_K
+        growth = (self.ripple_percent_per_k, self.friction_percent_per_k)
+        told = nearest(self.orders, self.loop, growth, now[: len(given)], given)
+        if told is None or not coldest <= self.reference_c + told.warmer_k <= hottest:
+            return None
+        return tuple(
+            each._counted(told) if isinstance(each, AmplitudeDrift) else told.counted(each) for each in now
+        )
+
+    def _counted(self, told: Told) -> AmplitudeDrift:
+        return self.model_copy(
+            update={
+                "ripple_percent_per_k": self.ripple_percent_per_k * told.per_ripple,
+                "friction_percent_per_k": self.friction_percent_per_k * told.per_loop,
+                "reference_c": round(self.reference_c + told.warmer_k, 1),
+            }
+        )
+
+    def needs(self) -> frozenset[Channel]:
+        """Returns the warmth's channels, and the torque if the orders grow with it."""
+        load = self.under_load
+        return super().needs() | (frozenset() if load is None else {Channel(load.torque)})
+
+    def columns(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
+        """Returns the effect of 1 % per kelvin on ripple and on loop, shape (n, 2)."""
+        orders = ripple(motion.motor_deg, phasors(self.orders))
+        if self.under_load is not None:
+            orders = orders * self.under_load.factor(motion, self.name)
+        parts = np.column_stack([orders, self.loop.law().predict(motion, start)])
+        columns: FloatArray = 0.01 * self.warmth(motion)[:, np.newaxis] * parts
+        return columns
+
+    def tracker(self, start: Start = Start.VIRGIN) -> Tracker:
+        """Returns an on-line tracker, in thermal equilibrium at its first moment."""
+        return _Tracker(self, self.loop.law().tracker(start))
+
+    def gentle_tracker(self, start: Start, fall_arcsec_per_deg: float) -> Tracker | None:
+        """If the load lags, returns a tracker whose loop, at the highest warmth, falls no more steeply than
+        this.
+        """
+        left = fall_arcsec_per_deg - self.ripple_fall()
+        if not self.loop_share() or left <= 0.0:
+            return None
+        loop = self.loop.law().gentle_tracker(start, left / self.loop_share())
+        return None if loop is None else _Tracker(self, loop)
+
+    def bound_arcsec(self) -> float:
+        """Bound at the highest warmth."""
+        ripple = abs(self.ripple_percent_per_k) * sum(each.amplitude_arcsec for each in self.orders)
+        ripple *= self._most()
+        return 0.01 * self.limit_k * (ripple + abs(self.friction_percent_per_k * self.loop.offset_arcsec))
+
+    def slope_bound_arcsec_per_deg(self) -> float:
+        """Steepest fall of the ripple; infinite if the loop changes, because the effect falls as steeply as
+        the loop rises.
+
+        It takes only a share of the model's loop, so the sum of both does not fall: see `combine.fall_bound`.
+        """
+        return self.ripple_fall() if not self.friction_percent_per_k else math.inf
+
+    def ripple_fall(self) -> float:
+        """Returns the steepest fall of the ripple alone, arcsec per motor degree."""
+        slope = sum(each.order * each.amplitude_arcsec for each in self.orders)
+        return 0.01 * self.limit_k * RAD_PER_DEG * abs(self.ripple_percent_per_k) * slope * self._most()
+
+    def loop_share(self) -> float:
+        """Returns the largest share of the loop that the effect can remove."""
+        return 0.01 * abs(self.friction_percent_per_k) * self.limit_k
+
+    def _most(self) -> float:
+        return 1.0 if self.under_load is None else 1.0 + self.under_load.most()
+
+    @classmethod
+    def _carried(cls, base: Sequence[Effect]) -> dict[str, Any]:
+        return {"orders": orders_of(base), "loop": loop_of(base), "under_load": growth_of(base)}
+
+
+class _Tracker(Tracker):
+    __slots__ = ("_friction", "_load", "_loop", "_orders", "_ripple", "_warmth")
+
+    def __init__(self, effect: AmplitudeDrift, loop: Tracker) -> None:
+        self._orders = OrderTracker(phasors(effect.orders))
+        self._load = effect.under_load
+        self._loop = loop
+        self._ripple = 0.01 * effect.ripple_percent_per_k
+        self._friction = 0.01 * effect.friction_percent_per_k
+        self._warmth = WarmthState(effect)
+
+    @property
+    def memory_deg(self) -> float:
+        """Memory of the loop."""
+        return self._loop.memory_deg
+
+    def peek(self, motor_deg: float, moment: Moment) -> float:
+        friction = self._friction * self._loop.peek(motor_deg, moment)
+        return self._warmth.at(moment) * (self._ripple_at(motor_deg, moment) + friction)
+
+    def advance(self, motor_deg: float, moment: Moment) -> float:
+        friction = self._friction * self._loop.advance(motor_deg, moment)
+        return self._warmth.to(moment) * (self._ripple_at(motor_deg, moment) + friction)
+
+    def _ripple_at(self, motor_deg: float, moment: Moment) -> float:
+        ripple = self._ripple * self._orders.peek(motor_deg, moment)
+        return ripple if self._load is None else ripple * self._load.factor_at(moment)

@@ -1,0 +1,151 @@
+"""Dead zone behind the gear: a loose key, a worn coupling, a gear stage on the output."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import Annotated, ClassVar, Self
+
+import numpy as np
+from pydantic import Field
+
+from hdbridge.axis.effects.base import (
+    Cause,
+    Compensable,
+    Effect,
+    Experiment,
+    FloatArray,
+    Linear,
+    Moment,
+    Motion,
+    Observations,
+    Shape,
+    Start,
+    Tracker,
+)
+from hdbridge.axis.effects.play import Stop, stop
+from hdbridge.units import ARCSEC_PER_DEG
+
+_SOFTNESS = 1.25
+
+
+class Backlash(Linear):
+    """-gap / 2 times the stop operator of the motor angle: the load lags by half the gap on either side.
+
+    In an ideal gap the load stands still while the motor crosses ``gap N / 3600`` degrees, and the total has
+    no inverse, because many motor angles give one load angle. `crossing_deg` may be larger (a soft contact).
+    If a gap is too steep to invert, the compensation treats it as a softer one (`gentle_tracker`) and makes
+    the motor jump most of the gap at once.
+    """
+
+    name: ClassVar[str] = "backlash"
+    about: ClassVar[Cause] = Cause(
+        title="backlash behind the gear",
+        equation="-(gap / 2) s, s = clip(s_before + 2 d theta_M / crossing, -1, 1)",
+        signature="after each reversal the load rests while the motor moves on, then it follows: a loop "
+        "opposite in sense "
+        "to the elastic one, crossed within a fraction of a motor degree",
+        consequence="the load lags by half the gap on either side, and is free within the gap",
+        remedy="tighten the coupling or key; preload the axis by torque; compensate what is left",
+        experiment="reversals with a load torque to one side: it holds the play closed, hysteresis stays",
+        aliases=("hysteresis_parameters", "wear", "hysteresis_memory"),
+        source="play operator (dead zone with a resting load)",
+        size="2-36 arcsec",
+        apart={
+            "hysteresis_parameters": Experiment(
+                3, "repeat the small reversals with a load torque to one side: it holds a gap closed"
+            ),
+            "hysteresis_memory": Experiment(
+                3, "reversals of 0.1 to 2 deg of the motor, each beyond where the last one turned"
+            ),
+        },
+    )
+    compensable: ClassVar[Compensable] = Compensable(
+        True,
+        "as long as friction holds the load against one side; the motor has to jump the gap at each "
+        "reversal, so with "
+        "a load that swings freely leave it out",
+    )
+    shape: ClassVar[tuple[Shape, ...]] = (Shape("crossing_deg", 0.02, 20.0, logarithmic=True),)
+    ordinary_arcsec: ClassVar[float] = 1.0
+    """Half a gap of 2 arcsec, as much as an elastic loop of another shape can leave as a residual."""
+    linear: ClassVar[tuple[str, ...]] = ("gap_arcsec",)
+
+    gap_arcsec: Annotated[float, Field(ge=0, le=3600, description="width of the dead zone, at the load")]
+    crossing_deg: Annotated[
+        float, Field(gt=0, le=360, description="motor angle that crosses it; at least gap N / 3600")
+    ]
+
+    @classmethod
+    def of_gap(cls, gap_arcsec: float, ratio: float, softness: float = _SOFTNESS) -> Self:
+        """Returns a gap that takes ``softness`` times its ideal motor angle; from 1.25 on it is
+        invertible.
+        """
+        return cls(gap_arcsec=gap_arcsec, crossing_deg=_crossing_deg(gap_arcsec, ratio, softness))
+
+    @classmethod
+    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[Backlash]:  # noqa: ARG003
+        """Yields gaps from a hard contact to a soft one."""
+        yield from (cls(gap_arcsec=1.0, crossing_deg=each) for each in (0.05, 0.15, 0.4, 1.0, 2.5, 6.0))
+
+    def unidentifiable(self, observations: Observations) -> str:
+        """Requires reversals, because only they show backlash."""
+        return "" if observations.reversals >= 2 else "no reversal in which play would show"
+
+    def tidied(self, ratio: float) -> Self:
+        """Widens the crossing to the angle that an inverse needs.
+
+        The load stands still while the motor crosses, but noise lets a fit return a smaller angle than is
+        possible.
+        """
+        crossing = _crossing_deg(self.gap_arcsec, ratio)
+        return self.fitted(self.coefficients(), {"crossing_deg": max(crossing, self.crossing_deg)})
+
+    def columns(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
+        """Returns the effect of a gap of 1 arcsec, shape (n, 1)."""
+        return (-0.5 * stop(motion.motor_deg, self.crossing_deg, start))[:, np.newaxis]
+
+    def tracker(self, start: Start = Start.VIRGIN) -> Tracker:
+        """Returns an on-line tracker; its first `advance` only sets the motor position."""
+        return _Tracker(-0.5 * self.gap_arcsec, Stop(self.crossing_deg, start))
+
+    def gentle_tracker(self, start: Start, fall_arcsec_per_deg: float) -> Tracker | None:
+        """Returns the tracker of a gap that takes a larger motor angle to cross."""
+        crossing = max(self.crossing_deg, self.gap_arcsec / fall_arcsec_per_deg)
+        return _Tracker(-0.5 * self.gap_arcsec, Stop(crossing, start))
+
+    def bound_arcsec(self) -> float:
+        """Half the gap."""
+        return 0.5 * self.gap_arcsec
+
+    def slope_bound_arcsec_per_deg(self) -> float:
+        """Gap divided by its crossing angle."""
+        return self.gap_arcsec / self.crossing_deg
+
+    @classmethod
+    def candidate(cls, ratio: float, base: Sequence[Effect] = ()) -> Self:  # noqa: ARG003
+        """Returns a gap of 10 arcsec."""
+        return cls.of_gap(10.0, ratio)
+
+
+def _crossing_deg(gap_arcsec: float, ratio: float, softness: float = _SOFTNESS) -> float:
+    """Returns the crossing angle of a gap, ``softness`` times the ideal one; motor degrees."""
+    return max(softness * gap_arcsec * ratio / ARCSEC_PER_DEG, 1e-6)
+
+
+class _Tracker(Tracker):
+    __slots__ = ("_height", "_stop")
+
+    def __init__(self, height: float, play: Stop) -> None:
+        self._height = height
+        self._stop = play
+
+    @property
+    def memory_deg(self) -> float:
+        """Motor angle that crosses the gap."""
+        return self._stop.memory_deg
+
+    def peek(self, motor_deg: float, moment: Moment) -> float:
+        return self._height * self._stop.at(motor_deg)
+
+    def advance(self, motor_deg: float, moment: Moment) -> float:
+        return self._height * self._stop.to(motor_deg)

@@ -1,0 +1,78 @@
+"""Parts of a model that a modulating effect carries: synchronous orders, their growth with torque, the loop.
+
+An effect such as `torque_modulation` states that the synchronous part grows with torque. To be predicted,
+tracked and read on its own, it carries a copy of the part that it modulates, taken from the model when it is
+created; `combine.refreshed` keeps the copy up to date.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Annotated
+
+from pydantic import Field
+
+from hdbridge.axis.effects.base import Effect, Part
+from hdbridge.axis.effects.hysteresis import Hysteresis
+from hdbridge.axis.effects.hysteresis_memory import HysteresisMemory
+from hdbridge.axis.effects.orders import MotorOrder
+from hdbridge.axis.effects.synchronous import TYPICAL_ORDERS, Synchronous
+from hdbridge.axis.effects.torque import TorqueGrowth
+from hdbridge.strictness import Strict
+
+
+class Loop(Strict):
+    """The modulated elastic loop: parameters of `hysteresis`, and the law it follows."""
+
+    offset_arcsec: Annotated[
+        float, Field(ge=-3600, le=3600, description="half the height, at the load; negative where it lags")
+    ]
+    width_deg: Annotated[float, Field(gt=0, le=3600, description="motor angle of a full crossing")]
+    exponent: Annotated[float, Field(gt=1, le=6, description="shape n of the branch")]
+    memory: Annotated[bool, Field(description="with return-point memory (hysteresis_memory)")] = False
+
+    def law(self) -> Hysteresis | HysteresisMemory:
+        """Returns the effect with these parameters."""
+        kind = HysteresisMemory if self.memory else Hysteresis
+        # During a fit it may be out of its range, like the effect it was copied from.
+        return kind.model_construct(
+            offset_arcsec=self.offset_arcsec, width_deg=self.width_deg, exponent=self.exponent
+        )
+
+
+TYPICAL_LOOP = Loop(offset_arcsec=40.0, width_deg=20.0, exponent=1.6)
+"""Loop of a published gear of ratio 50 (Table 2 of the article that hdbridge implements)."""
+
+
+def loop_of(base: Iterable[Effect]) -> Loop:
+    """Returns the loop of a model's elastic law, of either kind; a typical one if it has none."""
+    for each in base:
+        if isinstance(each, Hysteresis | HysteresisMemory):
+            return Loop.model_construct(**each.parameters(), memory=isinstance(each, HysteresisMemory))
+    return TYPICAL_LOOP
+
+
+def orders_of(base: Iterable[Effect]) -> tuple[MotorOrder, ...]:
+    """Returns the orders of a model's synchronous part; typical ones if it has none."""
+    for each in base:
+        if isinstance(each, Synchronous) and each.orders:
+            return each.orders
+    return TYPICAL_ORDERS
+
+
+def has_loop(base: Iterable[Effect]) -> bool:
+    """Returns True if a model has a loop that can be scaled."""
+    return any(each.part is Part.LOOP for each in base)
+
+
+def has_orders(base: Iterable[Effect]) -> bool:
+    """Returns True if a model has a ripple that can be scaled."""
+    return any(isinstance(each, Synchronous) and each.orders for each in base)
+
+
+def growth_of(base: Iterable[Effect]) -> TorqueGrowth | None:
+    """Returns the growth of a model's orders with torque, or None."""
+    for each in base:
+        if isinstance(each, TorqueGrowth):
+            return TorqueGrowth(**{name: getattr(each, name) for name in TorqueGrowth.model_fields})
+    return None

@@ -1,0 +1,137 @@
+"""Time skew between the samples of the two encoders."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Annotated, Any, ClassVar, Self
+
+import numpy as np
+from pydantic import Field
+
+from hdbridge.axis.effects.base import (
+    Cause,
+    Channel,
+    Compensable,
+    Effect,
+    Experiment,
+    FloatArray,
+    Linear,
+    Memoryless,
+    Moment,
+    Motion,
+    Observations,
+    Start,
+    Tracker,
+)
+from hdbridge.axis.effects.kinematics import acceleration_of, speed_of
+from hdbridge.axis.effects.load_order import Ratio
+from hdbridge.units import ARCSEC_PER_DEG
+
+
+class ChannelSkew(Linear):
+    """delay omega_L + second alpha_L / 2: the load encoder, sampled later than the motor's, reads farther on.
+
+    A pure delay has second = delay^2. It is a separate parameter because the speed is a difference over a
+    sample, delayed by half a step, and a delay is rarely a whole number of samples. Without it the residual
+    would be attributed to inertial wind-up.
+    """
+
+    name: ClassVar[str] = "channel_skew"
+    channels: ClassVar[frozenset[Channel]] = frozenset({Channel.SPEED, Channel.ACCELERATION})
+    about: ClassVar[Cause] = Cause(
+        title="delay between the two encoder samples",
+        subject="delays",
+        equation="delay omega_L + second alpha_L / 2; omega_L, alpha_L = commanded motor speed and "
+        "acceleration / N, limited",
+        signature="an error in proportion to the speed, a straight line through zero, none at rest",
+        consequence="none for the axis: the measurement alone is wrong while it moves",
+        remedy="latch both encoders by one signal, or correct the time stamps in the recording",
+        experiment="sweeps at several speeds both ways: skew is linear in speed, drag falls off",
+        aliases=("velocity_windup", "inertial_windup", "rate_dependence"),
+        source="Taylor series of the load angle about the sampling instant",
+        size="0.5 ms is 103 arcsec at 1 rad/s of the load",
+        apart={
+            "velocity_windup": Experiment(
+                2, "sweep three motor turns both ways at three speeds: skew is a straight line, drag bends"
+            ),
+            "inertial_windup": Experiment(
+                2, "sweep at constant speed both ways: a skew stays, inertia is silent"
+            ),
+        },
+    )
+    compensable: ClassVar[Compensable] = Compensable(
+        False, "it is an error of the measurement; to compensate it would make the load lag or lead"
+    )
+    ordinary_arcsec: ClassVar[float] = 1.0
+    """No two encoders are sampled at exactly the same instant."""
+    incidental: ClassVar[frozenset[str]] = frozenset({"second_order_ms2"})
+    """Includes the load's own wind-up."""
+    linear: ClassVar[tuple[str, ...]] = ("delay_ms", "second_order_ms2")
+    typical: ClassVar[Mapping[str, Any]] = {"delay_ms": 0.5, "second_order_ms2": 0.25}
+
+    ratio: Ratio
+    delay_ms: Annotated[
+        float,
+        Field(ge=-1000, le=1000, description="how much later the load encoder is sampled than the motor's"),
+    ]
+    second_order_ms2: Annotated[
+        float,
+        Field(
+            ge=-1e6,
+            le=1e6,
+            description="coefficient of half the acceleration; delay squared for a pure delay",
+        ),
+    ] = 0.0
+    limit_deg_s: Annotated[float, Field(gt=0, le=1e6, description="motor speed beyond which it is held")] = (
+        1e5
+    )
+    limit_deg_s2: Annotated[
+        float, Field(gt=0, le=1e8, description="motor acceleration beyond which it is held")
+    ] = 1e6
+
+    @classmethod
+    def of_delay(cls, delay_ms: float, ratio: float) -> Self:
+        """Returns a pure delay."""
+        return cls(ratio=ratio, delay_ms=delay_ms, second_order_ms2=delay_ms * delay_ms)
+
+    @classmethod
+    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[ChannelSkew]:  # noqa: ARG003
+        """Yields the single candidate."""
+        yield cls(ratio=observations.ratio, delay_ms=1.0, second_order_ms2=1.0)
+
+    def columns(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
+        """Returns the effect of 1 ms and of 1 ms^2, shape (n, 2)."""
+        speed = np.clip(speed_of(motion, self.name), -self.limit_deg_s, self.limit_deg_s)
+        acceleration = np.clip(acceleration_of(motion, self.name), -self.limit_deg_s2, self.limit_deg_s2)
+        gain = ARCSEC_PER_DEG / self.ratio
+        return np.column_stack([1e-3 * gain * speed, 0.5e-6 * gain * acceleration])
+
+    def tracker(self, start: Start = Start.VIRGIN) -> Tracker:
+        """Returns an on-line tracker; speed and acceleration come from the moment."""
+        return _Tracker(self)
+
+    def bound_arcsec(self) -> float:
+        """Bound at the highest speed and acceleration."""
+        speed = 1e-3 * abs(self.delay_ms) * self.limit_deg_s
+        acceleration = 0.5e-6 * abs(self.second_order_ms2) * self.limit_deg_s2
+        return ARCSEC_PER_DEG / self.ratio * (speed + acceleration)
+
+    def slope_bound_arcsec_per_deg(self) -> float:
+        """Zero, because the speed is the command's, independent of the angle."""
+        return 0.0
+
+
+class _Tracker(Memoryless):
+    __slots__ = ("_first", "_limit", "_limit2", "_second")
+
+    def __init__(self, effect: ChannelSkew) -> None:
+        gain = ARCSEC_PER_DEG / effect.ratio
+        self._first = 1e-3 * gain * effect.delay_ms
+        self._second = 0.5e-6 * gain * effect.second_order_ms2
+        self._limit = effect.limit_deg_s
+        self._limit2 = effect.limit_deg_s2
+
+    def peek(self, motor_deg: float, moment: Moment) -> float:
+        speed = min(max(moment.motor_speed_deg_s, -self._limit), self._limit)
+        acceleration = min(max(moment.motor_acceleration_deg_s2, -self._limit2), self._limit2)
+        return self._first * speed + self._second * acceleration

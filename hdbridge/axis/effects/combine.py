@@ -1,0 +1,137 @@
+"""Combination of effects in one model: extension, updating of carried parts, choice of
+compensable effects.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+
+from hdbridge.axis.effects.amplitude_drift import AmplitudeDrift
+from hdbridge.axis.effects.base import Effect, Part
+from hdbridge.axis.effects.carried import Loop, growth_of, loop_of
+from hdbridge.axis.effects.hysteresis import Hysteresis
+from hdbridge.axis.effects.hysteresis_memory import HysteresisMemory
+from hdbridge.axis.effects.hysteresis_parameters import HysteresisParameters
+from hdbridge.axis.effects.motor_order import MotorOrders
+from hdbridge.axis.effects.orders import MotorOrder
+from hdbridge.axis.effects.synchronous import Synchronous
+from hdbridge.axis.effects.torque import TorqueGrowth
+
+_LAWS = (Hysteresis, HysteresisMemory)
+
+
+def extended(effects: Iterable[Effect], new: Effect) -> tuple[Effect, ...]:
+    """Returns the effects of a model extended by a new one.
+
+    The new effect replaces one of the same name or the one that it replaces by definition
+    (`hysteresis_memory` replaces `hysteresis`, and vice versa). Changed hysteresis parameters go into the
+    model's own loop. Everything else is added. Copies of the changed part in other effects are updated
+    (`refreshed`).
+    """
+    given = list(effects)
+    if isinstance(new, HysteresisParameters):
+        new = new.changed().law()
+    old = {new.name, new.replaces} | {each.name for each in given if each.replaces == new.name}
+    places = [i for i, each in enumerate(given) if each.name in old]
+    if places:
+        given[places[0]] = new
+        given = [each for i, each in enumerate(given) if i not in places[1:]]
+    else:
+        given.append(new)
+    return refreshed(given)
+
+
+def refreshed(effects: Iterable[Effect]) -> tuple[Effect, ...]:
+    """Returns the effects with the copies of orders and loop that they carry updated to the present model.
+
+    The orders are those of the synchronous part and of added motor orders, because a change of the tooth
+    error changes all of it. If the model has no synchronous part, the orders stay as they are.
+    """
+    given = tuple(effects)
+    loop = loop_of(given) if any(isinstance(each, _LAWS) for each in given) else None
+    series = [each for each in given if isinstance(each, Synchronous | MotorOrders)]
+    orders: tuple[MotorOrder, ...] | None = None
+    if any(isinstance(each, Synchronous) for each in series):
+        # For an order that occurs twice, the synchronous part's is used: a fit cannot separate their shares.
+        by_number = {order.order: order for each in reversed(series) for order in each.orders}
+        orders = tuple(by_number[number] for number in sorted(by_number))
+    growth = growth_of(given)
+    return tuple(_refreshed(each, loop, orders, growth) for each in given)
+
+
+def _refreshed(
+    effect: Effect, loop: Loop | None, orders: tuple[MotorOrder, ...] | None, growth: TorqueGrowth | None
+) -> Effect:
+    carries = effect.carries
+    update: dict[str, object] = {}
+    if Part.GROWTH in carries:
+        update[carries[Part.GROWTH]] = growth
+    if loop is not None and Part.LOOP in carries:
+        update[carries[Part.LOOP]] = loop
+    if orders and Part.ORDERS in carries:
+        update[carries[Part.ORDERS]] = orders
+    return effect.model_copy(update=update) if update else effect
+
+
+def in_place(effect: Effect, kinds: Iterable[type[Effect]]) -> tuple[Effect, ...]:
+    """Returns the alternatives that can replace an effect, with its parameters; see `Effect.replaces`.
+
+    A fit may have moved these out of their ranges; `violations` reports it, as for `fitted`.
+    """
+    return tuple(
+        kind.model_construct(**effect.parameters())
+        for kind in kinds
+        if kind.replaces == effect.name or effect.replaces == kind.name
+    )
+
+
+def compensable(effects: Iterable[Effect]) -> tuple[Effect, ...]:
+    """Returns the effects that a compensation should correct: real, predictable motions of the load."""
+    return tuple(each for each in effects if each.is_compensable())
+
+
+def fall_bound(effects: Iterable[Effect]) -> float:
+    """Returns a bound on how steeply the *sum* can fall, arcsec per motor degree.
+
+    This is the sum of the effects' own bounds, with one exception. An effect that removes a share of the
+    model's loop falls as steeply as the loop rises, and while no more than the whole loop is removed, the sum
+    still rises. (An effect on a loop in which the load lags may fall without bound in either direction.)
+    """
+    given = tuple(effects)
+    left = {
+        _key(Loop(**each.parameters(), memory=isinstance(each, HysteresisMemory))): 1.0
+        for each in given
+        if isinstance(each, _LAWS) and each.offset_arcsec >= 0.0
+    }
+    total = 0.0
+    for each in given:
+        if isinstance(each, AmplitudeDrift) and each.friction_percent_per_k:
+            key = _key(each.loop)
+            left[key] = left.get(key, 0.0) - each.loop_share()
+            total += each.ripple_fall() if left[key] >= 0.0 else math.inf
+        else:
+            total += each.slope_bound_arcsec_per_deg()
+    return total
+
+
+def _key(loop: Loop) -> tuple[object, ...]:
+    return tuple(loop.model_dump().values())
+
+
+def conflicts(effects: Iterable[Effect], ratio: float) -> tuple[str, ...]:
+    """Returns the reasons why these effects cannot form one model with this gear ratio; empty if they can."""
+    given = tuple(effects)
+    names = {each.name for each in given}
+    return (
+        *(
+            f"'{each.name}' stands in place of '{each.replaces}': keep one of the two"
+            for each in given
+            if each.replaces in names
+        ),
+        *(
+            f"'{each.name}' was made for a gear of ratio {theirs:g}, the model's is {ratio:g}"
+            for each in given
+            if not math.isclose(theirs := getattr(each, "ratio", ratio), ratio, rel_tol=1e-9)
+        ),
+    )

@@ -1,0 +1,199 @@
+"""Wind-up of the gear by the load torque: a spring that stiffens at two torques."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import pairwise
+from typing import Annotated, Any, ClassVar, Literal, Self
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from hdbridge.axis.effects.base import (
+    SLOT,
+    Cause,
+    Channel,
+    Compensable,
+    Effect,
+    FloatArray,
+    Linear,
+    Memoryless,
+    Moment,
+    Motion,
+    Observations,
+    Shape,
+    Start,
+    Tracker,
+)
+from hdbridge.axis.effects.load_order import LoadOrders
+from hdbridge.axis.effects.observations import top
+from hdbridge.axis.effects.orders import orders_from
+from hdbridge.axis.effects.torque import TorqueChannel, TorqueLimit
+
+ARCSEC_PER_RAD = 648_000.0 / np.pi
+"""Conversion constant: a stiffness of K Nm/rad is a compliance of ARCSEC_PER_RAD / K arcsec/Nm."""
+
+SOFTER = 1.05
+"""Factor by which noise alone may make a zone softer than the one before it."""
+
+_Softness = Annotated[float, Field(ge=0, le=1000)]
+
+
+class Compliance(Linear):
+    """sense * (c1, c2, c3 per Nm in the zones up to T1, up to T2, beyond); c = 206265 / K.
+
+    Written in compliances, because the error is linear in them: c1 = 206265 / K1 arcsec/Nm with K1 in Nm/rad.
+    """
+
+    name: ClassVar[str] = "compliance"
+    channels: ClassVar[frozenset[Channel]] = frozenset({Channel.LOAD_TORQUE})
+    about: ClassVar[Cause] = Cause(
+        title="wind-up by the load torque",
+        subject="effects of torque",
+        equation="sense sgn(T) (c1 min(|T|, T1) + c2 (|T| between T1 and T2) + c3 (|T| beyond T2)), c = "
+        "206265 arcsec / K",
+        signature="the error follows the torque; with a mass off centre it looks like once per load turn",
+        consequence="the load sags under its weight and yields to process forces",
+        remedy="compensate it where the torque is known; balance the load; a larger or stiffer gear",
+        experiment="move or take off the mass: the wind-up goes with it, a load order stays",
+        aliases=("load_order", "inertial_windup", "velocity_windup"),
+        source="catalogue stiffness K1, K2, K3 of strain wave gears with torques T1, T2",
+        size="about 16 arcsec/Nm in a size 20; 10-100 arcsec",
+    )
+    compensable: ClassVar[Compensable] = Compensable(
+        True,
+        "the load really moves so, where the torque is known on line (a torque sensor, or gravity from a "
+        "model)",
+    )
+    shape: ClassVar[tuple[Shape, ...]] = (
+        Shape("torque1_nm", 0.1, 1e5, logarithmic=True),
+        Shape("torque2_nm", 0.2, 1e5, logarithmic=True),
+    )
+    linear: ClassVar[tuple[str, ...]] = ("c1_arcsec_per_nm", "c2_arcsec_per_nm", "c3_arcsec_per_nm")
+    typical: ClassVar[Mapping[str, Any]] = {
+        "c1_arcsec_per_nm": 15.9,
+        "c2_arcsec_per_nm": 11.5,
+        "c3_arcsec_per_nm": 9.0,
+        "torque1_nm": 7.0,
+        "torque2_nm": 25.0,
+    }
+    """Size 20, ratio 50: K1, K2, K3 of 1.3, 1.8 and 2.3e4 Nm/rad, T1 and T2 of 7 and 25 Nm."""
+
+    c1_arcsec_per_nm: Annotated[
+        _Softness, Field(description="compliance up to T1: 206265 / K1, K1 in Nm/rad")
+    ]
+    c2_arcsec_per_nm: Annotated[_Softness, Field(description="compliance from T1 to T2")]
+    c3_arcsec_per_nm: Annotated[_Softness, Field(description="compliance beyond T2")]
+    torque1_nm: Annotated[float, Field(gt=0, le=1e5, description="T1")]
+    torque2_nm: Annotated[float, Field(gt=0, le=1e5, description="T2, above T1")]
+    sense: Annotated[
+        Literal[1, -1],
+        Field(description="1: a positive torque pushes the load forward; -1: it is what the gear delivers"),
+    ] = 1
+    torque: TorqueChannel = "load_torque_nm"
+    limit_nm: TorqueLimit = 1000.0
+
+    @model_validator(mode="after")
+    def _stiffens(self) -> Self:
+        if not self.torque1_nm < self.torque2_nm:
+            raise ValueError("T1 (torque1_nm) must be below T2 (torque2_nm)")
+        return self
+
+    @classmethod
+    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[Compliance]:  # noqa: ARG003
+        """Yields a linear spring, and springs that stiffen once or twice within the torques of the record."""
+        largest = top(observations.motion, Channel.LOAD_TORQUE)
+        if largest:
+            beyond = (1e4, 2e4)
+            once = ((share * largest, beyond[1]) for share in (0.2, 0.45, 0.7))
+            for low, high in (beyond, *once, (0.4 * largest, 0.8 * largest)):
+                yield cls(
+                    c1_arcsec_per_nm=1.0, c2_arcsec_per_nm=1.0, c3_arcsec_per_nm=1.0,
+                    torque1_nm=low, torque2_nm=high,
+                )  # fmt: skip
+
+    def implausible(self, observations: Observations) -> str:
+        """Requires that the spring stiffens with torque; a zone that the record does not reach has no
+        compliance.
+        """
+        zones = [each for each in self.coefficients().tolist() if each != 0.0]
+        stiffens = all(later <= SOFTER * earlier for earlier, later in pairwise(zones))
+        return "" if stiffens else "a gear's spring does not soften with torque"
+
+    @classmethod
+    def unmeasured(cls, ratio: float) -> Effect:
+        """Returns load order 1, because with an off-centre mass the torque goes round once with the load."""
+        return LoadOrders(ratio=ratio, orders=orders_from([1]))
+
+    def needs(self) -> frozenset[Channel]:
+        """Returns the torque channel."""
+        return frozenset({Channel(self.torque)})
+
+    def columns(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
+        """Returns the signed part of the torque in each of the three zones, shape (n, 3)."""
+        given = motion.channel(Channel(self.torque), self.name)
+        torque = np.minimum(np.abs(given), self.limit_nm)
+        low, high = self.torque1_nm, self.torque2_nm
+        zones = np.column_stack(
+            [
+                np.minimum(torque, low),
+                np.clip(torque - low, 0.0, high - low),
+                np.maximum(torque - high, 0.0),
+            ]
+        )
+        signed: FloatArray = self.sense * np.sign(given)[:, np.newaxis] * zones
+        return signed
+
+    def fitted(self, coefficients: FloatArray, shape: Mapping[str, float] | None = None) -> Self:
+        """Returns other compliances; if their sum is negative the sense flips, because a torque's sign is a
+        convention.
+        """
+        values = np.asarray(coefficients, dtype=np.float64)
+        turned = values.sum() < 0.0
+        effect = super().fitted(-values if turned else values, shape)
+        return effect.model_copy(update={"sense": -self.sense}) if turned else effect
+
+    def tracker(self, start: Start = Start.VIRGIN) -> Tracker:
+        """Returns a stateless on-line tracker."""
+        return _Tracker(self)
+
+    def bound_arcsec(self) -> float:
+        """Wind-up at the highest torque."""
+        low, high, most = self.torque1_nm, self.torque2_nm, self.limit_nm
+        return (
+            abs(self.c1_arcsec_per_nm) * min(most, low)
+            + abs(self.c2_arcsec_per_nm) * min(max(most - low, 0.0), high - low)
+            + abs(self.c3_arcsec_per_nm) * max(most - high, 0.0)
+        )
+
+    def slope_bound_arcsec_per_deg(self) -> float:
+        """Zero, because it depends on the torque, not on the motor angle."""
+        return 0.0
+
+    def stiffness_nm_per_rad(self) -> tuple[float, float, float]:
+        """Returns K1, K2, K3 as in catalogues; infinite for a compliance of zero."""
+        first, second, third = (ARCSEC_PER_RAD / each if each else np.inf for each in self.coefficients())
+        return float(first), float(second), float(third)
+
+
+class _Tracker(Memoryless):
+    __slots__ = ("_c", "_high", "_limit", "_low", "_sense", "_slot")
+
+    def __init__(self, effect: Compliance) -> None:
+        self._c = (effect.c1_arcsec_per_nm, effect.c2_arcsec_per_nm, effect.c3_arcsec_per_nm)
+        self._low = effect.torque1_nm
+        self._high = effect.torque2_nm
+        self._limit = effect.limit_nm
+        self._sense = effect.sense
+        self._slot = SLOT[Channel(effect.torque)]
+
+    def peek(self, motor_deg: float, moment: Moment) -> float:
+        given = moment.measured[self._slot]
+        torque = min(abs(given), self._limit)
+        first, second, third = self._c
+        error = first * min(torque, self._low)
+        if torque > self._low:
+            error += second * min(torque - self._low, self._high - self._low)
+            if torque > self._high:
+                error += third * (torque - self._high)
+        return self._sense * error if given >= 0.0 else -self._sense * error

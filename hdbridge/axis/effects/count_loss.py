@@ -1,0 +1,170 @@
+"""Counts lost by an encoder, or a tooth jumped: a persistent step at one time."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Annotated, Any, ClassVar, Self
+
+import numpy as np
+from pydantic import Field
+
+from hdbridge.axis.effects.base import (
+    Cause,
+    Channel,
+    Coefficient,
+    Compensable,
+    Effect,
+    FloatArray,
+    Memoryless,
+    Moment,
+    Motion,
+    Moves,
+    Observations,
+    Shape,
+    Sought,
+    Start,
+    Stretch,
+    Tracker,
+)
+from hdbridge.axis.effects.path import away_from_reversals
+from hdbridge.strictness import Strict
+
+NEAR_S, LEAST_NEAR = 1.0, 5
+"""Neighbourhood of a step: duration in seconds, and minimum number of samples."""
+
+
+class Step(Strict):
+    """One loss: from this time on the error is larger by its size."""
+
+    time_s: Annotated[float, Field(ge=-1e10, le=1e10, description="when it happened, on the record's clock")]
+    size_arcsec: Annotated[float, Field(ge=-1e6, le=1e6, description="the step, at the load")]
+
+
+class CountLoss(Effect):
+    """Sum of size_j for all steps with time_j <= t."""
+
+    name: ClassVar[str] = "count_loss"
+    channels: ClassVar[frozenset[Channel]] = frozenset({Channel.TIME})
+    about: ClassVar[Cause] = Cause(
+        title="a step that stays",
+        subject="lost counts",
+        equation="sum of size_j over the steps with t >= t_j",
+        signature="at one instant everything shifts, by whole counts of an encoder or by a tooth, and "
+        "stays so",
+        consequence="every position after it is off by the step, until the axis is homed",
+        remedy="home again; check cable, shield and supply of the encoder. A step of a whole tooth (360/z "
+        "deg) is "
+        "ratcheting: stop and look at the gear",
+        experiment="pass an index pulse or a reference mark before and after",
+        aliases=("zero_drift", "wear"),
+        source="kinematics",
+        size="3 arcsec (one motor count) and up; a tooth is 360/z degrees",
+    )
+    compensable: ClassVar[Compensable] = Compensable(
+        False,
+        "it cannot be foreseen, and after homing it is gone; a loss in the load encoder is no motion at all",
+    )
+    shape: ClassVar[tuple[Shape, ...]] = (Shape("time_s", -1e10, 1e10, moves=Moves.NEVER),)
+    usual: ClassVar[int] = 2
+    sought: ClassVar[Sought | None] = Sought.STEP
+    inexact: ClassVar[float] = 0.03
+    """Slow effects leave small steps next to a large one."""
+    typical: ClassVar[Mapping[str, Any]] = {"steps": (Step(time_s=0.0, size_arcsec=10.0),)}
+    """One step of 10 arcsec at time zero."""
+
+    steps: Annotated[
+        tuple[Step, ...], Field(min_length=1, max_length=100, description="losses: time_s, size_arcsec each")
+    ]
+
+    @classmethod
+    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[CountLoss]:  # noqa: ARG003
+        """Yields one step in the middle of the record, as an example."""
+        if observations.motion.time_s is not None:
+            middle = float(np.quantile(observations.motion.time_s, 0.5))
+            yield cls(steps=(Step(time_s=middle, size_arcsec=1.0),))
+
+    def unidentifiable(self, observations: Observations) -> str:
+        """Requires reversals: on an axis that never revisits a position, a step in time may be one in
+        position.
+        """
+        return "" if observations.reversals >= 2 else "a step in time may as well be one at a place"
+
+    def shows(self, motion: Motion) -> Stretch | None:
+        """Returns the samples away from reversals, where a loop of another shape leaves no steps."""
+        return away_from_reversals(motion)
+
+    def changing(self, motion: Motion) -> FloatArray:
+        """Returns steps before and after it, within a time in which slow effects barely change: a real one is
+        sudden.
+        """
+        time_s = motion.channel(Channel.TIME, self.name)
+        first = int(np.searchsorted(time_s, self.steps[0].time_s))
+        near = max(LEAST_NEAR, round(NEAR_S / float(np.median(np.diff(time_s)))))
+        number = np.arange(len(time_s))
+        return np.column_stack([number >= first - near, number >= first + near]).astype(np.float64)
+
+    def pieces(self) -> tuple[Self, ...]:
+        """Returns one effect per step."""
+        return tuple(self.model_copy(update={"steps": (each,)}) for each in self.steps)
+
+    def joined(self, other: Effect) -> Self | None:
+        """Returns the effect with the steps of both."""
+        if not isinstance(other, CountLoss):
+            return None
+        steps = tuple(sorted((*self.steps, *other.steps), key=lambda each: each.time_s))
+        return self.model_copy(update={"steps": steps})
+
+    def named_coefficients(self) -> tuple[Coefficient, ...]:
+        """Returns the names of the step sizes."""
+        return tuple(
+            Coefficient(f"step_{i + 1}_size_arcsec", (i,), ("steps", i, "size_arcsec"))
+            for i in range(len(self.steps))
+        )
+
+    def predict(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
+        """Returns the error in arcsec, shape (n,)."""
+        error: FloatArray = self.columns(motion, start) @ self.coefficients()
+        return error
+
+    def tracker(self, start: Start = Start.VIRGIN) -> Tracker:
+        """Returns an on-line tracker; it depends only on the clock."""
+        return _Tracker([(each.time_s, each.size_arcsec) for each in self.steps])
+
+    def columns(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
+        """Returns a unit step per loss, shape (n, steps)."""
+        time_s = motion.channel(Channel.TIME, self.name)
+        return (time_s[:, np.newaxis] >= [each.time_s for each in self.steps]).astype(np.float64)
+
+    def coefficients(self) -> FloatArray:
+        """Returns the step sizes, arcsec."""
+        return np.array([each.size_arcsec for each in self.steps])
+
+    def fitted(self, coefficients: FloatArray, shape: Mapping[str, float] | None = None) -> Self:
+        """Returns other step sizes; ``time_s`` in ``shape`` moves the last step."""
+        times = [each.time_s for each in self.steps]
+        if shape and "time_s" in shape:
+            times[-1] = float(shape["time_s"])
+        steps = tuple(
+            Step.model_construct(time_s=time_s, size_arcsec=float(size))
+            for time_s, size in zip(times, coefficients, strict=True)
+        )
+        return self.model_copy(update={"steps": steps})
+
+    def bound_arcsec(self) -> float:
+        """Sum of the absolute sizes."""
+        return sum(abs(each.size_arcsec) for each in self.steps)
+
+    def slope_bound_arcsec_per_deg(self) -> float:
+        """Zero, because it depends on time alone."""
+        return 0.0
+
+
+class _Tracker(Memoryless):
+    __slots__ = ("_steps",)
+
+    def __init__(self, steps: list[tuple[float, float]]) -> None:
+        self._steps = steps
+
+    def peek(self, motor_deg: float, moment: Moment) -> float:
+        now = moment.time_s
+        return sum((size for time_s, size in self._steps if now >= time_s), 0.0)

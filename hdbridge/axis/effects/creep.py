@@ -1,0 +1,215 @@
+"""Creep: slow relaxation of strain after a stop."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Annotated, Any, ClassVar, Self
+
+import numpy as np
+from pydantic import Field
+
+from hdbridge.axis.effects import coordinate as over
+from hdbridge.axis.effects.base import (
+    Cause,
+    Channel,
+    Coefficient,
+    Compensable,
+    Coordinate,
+    Effect,
+    FloatArray,
+    Moment,
+    Motion,
+    Observations,
+    Shape,
+    Start,
+    Stretch,
+    Tracker,
+)
+from hdbridge.axis.effects.kinematics import speed_of
+from hdbridge.axis.effects.observations import longest_rest_s
+from hdbridge.axis.effects.path import standing_s
+from hdbridge.axis.effects.recurrence import recurrence
+from hdbridge.strictness import Strict
+
+RESTS = 3.0
+"""Maximum ratio of the shortest time constant to the longest rest; beyond it the curvature is not visible."""
+
+
+class Relaxation(Strict):
+    """One exponential."""
+
+    amplitude_arcsec: Annotated[
+        float, Field(ge=-3600, le=3600, description="strain after a long move forward, at the load")
+    ]
+    tau_s: Annotated[float, Field(gt=0, le=1e6, description="time constant at rest")]
+
+
+class Creep(Effect):
+    """Sum of A_j y_j; y_j approaches the direction in motion, and zero at rest.
+
+    In motion the time constant is ``build_up`` tau_j. A value of 1 is a linear viscoelastic element (short
+    moves strain it little); well below 1 each move strains it fully, and after each stop there is A_j exp(-t
+    / tau_j).
+    """
+
+    name: ClassVar[str] = "creep"
+    channels: ClassVar[frozenset[Channel]] = frozenset({Channel.TIME, Channel.SPEED})
+    about: ClassVar[Cause] = Cause(
+        title="relaxation after a stop",
+        equation="sum of A_j y_j; tau_j dy_j/dt = -y_j at rest, build_up tau_j dy_j/dt = sgn(v) - y_j in "
+        "motion",
+        signature="after a stop the load moves on for seconds to minutes while the motor stands still",
+        consequence="the position at the end of a move is not the one a minute later",
+        remedy="compensate it, or wait; less preload or friction torque; it is the flexspline and the grease",
+        experiment="long rests after moves in either direction; servo settling would show at the motor too",
+        aliases=("zero_drift",),
+        source="generalised Kelvin-Voigt element: a sum of exponentials",
+        size="1-10 arcsec",
+    )
+    compensable: ClassVar[Compensable] = Compensable(
+        True, "the load really moves so, and the command says when it stopped"
+    )
+    shape: ClassVar[tuple[Shape, ...]] = (
+        Shape("tau_s", 0.05, 3600.0, logarithmic=True),
+        Shape("build_up", 0.01, 1.0, logarithmic=True),
+    )
+    """``tau_s`` is that of the first exponential; the others keep their ratio to it."""
+
+    usual: ClassVar[int] = 8
+    """A real relaxation is a sum of exponentials."""
+    typical: ClassVar[Mapping[str, Any]] = {
+        "parts": tuple(Relaxation(amplitude_arcsec=2.0, tau_s=tau_s) for tau_s in (2.0, 20.0)),
+        "build_up": 0.1,
+    }
+
+    parts: Annotated[
+        tuple[Relaxation, ...],
+        Field(min_length=1, max_length=8, description="exponentials: amplitude_arcsec, tau_s each"),
+    ]
+    build_up: Annotated[
+        float, Field(gt=0, le=10, description="time constants in motion, relative to those at rest")
+    ] = 1.0
+
+    @classmethod
+    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[Creep]:  # noqa: ARG003
+        """Yields single exponentials; those found are combined afterwards."""
+        for tau_s in (0.3, 1.0, 3.0, 10.0, 30.0, 100.0):
+            for build_up in (0.03, 0.3, 1.0):
+                yield cls(parts=(Relaxation(amplitude_arcsec=1.0, tau_s=tau_s),), build_up=build_up)
+
+    def unidentifiable(self, observations: Observations) -> str:
+        """Requires a time constant comparable to a rest, because a much slower one need not end with it."""
+        if min(each.tau_s for each in self.parts) <= RESTS * longest_rest_s(observations.motion):
+            return ""
+        return "no rest is long enough to see it bend"
+
+    def shows(self, motion: Motion) -> Stretch:
+        """Returns the samples at rest; in motion it may be part of a speed-dependent effect."""
+        return Stretch(standing_s(motion) > 0.0, "not seen at rest")
+
+    def coordinate(self, motion: Motion, ratio: float) -> Coordinate:
+        """Returns the time since the axis last stopped or started."""
+        return over.since_change(motion)
+
+    def pieces(self) -> tuple[Self, ...]:
+        """Returns one effect per exponential."""
+        return tuple(self.model_copy(update={"parts": (each,)}) for each in self.parts)
+
+    def joined(self, other: Effect) -> Self | None:
+        """Returns the effect with the exponentials of both."""
+        if not isinstance(other, Creep):
+            return None
+        return self.model_copy(update={"parts": (*self.parts, *other.parts)})
+
+    def largest_piece_arcsec(self) -> float:
+        """Returns the largest amplitude, because exponentials may cancel."""
+        return max(abs(each.amplitude_arcsec) for each in self.parts)
+
+    def named_coefficients(self) -> tuple[Coefficient, ...]:
+        """Returns the names of the amplitudes."""
+        return tuple(
+            Coefficient(f"part_{i + 1}_amplitude_arcsec", (i,), ("parts", i, "amplitude_arcsec"))
+            for i in range(len(self.parts))
+        )
+
+    def predict(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
+        """Returns the error in arcsec, shape (n,)."""
+        error: FloatArray = self.columns(motion, start) @ self.coefficients()
+        return error
+
+    def tracker(self, start: Start = Start.VIRGIN) -> Tracker:
+        """Returns an on-line tracker, fully relaxed at its first moment."""
+        return _Tracker([(each.amplitude_arcsec, each.tau_s) for each in self.parts], self.build_up)
+
+    def columns(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
+        """Returns y_j of each exponential, shape (n, parts)."""
+        time_s = motion.channel(Channel.TIME, self.name)
+        going = np.sign(speed_of(motion, self.name))
+        step = np.maximum(np.diff(time_s, prepend=time_s[:1]), 0.0)
+        step = np.where(going != 0.0, step / self.build_up, step)
+        columns = np.empty((len(motion), len(self.parts)))
+        for j, each in enumerate(self.parts):
+            decay = np.exp(-step / each.tau_s)
+            columns[:, j] = recurrence(decay, (1.0 - decay) * going, 0.0)
+        return columns
+
+    def coefficients(self) -> FloatArray:
+        """Returns the amplitudes, arcsec."""
+        return np.array([each.amplitude_arcsec for each in self.parts])
+
+    def fitted(self, coefficients: FloatArray, shape: Mapping[str, float] | None = None) -> Self:
+        """Returns other amplitudes and, if given, other time constants (``tau_s`` scales them all) and
+        build-up.
+        """
+        given = dict(shape or {})
+        scale = given.pop("tau_s", self.parts[0].tau_s) / self.parts[0].tau_s
+        parts = tuple(
+            Relaxation.model_construct(amplitude_arcsec=float(amplitude), tau_s=scale * each.tau_s)
+            for each, amplitude in zip(self.parts, coefficients, strict=True)
+        )
+        return self.model_copy(update={"parts": parts, **given})
+
+    def bound_arcsec(self) -> float:
+        """Sum of the absolute amplitudes."""
+        return sum(abs(each.amplitude_arcsec) for each in self.parts)
+
+    def slope_bound_arcsec_per_deg(self) -> float:
+        """Zero, because it depends on time and on the command's direction."""
+        return 0.0
+
+
+class _Tracker(Tracker):
+    """State: y_j and the time they refer to."""
+
+    __slots__ = ("_amplitudes", "_build_up", "_rates", "_strains", "_time")
+
+    def __init__(self, parts: list[tuple[float, float]], build_up: float) -> None:
+        self._amplitudes = [amplitude for amplitude, _ in parts]
+        self._rates = [1.0 / tau_s for _, tau_s in parts]
+        self._build_up = build_up
+        self._strains = [0.0] * len(parts)
+        self._time: float | None = None
+
+    def peek(self, motor_deg: float, moment: Moment) -> float:
+        return sum(map(float.__mul__, self._amplitudes, self._at(moment)))
+
+    def advance(self, motor_deg: float, moment: Moment) -> float:
+        self._strains = self._at(moment)
+        self._time = moment.time_s
+        return sum(map(float.__mul__, self._amplitudes, self._strains))
+
+    def _at(self, moment: Moment) -> list[float]:
+        if self._time is None:
+            return self._strains
+        speed = moment.motor_speed_deg_s
+        step = max(moment.time_s - self._time, 0.0)
+        going = 0.0
+        if speed:
+            going = math.copysign(1.0, speed)
+            step /= self._build_up
+        strains = []
+        for rate, strain in zip(self._rates, self._strains, strict=True):
+            decay = math.exp(-step * rate)
+            strains.append(decay * strain + (1.0 - decay) * going)
+        return strains

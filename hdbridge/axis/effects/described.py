@@ -1,0 +1,136 @@
+"""Descriptive tables of an effect: texts, shape parameters, and its part in a model."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from enum import Enum
+from typing import NamedTuple
+
+from hdbridge.axis.effects.motion import BoolArray
+
+
+class Part(Enum):
+    """Part of a model that other effects may scale and therefore carry a copy of."""
+
+    ORDERS = "ripple"
+    """Orders of the motor angle."""
+    LOOP = "elastic loop"
+    GROWTH = "growth of the ripple with torque"
+
+
+class Sought(Enum):
+    """Form of an effect that a matched filter searches for at all locations simultaneously."""
+
+    STEP = "a step in time"
+    BUMP = "a bump at one load angle"
+    TONE = "one line of the spectrum over time"
+    LINE = "one line of the spectrum over a turn of the load"
+
+    @property
+    def is_line(self) -> bool:
+        """True for one sharp spectral line, which nothing smooth resembles."""
+        return self in {Sought.TONE, Sought.LINE}
+
+
+class Moves(Enum):
+    """Range from which a local step improves a shape parameter."""
+
+    ANYWHERE = "anywhere"
+    NEARBY = "nearby"
+    """Only from near its optimum, which must be found by a search."""
+    NEVER = "never"
+    """The error does not depend smoothly on it."""
+
+
+class Experiment(NamedTuple):
+    """Measurement that separates two causes."""
+
+    minutes: float
+    words: str
+
+
+@dataclass(frozen=True, slots=True)
+class Shape:
+    """Parameter that the effect is *not* linear in, with the range in which a fit searches."""
+
+    name: str
+    lower: float
+    upper: float
+    logarithmic: bool = False
+    """True if the fit should step in the logarithm (widths, time constants)."""
+    moves: Moves = Moves.ANYWHERE
+    is_frequency: bool = False
+    """True if it counts periods in time, so that its resolution depends on the length of the record."""
+
+    def grid(self, points: int) -> tuple[float, ...]:
+        """Returns ``points`` values over its range, evenly spaced (logarithmically if it is logarithmic)."""
+        if points < 2:
+            return (
+                math.sqrt(self.lower * self.upper) if self.logarithmic else 0.5 * (self.lower + self.upper),
+            )
+        share = [(i + 0.5) / points for i in range(points)]
+        if self.logarithmic:
+            return tuple(self.lower * (self.upper / self.lower) ** each for each in share)
+        return tuple(self.lower + (self.upper - self.lower) * each for each in share)
+
+
+@dataclass(frozen=True, slots=True)
+class Cause:
+    """Texts about an effect, for reports and the generated page of the catalogue."""
+
+    title: str
+    """Short name in standard terms."""
+    equation: str
+    """The law in plain text."""
+    signature: str
+    """Visible symptom in a record."""
+    consequence: str
+    """Consequence for the axis."""
+    remedy: str
+    """Advice to the user."""
+    experiment: str
+    """Measurement that separates it from similar causes."""
+    aliases: tuple[str, ...] = ()
+    """Names of the causes it can be confused with."""
+    source: str = ""
+    """Source of the equation."""
+    size: str = ""
+    """Typical size."""
+    subject: str = ""
+    """Plural noun that summaries of several causes use; empty for the name."""
+    apart: Mapping[str, Experiment] = field(default_factory=dict)
+    """Measurement that separates it from another cause, by that cause's name. Either of the two may declare
+    it.
+    """
+
+
+@dataclass(frozen=True, slots=True)
+class Compensable:
+    """Decision to compensate an effect or not, with the reason."""
+
+    possible: bool
+    why: str
+
+
+@dataclass(frozen=True, slots=True)
+class Coefficient:
+    """Name and place of one coefficient, or of a cosine with its sine."""
+
+    name: str
+    """Name of the parameter with its unit; for a cosine and sine the prefix of amplitude and phase."""
+    columns: tuple[int, ...]
+    """Its column; both columns for a cosine and sine."""
+    path: tuple[str | int, ...]
+    """Path of the parameter in `Effect.parameters`; for a cosine and sine the path of their parent."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Stretch:
+    """Samples at which an effect must be visible if it is present, whatever else acts elsewhere."""
+
+    rows: BoolArray
+    """Mask of the samples, shape (n,)."""
+    otherwise: str
+    """Reason to reject the effect if it is not visible there, for messages."""

@@ -1,0 +1,152 @@
+"""Shift of the synchronous part with the direction of travel, because other tooth flanks carry."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Annotated, Any, ClassVar, Self
+
+import numpy as np
+from pydantic import Field
+
+from hdbridge.axis.effects.base import (
+    Cause,
+    Channel,
+    Coefficient,
+    Compensable,
+    Effect,
+    FloatArray,
+    Memoryless,
+    Moment,
+    Motion,
+    Observations,
+    Part,
+    Start,
+    Tracker,
+)
+from hdbridge.axis.effects.carried import has_orders, orders_of
+from hdbridge.axis.effects.kinematics import direction_of
+from hdbridge.axis.effects.orders import RAD_PER_DEG, Orders, horner, phasors, ripple
+
+STEEPEST = 3.0
+"""Limit of tan(k shift), reached at k shift = 72 deg; up to 108 deg the mean is under a third
+of the order.
+"""
+
+
+class DirectionPhase(Effect):
+    """Direction-odd part of a tooth error T(theta_M + d shift), S being the mean over both flanks.
+
+    An order A_k of the tooth error appears as A_k cos(k shift) in the mean, which is the model's synchronous
+    part because that was fitted over both directions, and as A_k sin(k shift) in the odd part. The odd part
+    is therefore tan(k shift) times the mean's order, a quarter of its period ahead. The tangent is limited to
+    `STEEPEST`, beyond which hardly anything of an order is left in the mean. One angle shifts all orders: a
+    free amplitude per order would be many parameters for one cause.
+    """
+
+    name: ClassVar[str] = "direction_phase"
+    channels: ClassVar[frozenset[Channel]] = frozenset({Channel.DIRECTION})
+    about: ClassVar[Cause] = Cause(
+        title="synchronous part shifted with the direction",
+        equation="d times the sum over k of -A_k tan(k shift) sin(k theta_M + phi_k), A_k and phi_k the "
+        "synchronous part's, d the direction held at rest",
+        signature="the ripple within a motor turn is displaced between the two directions, by one angle "
+        "for all orders",
+        consequence="a compensation without it leaves the ripple's difference, with opposite signs in the "
+        "two directions",
+        remedy="compensate it; it is the change of tooth flanks, and grows with preload and with load",
+        experiment="slow sweeps over the same motor turns both ways; even and odd part in the direction",
+        aliases=("hysteresis_parameters",),
+        source="phase of the kinematic error differs between the tooth flanks that carry",
+        size="1-5 arcsec",
+    )
+    compensable: ClassVar[Compensable] = Compensable(
+        True, "the load really moves so; the direction is commanded"
+    )
+    carries: ClassVar[Mapping[Part, str]] = {Part.ORDERS: "orders"}
+    curved: ClassVar[bool] = True
+    typical: ClassVar[Mapping[str, Any]] = {"shift_deg": 1.0}
+    """A shift of 1 degree of the base's orders."""
+
+    orders: Orders
+    shift_deg: Annotated[
+        float,
+        Field(ge=-45, le=45, description="shift of the motor angle, forward ahead of backward by twice this"),
+    ]
+
+    @classmethod
+    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[DirectionPhase]:  # noqa: ARG003
+        """Yields a start at zero shift."""
+        if has_orders(base):
+            yield cls(orders=orders_of(base), shift_deg=0.0)
+
+    def left_in_mean(self, order: int) -> float:
+        """Returns the cosine of the shift, because the mean of two shifted flanks is smaller than either."""
+        return math.cos(order * math.radians(self.shift_deg))
+
+    def named_coefficients(self) -> tuple[Coefficient, ...]:
+        """Returns the name of the shift."""
+        return (Coefficient("shift_deg", (0,), ("shift_deg",)),)
+
+    def predict(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
+        """Returns the error in arcsec, shape (n,)."""
+        return self.columns(motion, start)[:, 0] * self.shift_deg
+
+    def tracker(self, start: Start = Start.VIRGIN) -> Tracker:
+        """Returns an on-line tracker; the direction comes from the moment."""
+        return _Tracker(tuple(self.shift_deg * each for each in self._odd()), start.value)
+
+    def columns(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
+        """Returns the effect per degree of shift *at the present shift*, shape (n, 1); nearly linear, so
+        iterate the fit.
+        """
+        error: FloatArray = direction_of(motion, start) * ripple(motion.motor_deg, self._odd())
+        return error[:, np.newaxis]
+
+    def coefficients(self) -> FloatArray:
+        """Returns the shift, motor degrees."""
+        return np.array([self.shift_deg])
+
+    def fitted(self, coefficients: FloatArray, shape: Mapping[str, float] | None = None) -> Self:
+        """Returns the effect with another shift."""
+        return self.model_copy(update={"shift_deg": float(coefficients[0])})
+
+    def bound_arcsec(self) -> float:
+        """Sum of A_k |tan(k shift)|."""
+        return abs(self.shift_deg) * sum(map(abs, self._odd()))
+
+    def slope_bound_arcsec_per_deg(self) -> float:
+        """Sum of k A_k |tan(k shift)|, per degree."""
+        steepness = sum(k * abs(each) for k, each in enumerate(reversed(self._odd())))
+        return RAD_PER_DEG * abs(self.shift_deg) * steepness
+
+    @classmethod
+    def _carried(cls, base: Sequence[Effect]) -> dict[str, Any]:
+        return {"orders": orders_of(base)}
+
+    def _odd(self) -> tuple[complex, ...]:
+        """Returns the phasors of the odd part per degree of shift: j A_k tan(k shift) / shift
+        exp(j phi_k).
+        """
+        given = phasors(self.orders)
+        highest = len(given) - 1
+        return tuple(1j * each * self._tangent(highest - i) for i, each in enumerate(given))
+
+    def _tangent(self, order: int) -> float:
+        if abs(self.shift_deg) < 1e-9:
+            return order * RAD_PER_DEG
+        tangent = math.tan(order * RAD_PER_DEG * self.shift_deg)
+        return min(max(tangent, -STEEPEST), STEEPEST) / self.shift_deg
+
+
+class _Tracker(Memoryless):
+    __slots__ = ("_phasors", "_start")
+
+    def __init__(self, amplitudes: tuple[complex, ...], start: int) -> None:
+        self._phasors = amplitudes
+        self._start = start
+
+    def peek(self, motor_deg: float, moment: Moment) -> float:
+        angle = RAD_PER_DEG * motor_deg
+        error = horner(self._phasors, complex(math.cos(angle), math.sin(angle))).real
+        return (moment.direction or self._start) * error

@@ -1,0 +1,151 @@
+"""Common base of the elastic-loop laws: offset, width and exponent, and the branch.
+
+The error is the offset times a loop of unit height (`_unit`), in which the laws differ.
+
+The offset has a sign. Positive: the load leads in the direction of motion, and the error rises along the
+path. Negative: the load lags, as it does behind friction at the load, and the error falls along the path. In
+that case the load stands still until the gear has wound up in the other direction, so the fall is at most the
+gear's own slope, 3600 / N arcsec per motor degree. Just after a reversal the formula is steeper; there the
+inverse uses a slope that it can invert (`gentle_tracker`).
+"""
+
+from __future__ import annotations
+
+import math
+from abc import abstractmethod
+from collections.abc import Mapping
+from typing import Annotated, Any, ClassVar, Self
+
+import numpy as np
+from pydantic import Field
+
+from hdbridge.axis.effects.base import (
+    Coefficient,
+    Compensable,
+    Effect,
+    FloatArray,
+    Motion,
+    Part,
+    Shape,
+    Start,
+    Tracker,
+)
+from hdbridge.axis.effects.path import once
+
+
+def rise(xi: FloatArray, n: float) -> FloatArray:
+    """Returns the branch g(xi): 0 at 0, 1 with zero slope at 1 and beyond.
+
+    g(xi) = (xi^(n-1) - (n-1) xi) / (2-n), and xi (1 - ln xi) for n = 2; written with expm1 so that it is
+    exact at n = 2 and on both sides of it.
+    """
+    clipped = np.minimum(xi, 1.0)
+    result = np.zeros_like(clipped)
+    inside = clipped > 0.0
+    logs = -np.log(clipped[inside])
+    m = 2.0 - n
+    bulge = logs if m == 0.0 else np.expm1(m * logs) / m
+    result[inside] = clipped[inside] * (1.0 + bulge)
+    return result
+
+
+def rise_at(xi: float, n: float, steepest: float = math.inf) -> float:
+    """Returns `rise` for one number, in plain floats for the control loop, limited to
+    ``steepest`` times xi.
+    """
+    if xi <= 0.0:
+        return 0.0
+    if xi >= 1.0:
+        return 1.0
+    log = -math.log(xi)
+    m = 2.0 - n
+    slope = 1.0 + (log if m == 0.0 else math.expm1(m * log) / m)
+    return xi * (slope if slope < steepest else steepest)
+
+
+class ElasticLoop(Effect):
+    """Base class of laws of a loop between plus and minus the offset, proportional to the offset."""
+
+    compensable: ClassVar[Compensable] = Compensable(
+        True, "the load really moves so, and the command says where it reverses"
+    )
+    shape: ClassVar[tuple[Shape, ...]] = (
+        Shape("width_deg", 0.5, 120.0, logarithmic=True),
+        Shape("exponent", 1.02, 4.0),
+    )
+    typical: ClassVar[Mapping[str, Any]] = {"offset_arcsec": 40.0, "width_deg": 20.0, "exponent": 1.6}
+    """A published gear of ratio 50."""
+    part: ClassVar[Part | None] = Part.LOOP
+    drifting: ClassVar[tuple[str, ...]] = ("offset_arcsec",)
+    """Preload settles, grease and friction change; width and exponent stay."""
+
+    offset_arcsec: Annotated[
+        float,
+        Field(
+            ge=-3600,
+            le=3600,
+            description="half the height of the loop, at the load; negative where the load lags",
+        ),
+    ]
+    width_deg: Annotated[float, Field(gt=0, le=3600, description="motor angle that a full crossing takes")]
+    exponent: Annotated[float, Field(gt=1, le=6, description="shape n of the branch")]
+
+    def predict(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
+        """Returns the error in arcsec, shape (n,)."""
+        return self.offset_arcsec * self._loop(motion.motor_deg, start)
+
+    def columns(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
+        """Returns the loop of unit offset, shape (n, 1)."""
+        return self._loop(motion.motor_deg, start)[:, np.newaxis]
+
+    def coefficients(self) -> FloatArray:
+        """Returns the offset, arcsec, shape (1,)."""
+        return np.array([self.offset_arcsec])
+
+    def named_coefficients(self) -> tuple[Coefficient, ...]:
+        """Returns the name of the offset."""
+        return (Coefficient("offset_arcsec", (0,), ("offset_arcsec",)),)
+
+    def fitted(self, coefficients: FloatArray, shape: Mapping[str, float] | None = None) -> Self:
+        """Returns another offset and, if given, another width and exponent."""
+        return self.model_copy(update={"offset_arcsec": float(coefficients[0]), **dict(shape or {})})
+
+    def bound_arcsec(self) -> float:
+        """Absolute offset."""
+        return abs(self.offset_arcsec)
+
+    def tracker(self, start: Start = Start.VIRGIN) -> Tracker:
+        """Returns an on-line tracker; its first `advance` only sets the motor position."""
+        return self._tracker(start, self.width_deg, math.inf)
+
+    def slope_bound_arcsec_per_deg(self) -> float:
+        """Zero if the load leads, because the error only rises along its path. If it lags: the slope at a
+        reversal, which is unbounded for exponents up to 2.
+        """
+        if self.offset_arcsec >= 0.0:
+            return 0.0
+        n = self.exponent
+        return -2.0 * self.offset_arcsec / self.width_deg * (n - 1.0) / (n - 2.0) if n > 2.0 else math.inf
+
+    def gentle_tracker(self, start: Start, fall_arcsec_per_deg: float) -> Tracker | None:
+        """If the load lags, returns the same branch with its slope after each reversal limited to this."""
+        if self.offset_arcsec >= 0.0:
+            return None
+        height = -2.0 * self.offset_arcsec
+        width = max(self.width_deg, height / fall_arcsec_per_deg)
+        return self._tracker(start, width, fall_arcsec_per_deg * width / height)
+
+    @abstractmethod
+    def _tracker(self, start: Start, width_deg: float, steepest: float) -> Tracker:
+        """Returns a tracker with this width whose branch rises by at most ``steepest`` per width."""
+
+    def _loop(self, motor_deg: FloatArray, start: Start) -> FloatArray:
+        """Returns `_unit`, computed once for all effects that carry this loop."""
+        if not len(motor_deg):
+            return np.empty(0)
+        key = (self.name, self.width_deg, self.exponent, start)
+        return once(motor_deg, start, key, lambda: self._unit(motor_deg, start))
+
+    @abstractmethod
+    def _unit(self, motor_deg: FloatArray, start: Start) -> FloatArray:
+        """Returns the loop for an offset of one, shape (n,)."""

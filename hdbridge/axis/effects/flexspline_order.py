@@ -1,0 +1,56 @@
+"""Orders of the wave generator relative to the flexspline, which turns backwards."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, ClassVar
+
+import numpy as np
+
+from hdbridge.axis.effects.base import Cause, Compensable, Coordinate, Effect, Motion, Observations
+from hdbridge.axis.effects.load_order import Ratio
+from hdbridge.axis.effects.orders import OrderSeries, missing_orders, orders_from
+from hdbridge.units import DEG_PER_TURN
+
+
+class FlexsplineOrders(OrderSeries):
+    """Sum of A_k cos(k (1 + 1/N) theta_M + phi_k)."""
+
+    name: ClassVar[str] = "flexspline_order"
+    about: ClassVar[Cause] = Cause(
+        title="order of the wave generator relative to the flexspline",
+        subject="orders",
+        equation="sum over k of A_k cos(k (1 + 1/N) theta_M + phi_k)",
+        signature="nearly an order of the motor, but its phase runs through once per load turn (k times "
+        "for order k)",
+        consequence="a ripple that a model of motor orders compensates at one load angle and doubles at "
+        "another",
+        remedy="add it to the model; it is a flexspline that is not of even stiffness or pitch around",
+        experiment="a slow sweep over at least one, better two turns of the load: shorter, it looks like a "
+        "motor order",
+        aliases=("motor_order", "synchronous"),
+        source="kinematics of a strain wave gear: the flexspline turns by -theta_M / N under the wave "
+        "generator",
+        size="1-10 arcsec",
+    )
+    compensable: ClassVar[Compensable] = Compensable(True, "the load really moves so, and it repeats")
+    typical: ClassVar[Mapping[str, Any]] = {"orders": orders_from((1, 2, 4), 2.0)}
+    """Orders 1, 2 and 4."""
+
+    ratio: Ratio
+
+    @classmethod
+    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[FlexsplineOrders]:
+        """Yields orders 1 to 8 one by one; those found are combined afterwards."""
+        ratio = observations.ratio
+        for number in missing_orders(cls(ratio=ratio, orders=orders_from(range(1, 9))), base):
+            yield cls(ratio=ratio, orders=orders_from([number]))
+
+    def coordinate(self, motion: Motion, ratio: float) -> Coordinate:
+        """Returns the wave generator's angle relative to the flexspline."""
+        angle = np.mod(motion.motor_deg * (1.0 + 1.0 / ratio), DEG_PER_TURN)
+        return Coordinate("angle of the wave generator to the flexspline", "deg", angle)
+
+    def turns_per_motor_turn(self) -> float:
+        """1 + 1 / N."""
+        return 1.0 + 1.0 / self.ratio

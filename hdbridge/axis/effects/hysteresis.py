@@ -1,0 +1,161 @@
+"""Nonlinear-elastic part: hysteresis of the flexspline after each reversal of the motor.
+
+The law is the rolling-friction law of the transmission-error literature, made exact in three places that are
+usually left open:
+
+* At a reversal the error is continuous: each branch starts from the value that the last one reached, and
+  rises by ``2 offset g(xi)`` along the new direction until it meets the offset.
+* It saturates only in the direction of travel. (Taken literally, "saturated when |error| >= offset" would
+  be a relay that jumps by twice the offset at each reversal.)
+* At rest the last direction holds.
+
+For 1 < n <= 2 the slope at the reversal is infinite, so a measured, quantised angle must not be used as
+input: one encoder count of chatter is several arcseconds. Drive it with the command.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import ClassVar
+
+import numpy as np
+
+from hdbridge.axis.effects.base import (
+    Cause,
+    Effect,
+    FloatArray,
+    Moment,
+    Observations,
+    Part,
+    Start,
+    Tracker,
+)
+from hdbridge.axis.effects.elastic_loop import ElasticLoop, rise, rise_at
+from hdbridge.axis.effects.path import path_of
+
+
+class Hysteresis(ElasticLoop):
+    """Continuous branches ``theta_rev + sgn 2 offset g(|theta_M - theta_M,rev| / width)``, up
+    to the offset.
+    """
+
+    name: ClassVar[str] = "hysteresis"
+    about: ClassVar[Cause] = Cause(
+        title="nonlinear-elastic transmission error (hysteresis)",
+        equation="theta_rev + sgn(omega) 2 offset g(xi), limited to sgn(omega) offset; "
+        "xi = |theta_M - theta_M,rev| / width; offset > 0: the load leads, offset < 0: it lags",
+        signature="a loop of constant height between the two directions; after a reversal it takes a fixed "
+        "motor angle to cross",
+        consequence="the load comes to rest ahead of its target in the direction of motion (offset > 0) or "
+        "short of it (offset < 0), from either side",
+        remedy="compensate it; a leading loop grows with preload and friction in the mesh, a lagging one "
+        "with friction at the load",
+        experiment="slow sines of several amplitudes, some smaller than the width",
+        aliases=("backlash",),
+        source="rolling-friction law with exponent n; the height is twice the offset",
+        size="10-80 arcsec from side to side",
+    )
+
+    @classmethod
+    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[Hysteresis]:  # noqa: ARG003
+        """Yields a narrow, a typical and a wide loop for a model without one."""
+        if all(each.part is not Part.LOOP for each in base):
+            for width in (3.0, 20.0, 60.0):
+                yield cls(offset_arcsec=1.0, width_deg=width, exponent=1.6)
+
+    def _tracker(self, start: Start, width_deg: float, steepest: float) -> Tracker:
+        return _HysteresisTracker(self.offset_arcsec, width_deg, self.exponent, start, steepest)
+
+    def _unit(self, motor_deg: FloatArray, start: Start) -> FloatArray:
+        """Returns the loop for an offset of one: a Python loop over the reversals, then all
+        samples at once.
+        """
+        path = path_of(motor_deg, start)
+        value = float(start.value)
+        values = []
+        crossed = np.abs(path.steps_deg) / self.width_deg
+        heights = 2.0 * rise(crossed, self.exponent)
+        if start is Start.VIRGIN:
+            heights[:1] = rise(2.0 * crossed[:1], self.exponent)
+        for height, sign in zip(heights.tolist(), path.signs, strict=True):
+            values.append(value)
+            value = sign * min(sign * value + height, 1.0)
+        first = path.turning[0] + 1
+        result = np.full(len(motor_deg), float(start.value))
+        result[first:] = path.sense
+        # Only samples closer to the reversal than the width are not saturated.
+        way_deg = np.abs(path.away_deg)
+        near = np.flatnonzero(way_deg < self.width_deg)
+        sense, begun = path.sense[near], np.repeat(values, path.lengths)[near]
+        xi_of = way_deg[near] / self.width_deg
+        height = 2.0 * rise(xi_of, self.exponent)
+        if start is Start.VIRGIN:
+            virgin = near < np.sum(path.lengths[:1])
+            height[virgin] = rise(2.0 * xi_of[virgin], self.exponent)
+        result[first + near] = sense * np.minimum(sense * begun + height, 1.0)
+        return result
+
+
+class _HysteresisTracker(Tracker):
+    """State: the present branch (starting angle, starting value, direction), the last angle and its value.
+
+    Values are those of a loop of unit offset.
+    """
+
+    __slots__ = (
+        "_angle", "_branch_angle", "_branch_value", "_exponent", "_offset", "_sign", "_steepest", "_value",
+        "_virgin", "_width",
+    )  # fmt: skip
+
+    def __init__(self, offset: float, width: float, exponent: float, start: Start, steepest: float) -> None:
+        self._offset = offset
+        self._width = width
+        self._exponent = exponent
+        self._steepest = steepest
+        self._sign = start.value
+        self._value = float(start.value)
+        self._virgin = start is Start.VIRGIN
+        self._angle: float | None = None
+        self._branch_angle = 0.0
+        self._branch_value = self._value
+
+    @property
+    def memory_deg(self) -> float:
+        """The width, which is the angle from side to side."""
+        return self._width
+
+    def peek(self, motor_deg: float, moment: Moment) -> float:
+        return self._offset * self._at(motor_deg)
+
+    def _at(self, motor_deg: float) -> float:
+        last = self._angle
+        if last is None or motor_deg == last:
+            return self._value
+        sign = 1 if motor_deg > last else -1
+        if sign == self._sign:
+            origin, value, virgin = self._branch_angle, self._branch_value, self._virgin
+        else:
+            origin, value, virgin = last, self._value, self._virgin and self._sign == 0
+        xi = abs(motor_deg - origin) / self._width
+        if xi >= 1.0:
+            return float(sign)  # end of every branch
+        if virgin:
+            height = rise_at(2.0 * xi, self._exponent, self._steepest)
+        else:
+            height = 2.0 * rise_at(xi, self._exponent, self._steepest)
+        return sign * min(sign * value + height, 1.0)
+
+    def advance(self, motor_deg: float, moment: Moment) -> float:
+        last = self._angle
+        if last is None:
+            self._angle = self._branch_angle = motor_deg
+            return self._offset * self._value
+        value = self._at(motor_deg)
+        if motor_deg != last:
+            sign = 1 if motor_deg > last else -1
+            if sign != self._sign:
+                self._virgin = self._virgin and self._sign == 0
+                self._branch_angle, self._branch_value, self._sign = last, self._value, sign
+            self._angle = motor_deg
+            self._value = value
+        return self._offset * value

@@ -1,0 +1,147 @@
+"""Changed elastic loop: another offset, width or exponent than in the model."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Annotated, Any, ClassVar, Self
+
+import numpy as np
+from pydantic import Field
+
+from hdbridge.axis.effects.base import (
+    Cause,
+    Compensable,
+    Effect,
+    FloatArray,
+    Moment,
+    Motion,
+    Observations,
+    Part,
+    Shape,
+    Start,
+    Tracker,
+)
+from hdbridge.axis.effects.carried import Loop, loop_of
+from hdbridge.axis.effects.hysteresis import Hysteresis
+
+
+class HysteresisParameters(Effect):
+    """Loop with new parameters minus the loop with the model's parameters (`base`).
+
+    It names a change. When a model is extended by it, it does not become an entry of its own: the model's
+    loop takes the new parameters (`combine.extended`). A separate entry would predict the same, but a
+    difference of loops falls infinitely steeply where the old one rises, so the compensation could not invert
+    it.
+    """
+
+    name: ClassVar[str] = "hysteresis_parameters"
+    about: ClassVar[Cause] = Cause(
+        title="the elastic loop has changed",
+        subject="hysteresis",
+        equation="H(offset, width, exponent) - H(the model's offset, width, exponent)",
+        signature="a rest of the loop after each reversal, or a constant distance between the two directions",
+        consequence="the compensation makes up for a loop that is not the axis's any more",
+        remedy="calibrate again; a smaller offset hints at lost preload, a larger one at friction (cold, "
+        "dry, misaligned)",
+        experiment="slow sines of several amplitudes, some smaller than the width",
+        aliases=("backlash", "hysteresis_memory", "direction_phase"),
+        source="the difference of two loops of one law",
+        size="5-30 % of the offset",
+    )
+    compensable: ClassVar[Compensable] = Compensable(
+        True, "through the model's loop, which takes over the new parameters"
+    )
+    changes: ClassVar[Part | None] = Part.LOOP
+    shape: ClassVar[tuple[Shape, ...]] = Hysteresis.shape
+
+    base: Annotated[Loop, Field(description="the model's loop")]
+    offset_arcsec: Annotated[
+        float, Field(ge=-3600, le=3600, description="new offset; negative where the load lags")
+    ]
+    width_deg: Annotated[float, Field(gt=0, le=3600, description="new width")]
+    exponent: Annotated[float, Field(gt=1, le=6, description="new exponent")]
+
+    @classmethod
+    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[HysteresisParameters]:  # noqa: ARG003
+        """Yields the model's loop with a larger width."""
+        if any(each.part is Part.LOOP for each in base):
+            loop = loop_of(base)
+            now = loop.model_dump(exclude={"memory"}) | {"width_deg": 1.6 * loop.width_deg}
+            yield cls(base=loop, **now)
+
+    @classmethod
+    def of_change(cls, before: Effect, now: Effect) -> HysteresisParameters | None:
+        """Returns this cause if the parameters of one law have changed."""
+        if before.part is not Part.LOOP or not isinstance(now, type(before)):
+            return None
+        return cls(base=loop_of([before]), **loop_of([now]).model_dump(exclude={"memory"}))
+
+    def found_in(self, effects: Sequence[Effect]) -> Effect:
+        """Returns the change from its own base to the loop that the model has."""
+        return self.model_copy(update=loop_of(effects).model_dump(exclude={"memory"}))
+
+    def changed(self) -> Loop:
+        """Returns the loop with the new parameters."""
+        return self.base.model_copy(
+            update={each: getattr(self, each) for each in ("offset_arcsec", "width_deg", "exponent")}
+        )
+
+    def predict(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
+        """Returns the error in arcsec, shape (n,)."""
+        return self.changed().law().predict(motion, start) - self.base.law().predict(motion, start)
+
+    def tracker(self, start: Start = Start.VIRGIN) -> Tracker:
+        """Returns an on-line tracker of the difference."""
+        return _Tracker(self.changed().law().tracker(start), self.base.law().tracker(start))
+
+    def columns(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
+        """Returns the loops of unit offset, new and old, shape (n, 2)."""
+        new, old = self.changed().law(), self.base.law()
+        return np.hstack([new.columns(motion, start), old.columns(motion, start)])
+
+    def coefficients(self) -> FloatArray:
+        """Returns the new offset and minus the old one, arcsec."""
+        return np.array([self.offset_arcsec, -self.base.offset_arcsec])
+
+    def fitted(self, coefficients: FloatArray, shape: Mapping[str, float] | None = None) -> Self:
+        """Returns other offsets and, if given, another new width and exponent."""
+        base = self.base.model_copy(update={"offset_arcsec": -float(coefficients[1])})
+        update = {"offset_arcsec": float(coefficients[0]), "base": base, **dict(shape or {})}
+        return self.model_copy(update=update)
+
+    def bound_arcsec(self) -> float:
+        """Sum of the absolute offsets."""
+        return abs(self.offset_arcsec) + abs(self.base.offset_arcsec)
+
+    def slope_bound_arcsec_per_deg(self) -> float:
+        """Infinite if a loop is subtracted that starts infinitely steeply, because the difference then falls
+        as steeply.
+        """
+        return math.inf if self.base.offset_arcsec > 0.0 or self.offset_arcsec < 0.0 else 0.0
+
+    @classmethod
+    def _carried(cls, base: Sequence[Effect]) -> dict[str, Any]:
+        """Returns an offset increased by 20 %."""
+        loop = loop_of(base)
+        changed = {**loop.model_dump(exclude={"memory"}), "offset_arcsec": 1.2 * loop.offset_arcsec}
+        return {"base": loop, **changed}
+
+
+class _Tracker(Tracker):
+    __slots__ = ("_new", "_old")
+
+    def __init__(self, new: Tracker, old: Tracker) -> None:
+        self._new = new
+        self._old = old
+
+    @property
+    def memory_deg(self) -> float:
+        """The longer memory of the two loops."""
+        return max(self._new.memory_deg, self._old.memory_deg)
+
+    def peek(self, motor_deg: float, moment: Moment) -> float:
+        return self._new.peek(motor_deg, moment) - self._old.peek(motor_deg, moment)
+
+    def advance(self, motor_deg: float, moment: Moment) -> float:
+        return self._new.advance(motor_deg, moment) - self._old.advance(motor_deg, moment)

@@ -1,0 +1,109 @@
+"""Wind-up of the gear by the load's own inertia during acceleration."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Annotated, Any, ClassVar
+
+import numpy as np
+from pydantic import Field
+
+from hdbridge.axis.effects.base import (
+    Cause,
+    Channel,
+    Compensable,
+    Effect,
+    FloatArray,
+    Level,
+    Linear,
+    Moment,
+    Motion,
+    Observations,
+    Start,
+    Tracker,
+)
+from hdbridge.axis.effects.kinematics import acceleration_of
+from hdbridge.axis.effects.load_order import Ratio
+from hdbridge.units import ARCSEC_PER_DEG
+
+
+class InertialWindup(Linear):
+    """-(J / K) alpha_L: the load lags while it is accelerated."""
+
+    name: ClassVar[str] = "inertial_windup"
+    channels: ClassVar[frozenset[Channel]] = frozenset({Channel.ACCELERATION})
+    about: ClassVar[Cause] = Cause(
+        title="wind-up by inertia",
+        subject="wind-up",
+        equation="-(J / K) alpha_L, alpha_L = commanded motor acceleration / N, limited to the limit / N",
+        signature="the error follows the acceleration; nothing at rest or at constant speed",
+        consequence="the load lags in each acceleration and leads in each deceleration",
+        remedy="compensate it, or accept it where only positions at rest count; less inertia, a stiffer gear",
+        experiment="the same move at another acceleration: it scales; a resonance rings at its own frequency",
+        aliases=("channel_skew", "compliance"),
+        source="spring and inertia far below the resonance: J / K = 1 / (2 pi f)^2",
+        size="7 arcsec at 200 deg/s^2 of the load with a resonance at 50 Hz",
+    )
+    compensable: ClassVar[Compensable] = Compensable(
+        True, "the load really moves so and the acceleration is commanded; at rest it is nothing"
+    )
+    ordinary_arcsec: ClassVar[float] = 1.5
+    """Every axis winds up a little in its fastest moves."""
+    linear: ClassVar[tuple[str, ...]] = ("inertia_over_stiffness_s2",)
+    typical: ClassVar[Mapping[str, Any]] = {"inertia_over_stiffness_s2": 1e-5}
+    """A resonance at 50 Hz."""
+
+    ratio: Ratio
+    inertia_over_stiffness_s2: Annotated[
+        float, Field(ge=0, le=0.1, description="J / K at the load, 1 / (2 pi f)^2 of its resonance")
+    ]
+    limit_deg_s2: Annotated[
+        float, Field(gt=0, le=1e8, description="motor acceleration beyond which it is held")
+    ] = 1e6
+
+    @classmethod
+    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[InertialWindup]:  # noqa: ARG003
+        """Yields the single candidate."""
+        yield cls(ratio=observations.ratio, inertia_over_stiffness_s2=1e-5)
+
+    def columns(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
+        """Returns the effect of J / K = 1 s^2, shape (n, 1)."""
+        limit = self.limit_deg_s2
+        acceleration = np.clip(acceleration_of(motion, self.name), -limit, limit)
+        return (-ARCSEC_PER_DEG / self.ratio * acceleration)[:, np.newaxis]
+
+    def law_discrepancy(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
+        """Returns the next term of the resonance, which this law neglects, shape (n, 1).
+
+        The load swings beyond the wind-up by J / K times the second time derivative of the wind-up.
+        """
+        beyond = np.zeros(len(motion))
+        step_s = 0.0 if motion.time_s is None else float(np.median(np.diff(motion.time_s)))
+        if step_s > 0.0:
+            bend = np.diff(self.predict(motion, start), 2) / step_s**2
+            beyond[1:-1] = self.inertia_over_stiffness_s2 * bend
+        return beyond[:, np.newaxis]
+
+    def tracker(self, start: Start = Start.VIRGIN) -> Tracker:
+        """Returns an on-line tracker; acceleration comes from the moment."""
+        gain = -ARCSEC_PER_DEG / self.ratio * self.inertia_over_stiffness_s2
+        return _Tracker(gain, self.limit_deg_s2)
+
+    def bound_arcsec(self) -> float:
+        """Wind-up at the highest acceleration."""
+        return ARCSEC_PER_DEG / self.ratio * abs(self.inertia_over_stiffness_s2) * self.limit_deg_s2
+
+    def slope_bound_arcsec_per_deg(self) -> float:
+        """Zero, because the acceleration is the command's, independent of the angle."""
+        return 0.0
+
+
+class _Tracker(Level):
+    __slots__ = ("_gain", "_limit")
+
+    def __init__(self, gain: float, limit: float) -> None:
+        self._gain = gain
+        self._limit = limit
+
+    def peek(self, motor_deg: float, moment: Moment) -> float:
+        return self._gain * min(max(moment.motor_acceleration_deg_s2, -self._limit), self._limit)

@@ -1,0 +1,91 @@
+"""Errors that repeat with every turn of the load: eccentricity of the load encoder, or pitch of
+the spline.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from typing import Annotated, Any, ClassVar, Literal
+
+from pydantic import Field
+
+from hdbridge.axis.effects import coordinate as over
+from hdbridge.axis.effects.base import (
+    Cause,
+    Compensable,
+    Coordinate,
+    Effect,
+    Experiment,
+    Motion,
+    Observations,
+)
+from hdbridge.axis.effects.orders import OrderSeries, missing_orders, orders_from
+
+Ratio = Annotated[float, Field(gt=0, le=1000, description="N of the model: motor turns per load turn")]
+
+
+class LoadOrders(OrderSeries):
+    """Sum of A_k cos(k theta_M / N + phi_k)."""
+
+    name: ClassVar[str] = "load_order"
+    about: ClassVar[Cause] = Cause(
+        title="once or twice per load turn",
+        subject="load orders",
+        equation="sum over k of A_k cos(k theta_M / N + phi_k)",
+        signature="k periods per turn of the load, the same in both directions and on every turn",
+        consequence="if it is the spline's pitch, the load is off by this much across its turn; if it is "
+        "the load "
+        "encoder, only the measurement is",
+        remedy="centre the load encoder; then compensate what is left (set origin: gear). Until then it is "
+        "left alone",
+        experiment="two load turns both ways, then again with the load encoder re-clocked by 90 deg: what "
+        "turns "
+        "with it is the encoder's. With a mass off centre: again without it",
+        aliases=("compliance", "ratio_error", "zero_drift"),
+        source="geometry of an eccentric disc; pitch error of the splines",
+        size="5-60 arcsec",
+        apart={
+            "compliance": Experiment(
+                5,
+                "take the mass off or turn it by 90 deg, sweep one load turn both ways: a wind-up goes "
+                "with it",
+            ),
+            "ratio_error": Experiment(
+                6, "sweep two whole load turns both ways: a ramp goes on, a load order comes back"
+            ),
+        },
+    )
+    compensable: ClassVar[Compensable] = Compensable(
+        False,
+        "no, unless its origin is known to be the gear: a load encoder's run-out is an error of the "
+        "measurement, and "
+        "to compensate it would move the load away from where it should be",
+    )
+    typical: ClassVar[Mapping[str, Any]] = {"orders": orders_from((1, 2), 10.0)}
+    """Orders 1 and 2."""
+
+    ratio: Ratio
+    origin: Annotated[
+        Literal["unknown", "gear", "load_encoder"],
+        Field(description="where it comes from; only the gear's is compensated"),
+    ] = "unknown"
+
+    @classmethod
+    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[LoadOrders]:
+        """Yields orders 1 to 4 one by one; those found are combined afterwards."""
+        ratio = observations.ratio
+        for number in missing_orders(cls(ratio=ratio, orders=orders_from(range(1, 5))), base):
+            yield cls(ratio=ratio, orders=orders_from([number]))
+
+    def coordinate(self, motion: Motion, ratio: float) -> Coordinate:
+        """Returns the load angle."""
+        return replace(over.load_angle(motion, ratio), bins=120)
+
+    def turns_per_motor_turn(self) -> float:
+        """1 / N."""
+        return 1.0 / self.ratio
+
+    def is_compensable(self) -> bool:
+        """Returns True only if the gear is known to be the origin, so that the load really moves."""
+        return self.origin == "gear"

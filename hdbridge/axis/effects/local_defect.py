@@ -1,0 +1,174 @@
+"""Bump at one load angle: a damaged tooth."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from typing import Annotated, Any, ClassVar
+
+import numpy as np
+from pydantic import Field
+
+from hdbridge.axis.effects import coordinate as over
+from hdbridge.axis.effects.base import (
+    Cause,
+    Compensable,
+    Coordinate,
+    Effect,
+    FloatArray,
+    Linear,
+    Memoryless,
+    Moment,
+    Motion,
+    Observations,
+    Shape,
+    Sought,
+    Start,
+    Stretch,
+    Tracker,
+)
+from hdbridge.axis.effects.load_order import Ratio
+from hdbridge.axis.effects.path import away_from_reversals
+from hdbridge.units import DEG_PER_TURN
+
+PASSES = 3
+OTHER_SPEED = 1.5
+"""Minimum number of passes, which must be in both directions or at speeds that differ by this factor."""
+
+
+FORM = 0.07
+"""Share of its height by which a real bump deviates from the formula."""
+
+
+class LocalDefect(Linear):
+    """height (1 + cos(pi u)) / 2 for |u| < 1, u = (theta_M / N - centre, wrapped) / half width."""
+
+    name: ClassVar[str] = "local_defect"
+    about: ClassVar[Cause] = Cause(
+        title="bump at one load angle",
+        subject="local defects",
+        equation="height (1 + cos(pi u)) / 2 where |u| < 1, u = ((theta_M / N - centre) mod 360 deg) / "
+        "half_width",
+        signature="the same bump on every pass over one load angle, in both directions, and nothing "
+        "elsewhere",
+        consequence="the load is off at this one place, and the tooth wears on",
+        remedy="look at the tooth; compensate it meanwhile; a mark on the load encoder's disc looks the "
+        "same: clean it",
+        experiment="several slow passes over the place, both ways, and again with the load encoder "
+        "re-clocked",
+        aliases=("load_order",),
+        source="raised cosine as a smooth bump of finite extent",
+        size="1-20 arcsec",
+    )
+    compensable: ClassVar[Compensable] = Compensable(
+        True, "the load really moves so, if it is a tooth and no mark on the encoder's disc"
+    )
+    shape: ClassVar[tuple[Shape, ...]] = (
+        Shape("centre_deg", 0.0, 360.0),
+        Shape("half_width_deg", 0.05, 30.0, logarithmic=True),
+    )
+    usual: ClassVar[int] = 2
+    sought: ClassVar[Sought | None] = Sought.BUMP
+    inexact: ClassVar[float] = 0.15
+    """The bump of a real damaged tooth never has exactly this form."""
+    linear: ClassVar[tuple[str, ...]] = ("height_arcsec",)
+    typical: ClassVar[Mapping[str, Any]] = {"height_arcsec": 5.0, "centre_deg": 0.0, "half_width_deg": 3.6}
+    """Height of 5 arcsec, tooth half width of 3.6 degrees."""
+
+    ratio: Ratio
+    height_arcsec: Annotated[float, Field(ge=-3600, le=3600, description="height of the bump")]
+    centre_deg: Annotated[float, Field(ge=-360, le=360, description="load angle of its centre")]
+    half_width_deg: Annotated[
+        float, Field(gt=0, le=180, description="load angle from its centre to its foot")
+    ]
+
+    @classmethod
+    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[LocalDefect]:  # noqa: ARG003
+        """Yields a tooth in the middle of the travel, as an example."""
+        load = float(np.median(observations.motion.motor_deg)) / observations.ratio
+        yield cls(
+            ratio=observations.ratio, height_arcsec=1.0, centre_deg=load % DEG_PER_TURN, half_width_deg=3.6
+        )
+
+    def unidentifiable(self, observations: Observations) -> str:
+        """Requires varied passes, because identical ones cannot separate a location from a moment of the
+        move.
+        """
+        return "" if self._is_met(observations) else "not passed often enough, or always alike"
+
+    def _is_met(self, observations: Observations) -> bool:
+        """Returns True if the axis passed the location several times, both ways or at different speeds."""
+        motion = observations.motion
+        if motion.motor_speed_deg_s is None or motion.time_s is None:
+            return False
+        turns = (motion.motor_deg / self.ratio - self.centre_deg) / DEG_PER_TURN
+        # Between two records the axis may have skipped it, which shows as a speed that it never reached.
+        steps, moved = np.diff(motion.time_s), np.abs(np.diff(motion.motor_deg))
+        real = moved <= 3.0 * float(np.max(np.abs(motion.motor_speed_deg_s))) * steps
+        speed = motion.motor_speed_deg_s[np.flatnonzero((np.diff(np.floor(turns)) != 0.0) & real)]
+        fast = np.abs(speed[speed != 0.0])
+        if len(fast) < PASSES:
+            return False
+        both = bool(np.any(speed > 0.0) and np.any(speed < 0.0)) and observations.reversals >= 2
+        return both or float(np.max(fast)) > OTHER_SPEED * float(np.min(fast))
+
+    def shows(self, motion: Motion) -> Stretch | None:
+        """Returns the samples away from reversals, where a loop of another shape leaves no bumps at a fixed
+        angle.
+        """
+        return away_from_reversals(motion)
+
+    def changing(self, motion: Motion) -> FloatArray:
+        """Returns the neighbouring bumps: a damaged tooth has none, a wave has one on either side."""
+        apart = 2.0 * self.half_width_deg
+        beside = [self.model_copy(update={"centre_deg": self.centre_deg + each}) for each in (-apart, apart)]
+        return np.hstack([each.columns(motion) for each in beside])
+
+    def coordinate(self, motion: Motion, ratio: float) -> Coordinate:
+        """Returns the load angle."""
+        return replace(over.load_angle(motion, ratio), bins=120)
+
+    def columns(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
+        """Returns a bump of 1 arcsec, shape (n, 1)."""
+        return self._bump(motion, self.half_width_deg)[:, np.newaxis]
+
+    def law_discrepancy(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
+        """Returns a sharper top and a wider foot, shape (n, 2)."""
+        widths = (0.5 * self.half_width_deg, 2.0 * self.half_width_deg)
+        return FORM * self.height_arcsec * np.column_stack([self._bump(motion, each) for each in widths])
+
+    def _bump(self, motion: Motion, half_width_deg: float) -> FloatArray:
+        turns = (motion.motor_deg / self.ratio - self.centre_deg) / DEG_PER_TURN
+        away = np.abs(turns - np.round(turns)) * DEG_PER_TURN
+        near = np.flatnonzero(away < half_width_deg)
+        bump = np.zeros(len(away))
+        bump[near] = 0.5 + 0.5 * np.cos((np.pi / half_width_deg) * away[near])
+        return bump
+
+    def tracker(self, start: Start = Start.VIRGIN) -> Tracker:
+        """Returns a stateless on-line tracker."""
+        return _Tracker(self)
+
+    def bound_arcsec(self) -> float:
+        """Absolute height."""
+        return abs(self.height_arcsec)
+
+    def slope_bound_arcsec_per_deg(self) -> float:
+        """Slope at the steepest point of the flank."""
+        return 0.5 * math.pi * abs(self.height_arcsec) / self.half_width_deg / self.ratio
+
+
+class _Tracker(Memoryless):
+    __slots__ = ("_centre", "_height", "_ratio", "_width")
+
+    def __init__(self, effect: LocalDefect) -> None:
+        self._height = effect.height_arcsec
+        self._centre = effect.centre_deg
+        self._width = effect.half_width_deg
+        self._ratio = effect.ratio
+
+    def peek(self, motor_deg: float, moment: Moment) -> float:
+        turns = (motor_deg / self._ratio - self._centre) / DEG_PER_TURN
+        u = abs(turns - round(turns)) * DEG_PER_TURN / self._width
+        return self._height * (0.5 + 0.5 * math.cos(math.pi * u)) if u < 1.0 else 0.0

@@ -1,0 +1,59 @@
+"""Eccentricity of the motor encoder disc, whose reading error becomes a real motor position error."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, ClassVar
+
+from hdbridge.axis.effects.base import Cause, Compensable, Effect, Observations, Part
+from hdbridge.axis.effects.orders import OrderSeries, orders_from
+
+
+class MotorEncoderEccentricity(OrderSeries):
+    """A_1 cos(theta_M + phi_1) + A_2 cos(2 theta_M + phi_2), amplitudes at the load."""
+
+    name: ClassVar[str] = "motor_encoder_eccentricity"
+    changes: ClassVar[Part | None] = Part.ORDERS
+    few: ClassVar[frozenset[int]] = frozenset({1, 2})
+    about: ClassVar[Cause] = Cause(
+        title="eccentric motor encoder disc",
+        subject="orders",
+        equation="A_1 cos(theta_M + phi_1) + A_2 cos(2 theta_M + phi_2); A_1 = (e / r) / N for a disc of "
+        "radius r "
+        "that is out of centre by e",
+        signature="order 1 (eccentric) and 2 (tilted or oval) of the motor angle, divided by N at the load",
+        consequence="the drive holds the encoder, so the motor and with it the load really run ahead and "
+        "behind "
+        "once per motor turn",
+        remedy="compensate it with the synchronous part; centre the disc; calibrate again whenever the "
+        "encoder has "
+        "been off",
+        experiment="re-clock the encoder on the motor shaft by 90 deg: its part turns with it, the gear's "
+        "does not",
+        aliases=("motor_order", "synchronous"),
+        source="geometry of an eccentric disc: reading error (e / r) sin(theta), first order in e / r",
+        size="1-10 arcsec",
+    )
+    compensable: ClassVar[Compensable] = Compensable(
+        True, "the position loop is closed on this encoder, so its error becomes a real motion of the load"
+    )
+    typical: ClassVar[Mapping[str, Any]] = {"orders": orders_from((1, 2), 3.0)}
+    """Eccentricity and tilt."""
+
+    @classmethod
+    def proposals(
+        cls,
+        observations: Observations,  # noqa: ARG003
+        base: Sequence[Effect],  # noqa: ARG003
+    ) -> Iterator[MotorEncoderEccentricity]:
+        """Yields both orders, whether or not the model has them, because they come from one disc."""
+        yield cls(orders=orders_from((1, 2)))
+
+    @classmethod
+    def of_change(cls, before: Effect, now: Effect) -> MotorEncoderEccentricity | None:
+        """Returns this cause if orders 1 and 2 of the model have changed."""
+        return cls._change(before, now)
+
+    def turns_per_motor_turn(self) -> float:
+        """One, because the disc is on the motor shaft."""
+        return 1.0

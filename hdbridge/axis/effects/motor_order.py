@@ -1,0 +1,63 @@
+"""Additional orders of the motor angle that the model's synchronous part lacks."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import Any, ClassVar
+
+from hdbridge.axis.effects.base import Cause, Compensable, Effect, Experiment, Observations, Part
+from hdbridge.axis.effects.orders import HIGHEST_MOTOR_ORDER, OrderSeries, missing_orders, orders_from
+
+
+class MotorOrders(OrderSeries):
+    """Sum of A_k cos(k theta_M + phi_k) over orders that the model lacks."""
+
+    name: ClassVar[str] = "motor_order"
+    about: ClassVar[Cause] = Cause(
+        title="an order of the motor that the model does not have",
+        subject="orders",
+        equation="sum over k of A_k cos(k theta_M + phi_k), k not among the synchronous part's orders",
+        signature="repeats with every motor turn; the same in both directions, at every load angle and speed",
+        consequence="a ripple of the load within each motor turn that the compensation leaves",
+        remedy="add the order to the model; new orders after months hint at wear of the wave generator's "
+        "bearing",
+        experiment="steps of another size, or a slow sweep: an order that was an alias of the step moves",
+        aliases=("motor_encoder_eccentricity", "synchronous"),
+        source="Fourier series over the wave generator's angle",
+        size="0.3-3 arcsec; often k = 3, 5, 7, 10, 12",
+        apart={
+            "motor_encoder_eccentricity": Experiment(
+                15,
+                "re-clock the motor encoder by 90 deg on its shaft and sweep ten motor turns: its part turns "
+                "with it",
+            )
+        },
+    )
+    compensable: ClassVar[Compensable] = Compensable(True, "the load really moves so, and it repeats")
+    part: ClassVar[Part | None] = Part.ORDERS
+    usual: ClassVar[int] = 4
+    """A worn wave generator bearing has several."""
+    drifting: ClassVar[tuple[str, ...]] = ("orders",)
+    """The same as for the synchronous part."""
+
+    def turns_per_motor_turn(self) -> float:
+        """One, because the orders refer to the motor angle itself."""
+        return 1.0
+
+    @classmethod
+    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[MotorOrders]:  # noqa: ARG003
+        """Yields single orders; those found are combined afterwards."""
+        for number in missing_orders(cls(orders=orders_from(range(1, HIGHEST_MOTOR_ORDER + 1))), base):
+            yield cls(orders=orders_from([number]))
+
+    @classmethod
+    def of_change(cls, before: Effect, now: Effect) -> MotorOrders | None:
+        """Returns this cause if the model's orders have changed."""
+        return cls._change(before, now)
+
+    @classmethod
+    def _carried(cls, base: Sequence[Effect]) -> dict[str, Any]:
+        """Returns those of orders 1 to 12 that the model lacks."""
+        present = {order.order for each in base if isinstance(each, OrderSeries)
+                   if each.turns_per_motor_turn() == 1.0 for order in each.orders}  # fmt: skip
+        return {"orders": orders_from(k for k in range(1, 13) if k not in present)}

@@ -1,0 +1,265 @@
+"""Harmonic series over an angle that turns with the motor: common base of all order effects."""
+
+from __future__ import annotations
+
+import cmath
+import math
+from abc import abstractmethod
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Annotated, ClassVar, Final, Self, TypeVar, cast
+
+import numpy as np
+from pydantic import Field, field_validator
+
+from hdbridge.axis.effects.base import (
+    Coefficient,
+    Effect,
+    FloatArray,
+    Memoryless,
+    Moment,
+    Motion,
+    Start,
+    Stretch,
+    Tracker,
+)
+from hdbridge.axis.effects.path import away_from_reversals, once
+from hdbridge.strictness import Strict
+
+RAD_PER_DEG = math.pi / 180.0
+HIGHEST_MOTOR_ORDER: Final = 24
+"""Highest motor order searched for: six times the strongest one of a strain wave gear, order 4 (two contacts,
+and harmonics of each from encoders or bearings).
+"""
+_ComplexArray = np.ndarray[tuple[int], np.dtype[np.complex128]]
+_Phasor = TypeVar("_Phasor", complex, _ComplexArray)
+
+
+class MotorOrder(Strict):
+    """One harmonic: amplitude * cos(order * angle + phase)."""
+
+    order: Annotated[int, Field(ge=1, le=1000, description="periods per turn")]
+    amplitude_arcsec: Annotated[float, Field(ge=0, le=3600, description="amplitude at the load")]
+    phase_deg: Annotated[float, Field(ge=-360, le=360, description="phase of the cosine")]
+
+
+Orders = Annotated[
+    tuple[MotorOrder, ...], Field(description="harmonics: order, amplitude_arcsec, phase_deg each")
+]
+
+
+class OrderSeries(Effect):
+    """Sum of A_k cos(k c theta_M + phi_k), with c the turns of the reference angle per motor turn."""
+
+    usual: ClassVar[int] = 2
+    few: ClassVar[frozenset[int]] = frozenset()
+    """Permitted orders, if only a few make physical sense."""
+
+    orders: Orders
+
+    @field_validator("orders")
+    @classmethod
+    def _distinct(cls, orders: tuple[MotorOrder, ...]) -> tuple[MotorOrder, ...]:
+        numbers = [each.order for each in orders]
+        if len(set(numbers)) != len(numbers):
+            raise ValueError("each order may stand only once")
+        if cls.few and not cls.few.issuperset(numbers):
+            raise ValueError(f"only orders {', '.join(map(str, sorted(cls.few)))} are of this cause")
+        return orders
+
+    @abstractmethod
+    def turns_per_motor_turn(self) -> float:
+        """Returns c, the periods of order 1 per motor turn."""
+
+    def predict(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
+        """Returns the error in arcsec, shape (n,)."""
+        error: FloatArray = horner(phasors(self.orders), turn_of(self._scale() * motion.motor_deg)).real
+        return error
+
+    def tracker(self, start: Start = Start.VIRGIN) -> Tracker:
+        """Returns a stateless on-line tracker."""
+        return OrderTracker(phasors(self.orders), self._scale())
+
+    def columns(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
+        """Returns cosine and sine of each order, shape (n, 2 * orders)."""
+        return cosines_and_sines(self._scale() * motion.motor_deg, [each.order for each in self.orders])
+
+    def coefficients(self) -> FloatArray:
+        """Returns A cos(phi) and -A sin(phi) of each order, arcsec."""
+        return coefficients_of(self.orders)
+
+    def fitted(self, coefficients: FloatArray, shape: Mapping[str, float] | None = None) -> Self:
+        """Returns the same orders with amplitudes and phases from cosine and sine coefficients."""
+        return self.model_copy(update={"orders": orders_fitted(self.orders, coefficients)})
+
+    def bound_arcsec(self) -> float:
+        """Sum of the amplitudes."""
+        return sum(each.amplitude_arcsec for each in self.orders)
+
+    def slope_bound_arcsec_per_deg(self) -> float:
+        """Sum of order times amplitude, per degree."""
+        return self._scale() * sum(each.order * each.amplitude_arcsec for each in self.orders)
+
+    def shows(self, motion: Motion) -> Stretch | None:
+        """Returns the samples away from reversals, where a loop of another shape leaves no periodic bumps."""
+        return away_from_reversals(motion)
+
+    def pieces(self) -> tuple[Self, ...]:
+        """Returns one effect per order."""
+        return tuple(self.model_copy(update={"orders": (each,)}) for each in self.orders)
+
+    def joined(self, other: Effect) -> Self | None:
+        """Returns the effect with the orders of two series over the same angle."""
+        if other.name != self.name or not isinstance(other, OrderSeries):
+            return None
+        own = {each.order for each in self.orders}
+        new = [each for each in other.orders if each.order not in own]
+        orders = tuple(sorted((*self.orders, *new), key=lambda each: each.order))
+        return self.model_copy(update={"orders": orders})
+
+    def largest_piece_arcsec(self) -> float:
+        """Returns the largest amplitude, because on an arc of its turn an order shows only in part."""
+        return max((each.amplitude_arcsec for each in self.orders), default=0.0)
+
+    def waves(self) -> tuple[tuple[float, float, float], ...]:
+        """Returns its orders."""
+        turns = self.turns_per_motor_turn()
+        return tuple((each.order * turns, each.amplitude_arcsec, each.phase_deg) for each in self.orders)
+
+    def named_coefficients(self) -> tuple[Coefficient, ...]:
+        """Returns the names of amplitude and phase of each order."""
+        return named_orders(self.orders)
+
+    def tidied(self, ratio: float) -> Self:
+        """Removes orders without amplitude, whose phases have no meaning."""
+        orders = tuple(each for each in self.orders if each.amplitude_arcsec > 1e-6)
+        return self.model_copy(update={"orders": orders})
+
+    @classmethod
+    def _change(cls, before: Effect, now: Effect) -> Self | None:
+        """Returns the difference of two series of motor orders, as orders of this kind; None if there is
+        none.
+        """
+        if not isinstance(before, OrderSeries) or not isinstance(now, type(before)):
+            return None
+        numbers = [each.order for each in before.orders]
+        if numbers != [each.order for each in now.orders] or (cls.few and not cls.few.issuperset(numbers)):
+            return None
+        change = orders_fitted(before.orders, now.coefficients() - before.coefficients())
+        return cast("Self", cls.model_construct(orders=change))
+
+    def _scale(self) -> float:
+        return RAD_PER_DEG * self.turns_per_motor_turn()
+
+
+def missing_orders(series: OrderSeries, base: Iterable[Effect]) -> Iterable[int]:
+    """Returns the orders of a series that no series over the same angle in ``base`` has."""
+    turns = series.turns_per_motor_turn()
+    present = {
+        order.order
+        for each in base
+        if isinstance(each, OrderSeries) and each.turns_per_motor_turn() == turns
+        for order in each.orders
+    }
+    return [each.order for each in series.orders if each.order not in present]
+
+
+def named_orders(orders: Iterable[MotorOrder]) -> tuple[Coefficient, ...]:
+    """Returns the names of cosine and sine of each order."""
+    return tuple(
+        Coefficient(f"order_{each.order}_", (2 * i, 2 * i + 1), ("orders", i))
+        for i, each in enumerate(orders)
+    )
+
+
+def orders_from(numbers: Iterable[int], amplitude_arcsec: float = 1.0) -> tuple[MotorOrder, ...]:
+    """Returns harmonics of one amplitude and zero phase, as the start of a fit."""
+    return tuple(MotorOrder(order=each, amplitude_arcsec=amplitude_arcsec, phase_deg=0.0) for each in numbers)
+
+
+def cosines_and_sines(angle_rad: FloatArray, numbers: Sequence[int]) -> FloatArray:
+    """Returns columns cos(k angle), sin(k angle) for each k, shape (n, 2 * len(numbers))."""
+    result = np.empty((2 * len(numbers), len(angle_rad))).T
+    for at, number in enumerate(numbers):
+        angle = number * angle_rad
+        np.cos(angle, out=result[:, 2 * at])
+        np.sin(angle, out=result[:, 2 * at + 1])
+    return result
+
+
+def coefficients_of(orders: Iterable[MotorOrder]) -> FloatArray:
+    """Returns A cos(phi) and -A sin(phi) of each order, in the order of `cosines_and_sines`."""
+    pairs = [
+        (each.amplitude_arcsec * math.cos(phase), -each.amplitude_arcsec * math.sin(phase))
+        for each in orders
+        for phase in [math.radians(each.phase_deg)]
+    ]
+    return np.array(pairs, dtype=np.float64).reshape(-1)
+
+
+def orders_fitted(orders: Sequence[MotorOrder], coefficients: FloatArray) -> tuple[MotorOrder, ...]:
+    """Returns the same orders with amplitudes and phases from the coefficients."""
+    pairs = np.asarray(coefficients, dtype=np.float64).reshape(len(orders), 2)
+    return tuple(
+        MotorOrder.model_construct(  # not validated: a fit may leave the range (`violations`)
+            order=each.order,
+            amplitude_arcsec=math.hypot(cosine, sine),
+            phase_deg=math.degrees(math.atan2(-sine, cosine)),
+        )
+        for each, (cosine, sine) in zip(orders, pairs.tolist(), strict=True)
+    )
+
+
+def phasors(orders: Iterable[MotorOrder]) -> tuple[complex, ...]:
+    """Returns the complex amplitudes from the highest order down to order 0, for `horner`."""
+    given = {each.order: cmath.rect(each.amplitude_arcsec, math.radians(each.phase_deg)) for each in orders}
+    return tuple(given.get(order, 0j) for order in range(max(given, default=0), -1, -1))
+
+
+def ripple(motor_deg: FloatArray, amplitudes: tuple[complex, ...]) -> FloatArray:
+    """Returns the sum of motor orders, arcsec, shape (n,); ``amplitudes`` as from `phasors`."""
+
+    def make() -> FloatArray:
+        return np.ascontiguousarray(horner(amplitudes, turn_of(RAD_PER_DEG * motor_deg)).real)
+
+    return once(motor_deg, Start.VIRGIN, amplitudes, make)
+
+
+def turn_of(angle_rad: FloatArray) -> _ComplexArray:
+    """Returns exp(j angle), shape (n,), from cosine and sine, several times faster than numpy's
+    complex one.
+    """
+    result = np.empty(len(angle_rad), dtype=np.complex128)
+    np.cos(angle_rad, out=result.real)
+    np.sin(angle_rad, out=result.imag)
+    return result
+
+
+def horner(amplitudes: tuple[complex, ...], turn: _Phasor) -> _Phasor:
+    """Evaluates the polynomial in ``turn`` = exp(j theta), for one angle or for a whole record.
+
+    One exponential and a few multiplications per order are several times faster in the control loop than a
+    cosine per order, and the same lines serve a record.
+    """
+    total = 0.0 * turn
+    for amplitude in amplitudes:
+        total = total * turn + amplitude
+    return total
+
+
+class OrderTracker(Memoryless):
+    """On-line tracker of a series of harmonics; ``scale`` is radians of order 1 per motor degree."""
+
+    __slots__ = ("_highest", "_lower", "_scale")
+
+    def __init__(self, amplitudes: tuple[complex, ...], scale: float = RAD_PER_DEG) -> None:
+        self._highest, *self._lower = amplitudes
+        self._scale = scale
+
+    def peek(self, motor_deg: float, moment: Moment) -> float:
+        """Returns the error at this motor angle, arcsec."""
+        # `horner`, inlined because it is called several times in each control cycle.
+        turn = cmath.rect(1.0, self._scale * motor_deg)
+        total = self._highest
+        for amplitude in self._lower:
+            total = total * turn + amplitude
+        return total.real

@@ -1,0 +1,60 @@
+"""Stop operator: follows the motor, limited to plus or minus one; the building block of dead zones."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from hdbridge.axis.effects.base import FloatArray, Start
+from hdbridge.axis.effects.path import path_of
+
+
+def stop(motor_deg: FloatArray, width_deg: float, start: Start) -> FloatArray:
+    """Returns s[i] = clip(s[i-1] + 2 (theta[i] - theta[i-1]) / width, -1, 1), shape (n,); linear time.
+
+    Between two reversals it suffices to clip once, so only the reversals need a Python loop.
+    """
+    if not len(motor_deg):
+        return np.empty(0)
+    path = path_of(motor_deg, start)
+    gain = 2.0 / width_deg
+    value = float(start.value)
+    begin = []
+    for step in (gain * path.steps_deg).tolist():
+        begin.append(value)
+        value += step
+        value = 1.0 if value > 1.0 else -1.0 if value < -1.0 else value
+    result = np.full(len(motor_deg), float(start.value))
+    inside = result[path.turning[0] + 1 :]
+    np.multiply(gain, path.away_deg, out=inside)
+    inside += np.repeat(begin, path.lengths)
+    np.clip(inside, -1.0, 1.0, out=inside)
+    return result
+
+
+class Stop:
+    """On-line stop operator: `at` evaluates, `to` moves."""
+
+    __slots__ = ("_angle", "_gain", "_value")
+
+    def __init__(self, width_deg: float, start: Start) -> None:
+        self._gain = 2.0 / width_deg
+        self._value = float(start.value)
+        self._angle: float | None = None
+
+    @property
+    def memory_deg(self) -> float:
+        """Motor angle from stop to stop."""
+        return 2.0 / self._gain
+
+    def at(self, motor_deg: float) -> float:
+        """Returns the value after a straight move to ``motor_deg``; changes nothing."""
+        if self._angle is None:
+            return self._value
+        value = self._value + self._gain * (motor_deg - self._angle)
+        return 1.0 if value > 1.0 else -1.0 if value < -1.0 else value
+
+    def to(self, motor_deg: float) -> float:
+        """Moves to ``motor_deg`` and returns the value there."""
+        self._value = self.at(motor_deg)
+        self._angle = motor_deg
+        return self._value

@@ -1,0 +1,145 @@
+"""Growth of the elastic loop with speed: friction rises with the logarithm of the sliding rate."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Annotated, Any, ClassVar
+
+import numpy as np
+from pydantic import Field
+
+from hdbridge.axis.effects.base import (
+    Cause,
+    Channel,
+    Compensable,
+    Coordinate,
+    Effect,
+    FloatArray,
+    Linear,
+    Moment,
+    Motion,
+    Observations,
+    Part,
+    Shape,
+    Start,
+    Tracker,
+)
+from hdbridge.axis.effects.carried import Loop, has_loop, loop_of
+from hdbridge.axis.effects.coordinate import Spacing
+from hdbridge.axis.effects.kinematics import speed_of
+from hdbridge.axis.effects.observations import top_speed_deg_s
+
+
+class RateDependence(Linear):
+    """growth log10(1 + |v| / reference) H: zero at rest, ``growth`` per decade above the reference."""
+
+    name: ClassVar[str] = "rate_dependence"
+    channels: ClassVar[frozenset[Channel]] = frozenset({Channel.SPEED})
+    about: ClassVar[Cause] = Cause(
+        title="loop that grows with speed",
+        equation="growth log10(1 + |v| / v_ref) H, H the model's loop, v the commanded motor speed, "
+        "limited to v_limit",
+        signature="the same sine at a higher frequency has a higher loop; at rest the difference is gone",
+        consequence="a loop measured slowly is too small for fast moves",
+        remedy="compensate it; calibrate at the speeds of the work; a thinner grease",
+        experiment="sines of one amplitude at 0.01 to 1 Hz",
+        aliases=("velocity_windup", "channel_skew", "hysteresis_parameters"),
+        source="rate-dependent friction, logarithmic in the rate (rate-and-state laws)",
+        size="5-30 % of the loop",
+    )
+    compensable: ClassVar[Compensable] = Compensable(True, "the load really moves so; the speed is commanded")
+    shape: ClassVar[tuple[Shape, ...]] = (Shape("reference_deg_s", 1.0, 1000.0, logarithmic=True),)
+    carries: ClassVar[Mapping[Part, str]] = {Part.LOOP: "loop"}
+    linear: ClassVar[tuple[str, ...]] = ("growth_percent",)
+    typical: ClassVar[Mapping[str, Any]] = {"growth_percent": 10.0, "reference_deg_s": 30.0}
+    """10 % per decade."""
+
+    loop: Annotated[Loop, Field(description="the model's loop")]
+    growth_percent: Annotated[float, Field(ge=0, le=200, description="growth per decade of speed")]
+    reference_deg_s: Annotated[float, Field(gt=0, le=1e5, description="motor speed from which on it grows")]
+    limit_deg_s: Annotated[float, Field(gt=0, le=1e6, description="motor speed beyond which it is held")] = (
+        20_000.0
+    )
+
+    @classmethod
+    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[RateDependence]:
+        """Yields growth from far below the speeds of the record, and from just below them."""
+        fastest = top_speed_deg_s(observations.motion)
+        if has_loop(base):
+            for share in (0.02, 0.2):
+                yield cls(
+                    loop=loop_of(base), growth_percent=1.0,
+                    reference_deg_s=min(max(share * fastest, 1.0), 1000.0),
+                )  # fmt: skip
+
+    def coordinate(self, motion: Motion, ratio: float) -> Coordinate:
+        """Returns the absolute speed."""
+        speed = np.abs(speed_of(motion, self.name))
+        return Coordinate("speed, forward or backward", "motor deg/s", speed, spacing=Spacing.FILLED)
+
+    def scales(self) -> tuple[Part, Effect]:
+        """Returns the loop."""
+        return Part.LOOP, self.loop.law()
+
+    def columns(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
+        """Returns the effect of 1 % growth, shape (n, 1)."""
+        speed = np.minimum(np.abs(speed_of(motion, self.name)), self.limit_deg_s)
+        rate = np.log1p(speed / self.reference_deg_s) * (0.01 / math.log(10.0))
+        return (rate * self.loop.law().predict(motion, start))[:, np.newaxis]
+
+    def tracker(self, start: Start = Start.VIRGIN) -> Tracker:
+        """Returns an on-line tracker; speed comes from the moment."""
+        return _Tracker(self, self.loop.law().tracker(start))
+
+    def bound_arcsec(self) -> float:
+        """Growth at the highest speed."""
+        return self._most() * abs(self.loop.offset_arcsec)
+
+    def slope_bound_arcsec_per_deg(self) -> float:
+        """Zero for a growing loop, which only rises along its path. A shrinking loop, or one in which the
+        load lags, falls as steeply as the loop starts.
+        """
+        return 0.0 if self.growth_percent * self.loop.offset_arcsec >= 0.0 else math.inf
+
+    def gentle_tracker(self, start: Start, fall_arcsec_per_deg: float) -> Tracker | None:
+        """If the load lags, returns a tracker whose loop, at the highest speed, falls no more steeply than
+        this.
+        """
+        if self.growth_percent <= 0.0:
+            return None
+        loop = self.loop.law().gentle_tracker(start, fall_arcsec_per_deg / self._most())
+        return None if loop is None else _Tracker(self, loop)
+
+    def _most(self) -> float:
+        """Returns the share of the loop at the highest speed."""
+        return 0.01 * self.growth_percent * math.log10(1.0 + self.limit_deg_s / self.reference_deg_s)
+
+    @classmethod
+    def _carried(cls, base: Sequence[Effect]) -> dict[str, Any]:
+        return {"loop": loop_of(base)}
+
+
+class _Tracker(Tracker):
+    __slots__ = ("_gain", "_limit", "_loop", "_reference")
+
+    def __init__(self, effect: RateDependence, loop: Tracker) -> None:
+        self._loop = loop
+        self._gain = 0.01 * effect.growth_percent / math.log(10.0)
+        self._reference = effect.reference_deg_s
+        self._limit = effect.limit_deg_s
+
+    @property
+    def memory_deg(self) -> float:
+        """Memory of the loop."""
+        return self._loop.memory_deg
+
+    def peek(self, motor_deg: float, moment: Moment) -> float:
+        return self._rate(moment) * self._loop.peek(motor_deg, moment)
+
+    def advance(self, motor_deg: float, moment: Moment) -> float:
+        return self._rate(moment) * self._loop.advance(motor_deg, moment)
+
+    def _rate(self, moment: Moment) -> float:
+        speed = min(abs(moment.motor_speed_deg_s), self._limit)
+        return self._gain * math.log1p(speed / self._reference)

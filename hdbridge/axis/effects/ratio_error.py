@@ -1,0 +1,128 @@
+"""Gear ratio that differs from the model's."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Annotated, Any, ClassVar
+
+import numpy as np
+from pydantic import Field
+
+from hdbridge.axis.effects import coordinate as over
+from hdbridge.axis.effects.base import (
+    Cause,
+    Compensable,
+    Coordinate,
+    Effect,
+    FloatArray,
+    Linear,
+    Memoryless,
+    Moment,
+    Motion,
+    Observations,
+    Start,
+    Tracker,
+)
+from hdbridge.units import ARCSEC_PER_DEG, DEG_PER_TURN
+
+TEETH_PER_TURN = 2.0
+"""Difference of the tooth numbers of circular spline and flexspline: teeth passed per turn of the motor."""
+SCALE = 1e-3
+"""Largest scale error of an encoder that was mounted as intended: a tape on a drum of 100 mm whose radius is
+0.1 mm off. A disc has none, because its lines are whole per turn."""
+SAME_TEETH = 1e-4
+"""Share of a ratio to which a ramp shows it next to other causes: a tenth of `SCALE`."""
+
+
+class RatioError(Linear):
+    """(1 / N_true - 1 / N) theta_M: a ramp in the motor angle."""
+
+    name: ClassVar[str] = "ratio_error"
+    about: ClassVar[Cause] = Cause(
+        title="wrong gear ratio or encoder scale",
+        subject="ratio errors",
+        equation="ramp theta_M, ramp = 3600 (1 / N_true - 1 / N), theta_M limited to +- limit",
+        signature="a ramp over the motor angle, the same in both directions, undone on the return",
+        consequence="the load is off in proportion to its distance from zero",
+        remedy="correct ratio, teeth or counts per turn in the axis file: a ratio is a fraction of tooth "
+        "numbers, not a fit",
+        experiment="a long sweep both ways, then rest: it grows with the angle, a drift with time",
+        aliases=("load_order", "zero_drift", "wear"),
+        source="kinematics",
+        size="784 arcsec per step of 43.56 motor degrees between ratios 40 and 50",
+    )
+    compensable: ClassVar[Compensable] = Compensable(
+        True,
+        "the load really moves so (unless the load encoder's scale is wrong), but correct the axis file "
+        "instead",
+    )
+    linear: ClassVar[tuple[str, ...]] = ("ramp_arcsec_per_turn",)
+    typical: ClassVar[Mapping[str, Any]] = {"ramp_arcsec_per_turn": 2.592}
+    """0.01 % of a ratio of 50."""
+
+    ramp_arcsec_per_turn: Annotated[float, Field(ge=-1e6, le=1e6, description="ramp per motor turn")]
+    limit_deg: Annotated[float, Field(gt=0, le=1e9, description="motor angle beyond which it is held")] = 1e6
+
+    def true_ratio(self, ratio: float) -> float:
+        """Returns the ratio that would leave no ramp, for a model with ``ratio``."""
+        return 1.0 / (1.0 / ratio + self.ramp_arcsec_per_turn / (DEG_PER_TURN * ARCSEC_PER_DEG))
+
+    @classmethod
+    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[RatioError]:  # noqa: ARG003
+        """Yields the single candidate."""
+        yield cls(ramp_arcsec_per_turn=1.0)
+
+    def implausible(self, observations: Observations) -> str:
+        """Requires whole tooth numbers, a whole turn of the load, or a small error of an encoder's scale.
+
+        The ratio of a strain wave gear is half the tooth number of its flexspline, or one more. On less than
+        a turn of the load, any other ramp is an arc of something that returns.
+        """
+        ratio = self.true_ratio(observations.ratio)
+        teeth = TEETH_PER_TURN * ratio
+        turned = float(np.ptp(observations.motion.motor_deg)) >= DEG_PER_TURN * observations.ratio
+        off = abs(teeth - round(teeth)) / teeth
+        if turned or abs(observations.ratio / ratio - 1.0) < SCALE or off < SAME_TEETH:
+            return ""
+        return f"no teeth have the ratio {ratio:.6g}, and no encoder's scale is so wrong"
+
+    def coordinate(self, motion: Motion, ratio: float) -> Coordinate:
+        """Returns the load angle over all turns."""
+        return over.position(motion, ratio)
+
+    def changing(self, motion: Motion) -> FloatArray:
+        """Returns bends at one third and two thirds of the travel: a wrong ratio has the same slope
+        everywhere.
+        """
+        angle = motion.motor_deg
+        low, span = float(np.min(angle)), float(np.ptp(angle))
+        bends = [np.maximum(angle - low - share * span, 0.0) for share in (1.0 / 3.0, 2.0 / 3.0)]
+        return np.column_stack(bends) / DEG_PER_TURN
+
+    def columns(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
+        """Returns the effect of 1 arcsec per motor turn, shape (n, 1)."""
+        angle = np.clip(motion.motor_deg, -self.limit_deg, self.limit_deg)
+        return (angle / DEG_PER_TURN)[:, np.newaxis]
+
+    def tracker(self, start: Start = Start.VIRGIN) -> Tracker:
+        """Returns a stateless on-line tracker."""
+        return _Tracker(self.ramp_arcsec_per_turn / DEG_PER_TURN, self.limit_deg)
+
+    def bound_arcsec(self) -> float:
+        """Ramp at the limit."""
+        return abs(self.ramp_arcsec_per_turn) / DEG_PER_TURN * self.limit_deg
+
+    def slope_bound_arcsec_per_deg(self) -> float:
+        """Slope of the ramp, if it falls."""
+        return max(-self.ramp_arcsec_per_turn, 0.0) / DEG_PER_TURN
+
+
+class _Tracker(Memoryless):
+    __slots__ = ("_limit", "_slope")
+
+    def __init__(self, slope: float, limit: float) -> None:
+        self._slope = slope
+        self._limit = limit
+
+    def peek(self, motor_deg: float, moment: Moment) -> float:
+        return self._slope * min(max(motor_deg, -self._limit), self._limit)

@@ -1,0 +1,155 @@
+"""Wind-up of the gear by drag on the output: seals, bearings, grease, a cable."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Annotated, Any, ClassVar
+
+import numpy as np
+from pydantic import Field
+
+from hdbridge.axis.effects.base import (
+    Cause,
+    Channel,
+    Compensable,
+    Effect,
+    FloatArray,
+    Level,
+    Linear,
+    Moment,
+    Motion,
+    Observations,
+    Shape,
+    Start,
+    Tracker,
+)
+from hdbridge.axis.effects.kinematics import speed_of
+from hdbridge.axis.effects.observations import top_speed_deg_s
+
+STRAIGHT = 20.0
+"""Ratio of shear speed to top speed above which the drag deviates from a straight line by less than 1/20."""
+
+
+EXPONENT = 0.58
+"""Standard deviation of the exponent of speed over shear speed.
+
+It lies between 0, an oil without shear thinning, and 1, a paste with a yield stress: this is the rms distance
+from the law's 1 if all values are equally likely.
+"""
+
+
+class VelocityWindup(Linear):
+    """-(coulomb sgn(v) + viscous v / (1 + |v| / shear)): drag over stiffness; zero at rest.
+
+    Dry friction that remains at rest belongs to the elastic loop. The viscous part thins with shear: at the
+    shear speed it is half of the linear value, and far above it is constant.
+    """
+
+    name: ClassVar[str] = "velocity_windup"
+    channels: ClassVar[frozenset[Channel]] = frozenset({Channel.SPEED})
+    about: ClassVar[Cause] = Cause(
+        title="wind-up by drag on the output",
+        subject="drag",
+        equation="-(coulomb sgn(v) + viscous v / (1 + |v| / v_shear)), v the commanded motor speed, "
+        "limited to v_limit",
+        signature="the error follows the speed, less than linearly, and goes back at rest",
+        consequence="the load lags while it moves",
+        remedy="compensate it; thinner grease, seals with less drag; warm the axis up first",
+        experiment="sweeps at several speeds both ways: drag bends with speed, a skew is a straight line",
+        aliases=("channel_skew", "rate_dependence"),
+        source="Coulomb and viscous friction with shear thinning, over the gear's stiffness",
+        size="5-50 arcsec",
+    )
+    compensable: ClassVar[Compensable] = Compensable(
+        True, "the load really lags and the speed is commanded; at rest it is nothing"
+    )
+    shape: ClassVar[tuple[Shape, ...]] = (Shape("shear_deg_s", 10.0, 100_000.0, logarithmic=True),)
+    nonnegative: ClassVar[bool] = True
+    """A drag never pushes. An absent one would otherwise come out on either side of zero by chance."""
+    linear: ClassVar[tuple[str, ...]] = ("coulomb_arcsec", "viscous_arcsec_s_per_deg")
+    typical: ClassVar[Mapping[str, Any]] = {
+        "coulomb_arcsec": 3.0,
+        "viscous_arcsec_s_per_deg": 0.015,
+        "shear_deg_s": 1000.0,
+    }
+    """About 10 arcsec at 1000 motor degrees per second."""
+
+    coulomb_arcsec: Annotated[
+        float, Field(ge=0, le=3600, description="dry drag over stiffness, while it moves")
+    ]
+    viscous_arcsec_s_per_deg: Annotated[
+        float, Field(ge=0, le=100, description="slope at low speed, per motor degree per second")
+    ]
+    shear_deg_s: Annotated[
+        float, Field(gt=0, le=1e7, description="motor speed at which it has fallen off by half")
+    ]
+    limit_deg_s: Annotated[float, Field(gt=0, le=1e6, description="motor speed beyond which it is held")] = (
+        50_000.0
+    )
+
+    @classmethod
+    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[VelocityWindup]:  # noqa: ARG003
+        """Yields drags that bend below, at and above the speeds of the record."""
+        fastest = top_speed_deg_s(observations.motion)
+        for share in (0.15, 1.0, 6.0):
+            yield cls(
+                coulomb_arcsec=1.0, viscous_arcsec_s_per_deg=0.01, shear_deg_s=max(share * fastest, 10.0)
+            )
+
+    def unidentifiable(self, observations: Observations) -> str:
+        """Requires curvature, because a linear drag is indistinguishable from a delayed sample.
+
+        A small dry part is no evidence either: it can come from quantisation, because a command in whole
+        counts is followed with a fixed fraction of a count, with the sign of the direction.
+        """
+        speed = observations.motion.motor_speed_deg_s
+        if speed is None or self.coulomb_arcsec > 0.5 * observations.motor_count_arcsec:
+            return ""
+        if self.shear_deg_s < STRAIGHT * float(np.max(np.abs(speed))):
+            return ""
+        return "a straight line in speed is a delay, not a drag"
+
+    def columns(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
+        """Returns the dry and the viscous part, shape (n, 2)."""
+        speed = np.clip(speed_of(motion, self.name), -self.limit_deg_s, self.limit_deg_s)
+        return -np.column_stack([np.sign(speed), speed / (1.0 + np.abs(speed) / self.shear_deg_s)])
+
+    def law_discrepancy(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
+        """Returns the derivative with respect to the shear exponent, which is 1 here, shape (n, 1)."""
+        speed = np.clip(speed_of(motion, self.name), -self.limit_deg_s, self.limit_deg_s)
+        share = np.abs(speed) / self.shear_deg_s
+        bent = share * np.log(np.maximum(share, 1e-300)) / (1.0 + share) ** 2
+        return (EXPONENT * self.viscous_arcsec_s_per_deg * speed * bent)[:, np.newaxis]
+
+    def tracker(self, start: Start = Start.VIRGIN) -> Tracker:
+        """Returns an on-line tracker; speed comes from the moment."""
+        return _Tracker(self)
+
+    def bound_arcsec(self) -> float:
+        """Wind-up at the highest speed."""
+        viscous = self.limit_deg_s / (1.0 + self.limit_deg_s / self.shear_deg_s)
+        return abs(self.coulomb_arcsec) + abs(self.viscous_arcsec_s_per_deg) * viscous
+
+    def slope_bound_arcsec_per_deg(self) -> float:
+        """Zero, because the speed is the command's, independent of the angle."""
+        return 0.0
+
+
+class _Tracker(Level):
+    __slots__ = ("_coulomb", "_limit", "_shear", "_viscous")
+
+    def __init__(self, effect: VelocityWindup) -> None:
+        self._coulomb = effect.coulomb_arcsec
+        self._viscous = effect.viscous_arcsec_s_per_deg
+        self._shear = effect.shear_deg_s
+        self._limit = effect.limit_deg_s
+
+    def peek(self, motor_deg: float, moment: Moment) -> float:
+        speed = min(max(moment.motor_speed_deg_s, -self._limit), self._limit)
+        if not speed:
+            return 0.0
+        return -(
+            self._coulomb * math.copysign(1.0, speed)
+            + self._viscous * speed / (1.0 + abs(speed) / self._shear)
+        )

@@ -1,0 +1,142 @@
+"""Vibration at a fixed frequency in time: a fan, a pump, a neighbouring machine, a resonance."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Annotated, Any, ClassVar, Self
+
+import numpy as np
+from pydantic import Field
+
+from hdbridge.axis.effects.base import (
+    Cause,
+    Channel,
+    Coefficient,
+    Compensable,
+    Coordinate,
+    Effect,
+    Experiment,
+    FloatArray,
+    Memoryless,
+    Moment,
+    Motion,
+    Observations,
+    Shape,
+    Sought,
+    Start,
+    Tracker,
+)
+from hdbridge.axis.effects.orders import cosines_and_sines
+
+
+class Vibration(Effect):
+    """amplitude cos(2 pi f t + phase)."""
+
+    name: ClassVar[str] = "vibration"
+    channels: ClassVar[frozenset[Channel]] = frozenset({Channel.TIME})
+    about: ClassVar[Cause] = Cause(
+        title="vibration at a fixed frequency",
+        equation="A cos(2 pi f t + phase)",
+        signature="the same frequency in hertz at every speed, and at rest",
+        consequence="the load (or only the reading head) trembles",
+        remedy="find the source by its frequency; decouple it; lower the loop's gain where it is a "
+        "resonance of the axis",
+        experiment="a standstill, and sweeps at two speeds: an order moves in hertz with the speed, a "
+        "vibration stays",
+        aliases=("motor_order", "load_order", "flexspline_order", "subdivisional_error"),
+        source="a sinusoid in time",
+        size="0.1-5 arcsec",
+        apart={
+            "motor_order": Experiment(
+                2, "stand still for a minute, then sweep at two speeds: a vibration keeps its frequency"
+            )
+        },
+    )
+    compensable: ClassVar[Compensable] = Compensable(
+        False, "its phase drifts and cannot be foreseen, and it is mostly faster than the axis can follow"
+    )
+    shape: ClassVar[tuple[Shape, ...]] = (
+        Shape("frequency_hz", 0.05, 5000.0, logarithmic=True, is_frequency=True),
+    )
+    usual: ClassVar[int] = 2
+    sought: ClassVar[Sought | None] = Sought.TONE
+    inexact: ClassVar[float] = 0.03
+    """No source keeps its frequency and amplitude exactly, and the gear's loop responds at
+    other frequencies.
+    """
+    typical: ClassVar[Mapping[str, Any]] = {"frequency_hz": 50.0, "amplitude_arcsec": 1.0, "phase_deg": 0.0}
+    """1 arcsec at 50 Hz, as an example; the real frequency comes from a search."""
+
+    frequency_hz: Annotated[float, Field(gt=0, le=1e5, description="frequency")]
+    amplitude_arcsec: Annotated[float, Field(ge=0, le=3600, description="amplitude at the load")]
+    phase_deg: Annotated[
+        float, Field(ge=-360, le=360, description="phase of the cosine at the record's time zero")
+    ]
+
+    @classmethod
+    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[Vibration]:  # noqa: ARG003
+        """Yields a fast vibration that the record can resolve, as an example."""
+        fast_hz = 0.137 / max(observations.period_s, 1e-6)
+        yield cls(frequency_hz=min(max(fast_hz, 0.3), 40.0), amplitude_arcsec=1.0, phase_deg=0.0)
+
+    def coordinate(self, motion: Motion, ratio: float) -> Coordinate:
+        """Returns the time within a period."""
+        period_s = 1.0 / self.frequency_hz
+        within = 1e3 * np.mod(motion.channel(Channel.TIME, self.name), period_s)
+        return Coordinate(f"time within a period of {1e3 * period_s:.4g} ms", "ms", within, bins=48)
+
+    def named_coefficients(self) -> tuple[Coefficient, ...]:
+        """Returns the names of amplitude and phase."""
+        return (Coefficient("", (0, 1), ()),)
+
+    def predict(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
+        """Returns the error in arcsec, shape (n,)."""
+        error: FloatArray = self.amplitude_arcsec * np.cos(self._angle(motion) + math.radians(self.phase_deg))
+        return error
+
+    def tracker(self, start: Start = Start.VIRGIN) -> Tracker:
+        """Returns an on-line tracker; it depends only on the clock."""
+        return _Tracker(self)
+
+    def columns(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
+        """Returns cosine and sine, shape (n, 2)."""
+        return cosines_and_sines(self._angle(motion), (1,))
+
+    def coefficients(self) -> FloatArray:
+        """Returns A cos(phase) and -A sin(phase), arcsec."""
+        phase = math.radians(self.phase_deg)
+        return self.amplitude_arcsec * np.array([math.cos(phase), -math.sin(phase)])
+
+    def fitted(self, coefficients: FloatArray, shape: Mapping[str, float] | None = None) -> Self:
+        """Returns another amplitude and phase and, if given, another frequency."""
+        cosine, sine = (float(each) for each in coefficients)
+        update = {
+            "amplitude_arcsec": math.hypot(cosine, sine),
+            "phase_deg": math.degrees(math.atan2(-sine, cosine)),
+            **dict(shape or {}),
+        }
+        return self.model_copy(update=update)
+
+    def bound_arcsec(self) -> float:
+        """The amplitude."""
+        return self.amplitude_arcsec
+
+    def slope_bound_arcsec_per_deg(self) -> float:
+        """Zero, because it depends on time alone."""
+        return 0.0
+
+    def _angle(self, motion: Motion) -> FloatArray:
+        return (2.0 * math.pi * self.frequency_hz) * motion.channel(Channel.TIME, self.name)
+
+
+class _Tracker(Memoryless):
+    __slots__ = ("_amplitude", "_omega", "_phase")
+
+    def __init__(self, effect: Vibration) -> None:
+        self._amplitude = effect.amplitude_arcsec
+        self._omega = 2.0 * math.pi * effect.frequency_hz
+        self._phase = math.radians(effect.phase_deg)
+
+    def peek(self, motor_deg: float, moment: Moment) -> float:
+        return self._amplitude * math.cos(self._omega * moment.time_s + self._phase)

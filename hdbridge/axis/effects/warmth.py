@@ -1,0 +1,124 @@
+"""Warmth of the gear, which drives the drifts."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from typing import Annotated, ClassVar, Final, Literal
+
+import numpy as np
+from pydantic import Field
+
+from hdbridge.axis.effects.base import (
+    SLOT,
+    Channel,
+    Effect,
+    FloatArray,
+    Moment,
+    Motion,
+    Observations,
+    Shape,
+)
+from hdbridge.axis.effects.observations import duration_s
+from hdbridge.axis.effects.recurrence import lagged
+
+VARIES_K: Final = 0.3
+"""Minimum temperature change with a visible effect; K."""
+QUICK_S: Final = (2.0, 15.0)
+SLOW_S: Final = (60.0, 240.0, 600.0, 1500.0, 4000.0)
+_TEMPERATURE = SLOT[Channel.TEMPERATURE]
+
+
+class Warmed(Effect):
+    """Base class of effects that follow the gear's warmth: a temperature excess in kelvin, as a first-order
+    lag.
+
+    Driven by the temperature channel, the gear follows the sensor with the time constant, in equilibrium at
+    the first sample; warmth is the excess over the reference. Without a sensor it is driven by time: the gear
+    warms up from a cold start at the first sample, finally by ``warm_up_k``.
+    """
+
+    channels: ClassVar[frozenset[Channel]] = frozenset({Channel.TIME})
+    shape: ClassVar[tuple[Shape, ...]] = (Shape("tau_s", 2.0, 3 * 3600.0, logarithmic=True),)
+
+    tau_s: Annotated[float, Field(gt=0, le=1e6, description="time constant of the gear's temperature")]
+    driven_by: Annotated[
+        Literal["temperature", "time"],
+        Field(description="the temperature channel, or time since a cold start"),
+    ] = "temperature"
+    reference_c: Annotated[
+        float, Field(ge=-60, le=200, description="temperature at which the effect is zero")
+    ] = 20.0
+    warm_up_k: Annotated[
+        float, Field(gt=0, le=200, description="warmth in the end, where driven by time (assumed)")
+    ] = 10.0
+    limit_k: Annotated[
+        float, Field(gt=0, le=200, description="warmth in either direction beyond which the effect is held")
+    ] = 60.0
+
+    @classmethod
+    def lags(cls, observations: Observations) -> Iterator[tuple[Literal["temperature", "time"], float]]:
+        """Yields the possible drivers in a record and their time constants (s).
+
+        A sensor on the gear itself hardly leads it. Without a sensor, a change that settles within a minute
+        is creep, and one that takes far longer than the record is a straight line.
+        """
+        temperature = observations.motion.measured.get(Channel.TEMPERATURE)
+        if temperature is not None and float(np.ptp(temperature)) > VARIES_K:
+            yield from (("temperature", each) for each in (*QUICK_S, *SLOW_S))
+        else:
+            longest = 6.0 * duration_s(observations.motion)
+            yield from (("time", each) for each in SLOW_S if each <= longest)
+
+    def needs(self) -> frozenset[Channel]:
+        """Returns time, and temperature if driven by it."""
+        return self.channels | ({Channel.TEMPERATURE} if self.driven_by == "temperature" else frozenset())
+
+    def warmth(self, motion: Motion) -> FloatArray:
+        """Returns the warmth in kelvin, shape (n,)."""
+        time_s = motion.channel(Channel.TIME, self.name)
+        if self.driven_by == "time":
+            warmth = self.warm_up_k * -np.expm1(-(time_s - time_s[:1]) / self.tau_s)
+        else:
+            temperature = motion.channel(Channel.TEMPERATURE, self.name)
+            warmth = lagged(temperature, time_s, self.tau_s) - self.reference_c
+        return np.clip(warmth, -self.limit_k, self.limit_k)
+
+
+class WarmthState:
+    """On-line warmth: `at` evaluates, `to` advances."""
+
+    __slots__ = ("_by_time", "_final", "_limit", "_reference", "_start", "_tau", "_temperature", "_time")
+
+    def __init__(self, effect: Warmed) -> None:
+        self._tau = effect.tau_s
+        self._by_time = effect.driven_by == "time"
+        self._reference = effect.reference_c
+        self._final = effect.warm_up_k
+        self._limit = effect.limit_k
+        self._start: float | None = None
+        self._time = self._temperature = 0.0
+
+    def at(self, moment: Moment) -> float:
+        """Returns the warmth at this moment, kelvin; changes nothing."""
+        if self._by_time:
+            since = 0.0 if self._start is None else moment.time_s - self._start
+            warmth = -self._final * math.expm1(-since / self._tau)
+        else:
+            warmth = self._followed(moment) - self._reference
+        return min(max(warmth, -self._limit), self._limit)
+
+    def to(self, moment: Moment) -> float:
+        """Advances to this moment and returns the warmth, kelvin."""
+        warmth = self.at(moment)
+        self._temperature = self._followed(moment)
+        if self._start is None:
+            self._start = moment.time_s
+        self._time = moment.time_s
+        return warmth
+
+    def _followed(self, moment: Moment) -> float:
+        if self._start is None:
+            return moment.measured[_TEMPERATURE]
+        decay = math.exp(-max(moment.time_s - self._time, 0.0) / self._tau)
+        return decay * self._temperature + (1.0 - decay) * moment.measured[_TEMPERATURE]

@@ -1,0 +1,178 @@
+"""Lost motion that grows with the distance run."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Annotated, Any, ClassVar, Self
+
+import numpy as np
+from pydantic import Field
+
+from hdbridge.axis.effects.base import (
+    Cause,
+    Compensable,
+    Coordinate,
+    Effect,
+    FloatArray,
+    Linear,
+    Moment,
+    Motion,
+    Observations,
+    Shape,
+    Start,
+    Tracker,
+)
+from hdbridge.axis.effects.path import once
+from hdbridge.axis.effects.play import stop
+from hdbridge.units import DEG_PER_TURN
+
+
+class Wear(Linear):
+    """(growth / 2) (run / 1000)^exponent s: a loop whose height grows with the motor turns run.
+
+    Growth is signed: a loop that widens in the sense of the elastic one is positive, a growing gap (the load
+    lags) negative. Steady wear has exponent 1; running-in, fast at first and then slower, an exponent below
+    1. Within the first turn the height grows linearly, because no power law holds there.
+    """
+
+    name: ClassVar[str] = "wear"
+    about: ClassVar[Cause] = Cause(
+        title="lost motion that grows",
+        equation="(growth / 2) (run / 1000)^exponent s, run = turns_before + sum |d theta_M| / 360, "
+        "s = clip(s_before + 2 d theta_M / width, -1, 1)",
+        signature="the distance between the two directions grows steadily with the turns run, at one "
+        "temperature",
+        consequence="repeatability from either side gets worse with time",
+        remedy="calibrate again at intervals; watch the rate; grease; replace the gear when it speeds up",
+        experiment="the same stepping test again, cold, some hours of running apart",
+        aliases=("amplitude_drift", "zero_drift", "ratio_error", "backlash"),
+        source="lost motion proportional to sliding distance (Archard's law), slowing down while it runs in",
+        size="grows by 0.1-10 arcsec per thousand motor turns in a fast test",
+    )
+    compensable: ClassVar[Compensable] = Compensable(
+        True, "the turns run are known; they have to be carried over from run to run in turns_before"
+    )
+    shape: ClassVar[tuple[Shape, ...]] = (
+        Shape("width_deg", 0.05, 60.0, logarithmic=True),
+        Shape("exponent", 0.3, 1.5),
+    )
+    linear: ClassVar[tuple[str, ...]] = ("growth_arcsec_per_kiloturn",)
+    typical: ClassVar[Mapping[str, Any]] = {"growth_arcsec_per_kiloturn": 1.0, "width_deg": 2.0}
+    """1 arcsec per thousand turns, crossed in 2 degrees."""
+
+    growth_arcsec_per_kiloturn: Annotated[
+        float, Field(ge=-1000, le=1000, description="growth of the loop's height in the first 1000 turns")
+    ]
+    width_deg: Annotated[float, Field(gt=0, le=360, description="motor angle of a full crossing")]
+    exponent: Annotated[
+        float, Field(ge=0.1, le=3, description="1 for steady wear, below 1 while it runs in")
+    ] = 1.0
+    turns_before: Annotated[
+        float, Field(ge=0, le=1e9, description="motor turns run before the first sample")
+    ] = 0.0
+    turns_limit: Annotated[
+        float, Field(gt=0, le=1e9, description="motor turns from which on the height is held")
+    ] = 10_000.0
+
+    @classmethod
+    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[Wear]:  # noqa: ARG003
+        """Yields widths from that of a gap to that of the elastic loop."""
+        yield from (cls(growth_arcsec_per_kiloturn=1.0, width_deg=each) for each in (0.5, 4.0, 20.0))
+
+    def coordinate(self, motion: Motion, ratio: float) -> Coordinate:
+        """Returns the motor turns since the record began."""
+        run = np.cumsum(np.abs(np.diff(motion.motor_deg, prepend=motion.motor_deg[:1]))) / DEG_PER_TURN
+        return Coordinate("motor turns run", "", run, both_ways=True, bins=20)
+
+    def columns(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
+        """Returns the effect of a growth of 1 arcsec in 1000 turns, shape (n, 1)."""
+        angle = motion.motor_deg
+        # The derivative with respect to the width uses the same growth.
+        key = (self.name, self.turns_before, self.turns_limit, self.exponent)
+        half = once(angle, start, key, lambda: self._growth(angle))
+        column: FloatArray = half * stop(angle, self.width_deg, start)
+        return column[:, np.newaxis]
+
+    def _growth(self, angle_deg: FloatArray) -> FloatArray:
+        run = self.turns_before + np.cumsum(np.abs(np.diff(angle_deg, prepend=angle_deg[:1]))) / DEG_PER_TURN
+        run = np.minimum(run, self.turns_limit)
+        share = np.where(run < 1.0, run, np.maximum(run, 1.0) ** self.exponent)
+        return np.asarray(0.5 * _kiloturns(1.0, self.exponent) * share)
+
+    def after(self, turns: float) -> Self:
+        """Returns the effect after the motor has run this many more turns."""
+        return self.model_copy(update={"turns_before": self.turns_before + turns})
+
+    def tracker(self, start: Start = Start.VIRGIN) -> Tracker:
+        """Returns an on-line tracker; its first `advance` only sets the motor position."""
+        return _Tracker(self, start, math.inf)
+
+    def gentle_tracker(self, start: Start, fall_arcsec_per_deg: float) -> Tracker | None:
+        """Returns a tracker whose crossing takes as much motor angle as the present height requires."""
+        if self.growth_arcsec_per_kiloturn >= 0.0:
+            return None
+        crossing = fall_arcsec_per_deg - self._fastest_growth()
+        return _Tracker(self, start, crossing) if crossing > 0.0 else None
+
+    def bound_arcsec(self) -> float:
+        """Height at the limit."""
+        return abs(self._half(self.turns_limit))
+
+    def slope_bound_arcsec_per_deg(self) -> float:
+        """Slope of a downward crossing at full height, plus the growth with travel."""
+        crossing = max(-2.0 * self._half(self.turns_limit) / self.width_deg, 0.0)
+        return crossing + self._fastest_growth()
+
+    def _half(self, turns: float) -> float:
+        """Returns half the height after this many turns, arcsec, signed."""
+        return 0.5 * self.growth_arcsec_per_kiloturn * _kiloturns(turns, self.exponent)
+
+    def _fastest_growth(self) -> float:
+        """Returns the fastest growth of half the height, arcsec per motor degree."""
+        late = self.exponent * math.pow(max(self.turns_limit, 1.0), self.exponent - 1.0)
+        return abs(self._half(1.0)) * max(1.0, self.exponent, late) / DEG_PER_TURN
+
+
+def _kiloturns(turns: float, exponent: float) -> float:
+    """Returns the height relative to that of the first thousand turns."""
+    return math.pow(1e-3, exponent) * (turns if turns < 1.0 else math.pow(turns, exponent))
+
+
+class _Tracker(Tracker):
+    """State: the stop operator's value, the distance run (degrees), the last angle."""
+
+    __slots__ = ("_angle", "_before", "_distance", "_fall", "_gain", "_half", "_limit", "_value")
+
+    def __init__(self, effect: Wear, start: Start, fall_arcsec_per_deg: float) -> None:
+        """``fall_arcsec_per_deg`` limits the slope of the crossing."""
+        self._half = effect._half
+        self._gain = 2.0 / effect.width_deg
+        self._fall = fall_arcsec_per_deg
+        self._before = effect.turns_before
+        self._limit = effect.turns_limit
+        self._value = float(start.value)
+        self._distance = 0.0
+        self._angle: float | None = None
+
+    @property
+    def memory_deg(self) -> float:
+        """Motor angle of a full crossing at the maximum height; the distance run comes from the file."""
+        return max(2.0 / self._gain, 2.0 * abs(self._half(self._limit)) / self._fall)
+
+    def peek(self, motor_deg: float, moment: Moment) -> float:
+        _, half, value = self._at(motor_deg)
+        return half * value
+
+    def advance(self, motor_deg: float, moment: Moment) -> float:
+        self._distance, half, self._value = self._at(motor_deg)
+        self._angle = motor_deg
+        return half * self._value
+
+    def _at(self, motor_deg: float) -> tuple[float, float, float]:
+        """Returns the distance run, half the height and the stop operator's value at an angle."""
+        step = 0.0 if self._angle is None else motor_deg - self._angle
+        distance = self._distance + abs(step)
+        half = self._half(min(self._before + distance / DEG_PER_TURN, self._limit))
+        gain = self._gain if abs(half) * self._gain <= self._fall else self._fall / abs(half)
+        return distance, half, min(max(self._value + gain * step, -1.0), 1.0)

@@ -1,0 +1,111 @@
+"""Zero shift with temperature, because housing, encoder mount and gear expand differently."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Annotated, Any, ClassVar
+
+import numpy as np
+from pydantic import Field
+
+from hdbridge.axis.effects import coordinate as over
+from hdbridge.axis.effects.base import (
+    Cause,
+    Compensable,
+    Coordinate,
+    Effect,
+    Experiment,
+    FloatArray,
+    Linear,
+    Moment,
+    Motion,
+    Observations,
+    Start,
+    Tracker,
+)
+from hdbridge.axis.effects.warmth import Warmed, WarmthState
+
+
+class ZeroDrift(Linear, Warmed):
+    """drift times the gear's warmth."""
+
+    name: ClassVar[str] = "zero_drift"
+    about: ClassVar[Cause] = Cause(
+        title="zero moves with temperature",
+        subject="drift",
+        equation="drift w, w = u - reference, tau du/dt = temperature - u "
+        "(or w = warm_up (1 - exp(-t / tau)))",
+        signature="everything shifts slowly and alike in both directions, with a time constant of minutes "
+        "to an hour",
+        consequence="all positions are off by the same amount, until the axis has the temperature of its "
+        "calibration",
+        remedy="warm up before work; home warm; a temperature sensor at the gear makes it predictable",
+        experiment="return to one reference pose again and again while it warms and cools, with the "
+        "temperature recorded",
+        aliases=("creep", "wear", "count_loss", "load_order", "ratio_error"),
+        source="thermal expansion with a first-order lag",
+        size="5-60 arcsec, tau 10-60 min",
+        apart={
+            "count_loss": Experiment(
+                4, "return to one reference pose every half minute: a step has happened, a drift goes on"
+            ),
+            "creep": Experiment(
+                10,
+                "stand still for ten minutes after a move in each direction: creep takes the sign of the "
+                "direction",
+            ),
+            "ratio_error": Experiment(
+                3,
+                "sweep a load turn forth and back at twice the speed: a ramp goes with the angle, a drift "
+                "with time",
+            ),
+        },
+    )
+    compensable: ClassVar[Compensable] = Compensable(
+        True, "where the temperature is recorded on line; driven by time alone only after a start from cold"
+    )
+    linear: ClassVar[tuple[str, ...]] = ("drift_arcsec_per_k",)
+    typical: ClassVar[Mapping[str, Any]] = {"drift_arcsec_per_k": 1.0, "tau_s": 1800.0}
+    """1 arcsec per kelvin, with a time constant of half an hour."""
+
+    drift_arcsec_per_k: Annotated[float, Field(ge=-1000, le=1000, description="shift per kelvin")]
+
+    @classmethod
+    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[ZeroDrift]:  # noqa: ARG003
+        """Yields effects driven by temperature if it changes, else by time."""
+        for driven_by, tau_s in cls.lags(observations):
+            yield cls(drift_arcsec_per_k=1.0, tau_s=tau_s, driven_by=driven_by)
+
+    def coordinate(self, motion: Motion, ratio: float) -> Coordinate:
+        """Returns the time, to show how the zero has moved since the record began."""
+        return over.time(motion)
+
+    def columns(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
+        """Returns the effect of 1 arcsec per kelvin, shape (n, 1)."""
+        return self.warmth(motion)[:, np.newaxis]
+
+    def tracker(self, start: Start = Start.VIRGIN) -> Tracker:
+        """Returns an on-line tracker, in equilibrium at its first moment."""
+        return _Tracker(self.drift_arcsec_per_k, WarmthState(self))
+
+    def bound_arcsec(self) -> float:
+        """Bound at the highest warmth."""
+        return abs(self.drift_arcsec_per_k) * self.limit_k
+
+    def slope_bound_arcsec_per_deg(self) -> float:
+        """Zero, because it depends on temperature and time."""
+        return 0.0
+
+
+class _Tracker(Tracker):
+    __slots__ = ("_drift", "_warmth")
+
+    def __init__(self, drift: float, warmth: WarmthState) -> None:
+        self._drift = drift
+        self._warmth = warmth
+
+    def peek(self, motor_deg: float, moment: Moment) -> float:
+        return self._drift * self._warmth.at(moment)
+
+    def advance(self, motor_deg: float, moment: Moment) -> float:
+        return self._drift * self._warmth.to(moment)

@@ -1,0 +1,67 @@
+"""Differences between two models, parameter by parameter. Pure."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+from hdbridge.axis.model import TransmissionModel
+
+
+class Difference(NamedTuple):
+    """One parameter in two models; None if a model lacks it."""
+
+    effect: str
+    """Name of the effect; empty for the ratio."""
+    parameter: str
+    """Name with its unit; in a list by its order or number: ``orders[2].amplitude_arcsec``."""
+    before: Any
+    after: Any
+    half_width: float | None
+    """Half width of its 95 % interval in the later model (else the earlier), if known."""
+
+    @property
+    def changed(self) -> bool:
+        """True if the two differ."""
+        return bool(self.before != self.after)
+
+
+def diff(before: TransmissionModel, after: TransmissionModel) -> list[Difference]:
+    """Returns all parameters of both models in file order, changed or not."""
+    old, new = dict(_parameters(before)), dict(_parameters(after))
+    widths = {**dict(_half_widths(before)), **dict(_half_widths(after))}
+    keys = list(dict.fromkeys([*old, *new]))
+    # Parameters that only the later model has are placed with the rest of their effect.
+    effects = list(dict.fromkeys(effect for effect, _ in keys))
+    keys.sort(key=lambda key: effects.index(key[0]))
+    return [Difference(*key, old.get(key), new.get(key), widths.get(key)) for key in keys]
+
+
+def _parameters(model: TransmissionModel) -> Iterator[tuple[tuple[str, str], Any]]:
+    yield ("", "ratio"), model.ratio
+    for effect in model.effects:
+        for name, value in flat(effect.parameters()):
+            yield (effect.name, name), value
+
+
+def _half_widths(model: TransmissionModel) -> Iterator[tuple[tuple[str, str], float]]:
+    for effect, widths in model.uncertainty.items():
+        for name, value in flat(widths):
+            if isinstance(value, int | float):
+                yield (effect, name), float(value)
+
+
+def flat(value: Any, name: str = "") -> Iterator[tuple[str, Any]]:
+    """Yields the leaves of nested parameters; list items are named by their ``order`` if they have one."""
+    if isinstance(value, dict):
+        for key, inner in value.items():
+            yield from flat(inner, f"{name}.{key}" if name else key)
+    elif isinstance(value, list | tuple):
+        for number, inner in enumerate(value):
+            if isinstance(inner, dict) and "order" in inner:
+                rest = {key: each for key, each in inner.items() if key != "order"}
+                yield from flat(rest, f"{name}[{inner['order']}]")
+            else:
+                yield from flat(inner, f"{name}[{number}]")
+    else:
+        yield name, value

@@ -1,0 +1,176 @@
+"""Model file: schema, reading with errors that give the place, and writing."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any, Literal, NamedTuple
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from hdbridge.axis import Identity, Teeth
+from hdbridge.axis.effects import CATALOGUE, Effect, conflicts
+from hdbridge.axis.model.response import Response
+from hdbridge.files.expectation import nearest
+from hdbridge.files.yamlfile import Document, Hex, Line, dump_yaml
+from hdbridge.strictness import Strict
+
+_HEADER = "# The transmission model of an axis, written by hdbridge. docs/files.md describes its keys.\n"
+
+
+class GearOfModel(Strict):
+    """Gear that a model was measured on."""
+
+    ratio: float = Field(gt=0, le=1000, description="N: motor turns per load turn")
+    teeth: Teeth | None = Field(None, description="numbers of teeth")
+
+
+class Provenance(Strict):
+    """Origin and binding of a model; unknown keys are kept as they are."""
+
+    model_config = ConfigDict(defer_build=True, frozen=True, extra="allow")
+
+    axis: str | None = Field(None, description="name of the axis that it was measured on")
+    drive: Identity | None = Field(None, description="identity of the drive that it was measured with")
+    gear: GearOfModel | None = Field(None, description="the gear that it was measured on")
+    date: str | None = Field(None, description="when it was made, ISO 8601")
+    reason: str | None = Field(None, description="why it was made, in words")
+
+
+class EffectEntry(BaseModel):
+    """One effect of the model file."""
+
+    model_config = ConfigDict(defer_build=True, frozen=True, extra="forbid")
+
+    effect: str = Field(description="name of the effect in the catalogue")
+    parameters: dict[str, Any] = Field(description="its parameters, with the unit in the name")
+    uncertainty: dict[str, Any] = Field(
+        default_factory=dict, description="half width of the 95 % interval of parameters, in their units"
+    )
+
+
+class ModelFile(BaseModel):
+    """Content of a model file; each effect checks its own parameters."""
+
+    schema_: Literal["hdbridge.model/1"] = Field(alias="schema", description="kind and version of this file")
+    ratio: float = Field(gt=0, le=1000, description="N: motor turns per load turn")
+    effects: tuple[EffectEntry, ...] = Field(description="the effects whose sum is the transmission error")
+    provenance: Provenance | None = Field(None, description="origin of the numbers")
+    response: Response | None = Field(None, description="response of the axis to the correction in motion")
+
+
+class Content(NamedTuple):
+    """Validated content of a model file."""
+
+    ratio: float
+    effects: tuple[Effect, ...]
+    uncertainty: dict[str, dict[str, Any]]
+    provenance: dict[str, Any]
+    response: Response | None = None
+
+
+def content_of(document: Document) -> Content:
+    """Reads a model file's document; raises `InputError` with file:line:column and the nearest valid name."""
+    file = document.validate(ModelFile)
+    effects: list[Effect] = []
+    uncertainty: dict[str, dict[str, Any]] = {}
+    for number, entry in enumerate(file.effects):
+        effect = _effect(document, number, entry, [each.name for each in effects])
+        effects.append(effect)
+        if entry.uncertainty:
+            uncertainty[effect.name] = entry.uncertainty
+    for conflict in conflicts(effects, file.ratio):
+        raise document.error(("effects",), conflict)
+    provenance = document.data.get("provenance") or {}
+    return Content(file.ratio, tuple(effects), uncertainty, provenance, file.response)
+
+
+def document_of(
+    ratio: float,
+    effects: Sequence[Effect],
+    uncertainty: Mapping[str, Mapping[str, Any]],
+    provenance: Mapping[str, Any],
+    response: Response | None = None,
+) -> dict[str, Any]:
+    """Returns the content of a model file as plain data."""
+    entries = [
+        {"effect": each.name, "parameters": each.parameters()}
+        | ({"uncertainty": dict(uncertainty[each.name])} if uncertainty.get(each.name) else {})
+        for each in effects
+    ]
+    data: dict[str, Any] = {"schema": "hdbridge.model/1", "ratio": ratio, "effects": entries}
+    if provenance:
+        data["provenance"] = dict(provenance)
+    if response is not None:
+        data["response"] = response.model_dump(mode="json")
+    return data
+
+
+def text_of(document: Mapping[str, Any]) -> str:
+    """Returns the text of a model file; it reads back exactly."""
+    data = dict(document)
+    if "provenance" in data:
+        data["provenance"] = _hexadecimal(data["provenance"])
+    if "response" in data:
+        data["response"] = _in_lines(data["response"])
+    return _HEADER + dump_yaml(data)
+
+
+def content_of_document(data: Mapping[str, Any]) -> Content:
+    """Reads the result of `document_of`, fast enough for the control loop.
+
+    Raises `KeyError` or `ValueError` for anything else.
+    """
+    entries = data["effects"]
+    return Content(
+        float(data["ratio"]),
+        tuple(CATALOGUE[each["effect"]].model_validate(each["parameters"]) for each in entries),
+        {each["effect"]: each["uncertainty"] for each in entries if "uncertainty" in each},
+        data.get("provenance", {}),
+        Response.model_validate(data["response"]) if "response" in data else None,
+    )
+
+
+def _effect(document: Document, number: int, entry: EffectEntry, before: list[str]) -> Effect:
+    at = ("effects", number)
+    kind = CATALOGUE.get(entry.effect)
+    if kind is None:
+        close = nearest(entry.effect, list(CATALOGUE))
+        hint = f"; did you mean '{close}'?" if close else ""
+        raise document.error(
+            (*at, "effect"),
+            f"no effect is called '{entry.effect}'; expected one of {', '.join(CATALOGUE)}{hint}",
+        )
+    if entry.effect in before:
+        raise document.error((*at, "effect"), f"'{entry.effect}' stands twice; expected each effect once")
+    for name, value in entry.uncertainty.items():
+        where = (*at, "uncertainty", name)
+        if name not in kind.model_fields:
+            close = nearest(name, list(kind.model_fields))
+            hint = f"did you mean '{close}'?" if close else f"expected {', '.join(kind.model_fields)}"
+            raise document.error(where, f"unknown parameter of {kind.name}; {hint}", key=True)
+        if isinstance(value, int | float) and not (value >= 0 and math.isfinite(value)):
+            raise document.error(where, f"found {value}; expected a half width of at least 0")
+    return document.validate(kind, (*at, "parameters"))
+
+
+def _hexadecimal(provenance: Mapping[str, Any]) -> dict[str, Any]:
+    """Returns the provenance with the drive's identity in hexadecimal, as in data sheets."""
+    data = dict(provenance)
+    if isinstance(data.get("drive"), Mapping):
+        data["drive"] = {
+            name: Hex(value) if isinstance(value, int) else value for name, value in data["drive"].items()
+        }
+    return data
+
+
+def _in_lines(data: Mapping[str, Any]) -> dict[str, Any]:
+    """Returns the data with each list in one line."""
+    return {
+        name: Line(value)
+        if isinstance(value, list)
+        else _in_lines(value)
+        if isinstance(value, Mapping)
+        else value
+        for name, value in data.items()
+    }

@@ -1,0 +1,149 @@
+"""Transmission model: a gear ratio and a sum of effects, and its file."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+
+from hdbridge.axis import AxisConfig, Identity
+from hdbridge.axis.effects import Effect, FloatArray, Moment, Motion, Start, Tracker
+from hdbridge.axis.model.binding import binding, check_binding
+from hdbridge.axis.model.file import content_of, content_of_document, document_of, text_of
+from hdbridge.axis.model.response import Response
+from hdbridge.errors import InputError
+from hdbridge.files.yamlfile import Document, document_from_text, read_yaml, write_atomically
+
+
+@dataclass(frozen=True)
+class TransmissionModel:
+    """theta_TE = theta_L - theta_M / N as a sum of effects, arcsec at the load.
+
+    The model does not contain the gear's past. The initial state is passed to `predict` and `tracker`
+    (`Start`), because it depends on the move before the record or the run, not on the gear.
+    """
+
+    ratio: float
+    """N: motor turns per load turn, positive."""
+    effects: tuple[Effect, ...] = ()
+    uncertainty: dict[str, dict[str, Any]] = field(default_factory=dict)
+    """Effect name -> parameter name -> half width of the 95 % interval, in the parameter's unit."""
+    provenance: dict[str, Any] = field(default_factory=dict)
+    """Origin of the numbers: recording, date, versions, drive identity (`Provenance`)."""
+    response: Response | None = None
+    """Response of the axis to the correction in motion; None if it has not been measured."""
+    path: Path | None = field(default=None, compare=False)
+    """File that it was read from."""
+
+    def predict(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
+        """Returns the transmission error in arcsec for each sample of a motion, shape (n,)."""
+        total = np.zeros(len(motion))
+        for effect in self.effects:
+            total += effect.predict(motion, start)
+        return total
+
+    def tracker(self, start: Start = Start.VIRGIN) -> ModelTracker:
+        """Returns a new on-line tracker of the whole sum."""
+        return ModelTracker([effect.tracker(start) for effect in self.effects])
+
+    def only(self, names: Iterable[str]) -> Self:
+        """Returns the model with only the named effects (unknown names are not an error).
+
+        A law that replaces another is also found by the other's name.
+        """
+        wanted = set(names)
+        kept = (each for each in self.effects if each.name in wanted or each.replaces in wanted)
+        return replace(self, effects=tuple(kept))
+
+    @classmethod
+    def load(cls, path: Path | str) -> Self:
+        """Reads a model file; raises `InputError` with file:line:column and the nearest valid name."""
+        return cls._from_document(read_yaml(path))
+
+    @classmethod
+    def from_text(cls, text: str, path: Path | str = "model.yaml") -> Self:
+        """Reads the text of a model file; ``path`` names it in messages."""
+        return cls._from_document(document_from_text(text, path))
+
+    @classmethod
+    def _from_document(cls, document: Document) -> Self:
+        content = content_of(document)
+        return cls(*content, path=document.path)
+
+    @classmethod
+    def from_document(cls, data: Mapping[str, Any], path: Path | None = None) -> Self:
+        """Reads the result of `document`; raises `KeyError` or `ValueError` for anything else."""
+        return cls(*content_of_document(data), path=path)
+
+    def document(self) -> dict[str, Any]:
+        """Returns the content of the model file as plain data, ready for JSON."""
+        return document_of(self.ratio, self.effects, self.uncertainty, self.provenance, self.response)
+
+    def dump(self) -> str:
+        """Returns the model file's text, which reads back exactly."""
+        return text_of(self.document())
+
+    def save(self, path: Path | str) -> None:
+        """Writes the model file atomically."""
+        write_atomically(path, self.dump())
+
+    def with_provenance(self, **provenance: Any) -> Self:
+        """Returns the model with these entries added to its provenance."""
+        return replace(self, provenance={**self.provenance, **provenance})
+
+    def bound_to(self, axis: AxisConfig, identity: Identity | None = None) -> Self:
+        """Returns the model bound to an axis and the identity of its drive (by default the axis file's)."""
+        return replace(self, provenance={**self.provenance, **binding(axis, identity)})
+
+    def check_ratio(self, axis: AxisConfig) -> None:
+        """Raises `InputError` if the model's gear ratio differs from the axis file's."""
+        if not math.isclose(self.ratio, axis.gear.ratio, rel_tol=1e-9):
+            raise InputError(
+                f"{self._name()}: ratio: this model is of a gear with ratio {self.ratio:g}, but "
+                f"{axis.path} says {axis.gear.ratio:g}; use the model of this gear, or calibrate it"
+            )
+
+    def check_bound_to(self, axis: AxisConfig, identity: Identity | None = None) -> None:
+        """Raises `InputError` if the model belongs to another drive, axis or gear.
+
+        ``identity`` is the one read from the drive, by default that of the axis file. Values that the model
+        or the drive leaves open are not compared, and neither is the revision, because new firmware does not
+        change a gear.
+        """
+        self.check_ratio(axis)
+        check_binding(self.provenance, axis, identity, self._name(), "model", "calibrate it")
+
+    def _name(self) -> str:
+        return str(self.path) if self.path else "this model"
+
+
+class ModelTracker(Tracker):
+    """Sum of the trackers of all effects."""
+
+    __slots__ = ("_trackers",)
+
+    def __init__(self, trackers: list[Tracker]) -> None:
+        self._trackers = trackers
+
+    @property
+    def memory_deg(self) -> float:
+        """Longest memory of its effects."""
+        return max((each.memory_deg for each in self._trackers), default=0.0)
+
+    def peek(self, motor_deg: float, moment: Moment) -> float:
+        """Returns the sum of the effects at ``motor_deg``, arcsec; changes nothing."""
+        total = 0.0
+        for tracker in self._trackers:
+            total += tracker.peek(motor_deg, moment)
+        return total
+
+    def advance(self, motor_deg: float, moment: Moment) -> float:
+        """Advances every effect and returns the sum, arcsec."""
+        total = 0.0
+        for tracker in self._trackers:
+            total += tracker.advance(motor_deg, moment)
+        return total

@@ -1,0 +1,1 @@
+"""The paths an engineer takes: bring-up, calibration, improvement, and the figures of a test."""

@@ -1,0 +1,251 @@
+"""Scan of a CAN bus: listens first, then queries each node id, and writes nothing.
+
+Only SDO read requests are sent (and an SDO abort if one was not answered). A node that is busy with another
+SDO client is left alone, because a second client on the same channel would spoil its transfer.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Final
+
+from hdbridge.commissioning.bringup import ASK_TIMEOUT_S, LISTEN_S
+from hdbridge.drive import objects
+from hdbridge.drive.link import Frame, Link
+from hdbridge.drive.manners import Ear, listening_s
+from hdbridge.drive.monitor import NetworkMonitor
+from hdbridge.drive.nameplate import IDENTITY
+from hdbridge.drive.objects import CYCLIC, Address, IntegerType, NmtState
+from hdbridge.drive.sdo import SdoAbortError, SdoClient
+from hdbridge.errors import SdoError
+
+DETAIL_TIMEOUT_S: Final = 0.3
+NODE_IDS: Final = range(1, 128)
+
+PROFILES: Final[dict[int, str]] = {
+    401: "input/output module",
+    402: "drive",
+    404: "measuring device or controller",
+    406: "encoder",
+    408: "hydraulic drive",
+    410: "inclinometer",
+    418: "battery",
+    419: "battery charger",
+}
+"""Device profiles of CiA, by the low half of object 1000h."""
+MODES: Final[dict[int, str]] = {
+    0: "PP", 1: "VL", 2: "PV", 3: "TQ", 5: "HM", 6: "IP", 7: "CSP", 8: "CSV", 9: "CST",
+}  # fmt: skip
+"""Modes of operation by their bit in 6502h."""
+_NAMES: Final = ((0x1008, "device"), (0x1009, "hardware"), (0x100A, "software"))
+_SCALING: Final = (
+    objects.ENCODER_INCREMENTS,
+    objects.ENCODER_REVOLUTIONS,
+    objects.GEAR_MOTOR,
+    objects.GEAR_SHAFT,
+    objects.RATED_TORQUE,
+    *objects.additional_resolution(1),
+)
+ENCODER_UNITS_PER_TURN: Final = Address(0x6001, 0, IntegerType.UINT32, "measuring units per revolution")
+"""Object of CiA 406."""
+
+
+@dataclass(slots=True)
+class Node:
+    """One node, as far as it is known."""
+
+    node_id: int
+    nmt_state: int | None = None
+    """Byte of its last heartbeat; None if it sends none."""
+    answers: bool = False
+    """True if it answered an SDO request."""
+    busy: bool = False
+    """True if another SDO client was using it, so that it was not queried."""
+    device_type: int | None = None
+    identity: dict[str, int] = field(default_factory=dict)
+    """Identity by the keys of ``drive.identity``; objects that the node lacks are missing."""
+    names: dict[str, str] = field(default_factory=dict)
+    """Device name, hardware and software version."""
+    modes: int | None = None
+    """Object 6502h of a drive."""
+    values: dict[Address, int] = field(default_factory=dict)
+    """Objects that help to write an axis file: resolutions, gear ratio, rated torque."""
+
+    @property
+    def profile(self) -> int | None:
+        """Device profile, 402 for a drive; None if it is not known."""
+        return None if self.device_type is None else self.device_type & 0xFFFF
+
+    @property
+    def kind(self) -> str:
+        """Kind of device, as text."""
+        if self.profile is None:
+            return "not asked: another SDO client is talking to it" if self.busy else "unknown"
+        return (
+            f"{PROFILES.get(self.profile, 'device')} (CiA {self.profile})" if self.profile else "no profile"
+        )
+
+    @property
+    def state(self) -> str:
+        """NMT state, as text."""
+        if self.nmt_state is None:
+            return "no heartbeat; it answers, so it is not stopped" if self.answers else "no heartbeat"
+        try:
+            return NmtState(self.nmt_state).name.lower().replace("_", "-")
+        except ValueError:
+            return f"unknown state {self.nmt_state:02X}h"
+
+    @property
+    def mode_names(self) -> list[str]:
+        """Supported modes of operation of a drive."""
+        return [name for bit, name in MODES.items() if (self.modes or 0) >> bit & 1]
+
+    @property
+    def usable(self) -> bool:
+        """True for a CiA-402 drive with a cyclic position mode, or with unknown modes."""
+        return self.profile == objects.DEVICE_PROFILE_402 and (self.modes is None or self.cyclic is not None)
+
+    @property
+    def cyclic(self) -> str | None:
+        """Value of ``drive.mode`` for this drive; None if it has neither mode or does not report them."""
+        has = [name for name, each in CYCLIC.items() if (self.modes or 0) & each.mode.supported_bit]
+        return has[0] if has else None
+
+
+@dataclass(frozen=True, slots=True)
+class Scan:
+    """Result of a scan."""
+
+    nodes: tuple[Node, ...]
+    remarks: tuple[str, ...] = ()
+    """Other observations that matter: other masters, other SDO clients."""
+
+    def node(self, node_id: int) -> Node | None:
+        """Returns the node with that id, or None."""
+        return next((each for each in self.nodes if each.node_id == node_id), None)
+
+
+class _Hearing:
+    """Takes every frame and records its sender."""
+
+    def __init__(self, link: Link) -> None:
+        self.link = link
+        self.monitor = NetworkMonitor(*NODE_IDS)
+        self.spoken: set[int] = set()
+        """Nodes of which any frame was heard."""
+        self.busy: set[int] = set()
+        self.syncs = 0
+        self.commands = 0
+        self.masters = Ear(NODE_IDS)
+
+    def take(self, frame: Frame) -> None:
+        self.masters.take(frame)
+        can_id, node_id = frame.can_id, frame.can_id & 0x7F
+        function = can_id - node_id
+        if self.monitor.dispatch(frame):
+            self.spoken.add(node_id)
+        elif can_id == objects.COB_SYNC:
+            self.syncs += 1
+        elif can_id == objects.COB_NMT:
+            self.commands += 1
+        elif function in (objects.COB_SDO_REQUEST, objects.COB_SDO_ANSWER) and node_id:
+            self.busy.add(node_id)
+
+    def listen(self, duration_s: float) -> None:
+        end_s = self.link.now() + duration_s
+        while (frame := self.link.recv(end_s)) is not None:
+            self.take(frame)
+            if frame.time_s >= end_s:
+                return
+
+    def remarks(self) -> list[str]:
+        remarks = []
+        if self.syncs:
+            remarks.append(
+                f"{self.syncs} SYNC messages were heard: another master runs on this bus; stop it before you "
+                "master an axis here"
+            )
+        if self.commands:
+            remarks.append(f"{self.commands} NMT commands of another master were heard")
+        if self.busy:
+            who = ", ".join(map(str, sorted(self.busy)))
+            remarks.append(
+                f"another SDO client is talking to node {who}; it was not asked: stop that client, scan again"
+            )
+        return remarks
+
+
+def scan_bus(
+    link: Link,
+    *,
+    listen_s: float = LISTEN_S,
+    timeout_s: float = ASK_TIMEOUT_S,
+    progress: Callable[[float], None] = lambda _: None,
+    force: bool = False,
+) -> Scan:
+    """Listens for ``listen_s``, then queries the device type of every node id, and more of those that answer.
+
+    ``progress`` receives the share done. Raises `BusInUseError` before anything is sent if another master is
+    heard, because a request may stop the axis that it moves; it listens for as long as that detection takes.
+    ``force`` skips the detection. Raises `BusError` if the interface fails.
+    """
+    force = force or link.private
+    ear = _Hearing(link)
+    duration_s = listen_s if force else max(listen_s, listening_s())
+    ear.listen(duration_s)
+    if not force:
+        ear.masters.refuse(link.name, duration_s)
+    nodes: dict[int, Node] = {}
+    for place, node_id in enumerate(NODE_IDS):
+        if node_id in ear.busy:
+            nodes[node_id] = Node(node_id, busy=True)
+        else:
+            node = _ask(ear, node_id, timeout_s)
+            if node.answers:
+                nodes[node_id] = node
+        progress((place + 1) / len(NODE_IDS))
+    for node_id, status in ear.monitor.nodes.items():
+        if status.heartbeat_s is not None or status.emergency_count:
+            nodes.setdefault(node_id, Node(node_id)).nmt_state = status.nmt_state
+    return Scan(tuple(nodes[each] for each in sorted(nodes)), tuple(ear.remarks()))
+
+
+def _ask(ear: _Hearing, node_id: int, timeout_s: float) -> Node:
+    node = Node(node_id)
+    sdo = SdoClient(ear.link, ear.monitor, node_id, None, timeout_s, attempts=1)
+    try:
+        node.device_type = sdo.fetch(objects.DEVICE_TYPE)
+    except SdoAbortError:
+        pass  # it is present and refuses the one object that every node has
+    except SdoError:
+        return node
+    node.answers = True
+    sdo = SdoClient(ear.link, ear.monitor, node_id, None, DETAIL_TIMEOUT_S, attempts=2)
+    for address, name in IDENTITY:
+        value = _fetch(sdo, address)
+        if value is not None:
+            node.identity[name] = value
+    for index, name in _NAMES:
+        try:
+            node.names[name] = sdo.read_text(index)
+        except SdoError:
+            continue
+    wanted: tuple[Address, ...] = ()
+    if node.profile == objects.DEVICE_PROFILE_402:
+        node.modes = _fetch(sdo, objects.SUPPORTED_MODES)
+        wanted = _SCALING
+    elif node.profile == 406:
+        wanted = (ENCODER_UNITS_PER_TURN,)
+    for address in wanted:
+        value = _fetch(sdo, address)
+        if value is not None:
+            node.values[address] = value
+    return node
+
+
+def _fetch(sdo: SdoClient, address: Address) -> int | None:
+    try:
+        return sdo.read(address.index, address.sub, address.type)
+    except SdoError:
+        return None  # optional object

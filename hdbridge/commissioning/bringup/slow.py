@@ -1,0 +1,360 @@
+"""Slow, short, torque-limited motion of an unverified axis, in raw encoder counts.
+
+Each `enabled` block switches power on at rest, and on every exit brings the axis to rest and switches it off
+again. Everything runs in the control cycle with full supervision.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from statistics import fmean
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+from hdbridge.clock import Clock
+from hdbridge.commissioning.bringup.scale import Turned
+from hdbridge.control.cycle import Cycle, Feedback
+from hdbridge.drive import objects
+from hdbridge.drive.drive import Drive
+from hdbridge.drive.link import Frame, Link
+from hdbridge.drive.monitor import Emergency
+from hdbridge.drive.objects import COB_EMCY
+from hdbridge.drive.states import State, decode
+from hdbridge.drive.supervision import Event, Supervision
+from hdbridge.drive.switching import STANDING, STOP_TIMEOUT_S, until_enabled
+from hdbridge.drive.unwrap import wrap_int32
+from hdbridge.errors import HdbridgeError, SafetyStop
+from hdbridge.motion.procedures.moves import MotionLimits, MoveTo, Path
+
+if TYPE_CHECKING:
+    import can
+
+    from hdbridge.axis import AxisConfig
+
+MOTOR_SPEED_DEG_S: Final = 120.0
+"""Speed of the moves, motor degrees per second, if the limits allow four times as much."""
+LEAD_DEG: Final = 45.0
+"""Motor travel before a measured standstill, which puts the gear's hysteresis on the same side."""
+MARGIN_DEG: Final = 1.0
+"""Motor travel kept clear of the axis limits, degrees."""
+LEAST_TRAVEL_DEG: Final = 20.0
+STILL_CYCLES: Final = 3
+
+
+class TravelPlan(NamedTuple):
+    """Planned travel from the present position, signed motor degrees."""
+
+    lead_deg: float
+    span_deg: float
+    """Whole motor turns if the limits allow, so that periodic errors cancel out."""
+
+
+def plan_travel(axis: AxisConfig, here_deg: float) -> TravelPlan | None:
+    """Returns the travel from a motor angle, to the side with more space; None if there is too little.
+
+    One motor turn, or more if the ratio is too high to be distinguished from its neighbour in one.
+    """
+    limits, ratio = axis.limits, axis.gear.ratio
+    ahead = limits.position_max_deg * ratio - here_deg - MARGIN_DEG
+    behind = here_deg - limits.position_min_deg * ratio - MARGIN_DEG
+    wanted = 360.0 * max(1, round(ratio / 50.0))
+    sign = 1.0 if ahead >= min(wanted + LEAD_DEG, behind) else -1.0
+    room = max(ahead, behind) if sign < 0 else ahead
+    if room < LEAST_TRAVEL_DEG:
+        return None
+    lead = min(LEAD_DEG, room / 8.0)
+    span = min(wanted, room - lead)
+    if span >= 360.0:
+        span = 360.0 * math.floor(span / 360.0)
+    return TravelPlan(sign * lead, sign * span)
+
+
+class QuietLink(Link):
+    """Link that withholds some identifiers, like a master that has died."""
+
+    __slots__ = ("muted", "sent_s", "unheard", "withheld")
+
+    def __init__(self, bus: can.BusABC, clock: Clock) -> None:
+        super().__init__(bus, clock)
+        self.muted: set[int] = set()
+        self.sent_s: dict[int, float] = {}
+        """Time at which each identifier was last actually sent; s."""
+        self.unheard: set[int] = set()
+        """Identifiers that are received but not passed on."""
+        self.withheld: list[Frame] = []
+        """Withheld frames with those identifiers."""
+
+    def recv(self, deadline_s: float) -> Frame | None:
+        """Receives a frame, skipping those in `unheard`."""
+        while (frame := super().recv(deadline_s)) is not None and frame.can_id in self.unheard:
+            self.withheld.append(frame)
+        return frame
+
+    def send(self, can_id: int, data: bytes) -> None:
+        """Sends a frame unless its identifier is muted."""
+        if can_id not in self.muted:
+            super().send(can_id, data)
+            self.sent_s[can_id] = self.now()
+
+
+@dataclass(frozen=True, slots=True)
+class Silence:
+    """Reaction of the drive to a silent master."""
+
+    noticed_after_s: float | None
+    """Time from the last frame to the drive's reaction, s; None if there was none within its time-out."""
+    event: Event | None
+    """First event of the master's supervision, if it kept running."""
+    statusword: int
+    """Statusword of the drive at standstill."""
+    stands: bool
+    distance_deg: float
+    """Motor travel from the last frame to standstill, degrees."""
+    emergencies: tuple[Emergency, ...] = ()
+    """Emergency messages that the drive sent about it."""
+    resumed: bool = False
+    """True if it entered the quick stop and left it again by the master's own controlword."""
+
+
+class SlowAxis:
+    """Axis in slow motion. ``interrupted`` is called in each cycle; True stops the axis."""
+
+    def __init__(self, drive: Drive, torque_percent: float, interrupted: Callable[[], bool]) -> None:
+        self.axis = drive.axis
+        self.image = drive.image
+        self.supervision = Supervision()
+        self.link = QuietLink(drive.link.bus, drive.link.clock)
+        self.cycle = Cycle(
+            self.link,
+            drive.link.clock,
+            drive.image,
+            self.supervision,
+            drive.axis.drive.cycle_s,
+            monitor=drive.monitor,
+        )
+        self.torque_percent = min(torque_percent, drive.axis.limits.torque_percent)
+        self._drive = drive
+        self._interrupted = interrupted
+        self._place_deg = 0.0
+
+    # -- power --------------------------------------------------------------------------------------------
+
+    @contextmanager
+    def enabled(self) -> Iterator[Feedback]:
+        """Switches power on at rest and off again at the end; yields the first feedback under power."""
+        drive, power = self._drive, self.image.power
+        if drive.can_set(objects.MAX_TORQUE):
+            drive.sdo.store(objects.MAX_TORQUE, round(10.0 * self.torque_percent))
+        drive.enable()
+        self.cycle.restart()
+        try:
+            feedback = until_enabled(lambda: self._tick(None), power, self.cycle.period_s)
+            self._place_deg = self.image.motor_deg(feedback.motor_counts)
+            yield feedback
+            self._rest()
+        except BaseException:
+            # On any failure, Ctrl-C included, the axis is stopped before the error propagates.
+            with suppress(HdbridgeError):
+                self._rest()
+            with suppress(HdbridgeError):
+                drive.disable()
+            raise
+        drive.disable()
+
+    def _rest(self) -> None:
+        if self.supervision.stop is None and self.image.power.state is State.OPERATION_ENABLED:
+            self.stop()
+
+    def stop(self) -> list[Feedback]:
+        """Quick-stops, cycle by cycle, until the motor stands; returns the feedback of these cycles."""
+        power = self.image.power
+        power.quick_stop()
+        seen: list[Feedback] = []
+        still = 0
+        for _ in range(math.ceil(STOP_TIMEOUT_S / self.cycle.period_s)):
+            before = self.image.motor_counts
+            seen.append(self.cycle.tick())
+            rests = power.state in STANDING and abs(self.image.motor_counts - before) <= 1
+            still = still + 1 if rests else 0
+            if still >= STILL_CYCLES:
+                break
+        return seen
+
+    # -- motion -------------------------------------------------------------------------------------------
+
+    @property
+    def place_deg(self) -> float:
+        """Target motor angle, degrees."""
+        return self._place_deg
+
+    def sit(self, duration_s: float) -> list[Feedback]:
+        """Runs cycles without motion, with or without power; returns their feedback."""
+        return [self._tick(None) for _ in range(math.ceil(duration_s / self.cycle.period_s))]
+
+    def travel(self, motor_deg: float, least_s: float = 0.0) -> list[Feedback]:
+        """Moves slowly to a motor angle; returns the feedback of each cycle."""
+        return list(self._follow(motor_deg, least_s))
+
+    def stand(self, duration_s: float = 0.4) -> Turned:
+        """Stands still and returns the mean position of both encoders over the last quarter."""
+        seen = self.sit(duration_s)
+        tail = seen[-max(len(seen) // 4, 1) :]
+        return Turned(
+            fmean(each.motor_counts for each in tail), fmean(float(each.load_counts) for each in tail)
+        )
+
+    def speed_deg_s(self, way_deg: float, least_s: float = 0.0) -> float:
+        """Returns the speed of a move over ``way_deg`` of the motor that is to last at least ``least_s``."""
+        limits = self.axis.limits
+        speed = min(MOTOR_SPEED_DEG_S, 0.25 * limits.velocity_deg_s * self.axis.gear.ratio)
+        return min(speed, abs(way_deg) / least_s) if least_s > 0.0 else speed
+
+    def _path(self, motor_deg: float, least_s: float) -> Path:
+        ratio, limits = self.axis.gear.ratio, self.axis.limits
+        speed = self.speed_deg_s(motor_deg - self._place_deg, least_s) / ratio
+        slow = MotionLimits(
+            limits.position_min_deg,
+            limits.position_max_deg,
+            speed,
+            0.5 * limits.acceleration_deg_s2,
+            limits.jerk_deg_s3,
+        )
+        return MoveTo(motor_deg / ratio).path(self._place_deg / ratio, slow)
+
+    def _follow(self, motor_deg: float, least_s: float = 0.0) -> Iterator[Feedback]:
+        path, period_s, ratio = self._path(motor_deg, least_s), self.cycle.period_s, self.axis.gear.ratio
+        elapsed_s = 0.0
+        while True:
+            self._place_deg = path.at(elapsed_s) * ratio
+            yield self._tick(self.image.target_counts_for(self._place_deg))
+            if elapsed_s >= path.duration_s:
+                return
+            elapsed_s += period_s
+
+    def _tick(self, target: int | None) -> Feedback:
+        feedback = self.cycle.tick(target)
+        if self._interrupted():
+            if self.image.power.state is State.OPERATION_ENABLED:
+                self.stop()
+            raise KeyboardInterrupt
+        return feedback
+
+    # -- stops --------------------------------------------------------------------------------------------
+
+    def stop_on_the_way(self, motor_deg: float) -> tuple[float, float, float]:
+        """Moves and quick-stops half-way; returns the speed before, and travel and time of the stop (motor
+        degrees, s).
+        """
+        moved = self._half_way(self._follow(motor_deg), motor_deg)
+        speed = self._measured_speed(moved)
+        stopping = self.stop()
+        start, end = moved[-1].motor_counts, stopping[-1].motor_counts
+        rest = next(place for place, each in enumerate(stopping) if abs(each.motor_counts - end) <= 1)
+        way = abs(self.axis.motor_encoder.degrees(end - start))
+        return speed, way, (rest + 1) * self.cycle.period_s
+
+    def lose_heartbeat(self, motor_deg: float, patience_s: float) -> tuple[float, Silence]:
+        """Moves and withholds the master's heartbeat from half-way on; returns the speed and the reaction."""
+        moving = self._follow(motor_deg, 2.0 * patience_s + 1.0)
+        moved = self._half_way(moving, motor_deg)
+        speed = self._measured_speed(moved)
+        start = moved[-1]
+        identifier = self.image.heartbeat_id
+        last_s = self.link.sent_s.get(identifier, self.link.now())
+        muted_s = self.link.now()
+        self.link.muted.add(identifier)
+        # The emergency message would make this master stop the axis before the drive's own reaction shows.
+        self.link.unheard.add(COB_EMCY + self.axis.drive.node_id)
+        noticed_s: float | None = None
+        try:
+            for _ in moving:
+                if self.link.now() - muted_s > patience_s:
+                    break
+        except SafetyStop:
+            pass  # `supervision.stop` holds the cause
+        finally:
+            self.link.muted.discard(identifier)
+            self.link.unheard.clear()
+            for frame in self.link.withheld:
+                self._drive.monitor.dispatch(frame)
+            self.link.withheld.clear()
+        event = self.supervision.stop
+        if event is not None:
+            noticed_s = muted_s - last_s + (event.cycle - start.cycle) * self.cycle.period_s
+        states = [decode(each.statusword) for each in self.cycle.stopping] if event is not None else []
+        if event is None:
+            self.stop()
+        silence = self._after_silence(start.motor_counts, noticed_s, event, self._pause)
+        said = self._drive.monitor.nodes[self.axis.drive.node_id].emergencies
+        return speed, replace(
+            silence,
+            emergencies=tuple(each for each in said if each.time_s >= muted_s and each.code >> 8),
+            resumed=(State.QUICK_STOP_ACTIVE, State.OPERATION_ENABLED) in pairwise(states),
+        )
+
+    def lose_set_points(self, motor_deg: float, patience_s: float) -> tuple[float, Silence]:
+        """Moves and stops sending SYNC and set-points half-way; the heartbeat continues. Returns speed and
+        reaction.
+        """
+        moved = self._half_way(self._follow(motor_deg), motor_deg)
+        speed, start, drive = self._measured_speed(moved), moved[-1], self._drive
+        last_s = self.link.now()
+        noticed_s: float | None = None
+        while self.link.now() - last_s <= patience_s:
+            if self._interrupted():
+                raise KeyboardInterrupt  # leaving `enabled` and the drive's own exit stop it
+            drive.wait(0.002)
+            if decode(drive.sdo.fetch(objects.STATUSWORD)) is not State.OPERATION_ENABLED:
+                noticed_s = self.link.now() - last_s
+                break
+        if noticed_s is None:
+            drive.quick_stop()
+        result = self._after_silence(start.motor_counts, noticed_s, None, drive.wait)
+        self.image.power.observe(result.statusword)
+        return speed, result
+
+    def _half_way(self, moving: Iterator[Feedback], motor_deg: float) -> Sequence[Feedback]:
+        """Moves to the middle of the travel, where it has full speed; ``moving`` is not exhausted."""
+        begin = self._place_deg
+        seen: list[Feedback] = []
+        for feedback in moving:
+            seen.append(feedback)
+            if abs(self._place_deg - begin) >= 0.5 * abs(motor_deg - begin):
+                break
+        return seen
+
+    def _measured_speed(self, seen: Sequence[Feedback]) -> float:
+        late = seen[-min(len(seen), 6) :]
+        counts, time_s = late[-1].motor_counts - late[0].motor_counts, late[-1].time_s - late[0].time_s
+        return abs(self.axis.motor_encoder.degrees(counts)) / time_s if time_s else 0.0
+
+    def _pause(self, duration_s: float) -> None:
+        self.link.clock.sleep_until(self.link.now() + duration_s)
+
+    def _after_silence(
+        self,
+        start_counts: int,
+        noticed_s: float | None,
+        event: Event | None,
+        pause: Callable[[float], None],
+    ) -> Silence:
+        """Reads position and standstill by SDO, because the drive may have stopped sending PDOs."""
+        sdo, clock = self._drive.sdo, self.link.clock
+        last = sdo.fetch(objects.POSITION_ACTUAL)
+        stands = False
+        end_s = clock.now() + STOP_TIMEOUT_S
+        while not stands and clock.now() < end_s:
+            pause(0.05)
+            position = sdo.fetch(objects.POSITION_ACTUAL)
+            stands, last = abs(wrap_int32(position - last)) <= 2, position
+        way = wrap_int32(last - wrap_int32(start_counts))
+        return Silence(
+            noticed_s,
+            event,
+            sdo.fetch(objects.STATUSWORD),
+            stands,
+            abs(self.axis.motor_encoder.degrees(way)),
+        )

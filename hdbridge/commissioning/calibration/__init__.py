@@ -1,0 +1,34 @@
+"""Calibration: measures an axis, fits a model, tests it, and offers it for commit.
+
+    measure      runs a plan on a bench, without compensation, into a growing recording folder (`Journal`)
+    identify     fits a model to this or any other recording (`FitResult`)
+    validate     runs the stepping test with the old model and with the new one
+    propose      makes the model the profile's pending one if it is better on unseen data
+
+`calibrate` does all four. Bench and drive are passed in, real or simulated.
+"""
+
+from hdbridge.commissioning.calibration.fit import fit
+from hdbridge.commissioning.calibration.identification import identify, measured_of
+from hdbridge.commissioning.calibration.journal import Journal
+from hdbridge.commissioning.calibration.measure import measure, start_journal
+from hdbridge.commissioning.calibration.pipeline import calibrate, conclude, concluded
+from hdbridge.commissioning.calibration.result import Calibration, Offer, Stepped
+from hdbridge.commissioning.calibration.validation import Validation, validate
+
+__all__ = [
+    "Calibration",
+    "Journal",
+    "Offer",
+    "Stepped",
+    "Validation",
+    "calibrate",
+    "conclude",
+    "concluded",
+    "fit",
+    "identify",
+    "measure",
+    "measured_of",
+    "start_journal",
+    "validate",
+]

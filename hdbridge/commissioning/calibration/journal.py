@@ -1,0 +1,234 @@
+"""Growing recording folder: one file per task of a plan; a valid recording at any time.
+
+After each task its samples are written, then ``recording.yaml`` is replaced atomically. However the
+measurement ends (Ctrl-C, a fault, a kill, a power cut), the folder holds all tasks completed before, and the
+samples of an interrupted task if there was time to write them. `Journal.open` resumes it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from datetime import datetime
+from pathlib import Path
+from typing import Any, Self
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from hdbridge.axis import AxisConfig, Identity
+from hdbridge.control.survived import Survived, lines
+from hdbridge.errors import InputError
+from hdbridge.files.yamlfile import Hex, dump_yaml, read_yaml, write_atomically
+from hdbridge.motion.procedures.plan import Plan
+from hdbridge.records.record import Record
+from hdbridge.records.recording import (
+    ABOUT_NAME,
+    HEADER,
+    Recording,
+    RecordingFile,
+    Segment,
+    sha256_of,
+    versions_here,
+)
+
+PAUSE_S = 1.0
+"""Gap between two tasks on the recording's time axis, during which the drive is disabled."""
+
+
+class TaskEntry(BaseModel):
+    """One run of a task of the plan, as the recording's notes list it."""
+
+    model_config = ConfigDict(defer_build=True, frozen=True, extra="forbid")
+
+    task: str = Field(description="its name in the plan")
+    file: str = Field(description="file with its samples")
+    session: int = Field(ge=1, description="the encoders kept their zeros within a session")
+    complete: bool = Field(description="false: it was interrupted")
+    start_s: float = Field(description="time of its first sample")
+    end_s: float = Field(description="time of its last sample")
+    lost: tuple[str, ...] = Field(
+        (),
+        description="channels of the axis file that failed during the test; the samples do not contain them",
+    )
+    survived: tuple[Survived, ...] = Field(
+        (),
+        description="faults that the run tolerated, and the one that ended it",
+    )
+
+
+class _Notes(BaseModel):
+    model_config = ConfigDict(defer_build=True, frozen=True, extra="allow")
+
+    plan: dict[str, Any]
+    tasks: tuple[TaskEntry, ...] = ()
+
+
+class Journal:
+    """Recording folder of a calibration; `add` writes a task into it."""
+
+    def __init__(self, folder: Path, about: RecordingFile, plan: Plan) -> None:
+        self.folder = folder
+        self.plan = plan
+        self._about = about
+        self._tasks = list(_Notes.model_validate(about.notes).tasks)
+        self._session = max((each.session for each in self._tasks), default=0)
+
+    @classmethod
+    def create(
+        cls,
+        folder: Path,
+        axis: AxisConfig,
+        plan: Plan,
+        date: datetime,
+        identity: Identity,
+        notes: dict[str, Any],
+    ) -> Self:
+        """Creates a journal, written with its first task. InputError if the folder has a recording."""
+        if (folder / ABOUT_NAME).exists():
+            raise InputError(
+                f"{folder}: there is a recording already; expected a new folder, or --resume to continue it"
+            )
+        about = RecordingFile.model_construct(
+            schema_="hdbridge.recording/1",
+            axis=axis.name,
+            ratio=axis.gear.ratio,
+            drive=identity,
+            date=date.isoformat(timespec="seconds"),
+            versions=versions_here(),
+            notes={"plan": plan.as_dict(), **notes},
+            files=(),
+            segments=(),
+        )
+        return cls(folder, about, plan)
+
+    @classmethod
+    def open(cls, folder: Path) -> Self:
+        """Opens a journal to resume it; InputError if the folder is not the recording of a calibration."""
+        if not (folder / ABOUT_NAME).exists():
+            raise InputError(f"{folder}: no {ABOUT_NAME} in this folder; expected a calibration's recording")
+        document = read_yaml(folder / ABOUT_NAME)
+        about = document.validate(RecordingFile)
+        if "plan" not in about.notes:
+            raise document.error(
+                ("notes",), "has no plan; expected the recording of a calibration ('hdbridge calibrate')"
+            )
+        plan = document.validate(Plan, ("notes", "plan"))
+        Recording.load(folder)  # detects changed files before anything moves
+        return cls(folder, about, plan)
+
+    def check_is_of(self, axis: AxisConfig, identity: Identity | None = None) -> None:
+        """Refuses a recording of another axis, gear or drive with InputError."""
+        for what, theirs, ours in (
+            ("axis", self._about.axis, axis.name),
+            ("gear ratio", self._about.ratio, axis.gear.ratio),
+            *(
+                (f"drive {name}", getattr(self._about.drive, name, None), getattr(identity, name, None))
+                for name in ("vendor_id", "product_code", "serial")
+            ),
+        ):
+            if theirs is not None and ours is not None and theirs != ours:
+                raise InputError(
+                    f"{self.folder / ABOUT_NAME}: this recording is of {what} {theirs}, but here is {ours} "
+                    f"({axis.path}); resume it there, or begin a new one"
+                )
+
+    @property
+    def done(self) -> frozenset[str]:
+        """Names of the completed tasks."""
+        return frozenset(each.task for each in self._tasks if each.complete)
+
+    @property
+    def date(self) -> str:
+        """Date and time of its start, ISO 8601."""
+        return self._about.date or ""
+
+    @property
+    def identity(self) -> Identity | None:
+        """Identity of the drive that it was measured with."""
+        return self._about.drive
+
+    @property
+    def notes(self) -> dict[str, Any]:
+        """Notes of the recording."""
+        return dict(self._about.notes)
+
+    def begin_session(self) -> None:
+        """Starts a session, because the encoders may have lost their zeros since the last task."""
+        self._session += 1
+
+    def add(
+        self,
+        task: str,
+        record: Record,
+        legs: Sequence[Segment],
+        *,
+        complete: bool,
+        lost: tuple[str, ...] = (),
+        survived: tuple[Survived, ...] = (),
+    ) -> None:
+        """Writes a task's samples and legs; does nothing if there are no samples."""
+        if not len(record):
+            return
+        end_s = max((each.end_s for each in self._tasks), default=-PAUSE_S)
+        # Each run on the bench has its own zero of time.
+        shift_s = end_s + PAUSE_S - float(record.time_s[0])
+        if shift_s:
+            record = Record({**record.columns, "time_s": record.time_s + shift_s})
+        self.folder.mkdir(parents=True, exist_ok=True)
+        again = sum(each.task == task for each in self._tasks)
+        name = f"{task}{f'-{again + 1}' if again else ''}.csv.gz"
+        record.write_csv(self.folder / name)
+        entry = TaskEntry(
+            task=task,
+            file=name,
+            session=self._session,
+            complete=complete,
+            start_s=float(record.time_s[0]),
+            end_s=float(record.time_s[-1]),
+            lost=lost,
+            survived=survived,
+        )
+        self._tasks.append(entry)
+        segments = [
+            {"kind": each.kind, "start_s": each.start_s + shift_s, "end_s": each.end_s + shift_s}
+            for each in legs
+        ]
+        file = {"name": name, "sha256": sha256_of(self.folder / name), "samples": len(record)}
+        self._write(file, segments)
+
+    def recording(self) -> Recording:
+        """Loads everything measured so far."""
+        return Recording.load(self.folder)
+
+    def _write(self, file: dict[str, Any], segments: list[dict[str, Any]]) -> None:
+        before = self._about
+        drive = before.drive.model_dump(exclude_none=True) if before.drive else {}
+        tasks = [each.model_dump(mode="json", exclude_defaults=True) for each in self._tasks]
+        data = {
+            "schema": "hdbridge.recording/1",
+            "axis": before.axis,
+            "ratio": before.ratio,
+            "drive": {name: Hex(value) for name, value in drive.items()},
+            "date": before.date,
+            "versions": before.versions,
+            "notes": {**before.notes, "tasks": tasks},
+            "files": [*(each.model_dump() for each in before.files), file],
+            "segments": [*(each.model_dump(exclude={"notes"}) for each in before.segments), *segments],
+        }
+        write_atomically(self.folder / ABOUT_NAME, HEADER + dump_yaml(data))
+        self._about = RecordingFile.model_validate({**data, "drive": before.drive})
+
+
+def survived_in(folders: Iterable[Path]) -> tuple[str, ...]:
+    """Returns one line for each file whose run tolerated faults."""
+    found = []
+    for folder in folders:
+        if (folder / ABOUT_NAME).exists():
+            notes = read_yaml(folder / ABOUT_NAME).validate(RecordingFile).notes
+            tasks = _Notes.model_validate({"plan": {}, **notes}).tasks if "plan" in notes else ()
+            found += [(f"{folder.name}/{each.file}", each.survived) for each in tasks]
+    return tuple(lines(found))
+
+
+def tasks_of(recording: Recording) -> tuple[TaskEntry, ...]:
+    """Returns the tasks of a calibration's recording; none for any other recording."""
+    return _Notes.model_validate({"plan": {}, **recording.notes}).tasks if "plan" in recording.notes else ()

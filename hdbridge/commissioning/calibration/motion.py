@@ -1,0 +1,532 @@
+"""Motion test: ripple over speed by order, path errors, and the response of the axis measured by it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from hdbridge.analysis.response import (
+    LEAST_ARCSEC,
+    STOP,
+    Harmonics,
+    Limits,
+    Trial,
+    agree,
+    difference,
+    following_lag_s,
+    gain,
+    harmonics,
+    motor_orders,
+    order_hz,
+    response_of,
+)
+from hdbridge.axis import AxisConfig
+from hdbridge.axis.effects import InertialWindup, Motion, Synchronous
+from hdbridge.axis.model import TransmissionModel
+from hdbridge.axis.model.response import Response
+from hdbridge.commissioning.calibration.measure import Pace
+from hdbridge.commissioning.calibration.path import PathError, inertia_over_stiffness, path_errors
+from hdbridge.control.bench import axis_view, compensation_for
+from hdbridge.control.rig import Rig, bench_on
+from hdbridge.drive.drive import Drive
+from hdbridge.drive.gains import changed_gains, read_gains
+from hdbridge.errors import InputError
+from hdbridge.motion.procedures.even_speed import SHARES, EvenRun, EvenSpeed
+from hdbridge.motion.procedures.path_test import PathRun, PathTest
+from hdbridge.motion.procedures.rehearsal import rehearse
+from hdbridge.units import ARCSEC_PER_DEG
+
+CHANCE = 1.05
+"""Factor by which a ripple must be larger to count as larger."""
+FADED = 0.5
+"""Share of the wanted gain below which the filter no longer corrects an order."""
+RETUNED = (
+    "the servo does not answer as it did when the response was measured (following lag {:.1f} ms then, "
+    "{:.1f} ms now; the response differs by {:.0f} %): it was retuned, or the load changed; measure the "
+    "response again"
+)
+CHECKED = (0.64, 0.38, 0.18)
+"""Speeds of a check of the stored response, as shares of the limit."""
+NO_LOAD_ENCODER = (
+    "load_encoder.source is the motor encoder: the ripple is that of the load angle predicted from motor "
+    "encoder and model; path errors are not measured"
+)
+TRIALS = 3
+"""Maximum number of filters tried, each based on the runs of those before it. The first one explores: it
+also corrects orders beyond the known frequency range."""
+
+
+@dataclass(frozen=True, slots=True)
+class OrderRipple:
+    """Amplitude of one motor order of the load error at one speed, both directions together; arcsec."""
+
+    order: int
+    frequency_hz: float
+    none_arcsec: float
+    static_arcsec: float | None = None
+    filtered_arcsec: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class PathResult:
+    """Error on one path without correction, with the static one, with the filtered one, and with the
+    wind-up compensated as well.
+    """
+
+    name: str
+    none: PathError
+    static: PathError
+    filtered: PathError | None = None
+    wind_up: PathError | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Ripple:
+    """Rms of the load error about a straight line at one speed, both directions together; arcsec."""
+
+    speed_deg_s: float
+    none_arcsec: float
+    static_arcsec: float | None = None
+    filtered_arcsec: float | None = None
+    faded: tuple[int, ...] = ()
+    """Motor orders that the filter does not correct at this speed, because they are too fast."""
+    orders: tuple[OrderRipple, ...] = ()
+
+    @property
+    def in_force_arcsec(self) -> float | None:
+        """Ripple with the filtered correction, or with the static one if there is no filter."""
+        return self.static_arcsec if self.filtered_arcsec is None else self.filtered_arcsec
+
+    @property
+    def removed_in_force_percent(self) -> float | None:
+        """Share of the ripple that the correction in force removes."""
+        return _removed(self.none_arcsec, self.in_force_arcsec)
+
+    @property
+    def removed_percent(self) -> float | None:
+        """Share of the ripple that the filtered correction removes."""
+        return _removed(self.none_arcsec, self.filtered_arcsec)
+
+    @property
+    def removed_static_percent(self) -> float | None:
+        """Share of the ripple that the static correction removes."""
+        return _removed(self.none_arcsec, self.static_arcsec)
+
+
+@dataclass(frozen=True, slots=True)
+class MotionTest:
+    """Ripple over speed without correction, with the static one, and with the filtered one."""
+
+    ripples: tuple[Ripple, ...]
+    response: Response | None
+    """Response with the filter of the correction; None if no filter helps."""
+    remarks: tuple[str, ...] = ()
+    paths: tuple[PathResult, ...] = ()
+    wind_up: InertialWindup | None = None
+    """Wind-up of the load in acceleration, if compensating for it makes the path error smaller."""
+
+    def applied(self, model: TransmissionModel) -> TransmissionModel:
+        """Returns a model with the response and the wind-up of this test."""
+        effects = model.effects if self.wind_up is None else (*model.effects, self.wind_up)
+        return replace(model, effects=effects, response=self.response)
+
+    @property
+    def helps_to_deg_s(self) -> float | None:
+        """Highest speed up to which the correction in force removes at least half of the ripple."""
+        reached = None
+        for each in sorted(self.ripples, key=lambda one: one.speed_deg_s):
+            removed = each.removed_in_force_percent
+            if removed is None or removed < 50.0:
+                break
+            reached = each.speed_deg_s
+        return reached
+
+    @property
+    def summary(self) -> str:
+        """Ripple at the highest speed, without and with the correction in force, in words."""
+        fastest = max(self.ripples, key=lambda each: each.speed_deg_s)
+        after = fastest.in_force_arcsec
+        left = "" if after is None else f" to {after:.2f}"
+        return f"ripple at {fastest.speed_deg_s:g} deg/s {fastest.none_arcsec:.2f}{left} arcsec"
+
+    @property
+    def harms_at(self) -> tuple[float, ...]:
+        """Speeds at which the filtered correction leaves more ripple than no correction, deg/s."""
+        return tuple(
+            each.speed_deg_s
+            for each in self.ripples
+            if each.filtered_arcsec is not None and each.filtered_arcsec > CHANCE * each.none_arcsec
+        )
+
+    @property
+    def harms_paths(self) -> bool:
+        """True if the error on all paths together is larger with the filtered correction than without."""
+        filtered = [each.filtered.path_arcsec for each in self.paths if each.filtered is not None]
+        return bool(filtered) and _rms(filtered) > CHANCE * _rms(
+            [each.none.path_arcsec for each in self.paths]
+        )
+
+    @property
+    def gains_by_wind_up(self) -> bool:
+        """True if the error with wind-up, on all paths together, is smaller once that is compensated."""
+        pairs = [(each.filtered, each.wind_up) for each in self.paths]
+        before, after = ([one.delayed_arcsec for one in each if one] for each in zip(*pairs, strict=True))
+        return bool(after) and CHANCE * _rms(after) < _rms(before)
+
+    @property
+    def remaining(self) -> float:
+        """Mean share of the ripple that the filtered correction leaves; 1 without one."""
+        shares = [
+            1.0 if each.filtered_arcsec is None else each.filtered_arcsec / each.none_arcsec
+            for each in self.ripples
+        ]
+        return sum(shares) / len(shares)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Returns the document of ``hdbridge motion --json``, schema ``hdbridge.motion/1``."""
+        return {
+            "schema": "hdbridge.motion/1",
+            "helps_to_deg_s": self.helps_to_deg_s,
+            "speeds": [
+                {
+                    "speed_deg_s": each.speed_deg_s,
+                    "none_arcsec": each.none_arcsec,
+                    "static_arcsec": each.static_arcsec,
+                    "filtered_arcsec": each.filtered_arcsec,
+                    "removed_static_percent": each.removed_static_percent,
+                    "removed_percent": each.removed_percent,
+                    "faded_orders": list(each.faded),
+                    "orders": [asdict(order) for order in each.orders],
+                }
+                for each in self.ripples
+            ],
+            "paths": [asdict(each) for each in self.paths],
+            "response": self.response.model_dump(mode="json") if self.response else None,
+            "wind_up": self.wind_up.parameters() if self.wind_up else None,
+            "remarks": list(self.remarks),
+        }
+
+    @classmethod
+    def from_dict(cls, data: dict[str, Any]) -> MotionTest:
+        """Restores a test from `as_dict`."""
+        ripples = tuple(
+            Ripple(
+                each["speed_deg_s"],
+                each["none_arcsec"],
+                each["static_arcsec"],
+                each["filtered_arcsec"],
+                tuple(each["faded_orders"]),
+                tuple(OrderRipple(**order) for order in each.get("orders", ())),
+            )
+            for each in data["speeds"]
+        )
+        paths = tuple(
+            PathResult(
+                each["name"],
+                PathError(**each["none"]),
+                PathError(**each["static"]),
+                *(PathError(**each[name]) if each.get(name) else None for name in ("filtered", "wind_up")),
+            )
+            for each in data.get("paths", ())
+        )
+        response = Response.model_validate(data["response"]) if data["response"] else None
+        wind_up = InertialWindup.model_validate(data["wind_up"]) if data.get("wind_up") else None
+        return cls(ripples, response, tuple(map(str, data["remarks"])), paths, wind_up)
+
+
+def motion_test_s(axis: AxisConfig, runs: int = 2 + TRIALS) -> float:
+    """Returns the longest duration of the test on an ideal axis."""
+    view = axis_view(axis)
+    middle = 0.5 * (axis.limits.position_min_deg + axis.limits.position_max_deg)
+    paths_s = 4.0 * rehearse(PathTest(), view, middle).duration_s
+    return paths_s + runs * rehearse(EvenSpeed.spread(view), view, middle).duration_s
+
+
+def motion_test(
+    drive: Drive | Rig,
+    model: TransmissionModel,
+    *,
+    measure: bool = True,
+    progress: Callable[[str, float, float], None] = lambda *_: None,
+    interrupted: Callable[[], bool] = lambda: False,
+) -> MotionTest:
+    """Runs a booted drive's axis at several speeds and on paths, without and with the model's correction.
+
+    With ``measure`` the response is measured, otherwise the model's own is tested. A filter is kept only if
+    at every speed it leaves no more ripple than no correction, and no larger path error. InputError if no
+    motor order of the model is large enough to measure, or if the travel is too short. Without an encoder at
+    the load, the ripple is that of the load angle predicted from the motor encoder, and no path is run.
+    """
+    runner = _Runner(drive, model, progress, interrupted)
+    gains = read_gains(drive.sdo) if isinstance(drive, Drive) else {}
+    found = _ripple_test(runner, model, measure)
+    if found.response is not None and measure:
+        found = replace(found, response=found.response.model_copy(update={"gain_objects": gains}))
+    elif found.response is not None:
+        changed = changed_gains(found.response.gain_objects, gains)
+        found = replace(found, remarks=(*found.remarks, *changed))
+    if drive.axis.load_encoder.is_motor_encoder:
+        return replace(found, remarks=(*found.remarks, NO_LOAD_ENCODER))
+    used = [replace(model.only(()), response=None), replace(model, response=None)]
+    if found.response is not None:
+        used.append(replace(model, response=found.response))
+    runs = [runner.run_paths(each) for each in used]
+    errors = path_errors(runs, model.ratio, runner.lag_s)
+    if measure and found.response is not None and (wind_up := runner.wind_up(runs[-1])) is not None:
+        found = replace(found, wind_up=wind_up)
+        corrected = runner.run_paths(found.applied(model))
+        errors.append(path_errors([runs[0], corrected], model.ratio, runner.lag_s)[1])
+    found = replace(found, paths=tuple(PathResult(each[0].name, *each) for each in zip(*errors, strict=True)))
+    if found.wind_up is not None and not found.gains_by_wind_up:
+        found = replace(found, wind_up=None)
+    if measure and found.harms_paths:
+        remark = "no filter is kept: with it the path error is larger than without correction"
+        return replace(found, response=None, wind_up=None, remarks=(*found.remarks, remark))
+    return found
+
+
+def _ripple_test(runner: _Runner, model: TransmissionModel, measure: bool) -> MotionTest:
+    """Runs the constant-speed part of the test."""
+    axis = runner.axis
+    none = runner.run("without correction", replace(model.only(()), response=None))
+    runner.lag_s = following_lag_s(none)
+    static_model = replace(model, response=None)
+    static = runner.run("correction of rest", static_model)
+    limits = limits_of(axis, model)
+    if not measure:
+        return _tested(runner, model, none, static, limits)
+    trials = [Trial(static)]
+    highest, best = math.inf, MotionTest(_ripples(runner, none, static), None)
+    for explore in (True, *[False] * (TRIALS - 1)):
+        response = response_of(
+            none,
+            trials,
+            runner.orders,
+            model.ratio,
+            axis.drive.cycle_s,
+            limits,
+            highest_hz=highest,
+            explore=explore,
+        )
+        if response is None:
+            break
+        filtered = runner.run("filtered correction", replace(model, response=response))
+        found = MotionTest(_ripples(runner, none, static, filtered, response), response)
+        if not explore and found.harms_at:
+            # The cause is not known, but it lies within the range of the filter.
+            highest = 0.7 * response.known_to_hz
+        elif not explore and (best.response is None or found.remaining < best.remaining):
+            best = found
+        trials.append(Trial(filtered, response.filter))
+    if best.response is not None:
+        return best
+    if len(trials) <= 2:
+        return replace(best, remarks=("the response cannot be measured: the ripple is too small",))
+    at = ", ".join(f"{speed:g}" for speed in found.harms_at)
+    return replace(
+        best, remarks=(f"no filter is kept: at {at} deg/s it leaves more ripple than no correction",)
+    )
+
+
+def _tested(
+    runner: _Runner,
+    model: TransmissionModel,
+    none: tuple[Harmonics, ...],
+    static: tuple[Harmonics, ...],
+    limits: Limits,
+) -> MotionTest:
+    """Tests the model's own response; remarks on it if the servo has changed since it was measured."""
+    stored = model.response
+    if stored is None:
+        return MotionTest(_ripples(runner, none, static), None)
+    filtered = runner.run("filtered correction", model)
+    trials = [Trial(static), Trial(filtered, stored.filter)]
+    found = response_of(none, trials, runner.orders, model.ratio, runner.cycle_s, limits)
+    remark = None if found is None else ServoCheck.of(stored, found).remark
+    remarks = () if remark is None else (remark,)
+    return MotionTest(_ripples(runner, none, static, filtered, stored), stored, remarks)
+
+
+@dataclass(frozen=True, slots=True)
+class ServoCheck:
+    """Comparison of the stored response with a new measurement."""
+
+    stored_lag_ms: float
+    lag_ms: float
+    difference: float
+    """Rms relative difference of the responses over the frequencies that both have, less its noise."""
+    agrees: bool
+
+    @classmethod
+    def of(cls, stored: Response, found: Response) -> ServoCheck:
+        """Compares two responses."""
+        apart = difference(stored, found)
+        return cls(stored.following_lag_ms, found.following_lag_ms, apart, agree(stored, found))
+
+    @property
+    def remark(self) -> str | None:
+        """Reason why the stored response is not valid any more; None if it is."""
+        if self.agrees:
+            return None
+        return RETUNED.format(self.stored_lag_ms, self.lag_ms, 100.0 * self.difference)
+
+
+def servo_check(
+    drive: Drive, model: TransmissionModel, interrupted: Callable[[], bool] = lambda: False
+) -> ServoCheck:
+    """Measures a few frequencies of a booted drive's response, and compares them with the model's response.
+
+    InputError if the model has no response or no motor order, or if the ripple is too small.
+    """
+    stored = model.response
+    if stored is None:
+        raise InputError(f"{model.path}: has no response in motion; measure it: hdbridge motion --propose")
+    runner = _Runner(drive, model, lambda *_: None, interrupted, CHECKED)
+    none = runner.run("without correction", replace(model.only(()), response=None))
+    filtered = runner.run("filtered correction", model)
+    found = response_of(
+        none,
+        [Trial(filtered, stored.filter)],
+        runner.orders,
+        model.ratio,
+        runner.cycle_s,
+        limits_of(drive.axis, model),
+    )
+    if found is None:
+        raise InputError("the response cannot be measured: the ripple is too small")
+    return ServoCheck.of(stored, found)
+
+
+class _Runner:
+    """Runs the procedures with a given correction."""
+
+    def __init__(
+        self,
+        drive: Drive | Rig,
+        model: TransmissionModel,
+        progress: Callable[[str, float, float], None],
+        interrupted: Callable[[], bool],
+        shares: Sequence[float] = SHARES,
+    ) -> None:
+        axis = self.axis = drive.axis
+        self.orders = tuple(each.order for each in motor_orders(model))
+        if not self.orders:
+            raise InputError(
+                f"the model has no motor order of {LEAST_ARCSEC:g} arcsec or more: there is no ripple to "
+                "measure the response by; calibrate the axis first"
+            )
+        self.lag_s = 0.0
+        """Following lag, from the runs without correction."""
+        self._model = model
+        self.procedure = EvenSpeed.spread(axis_view(axis), shares)
+        self._orders_only = TransmissionModel(model.ratio, (Synchronous(orders=tuple(motor_orders(model))),))
+        self.ratio, self.cycle_s = model.ratio, axis.drive.cycle_s
+        self._drive = drive
+        self._pace = Pace(motion_test_s(axis), self.cycle_s, progress, interrupted)
+
+    def run(self, name: str, model: TransmissionModel) -> tuple[Harmonics, ...]:
+        """Runs all speeds with this model; returns the orders of each run."""
+        self._pace.begin(name)
+        bench = bench_on(self._drive, compensation_for(self.axis, model), interrupted=self._pace.interrupted)
+        runs = bench.run(self.procedure).outcome
+        if self.axis.load_encoder.is_motor_encoder:
+            runs = tuple(predicted_run(each, self._orders_only) for each in runs)
+        return tuple(harmonics(each, self.orders, self.ratio) for each in runs)
+
+    def wind_up(self, runs: Sequence[PathRun]) -> InertialWindup | None:
+        """Returns the wind-up in compensated runs; None if it is not significant or the model has it."""
+        if wind_up_of(self._model) is not None:
+            return None
+        moves = [each for each in runs if not each.skipped]
+        found_s2, spread_s2 = inertia_over_stiffness(moves, self._orders_only, self.lag_s)
+        if found_s2 < 2.0 * spread_s2:
+            return None
+        limit_deg_s2 = self.axis.limits.acceleration_deg_s2 * self.ratio
+        return InertialWindup(
+            ratio=self.ratio, inertia_over_stiffness_s2=float(f"{found_s2:.3g}"), limit_deg_s2=limit_deg_s2
+        )
+
+    def run_paths(self, model: TransmissionModel) -> tuple[PathRun, ...]:
+        """Runs the paths with this model."""
+        self._pace.begin("path error")
+        compensation = compensation_for(self.axis, model)
+        return bench_on(self._drive, compensation, interrupted=self._pace.interrupted).run(PathTest()).outcome
+
+
+def wind_up_of(model: TransmissionModel) -> InertialWindup | None:
+    """Returns the wind-up of the load in acceleration that a model has."""
+    return next((each for each in model.effects if isinstance(each, InertialWindup)), None)
+
+
+def predicted_run(run: EvenRun, model: TransmissionModel) -> EvenRun:
+    """Returns a run with the load angle that the motor encoder and the model predict."""
+    motor_deg = np.array([each.motor_position_deg for each in run.samples])
+    load_deg = motor_deg / model.ratio + model.predict(Motion(motor_deg)) / ARCSEC_PER_DEG
+    samples = zip(run.samples, load_deg.tolist(), strict=True)
+    return replace(run, samples=tuple(each._replace(load_position_deg=load) for each, load in samples))
+
+
+def limits_of(axis: AxisConfig, model: TransmissionModel) -> Limits:
+    """Returns the limits of the axis file on a correction of the model's motor orders."""
+    speed = axis.limits.velocity_deg_s
+    tops = (
+        (float(order_hz(each.order, speed, model.ratio)), each.amplitude_arcsec)
+        for each in motor_orders(model)
+    )
+    return Limits(
+        tuple(tops),
+        axis.compensation.maximum_arcsec,
+        axis.compensation.slew_arcsec_s,
+        axis.limits.acceleration_deg_s2,
+    )
+
+
+def _ripples(
+    runner: _Runner,
+    none: tuple[Harmonics, ...],
+    static: tuple[Harmonics, ...],
+    filtered: tuple[Harmonics, ...] | None = None,
+    response: Response | None = None,
+) -> tuple[Ripple, ...]:
+    ripples: list[Ripple] = []
+    variants = [none, static, *([filtered] if filtered else [])]
+    for speed in sorted({abs(each.speed_deg_s) for each in none}):
+        both = [[run for run in each if abs(run.speed_deg_s) == speed] for each in variants]
+        whole = [_rms([run.ripple_arcsec for run in runs]) for runs in both]
+        orders = tuple(
+            OrderRipple(
+                order,
+                round(float(order_hz(order, speed, runner.ratio)), 2),
+                *(_rms([abs(run.amplitudes[place]) for run in runs]) for runs in both),
+            )
+            for place, order in enumerate(runner.orders)
+        )
+        faded = faded_orders(response, runner.orders, speed, runner.ratio) if response else ()
+        last = whole[2] if filtered else None
+        ripples.append(Ripple(speed, whole[0], whole[1], last, tuple(faded), orders))
+    return tuple(ripples)
+
+
+def faded_orders(
+    response: Response, orders: tuple[int, ...], speed_deg_s: float, ratio: float
+) -> Iterator[int]:
+    """Yields the motor orders that the filter does not correct at a speed."""
+    cycle_s = response.cycle_ms / 1000.0
+    for order in orders:
+        hertz = float(order_hz(order, speed_deg_s, ratio))
+        wanted = 1.0 / float(np.interp(hertz, response.frequency_hz, response.gain))
+        given = abs(gain(response.filter, np.array([hertz]), cycle_s)[0])
+        if hertz > STOP / cycle_s or given < FADED * wanted:
+            yield order
+
+
+def _rms(values: list[float]) -> float:
+    return math.sqrt(sum(each**2 for each in values) / len(values))
+
+
+def _removed(none_arcsec: float, arcsec: float | None) -> float | None:
+    return None if arcsec is None else 100.0 * (1.0 - arcsec / none_arcsec)

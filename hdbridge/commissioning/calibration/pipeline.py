@@ -1,0 +1,206 @@
+"""Whole calibration, from a booted drive to a pending model, and its result read again from its folder."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
+from datetime import datetime
+from pathlib import Path
+
+from hdbridge.axis import AxisConfig
+from hdbridge.axis.model import TransmissionModel
+from hdbridge.axis.model.store import propose
+from hdbridge.commissioning.calibration.identification import identify, provenance, standings, with_provenance
+from hdbridge.commissioning.calibration.journal import Journal, survived_in, tasks_of
+from hdbridge.commissioning.calibration.measure import measure
+from hdbridge.commissioning.calibration.motion import MotionTest, motion_test, wind_up_of
+from hdbridge.commissioning.calibration.result import Calibration, Offer
+from hdbridge.commissioning.calibration.validation import Validation, floor_of, validate
+from hdbridge.control.caps import cap_remark
+from hdbridge.control.realtime import left_realtime
+from hdbridge.control.rig import Rig
+from hdbridge.drive.drive import Drive
+from hdbridge.errors import InputError, OutputError
+from hdbridge.files.atomic import write_atomically
+from hdbridge.files.outputs import defer, writing
+from hdbridge.records.recording import Recording
+
+RESULT_NAME = "calibration.json"
+MODEL_NAME = "model.yaml"
+ACTIVE_NAME = "active.yaml"
+Progress = Callable[[str, float, float], None]
+
+
+@left_realtime()  # fitting takes long; a bench resumes real-time priority for each motion
+def calibrate(
+    drive: Drive | Rig,
+    journal: Journal,
+    profile: Path,
+    date: datetime,
+    *,
+    progress: Progress = lambda *_: None,
+    interrupted: Callable[[], bool] = lambda: False,
+    tell: Callable[[str], None] = lambda _: None,
+) -> Calibration:
+    """Measures the remaining tasks, fits, validates, and proposes the model to the profile.
+
+    ``profile`` is the folder of axis.yaml; ``tell`` receives a line for each step. A model that does not
+    improve on unseen data, or that makes the axis point worse, is saved in the recording's folder but not
+    proposed.
+    """
+    axis = drive.axis
+    measure(drive, journal, progress=progress, interrupted=interrupted)
+    active = active_model(profile, axis, drive, tell)
+    tell("fitting")
+    recording = journal.recording()
+    result = conclude({journal.folder: recording}, axis.gear.ratio, active, axis=axis)
+    if active and active.response and active.response.fits_cycle(axis.drive.cycle_s):
+        # This calibration measured the gear again, but neither the servo nor the load's inertia.
+        kept = MotionTest(
+            (), active.response, wind_up=wind_up_of(active) if not wind_up_of(result.model) else None
+        )
+        result = replace(result, model=kept.applied(result.model))
+    if not result.fit.held_out.improves:
+        result = replace(result, offer=Offer(False, f"not offered for commit: {result.fit.held_out.text}"))
+        return _kept(journal.folder, result)
+    if remark := cap_remark(axis, result.model):
+        tell(remark)
+    if journal.plan.validation.motion:
+        tell("measuring the response in motion")
+        try:
+            tested = motion_test(drive, result.model, progress=progress, interrupted=interrupted)
+        except InputError as problem:
+            tell(f"not tested in motion: {problem}")
+        else:
+            result = replace(result, model=tested.applied(result.model), motion=tested)
+    tell("testing it on the axis, before and after")
+    floor = floor_of(axis, recording)
+    checked = validate(
+        drive,
+        journal.plan,
+        active,
+        result.model,
+        floor,
+        journal.folder,
+        progress=progress,
+        interrupted=interrupted,
+    )
+    result = replace(result, validation=checked)
+    before, after = (each.pooled.three_sigma_arcsec for each in (checked.before, checked.after))
+    if not checked.improves:
+        reason = (
+            f"not offered for commit: stepping is worse, 3 sigma {after:.2f} arcsec after {before:.2f} "
+            f"with {checked.before.model}"
+        )
+        return _kept(journal.folder, replace(result, offer=Offer(False, reason)))
+    figures = (f"stepping 3 sigma {before:.2f} to {after:.2f} arcsec", *checked.worse)
+    if result.motion is not None:
+        figures = (*figures, result.motion.summary)
+    reason = f"calibration {journal.folder.name}: {', '.join(figures)}"
+    return _kept(journal.folder, replace(result, offer=proposed(profile, result.model, reason, date, drive)))
+
+
+def proposed(
+    profile: Path, model: TransmissionModel, reason: str, date: datetime, drive: Drive | Rig
+) -> Offer:
+    """Makes the model pending; if it cannot be written, the offer's reason still states the figures."""
+    try:
+        return Offer(True, reason, propose(profile, model, reason, date, drive.identity))
+    except OutputError as problem:
+        defer(problem)
+        return Offer(False, f"not offered for commit: {problem}; {reason}")
+
+
+def conclude(
+    recordings: Mapping[Path, Recording],
+    ratio: float,
+    active: TransmissionModel | None = None,
+    *,
+    axis: AxisConfig | None = None,
+    independent_zeros: bool = False,
+) -> Calibration:
+    """Fits recordings in the order given, keyed by their paths; needs no drive.
+
+    With ``axis`` the model is bound to it.
+    """
+    measured = list(recordings.values())
+    fit = identify(measured, ratio, active, independent_zeros=independent_zeros)
+    fit = replace(fit, warnings=(*_lost(recordings), *survived_in(recordings), *fit.warnings))
+    gain = fit.held_out.gain
+    model = with_provenance(
+        fit.model, provenance(recordings, measured, gain.as_dict() if gain else fit.held_out.text)
+    )
+    first = measured[0]
+    return Calibration(
+        recordings=tuple(map(str, recordings)),
+        fit=fit,
+        model=model.bound_to(axis, first.drive) if axis else model,
+        active=active,
+        axis=axis.name if axis else first.axis,
+        date=first.date,
+        plan=first.notes.get("plan", {}).get("name"),
+        shortened=tuple(first.notes.get("shortened", ())),
+        drift=tuple(standings(first, ratio)) if len(measured) == 1 else (),
+    )
+
+
+def _lost(recordings: Mapping[Path, Recording]) -> Iterator[str]:
+    """Yields one line for each channel that failed during a task."""
+    tasks = [(task, path) for path, each in recordings.items() for task in tasks_of(each)]
+    for key in dict.fromkeys(key for task, _ in tasks for key in task.lost):
+        places = ", ".join(f"{path.name}/{task.file}" for task, path in tasks if key in task.lost)
+        yield f"the {key.replace('_', ' ')} was lost during the test ({places}); the fit does without it"
+
+
+def concluded(folder: Path) -> Calibration:
+    """Restores the result of a calibration from its folder: refits it and reads the stored tests and offer.
+
+    InputError if the recording has no gear ratio, or if the stored result is damaged.
+    """
+    recording = Recording.load(folder)
+    if recording.ratio is None:
+        raise InputError(f"{folder}: the recording names no gear ratio; fit it with 'hdbridge fit --ratio'")
+    before = folder / ACTIVE_NAME
+    active = TransmissionModel.load(before) if before.exists() else None
+    result = conclude({folder: recording}, recording.ratio, active)
+    path = folder / RESULT_NAME
+    if not path.exists():
+        return result
+    try:
+        data = json.loads(path.read_text(encoding="utf-8"))
+        validation = Validation.from_dict(data["stepping"]) if data["stepping"] else None
+        motion = MotionTest.from_dict(data["motion"]) if data.get("motion") else None
+        offer = Offer(bool(data["offered"]), str(data["reason"]))
+    except (ValueError, KeyError, TypeError, OSError):
+        raise InputError(
+            f"{path}: not the result of a calibration; restore it, or remove it and report without it"
+        ) from None
+    return replace(result, validation=validation, motion=motion, offer=offer)
+
+
+def active_model(
+    profile: Path, axis: AxisConfig, drive: Drive | Rig, tell: Callable[[str], None] = lambda _: None
+) -> TransmissionModel | None:
+    """Returns the profile's active model if it belongs to this axis and drive, else None."""
+    path = profile / "model.yaml"
+    if not path.exists():
+        return None
+    model = TransmissionModel.load(path)
+    try:
+        model.check_bound_to(axis, drive.identity)
+    except InputError as problem:
+        tell(f"not compared with the active model: {problem}")
+        return None
+    return model
+
+
+def _kept(folder: Path, result: Calibration) -> Calibration:
+    """Saves the result, the new model and the active one next to the recording."""
+    with writing():
+        result.model.save(folder / MODEL_NAME)
+        if result.active:
+            result.active.save(folder / ACTIVE_NAME)
+        text = json.dumps(result.as_dict(), indent=1, allow_nan=False)
+        write_atomically(folder / RESULT_NAME, text + "\n")
+    return result

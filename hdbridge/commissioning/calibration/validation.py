@@ -1,0 +1,287 @@
+"""Validation of a model: the stepping test with the model before and with the new one."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hdbridge.axis import AxisConfig
+from hdbridge.axis.model import TransmissionModel
+from hdbridge.commissioning.calibration.identification import resting
+from hdbridge.commissioning.calibration.measure import Pace
+from hdbridge.commissioning.evaluation.accuracy import AxisAccuracy, axis_accuracy
+from hdbridge.commissioning.evaluation.stepping import Scatter, SchemeResult, quantisation_floor_arcsec
+from hdbridge.control.bench import axis_view, compensation_for
+from hdbridge.control.rig import ProcedureBench, Rig, bench_on
+from hdbridge.control.survived import Survived, lines
+from hdbridge.drive.drive import Drive
+from hdbridge.files.outputs import writing
+from hdbridge.motion.procedures.plan import Plan
+from hdbridge.motion.procedures.rehearsal import rehearse
+from hdbridge.motion.procedures.stepping import SteppingOutcome
+from hdbridge.records.recording import Recording
+from hdbridge.units import figure
+
+WINDOW_S = 0.06
+"""Averaging time of the stepping test at rest."""
+CHANCE = 2.0
+"""Number of standard errors by which a stepping test must be worse to count as worse."""
+
+
+@dataclass(frozen=True, slots=True)
+class Stepped:
+    """Result of a stepping test with one model."""
+
+    model: str
+    """Description of the model."""
+    cw: Scatter
+    ccw: Scatter
+    pooled: Scatter
+    errors_arcsec: tuple[tuple[float, ...], tuple[float, ...]]
+    """Error of each step, outward and back."""
+    targets_deg: tuple[tuple[float, ...], tuple[float, ...]]
+
+    @classmethod
+    def of(cls, model: str, outcome: SteppingOutcome) -> Stepped:
+        """Creates it from the procedure's outcome."""
+        result = SchemeResult.of(outcome)
+        return cls(
+            model,
+            result.cw,
+            result.ccw,
+            result.pooled,
+            (
+                tuple(each.error_arcsec for each in outcome.cw),
+                tuple(each.error_arcsec for each in outcome.ccw),
+            ),
+            (tuple(each.target_deg for each in outcome.cw), tuple(each.target_deg for each in outcome.ccw)),
+        )
+
+    def as_dict(self) -> dict[str, Any]:
+        """Returns plain data, which `from_dict` reads."""
+        return {
+            "model": self.model,
+            **{
+                name: {"three_sigma_arcsec": part.three_sigma_arcsec, "mean_arcsec": part.mean_arcsec}
+                for name, part in (("cw", self.cw), ("ccw", self.ccw), ("pooled", self.pooled))
+            },
+            "errors_arcsec": [list(each) for each in self.errors_arcsec],
+            "targets_deg": [list(each) for each in self.targets_deg],
+        }
+
+    @classmethod
+    def from_dict(cls, data: dict[str, Any]) -> Stepped:
+        """Restores it from `as_dict`."""
+        errors, targets = (
+            (tuple(map(float, data[name][0])), tuple(map(float, data[name][1])))
+            for name in ("errors_arcsec", "targets_deg")
+        )
+        cw, ccw, pooled = (
+            Scatter(data[name]["three_sigma_arcsec"], data[name]["mean_arcsec"])
+            for name in ("cw", "ccw", "pooled")
+        )
+        return cls(data["model"], cw, ccw, pooled, errors, targets)
+
+
+def worse_ways(before: Stepped, after: Stepped) -> tuple[str, ...]:
+    """Describes each direction in which steps scatter significantly more after than before.
+
+    The pooled scatter may be smaller nevertheless.
+    """
+    found = []
+    for name, one, other, errors in (
+        ("CW", before.cw, after.cw, after.errors_arcsec[0]),
+        ("CCW", before.ccw, after.ccw, after.errors_arcsec[1]),
+    ):
+        if other.three_sigma_arcsec > _chance(len(errors)) * one.three_sigma_arcsec:
+            found.append(
+                f"worse {name}: 3 sigma {one.three_sigma_arcsec:.2f} to {other.three_sigma_arcsec:.2f} arcsec"
+            )
+    return tuple(found)
+
+
+def _chance(steps: int) -> float:
+    """Returns the ratio above which a standard deviation from this number of steps is significantly larger.
+
+    The relative standard error of one is 1 / sqrt(2 n), that of the ratio of two 1 / sqrt(n).
+    """
+    return 1.0 + CHANCE / math.sqrt(max(steps, 1))
+
+
+@dataclass(frozen=True, slots=True)
+class Validation:
+    """Stepping test before and after, with the best possible result on the axis."""
+
+    before: Stepped
+    after: Stepped
+    floor: Floor
+    accuracy_before: AxisAccuracy | None = None
+    accuracy_after: AxisAccuracy | None = None
+    """Accuracy by the positioning test, if the plan has one."""
+    survived: tuple[str, ...] = ()
+    """One line for each run that tolerated faults."""
+
+    @property
+    def improves(self) -> bool:
+        """True if the axis does not point significantly worse with the new model."""
+        worse = _chance(sum(map(len, self.after.errors_arcsec)))
+        return self.after.pooled.three_sigma_arcsec <= worse * self.before.pooled.three_sigma_arcsec
+
+    @property
+    def worse(self) -> tuple[str, ...]:
+        """Directions that became worse, in words."""
+        return worse_ways(self.before, self.after)
+
+    @property
+    def summary(self) -> str:
+        """Result in one sentence: 3 sigma before and after, their ratio, and the best possible."""
+        before, after = (each.pooled.three_sigma_arcsec for each in (self.before, self.after))
+        ratio = before / after if after <= before else after / before
+        return (
+            f"{before:.1f} to {after:.1f} arcsec (3 sigma), {figure(ratio, 2)} times "
+            f"{'better' if after <= before else 'worse'}; best possible {self.floor.three_sigma_arcsec:.2f}"
+        )
+
+    def as_dict(self) -> dict[str, Any]:
+        """Returns plain data, which `from_dict` reads."""
+        return {
+            "before": self.before.as_dict(),
+            "after": self.after.as_dict(),
+            "floor_arcsec": self.floor.three_sigma_arcsec,
+            "quantisation_floor_arcsec": self.floor.quantisation_arcsec,
+            "noise_floor_arcsec": self.floor.noise_arcsec,
+            "worse": list(self.worse),
+            "survived": list(self.survived),
+            "of_floor": self.after.pooled.three_sigma_arcsec / self.floor.three_sigma_arcsec,
+            "accuracy": {
+                "before": self.accuracy_before.as_dict() if self.accuracy_before else None,
+                "after": self.accuracy_after.as_dict() if self.accuracy_after else None,
+            },
+        }
+
+    @classmethod
+    def from_dict(cls, data: dict[str, Any]) -> Validation:
+        """Restores it from `as_dict`; the oldest files have no accuracy."""
+        floor = Floor(data["quantisation_floor_arcsec"], data["noise_floor_arcsec"])
+        measured = data.get("accuracy", {})
+        before, after = (_accuracy(measured.get(name)) for name in ("before", "after"))
+        return cls(
+            Stepped.from_dict(data["before"]),
+            Stepped.from_dict(data["after"]),
+            floor,
+            before,
+            after,
+            tuple(map(str, data.get("survived", ()))),
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Floor:
+    """Best possible three sigma of a stepping test, with the gear perfectly known; arcsec."""
+
+    quantisation_arcsec: float
+    """Share of the motor encoder, because a motor target is a whole number of counts."""
+    noise_arcsec: float
+    """Share of the load encoder: its noise between settled windows, and its resolution."""
+
+    @property
+    def three_sigma_arcsec(self) -> float:
+        """Root sum square of both."""
+        return math.hypot(self.quantisation_arcsec, self.noise_arcsec)
+
+
+def floor_of(axis: AxisConfig, recording: Recording) -> Floor:
+    """Returns the best possible result, from the encoders' resolutions and the recorded noise at rest."""
+    means = resting(recording, WINDOW_S)
+    count = axis.load_encoder.resolution_arcsec / math.sqrt(12.0)
+    noise = float(np.std(means)) if len(means) else 0.0
+    quantisation = quantisation_floor_arcsec(axis.motor_encoder.counts_per_turn, axis.gear.ratio)
+    return Floor(quantisation, 3.0 * math.hypot(noise, count))
+
+
+def validation_s(plan: Plan, axis: AxisConfig) -> float:
+    """Returns the duration of a plan's validation on an ideal axis."""
+    view = axis_view(axis)
+    stepping, positioning = plan.stepping(view), plan.positioning(view)
+    each_s = rehearse(stepping, view, stepping.start_deg).duration_s
+    if positioning:
+        each_s += rehearse(positioning, view, positioning.targets_deg[0]).duration_s
+    return 2.0 * each_s
+
+
+def validate(
+    drive: Drive | Rig,
+    plan: Plan,
+    before: TransmissionModel | None,
+    after: TransmissionModel,
+    floor: Floor,
+    folder: Path,
+    *,
+    progress: Callable[[str, float, float], None] = lambda *_: None,
+    interrupted: Callable[[], bool] = lambda: False,
+) -> Validation:
+    """Runs the stepping and positioning tests with the model before (None: none) and with the new one.
+
+    ``drive`` is booted. The samples of each run go to ``folder``, even if it is stopped.
+    """
+    axis = drive.axis
+    stepping = plan.stepping(axis_view(axis))
+    positioning = plan.positioning(axis_view(axis))
+    pace = Pace(validation_s(plan, axis), axis.drive.cycle_s, progress, interrupted)
+    results: list[Stepped] = []
+    accuracies: list[AxisAccuracy] = []
+    survived: list[tuple[str, tuple[Survived, ...]]] = []
+    for name, model, words in (
+        ("before", before, "the active model" if before else "no compensation"),
+        ("after", after, "the new model"),
+    ):
+        pace.begin(f"stepping {name}")
+        compensation = compensation_for(axis, model or TransmissionModel(axis.gear.ratio))
+        bench = bench_on(drive, compensation, interrupted=pace.interrupted)
+        with record_kept(bench, folder / f"stepping-{name}.csv.gz"):
+            run = bench.run(stepping)
+            results.append(Stepped.of(words, run.outcome))
+            survived.append((f"stepping {name}", run.survived))
+        if positioning:
+            pace.begin(f"positioning {name}")
+            with record_kept(bench, folder / f"positioning-{name}.csv.gz"):
+                measured = bench.run(positioning)
+            approaches = measured.outcome
+            survived.append((f"positioning {name}", measured.survived))
+            accuracies.append(
+                axis_accuracy(
+                    [each.target_deg for each in approaches],
+                    [each.error_arcsec for each in approaches],
+                    [each.forward for each in approaches],
+                )
+            )
+    accurate = (accuracies[0], accuracies[1]) if accuracies else (None, None)
+    return Validation(results[0], results[1], floor, accurate[0], accurate[1], tuple(lines(survived)))
+
+
+@contextmanager
+def record_kept(bench: ProcedureBench, path: Path) -> Iterator[None]:
+    """Writes the bench's record to ``path`` on exit, even if the run is stopped."""
+    try:
+        yield
+    finally:
+        record = bench.record()
+        if len(record):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            with writing():
+                record.write_csv(path)
+
+
+def _accuracy(data: dict[str, Any] | None) -> AxisAccuracy | None:
+    """Restores what `AxisAccuracy.as_dict` returned."""
+    return (
+        AxisAccuracy(**{name.removesuffix("_arcsec"): value for name, value in data.items()})
+        if data
+        else None
+    )

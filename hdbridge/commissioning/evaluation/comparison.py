@@ -1,0 +1,80 @@
+"""Stepping test under each compensation scheme, one after the other on one axis."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+from hdbridge.axis import AxisConfig
+from hdbridge.axis.model import TransmissionModel
+from hdbridge.commissioning.evaluation.stepping import Scheme, SchemeResult, quantisation_floor_arcsec
+from hdbridge.control.bench import Run, compensation_for
+from hdbridge.control.rig import Rig, bench_on
+from hdbridge.control.survived import lines
+from hdbridge.drive.drive import Drive
+from hdbridge.motion.procedures.stepping import Stepping, SteppingOutcome
+from hdbridge.records.record import Record
+
+
+@dataclass(frozen=True, slots=True)
+class Comparison:
+    """Results of the stepping test under each scheme."""
+
+    results: dict[Scheme, SchemeResult]
+    runs: dict[Scheme, Run[SteppingOutcome]]
+    quantisation_floor_arcsec: float
+
+    @classmethod
+    def of(cls, axis: AxisConfig, runs: dict[Scheme, Run[SteppingOutcome]]) -> Comparison:
+        """Evaluates the completed runs."""
+        floor = quantisation_floor_arcsec(axis.motor_encoder.counts_per_turn, axis.gear.ratio)
+        return cls({scheme: SchemeResult.of(run.outcome) for scheme, run in runs.items()}, runs, floor)
+
+    @property
+    def survived(self) -> tuple[str, ...]:
+        """One line for each scheme whose test continued despite tolerated faults."""
+        return tuple(lines((f"'{scheme.value}'", run.survived) for scheme, run in self.runs.items()))
+
+    def as_dict(self) -> dict[str, Any]:
+        """Returns the document of ``hdbridge step --json``."""
+        return {
+            "schema": "hdbridge.stepping/1",
+            **{scheme.value: result.as_dict() for scheme, result in self.results.items()},
+            "survived": list(self.survived),
+            "quantisation_floor_arcsec": self.quantisation_floor_arcsec,
+        }
+
+
+def compare_schemes(
+    drive: Drive | Rig,
+    model: TransmissionModel,
+    schemes: Sequence[Scheme],
+    stepping: Stepping,
+    *,
+    progress: Callable[[Scheme, float], None] = lambda *_: None,
+    interrupted: Callable[[], bool] = lambda: False,
+    finished: Callable[[Scheme, Run[SteppingOutcome]], None] = lambda *_: None,
+    stopped: Callable[[Scheme, Record], None] = lambda *_: None,
+) -> Comparison:
+    """Runs the stepping test under each scheme on a booted drive, which is enabled for each and disabled
+    after it.
+
+    ``progress`` receives the completed share of the present scheme, ``finished`` each completed run, and
+    ``stopped`` the measurements of an interrupted one, so that nothing measured is lost.
+    """
+    drive.axis.require_load_encoder()
+    # All of them first, so that an impossible compensation is refused before anything moves.
+    compensations = {scheme: compensation_for(drive.axis, scheme.of(model)) for scheme in schemes}
+    runs: dict[Scheme, Run[SteppingOutcome]] = {}
+    for scheme, compensation in compensations.items():
+        bench = bench_on(drive, compensation, interrupted=interrupted)
+        try:
+            runs[scheme] = bench.run(stepping, partial(progress, scheme))
+        except BaseException:
+            if len(record := bench.record()):
+                stopped(scheme, record)
+            raise
+        finished(scheme, runs[scheme])
+    return Comparison.of(drive.axis, runs)

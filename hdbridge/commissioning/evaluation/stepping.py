@@ -1,0 +1,106 @@
+"""Figures of a stepping test: scatter and mean per direction and pooled, and the quantisation floor."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import Enum
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from hdbridge.units import ARCSEC_PER_DEG, DEG_PER_TURN
+
+if TYPE_CHECKING:
+    from hdbridge.axis.model import TransmissionModel
+    from hdbridge.motion.procedures.stepping import SteppingOutcome
+
+
+class Scheme(Enum):
+    """Parts of the model that the compensation uses."""
+
+    NONE = "none"
+    SYNCHRONOUS = "synchronous"
+    HYSTERESIS = "hysteresis"
+    BOTH = "both"
+    EXTENDED = "extended"
+
+    def of(self, model: TransmissionModel) -> TransmissionModel:
+        """Returns the model with only this scheme's effects."""
+        match self:
+            case Scheme.NONE:
+                return model.only(())
+            case Scheme.SYNCHRONOUS | Scheme.HYSTERESIS:
+                return model.only((self.value,))
+            case Scheme.BOTH:
+                return model.only(("synchronous", "hysteresis"))
+            case Scheme.EXTENDED:
+                return model
+
+    @staticmethod
+    def offered_by(model: TransmissionModel) -> tuple[Scheme, ...]:
+        """Returns the article's four schemes, and `EXTENDED` if the model has more than the two
+        basic parts.
+        """
+        four = (Scheme.NONE, Scheme.SYNCHRONOUS, Scheme.HYSTERESIS, Scheme.BOTH)
+        more = any(each.name not in {"synchronous", "hysteresis"} for each in model.effects)
+        return (*four, Scheme.EXTENDED) if more else four
+
+
+@dataclass(frozen=True, slots=True)
+class Scatter:
+    """Three standard deviations and the mean of a set of errors at rest, arcsec."""
+
+    three_sigma_arcsec: float
+    mean_arcsec: float
+
+    @classmethod
+    def of(cls, errors_arcsec: Sequence[float]) -> Scatter:
+        """Uses the population standard deviation, as is usual for 3 sigma in the literature."""
+        errors = np.asarray(errors_arcsec)
+        return cls(3.0 * float(np.std(errors)), float(np.mean(errors)))
+
+
+@dataclass(frozen=True, slots=True)
+class SchemeResult:
+    """Stepping test of one scheme."""
+
+    cw: Scatter
+    ccw: Scatter
+    pooled: Scatter
+    outcome: SteppingOutcome
+
+    @classmethod
+    def of(cls, outcome: SteppingOutcome) -> SchemeResult:
+        """Computes the statistics per direction, and of both directions together."""
+        cw = [each.error_arcsec for each in outcome.cw]
+        ccw = [each.error_arcsec for each in outcome.ccw]
+        return cls(Scatter.of(cw), Scatter.of(ccw), Scatter.of(cw + ccw), outcome)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Returns the part of ``hdbridge step --json``; ``steps`` has each step's target and
+        error, in order.
+        """
+        scatter = {
+            name: {"three_sigma_arcsec": part.three_sigma_arcsec, "mean_arcsec": part.mean_arcsec}
+            for name, part in (("cw", self.cw), ("ccw", self.ccw), ("pooled", self.pooled))
+        }
+        steps = {
+            name: {
+                "target_deg": [each.target_deg for each in stands],
+                "error_arcsec": [each.error_arcsec for each in stands],
+            }
+            for name, stands in (("cw", self.outcome.cw), ("ccw", self.outcome.ccw))
+        }
+        return {**scatter, "steps": steps}
+
+
+def quantisation_floor_arcsec(motor_counts_per_turn: float, ratio: float) -> float:
+    """Returns three sigma at the load of a motor target rounded to whole counts: a uniform error of one
+    count.
+
+    No compensation by motor targets can be more accurate, however good its model.
+    """
+    count = DEG_PER_TURN * ARCSEC_PER_DEG / (motor_counts_per_turn * ratio)
+    return 3.0 * count / math.sqrt(12.0)

@@ -1,0 +1,30 @@
+"""Improvement: diagnosis, extension and trial of a model on a drive.
+
+    diagnose     a recording, measured by a plan or given, against the active model
+    further      the shortest experiment of the axis that separates the remaining alternatives
+    extension    the extended model, without unpredictable effects
+    trial        stepping with the active and the extended model, in turns
+    improve      all steps, up to a pending model
+
+Drive and dates are passed in; nothing here depends on whether the drive is simulated.
+"""
+
+from hdbridge.commissioning.improvement.extension import Extension, extension_of
+from hdbridge.commissioning.improvement.further import Choice, choose, untold
+from hdbridge.commissioning.improvement.improve import Source, improve
+from hdbridge.commissioning.improvement.result import Improvement, Round
+from hdbridge.commissioning.improvement.trial import Trial, try_out
+
+__all__ = [
+    "Choice",
+    "Extension",
+    "Improvement",
+    "Round",
+    "Source",
+    "Trial",
+    "choose",
+    "extension_of",
+    "improve",
+    "try_out",
+    "untold",
+]

@@ -1,0 +1,119 @@
+"""Selection of the findings that enter the proposed model, and of the causes that they must be separated
+from.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from hdbridge.analysis.findings import Diagnosis, Finding
+from hdbridge.analysis.gain import Gain
+from hdbridge.axis.effects import CATALOGUE, Channel, Effect, Wear
+from hdbridge.axis.model import TransmissionModel
+from hdbridge.units import DEG_PER_TURN
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Extension:
+    """Extended model, and the findings that the compensation corrects."""
+
+    model: TransmissionModel
+    carried: tuple[Finding, ...]
+    """Findings that the compensation corrects."""
+    left: tuple[str, ...]
+    """Findings that are not compensated, each with the reason."""
+
+    refused: tuple[str, ...] = ()
+    """Changes within the model that must not be offered, with the reason; they cannot be removed from it."""
+
+    @property
+    def improves(self) -> bool:
+        """True if every change of the model improves held-out data."""
+        return bool(self.carried) and not self.refused
+
+    def gains(self) -> list[tuple[str, Gain]]:
+        """Returns the held-out gain of each compensated finding, by cause."""
+        return [(each.cause, each.gain) for each in self.carried if each.gain is not None]
+
+
+def extension_of(
+    diagnosis: Diagnosis, active: TransmissionModel, rivals: Mapping[str, Sequence[str]] | None = None
+) -> Extension:
+    """Returns the diagnosis's extended model without effects bound to the time of its record.
+
+    A lost count or the phase of a vibration has no predictive value. Repeatable effects that are not
+    compensated (orders of the load of unknown origin) stay in the model, where the user can state their
+    origin. Wear continues from the turns that the motor has run by the end of the record. Findings without a
+    gain on held-out data, or that may be nothing (`Finding.refusal`), are left out.
+
+    ``rivals`` are the causes from which each has not been separated (`further.untold`). If one of them must
+    not be compensated, the finding is left out too, because it may be that one.
+    """
+    known = {each.name for each in active.effects}
+    reasons = {id(each): _why_not(each, (rivals or {}).get(each.cause, ())) for each in diagnosis.findings}
+    carried = tuple(each for each in diagnosis.findings if not reasons[id(each)])
+    names = {each.cause for each in carried}
+    refused = tuple(
+        f"{each.cause}: {each.refusal()}" for each in diagnosis.findings if each.within and each.refusal()
+    )
+    doubtful = {
+        each.cause
+        for each in diagnosis.findings
+        if each.effect is not None and (each.effect.is_compensable() or each.refusal())
+    } - names
+    turns = _turns_run(diagnosis)
+    kept = tuple(
+        each.after(turns) if isinstance(each, Wear) else each
+        for each in diagnosis.model.effects
+        if each.name in known or not (_of_its_time(each) or each.name in doubtful)
+    )
+    uncertainty = {
+        name: widths
+        for name, widths in diagnosis.model.uncertainty.items()
+        if name in {each.name for each in kept}
+    }
+    left = tuple(dict.fromkeys(each for each in reasons.values() if each))
+    model = replace(diagnosis.model, effects=kept, uncertainty=uncertainty)
+    return Extension(model, carried, left, refused)
+
+
+def named(findings: Sequence[Finding]) -> str:
+    """Lists causes with their alternatives and probabilities, as text."""
+    return ", ".join(f"{alternatives(each)} {each.probability:.2f}" for each in findings)
+
+
+def alternatives(finding: Finding) -> str:
+    """Returns a cause with its alternatives, as text."""
+    return " or ".join((finding.cause, *finding.aliases))
+
+
+def _turns_run(diagnosis: Diagnosis) -> float:
+    """Returns the motor turns of the record."""
+    return float(np.sum(np.abs(np.diff(diagnosis.traces.motion.motor_deg)))) / DEG_PER_TURN
+
+
+def _of_its_time(effect: Effect) -> bool:
+    return Channel.TIME in effect.needs() and not effect.is_compensable()
+
+
+def _why_not(finding: Finding, rivals: Sequence[str]) -> str:
+    """Returns the reason why the compensation does not correct a finding; empty if it does."""
+    if finding.cause == "unexplained":
+        return (
+            f"unexplained, depends on the {finding.lives_in or 'time'}: no law of the catalogue to compensate"
+        )
+    if refused := finding.refusal():
+        return f"{finding.cause} is not offered: {refused}"
+    # A change of an existing part of the model needs no effect of its own.
+    if finding.effect is not None and not finding.effect.is_compensable():
+        return f"{finding.cause} is not compensated: {CATALOGUE[finding.cause].compensable.why}"
+    for rival in rivals:
+        if not CATALOGUE[rival].compensable.possible:
+            return (
+                f"{finding.cause} is not compensated: not yet distinguished from {rival}, which must not "
+                f"be: {CATALOGUE[rival].compensable.why}"
+            )
+    return ""

@@ -1,0 +1,128 @@
+"""Further experiments of the axis that separate what a diagnosis leaves open."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from hdbridge.analysis.findings import Diagnosis
+from hdbridge.analysis.identifiability import plan_report
+from hdbridge.axis.model import TransmissionModel
+from hdbridge.commissioning.improvement.experiments import machine_for_unexplained, machine_plans
+from hdbridge.commissioning.improvement.extension import alternatives
+from hdbridge.motion.procedures.moves import AxisView
+from hdbridge.motion.procedures.plan import Plan
+from hdbridge.motion.procedures.rehearsal import rehearse
+
+
+@dataclass(frozen=True, slots=True)
+class Choice:
+    """An experiment that is worth its time."""
+
+    plan: Plan
+    duration_s: float
+    """Duration on an ideal axis."""
+    tells: tuple[str, ...]
+    """Alternatives that it is predicted to separate, as text."""
+
+    def as_dict(self) -> dict[str, Any]:
+        """Returns the choice as data."""
+        return {
+            "experiment": self.plan.name,
+            "about": self.plan.about,
+            "duration_s": self.duration_s,
+            "tells": list(self.tells),
+        }
+
+
+def untold(
+    diagnosis: Diagnosis, model: TransmissionModel, view: AxisView, plans: Sequence[Plan] = ()
+) -> dict[str, tuple[str, ...]]:
+    """Returns for each cause found the other causes from which it has not been separated.
+
+    These are its aliases in the diagnosis, and those that none of the ``plans`` used for measuring can
+    separate from it: on a short travel a load order is a ramp, and one of the two always fits slightly
+    better.
+    """
+    reports = [plan_report(each, model, view.limits)["identifiability"] for each in plans]
+    rivals: dict[str, tuple[str, ...]] = {}
+    for finding in diagnosis.findings:
+        one = finding.cause
+        found = [*rivals.get(one, ()), *finding.aliases]
+        for other in reports[0][one]["aliases"] if reports and one in reports[0] else ():
+            if reports[0][other]["detectable"] and not any(
+                _separates(each, one, other, finding.peak_arcsec) for each in reports
+            ):
+                found.append(other)
+        if found:
+            rivals[one] = tuple(dict.fromkeys(found))
+    return rivals
+
+
+def choose(
+    diagnosis: Diagnosis,
+    rivals: Mapping[str, Sequence[str]],
+    model: TransmissionModel,
+    view: AxisView,
+    done: Collection[str] = (),
+) -> Choice | None:
+    """Returns the experiment, not ``done`` yet, predicted to separate most causes from their ``rivals``; of
+    several, the shortest.
+
+    If none does but something is unexplained: the experiment that investigates the coordinate it depends on.
+    None if the axis cannot learn more on its own.
+    """
+    menu = sorted(
+        ((_duration_s(plan, view), plan) for name, plan in machine_plans().items() if name not in done),
+        key=lambda each: each[0],
+    )
+    pairs = [
+        (each.cause, other, each.peak_arcsec)
+        for each in diagnosis.findings
+        for other in rivals.get(each.cause, ())
+    ]
+    best: Choice | None = None
+    for duration_s, plan in menu if pairs else ():
+        report = plan_report(plan, model, view.limits)["identifiability"]
+        told = dict.fromkeys(
+            f"{one} or {other}" for one, other, peak in pairs if _separates(report, one, other, peak)
+        )
+        if len(told) > (len(best.tells) if best else 0):
+            best = Choice(plan, duration_s, tuple(told))
+        if len(told) == len(pairs):
+            break
+    if best:
+        return best
+    for finding in diagnosis.findings:
+        if finding.cause == "unexplained":
+            name = machine_for_unexplained(finding.lives_in)
+            for duration_s, plan in menu:
+                if plan.name == name:
+                    return Choice(plan, duration_s, (f"what depends on the {finding.lives_in or 'time'}",))
+    return None
+
+
+def advice(diagnosis: Diagnosis) -> tuple[str, ...]:
+    """Returns advice to the user for each open question."""
+    return tuple(
+        dict.fromkeys(
+            f"{alternatives(each)}: {each.experiment}"
+            for each in diagnosis.findings
+            if each.experiment and (each.aliases or each.cause == "unexplained")
+        )
+    )
+
+
+def _separates(report: dict[str, Any], one: str, other: str, peak_arcsec: float) -> bool:
+    """Returns True if the plan alone would detect the cause at its size and not confuse it with the other."""
+    seen = report[one]
+    limit = seen["detection_limit_arcsec"]
+    if not seen["detectable"] or limit is None or limit > peak_arcsec:
+        return False
+    return other not in seen["aliases"] and one not in report[other]["aliases"]
+
+
+def _duration_s(plan: Plan, view: AxisView) -> float:
+    middle = 0.5 * (view.limits.position_min_deg + view.limits.position_max_deg)
+    return sum(rehearse(each.procedure, view, middle).duration_s for each in plan.tasks(view).tasks)

@@ -1,0 +1,267 @@
+"""Complete workflow, from a booted drive to a pending model that improves positioning."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+from hdbridge.analysis.diagnosis import diagnose
+from hdbridge.analysis.findings import Diagnosis
+from hdbridge.axis import AxisConfig
+from hdbridge.axis.model import TransmissionModel
+from hdbridge.commissioning.calibration.identification import provenance, with_provenance
+from hdbridge.commissioning.calibration.journal import Journal, survived_in, tasks_of
+from hdbridge.commissioning.calibration.measure import measure, start_journal
+from hdbridge.commissioning.calibration.pipeline import ACTIVE_NAME, MODEL_NAME, proposed
+from hdbridge.commissioning.calibration.result import Offer
+from hdbridge.commissioning.calibration.validation import floor_of
+from hdbridge.commissioning.improvement.extension import alternatives, extension_of, named
+from hdbridge.commissioning.improvement.further import advice, choose, untold
+from hdbridge.commissioning.improvement.result import Improvement, Round
+from hdbridge.commissioning.improvement.trial import Trial, try_out
+from hdbridge.control.bench import axis_view
+from hdbridge.control.caps import cap_remark
+from hdbridge.control.realtime import left_realtime
+from hdbridge.control.rig import Rig
+from hdbridge.drive.drive import Drive
+from hdbridge.errors import InputError
+from hdbridge.files.atomic import write_atomically
+from hdbridge.files.outputs import writing
+from hdbridge.motion.procedures.plan import Plan
+from hdbridge.records.recording import ABOUT_NAME, Recording
+
+RESULT_NAME = "improvement.json"
+Progress = Callable[[str, float, float], None]
+
+
+@dataclass(frozen=True, slots=True)
+class Source:
+    """Data for the diagnosis: a plan to be run (its journal), or existing recordings."""
+
+    plan: Plan
+    """Plan whose stepping test the trial uses, also for given recordings."""
+    folder: Path
+    """Folder for everything new."""
+    journal: Journal | None = None
+    given: Mapping[Path, Recording] = field(default_factory=dict)
+    independent_zeros: bool = False
+    """True if the encoders' zeros were lost between the given recordings."""
+
+
+@left_realtime()  # a fit takes time; a bench returns to real time for each motion
+def improve(
+    drive: Drive | Rig,
+    source: Source,
+    profile: Path,
+    active: TransmissionModel,
+    date: datetime,
+    *,
+    rounds: int = 0,
+    progress: Progress = lambda *_: None,
+    interrupted: Callable[[], bool] = lambda: False,
+    tell: Callable[[str], None] = lambda _: None,
+) -> Improvement:
+    """Diagnoses, extends, steps with both models, and proposes the better one to the profile.
+
+    ``profile`` is the folder of axis.yaml, ``active`` its model; ``tell`` receives a line for each step. The
+    axis runs up to ``rounds`` further experiments while causes remain to be separated. Nothing is proposed if
+    nothing is found, if nothing found can be compensated, or if the model does not gain on held-out data and
+    in stepping. Raises `InputError` if model or recordings belong to another axis or drive.
+    """
+    active.check_bound_to(drive.axis, drive.identity)
+    drive.axis.require_load_encoder()
+    bench = _Bench(drive, date, progress, interrupted)
+    earlier = source.journal is None or bool(source.journal.done)  # measured before the drive was booted
+    recordings, apart = _begin(source, bench)
+    tell("diagnosing")
+    diagnosis = diagnose(recordings, active, independent_zeros=apart)
+    view = axis_view(drive.axis)
+    plans = _plans_of(source, recordings.values())
+    rivals = untold(diagnosis, active, view, plans)
+    found: list[Round] = []
+    while len(found) < rounds:
+        folder = source.folder / f"round-{len(found) + 1}"
+        journal, tells = _journal(folder, bench, diagnosis, rivals, active, plans)
+        if journal is None:
+            break
+        tell(diagnosis.verdict())
+        tell(f"round {len(found) + 1}: {journal.plan.about}, to tell {', '.join(tells) or 'more'}")
+        apart = bench.run(journal) or apart or earlier
+        recordings[folder] = journal.recording()
+        diagnosis = diagnose(recordings, active, independent_zeros=apart)
+        plans.append(journal.plan)
+        rivals = untold(diagnosis, active, view, plans)
+        left = tuple(map(alternatives, diagnosis.findings))
+        found.append(Round(journal.plan.name, journal.plan.about, str(folder), tells, left))
+    result = Improvement(
+        axis=drive.axis.name,
+        recordings=tuple(map(str, recordings)),
+        date=next(iter(recordings.values())).date,
+        plan=source.plan.name,
+        active=active,
+        diagnosis=diagnosis,
+        extension=extension_of(diagnosis, active, rivals),
+        untold=rivals,
+        rounds=tuple(found),
+        further=choose(diagnosis, rivals, active, view, [each.name for each in plans]),
+        advice=advice(diagnosis),
+        trial=None,
+        offer=Offer(False, "nothing found: the active model stays"),
+        survived=survived_in(list(recordings)),
+    )
+    if diagnosis.findings:
+        whole = Recording.joined(list(recordings.values()))
+        result = _concluded(result, bench, source, profile, whole, tell)
+    return _kept(source.folder, result)
+
+
+@dataclass(frozen=True, slots=True)
+class _Bench:
+    """Common settings of all measurements here."""
+
+    drive: Drive | Rig
+    date: datetime
+    progress: Progress
+    interrupted: Callable[[], bool]
+
+    def run(self, journal: Journal) -> bool:
+        """Measures what is missing; returns True if an encoder may have lost its zero between tasks."""
+        measure(self.drive, journal, progress=self.progress, interrupted=self.interrupted)
+        return len({each.session for each in tasks_of(journal.recording())}) > 1
+
+
+def _begin(source: Source, bench: _Bench) -> tuple[dict[Path, Recording], bool]:
+    """Returns the recordings to diagnose first, and True if an encoder may have lost its zero
+    between them.
+    """
+    if source.journal is not None:
+        apart = bench.run(source.journal)
+        return {source.journal.folder: source.journal.recording()}, apart
+    for path, recording in source.given.items():
+        _check_is_of(recording, bench.drive.axis, path)
+    return dict(source.given), source.independent_zeros
+
+
+def _plans_of(source: Source, given: Iterable[Recording]) -> list[Plan]:
+    """Returns the plans used for measuring, as far as they are known."""
+    if source.journal is not None:
+        return [source.journal.plan]
+    return [Plan.model_validate(each.notes["plan"]) for each in given if "plan" in each.notes]
+
+
+def _check_is_of(recording: Recording, axis: AxisConfig, path: Path) -> None:
+    for what, theirs, ours in (
+        ("axis", recording.axis, axis.name),
+        ("gear ratio", recording.ratio, axis.gear.ratio),
+    ):
+        if theirs is not None and theirs != ours:
+            raise InputError(
+                f"{path}: this recording is of {what} {theirs}, but here is {ours} ({axis.path}); "
+                "improve the axis that it was measured on"
+            )
+
+
+def _journal(
+    folder: Path,
+    bench: _Bench,
+    diagnosis: Diagnosis,
+    rivals: Mapping[str, Sequence[str]],
+    active: TransmissionModel,
+    plans: Sequence[Plan],
+) -> tuple[Journal | None, tuple[str, ...]]:
+    """Returns the journal of the next experiment: one begun earlier, or the most useful one now."""
+    axis = bench.drive.axis
+    if (folder / ABOUT_NAME).exists():
+        journal = Journal.open(folder)
+        journal.check_is_of(axis, bench.drive.identity)
+        return journal, ()
+    choice = choose(diagnosis, rivals, active, axis_view(axis), [each.name for each in plans])
+    if choice is None:
+        return None, ()
+    return start_journal(folder, axis, choice.plan, bench.date, bench.drive.identity), choice.tells
+
+
+def _concluded(
+    result: Improvement,
+    bench: _Bench,
+    source: Source,
+    profile: Path,
+    recording: Recording,
+    tell: Callable[[str], None],
+) -> Improvement:
+    """Adds the trial, if it is worth its time, and the offer."""
+    extension, drive = result.extension, bench.drive
+    if not extension.carried:
+        return replace(result, offer=Offer(False, f"nothing proposed: {'; '.join(extension.left)}"))
+    if not extension.improves:
+        return replace(result, offer=Offer(False, f"not offered: {'; '.join(extension.refused)}"))
+    model = with_provenance(extension.model, _provenance(result, recording))
+    if remark := cap_remark(drive.axis, model):
+        tell(remark)
+    tell("stepping with the active and with the extended model, in turns")
+    floor = floor_of(drive.axis, recording)
+    try:
+        trial = try_out(
+            drive,
+            source.plan,
+            result.active,
+            model,
+            floor,
+            source.folder,
+            progress=bench.progress,
+            interrupted=bench.interrupted,
+        )
+    except InputError as problem:
+        return replace(result, offer=Offer(False, f"not offered: {problem}"))
+    result = replace(result, trial=trial)
+    told = _told(trial)
+    if not trial.improves:
+        return replace(result, offer=Offer(False, f"not offered: the axis does not point better, {told}"))
+    reason = f"improvement {source.folder.name}: {named(extension.carried)}; {told}"
+    return replace(result, offer=proposed(profile, model, reason, bench.date, drive))
+
+
+def _told(trial: Trial) -> str:
+    big = [each.pooled.three_sigma_arcsec for each in (trial.stepping.before, trial.stepping.after)]
+    small = [each.pooled.three_sigma_arcsec for each in trial.small]
+    figures = (
+        f"stepping 3 sigma {big[0]:.2f} to {big[1]:.2f} arcsec",
+        f"small steps {small[0]:.2f} to {small[1]:.2f}",
+        *trial.worse,
+    )
+    return ", ".join(figures)
+
+
+def _provenance(result: Improvement, recording: Recording) -> dict[str, Any]:
+    cause, gain = result.extension.gains()[0]
+    held_out = gain.as_dict() | {"over": f"{gain.over} left out of the fit, without and with {cause}"}
+    found = [
+        {"cause": each.cause, "probability": round(each.probability, 3), "aliases": list(each.aliases)}
+        | (
+            {
+                "held_out_before_arcsec": each.gain.before_arcsec,
+                "held_out_after_arcsec": each.gain.after_arcsec,
+            }
+            if each.gain
+            else {}
+        )
+        | ({"not_offered": refused} if (refused := each.refusal()) else {})
+        for each in result.diagnosis.findings
+    ]
+    return {**provenance(result.recordings, [recording], held_out), "found": found}
+
+
+def _kept(folder: Path, result: Improvement) -> Improvement:
+    """Saves result and models next to the recording, unless nothing new was measured."""
+    if folder.is_dir() and any(folder.iterdir()):
+        with writing():
+            if result.diagnosis.findings:
+                result.extension.model.save(folder / MODEL_NAME)
+            result.active.save(folder / ACTIVE_NAME)
+            text = json.dumps(result.as_dict(), indent=1, allow_nan=False)
+            write_atomically(folder / RESULT_NAME, text + "\n")
+    return result

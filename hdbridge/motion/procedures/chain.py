@@ -1,0 +1,40 @@
+"""Sequence of procedures as one, optionally with limited acceleration."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+from hdbridge.motion.procedures.moves import AxisView, Move, MoveTo, Procedure, Sample, Steps
+
+
+@dataclass(frozen=True, slots=True)
+class Chain:
+    """Procedures run one after the other; the outcome is the last one's.
+
+    ``acceleration_deg_s2`` (at the load) limits every move. Acceleration winds the gear's spring up, and a
+    calibration measures the gear without that.
+    """
+
+    parts: tuple[Procedure[object], ...]
+    acceleration_deg_s2: float | None = None
+
+    def moves(self, axis: AxisView) -> Steps[object]:
+        """Yields the moves of each procedure."""
+        outcome: object = None
+        for part in self.parts:
+            steps = part.moves(axis)
+            reply: Sequence[Sample] | None = None
+            while True:
+                try:
+                    move = next(steps) if reply is None else steps.send(reply)
+                except StopIteration as end:
+                    outcome = end.value
+                    break
+                reply = yield self._gently(move)
+        return outcome
+
+    def _gently(self, move: Move) -> Move:
+        if self.acceleration_deg_s2 is None or not isinstance(move, MoveTo):
+            return move
+        return replace(move, acceleration_deg_s2=self.acceleration_deg_s2)

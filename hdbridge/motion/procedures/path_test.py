@@ -1,0 +1,73 @@
+"""Path test: moves at the axis's limits, there and back, and a sine; each with the rest that follows."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from hdbridge.motion.procedures.moves import AxisView, Dwell, MoveTo, Sample, Sine, Steps
+from hdbridge.units import DEG_PER_TURN
+
+PRECONDITION_TURNS = 2.0
+"""Motor turns before each path, in its direction: more than the gear's hysteresis is wide, so that every path
+begins in the same state of the gear.
+"""
+SHORT_TURNS = 1.5
+"""Motor turns of the short moves."""
+EVEN_S = 0.3
+"""Time at the speed limit in the long moves."""
+SINE_HZ = 0.5
+SINE_PERIODS = 3
+SINE_SPEED = 0.4
+"""Highest speed of the sine, as a share of the limit."""
+REST_S = 0.8
+KIND = "path"
+
+
+@dataclass(frozen=True, slots=True)
+class PathRun:
+    """One path: its samples, and those of the rest after it."""
+
+    name: str
+    samples: tuple[Sample, ...]
+    rest: tuple[Sample, ...]
+    skipped: int = 0
+    """Samples at the beginning that are not judged."""
+
+
+@dataclass(frozen=True, slots=True)
+class PathTest:
+    """A long and a short move there and back, and a sine, about the middle of the travel."""
+
+    def moves(self, axis: AxisView) -> Steps[tuple[PathRun, ...]]:
+        """Each path after a run-up in its own direction."""
+        limits = axis.limits
+        travel_deg = limits.position_max_deg - limits.position_min_deg
+        middle = limits.position_min_deg + 0.5 * travel_deg
+        run_up_deg = min(PRECONDITION_TURNS * DEG_PER_TURN / axis.ratio, 0.1 * travel_deg)
+        room_deg = 0.98 * travel_deg - 2.0 * run_up_deg
+        ramp_s = limits.velocity_deg_s / limits.acceleration_deg_s2
+        ramp_s += limits.acceleration_deg_s2 / limits.jerk_deg_s3
+        far_deg = min(limits.velocity_deg_s * (ramp_s + EVEN_S), room_deg)
+        short_deg = min(SHORT_TURNS * DEG_PER_TURN / axis.ratio, far_deg)
+        runs: list[PathRun] = []
+        for name, distance_deg in (("long move", far_deg), ("short move", short_deg)):
+            for sign in (1.0, -1.0):
+                begin, end = middle - sign * 0.5 * distance_deg, middle + sign * 0.5 * distance_deg
+                yield MoveTo(begin - sign * run_up_deg, kind="precondition")
+                yield MoveTo(begin, kind="precondition")
+                yield Dwell(REST_S, kind="precondition")
+                samples = yield MoveTo(end, kind=KIND)
+                rest = yield Dwell(REST_S, kind=KIND)
+                runs.append(PathRun(f"{name} {'forward' if sign > 0.0 else 'back'}", (*samples,), (*rest,)))
+        omega = math.tau * SINE_HZ
+        speed = min(SINE_SPEED * limits.velocity_deg_s, limits.acceleration_deg_s2 / omega)
+        amplitude_deg = min(speed / omega, 0.5 * room_deg)
+        yield MoveTo(middle + amplitude_deg - run_up_deg, kind="precondition")
+        yield MoveTo(middle + amplitude_deg, kind="precondition")
+        yield Dwell(REST_S, kind="precondition")
+        samples = yield Sine(middle, amplitude_deg, SINE_HZ, SINE_PERIODS, kind=KIND)
+        rest = yield Dwell(REST_S, kind=KIND)
+        # A sine begins with a step of the acceleration.
+        runs.append(PathRun("sine", (*samples,), (*rest,), len(samples) // SINE_PERIODS))
+        return tuple(runs)

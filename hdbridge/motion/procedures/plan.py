@@ -1,0 +1,335 @@
+"""Plans: the procedures of a calibration, as data.
+
+A plan uses units that suit every axis (load turns, motor degrees, motor turns per second). `Plan.tasks`
+adapts it to the ratio, permitted travel and speed of one axis, and reports what had to be shortened.
+
+Every task starts at the plan's reference pose, approached by a pre-conditioning move. The elastic state is
+thus known wherever a recording is interrupted and resumed, and the recurring pose shows drift.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self
+
+from pydantic import Discriminator, Field, Tag, model_validator
+
+from hdbridge.errors import InputError
+from hdbridge.files.bundled import bundled_folder
+from hdbridge.files.expectation import nearest
+from hdbridge.files.yamlfile import read_yaml, wrong
+from hdbridge.motion.procedures.chain import Chain
+from hdbridge.motion.procedures.moves import AxisView, Procedure
+from hdbridge.motion.procedures.positioning import Positioning, targets
+from hdbridge.motion.procedures.reversals import Reversals
+from hdbridge.motion.procedures.sine import Sines
+from hdbridge.motion.procedures.standstill import Precondition, Reference, Standstill
+from hdbridge.motion.procedures.stepping import Stepping
+from hdbridge.motion.procedures.sweep import Sweep
+from hdbridge.strictness import Strict
+from hdbridge.units import DEG_PER_TURN
+
+SPEED_SHARE = 0.95
+"""Maximum share of the axis's velocity limit that a plan uses."""
+SMALLEST_TRAVEL_DEG = 90.0
+"""Minimum travel on either side of the middle, motor degrees, below which no procedure is useful."""
+
+
+class StandstillEntry(Strict):
+    """Standstill at the reference pose: noise of the encoders."""
+
+    procedure: Literal["standstill"] = Field(description="stand at the reference pose")
+    duration_s: float = Field(5.0, ge=0.5, le=36_000, description="for so long")
+
+    def fitted(self, room: Room, name: str) -> Iterator[Procedure[object]]:
+        """Yields the procedure unchanged."""
+        yield Standstill(room.pose_deg, self.duration_s)
+
+
+class SweepEntry(Strict):
+    """Constant speed in both directions: the synchronous part, load orders, the height of the loop."""
+
+    procedure: Literal["sweep"] = Field(description="both ways at constant speed, about the middle")
+    load_turns: float | None = Field(
+        None, gt=0, le=100, description="turns of the load, or the whole permitted travel if that is less"
+    )
+    motor_turns: float | None = Field(None, gt=0, le=100_000, description="instead: turns of the motor")
+    motor_turns_per_s: float = Field(1.0, gt=0, le=100, description="speed of the motor")
+    laps: int = Field(1, ge=1, le=1000, description="how often there and back")
+
+    @model_validator(mode="after")
+    def _one_length(self) -> Self:
+        if (self.load_turns is None) == (self.motor_turns is None):
+            raise wrong("expected one of load_turns and motor_turns", "procedure")
+        return self
+
+    def fitted(self, room: Room, name: str) -> Iterator[Procedure[object]]:
+        """Yields the sweep, shortened to the permitted travel and slowed to the permitted speed."""
+        turns = self.load_turns if self.load_turns is not None else (self.motor_turns or 0.0) / room.ratio
+        half = room.half(name, "the sweep", 0.5 * turns * DEG_PER_TURN)
+        speed = room.speed(name, self.motor_turns_per_s * DEG_PER_TURN)
+        yield Sweep(room.middle_deg - half, room.middle_deg + half, speed, self.laps)
+
+
+class SinesEntry(Strict):
+    """Slow sines of several amplitudes, some smaller than the width of the hysteresis."""
+
+    procedure: Literal["sines"] = Field(description="slow sines about the reference pose")
+    amplitudes_deg: tuple[Annotated[float, Field(gt=0, le=36_000)], ...] = Field(
+        (180.0, 45.0, 5.0), min_length=1, max_length=100, description="amplitudes at the motor"
+    )
+    frequency_hz: float = Field(0.05, gt=0, le=10, description="frequency")
+    periods: float = Field(2.0, ge=0.5, le=1000, description="periods of each")
+
+    def fitted(self, room: Room, name: str) -> Iterator[Procedure[object]]:
+        """Yields the sines, with amplitudes shortened to the travel and the frequency lowered to the
+        permitted speed.
+        """
+        amplitudes = tuple(
+            dict.fromkeys(
+                round(room.half(name, f"the sine of {each:g} deg", each / room.ratio) * room.ratio, 6)
+                for each in self.amplitudes_deg
+            )
+        )
+        top = room.speed(name, math.tau * self.frequency_hz * max(amplitudes)) * room.ratio
+        frequency = min(self.frequency_hz, top / (math.tau * max(amplitudes)))
+        yield Sines(room.middle_deg, amplitudes, frequency, self.periods)
+
+
+class ReversalsEntry(Strict):
+    """Nested reversals: first-order reversal curves."""
+
+    procedure: Literal["reversals"] = Field(description="nested reversals at the reference pose")
+    depths_deg: tuple[Annotated[float, Field(gt=0, le=3600)], ...] = Field(
+        (2.0, 4.0, 8.0, 12.0, 16.0, 24.0), min_length=1, max_length=100, description="depths at the motor"
+    )
+    reach_deg: float = Field(
+        60.0, gt=0, le=3600, description="travel of the motor before each, more than the hysteresis is wide"
+    )
+    motor_deg_per_s: float = Field(10.0, gt=0, le=3600, description="speed of the motor")
+    beyond: bool = Field(
+        False, description="all depths in one curve, each beyond the last turning point: shows memory"
+    )
+
+    def fitted(self, room: Room, name: str) -> Iterator[Procedure[object]]:
+        """Yields the reversals, slowed to the permitted speed, with the reach shortened to the travel."""
+        reach = room.half(name, "the reach of the reversals", self.reach_deg / room.ratio) * room.ratio
+        depths = tuple(each for each in self.depths_deg if each <= reach)
+        yield Reversals(room.middle_deg, depths, reach, room.speed(name, self.motor_deg_per_s), self.beyond)
+
+
+class SteppingEntry(Strict):
+    """Stepping test without compensation."""
+
+    procedure: Literal["stepping"] = Field(description="steps both ways, at rest after each")
+    count: int = Field(30, ge=2, le=100_000, description="steps each way")
+    step_deg: float = Field(43.56, gt=0, le=36_000, description="step at the motor")
+
+    def fitted(self, room: Room, name: str) -> Iterator[Procedure[object]]:
+        """Yields as many steps as the travel permits, about the middle."""
+        yield room.stepping(name, self.count, self.step_deg)
+
+
+PROCEDURES = ("standstill", "sweep", "sines", "reversals", "stepping")
+
+
+class _Context(dict[str, Any]):
+    """Hashable dictionary, because type annotations must be hashable."""
+
+    __hash__ = object.__hash__  # type: ignore[assignment]
+
+
+def _named(entry: Any) -> str | None:
+    """Returns the procedure that an entry names; None if there is none of that name."""
+    name = entry.get("procedure") if isinstance(entry, dict) else getattr(entry, "procedure", None)
+    return name if name in PROCEDURES else None
+
+
+Entry = Annotated[
+    Annotated[StandstillEntry, Tag("standstill")]
+    | Annotated[SweepEntry, Tag("sweep")]
+    | Annotated[SinesEntry, Tag("sines")]
+    | Annotated[ReversalsEntry, Tag("reversals")]
+    | Annotated[SteppingEntry, Tag("stepping")],
+    Discriminator(
+        _named,
+        custom_error_type="hdbridge",
+        custom_error_message="no such procedure; expected one of " + ", ".join(PROCEDURES),
+        custom_error_context=_Context(at=("procedure",)),
+    ),
+]
+
+
+class ValidationEntry(Strict):
+    """Stepping test that judges a new model, with and without it."""
+
+    count: int = Field(120, ge=2, le=100_000, description="steps each way")
+    step_deg: float = Field(43.56, gt=0, le=36_000, description="step at the motor")
+    cycles: int = Field(
+        5,
+        ge=0,
+        le=100,
+        description="approaches of the positioning test (ISO 230-2) from each side; 0: no test",
+    )
+    travel_deg: float = Field(
+        360.0,
+        gt=0,
+        le=36_000,
+        description="travel of the positioning test at the load, if the limits allow it",
+    )
+
+    motion: bool = Field(
+        False, description="measure the response of the axis in motion, and test the compensation with it"
+    )
+
+    @model_validator(mode="after")
+    def _enough(self) -> Self:
+        if self.cycles == 1:
+            raise wrong(
+                "one approach shows no repeatability; expected 0, or at least 2 (the standard: 5)", "cycles"
+            )
+        return self
+
+
+class Plan(Strict):
+    """A plan file."""
+
+    schema_: Literal["hdbridge.plan/1"] = Field(alias="schema", description="kind and version of this file")
+    name: str = Field(
+        pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$", description="name: letters, digits, '.', '_', '-'"
+    )
+    about: str = Field("", description="purpose, in words")
+    precondition_deg: float = Field(
+        100.0,
+        gt=0,
+        le=3600,
+        description="pre-conditioning move at the motor, more than any hysteresis is wide",
+    )
+    reference_s: float = Field(1.5, ge=0.2, le=600, description="how long it stands at the reference pose")
+    acceleration_deg_s2: float = Field(
+        5.0,
+        gt=0,
+        le=1e7,
+        description="acceleration of its moves at the load, if the axis file allows it: gentle, so that the "
+        "load does not wind the gear's spring up",
+    )
+    procedures: tuple[Entry, ...] = Field(min_length=1, max_length=1000, description="procedures, in order")
+    validation: ValidationEntry = Field(
+        default_factory=ValidationEntry, description="the stepping test of the new model"
+    )
+
+    @classmethod
+    def load(cls, name: str) -> Self:
+        """Loads a bundled plan by its name, else a plan file; raises `InputError` with the bundled names."""
+        bundled = bundled_folder("profiles") / "plans"
+        known = sorted(each.stem for each in bundled.glob("*.yaml"))
+        path = bundled / f"{name}.yaml" if name in known else Path(name)
+        if not path.exists():
+            close = nearest(name, known)
+            hint = f"; did you mean '{close}'?" if close else ""
+            raise InputError(
+                f"{name}: no such plan; expected a plan file or one of: {', '.join(known) or 'none'}{hint}"
+            )
+        return read_yaml(path).validate(cls)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Returns plain data that can be validated again."""
+        return self.model_dump(by_alias=True, exclude_none=True, mode="json")
+
+    def tasks(self, axis: AxisView) -> Tasks:
+        """Returns the tasks for one axis; raises `InputError` if its travel is too small for anything."""
+        room = Room(axis, self.precondition_deg)
+        prelude = (
+            Precondition(room.pose_deg, self.precondition_deg / axis.ratio),
+            Reference(room.pose_deg, self.reference_s),
+        )
+        tasks = []
+        for number, entry in enumerate(self.procedures, 1):
+            name = f"{number:02d}-{entry.procedure}"
+            parts: tuple[Procedure[object], ...] = (*prelude, *entry.fitted(room, name))
+            tasks.append(Task(name, Chain(parts, self.acceleration_deg_s2)))
+        tasks.append(Task(f"{len(tasks) + 1:02d}-reference", Chain(prelude, self.acceleration_deg_s2)))
+        return Tasks(tuple(tasks), tuple(room.notes))
+
+    def stepping(self, axis: AxisView) -> Stepping:
+        """Returns the stepping test of the validation for one axis."""
+        room = Room(axis, self.precondition_deg)
+        return room.stepping("validation", self.validation.count, self.validation.step_deg)
+
+    def positioning(self, axis: AxisView) -> Positioning | None:
+        """Returns the positioning test of the validation for one axis; None if the plan has none."""
+        if not self.validation.cycles:
+            return None
+        room = Room(axis, self.precondition_deg)
+        half = room.half("validation", "the positioning test", 0.5 * self.validation.travel_deg)
+        places = targets(room.middle_deg - half, room.middle_deg + half, axis)
+        return Positioning(places, self.validation.cycles, self.precondition_deg / axis.ratio)
+
+
+@dataclass(frozen=True, slots=True)
+class Task:
+    """Procedure of a plan, adapted to an axis."""
+
+    name: str
+    """Number and procedure, usable as a file name."""
+    procedure: Procedure[object]
+
+
+@dataclass(frozen=True, slots=True)
+class Tasks:
+    """A plan adapted to an axis."""
+
+    tasks: tuple[Task, ...]
+    notes: tuple[str, ...]
+    """Descriptions of what had to be shortened or slowed."""
+
+
+class Room:
+    """Permitted travel and speed of an axis for a plan; records every reduction."""
+
+    def __init__(self, axis: AxisView, precondition_deg: float) -> None:
+        limits = axis.limits
+        self.ratio = axis.ratio
+        self.middle_deg = self.pose_deg = 0.5 * (limits.position_min_deg + limits.position_max_deg)
+        self.notes: list[str] = []
+        self._axis = axis
+        self._back_deg = precondition_deg / axis.ratio
+        # On either side: the extra travel of a pre-conditioning move.
+        self._half_deg = 0.5 * (limits.position_max_deg - limits.position_min_deg) - 1.01 * self._back_deg
+        if self._half_deg * axis.ratio < SMALLEST_TRAVEL_DEG:
+            least = 2.0 * (SMALLEST_TRAVEL_DEG / axis.ratio + 1.01 * self._back_deg)
+            raise InputError(
+                f"the axis may only move from {limits.position_min_deg:g} to {limits.position_max_deg:g} deg "
+                f"(limits); a calibration needs at least {least:.3g} deg of the load"
+            )
+
+    def half(self, name: str, what: str, wanted_deg: float) -> float:
+        """Returns half the travel about the middle, load degrees, reduced to the permitted one."""
+        if wanted_deg <= self._half_deg:
+            return wanted_deg
+        self.notes.append(
+            f"{name}: {what} is shortened from {2 * wanted_deg:.4g} to {2 * self._half_deg:.4g} deg of the "
+            "load, the permitted travel"
+        )
+        return self._half_deg
+
+    def speed(self, name: str, motor_deg_s: float) -> float:
+        """Returns a speed at the load, deg/s, reduced to the permitted one."""
+        top = SPEED_SHARE * self._axis.limits.velocity_deg_s
+        wanted = motor_deg_s / self.ratio
+        if wanted > top:
+            self.notes.append(f"{name}: slowed from {wanted:.4g} to {top:.4g} deg/s at the load")
+        return min(wanted, top)
+
+    def stepping(self, name: str, count: int, step_deg: float) -> Stepping:
+        """Returns centred upward steps: ``count`` of them, or as many as the travel permits."""
+        step = step_deg / self.ratio
+        possible = max(int(2.0 * self._half_deg / step), 2)
+        if count > possible:
+            self.notes.append(f"{name}: {possible} steps instead of {count}, the permitted travel")
+        count = min(count, possible)
+        start = self.middle_deg - 0.5 * count * step
+        return Stepping(count, step_deg, start, self._back_deg)

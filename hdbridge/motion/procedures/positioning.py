@@ -1,0 +1,67 @@
+"""Positioning test for machine tools (ISO 230-2): repeated approaches of targets from both sides."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from hdbridge.motion.procedures.moves import AxisView, MoveTo, Sample, Settle, Steps
+from hdbridge.units import ARCSEC_PER_DEG
+
+
+@dataclass(frozen=True, slots=True)
+class Approach:
+    """One approach of a target."""
+
+    target_deg: float
+    forward: bool
+    error_arcsec: float
+    """Load encoder minus target, mean over the settled window."""
+
+
+@dataclass(frozen=True, slots=True)
+class Positioning:
+    """Standard test cycle: up through all targets, past the last, down through all, past the first."""
+
+    targets_deg: tuple[float, ...]
+    """Load angles, ascending."""
+    cycles: int = 5
+    overrun_deg: float = 2.0
+    """Travel beyond the first and the last target, at the load; larger than the width of any hysteresis."""
+    settle: Settle = Settle()
+
+    def moves(self, axis: AxisView) -> Steps[tuple[Approach, ...]]:
+        """Yields a jerk-limited move and a settle for each approach."""
+        found: list[Approach] = []
+        yield MoveTo(self.targets_deg[0] - self.overrun_deg, kind="precondition")
+        for _ in range(self.cycles):
+            for upwards in (True, False):
+                for target in self.targets_deg if upwards else reversed(self.targets_deg):
+                    yield MoveTo(target, kind="step")
+                    samples = yield self.settle
+                    found.append(Approach(target, upwards, self._error(target, samples)))
+                beyond = self.overrun_deg if upwards else -self.overrun_deg
+                yield MoveTo(self.targets_deg[-1 if upwards else 0] + beyond, kind="precondition")
+        return tuple(found)
+
+    def _error(self, target_deg: float, samples: Sequence[Sample]) -> float:
+        window = self.settle.window(samples)
+        return sum(each.load_position_deg - target_deg for each in window) / len(window) * ARCSEC_PER_DEG
+
+
+def targets(low_deg: float, high_deg: float, axis: AxisView) -> tuple[float, ...]:
+    """Returns as many targets over a travel as ISO 230-2 requires of a rotary axis (at least 3, 5 or 8).
+
+    Within their spacing they are distributed over the motor turn by the golden ratio, so that an error that
+    repeats with the motor turn is sampled at different phases.
+    """
+    travel = high_deg - low_deg
+    count = 3 if travel <= 90.0 else 5 if travel <= 180.0 else 8
+    turn = 360.0 / axis.ratio
+    places = []
+    for index in range(count):
+        even = low_deg + travel * index / (count - 1)
+        phase = (0.618_033_988_75 * index) % 1.0
+        shift = (phase - 0.5) * min(turn, 0.5 * travel / count)
+        places.append(min(max(even + shift, low_deg), high_deg))
+    return tuple(places)

@@ -1,0 +1,25 @@
+"""Slow sines of several amplitudes: Lissajous loops of the hysteresis, some smaller than its width."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from hdbridge.motion.procedures.moves import AxisView, Dwell, MoveTo, Sine, Steps
+
+
+@dataclass(frozen=True, slots=True)
+class Sines:
+    """Sines of ``amplitudes_deg`` (at the motor) about ``centre_deg`` (at the load), one after the other."""
+
+    centre_deg: float = 0.0
+    amplitudes_deg: tuple[float, ...] = (180.0, 45.0, 5.0)
+    frequency_hz: float = 0.05
+    periods: float = 2.0
+
+    def moves(self, axis: AxisView) -> Steps[None]:
+        """Yields the sines, each starting at its upper extreme."""
+        for amplitude_deg in self.amplitudes_deg:
+            amplitude = amplitude_deg / axis.ratio
+            yield MoveTo(self.centre_deg + amplitude)
+            yield Dwell(0.2, kind="move")
+            yield Sine(self.centre_deg, amplitude, self.frequency_hz, self.periods)

@@ -1,0 +1,81 @@
+"""Stepping test: deviation of the load from its target at rest, step by step."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from hdbridge.errors import InputError
+from hdbridge.motion.procedures.moves import AxisView, MoveTo, Sample, Settle, Steps
+from hdbridge.units import ARCSEC_PER_DEG
+
+
+@dataclass(frozen=True, slots=True)
+class Standing:
+    """One step at rest."""
+
+    target_deg: float
+    """Load target, degrees."""
+    error_arcsec: float
+    """Load encoder minus target, mean over the settled window, arcsec."""
+    settle_s: float
+    """Time from the end of the move until the load stood still."""
+
+    @property
+    def load_deg(self) -> float:
+        """Load position by the load encoder, degrees."""
+        return self.target_deg + self.error_arcsec / ARCSEC_PER_DEG
+
+
+@dataclass(frozen=True, slots=True)
+class SteppingOutcome:
+    """All steps of both directions."""
+
+    cw: tuple[Standing, ...]
+    """The first pass, towards positive angles."""
+    ccw: tuple[Standing, ...]
+    """The steps back."""
+
+
+@dataclass(frozen=True, slots=True)
+class Stepping:
+    """``count`` steps of ``step_deg`` at the motor one way, then back.
+
+    It starts with a pre-conditioning move (back by ``precondition_deg`` and forward again), so that the
+    gear's elastic state is that of an axis that last moved forward.
+    """
+
+    count: int = 240
+    step_deg: float = 43.56
+    start_deg: float = 0.0
+    """Load angle of the start."""
+    precondition_deg: float = 2.0
+    """Load degrees; larger than the width of any hysteresis."""
+    settle: Settle = Settle()
+
+    def __post_init__(self) -> None:
+        """Raises `InputError` for steps of size zero."""
+        if self.step_deg == 0.0:
+            raise InputError("step_deg: found 0; expected the size of a step, negative for steps down first")
+
+    def moves(self, axis: AxisView) -> Steps[SteppingOutcome]:
+        """Yields a jerk-limited move and a settle for each step."""
+        yield MoveTo(self.start_deg - self.precondition_deg, kind="precondition")
+        yield MoveTo(self.start_deg, kind="precondition")
+        passes: list[tuple[Standing, ...]] = []
+        for order in (range(1, self.count + 1), range(self.count - 1, -1, -1)):
+            stands: list[Standing] = []
+            for index in order:
+                target = self.start_deg + index * self.step_deg / axis.ratio
+                yield MoveTo(target, kind="step")
+                samples = yield self.settle
+                stands.append(standing(target, samples, self.settle))
+            passes.append(tuple(stands))
+        return SteppingOutcome(cw=passes[0], ccw=passes[1])
+
+
+def standing(target_deg: float, samples: Sequence[Sample], settle: Settle) -> Standing:
+    """Returns the result at a target: the mean over the settled window."""
+    window = settle.window(samples)
+    mean = sum(each.load_position_deg - target_deg for each in window) / len(window)
+    return Standing(target_deg, mean * ARCSEC_PER_DEG, samples[-1].time_s - samples[0].time_s)

@@ -1,0 +1,24 @@
+"""Slow sweeps in both directions: the synchronous part, load orders, and the height of the loop."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from hdbridge.motion.procedures.moves import AxisView, MoveTo, Steps
+
+
+@dataclass(frozen=True, slots=True)
+class Sweep:
+    """From ``low_deg`` to ``high_deg`` and back at a constant speed, ``laps`` times."""
+
+    low_deg: float
+    high_deg: float
+    velocity_deg_s: float
+    laps: int = 1
+
+    def moves(self, axis: AxisView) -> Steps[None]:
+        """Yields the laps; the elastic state is that of an axis coming from ``low_deg``."""
+        yield MoveTo(self.low_deg)
+        for _ in range(self.laps):
+            yield MoveTo(self.high_deg, self.velocity_deg_s, kind="sweep")
+            yield MoveTo(self.low_deg, self.velocity_deg_s, kind="sweep")

@@ -1,0 +1,55 @@
+"""Moves from one load angle to the next, holding the last."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+from hdbridge.motion.procedures.moves import AxisView, MotionLimits, MoveTo, Path, Sample, Settle, Steps
+from hdbridge.motion.procedures.stepping import Standing, standing
+
+
+class Hold:
+    """Standstill for a while, or until released; the duration of the leg is not known in advance."""
+
+    kind = "hold"
+
+    def __init__(self, duration_s: float = math.inf, released: Callable[[], bool] = lambda: False) -> None:
+        """``released`` is called in each cycle."""
+        self.begun = False
+        """True once the axis stands there."""
+        self._duration_s, self._released = duration_s, released
+        self._since_s = 0.0
+
+    def path(self, start_deg: float, limits: MotionLimits) -> Path:
+        """Returns a path without motion."""
+        return Path(0.0, lambda _: start_deg, start_deg, start_deg)
+
+    def ended(self, samples: Sequence[Sample]) -> bool:
+        """Returns True if the time is over or the axis was released."""
+        if not self.begun:
+            self.begun, self._since_s = True, samples[0].time_s
+        return self._released() or samples[-1].time_s - self._since_s >= self._duration_s
+
+
+@dataclass(frozen=True, slots=True)
+class WayPoints:
+    """Jerk-limited moves, each followed by a rest; the axis is held at the last."""
+
+    targets_deg: tuple[float, ...]
+    """Load angles."""
+    hold: Hold = field(default_factory=lambda: Hold(0.0))
+    velocity_deg_s: float | None = None
+    """Speed at the load; None for the axis's limit."""
+    settle: Settle = Settle()
+
+    def moves(self, axis: AxisView) -> Steps[tuple[Standing, ...]]:
+        """Yields a move and a settle for each way point; the outcome is where the load then stood."""
+        stands: list[Standing] = []
+        for target_deg in self.targets_deg:
+            yield MoveTo(target_deg, self.velocity_deg_s)
+            samples = yield self.settle
+            stands.append(standing(target_deg, samples, self.settle))
+        yield self.hold
+        return tuple(stands)
