@@ -18,6 +18,7 @@ from canopen.objectdictionary import ObjectDictionary, datatypes
 from canopen.objectdictionary.eds import import_eds
 
 from hdbridge.errors import InputError
+from hdbridge.files.regular import open_regular
 
 MAX_BYTES: Final = 16 << 20
 _MOST_OBJECTS: Final = 100_000
@@ -62,7 +63,8 @@ def read_eds(path: Path | str, node_id: int) -> Eds:
     try:
         if path.stat().st_size > MAX_BYTES:
             raise InputError(f"{path}: is larger than {MAX_BYTES >> 20} MiB; expected an EDS file")
-        data = path.read_bytes()
+        with open_regular(path) as file:
+            data = file.read()
     except OSError as error:
         raise InputError(
             f"{path}: cannot be read: {error.strerror or error}; expected the drive's EDS file"
