@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from hdbridge.axis.effects.orders import MotorOrder, OrderSeries
+from hdbridge.axis.effects.orders import MotorOrder, compensated_orders
 from hdbridge.axis.model import TransmissionModel
 from hdbridge.axis.model.response import LeadFilter, Response
 from hdbridge.errors import InputError
@@ -161,13 +161,7 @@ def harmonics_of(
 
 def motor_orders(model: TransmissionModel) -> list[MotorOrder]:
     """Returns the motor orders that the model corrects, by number, from `LEAST_ARCSEC` up."""
-    series = [
-        each
-        for each in model.effects
-        if isinstance(each, OrderSeries) and each.is_compensable() and each.turns_per_motor_turn() == 1.0
-    ]
-    found = {order.order: order for each in series for order in each.orders}
-    return [found[number] for number in sorted(found) if found[number].amplitude_arcsec >= LEAST_ARCSEC]
+    return [each for each in compensated_orders(model.effects) if each.amplitude_arcsec >= LEAST_ARCSEC]
 
 
 @dataclass(frozen=True, slots=True)

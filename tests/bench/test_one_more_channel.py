@@ -86,7 +86,7 @@ def test_a_channel_more_is_one_row(tmp_path):
     shutil.copytree(ROOT / "hdbridge", package, ignore=shutil.ignore_patterns("__pycache__"))
     for folder in ("eds", "profiles"):
         shutil.copytree(ROOT / folder, package / "_bundled" / folder)
-    table = package / "effects" / "motion.py"
+    table = package / "axis" / "effects" / "motion.py"
     text = table.read_text(encoding="utf-8")
     last = next(line for line in text.splitlines(keepends=True) if line.startswith("    TEMPERATURE = "))
     table.write_text(text.replace(last, last + ROW), encoding="utf-8")

@@ -246,6 +246,17 @@ def horner(amplitudes: tuple[complex, ...], turn: _Phasor) -> _Phasor:
     return total
 
 
+def compensated_orders(effects: Iterable[Effect]) -> list[MotorOrder]:
+    """Returns the orders of the motor angle that a compensation corrects, by number."""
+    series = [
+        each
+        for each in effects
+        if isinstance(each, OrderSeries) and each.is_compensable() and each.turns_per_motor_turn() == 1.0
+    ]
+    found = {order.order: order for each in series for order in each.orders}
+    return [found[number] for number in sorted(found)]
+
+
 class OrderTracker(Memoryless):
     """On-line tracker of a series of harmonics; ``scale`` is radians of order 1 per motor degree."""
 
