@@ -63,7 +63,7 @@ def test_commit_activate_roll_back_and_log(hdbridge, propose, tmp_path):
     done = hdbridge("model", "log", folder, "--json", "log.json")
     assert "the first was better" in done.stdout
     log = json.loads((tmp_path / "log.json").read_text())
-    assert log["schema"] == "hdbridge.axis.model-log/1"
+    assert log["schema"] == "hdbridge.model-log/1"
     assert [each["number"] for each in log["models"]] == [2, 1]
     assert [each["active"] for each in log["models"]] == [False, True]
     assert log["models"][1]["reason"] == "offset 41.0"
