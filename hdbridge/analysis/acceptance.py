@@ -89,7 +89,7 @@ def block_robust(
 def gate(estimator: Estimator, fitted: Fitted, place: int) -> Gate:
     """Tests one finding."""
     effect = fitted.hypothesis.effects[place]
-    needed = estimator.scales.robust
+    needed = estimator.scales.robust + estimator.scales.robust_more * (len(evident(effect)) - 1)
     laws = law_discrepancies(estimator, fitted.hypothesis.without(place))
     robust = robust_chi_square(estimator, fitted, place, laws=laws)
     if robust < needed:

@@ -28,7 +28,7 @@ from hdbridge.analysis.hypothesis import Estimator, Fitted, Hypothesis
 from hdbridge.analysis.identifiability import identifiability
 from hdbridge.analysis.linear import about_zeros
 from hdbridge.analysis.parameters import confounded, covariance, parameters_of, precisely
-from hdbridge.analysis.prepared import Observed, gather
+from hdbridge.analysis.prepared import gather
 from hdbridge.analysis.probability import Context, Prior, weighed
 from hdbridge.analysis.scales import Scales
 from hdbridge.analysis.search import (
@@ -38,7 +38,6 @@ from hdbridge.analysis.search import (
     waves_alike,
     with_measured,
 )
-from hdbridge.analysis.swing import ORDINARY_HZ, allowed_for, seen_swing
 from hdbridge.analysis.unexplained import (
     LESS,
     Rest,
@@ -95,32 +94,23 @@ def diagnose(
     data = gather(
         record, model.ratio, legs, independent_zeros, lambda motion: model.predict(motion, Start.VIRGIN)
     )
-    search = _search(data, model, scales or Scales())
-    begun = search.begun()
-    swing = seen_swing(search.estimator, begun)
-    if swing is not None and swing.frequency_hz <= ORDINARY_HZ:
-        swing = None  # softer than is ordinary: a cause to be found
-    elif (less := allowed_for(search.estimator, begun, swing)) is not data:
-        search = _search(less, model, search.scales)
-    estimator = search.estimator
+    estimator = Estimator(data, scales or Scales())
+    estimator.calibrated = calibrated(
+        model.effects,
+        model.uncertainty,
+        lambda effect: estimator.columns(effect, Start.VIRGIN),
+        estimator.scales,
+    )
+    search = Search(estimator, model.effects)
     first = unfitted(estimator, model.effects)
     held = beyond_limit(model.effects, data.full.motion)
-    own = [swing.remark()] if swing is not None else []
-    told = (*((first,) if first else ()), *held, *data.remarks, *own)
-    estimator.data = replace(estimator.data, remarks=told)
+    data = replace(data, remarks=(*((first,) if first else ()), *held, *data.remarks))
+    estimator.data = data
     progress("searching for causes")
     found = search.run()
     progress("judging what was found")
     diagnosis = _Judge(search, model, bool(first), prior).of(found)
     return replace(diagnosis, remarks=(*remarks, *diagnosis.remarks))
-
-
-def _search(data: Observed, model: TransmissionModel, scales: Scales) -> Search:
-    estimator = Estimator(data, scales)
-    estimator.calibrated = calibrated(
-        model.effects, model.uncertainty, lambda effect: estimator.columns(effect, Start.VIRGIN), scales
-    )
-    return Search(estimator, model.effects)
 
 
 def _of_zeros(parts: Sequence[Record], ratio: float) -> tuple[str, ...]:
@@ -159,6 +149,7 @@ class _Judge:
     def of(self, fitted: Fitted) -> Diagnosis:
         """Turns the result of the search into a diagnosis."""
         estimator, given = self.estimator, self.model.effects
+        base = len(given)
         fitted = self.search.eliminated(fitted, self._stopped, self.considered)
         fitted = self.search.eliminated(fitted, self._shadow, self.considered)
         fitted = with_measured(self.search, fitted)
@@ -170,7 +161,15 @@ class _Judge:
         self.considered.extend(each for each in refused if each.split(":")[0] not in known)
         findings = self._with_unexplained(findings, judged.left)
         refitted = estimator.fit(Hypothesis(given, fitted.hypothesis.start))
-        fitted, findings, extended = self._written(fitted, findings)
+        fitted = as_named(estimator, fitted, given, {each.cause for each in findings})
+        spread = covariance(estimator, fitted)
+        alone = {each.cause for each in findings if each.left_alone}
+        sound = supported(estimator, fitted, given, alone)
+        fitted = replace(fitted, hypothesis=replace(fitted.hypothesis, effects=sound))
+        named = {each.cause for each in findings if not each.within}
+        chosen = [place for place in range(base, len(sound)) if sound[place].name in named]
+        reason = "diagnosis: " + (", ".join(each.cause for each in findings) or "nothing found, refitted")
+        extended = extended_model(self.model, fitted, chosen, spread, reason, base)
         # Residual of the given model from the best-fitting elastic start.
         each_start = (self._left_by(given, start) for start in Start)
         before = min(each_start, key=lambda error: float(error @ error))
@@ -186,7 +185,7 @@ class _Judge:
             identifiability=visible,
             capability=capability(estimator.data, given, visible, estimator.scales),
             by_kind=self._by_kind(before, after),
-            remarks=(*estimator.data.remarks, *([judged.left.remark] if judged.left.remark else [])),
+            remarks=estimator.data.remarks,
             model=extended,
             traces=Traces(
                 measured_arcsec=measured,
@@ -201,32 +200,6 @@ class _Judge:
             considered=tuple(dict.fromkeys(self.considered)),
             scales=estimator.scales,
         )
-
-    def _written(
-        self, fitted: Fitted, findings: list[Finding]
-    ) -> tuple[Fitted, list[Finding], TransmissionModel]:
-        """Returns the extended model, its fit, and the findings that it contains.
-
-        A finding that cannot be written is none: its parameters are out of bounds, the compensation could not
-        invert the model with it, or the record does not determine it.
-        """
-        estimator, given = self.estimator, self.model.effects
-        while True:
-            as_reported = as_named(estimator, fitted, given, {each.cause for each in findings})
-            alone = {each.cause for each in findings if each.left_alone}
-            spread = covariance(estimator, as_reported)
-            sound = supported(estimator, as_reported, given, alone)
-            as_reported = replace(as_reported, hypothesis=replace(as_reported.hypothesis, effects=sound))
-            named = {each.cause for each in findings if not each.within}
-            chosen = [place for place in range(len(given), len(sound)) if sound[place].name in named]
-            reason = "diagnosis: " + (", ".join(each.cause for each in findings) or "nothing found, refitted")
-            extended = extended_model(self.model, as_reported, chosen, spread, reason, len(given))
-            changed = [new for new in extended.effects if new not in given]
-            missing = [each for each in findings if not (each.left_alone or _is_in(each, changed))]
-            if not missing:
-                return as_reported, findings, extended
-            self.considered.extend(f"{each.cause}: it cannot be written into the model" for each in missing)
-            findings = [each for each in findings if each not in missing]
 
     def _stopped(self, fitted: Fitted) -> tuple[int, str] | None:
         """Returns the weakest cause that fails its gate, else an implausible or unidentifiable one."""
@@ -383,8 +356,6 @@ class _Judge:
             note = f"the loop has another shape than either law: {left.arcsec:.2g} arcsec rms are left"
             told = replace(loops[0], note=note, lives_in=lives)
             return [told if each is loops[0] else each for each in findings]
-        if size < self.estimator.floor_arcsec:
-            return findings
         largest = max((each.peak_arcsec for each in findings), default=0.0)
         return [*findings, unknown] if largest > size else [unknown, *findings]
 
@@ -409,15 +380,6 @@ class _Judge:
             for name, rows in masks.items()
             if np.count_nonzero(rows) > 10
         }
-
-
-def _is_in(finding: Finding, changed: Sequence[Effect]) -> bool:
-    """Returns True if these effects, which differ from those of the given model, contain the finding."""
-    effect = finding.effect
-    if effect is None:  # something unexplained
-        return True
-    part = effect.changes or effect.part
-    return any(each.name == effect.name or (part is not None and each.part is part) for each in changed)
 
 
 def _ordinary(finding: Finding) -> bool:

@@ -39,6 +39,9 @@ class Scales:
     robust: float = _scale(
         25.0, "chi square of block sums", 0.0, "five standard deviations in independent stretches"
     )
+    robust_more: float = _scale(
+        6.0, "chi square of block sums per further parameter", 0.0, "95 % of chi square of two"
+    )
 
     # Termination and revision of the search.
     few: float = _scale(3.0, "causes", math.inf, "more mean something that is none of them")
@@ -49,6 +52,7 @@ class Scales:
         math.inf,
         "the fourth partial of a sawtooth leaves 0.78 of what the first three leave",
     )
+    leftover: float = _scale(2e-5, "share of the largest one's chi square", 0.0, "error of a linearisation")
     extrapolated: float = _scale(
         2.0,
         "largest piece over what is seen",

@@ -57,7 +57,7 @@ class Search:
 
     def run(self) -> Fitted:
         """Adds causes, best first, then removes those that no longer improve the fit enough."""
-        fitted = self._with_best_law(self._with_best_sign(self.begun()))
+        fitted = self._with_best_law(self._with_best_sign(self._begin()))
         for number in range(MOST):
             found = self._best_addition(fitted)
             if number < ANEW and fitted.hypothesis.nuisances is None:
@@ -78,8 +78,7 @@ class Search:
             fitted = self._swapped(fitted)
         return self._with_best_law(self.eliminated(fitted, self._least, []))
 
-    def begun(self) -> Fitted:
-        """Fits the model alone, from the best elastic state at the start."""
+    def _begin(self) -> Fitted:
         fits = [self.estimator.fit(Hypothesis(self._base, start)) for start in Start]
         return min(fits, key=lambda each: each.chi_square)
 
@@ -93,12 +92,12 @@ class Search:
         if self.estimator.data.reversals < 2 or not loops or any(each.coefficients()[0] for each in loops):
             return known  # a coefficient that is not held at zero confirms the model's sign
         self.estimator.loop_sign *= -1.0
-        other = self.begun()
+        other = self._begin()
         self.estimator.loop_sign *= -1.0
         rival = self._best_addition(known) or known
         if self.cost(other) + self.scales.enter < self.cost(rival):
             self.estimator.loop_sign *= -1.0
-        return self.begun()
+        return self._begin()
 
     def _with_best_law(self, fitted: Fitted) -> Fitted:
         """Exchanges the hysteresis law for an equivalent one if that fits better."""
@@ -167,11 +166,11 @@ class Search:
         }
         toll = {each: self.scales.penalty * len(fitted.places(each)) + self.scales.enter for each in gains}
         place = min(gains, key=lambda each: gains[each] - toll[each])
-        small = self.peak(fitted, place) < self.estimator.floor_arcsec
+        small = self.peak(fitted, place) < self.scales.floor_arcsec
         # The error of a large effect's law resembles a small effect of the same kind.
         alike = [each for each in gains if each != place and effects[each].name == effects[place].name]
         share = effects[place].inexact * max((gains[each] for each in alike), default=0.0)
-        needed = max(toll[place], share)
+        needed = max(toll[place], self.scales.leftover * max(gains.values()), share)
         return None if gains[place] > needed and not small else (place, "")
 
     def _lacking(self, fitted: Fitted, place: int) -> Fitted:
@@ -200,9 +199,8 @@ class Search:
                 trial = self._with(fitted, score)
                 toll = self.scales.penalty * max(trial.free() - fitted.free(), 1) + self.scales.enter
                 net = self._gain(fitted, trial, cause) - toll
-                none = net <= 0.0
-                small = "" if none or not self._too_small(trial, cause) else "too small to act on"
-                reason = "" if none else small or self._refusal(trial, cause)
+                none = net <= 0.0 or self._too_small(trial, cause)
+                reason = "" if none else self._refusal(trial, cause)
                 if reason:
                     self.refusals[cause] = reason
                 if none or reason:
@@ -222,7 +220,7 @@ class Search:
 
     def _too_small(self, trial: Fitted, cause: str) -> bool:
         """Returns True if the last effect of this name is below the floor of practical relevance."""
-        return self.peak(trial, _last(trial, cause)) < self.estimator.floor_arcsec
+        return self.peak(trial, _last(trial, cause)) < self.scales.floor_arcsec
 
     def _refusal(self, trial: Fitted, cause: str, as_alias: bool = False) -> str:
         """Returns the reason to reject the last effect of this name, or an empty string.

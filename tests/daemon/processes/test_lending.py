@@ -102,7 +102,7 @@ def test_others_see_who_has_the_bus_and_can_stop_it(daemon: Daemon) -> None:
         assert f"the bus is lent to process {borrower.pid}" in state["warnings"][0]
         lease = daemon.client.post("/lease", json={"client": "test", "force": True}).json()["token"]
         refused = daemon.client.post("/axes/article/enable", headers={"X-Lease": lease})
-        assert refused.status_code == 409
+        assert refused.status_code == 409, refused.text
         assert "the bus is lent to process" in refused.text
         daemon.client.delete("/lease", headers={"X-Lease": lease})
         stop = daemon.client.post("/quick-stop")
