@@ -119,6 +119,7 @@ def run(
 
     fleet = _Fleet.checked(sources, out, manifest, model, models, scheduler, workers, memory)
     found = find_sources(sources or [], manifest, fleet.dataset.stored())
+    fleet.dataset.create()
     with deferred_interrupt() as interrupted:
         try:
             fleet.diagnose(found, interrupted)
@@ -162,6 +163,8 @@ def watch(
     def find(stored: Stored) -> Sequence[Source]:
         return find_sources(sources or [], manifest, stored, may_be_empty=True)
 
+    find(fleet.dataset.stored())
+    fleet.dataset.create()
     with deferred_interrupt() as interrupted:
 
         def diagnose(found: Sequence[Source], retried: Collection[str]) -> None:

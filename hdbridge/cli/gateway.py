@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from itertools import chain
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated, Any
@@ -110,12 +111,13 @@ def doctor(
     """
     from hdbridge.daemon.gateway.trace import Trace
 
+    logged = None if log is None else _begun(_logged(log))
     config, settings = gateway_axis(machine, axis)
     node_id = settings.nodes[config.name]
     trace = Trace(node_id, eds_of(config, settings))
     rows: list[dict[str, Any]] = []
     begun_s: float | None = None
-    frames = _logged(log) if log is not None else _heard(settings, duration_s)
+    frames = logged if logged is not None else _heard(settings, duration_s)
     for frame in frames:
         begun_s = frame.time_s if begun_s is None else begun_s
         for line in trace.take(frame):
@@ -166,6 +168,11 @@ def _heard(settings: GatewaySettings, duration_s: float) -> Iterator[Frame]:
         while not interrupted() and (now_s := link.now()) < end_s:
             if (frame := link.recv(min(end_s, now_s + 0.2))) is not None:
                 yield frame
+
+
+def _begun(frames: Iterator[Frame]) -> Iterator[Frame]:
+    """Returns the same frames, the first of them read already, so that a wrong file is refused first."""
+    return chain([first for first in (next(frames, None),) if first is not None], frames)
 
 
 def _logged(path: Path) -> Iterator[Frame]:

@@ -109,7 +109,7 @@ def _(t: NodeTester) -> None:
 # ---------------------------------------------------------------- states without power
 
 
-@check("402.state.reset", "After a reset the drive reaches switch on disabled", _STATES)
+@check("402.state.reset", "After the NMT command reset node the drive reaches switch on disabled", _STATES)
 def _(t: NodeTester) -> None:
     t.need_402()
     t.reset(NMT_RESET_NODE)

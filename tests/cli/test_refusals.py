@@ -42,11 +42,12 @@ RIGHT = {
 NEEDED = {
     ("diagnose", "--model"), ("record", "export", "--out"), ("record", "import", "--out"),
     ("fleet", "run", "--out"), ("fleet", "run", "--manifest"),
+    ("fleet", "watch", "--out"), ("fleet", "watch", "--manifest"),
 }  # fmt: skip
 """Options that a command cannot do without, except in another use of it."""
 PARENTS_MADE = {
     ("new", "NAME"), ("record", "export", "--out"), ("record", "import", "--out"),
-    ("fleet", "run", "--out"), ("fleet", "simulate", "FOLDER"),
+    ("fleet", "run", "--out"), ("fleet", "watch", "--out"), ("fleet", "simulate", "FOLDER"),
 }  # fmt: skip
 """A folder that is not there is right, with its parents."""
 BY_ANOTHER = {("setup", "NAME"), ("setup", "--eds")}
