@@ -279,7 +279,7 @@ def report(
     pages: PagesOption = False,
     joints: Annotated[
         list[str] | None,
-        typer.Option("--joint", metavar="NAME", help="Write the page of this joint too."),
+        typer.Option("--joint", metavar="NAME", help="Joint whose page is made, too."),
     ] = None,
 ) -> None:
     """Write the page of a run again, and print which joints to look at first."""
