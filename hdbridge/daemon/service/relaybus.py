@@ -17,7 +17,7 @@ import can
 from hdbridge.clock import Clock
 from hdbridge.daemon.memory import Cell, Memory, RelayedFrame
 from hdbridge.drive import objects
-from hdbridge.errors import DaemonError
+from hdbridge.errors import DaemonError, RefusedError
 
 POLL_S: Final = 0.001
 """Interval between checks for a frame; shorter than any cycle."""
@@ -57,7 +57,7 @@ class RelayBus(can.BusABC):
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
         """Sends a frame. Drops the master's heartbeat, which the control process sends."""
         if self._status.get(Cell.BUS_LENT):
-            raise DaemonError("the bus is lent to another program: nothing is sent until it is returned")
+            raise RefusedError("the bus is lent to another program: nothing is sent until it is returned")
         can_id = msg.arbitration_id
         function, node = can_id & _FUNCTION, can_id & _NODE
         if function == objects.COB_HEARTBEAT:
