@@ -50,7 +50,11 @@ def daemon(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Daemon]:
             (tmp_path / each.name).write_bytes(each.read_bytes())
     path = tmp_path / "axis.yaml"
     axis = yaml.safe_load(path.read_text())
-    axis["bus"] = {"interface": "udp_multicast", "channel": channel, "options": {"hop_limit": 0}}
+    options = {
+        "port": random.randrange(20_000, 32_000),
+        "hop_limit": 0,
+    }  # a port has the frames of all groups
+    axis["bus"] = {"interface": "udp_multicast", "channel": channel, "options": options}
     path.write_text(yaml.safe_dump(axis))
     with started(tmp_path, "simulate", tmp_path), running(tmp_path, tmp_path, name="article") as daemon:
         daemon.until_told("READY=1")
