@@ -249,6 +249,10 @@ class FakeBridge:
     def jobs(self) -> list[messages.Job]:
         return self.ran
 
+    async def lend_bus(self, holder: str) -> None:
+        self.lease.check(holder)
+        raise RefusedError("the bus cannot be lent: its axes are simulated")
+
     async def quick_stop(self) -> None:
         for each in self.axes.values():
             await each.quick_stop()

@@ -65,6 +65,7 @@ OF_THE_MACHINE = {
     "do": lambda c: c.state(),
     "stop": lambda c: c.stop(),
     "quick_stop": lambda c: c.quick_stop(),
+    "lend_bus": lambda c: c.lend_bus(),
     "close": lambda c: None,
 }
 OF_AN_AXIS = {
