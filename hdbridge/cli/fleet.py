@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -17,6 +18,7 @@ from hdbridge.cli.options import (
     notes,
     print_table,
     progress_bar,
+    taking,
     write_json,
     write_result,
 )
@@ -26,7 +28,6 @@ from hdbridge.files.outputs import Kind
 
 if TYPE_CHECKING:
     from hdbridge.fleet.dataset import Dataset
-    from hdbridge.fleet.engine import Cluster
     from hdbridge.fleet.sources import Source, Stored
     from hdbridge.fleet.summary import Row, Summary
 
@@ -91,34 +92,117 @@ def register(app: typer.Typer) -> None:
         no_args_is_help=True,
         rich_markup_mode="markdown",
     )
-    group.command()(run)
-    group.command()(watch)
+    group.command()(taking(Fleet)(run))
+    group.command()(taking(Fleet)(watch))
     group.command()(report)
     group.command()(simulate)
     app.add_typer(group, name="fleet")
 
 
-def run(
-    sources: JoinsOption = None,
-    out: OutOption = None,
-    manifest: ManifestOption = None,
-    model: ModelOption = None,
-    models: ModelsOption = None,
-    scheduler: SchedulerOption = None,
-    workers: WorkersOption = None,
-    memory: MemoryOption = "2GB",
-    limit_arcsec: LimitOption = 10.0,
-    pages: PagesOption = False,
-) -> None:
+@dataclass(frozen=True)
+class Fleet:
+    """Recordings to diagnose, as the user of `run` or `watch` names them; InputError names a wrong option."""
+
+    sources: JoinsOption = None
+    out: OutOption = None
+    manifest: ManifestOption = None
+    model: ModelOption = None
+    models: ModelsOption = None
+    scheduler: SchedulerOption = None
+    workers: WorkersOption = None
+    memory: MemoryOption = "2GB"
+    limit_arcsec: LimitOption = 10.0
+    pages: PagesOption = False
+
+    def __post_init__(self) -> None:
+        from hdbridge.axis.model import TransmissionModel
+
+        need_extra("a fleet needs", _EXTRA, "fleet")
+        if self.out is None:
+            raise InputError("--out is missing; name a new folder, or one of an earlier run")
+        if not self.sources and self.manifest is None:
+            raise InputError(
+                "no source; name folders, globs or URLs of recordings, or a manifest with --manifest"
+            )
+        if self.scheduler is not None and self.workers is not None:
+            raise InputError(
+                "--workers: a cluster that exists has its own workers; leave out --workers or --scheduler"
+            )
+        _check_memory(self.memory)
+        if self.scheduler == "":
+            raise InputError("--scheduler: found no address; expected one such as tcp://HOST:8786")
+        if "" in (self.sources or []):
+            raise InputError("SOURCE: found an empty name; expected a folder, a glob or a URL")
+        if self.model is not None:
+            TransmissionModel.load(self.model)
+        if self.models is not None and not self.models.is_dir():
+            raise InputError(
+                f"--models: '{self.models}' is not a folder; expected one with JOINT.yaml for each joint"
+            )
+
+    @cached_property
+    def dataset(self) -> Dataset:
+        """The data set of the results."""
+        from hdbridge.fleet.dataset import Dataset
+
+        assert self.out is not None
+        return Dataset(self.out)
+
+    def find(self, stored: Stored, *, may_be_empty: bool = False) -> Sequence[Source]:
+        """Returns the recordings that are there; raises `InputError` for a wrong source or manifest."""
+        from hdbridge.fleet.sources import find_sources
+
+        return find_sources(self.sources or [], self.manifest, stored, may_be_empty=may_be_empty)
+
+    def diagnose(
+        self,
+        found: Sequence[Source],
+        interrupted: Callable[[], bool],
+        retried: Collection[str] | None = None,
+    ) -> None:
+        """Runs over the recordings with a progress bar."""
+        from hdbridge.fleet.engine import RETRIED, Cluster, Progress
+        from hdbridge.fleet.engine import run as run_fleet
+
+        _note(f"{len(found)} sources, {len({each.joint for each in found})} joints")
+        with progress_bar() as bar:
+            task = bar.add_task("diagnosing", total=len(found))
+
+            def tell(now: Progress) -> None:
+                words = f"{now.done} of {now.total}" + f", {now.failed} failed" * bool(now.failed)
+                bar.update(task, completed=now.done, total=max(now.total, 1), description=words)
+
+            end = run_fleet(
+                found,
+                self.dataset,
+                Cluster(self.scheduler, self.workers, self.memory),
+                model=self.model,
+                models=self.models,
+                progress=tell,
+                interrupted=interrupted,
+                retried=RETRIED if retried is None else retried,
+            )
+        _say(
+            f"{self.dataset.folder}: {end.done} recordings, {end.known} of them known already, "
+            f"{end.failed} newly failed; largest memory of a worker {end.memory_mb:.0f} MB"
+        )
+
+    def summarise(self) -> None:
+        """Prints and writes what the data set says."""
+        _summarise(self.dataset, self.limit_arcsec, pages=self.pages)
+
+    def say_interrupted(self) -> None:
+        """Reports that the finished part is kept."""
+        _note(f"interrupted; {self.dataset.folder} keeps what is done, and the same command continues")
+
+
+def run(fleet: Fleet) -> None:
     """Diagnose every recording that is not in FOLDER yet, and write Parquet and a page there.
 
     A joint without a model gets one fitted to its earliest recording. A recording that cannot be used is a
     row with the reason. Ctrl-C keeps what is done; the same command continues.
     """
-    from hdbridge.fleet.sources import find_sources
-
-    fleet = _Fleet.checked(sources, out, manifest, model, models, scheduler, workers, memory)
-    found = find_sources(sources or [], manifest, fleet.dataset.stored())
+    found = fleet.find(fleet.dataset.stored())
     fleet.dataset.create()
     with deferred_interrupt() as interrupted:
         try:
@@ -126,20 +210,11 @@ def run(
         except KeyboardInterrupt:
             fleet.say_interrupted()
             raise
-    _summarise(fleet.dataset, limit_arcsec, pages=pages)
+    fleet.summarise()
 
 
 def watch(
-    sources: JoinsOption = None,
-    out: OutOption = None,
-    manifest: ManifestOption = None,
-    model: ModelOption = None,
-    models: ModelsOption = None,
-    scheduler: SchedulerOption = None,
-    workers: WorkersOption = None,
-    memory: MemoryOption = "2GB",
-    limit_arcsec: LimitOption = 10.0,
-    pages: PagesOption = False,
+    fleet: Fleet,
     interval_s: Annotated[
         float,
         typer.Option(
@@ -156,115 +231,20 @@ def watch(
     waits for the next round. Ctrl-C ends it and keeps what is done (exit status 0).
     """
     from hdbridge.fleet.engine import watch as watch_fleet
-    from hdbridge.fleet.sources import find_sources
 
-    fleet = _Fleet.checked(sources, out, manifest, model, models, scheduler, workers, memory)
-
-    def find(stored: Stored) -> Sequence[Source]:
-        return find_sources(sources or [], manifest, stored, may_be_empty=True)
-
-    find(fleet.dataset.stored())
-    fleet.dataset.create()
     with deferred_interrupt() as interrupted:
 
         def diagnose(found: Sequence[Source], retried: Collection[str]) -> None:
             fleet.diagnose(found, interrupted, retried)
-            _summarise(fleet.dataset, limit_arcsec, pages=pages)
+            fleet.summarise()
 
         try:
             watch_fleet(
-                find, fleet.dataset, interval_s, diagnose, once=once, report=_note, interrupted=interrupted
-            )
+                partial(fleet.find, may_be_empty=True), fleet.dataset, interval_s, diagnose,
+                once=once, report=_note, interrupted=interrupted,
+            )  # fmt: skip
         except KeyboardInterrupt:
             fleet.say_interrupted()
-
-
-@dataclass(frozen=True)
-class _Fleet:
-    """Checked options of a run."""
-
-    dataset: Dataset
-    cluster: Cluster
-    model: Path | None
-    models: Path | None
-
-    @classmethod
-    def checked(
-        cls,
-        sources: list[str] | None,
-        out: Path | None,
-        manifest: Path | None,
-        model: Path | None,
-        models: Path | None,
-        scheduler: str | None,
-        workers: int | None,
-        memory: str,
-    ) -> _Fleet:
-        """Checks the options; InputError names the wrong one."""
-        from hdbridge.axis.model import TransmissionModel
-        from hdbridge.fleet.dataset import Dataset
-        from hdbridge.fleet.engine import Cluster
-
-        need_extra("a fleet needs", _EXTRA, "fleet")
-        if out is None:
-            raise InputError("--out is missing; name a new folder, or one of an earlier run")
-        if not sources and manifest is None:
-            raise InputError(
-                "no source; name folders, globs or URLs of recordings, or a manifest with --manifest"
-            )
-        if scheduler is not None and workers is not None:
-            raise InputError(
-                "--workers: a cluster that exists has its own workers; leave out --workers or --scheduler"
-            )
-        _check_memory(memory)
-        if scheduler == "":
-            raise InputError("--scheduler: found no address; expected one such as tcp://HOST:8786")
-        if "" in (sources or []):
-            raise InputError("SOURCE: found an empty name; expected a folder, a glob or a URL")
-        if model is not None:
-            TransmissionModel.load(model)
-        if models is not None and not models.is_dir():
-            raise InputError(
-                f"--models: '{models}' is not a folder; expected one with JOINT.yaml for each joint"
-            )
-        return cls(Dataset(out), Cluster(scheduler, workers, memory), model, models)
-
-    def diagnose(
-        self,
-        found: Sequence[Source],
-        interrupted: Callable[[], bool],
-        retried: Collection[str] | None = None,
-    ) -> None:
-        """Runs over the recordings with a progress bar."""
-        from hdbridge.fleet.engine import RETRIED, Progress
-        from hdbridge.fleet.engine import run as run_fleet
-
-        _note(f"{len(found)} sources, {len({each.joint for each in found})} joints")
-        with progress_bar() as bar:
-            task = bar.add_task("diagnosing", total=len(found))
-
-            def tell(now: Progress) -> None:
-                words = f"{now.done} of {now.total}" + f", {now.failed} failed" * bool(now.failed)
-                bar.update(task, completed=now.done, total=max(now.total, 1), description=words)
-
-            end = run_fleet(
-                found,
-                self.dataset,
-                self.cluster,
-                model=self.model,
-                models=self.models,
-                progress=tell,
-                interrupted=interrupted,
-                retried=RETRIED if retried is None else retried,
-            )
-        _say(
-            f"{self.dataset.folder}: {end.done} recordings, {end.known} of them known already, "
-            f"{end.failed} newly failed; largest memory of a worker {end.memory_mb:.0f} MB"
-        )
-
-    def say_interrupted(self) -> None:
-        """Reports that the finished part is kept."""
-        _note(f"interrupted; {self.dataset.folder} keeps what is done, and the same command continues")
 
 
 def report(

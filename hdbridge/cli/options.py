@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import inspect
 import json
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from functools import wraps
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 
 import typer
 from rich.console import Console
@@ -123,6 +125,36 @@ HtmlOption = Annotated[
     typer.Option("--html", metavar="FILE", help="Write a page that opens without a network."),
     Kind.PAGE,
 ]
+
+
+def taking(group: type[Any]) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Gives a command the fields of a dataclass as options; it receives them as its first argument.
+
+    The dataclass's first field stands first, its other fields behind the command's own options.
+    """
+
+    def decorate(command: Callable[..., None]) -> Callable[..., None]:
+        first, *behind = _parameters(group)
+
+        @wraps(command)
+        def with_options(**values: Any) -> None:
+            given = group(**{each.name: values.pop(each.name) for each in (first, *behind)})
+            command(given, **values)
+
+        every = (first, *_parameters(command)[1:], *behind)
+        parameters = [each.replace(kind=inspect.Parameter.KEYWORD_ONLY) for each in every]
+        with_options.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+        with_options.__annotations__ = {each.name: each.annotation for each in parameters}
+        return with_options
+
+    return decorate
+
+
+def _parameters(function: Callable[..., Any]) -> list[inspect.Parameter]:
+    """Returns the parameters with their annotations evaluated."""
+    hints = get_type_hints(function, include_extras=True)
+    given = inspect.signature(function).parameters.values()
+    return [each.replace(annotation=hints[each.name]) for each in given]
 
 
 def need_extra(subject: str, packages: Sequence[str], extra: str) -> None:

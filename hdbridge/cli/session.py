@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import inspect
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
-from functools import cached_property, wraps
+from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Concatenate, ParamSpec, get_type_hints
+from typing import TYPE_CHECKING
 
 from hdbridge.cli.interrupt import deferred_interrupt
 from hdbridge.cli.options import (
@@ -21,6 +20,7 @@ from hdbridge.cli.options import (
     SimulateOption,
     TruthOption,
     notes,
+    taking,
 )
 from hdbridge.clock import Clock, MonotonicClock
 from hdbridge.errors import DaemonError, InputError
@@ -31,8 +31,6 @@ if TYPE_CHECKING:
 
     from hdbridge.axis import AxisConfig, BusConfig
     from hdbridge.drive.drive import Drive
-
-P = ParamSpec("P")
 
 
 @dataclass(frozen=True)
@@ -64,7 +62,16 @@ class Session:
     @cached_property
     def axis(self) -> AxisConfig:
         """The axis file, with the bus replaced by the options."""
-        return load_axis(self.files, self.interface, self.channel, simulate=self.simulate)
+        from hdbridge.axis import AxisConfig
+        from hdbridge.drive.link import check_interface
+
+        axis = AxisConfig.load(self.files.axis)
+        if not self.simulate:
+            where = "--interface" if self.interface else axis.where("bus.interface")
+            check_interface(self.interface or axis.bus.interface, where)
+        given = {"interface": self.interface, "channel": self.channel}
+        changes = {name: value for name, value in given.items() if value is not None}
+        return axis.on_bus(**changes) if changes else axis
 
     @property
     def simulated_seed(self) -> int | None:
@@ -122,30 +129,8 @@ class Session:
             yield drive, interrupted
 
 
-def on_axis(command: Callable[Concatenate[Session, P], None]) -> Callable[..., None]:
-    """Gives a command the options of a `Session`, which the command receives as its first argument.
-
-    PROFILE stands first, the other options of the session behind the command's own.
-    """
-    own = _parameters(command)[1:]
-    profile, *options = _parameters(Session)
-
-    @wraps(command)
-    def with_options(**values: Any) -> None:
-        session = Session(**{each.name: values.pop(each.name) for each in (profile, *options)})
-        command(session, **values)  # type: ignore[call-arg]
-
-    parameters = [each.replace(kind=inspect.Parameter.KEYWORD_ONLY) for each in (profile, *own, *options)]
-    with_options.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
-    with_options.__annotations__ = {each.name: each.annotation for each in parameters}
-    return with_options
-
-
-def _parameters(function: Callable[..., Any]) -> list[inspect.Parameter]:
-    """Returns the parameters with their annotations evaluated."""
-    hints = get_type_hints(function, include_extras=True)
-    given = inspect.signature(function).parameters.values()
-    return [each.replace(annotation=hints[each.name]) for each in given]
+on_axis = taking(Session)
+"""Gives a command the options of a `Session`, which it receives as its first argument."""
 
 
 def check_bus_options(interface: str | None, channel: str | None, *, simulate: bool) -> None:
@@ -155,24 +140,6 @@ def check_bus_options(interface: str | None, channel: str | None, *, simulate: b
             "--simulate has a bus of its own in this process: leave out --interface and --channel; a "
             "simulated drive on a bus is 'hdbridge simulate' in another process"
         )
-
-
-def load_axis(
-    files: Profile, interface: str | None, channel: str | None, *, simulate: bool = False
-) -> AxisConfig:
-    """Loads the axis file, with the bus replaced by the options."""
-    from hdbridge.axis import AxisConfig
-    from hdbridge.drive.link import check_interface
-
-    axis = AxisConfig.load(files.axis)
-    if not simulate:
-        check_interface(
-            interface or axis.bus.interface, "--interface" if interface else axis.where("bus.interface")
-        )
-    changes = {
-        name: value for name, value in (("interface", interface), ("channel", channel)) if value is not None
-    }
-    return axis.on_bus(**changes) if changes else axis
 
 
 def _borrow(bus: BusConfig) -> None:

@@ -15,10 +15,9 @@ from hdbridge.cli.options import (
     TruthOption,
     notes,
 )
-from hdbridge.cli.session import load_axis, simulated_by
+from hdbridge.cli.session import Session, simulated_by
 from hdbridge.clock import MonotonicClock
 from hdbridge.errors import InputError
-from hdbridge.files.profile import Profile
 
 
 def register(app: typer.Typer) -> None:
@@ -52,15 +51,15 @@ def simulate(
     from hdbridge.sim.machine import Machine
     from hdbridge.sim.truth import Truth
 
-    files = Profile.find(profile)
-    axis = load_axis(files, interface, channel)
+    session = Session(profile, interface=interface, channel=channel)
+    axis = session.axis
     if axis.bus.interface == "virtual":
         raise InputError(
             "the bus 'virtual' exists within one process only, so the simulated drive cannot be reached; "
             "give --interface udp_multicast --channel 239.0.0.1, or socketcan, "
             "or use 'hdbridge step --simulate'"
         )
-    known = Truth.load(simulated_by(files, truth))
+    known = Truth.load(simulated_by(session.files, truth))
     clock = MonotonicClock()
     with deferred_interrupt() as interrupted, open_bus(axis.bus, shared=True) as bus:
         nameplate = nameplate_of(known, load_object=axis.load_encoder.source.address)

@@ -149,6 +149,8 @@ def watch(
                 raise
             report(f"{problem}; the next round tries again")
         else:
+            if before is None:
+                dataset.create()  # refused now, not after an interval
             files: dict[str, list[Source]] = defaultdict(list)
             for each in found:
                 files[each.path].append(each)
