@@ -312,28 +312,18 @@ _option(0x605E, "fault reaction", 5)
 # ---------------------------------------------------------------- units and limits
 
 
-@check("402.units.encoder", "608Fh: increments and revolutions are not 0", _UNITS)
-def _(t: NodeTester) -> None:
-    t.need_402()
-    t.require(0x608F, 1)
-    found = [t.read(0x608F, sub) for sub in (1, 2)]
-    t.true(all(found), f"608Fh = {found}", "both above 0")
+def _ratio(index: int, name: str, words: str) -> None:
+    @check(f"402.units.{name}", f"{index:04X}h: {words} are not 0", _UNITS)
+    def _(t: NodeTester) -> None:
+        t.need_402()
+        t.require(index, 1)
+        found = [t.read(index, sub) for sub in (1, 2)]
+        t.true(all(found), f"{index:04X}h = {found}", "both above 0")
 
 
-@check("402.units.gear", "6091h: motor and driving shaft revolutions are not 0", _UNITS)
-def _(t: NodeTester) -> None:
-    t.need_402()
-    t.require(0x6091, 1)
-    found = [t.read(0x6091, sub) for sub in (1, 2)]
-    t.true(all(found), f"6091h = {found}", "both above 0")
-
-
-@check("402.units.feed", "6092h: feed and driving shaft revolutions are not 0", _UNITS)
-def _(t: NodeTester) -> None:
-    t.need_402()
-    t.require(0x6092, 1)
-    found = [t.read(0x6092, sub) for sub in (1, 2)]
-    t.true(all(found), f"6092h = {found}", "both above 0")
+_ratio(0x608F, "encoder", "increments and revolutions")
+_ratio(0x6091, "gear", "motor and driving shaft revolutions")
+_ratio(0x6092, "feed", "feed and driving shaft revolutions")
 
 
 @check("402.units.position", "6064h is 6063h · 6092h / (608Fh · 6091h) apart from a home offset", _UNITS)

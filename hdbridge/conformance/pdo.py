@@ -253,8 +253,7 @@ _fixed_mapping(_RPDO)
 @check("tpdo.mapping.data", "A TPDO carries the value of its object", _PDO)
 def _(t: NodeTester) -> None:
     kind = t.scratch()
-    can_id = t.map_pdo(_TPDO, (kind,), 1)
-    _start(t)
+    can_id = _sent(t, (kind,), 1)
     since = t.mark()
     t.sync()
     frame = t.hears(can_id, since=since)
@@ -264,8 +263,7 @@ def _(t: NodeTester) -> None:
 @check("tpdo.mapping.order", "A TPDO carries its objects in the order of the mapping", _PDO)
 def _(t: NodeTester) -> None:
     index, sub, bits = t.scratch()
-    can_id = t.map_pdo(_TPDO, (_REGISTER, (index, sub, bits), _REGISTER), 1)
-    _start(t)
+    can_id = _sent(t, (_REGISTER, (index, sub, bits), _REGISTER), 1)
     since = t.mark()
     t.sync()
     frame = t.hears(can_id, since=since)
@@ -276,11 +274,23 @@ def _(t: NodeTester) -> None:
 # ---------------------------------------------------------------- transmission of TPDOs
 
 
+def _sent(
+    t: NodeTester,
+    objects: tuple[tuple[int, int, int], ...],
+    transmission: int,
+    can_id: int | None = None,
+    timers: dict[int, int] | None = None,
+) -> int:
+    """Maps objects to TPDO 1 and starts the node; returns the identifier."""
+    used = t.map_pdo(_TPDO, objects, transmission, can_id, timers)
+    _start(t)
+    return used
+
+
 def _every(number: int) -> None:
     @check(f"tpdo.sync.{number}", f"Transmission type {number}: a TPDO at every {number}. SYNC", _PDO)
     def _(t: NodeTester) -> None:
-        can_id = t.map_pdo(_TPDO, (_REGISTER,), number)
-        _start(t)
+        can_id = _sent(t, (_REGISTER,), number)
         answers = _syncs(t, can_id, 3 * number)
         t.equal(sum(answers), 3, f"TPDOs at {3 * number} SYNCs")
         t.equal(max(answers), 1, "TPDOs at one SYNC")
@@ -295,8 +305,7 @@ _every(5)
 
 @check("tpdo.sync.none", "A synchronous TPDO is not sent without SYNC", _PDO)
 def _(t: NodeTester) -> None:
-    can_id = t.map_pdo(_TPDO, (_REGISTER,), 1)
-    _start(t)
+    can_id = _sent(t, (_REGISTER,), 1)
     since = t.mark()
     t.wait(0.2)
     t.equal(len(t.heard(can_id, since)), 0, "number of TPDOs")
@@ -305,8 +314,7 @@ def _(t: NodeTester) -> None:
 @check("tpdo.sync.0", "Transmission type 0: a TPDO at the SYNC after a change, and only then", _PDO)
 def _(t: NodeTester) -> None:
     index, sub, bits = t.scratch()
-    can_id = t.map_pdo(_TPDO, ((index, sub, bits),), 0)
-    _start(t)
+    can_id = _sent(t, ((index, sub, bits),), 0)
     _syncs(t, can_id, 2)
     t.equal(_syncs(t, can_id, 2), [0, 0], "TPDOs without a change")
     since = t.mark()
@@ -326,8 +334,7 @@ def _(t: NodeTester) -> None:
 
 @check("tpdo.identifier.other", "A TPDO is sent with the identifier that was written", _PDO)
 def _(t: NodeTester) -> None:
-    can_id = t.map_pdo(_TPDO, (_REGISTER,), 1, _SPARE_ID)
-    _start(t)
+    can_id = _sent(t, (_REGISTER,), 1, _SPARE_ID)
     t.equal(_syncs(t, can_id, 2), [1, 1], "TPDOs with the new identifier")
 
 
@@ -335,8 +342,7 @@ def _event(kind: int) -> None:
     @check(f"tpdo.event.{kind}", f"Transmission type {kind}: a change is sent at once", _PDO)
     def _(t: NodeTester) -> None:
         index, sub, bits = t.scratch()
-        can_id = t.map_pdo(_TPDO, ((index, sub, bits),), kind, timers=_off(t, 5))
-        _start(t)
+        can_id = _sent(t, ((index, sub, bits),), kind, timers=_off(t, 5))
         t.wait(0.05)
         since = t.mark()
         value = t.other_value(index, sub, bits)
@@ -347,8 +353,7 @@ def _event(kind: int) -> None:
     @check(f"tpdo.event.{kind}.quiet", f"Transmission type {kind}: nothing is sent without an event", _PDO)
     def _(t: NodeTester) -> None:
         index, sub, bits = t.scratch()
-        can_id = t.map_pdo(_TPDO, ((index, sub, bits),), kind, timers=_off(t, 5))
-        _start(t)
+        can_id = _sent(t, ((index, sub, bits),), kind, timers=_off(t, 5))
         t.wait(0.1)
         since = t.mark()
         for _ in range(3):
@@ -368,8 +373,7 @@ _event(255)
 @check("tpdo.event-timer", "The event timer repeats a TPDO", _PDO)
 def _(t: NodeTester) -> None:
     t.require(_TPDO, 5)
-    can_id = t.map_pdo(_TPDO, (_REGISTER,), 255, timers={5: 50})
-    _start(t)
+    can_id = _sent(t, (_REGISTER,), 255, timers={5: 50})
     since = t.mark()
     t.wait(0.4)
     times = [frame.time_s for frame in t.heard(can_id, since)]
@@ -381,8 +385,7 @@ def _(t: NodeTester) -> None:
 @check("tpdo.event-timer.off", "Event timer 0 repeats nothing", _PDO)
 def _(t: NodeTester) -> None:
     t.require(_TPDO, 5)
-    can_id = t.map_pdo(_TPDO, (_REGISTER,), 255, timers={5: 0})
-    _start(t)
+    can_id = _sent(t, (_REGISTER,), 255, timers={5: 0})
     t.wait(0.05)
     since = t.mark()
     t.wait(0.3)
@@ -393,8 +396,7 @@ def _(t: NodeTester) -> None:
 def _(t: NodeTester) -> None:
     index, sub, bits = t.scratch()
     t.require(_TPDO, 3)
-    can_id = t.map_pdo(_TPDO, ((index, sub, bits),), 255, timers={3: 1000, **_off(t, 5)})
-    _start(t)
+    can_id = _sent(t, ((index, sub, bits),), 255, timers={3: 1000, **_off(t, 5)})
     t.wait(0.2)
     since = t.mark()
     before = t.upload(index, sub)
@@ -413,8 +415,7 @@ def _(t: NodeTester) -> None:
 def _(t: NodeTester) -> None:
     index, sub, bits = t.scratch()
     t.require(_TPDO, 3)
-    can_id = t.map_pdo(_TPDO, ((index, sub, bits),), 255, timers={3: 1000, **_off(t, 5)})
-    _start(t)
+    can_id = _sent(t, ((index, sub, bits),), 255, timers={3: 1000, **_off(t, 5)})
     t.wait(0.2)
     since = t.mark()
     before = t.upload(index, sub)
@@ -429,166 +430,166 @@ def _(t: NodeTester) -> None:
 # ---------------------------------------------------------------- reception
 
 
-def _receive(t: NodeTester, transmission: int, *, start: bool = True) -> tuple[int, int, int, int, int]:
-    """Maps the scratch object to RPDO 1; returns identifier, index, sub-index, size and another value."""
-    index, sub, bits = t.scratch()
-    value = t.other_value(index, sub, bits)
-    t.write(index, sub, int.from_bytes(t.upload(index, sub), "little"), bits // 8)
-    can_id = t.map_pdo(_RPDO, ((index, sub, bits),), transmission)
-    if start:
-        _start(t)
-    return can_id, index, sub, bits // 8, value
+class _Reception:
+    """The scratch object, mapped to RPDO 1 behind ``ahead``; ``value`` differs from the one ``before``."""
 
+    def __init__(
+        self,
+        t: NodeTester,
+        transmission: int,
+        *,
+        can_id: int | None = None,
+        ahead: tuple[tuple[int, int, int], ...] = (),
+        start: bool = True,
+    ) -> None:
+        self._t = t
+        self.index, self.sub, bits = t.scratch()
+        self.size = bits // 8
+        self.value = t.other_value(self.index, self.sub, bits)
+        t.write(self.index, self.sub, int.from_bytes(t.upload(self.index, self.sub), "little"), self.size)
+        self.before = self.read()
+        self.can_id = t.map_pdo(_RPDO, (*ahead, (self.index, self.sub, bits)), transmission, can_id)
+        if start:
+            _start(t)
 
-def _stored(t: NodeTester, index: int, sub: int, value: int, what: str) -> None:
-    t.equal(t.read(index, sub), value, f"{index:04X}h:{sub:02X} {what}")
+    def read(self) -> int:
+        return self._t.read(self.index, self.sub)
+
+    def data(self, value: int | None = None) -> bytes:
+        return pack(self.value if value is None else value, self.size)
+
+    def send(self, data: bytes | None = None) -> None:
+        self._t.send(self.can_id, self.data() if data is None else data)
+
+    def holds(self, value: int, when: str, found: int | None = None) -> None:
+        """Checks the object's value: ``found``, or the one after the time to process a frame."""
+        if found is None:
+            self._t.wait(0.02)
+            found = self.read()
+        self._t.equal(found, value, f"{self.index:04X}h:{self.sub:02X} {when}")
+
+    def after(self, data: bytes) -> int:
+        """Returns the object's value after an RPDO of a wrong length; a right one then ends the error."""
+        self.send(data)
+        self._t.wait(0.02)
+        found = self.read()
+        self.send(self.data(self.before))
+        return found
 
 
 @check("rpdo.event", "An RPDO of type 255 is taken at once", _PDO)
 def _(t: NodeTester) -> None:
-    can_id, index, sub, size, value = _receive(t, 255)
-    t.send(can_id, pack(value, size))
-    t.wait(0.02)
-    _stored(t, index, sub, value, "after the RPDO")
+    rpdo = _Reception(t, 255)
+    rpdo.send()
+    rpdo.holds(rpdo.value, "after the RPDO")
 
 
 @check("rpdo.sync.before", "A synchronous RPDO has no effect before SYNC", _PDO)
 def _(t: NodeTester) -> None:
-    can_id, index, sub, size, value = _receive(t, 1)
-    before = t.read(index, sub)
-    t.send(can_id, pack(value, size))
-    t.wait(0.02)
-    _stored(t, index, sub, before, "before SYNC")
+    rpdo = _Reception(t, 1)
+    rpdo.send()
+    rpdo.holds(rpdo.before, "before SYNC")
 
 
 @check("rpdo.sync.after", "A synchronous RPDO takes effect at SYNC", _PDO)
 def _(t: NodeTester) -> None:
-    can_id, index, sub, size, value = _receive(t, 1)
-    t.send(can_id, pack(value, size))
+    rpdo = _Reception(t, 1)
+    rpdo.send()
     t.sync()
-    t.wait(0.02)
-    _stored(t, index, sub, value, "after SYNC")
+    rpdo.holds(rpdo.value, "after SYNC")
 
 
 @check("rpdo.sync.last", "Of two synchronous RPDOs the last one counts", _PDO)
 def _(t: NodeTester) -> None:
-    can_id, index, sub, size, value = _receive(t, 1)
-    t.send(can_id, pack(value + 5, size))
-    t.send(can_id, pack(value, size))
+    rpdo = _Reception(t, 1)
+    rpdo.send(rpdo.data(rpdo.value + 5))
+    rpdo.send()
     t.sync()
-    t.wait(0.02)
-    _stored(t, index, sub, value, "after SYNC")
+    rpdo.holds(rpdo.value, "after SYNC")
 
 
 @check("rpdo.sync.once", "A synchronous RPDO takes effect once", _PDO)
 def _(t: NodeTester) -> None:
-    can_id, index, sub, size, value = _receive(t, 1)
-    before = t.read(index, sub)
-    t.send(can_id, pack(value, size))
+    rpdo = _Reception(t, 1)
+    rpdo.send()
     t.sync()
     t.wait(0.02)
-    t.put(index, sub, before, size)
+    t.put(rpdo.index, rpdo.sub, rpdo.before, rpdo.size)
     t.sync()
-    t.wait(0.02)
-    _stored(t, index, sub, before, "after a second SYNC without an RPDO")
+    rpdo.holds(rpdo.before, "after a second SYNC without an RPDO")
 
 
 @check("rpdo.pre-operational", "An RPDO in PRE-OPERATIONAL has no effect", _PDO)
 def _(t: NodeTester) -> None:
-    can_id, index, sub, size, value = _receive(t, 255, start=False)
-    before = t.read(index, sub)
-    t.send(can_id, pack(value, size))
-    t.wait(0.02)
-    _stored(t, index, sub, before, "after the RPDO")
+    rpdo = _Reception(t, 255, start=False)
+    rpdo.send()
+    rpdo.holds(rpdo.before, "after the RPDO")
 
 
 @check("rpdo.stale", "An RPDO from before PRE-OPERATIONAL has no effect when the node starts again", _PDO)
 def _(t: NodeTester) -> None:
-    can_id, index, sub, size, value = _receive(t, 1)
-    before = t.read(index, sub)
-    t.send(can_id, pack(value, size))
+    rpdo = _Reception(t, 1)
+    rpdo.send()
     t.nmt(NMT_PRE_OPERATIONAL)
     _start(t)
     t.sync()
-    t.wait(0.02)
-    _stored(t, index, sub, before, "after NMT start and SYNC")
+    rpdo.holds(rpdo.before, "after NMT start and SYNC")
 
 
 @check("rpdo.disabled", "An RPDO with bit 31 set has no effect", _PDO)
 def _(t: NodeTester) -> None:
-    can_id, index, sub, size, value = _receive(t, 255)
-    before = t.read(index, sub)
+    rpdo = _Reception(t, 255)
     t.put(_RPDO, 1, t.read(_RPDO, 1) | PDO_INVALID, 4)
-    t.send(can_id, pack(value, size))
-    t.wait(0.02)
-    _stored(t, index, sub, before, "after the RPDO")
+    rpdo.send()
+    rpdo.holds(rpdo.before, "after the RPDO")
 
 
 @check("rpdo.identifier.other", "An RPDO is received with the identifier that was written", _PDO)
 def _(t: NodeTester) -> None:
-    index, sub, bits = t.scratch()
-    value = t.other_value(index, sub, bits)
-    t.write(index, sub, int.from_bytes(t.upload(index, sub), "little"), bits // 8)
-    t.map_pdo(_RPDO, ((index, sub, bits),), 255, _SPARE_ID)
-    _start(t)
-    t.send(_SPARE_ID, pack(value, bits // 8))
-    t.wait(0.02)
-    _stored(t, index, sub, value, "after the RPDO")
+    rpdo = _Reception(t, 255, can_id=_SPARE_ID)
+    rpdo.send()
+    rpdo.holds(rpdo.value, "after the RPDO")
 
 
 @check("rpdo.short", "An RPDO that is too short has no effect", _PDO)
 def _(t: NodeTester) -> None:
-    can_id, index, sub, size, value = _receive(t, 255)
-    t.need(size > 1, "the object has one byte")
-    before = t.read(index, sub)
-    t.send(can_id, pack(value, size)[:-1])
-    t.wait(0.02)
-    found = t.read(index, sub)
-    t.send(can_id, pack(before, size))
-    t.equal(found, before, f"{index:04X}h:{sub:02X} after the RPDO")
+    rpdo = _Reception(t, 255)
+    t.need(rpdo.size > 1, "the object has one byte")
+    rpdo.holds(rpdo.before, "after the RPDO", rpdo.after(rpdo.data()[:-1]))
 
 
 @check("rpdo.short.emergency", "An RPDO that is too short is EMCY 8210h", "CiA 301, 7.2.7")
 def _(t: NodeTester) -> None:
-    can_id, _, _, size, value = _receive(t, 255)
+    rpdo = _Reception(t, 255)
     since = t.mark()
-    t.send(can_id, pack(value, size)[:-1])
+    rpdo.send(rpdo.data()[:-1])
     t.wait(0.05)
     codes = t.emergencies(since)
-    t.send(can_id, pack(value, size))
+    rpdo.send()
     t.true(0x8210 in codes, f"EMCY codes {[f'{code:04X}h' for code in codes]}", "8210h")
 
 
 @check("rpdo.long", "Of an RPDO that is too long the first bytes are taken", _PDO)
 def _(t: NodeTester) -> None:
-    can_id, index, sub, size, value = _receive(t, 255)
-    t.send(can_id, pack(value, size) + b"\xff")
-    t.wait(0.02)
-    t.send(can_id, pack(value, size))
-    _stored(t, index, sub, value, "after the RPDO")
+    rpdo = _Reception(t, 255)
+    rpdo.holds(rpdo.value, "after the RPDO", rpdo.after(rpdo.data() + b"\xff"))
 
 
 @check("rpdo.extended", "A frame with a 29-bit identifier is no RPDO", _PDO)
 def _(t: NodeTester) -> None:
-    can_id, index, sub, size, value = _receive(t, 255)
-    before = t.read(index, sub)
-    t.send_special(can_id, pack(value, size))
-    t.wait(0.02)
-    _stored(t, index, sub, before, "after the frame")
+    rpdo = _Reception(t, 255)
+    t.send_special(rpdo.can_id, rpdo.data())
+    rpdo.holds(rpdo.before, "after the frame")
 
 
 @check("rpdo.order", "An RPDO fills its objects in the order of the mapping", _PDO)
 def _(t: NodeTester) -> None:
-    index, sub, bits = t.scratch()
+    _, _, bits = t.scratch()
     t.need(bits <= 32, "the object has more than four bytes")
-    value = t.other_value(index, sub, bits)
-    t.write(index, sub, int.from_bytes(t.upload(index, sub), "little"), bits // 8)
     t.need(_maps_dummy(t), "dummy objects cannot be mapped")
-    can_id = t.map_pdo(_RPDO, (_DUMMY, (index, sub, bits)), 255)
-    _start(t)
-    t.send(can_id, b"\xaa" + pack(value, bits // 8))
-    t.wait(0.02)
-    _stored(t, index, sub, value, "behind a dummy byte")
+    rpdo = _Reception(t, 255, ahead=(_DUMMY,))
+    rpdo.send(b"\xaa" + rpdo.data())
+    rpdo.holds(rpdo.value, "behind a dummy byte")
 
 
 def _maps_dummy(t: NodeTester) -> bool:
@@ -636,8 +637,7 @@ def _(t: NodeTester) -> None:
 def _(t: NodeTester) -> None:
     t.require(0x1019)
     t.write(0x1019, 0, 10, 1)
-    can_id = t.map_pdo(_TPDO, (_REGISTER,), 1)
-    _start(t)
+    can_id = _sent(t, (_REGISTER,), 1)
     t.equal(_syncs(t, can_id, 3, 1), [1, 1, 1], "TPDOs")
 
 
@@ -646,8 +646,7 @@ def _(t: NodeTester) -> None:
     t.require(0x1019)
     t.require(_TPDO, 6)
     t.write(0x1019, 0, 10, 1)
-    can_id = t.map_pdo(_TPDO, (_REGISTER,), 2, timers={6: 3})
-    _start(t)
+    can_id = _sent(t, (_REGISTER,), 2, timers={6: 3})
     t.equal(_syncs(t, can_id, 8, 1), [0, 0, 1, 0, 1, 0, 1, 0], "TPDOs at counters 1 to 8")
 
 

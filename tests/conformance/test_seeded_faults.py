@@ -522,6 +522,12 @@ def _(patch, node, bus):
     node._on_rpdo = lambda pdo, data, now_s: take(pdo, bytearray(bytes(data).ljust(pdo.length, b"\0")), now_s)
 
 
+@fault("rpdo.long", "an RPDO that is too long is ignored")
+def _(patch, node, bus):
+    take = node._on_rpdo
+    node._on_rpdo = lambda pdo, data, now_s: take(pdo, data, now_s) if len(data) <= pdo.length else None
+
+
 @fault("rpdo.pre-operational", "RPDOs act in PRE-OPERATIONAL")
 def _(patch, node, bus):
     def also():
