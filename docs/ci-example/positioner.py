@@ -12,13 +12,13 @@ LOAD_COUNTS_PER_DEG = 2_880_000 / 360
 CYCLE_S = 0.010
 SPEED_DEG_S = 15.0
 ANSWER_S = 0.3  # a drive that has not answered for so long is lost
-WATCHDOG_MS = 500  # the drive stops by itself when set-points stay away for so long
+WATCHDOG_MS = 500  # the drive stops on its own when set-points are missing for this long
 LARGEST_STEP_DEG = 1.0  # of the load encoder, from one cycle to the next
 ENABLED, FAULT = 0x27, 0x08
 
 
 class Stopped(Exception):
-    """The axis was stopped, or stopped by itself; the text says why."""
+    """The axis was stopped, or stopped on its own; the text gives the reason."""
 
 
 class Axis:

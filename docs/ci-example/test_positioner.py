@@ -1,4 +1,4 @@
-"""What the motion program does on a simulated drive: on which bus, pytest.ini or the command line says."""
+"""The motion program on a simulated drive; pytest.ini or the command line chooses the bus."""
 
 import subprocess
 import sys
@@ -66,4 +66,4 @@ def test_the_drive_stops_by_itself_when_the_program_is_killed(drive):
     program.kill()
     program.wait()
     drive.wait_until(lambda: drive.state == "fault")
-    assert drive.emergencies == (0x8250,)  # set-points stay away
+    assert drive.emergencies == (0x8250,)  # set-points are missing

@@ -52,7 +52,8 @@ class Behaviour(Strict):
         0.0,
         ge=0,
         le=1000,
-        description="in a cyclic mode, SYNC overdue by so many periods is a lost master (6007h); 0: never",
+        description="in a cyclic mode, SYNC overdue by this many periods counts as a lost master (6007h); "
+        "0: never",
     )
     status_delay_ms: float = Field(
         0.0, ge=0, le=1_000, description="after a command, 6041h and 6061h keep their old values this long"

@@ -317,6 +317,6 @@ def mermaid() -> str:
     lines += [f"    {state.name}: {state.value}" for state in State if state is not State.UNKNOWN]
     lines.append(f"    [*] --> {State.NOT_READY_TO_SWITCH_ON.name}")
     for row in TRANSITIONS:
-        label = row.command.label if row.command else ("a fault occurs" if row.number == 13 else "by itself")
+        label = row.command.label if row.command else ("a fault occurs" if row.number == 13 else "automatic")
         lines.append(f"    {row.source.name} --> {row.target.name}: {row.number} {label}")
     return "\n".join(lines)
