@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import asyncio
+import select
 import ssl
-from typing import Any
+import threading
+import time
+from collections.abc import Callable
+from typing import Any, TypeVar
 
 import httpx
 
@@ -13,11 +17,66 @@ from hdbridge.client.calls import PREFIX, A, Call
 from hdbridge.client.messages import LeaseGrant
 from hdbridge.errors import DaemonError
 
+T = TypeVar("T")
+
+
+class TlsSocket(ssl.SSLSocket):
+    """TLS socket that one thread can read while another writes.
+
+    OpenSSL allows one call at a time on a connection (https://github.com/openssl/openssl/issues/20446), and
+    a WebSocket has a thread of its own that reads. Each call is made under a lock and does not block. The
+    lock is free while a thread waits for the peer.
+    """
+
+    _calls: threading.Lock
+    _timeout_s: float | None
+
+    def __new__(cls, *arguments: Any, **options: Any) -> TlsSocket:
+        made = super().__new__(cls, *arguments, **options)
+        made._calls, made._timeout_s = threading.Lock(), None
+        return made
+
+    def settimeout(self, value: float | None) -> None:
+        self._timeout_s = value
+
+    def gettimeout(self) -> float | None:
+        return self._timeout_s
+
+    def do_handshake(self, block: bool = False) -> None:
+        super().settimeout(self._timeout_s)
+        super().do_handshake(block)
+        super().settimeout(0)
+
+    def recv(self, buflen: int = 1024, flags: int = 0) -> bytes:
+        return self._in_turn(lambda: super(TlsSocket, self).recv(buflen, flags))
+
+    def send(self, data: Any, flags: int = 0) -> int:
+        return self._in_turn(lambda: super(TlsSocket, self).send(data, flags))
+
+    def _in_turn(self, call: Callable[[], T]) -> T:
+        """Repeats a call until it does not have to wait. Raises TimeoutError."""
+        until_s = None if self._timeout_s is None else time.monotonic() + self._timeout_s
+        while True:
+            try:
+                with self._calls:
+                    return call()
+            except ssl.SSLWantReadError:
+                event = select.POLLIN
+            except ssl.SSLWantWriteError:
+                event = select.POLLOUT
+            waiting = select.poll()
+            waiting.register(self, event)
+            if not waiting.poll(None if until_s is None else max(0.0, 1e3 * (until_s - time.monotonic()))):
+                raise TimeoutError("timed out")
+
 
 def tls_context(address: Address) -> ssl.SSLContext | None:
     """Returns the TLS context for HTTPS, with the certificates of the system or ``$SSL_CERT_FILE``."""
-    https = address.socket is None and address.url.startswith("https")
-    return ssl.create_default_context() if https else None
+    if address.socket is not None or not address.url.startswith("https"):
+        return None
+    context = ssl.create_default_context()
+    context.sslsocket_class = TlsSocket
+    return context
 
 
 def settings(address: Address) -> dict[str, Any]:
