@@ -274,6 +274,11 @@ def test_hold_freezes_the_correction():
     assert motor == pytest.approx(50 * (loads[400] - frozen / 3600))
 
 
+def test_a_new_one_is_the_plain_gear():
+    compensation = Compensation(model(), CompensationLimits(), PERIOD)
+    assert compensation.command(0.1, NOW) == pytest.approx(5.0, abs=1e-9)
+
+
 def test_reset_begins_without_a_correction_wherever_the_motor_stands():
     compensation = Compensation(model(), CompensationLimits(), PERIOD)
     compensation.reset(1234.5)

@@ -19,6 +19,7 @@ from hdbridge.clock import MonotonicClock
 from hdbridge.device.node import DriveNode
 from hdbridge.device.run import run
 from hdbridge.errors import BusError
+from hdbridge.sim.lockstep import VirtualClock
 
 EDS = Path(__file__).parents[2] / "eds" / "hdbridge-402.eds"
 
@@ -144,19 +145,8 @@ class BrokenBus(can.BusABC):
         raise can.CanOperationError("network is down")
 
 
-class SteppedClock:
-    def __init__(self) -> None:
-        self.time_s = 0.0
-
-    def now(self) -> float:
-        return self.time_s
-
-    def sleep_until(self, deadline_s: float) -> None:
-        self.time_s = max(self.time_s, deadline_s)
-
-
 def test_a_drive_whose_bus_is_gone_runs_on_and_gives_up_in_the_end(motor):
-    clock = SteppedClock()
+    clock = VirtualClock()
     with BrokenBus() as bus:
         node = DriveNode(bus, motor, EDS, 1, clock)
         with pytest.raises(BusError, match="gone: cannot be read"):
@@ -167,6 +157,6 @@ def test_a_drive_whose_bus_is_gone_runs_on_and_gives_up_in_the_end(motor):
 def test_frames_that_cannot_be_sent_are_dropped(motor):
     with BrokenBus() as bus:
         bus.recv = lambda timeout: None
-        node = DriveNode(bus, motor, EDS, 1, SteppedClock())
+        node = DriveNode(bus, motor, EDS, 1, VirtualClock())
         node.poll(0.0)
         assert node.lost_frames == 1

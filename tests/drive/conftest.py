@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from copy import deepcopy
 from pathlib import Path
 from typing import Any
 from uuid import uuid4
 
 import can
 import pytest
+from support.keys import with_keys
 
 from hdbridge.axis import AxisConfig
 from hdbridge.drive import load_eds
+from hdbridge.sim.lockstep import VirtualClock
 
 AXIS: dict[str, Any] = {
     "schema": "hdbridge.axis/1",
@@ -43,27 +44,7 @@ AXIS: dict[str, Any] = {
 
 def make_axis(**changes: Any) -> AxisConfig:
     """The axis above; ``changes`` are dotted names, with two underscores for the dot."""
-    content = deepcopy(AXIS)
-    for name, value in changes.items():
-        *parents, last = name.split("__")
-        target = content
-        for parent in parents:
-            target = target.setdefault(parent, {})
-        target[last] = value
-    return AxisConfig.model_validate(content)
-
-
-class SteppedClock:
-    """A clock that only moves when it is told to."""
-
-    def __init__(self) -> None:
-        self.time_s = 0.0
-
-    def now(self) -> float:
-        return self.time_s
-
-    def sleep_until(self, deadline_s: float) -> None:
-        self.time_s = max(self.time_s, deadline_s)
+    return AxisConfig.model_validate(with_keys(AXIS, changes))
 
 
 class PeerBus(can.BusABC):
@@ -75,7 +56,7 @@ class PeerBus(can.BusABC):
 
     step_s = 0.001
 
-    def __init__(self, clock: SteppedClock, channel: str) -> None:
+    def __init__(self, clock: VirtualClock, channel: str) -> None:
         self._inner = can.Bus(interface="virtual", channel=channel, ignore_config=True)
         self._clock = clock
         self.peers: list[Callable[[], None]] = []
@@ -125,8 +106,8 @@ def build_axis() -> Callable[..., AxisConfig]:
 
 
 @pytest.fixture
-def clock() -> SteppedClock:
-    return SteppedClock()
+def clock() -> VirtualClock:
+    return VirtualClock()
 
 
 @pytest.fixture
@@ -135,7 +116,7 @@ def channel() -> str:
 
 
 @pytest.fixture
-def bus(clock: SteppedClock, channel: str) -> Iterator[PeerBus]:
+def bus(clock: VirtualClock, channel: str) -> Iterator[PeerBus]:
     with PeerBus(clock, channel) as bus:
         yield bus
 
@@ -154,7 +135,7 @@ class TinyDrive:
     to the frames that are sent back. `stuck` objects take no value; `silent` answers nothing at all.
     """
 
-    def __init__(self, bus: can.BusABC, clock: SteppedClock, node_id: int = 1) -> None:
+    def __init__(self, bus: can.BusABC, clock: VirtualClock, node_id: int = 1) -> None:
         self.bus, self.clock, self.node_id = bus, clock, node_id
         self.od = load_eds(EDS, node_id)
         self.values: dict[tuple[int, int], int | bytes] = {}
@@ -314,7 +295,7 @@ EDS = Path(__file__).parents[2] / "eds" / "hdbridge-402.eds"
 
 
 @pytest.fixture
-def tiny(bus: PeerBus, peer_bus: can.BusABC, clock: SteppedClock) -> TinyDrive:
+def tiny(bus: PeerBus, peer_bus: can.BusABC, clock: VirtualClock) -> TinyDrive:
     """A scripted drive at the other end of ``bus``."""
     drive = TinyDrive(peer_bus, clock)
     bus.peers.append(drive)

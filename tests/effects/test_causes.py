@@ -400,3 +400,34 @@ def test_the_title_of_a_channel_is_its_name_without_the_unit():
         "direction": "direction",
         "load_deg": "load",
     }
+
+
+# ---- what a mutation run showed that no other test notices --------------------------------------
+
+
+def test_the_discrepancy_of_a_drag_is_its_derivative_by_the_exponent_of_the_thinning():
+    drag = VelocityWindup(coulomb_arcsec=0.0, viscous_arcsec_s_per_deg=0.02, shear_deg_s=400.0)
+    motion = Motion(1e-3 * np.arange(0.0, 4000.0) ** 2, np.arange(0.0, 40.0, 0.01))
+    speed = np.array([each.motor_speed_deg_s for each in moments(motion)])
+
+    def viscous(exponent: float) -> np.ndarray:
+        return -0.02 * speed / (1.0 + (np.abs(speed) / 400.0) ** exponent)
+
+    derivative = (viscous(1.0 + 1e-5) - viscous(1.0 - 1e-5)) / 2e-5
+    (found,) = drag.law_discrepancy(motion).T
+    scale = float(found @ derivative / (derivative @ derivative))
+    assert scale > 0.0
+    assert found == pytest.approx(scale * derivative, rel=1e-4, abs=1e-6)
+
+
+def test_time_that_goes_back_does_not_change_what_has_crept():
+    tracker = Creep(parts=(Relaxation(amplitude_arcsec=5.0, tau_s=10.0),), build_up=0.1).tracker()
+    tracker.advance(0.0, Moment(time_s=0.0))
+    crept = tracker.advance(10.0, Moment(time_s=1.0, motor_speed_deg_s=10.0))
+    assert tracker.peek(10.0, Moment(time_s=0.5)) == crept != 0.0
+
+
+def test_a_grid_of_two_values_is_a_quarter_of_the_range_from_either_end():
+    shape = next(each for each in LocalDefect.candidate(50.0).shape if each.name == "centre_deg")
+    assert shape.grid(1) == (180.0,)
+    assert shape.grid(2) == (90.0, 270.0)

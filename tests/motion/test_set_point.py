@@ -254,3 +254,7 @@ def test_limits_without_room_are_refused():
         SetPoint(LIMITS.__class__(1.0, 0.0, 60.0, 200.0, 4000.0), PERIOD_S)
     with pytest.raises(InputError, match="above 0"):
         SetPoint(LIMITS.__class__(0.0, 1.0, 60.0, 0.0, 4000.0), PERIOD_S)
+
+
+def test_no_knot_would_be_taken_outside_a_stream():
+    assert SetPoint(LIMITS, PERIOD_S).room == 0

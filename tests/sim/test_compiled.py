@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import random
 from pathlib import Path
 from typing import Any
@@ -11,6 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support.keys import with_keys
 
 from hdbridge.axis import AxisConfig
 from hdbridge.control.bench import Bench
@@ -47,14 +47,7 @@ def may_compile(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def truth(changes: dict[str, Any]) -> Truth:
     """The article's axis with keys like ``load__gravity`` changed."""
-    data = copy.deepcopy(DATA)
-    for path, value in changes.items():
-        *parts, last = path.split("__")
-        place = data
-        for part in parts:
-            place = place[part]
-        place[last] = value
-    return Truth.model_validate(data)
+    return Truth.model_validate(with_keys(DATA, changes))
 
 
 def numbers(low: float, high: float) -> st.SearchStrategy[float]:

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from support.hidden.elastic import remembering
+from support.keys import with_keys
 
 from hdbridge.sim.encoder import Disc, Late, Losses, Signals
 from hdbridge.sim.exercise import Exercise
@@ -31,13 +32,7 @@ def axis(**changes: Any) -> Truth:
     data["gear"].update(motor_orders=[], hysteresis=None)
     data["motor"]["encoder"].update(counts_per_turn=512_000, interpolation=1)
     data["load"]["encoder"].update(counts_per_turn=28_800_000, coupling=None)
-    for path, value in changes.items():
-        *parts, last = path.split("__")
-        place = data
-        for part in parts:
-            place = place[part]
-        place[last] = value
-    return Truth.model_validate(data)
+    return Truth.model_validate(with_keys(data, changes))
 
 
 def mass(torque_nm: float = 20.0, down_deg: float = 0.0) -> dict[str, float]:

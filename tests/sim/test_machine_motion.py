@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 import ruckig
+from support.keys import with_keys
 
 from hdbridge.sim.machine import Machine
 from hdbridge.sim.servo import Notch
@@ -24,13 +25,7 @@ STEP_COUNTS = 968
 def truth(profile: str = "article", **changes: Any) -> Truth:
     """A profile's axis with values changed, keys like ``gear__ratio``."""
     data = Truth.load(PROFILES / profile).model_dump(by_alias=True)
-    for path, value in changes.items():
-        *parts, last = path.split("__")
-        place = data
-        for part in parts:
-            place = place[part]
-        place[last] = value
-    return Truth.model_validate(data)
+    return Truth.model_validate(with_keys(data, changes))
 
 
 def trajectory(distance_counts: int) -> list[int]:

@@ -1,0 +1,19 @@
+"""Changes of nested mappings by dotted keys, with two underscores for the dot."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Mapping
+from typing import Any
+
+
+def with_keys(data: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
+    """Returns a deep copy with keys like ``load__gravity`` changed; missing mappings are made."""
+    made = copy.deepcopy(dict(data))
+    for path, value in changes.items():
+        *parents, last = path.split("__")
+        place = made
+        for parent in parents:
+            place = place.setdefault(parent, {})
+        place[last] = value
+    return made
