@@ -10,18 +10,16 @@ axis and for one axis more is printed: what is linear in n has both constant or 
 
 from __future__ import annotations
 
-import argparse
-import json
 import math
 import statistics
 import time
 import warnings
 from collections.abc import Callable
-from contextlib import suppress
-from pathlib import Path
+from functools import partial
 from typing import Any
 
-from cycle import PROFILE, AnsweringBus, LoopbackSocket, NeverSleeping, Variants, block_us, loopback_bus
+from cycle import AnsweringBus, LoopbackSocket, NeverSleeping, Variants, loopback_bus
+from harness import PROFILE, Busy, block_us, in_turn, keep, medians, parser, undisturbed
 
 from hdbridge.axis import AxisConfig
 from hdbridge.axis.model import TransmissionModel
@@ -34,14 +32,9 @@ from hdbridge.drive.image import ProcessImage
 from hdbridge.drive.link import Link
 from hdbridge.drive.states import State
 from hdbridge.drive.supervision import Supervision
-from hdbridge.errors import SafetyStop
 
 AXES = (1, 2, 4, 6)
 HELD, COMPENSATED = "held", "compensated"
-
-
-class Busy(Exception):  # noqa: N818 - what happened
-    """The machine stalled within a block, and the cycle made a fault of it."""
 
 
 class Axes:
@@ -113,14 +106,9 @@ class Worker:
 
     def block(self, interface: str, count: int, kind: str, cycles: int) -> float:
         """Own cost of one cycle, us; ``count`` 0 is one axis through `Cycle`."""
-        for _ in range(20):
-            with suppress(SafetyStop, Busy):
-                return (
-                    self._single(interface, kind, cycles)
-                    if not count
-                    else self._bus(interface, count, kind, cycles)
-                )
-        raise SystemExit("no block ran to its end: this machine is too busy to measure on")
+        if not count:
+            return undisturbed(lambda: self._single(interface, kind, cycles))
+        return undisturbed(lambda: self._bus(interface, count, kind, cycles))
 
     def _single(self, interface: str, kind: str, cycles: int) -> float:
         if interface not in self.singles:
@@ -155,19 +143,15 @@ class Worker:
 def measure(interface: str, blocks: int, cycles: int) -> dict[str, dict[str, float]]:
     """Returns medians by kind and variant, us, and the median ratio of neighbouring blocks."""
     worker = Worker()
-    times: dict[tuple[str, str], list[float]] = {}
-    for _ in range(blocks):
-        for kind in (HELD, COMPENSATED):
-            times.setdefault((kind, "now"), []).append(worker.block(interface, 0, kind, cycles))
-            for count in AXES:
-                own_us = worker.block(interface, count, kind, max(cycles // count, 50))
-                times.setdefault((kind, str(count)), []).append(own_us)
-    result: dict[str, dict[str, float]] = {HELD: {}, COMPENSATED: {}}
-    for (kind, name), values in times.items():
-        result[kind][name] = statistics.median(values)
-    for kind, figures in result.items():
-        pairs = zip(times[kind, "1"], times[kind, "now"], strict=True)
-        figures["bus of one / now"] = statistics.median(a / b for a, b in pairs)
+    result = {}
+    for kind in (HELD, COMPENSATED):
+        variants = {"now": partial(worker.block, interface, 0, kind, cycles)} | {
+            str(count): partial(worker.block, interface, count, kind, max(cycles // count, 50))
+            for count in AXES
+        }
+        times = in_turn(variants, blocks)
+        ratio = statistics.median(a / b for a, b in zip(times["1"], times["now"], strict=True))
+        result[kind] = medians(times) | {"bus of one / now": ratio}
     return result
 
 
@@ -193,14 +177,9 @@ def report(result: dict[str, dict[str, float]], where: str) -> str:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--interface", choices=("virtual", "loopback"), action="append")
-    parser.add_argument("--blocks", type=int, default=41, help="blocks per variant")
-    parser.add_argument("--cycles", type=int, default=400, help="cycles per block, for one axis")
-    parser.add_argument("--json", type=Path)
-    options = parser.parse_args()
+    given = parser(__doc__, blocks=41, cycles=400)
+    given.add_argument("--interface", choices=("virtual", "loopback"), action="append")
+    options = given.parse_args()
     warnings.simplefilter("ignore")
     began_s = time.monotonic()
     results = {}
@@ -208,8 +187,7 @@ def main() -> int:
         results[interface] = measure(interface, options.blocks, options.cycles)
         print(report(results[interface], interface), end="\n\n")
     print(f"{time.monotonic() - began_s:.0f} s")
-    if options.json is not None:
-        options.json.write_text(json.dumps(results, indent=2) + "\n")
+    keep(results, options.json)
     return 0
 
 

@@ -25,10 +25,8 @@ Without --interface all are measured that this machine has.
 from __future__ import annotations
 
 import argparse
-import json
 import math
 import socket
-import statistics
 import struct
 import subprocess
 import time
@@ -36,6 +34,7 @@ import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import can
@@ -44,6 +43,7 @@ from can.interfaces.socketcan import SocketcanBus
 from can.interfaces.socketcan.constants import SO_TIMESTAMPNS
 from can.interfaces.socketcan.socketcan import build_can_frame
 from can.interfaces.virtual import VirtualBus
+from harness import PROFILE, block_us, in_turn, keep, medians, parser, undisturbed
 
 from hdbridge.axis import AxisConfig
 from hdbridge.axis.effects import InertialWindup, Observer
@@ -58,7 +58,6 @@ from hdbridge.drive.states import State
 from hdbridge.drive.supervision import Supervision
 from hdbridge.errors import SafetyStop
 
-PROFILE = Path(__file__).resolve().parents[2] / "profiles" / "article"
 STATUS_ENABLED = 0x1237
 ENABLE = 0x0F
 TPDO1, TPDO2, RPDO1 = struct.Struct("<Hih"), struct.Struct("<ii"), struct.Struct("<Hi")
@@ -371,26 +370,6 @@ class Variants:
             network.send_message(0x77F, b"\x05")
 
 
-def block_us(work: Callable[[], object], cycles: int, timer: Callable[[], float] = time.thread_time) -> float:
-    """Time per call, us."""
-    begin = timer()
-    for _ in range(cycles):
-        work()
-    return 1e6 * (timer() - begin) / cycles
-
-
-def block_of(
-    variants: Variants, loop: Callable[[], object], cycles: int, timer: Callable[[], float]
-) -> float:
-    """One block's time per cycle, us; begun anew when a busy machine has made the cycle stop in it."""
-    for _ in range(20):
-        with suppress(SafetyStop):
-            variants.start()
-            block_us(loop, 20)
-            return block_us(loop, cycles, timer)
-    raise SystemExit("no block ran to its end: this machine is too busy to measure on")
-
-
 def run(
     variants: Variants,
     blocks: int,
@@ -399,6 +378,12 @@ def run(
     timer: Callable[[], float],
 ) -> dict[str, float]:
     """Median time per cycle of each variant, us, without what the answering node costs."""
+
+    def block(loop: Callable[[], object]) -> float:
+        variants.start()
+        block_us(loop, 20)
+        return block_us(loop, cycles, timer)
+
     loops: dict[str, Callable[[], object]] = {
         "bare": variants.bare,
         "cycle": variants.plain,
@@ -407,17 +392,12 @@ def run(
         "wind-up": variants.wind_up,
         "canopen": variants.with_canopen,
     }
-    times: dict[str, list[float]] = {name: [] for name in loops}
-    costs: list[float] = []
-    for _ in range(blocks):
-        for name, loop in loops.items():
-            times[name].append(block_of(variants, loop, cycles, timer))
-        if responder is not None:
-            costs.append(block_us(responder, cycles))
-    cost = statistics.median(costs) if costs else 0.0
-    result = {name: statistics.median(values) - cost for name, values in times.items()}
-    result["responder"] = cost
-    return result
+    measured = {name: partial(undisturbed, partial(block, loop)) for name, loop in loops.items()}
+    if responder is not None:
+        measured["responder"] = partial(block_us, responder, cycles)
+    result = {"responder": 0.0} | medians(in_turn(measured, blocks))
+    cost = result.pop("responder")
+    return {name: value - cost for name, value in result.items()} | {"responder": cost}
 
 
 def report(result: dict[str, float], where: str) -> str:
@@ -468,16 +448,11 @@ def measure(
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--interface", choices=("virtual", "loopback", "socketcan"), action="append")
-    parser.add_argument("--channel", default="vcan0", help="of socketcan")
-    parser.add_argument("--profile", type=Path, default=PROFILE)
-    parser.add_argument("--blocks", type=int, default=21, help="blocks per variant")
-    parser.add_argument("--cycles", type=int, default=500, help="cycles per block")
-    parser.add_argument("--json", type=Path)
-    options = parser.parse_args()
+    given = parser(__doc__, blocks=21, cycles=500)
+    given.add_argument("--interface", choices=("virtual", "loopback", "socketcan"), action="append")
+    given.add_argument("--channel", default="vcan0", help="of socketcan")
+    given.add_argument("--profile", type=Path, default=PROFILE)
+    options = given.parse_args()
     warnings.simplefilter("ignore")
     axis = AxisConfig.load(options.profile)
     model = TransmissionModel.load(options.profile / "model.yaml")
@@ -489,8 +464,7 @@ def main() -> int:
         where, result = measure(interface, options, axis, model)
         print(report(result, where), end="\n\n")
         results.append({"where": where, "unit": "us", **result})
-    if options.json is not None:
-        options.json.write_text(json.dumps(results, indent=2) + "\n")
+    keep(results, options.json)
     return 0
 
 

@@ -39,6 +39,7 @@ from typing import Any, Final
 import numpy as np
 from daemon_loop import bench_cycle
 from daemon_realtime import RealClock
+from harness import keep, parser
 from rundaemon import CONTROL, SERVICE, Clients, Cost, RunningDaemon, running
 
 from hdbridge.axis import AxisConfig
@@ -234,14 +235,11 @@ def table(phases: dict[str, list[Phase]]) -> str:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--rounds", type=int, default=5)
-    parser.add_argument("--seconds", type=float, default=12.0, help="of each phase")
-    parser.add_argument("--json", type=Path)
-    parser.add_argument("--bench", action="store_true", help=argparse.SUPPRESS)
-    options = parser.parse_args()
+    given = parser(__doc__)
+    given.add_argument("--rounds", type=int, default=5)
+    given.add_argument("--seconds", type=float, default=12.0, help="of each phase")
+    given.add_argument("--bench", action="store_true", help=argparse.SUPPRESS)
+    options = given.parse_args()
     if options.bench:
         return serve_bench()
     phases: dict[str, list[Phase]] = {kind: [] for kind in KINDS}
@@ -270,9 +268,8 @@ def main() -> int:
         bench.close()
     print(table(phases))
     print("clients:", json.dumps(seen))
-    if options.json is not None:
-        found = {kind: [asdict(each) for each in phases[kind]] for kind in KINDS}
-        options.json.write_text(json.dumps({**found, "clients": seen}, indent=2) + "\n", encoding="utf-8")
+    found = {kind: [asdict(each) for each in phases[kind]] for kind in KINDS}
+    keep({**found, "clients": seen}, options.json)
     return 0
 
 

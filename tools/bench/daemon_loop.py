@@ -14,16 +14,13 @@ run in the same thread; what they cost is measured in the same blocks and subtra
 
 from __future__ import annotations
 
-import argparse
-import json
-import statistics
 import warnings
 from collections.abc import Callable
-from contextlib import suppress
-from pathlib import Path
+from functools import partial
 
 import can
-from cycle import PROFILE, AnsweringBus, NeverSleeping, block_us
+from cycle import AnsweringBus, NeverSleeping
+from harness import PROFILE, Busy, block_us, in_turn, keep, medians, parser, undisturbed
 
 from hdbridge.axis import AxisConfig
 from hdbridge.axis.effects import Moment, Observer
@@ -42,7 +39,6 @@ from hdbridge.drive.image import ProcessImage
 from hdbridge.drive.link import Link
 from hdbridge.drive.states import State
 from hdbridge.drive.supervision import Supervision
-from hdbridge.errors import SafetyStop
 from hdbridge.motion import SetPoint
 
 GOAL = 1.3
@@ -141,38 +137,34 @@ def follow(controller: Controller, memory: Memory, turns: int) -> None:
 
 
 def loop_block(count: int, model: TransmissionModel, cycles: int, *, followed: bool = False) -> float:
-    """CPU time of a turn for so many axes, us; begun anew when a busy machine has stopped an axis in it."""
-    for _ in range(20):
-        with AnsweringBus(*range(1, count + 1)) as bus, Memory.create(count, 0.004) as memory:
-            controller = controller_of(bus, memory, model, followed=cycles + 100 if followed else 0)
-            block_us(controller.turn, 50)
-            own = block_us(controller.turn, cycles)
-            if all(axis.state is AxisState.ENABLED for axis in controller.axes):
-                return own - block_us(bus.answer, cycles)
-    raise SystemExit("no block ran to its end: this machine is too busy to measure on")
+    """Returns the CPU time of a turn for several axes, us."""
+    with AnsweringBus(*range(1, count + 1)) as bus, Memory.create(count, 0.004) as memory:
+        controller = controller_of(bus, memory, model, followed=cycles + 100 if followed else 0)
+        block_us(controller.turn, 50)
+        own = block_us(controller.turn, cycles)
+        if any(axis.state is not AxisState.ENABLED for axis in controller.axes):
+            raise Busy
+        return own - block_us(bus.answer, cycles)
 
 
 def bench_block(model: TransmissionModel, cycles: int) -> float:
     """The same of the bench's cycle."""
-    for _ in range(20):
-        with suppress(SafetyStop), AnsweringBus(1) as bus:
-            turn, _ = bench_cycle(bus, model)
-            block_us(turn, 50)
-            own = block_us(turn, cycles)
-            return own - block_us(bus.answer, cycles)
-    raise SystemExit("no block ran to its end: this machine is too busy to measure on")
+    with AnsweringBus(1) as bus:
+        turn, _ = bench_cycle(bus, model)
+        block_us(turn, 50)
+        own = block_us(turn, cycles)
+        return own - block_us(bus.answer, cycles)
 
 
 def measure(counts: list[int], blocks: int, cycles: int) -> dict[str, float]:
     """Median CPU time of one cycle of each, us, without the answering nodes."""
     model = TransmissionModel.load(PROFILE / "model.yaml")
-    times: dict[str, list[float]] = {}
-    for _ in range(blocks):
-        times.setdefault("bench", []).append(bench_block(model, cycles))
-        for count in counts:
-            times.setdefault(f"loop {count}", []).append(loop_block(count, model, cycles))
-        times.setdefault("follow 1", []).append(loop_block(1, model, cycles, followed=True))
-    return {name: statistics.median(values) for name, values in times.items()}
+    variants = {
+        "bench": partial(bench_block, model, cycles),
+        **{f"loop {count}": partial(loop_block, count, model, cycles) for count in counts},
+        "follow 1": partial(loop_block, 1, model, cycles, followed=True),
+    }
+    return medians(in_turn({name: partial(undisturbed, each) for name, each in variants.items()}, blocks))
 
 
 def report(result: dict[str, float]) -> str:
@@ -190,19 +182,13 @@ def report(result: dict[str, float]) -> str:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--axes", default="1,2,6", help="numbers of axes, comma-separated")
-    parser.add_argument("--blocks", type=int, default=21, help="blocks per variant")
-    parser.add_argument("--cycles", type=int, default=500, help="cycles per block")
-    parser.add_argument("--json", type=Path)
-    options = parser.parse_args()
+    given = parser(__doc__, blocks=21, cycles=500)
+    given.add_argument("--axes", default="1,2,6", help="numbers of axes, comma-separated")
+    options = given.parse_args()
     warnings.simplefilter("ignore")
     result = measure([int(each) for each in options.axes.split(",")], options.blocks, options.cycles)
     print(report(result))
-    if options.json is not None:
-        options.json.write_text(json.dumps({"unit": "us", **result}, indent=2) + "\n")
+    keep({"unit": "us", **result}, options.json)
     return 0
 
 

@@ -8,13 +8,13 @@ In the corrections' figures the axis moves; `changing` is a cycle in which two m
 
 from __future__ import annotations
 
-import argparse
-import json
 import pickle
 import statistics
 import time
 from collections.abc import Callable
 from pathlib import Path
+
+from harness import keep, parser
 
 from hdbridge.axis import AxisConfig
 from hdbridge.axis.effects import Moment
@@ -141,16 +141,14 @@ def pickles() -> dict[str, float]:
 
 def main() -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--json", type=Path)
-    given = parser.parse_args()
+    given = parser(__doc__)
+    options = given.parse_args()
     yardstick = median_us(unit)
     figures = {**set_points(), **corrections(), **pickles()}
     print(f"{'':40} {'us':>8} {'units':>8}   (unit: {yardstick:.2f} us)")
     for name, taken in figures.items():
         print(f"{name:40} {taken:8.2f} {taken / yardstick:8.2f}")
-    if given.json:
-        given.json.write_text(json.dumps({"unit_us": yardstick, "us": figures}, indent=2) + "\n")
+    keep({"unit_us": yardstick, "us": figures}, options.json)
 
 
 if __name__ == "__main__":

@@ -16,8 +16,6 @@ Then six axes on one bus, compensated, at 250 Hz (`buscycle.py`).
 
 from __future__ import annotations
 
-import argparse
-import json
 import subprocess
 import time
 import warnings
@@ -28,7 +26,8 @@ from pathlib import Path
 import can
 import numpy as np
 from buscycle import COMPENSATED, Axes
-from cycle import PROFILE, Variants, answering_kernel
+from cycle import Variants, answering_kernel
+from harness import PROFILE, keep, parser
 
 from hdbridge.axis import AxisConfig
 from hdbridge.axis.model import TransmissionModel
@@ -134,15 +133,12 @@ def table(figures: list[Figures], period_s: float) -> str:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--channel", default="vcan0")
-    parser.add_argument("--cycles", type=int, default=20_000)
-    parser.add_argument("--master", type=Path, help="the compiled master.c")
-    parser.add_argument("--only", choices=KINDS, action="append", help="measure these only")
-    parser.add_argument("--json", type=Path)
-    options = parser.parse_args()
+    given = parser(__doc__)
+    given.add_argument("--channel", default="vcan0")
+    given.add_argument("--cycles", type=int, default=20_000)
+    given.add_argument("--master", type=Path, help="the compiled master.c")
+    given.add_argument("--only", choices=KINDS, action="append", help="measure these only")
+    options = given.parse_args()
     warnings.simplefilter("ignore")
     axis = AxisConfig.load(PROFILE)
     axis = axis.model_copy(update={"drive": axis.drive.model_copy(update={"cycle_ms": 1.0})})
@@ -177,8 +173,7 @@ def main() -> int:
         several, several_s = of_axes(options.channel, model, clock, options.cycles)
         print(table([several], several_s))
         figures.append(several)
-    if options.json is not None:
-        options.json.write_text(json.dumps([asdict(each) for each in figures], indent=2) + "\n")
+    keep([asdict(each) for each in figures], options.json)
     return 0
 
 

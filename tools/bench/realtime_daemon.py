@@ -31,13 +31,13 @@ import warnings
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, replace
-from pathlib import Path
 from typing import Any
 
 import can
 import numpy as np
-from cycle import PROFILE, answering_kernel
+from cycle import answering_kernel
 from daemon_loop import bench_cycle, configs_of
+from harness import PROFILE, keep, parser
 from realtime_cycle import WARM_UP, Figures, Waking, table
 
 from hdbridge.axis.model import TransmissionModel
@@ -284,16 +284,13 @@ def report(seen: dict[str, Any]) -> None:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--channel", default="vcan0")
-    parser.add_argument("--turns", type=int, default=20_000)
-    parser.add_argument("--only", choices=tuple(VARIANTS), action="append", help="measure these only")
-    parser.add_argument("--json", type=Path)
-    parser.add_argument("--serve", type=int, metavar="FD", help=argparse.SUPPRESS)
-    parser.add_argument("--axes", type=int, default=1, help=argparse.SUPPRESS)
-    options = parser.parse_args()
+    given = parser(__doc__)
+    given.add_argument("--channel", default="vcan0")
+    given.add_argument("--turns", type=int, default=20_000)
+    given.add_argument("--only", choices=tuple(VARIANTS), action="append", help="measure these only")
+    given.add_argument("--serve", type=int, metavar="FD", help=argparse.SUPPRESS)
+    given.add_argument("--axes", type=int, default=1, help=argparse.SUPPRESS)
+    options = given.parse_args()
     warnings.simplefilter("ignore")
     if options.serve is not None:
         return serve(options.serve, options.axes)
@@ -307,8 +304,7 @@ def main() -> int:
         print(table([figures], 1e-3 * cycle_ms), flush=True)
         report(seen)
         results.append({**asdict(figures), "cycle_ms": cycle_ms, **seen})
-    if options.json is not None:
-        options.json.write_text(json.dumps(results, indent=2) + "\n")
+    keep(results, options.json)
     return 0
 
 

@@ -10,7 +10,6 @@ open without more. Processor time is that of the thread, without the disk's.
 
 from __future__ import annotations
 
-import argparse
 import json
 import tempfile
 import time
@@ -18,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from harness import keep, parser
 from mcap.writer import CompressionType, Writer
 
 from hdbridge.daemon.memory import AXIS_SAMPLE, sample_dtype
@@ -139,13 +139,12 @@ def measured(axes: int, seconds: int, rate: int) -> dict[str, Any]:
 
 def main() -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("--axes", type=int, nargs="+", default=[1, 6])
-    parser.add_argument("--seconds", type=int, default=120)
-    parser.add_argument("--rate", type=int, default=250)
-    parser.add_argument("--json", type=Path)
-    given = parser.parse_args()
-    results = [measured(axes, given.seconds, given.rate) for axes in given.axes]
+    given = parser(__doc__)
+    given.add_argument("--axes", type=int, nargs="+", default=[1, 6])
+    given.add_argument("--seconds", type=int, default=120)
+    given.add_argument("--rate", type=int, default=250)
+    options = given.parse_args()
+    results = [measured(axes, options.seconds, options.rate) for axes in options.axes]
     print(f"{'axes':>4} {'encoding':>9} {'us/message':>11} {'% of a core':>12} {'MB/hour':>8}")
     for each in results:
         for name in ("recorder", "json"):
@@ -156,8 +155,7 @@ def main() -> None:
                 f"{row['mb_per_hour']:8.0f}"
             )
         print(f"     reading back: {each['reading_us_per_message']:.1f} us a message")
-    if given.json:
-        given.json.write_text(json.dumps(results, indent=2) + "\n")
+    keep(results, options.json)
 
 
 if __name__ == "__main__":

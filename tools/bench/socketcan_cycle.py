@@ -11,8 +11,6 @@ nothing was missed, 1 otherwise.
 
 from __future__ import annotations
 
-import argparse
-import json
 import math
 import subprocess
 import sys
@@ -20,6 +18,8 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+
+from harness import PROFILE, keep, parser
 
 from hdbridge.axis import AxisConfig
 from hdbridge.axis.model import TransmissionModel
@@ -35,7 +35,6 @@ from hdbridge.drive.states import State
 from hdbridge.drive.supervision import Fault, Supervision
 from hdbridge.errors import HdbridgeError, SafetyStop
 
-PROFILE = Path(__file__).resolve().parents[2] / "profiles" / "article"
 SWING_DEG = 2.0
 BOOT_ATTEMPTS = 20
 
@@ -105,14 +104,11 @@ def measure(drive: Drive, model: TransmissionModel, cycles: int) -> dict[str, ob
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--channel", default="vcan0")
-    parser.add_argument("--cycles", type=int, default=5000)
-    parser.add_argument("--profile", type=Path, default=PROFILE)
-    parser.add_argument("--json", type=Path)
-    options = parser.parse_args()
+    given = parser(__doc__)
+    given.add_argument("--channel", default="vcan0")
+    given.add_argument("--cycles", type=int, default=5000)
+    given.add_argument("--profile", type=Path, default=PROFILE)
+    options = given.parse_args()
     axis = AxisConfig.load(options.profile)
     bus = axis.bus.model_copy(update={"interface": "socketcan", "channel": options.channel})
     model = TransmissionModel.load(options.profile / "model.yaml")
@@ -132,8 +128,7 @@ def main() -> int:
     result["empty_loop"] = {"begun_late": late, "skipped": empty.skipped, **empty.histogram.as_dict()}
     for name, value in result.items():
         print(f"{name:>26}: {value}")
-    if options.json is not None:
-        options.json.write_text(json.dumps(result, indent=2) + "\n")
+    keep(result, options.json)
     good = not result["missed_periods"] and not result["cycles_without_all_tpdos"] and not result["stopped"]
     return 0 if good and result["cycles"] == options.cycles else 1
 

@@ -1,0 +1,68 @@
+"""Harness of the benchmarks: command line, blocks in turn, repetition of disturbed blocks."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import statistics
+import time
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+from hdbridge.errors import SafetyStop
+
+PROFILE = Path(__file__).resolve().parents[2] / "profiles" / "article"
+ATTEMPTS = 20
+
+
+class Busy(Exception):  # noqa: N818 - what happened
+    """The machine stalled within a block, and the cycle made a fault of it."""
+
+
+def parser(text: str | None, *, blocks: int = 0, cycles: int = 0) -> argparse.ArgumentParser:
+    """Returns the options of a benchmark; ``blocks`` and ``cycles`` are defaults, 0: it has none."""
+    made = argparse.ArgumentParser(description=text, formatter_class=argparse.RawDescriptionHelpFormatter)
+    made.add_argument("--json", type=Path, help="write the figures for machines")
+    if blocks:
+        made.add_argument("--blocks", type=int, default=blocks, help="blocks per variant")
+    if cycles:
+        made.add_argument("--cycles", type=int, default=cycles, help="cycles per block, for one axis")
+    return made
+
+
+def keep(result: Any, path: Path | None) -> None:
+    """Writes the figures if a file was named."""
+    if path is not None:
+        path.write_text(json.dumps(result, indent=2) + "\n", encoding="utf-8")
+
+
+def block_us(work: Callable[[], object], cycles: int, timer: Callable[[], float] = time.thread_time) -> float:
+    """Returns the time per call, us."""
+    begin = timer()
+    for _ in range(cycles):
+        work()
+    return 1e6 * (timer() - begin) / cycles
+
+
+def undisturbed(block: Callable[[], float]) -> float:
+    """Returns the result of a block; begins again if a busy machine has stopped an axis in it."""
+    for _ in range(ATTEMPTS):
+        with suppress(SafetyStop, Busy):
+            return block()
+    raise SystemExit("no block ran to its end: this machine is too busy to measure on")
+
+
+def in_turn(variants: Mapping[str, Callable[[], float]], blocks: int) -> dict[str, list[float]]:
+    """Returns the results of every block of each variant; one block of each in turn."""
+    times: dict[str, list[float]] = {name: [] for name in variants}
+    for _ in range(blocks):
+        for name, block in variants.items():
+            times[name].append(block())
+    return times
+
+
+def medians(times: Mapping[str, list[float]]) -> dict[str, float]:
+    """Returns the median of each variant."""
+    return {name: statistics.median(values) for name, values in times.items()}
