@@ -13,25 +13,15 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-from collections.abc import Iterator
-from itertools import pairwise
+from itertools import chain
 from pathlib import Path
-from typing import Any
 
 import numpy as np
+from reliability import Row, diagram, from_suite, from_trials, kept
 from scipy.optimize import minimize
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
-sys.path.insert(0, str(Path(__file__).parent))
-from blind.case import record_of, unsealed
-from support.trials import CAUSES, LOOPS, NONE, PAIRS, SHORT, SPECIAL, SYNONYMS, UNKNOWN, planted
-
-from hdbridge.analysis.diagnosis import diagnose
-from hdbridge.analysis.findings import Diagnosis
 from hdbridge.analysis.probability import coefficients
 from hdbridge.analysis.scales import Scales
-from hdbridge.axis.model import TransmissionModel
-from hdbridge.records.recording import Recording
 
 RIDGE = 1.0
 FOLDS = 10
@@ -39,48 +29,6 @@ FREE = frozenset({"constant"})
 AGAINST = frozenset({"excess", "unexplained"})
 PRIOR = {"unexplained": -1.0}
 """Coefficients that the ridge draws towards where these records say little; 0 for all others."""
-BINS = (0.0, 0.5, 0.7, 0.8, 0.9, 0.95, 0.99, 1.01)
-Row = dict[str, Any]
-
-
-def judged(
-    source: str, name: str, result: Diagnosis, there: set[str], also: set[str], loop: bool
-) -> Iterator[Row]:
-    """Yields one row for each reported cause; those in ``also`` count neither right nor wrong."""
-    met: set[str] = set()
-    for each in result.findings:
-        names = {each.cause, *each.aliases}
-        hits = {one for one in there if names & {one, *SYNONYMS.get(one, ())}} - met
-        if each.cause == "unexplained" or (each.cause in also and not hits):
-            continue
-        met |= set(sorted(hits)[:1])
-        right = bool(hits) or (loop and bool(names & LOOPS))
-        yield {
-            "source": source, "record": name, "cause": each.cause, "right": right,
-            "terms": dict(each.terms), "given": each.probability,
-        }  # fmt: skip
-
-
-def from_suite(folder: Path) -> Iterator[Row]:
-    """Yields the findings in the cases of a blind suite."""
-    for case in sorted(each.parent for each in folder.glob("[!.]*/sealed.json")):
-        hidden = unsealed(case)
-        recording = Recording.load(*record_of(case))
-        model = TransmissionModel.load(case / "model.yaml")
-        result = diagnose(recording, model, scales=Scales(named_from=0.0))
-        there = {each["cause"] for each in hidden["hidden"]} - {"unexplained"}
-        loop = hidden["kind"] in {"law", "other_law"}
-        yield from judged(folder.name, f"{folder.name}/{case.name}", result, there, set(hidden["also"]), loop)
-
-
-def from_trials(seeds: int, first: int = 100) -> Iterator[Row]:
-    """Yields the findings in short records from formulas."""
-    for seed in range(first, first + seeds):
-        for name in (*CAUSES, *SPECIAL, *NONE, *UNKNOWN, *PAIRS):
-            there, record, model = planted(name, seed, SHORT)
-            loop = name.startswith("none:") or bool(there & LOOPS)
-            result = diagnose(record, model, scales=Scales(named_from=0.0))
-            yield from judged("trials", f"{name} {seed}", result, there - {"unexplained"}, set(), loop)
 
 
 def fitted(terms: np.ndarray, right: np.ndarray, names: list[str]) -> np.ndarray:
@@ -105,20 +53,6 @@ def probabilities(terms: np.ndarray, values: np.ndarray) -> np.ndarray:
     return np.asarray(np.minimum(1.0 / (1.0 + np.exp(-terms @ values)), Scales().surest))
 
 
-def reliability(title: str, given: np.ndarray, right: np.ndarray) -> None:
-    """Prints the share of right names by predicted probability, and the Brier score."""
-    print(
-        f"{title}: {len(right)} names, {int(np.sum(right))} right; Brier {np.mean((given - right) ** 2):.4f}"
-    )
-    for low, high in pairwise(BINS):
-        rows = (given >= low) & (given < high)
-        if np.any(rows):
-            print(
-                f"  {low:.2f} to {min(high, 1):.2f}: mean {np.mean(given[rows]):.3f}, "
-                f"right {int(np.sum(right[rows]))} / {int(np.sum(rows))}"
-            )
-
-
 def main() -> int:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -130,10 +64,8 @@ def main() -> int:
     if options.keep and options.keep.exists():
         rows: list[Row] = json.loads(options.keep.read_text(encoding="utf-8"))
     else:
-        rows = [row for each in options.suite for row in from_suite(each)]
-        rows += from_trials(options.trials)
-        if options.keep:
-            options.keep.write_text(json.dumps(rows, indent=1), encoding="utf-8")
+        suites = (row for each in options.suite for row in from_suite(each))
+        rows = kept(chain(suites, from_trials(options.trials, 100)), options.keep)
     if not rows:
         print("no findings; give --suite or --trials", file=sys.stderr)
         return 2
@@ -146,10 +78,11 @@ def main() -> int:
     for number in range(FOLDS):
         held = fold == number
         left_out[held] = probabilities(terms[held], fitted(terms[~held], right[~held], names))
-    reliability("as given", np.array([float(row["given"]) for row in rows]), right)
+    print(f"as given\n\n{diagram(rows)}")
     for source in [*dict.fromkeys(row["source"] for row in rows), ""]:
         chosen = np.array([source in ("", row["source"]) for row in rows])
-        reliability(f"cross-validated {source or 'all'}", left_out[chosen], right[chosen])
+        held_out = [{"given": p, "right": r} for p, r in zip(left_out[chosen], right[chosen], strict=True)]
+        print(f"\ncross-validated {source or 'all'}\n\n{diagram(held_out)}")
     for name, value in zip(names, fitted(terms, right, names), strict=True):
         print(f'    "{name}": {value:.2f},')
     return 0

@@ -5,7 +5,7 @@
     python tools/reliability.py --trials 2 --first 5000 --keep build/reliability.json
 
 Compares the stated probability of each name with whether it, or one of its aliases, was there: of the answers
-that tools/blind/score.py has kept of a suite, or of short records from formulas (tools/fit_probabilities.py),
+that tools/blind/score.py has kept of a suite, or of short records from formulas (tests/support/trials.py),
 which it diagnoses. Prints a diagram as a Markdown table: bins with counts, mean probability, share that was
 right with its 95 % interval, and the Brier score. The findings of trials are kept in a table as they come; an
 existing one is read instead of made again.
@@ -16,7 +16,7 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -25,9 +25,16 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 sys.path.insert(0, str(Path(__file__).parent))
+from blind.case import record_of, unsealed
 from blind.score import verdict_of
 from blind.tables import rate
-from fit_probabilities import from_trials
+from support.trials import CAUSES, LOOPS, NONE, PAIRS, SHORT, SPECIAL, SYNONYMS, UNKNOWN, planted
+
+from hdbridge.analysis.diagnosis import diagnose
+from hdbridge.analysis.findings import Diagnosis
+from hdbridge.analysis.scales import Scales
+from hdbridge.axis.model import TransmissionModel
+from hdbridge.records.recording import Recording
 
 BINS = (0.0, 0.3, 0.5, 0.7, 0.9, 0.95, 1.01)
 BAR = 20
@@ -55,6 +62,46 @@ def diagram(rows: Sequence[Row]) -> str:
         f"probability for every name ({len(rows)} names, {int(np.sum(right))} right)"
     )
     return "\n".join(lines)
+
+
+def judged(
+    source: str, name: str, result: Diagnosis, there: set[str], also: set[str], loop: bool
+) -> Iterator[Row]:
+    """Yields one row for each reported cause; those in ``also`` count neither right nor wrong."""
+    met: set[str] = set()
+    for each in result.findings:
+        names = {each.cause, *each.aliases}
+        hits = {one for one in there if names & {one, *SYNONYMS.get(one, ())}} - met
+        if each.cause == "unexplained" or (each.cause in also and not hits):
+            continue
+        met |= set(sorted(hits)[:1])
+        right = bool(hits) or (loop and bool(names & LOOPS))
+        yield {
+            "source": source, "record": name, "cause": each.cause, "right": right,
+            "terms": dict(each.terms), "given": each.probability,
+        }  # fmt: skip
+
+
+def from_suite(folder: Path) -> Iterator[Row]:
+    """Yields the findings in the cases of a blind suite."""
+    for case in sorted(each.parent for each in folder.glob("[!.]*/sealed.json")):
+        hidden = unsealed(case)
+        recording = Recording.load(*record_of(case))
+        model = TransmissionModel.load(case / "model.yaml")
+        result = diagnose(recording, model, scales=Scales(named_from=0.0))
+        there = {each["cause"] for each in hidden["hidden"]} - {"unexplained"}
+        loop = hidden["kind"] in {"law", "other_law"}
+        yield from judged(folder.name, f"{folder.name}/{case.name}", result, there, set(hidden["also"]), loop)
+
+
+def from_trials(seeds: int, first: int) -> Iterator[Row]:
+    """Yields the findings in short records from formulas."""
+    for seed in range(first, first + seeds):
+        for name in (*CAUSES, *SPECIAL, *NONE, *UNKNOWN, *PAIRS):
+            there, record, model = planted(name, seed, SHORT)
+            loop = name.startswith("none:") or bool(there & LOOPS)
+            result = diagnose(record, model, scales=Scales(named_from=0.0))
+            yield from judged("trials", f"{name} {seed}", result, there - {"unexplained"}, set(), loop)
 
 
 def answered(suite: Path, answers: Path) -> Iterable[Row]:

@@ -98,7 +98,6 @@ def compared(own: Calibration, again: Calibration) -> str:
 def main() -> None:
     given = parser(__doc__, axes=4, workers=2)
     given.add_argument("--plan", default="quick", help="of the calibrations")
-    given.add_argument("--workers", type=int, default=2)
     options = given.parse_args()
     print("the axis, its twin (how far that is off)")
     for seed in seeds(options):

@@ -11,11 +11,14 @@ each axis is changed, recorded again and held against its twin.
 
 from __future__ import annotations
 
+import os
 import sys
 import tempfile
 import time
 from dataclasses import replace
 from pathlib import Path
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # the matrices are small, so threads only cost time
 
 import yaml
 from foreign.bench import bench_of

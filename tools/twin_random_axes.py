@@ -16,12 +16,15 @@ that): this tool measures the rest.
 from __future__ import annotations
 
 import math
+import os
 import sys
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from itertools import combinations
 from typing import Any
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # the matrices are small, so threads only cost time
 
 import numpy as np
 import random_axes
