@@ -48,19 +48,17 @@ def step(
         list[Scheme] | None,
         typer.Option(
             "--scheme",
-            help="Only this scheme; may stand several times. Else all of the model. `none` needs none.",
+            help="Only this scheme; may be repeated. Else all of the model.",
         ),
     ] = None,
     count: Annotated[int, typer.Option("--count", min=2, max=100_000, help="Steps each way.")] = 240,
-    step_deg: Annotated[float, typer.Option("--step-deg", help="Step, in degrees of the motor.")] = 43.56,
-    start_deg: Annotated[
-        float, typer.Option("--start-deg", help="Load angle of the start, in degrees.")
-    ] = 0.0,
+    step_deg: Annotated[float, typer.Option("--step-deg", help="Step, motor degrees.")] = 43.56,
+    start_deg: Annotated[float, typer.Option("--start-deg", help="Load angle of the start, deg.")] = 0.0,
     json_file: JsonOption = None,
     html_file: HtmlOption = None,
     record: Annotated[
         Path | None,
-        typer.Option("--record", metavar="FOLDER", help="Keep what was measured: one CSV file per scheme."),
+        typer.Option("--record", metavar="FOLDER", help="Keep the records: one CSV file per scheme."),
         Kind.FOLDER,
     ] = None,
 ) -> None:

@@ -37,15 +37,13 @@ AtOption = Annotated[
 ]
 OneAxisArgument = Annotated[
     str | None,
-    typer.Argument(metavar="AXIS", help="Name of the axis; may be left out where there is one only."),
+    typer.Argument(metavar="AXIS", help="Name of the axis; needed if there are several."),
 ]
 AxisArgument = Annotated[str, typer.Argument(metavar="AXIS", help="Name of the axis.")]
-AxesArgument = Annotated[
-    list[str] | None, typer.Argument(metavar="AXIS...", help="Names of axes; else every one.")
-]
+AxesArgument = Annotated[list[str] | None, typer.Argument(metavar="AXIS...", help="Names of axes; else all.")]
 TakeOption = Annotated[
     bool,
-    typer.Option("--force", help="Take the right to move from whoever has it, whose motion is stopped."),
+    typer.Option("--force", help="Take the lease from its holder, whose motion is stopped."),
 ]
 
 
