@@ -60,9 +60,9 @@ class Creep(Effect):
         equation="sum of A_j y_j; tau_j dy_j/dt = -y_j at rest, build_up tau_j dy_j/dt = sgn(v) - y_j in "
         "motion",
         signature="after a stop the load moves on for seconds to minutes while the motor stands still",
-        consequence="the position at the end of a move is not the one a minute later",
-        remedy="compensate it, or wait; less preload or friction torque; it is the flexspline and the grease",
-        experiment="long rests after moves in either direction; servo settling would show at the motor too",
+        consequence="the position after a move differs from that a minute later",
+        remedy="compensate it, or wait; less preload or friction torque",
+        experiment="long rests after moves in either direction; servo settling shows at the motor, too",
         aliases=("zero_drift",),
         source="generalised Kelvin-Voigt element: a sum of exponentials",
         size="1-10 arcsec",
