@@ -128,11 +128,11 @@ SEEN_BY: Mapping[Fault, str] = {
 
 def fault_table() -> str:
     """Returns the reactions to each fault, and the advice."""
-    lines = ["| fault | at once | in the next cycle | seen by | what to do |", "|---|---|---|---|---|"]
+    lines = ["| fault | reaction; in the next cycle | seen by | what to do |", "|---|---|---|---|"]
     for row in TABLE:
-        later = REACTION_WORDS[row.then] if row.then is not row.first else ""
-        first = REACTION_WORDS[row.first]
-        lines.append(f"| {row.fault.value} | {first} | {later} | {SEEN_BY[row.fault]} | {row.hint} |")
+        later = f"; {REACTION_WORDS[row.then]}" if row.then is not row.first else ""
+        reaction = REACTION_WORDS[row.first] + later
+        lines.append(f"| {row.fault.value} | {reaction} | {SEEN_BY[row.fault]} | {row.hint} |")
     return "\n".join(lines) + "\n"
 
 

@@ -39,9 +39,9 @@ PAGE = ROOT / "docs" / "reliability.md"
 DAEMON_TESTS = sorted(Path("tests/daemon/loop").glob("test_reliability*.py"))
 SOCKETCAN_TESTS = ("tests/socketcan/test_reliability.py", "tests/socketcan/test_daemon.py")
 _BLOCK = re.compile(r"(<!-- tried: (?P<name>[a-z-]+) -->\n).*?(<!-- end -->)", re.DOTALL)
-HEAD = "| fault | expected | within | bench | bench, vcan | daemon |\n|---|---|---|---|---|---|\n"
-FURTHER_HEAD = "| fault | expected | within | taken |\n|---|---|---|---|\n"
-DAEMON_VCAN_HEAD = "| fault | expected | within | cycles |\n|---|---|---|---|\n"
+HEAD = "| fault | expected | within | cycles |\n|---|---|---|---|\n"
+PLACES = {VIRTUAL: "bench", VCAN: "vcan", DAEMON: "daemon"}
+"""Places of the suite in the order of the page, as the page names them."""
 
 
 def rows() -> list[str]:
@@ -80,18 +80,24 @@ def page(seen: list[Seen]) -> str:
 
     lines = []
     for row in ROWS:
-        cells = " | ".join(cell(row, place) for place in (VIRTUAL, VCAN, DAEMON))
-        lines.append(f"| {row.name} | {_expected(row)} | {_within(row)} | {cells} |")
+        cells = {name: cell(row, place) for place, name in PLACES.items()}
+        lines.append(f"| {row.name} | {_expected(row)} | {_within(row)} | {together(cells)} |")
     blocks = {
         "drives": "".join(f"* *{each}*: {_behaviour(each)}\n" for each in CHARACTERS),
         "axis": HEAD + "\n".join(lines) + "\n",
-        "daemon": FURTHER_HEAD + "".join(_further(each, seen_of(each.name, DAEMON)) for each in FURTHER),
-        "processes": DAEMON_VCAN_HEAD
-        + "".join(_whole(row, seen_of(row.name, DAEMON_VCAN)) for row in DAEMON_ROWS),
+        "daemon": HEAD + "".join(_further(each, seen_of(each.name, DAEMON)) for each in FURTHER),
+        "processes": HEAD + "".join(_whole(row, seen_of(row.name, DAEMON_VCAN)) for row in DAEMON_ROWS),
     }
     return _BLOCK.sub(
         lambda match: match[1] + blocks[match["name"]] + match[3], PAGE.read_text(encoding="utf-8")
     )
+
+
+def together(cells: dict[str, str]) -> str:
+    """Returns the results of a row at all places as one cell; a single result if they agree."""
+    if len({*cells.values()}) == 1:
+        return next(iter(cells.values()))
+    return ", ".join(f"{place} {taken}" for place, taken in cells.items() if taken != "–")
 
 
 def _further(row: Further, seen: Seen) -> str:
