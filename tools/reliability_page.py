@@ -1,4 +1,4 @@
-"""Writes the tables of docs/reliability.md: results of every fault of the suite, wherever it is tried.
+"""Writes the tables of docs/reliability.md: results of every fault of the suite, at every place.
 
 python tools/reliability_page.py            try them (minutes; vcan by tools/socketcan.sh), write the page
 python tools/reliability_page.py --check    only report if the page has the suite's rows

@@ -34,7 +34,7 @@ PERIOD_S = 0.004
 def median_us(
     action: Callable[[], object], prepare: Callable[[], object] = lambda: None, count: int = 3000
 ) -> float:
-    """Median of one call, microseconds; ``prepare`` is not counted."""
+    """Returns the median time of one call, microseconds, without ``prepare``."""
     taken = []
     for _ in range(count):
         prepare()
@@ -45,7 +45,7 @@ def median_us(
 
 
 def unit() -> float:
-    """The yardstick."""
+    """Runs the reference loop."""
     value = 1.0
     for _ in range(100):
         value *= 1.000001
@@ -53,7 +53,7 @@ def unit() -> float:
 
 
 def moving() -> SetPoint:
-    """In motion, with a long way to go."""
+    """Returns a set-point in a long motion."""
     set_point = SetPoint(LIMITS, PERIOD_S)
     set_point.goto(3600.0)
     for _ in range(30):
@@ -140,7 +140,7 @@ def pickles() -> dict[str, float]:
 
 
 def main() -> None:
-    """Measure and print."""
+    """Measures and prints."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--json", type=Path)
     given = parser.parse_args()
