@@ -1,4 +1,4 @@
-"""``hdbridge fleet``: many joints at once, from their recordings to whom to look at first."""
+"""``hdbridge fleet``: diagnoses many joints and ranks them."""
 
 from __future__ import annotations
 
@@ -184,7 +184,7 @@ class Fleet:
         )
 
     def summarise(self) -> None:
-        """Prints and writes what the data set says."""
+        """Prints and writes the summary of the data set."""
         _summarise(self.dataset, self.limit_arcsec, pages=self.pages)
 
     def say_interrupted(self) -> None:
@@ -297,7 +297,7 @@ def _summarise(
     pages: bool = False,
     joints: Sequence[str] = (),
 ) -> None:
-    """Prints and writes what the data set says; also the pages of these joints, and of all of the list."""
+    """Prints and writes the summary, the pages of these joints, and those of all listed joints."""
     from rich.table import Table
 
     from hdbridge.fleet.prior import write_prior

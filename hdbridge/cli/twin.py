@@ -208,7 +208,7 @@ def _left(twin: Twin) -> list[Named]:
 def _check(
     files: Profile, axis: AxisConfig, recording: Recording, json_file: Path | None, html_file: Path | None
 ) -> None:
-    """Reports in one sentence what has changed since the profile's twin was made."""
+    """Reports the changes since the profile's twin was made in one sentence."""
     from hdbridge.twin.check import check
     from hdbridge.twin.twin import KeptTwin
 

@@ -177,7 +177,7 @@ class Dataset:
             os.close(folder)
 
     def stored(self) -> Stored:
-        """Returns what a run needs to know of the rows: no figures, no findings."""
+        """Returns the columns that a run needs, without figures and findings."""
         return Stored(self._rows(RECORDINGS, STORED))
 
     def renew(self, changes: Mapping[tuple[str, str], Mapping[str, Any]]) -> None:

@@ -111,7 +111,7 @@ NOTHING_STORED: Final = Stored()
 
 
 class NotFetchedError(InputError):
-    """A remote recording cannot be fetched; that says nothing about its content."""
+    """A remote recording cannot be fetched; its content is unknown."""
 
 
 def find_sources(
@@ -211,7 +211,7 @@ def _stamp(source: Source, mark: str | None) -> str | None:
 
 
 def _with_about(source: Source, stored: Stored) -> Source:
-    """Fills in what only ``recording.yaml`` says: joint, ratio and date."""
+    """Fills in joint, ratio and date from ``recording.yaml``."""
     if source.joint is not None or source.path.endswith(CSV_NAMES + FLIGHT + BUS_LOGS):
         return source
     about: Mapping[str, Any] = {}

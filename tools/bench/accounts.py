@@ -1,4 +1,4 @@
-"""An account of the cycles: each number is that of a sample, was told as skipped, or was lost by a reader."""
+"""Account of the cycles: each number has a sample, was reported as skipped, or was lost by a reader."""
 
 from __future__ import annotations
 

@@ -106,7 +106,7 @@ def bench_cycle(
     clock: Clock | None = None,
     image: ProcessImage | None = None,
 ) -> tuple[Callable[[], None], Cycle]:
-    """The bench's own cycle: `Bench._leg` without what keeps the samples; by default it never sleeps.
+    """Returns the bench's cycle: `Bench._leg` without the storage of samples; by default it never sleeps.
 
     ``image`` is that of a drive that was made ready for power.
     """
@@ -142,7 +142,7 @@ def bench_cycle(
             goal = -goal
         target_deg = set_point.step()
         feedback = cycle.tick(answer)
-        # What the bench keeps of each cycle, as numbers.
+        # Numbers that the bench stores per cycle.
         image.motor_deg(feedback.demand_counts)
         image.motor_deg(feedback.motor_counts)
         image.load_deg(feedback.load_counts)

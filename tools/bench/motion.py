@@ -94,7 +94,7 @@ def corrections() -> dict[str, float]:
     """Measures a cycle of the compensation, alone and behind a `Correction`, and the load loop's."""
     model = TransmissionModel.load(PROFILES / "article" / "model.yaml")
     moment = Moment()
-    # So slow a ramp that the change lasts as long as it is measured.
+    # A slow ramp, so that the change lasts for the whole measurement.
     slow = CompensationLimits(ramp_s=1e6)
 
     def made() -> Compensation:
@@ -115,7 +115,7 @@ def corrections() -> dict[str, float]:
         return run
 
     loop = LoadLoop(1.0, 40.0, 100.0, PERIOD_S, counts_arcsec=3.6)
-    # In turns, so that a machine that slows down does so for both.
+    # Alternating, so that a slower machine affects both.
     alone_us, behind_us = [], []
     for _ in range(9):
         alone_us.append(median_us(cycle(0, alone), count=1000))

@@ -1,4 +1,4 @@
-"""``hdbridge run --simulate`` as processes, and what they cost: for `daemon.py` and `endurance.py`."""
+"""``hdbridge run --simulate`` as processes, with their cost: for `daemon.py` and `endurance.py`."""
 
 from __future__ import annotations
 

@@ -202,7 +202,7 @@ class Story:
         await self.sleep(0.5)
         middle_deg = self.axis.state().load_target_deg
         assert middle_deg is not None
-        ends = self.chance.random() < 0.8  # else its set-points run out
+        ends = self.chance.random() < 0.8  # otherwise its set-points run out
         async with await self.axis.stream(self.token) as stream:
             for begin in range(0, 201, 50):
                 phases = [(0.01 * knot, math.pi * 0.01 * knot) for knot in range(begin, min(begin + 50, 201))]

@@ -260,8 +260,9 @@ def everyday_axes(
     law: str = "rolling_friction",
     encoders: Sequence[tuple[int, float] | None] = (None,),
 ) -> list[EverydayAxis]:
-    """Draws an axis, once for each motor encoder (counts per turn and flicker; drawn if None). An axis that does not come to rest after a move, or lacks the torque for it, is
-    drawn again.
+    """Draws an axis with each motor encoder: counts per turn and flicker, or drawn if None.
+
+    An axis that does not come to rest after a move, or lacks the torque for it, is drawn again.
     """
     base = yaml.safe_load((bundled_profile("demo") / "axis.yaml").read_text(encoding="utf-8"))
     while True:

@@ -1,4 +1,4 @@
-"""One blind case: what is hidden in it, drawn by its name and the suite's seed, and its folder."""
+"""Blind case: its hidden cause, drawn by its name and the suite's seed, and its folder."""
 
 from __future__ import annotations
 
@@ -154,7 +154,7 @@ def _together(rng: random.Random, number: int) -> tuple[str, ...]:
 
 
 def make(case: Case, seed: int, suite: Path, means: bool = False) -> Path:
-    """Draw, run and write a case, whole or not at all; its folder.
+    """Draws, runs and writes a case atomically; returns its folder.
 
     The folder holds the record (CSV files, or a recording in ``record``), ``model.yaml``, ``sealed.json``
     and, if there is a cause, ``fresh``: the same course again on the same plant, with other noise.
@@ -292,7 +292,7 @@ def write_csv(path: Path, columns: dict[str, tuple[Any, str]]) -> None:
 
 
 def axis_of(case: Case, seed: int) -> EverydayAxis:
-    """Returns the axis of an everyday case; the axes of a flickering pair differ only in the motor encoder."""
+    """Returns the axis of an everyday case; those of a flickering pair differ only in the motor encoder."""
     if not case.pair:
         return everyday_axes(random.Random(f"axis {seed} {case.axis}"), case.axis, case.law)[0]
     name, _, encoder = case.axis.rpartition("-")
@@ -347,7 +347,7 @@ def _everyday(case: Case, seed: int, folder: Path, axes: Path) -> dict[str, Any]
         course = _work_course(rig, bench, kind, rng, SLOW_S if slow else 10.0)
     run = course.run(axis.config.gear.ratio)
     truth, hidden, seen, healthy = _with_cause(case, axis, course, run, rng)
-    # Only now: a case without the cause draws the same.
+    # Drawn last, so that a case without the cause has the same draws.
     period_s = axis.config.drive.cycle_s
     as_recorded = (case.bench and rng.random() < 0.6) or (course.motion == "daemon" and rng.random() < 0.6)
     rate_hz = math.exp(rng.uniform(math.log(10.0), math.log(1000.0)))

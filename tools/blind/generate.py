@@ -1,4 +1,4 @@
-"""Make a blind suite: records of simulated axes with something hidden in them, or nothing.
+"""Makes a blind suite: records of simulated axes with hidden causes, or none.
 
     python tools/blind/generate.py build/blind                      # everyday records, to develop on: seed 1
     python tools/blind/generate.py build/held --seed 4711 --suite everyday

@@ -1,4 +1,4 @@
-"""The parameters of a finding if it were right: what was hidden, in the finding's units and conventions.
+"""True parameters of a finding: the hidden cause in the finding's units and conventions.
 
 The secret says what was hidden and what the plant is, model.yaml what the diagnosis compared it with. A
 parameter is missing if the two do not mean the same, for the reasons given next to each cause.
@@ -114,7 +114,7 @@ def _motor_orders(secret: Secret) -> Values:
     if disc:
         total = _read_by(disc, total, float(secret.gear["ratio"]))
     shift_deg = float(secret.gear.get("flank", {}).get("shift_deg", 0.0))
-    # What a finding tells is the mean over both flanks.
+    # A finding reports the mean over both flanks.
     total = {order: each * math.cos(math.radians(order * shift_deg)) for order, each in total.items()}
     given = _sum_of(
         row
@@ -183,7 +183,7 @@ def _inertial(secret: Secret) -> Values:
 
 
 def _velocity(secret: Secret) -> Values:
-    """Returns the dry part. The viscous slope at rest would be an extrapolation by another law of thinning."""
+    """Returns the dry part. The viscous slope at rest would extrapolate another law of thinning."""
     stiffness, dry = secret.stiffness, secret.parameters.get("coulomb_nm")
     if stiffness is None or not dry:
         return {}
@@ -191,9 +191,9 @@ def _velocity(secret: Secret) -> Values:
 
 
 def _loop_height(secret: Secret) -> Values:
-    """Returns half the height of both laws together. Width and exponent are those of a law that the plant, with
-    memory in a share of its loop, does not have.
-    """
+    """Returns half the height of both laws together.
+
+    Width and exponent have no true values, because the plant obeys another law."""
     height = 0.0
     for name in ("hysteresis", "second_hysteresis"):
         law = secret.gear.get(name) or {}

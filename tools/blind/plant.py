@@ -159,7 +159,7 @@ class PlantBench:
         self._place = targets[-1]
         self._samples.append(seen)
         if len(targets) > 1_000:
-            return []  # no settling takes as long
+            return []  # longer than any settling
         rows = zip(
             seen["time_s"].tolist(), targets, seen["motor_target_deg"].tolist(),
             seen["motor_position_deg"].tolist(), seen["load_position_deg"].tolist(),

@@ -1,4 +1,4 @@
-"""Compares what a diagnosis says with what was hidden: one verdict for each case.
+"""Compares a diagnosis with the hidden causes: one verdict for each case.
 
 Only the published JSON of ``hdbridge diagnose`` and the model that it writes are read. A cause is *named* if
 its probability is above 0.5. A finding *meets* a hidden cause if it names it, or gives it as an alias. What

@@ -91,7 +91,7 @@ class AmplitudeDrift(Linear, Warmed):
                 )  # fmt: skip
 
     def scales(self) -> tuple[Part, Effect]:
-        """Returns loop or ripple, whichever changes more."""
+        """Returns the part that changes more: loop or ripple."""
         ripple = math.sqrt(0.5 * sum(each.amplitude_arcsec**2 for each in self.orders))
         friction = abs(self.friction_percent_per_k * self.loop.offset_arcsec)
         if abs(self.ripple_percent_per_k) * ripple <= friction:

@@ -75,9 +75,7 @@ class Backlash(Linear):
 
     @classmethod
     def of_gap(cls, gap_arcsec: float, ratio: float, softness: float = _SOFTNESS) -> Self:
-        """Returns a gap that takes ``softness`` times its ideal motor angle; from 1.25 on it is
-        invertible.
-        """
+        """Returns a gap with a crossing of ``softness`` times the ideal angle; invertible from 1.25 on."""
         return cls(gap_arcsec=gap_arcsec, crossing_deg=_crossing_deg(gap_arcsec, ratio, softness))
 
     @classmethod

@@ -61,7 +61,7 @@ class ChannelSkew(Linear):
     )
     compensable: ClassVar[Compensable] = Compensable(False, "it is an error of the measurement")
     ordinary_arcsec: ClassVar[float] = 1.0
-    """No two encoders are sampled at exactly the same instant."""
+    """Usual skew, because no two encoders are sampled at exactly the same instant."""
     incidental: ClassVar[frozenset[str]] = frozenset({"second_order_ms2"})
     """Includes the load's own wind-up."""
     linear: ClassVar[tuple[str, ...]] = ("delay_ms", "second_order_ms2")

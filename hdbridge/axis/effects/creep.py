@@ -74,7 +74,7 @@ class Creep(Effect):
         Shape("tau_s", 0.05, 3600.0, logarithmic=True),
         Shape("build_up", 0.01, 1.0, logarithmic=True),
     )
-    """``tau_s`` is that of the first exponential; the others keep their ratio to it."""
+    """Time constant of the first exponential; the others keep their ratio to it."""
 
     usual: ClassVar[int] = 8
     """A real relaxation is a sum of exponentials."""

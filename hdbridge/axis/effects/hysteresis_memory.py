@@ -157,7 +157,7 @@ class _Memory:
         nothing.
         """
         depth = len(self._points)
-        if sign == -self._sign:  # a reversal: first its own branch, which closes where the last one began
+        if sign == -self._sign:  # a reversal starts a branch that closes at the start of the last one
             if depth > _DEPTH:
                 depth -= 2
             closing = self._points[depth - 1][0] if depth else 2.0 * self._origin - last

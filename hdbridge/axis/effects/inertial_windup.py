@@ -49,7 +49,7 @@ class InertialWindup(Linear):
         True, "the load really moves so and the acceleration is commanded; at rest it is nothing"
     )
     ordinary_arcsec: ClassVar[float] = 1.5
-    """Every axis winds up a little in its fastest moves."""
+    """Wind-up of any axis in its fastest moves."""
     linear: ClassVar[tuple[str, ...]] = ("inertia_over_stiffness_s2",)
     typical: ClassVar[Mapping[str, Any]] = {"inertia_over_stiffness_s2": 1e-5}
     """A resonance at 50 Hz."""

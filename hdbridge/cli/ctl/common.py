@@ -81,7 +81,7 @@ def stopping(at: str | None) -> Iterator[Client]:
             yield client
     except DaemonError as problem:
         if type(problem) is not DaemonError:
-            raise  # it answers
+            raise  # the daemon answers
         raise DaemonError(f"{problem}; {_who_holds(at)}") from None
 
 
