@@ -136,7 +136,7 @@ def held_against(recording: Recording, truth: Truth) -> Comparison:
 
 
 def _twins(folder: Path) -> None:
-    """Prints the errors of a twin of three recordings in the fourth."""
+    """Prints the errors of a twin, fitted to three recordings, on the fourth."""
     for joint in (4, 5):
         recordings = joint_recordings(folder, joint)
         left: dict[tuple[str, str], list[float]] = {}

@@ -222,7 +222,7 @@ def print_diagnosis(result: Diagnosis) -> None:
 
 
 def _details(finding: Finding) -> Iterator[str]:
-    """Yields what is known of a finding beyond its line in the table."""
+    """Yields the details of a finding that its line in the table omits."""
     said = [f"{name} {_number(each)}" for name, each in finding.parameters.items()]
     if finding.aliases:
         said.insert(0, f"it may also be: {', '.join(finding.aliases)}")

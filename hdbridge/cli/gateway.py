@@ -35,7 +35,8 @@ def register(app: typer.Typer) -> None:
 
 
 AxisOption = Annotated[
-    str | None, typer.Option("--axis", help="Which axis, if the gateway has several.", show_default=False)
+    str | None,
+    typer.Option("--axis", help="Name of the axis; needed if the gateway has several.", show_default=False),
 ]
 
 
@@ -54,7 +55,7 @@ def simulate(
     axis: AxisOption = None,
     duration_s: Annotated[
         float | None,
-        typer.Option("--duration", min=0.0, help="Stop after this many seconds; without it at Ctrl-C."),
+        typer.Option("--duration", min=0.0, help="Stop after this time, s; else at Ctrl-C."),
     ] = None,
 ) -> None:
     """Run an ideal drive in place of the gateway, in real time, until Ctrl-C.
@@ -93,12 +94,12 @@ def doctor(
     axis: AxisOption = None,
     duration_s: Annotated[
         float,
-        typer.Option("--duration", min=0.1, max=86_400.0, help="Seconds to listen; Ctrl-C ends sooner."),
+        typer.Option("--duration", min=0.1, max=86_400.0, help="Time to listen, s; Ctrl-C ends it earlier."),
     ] = 10.0,
     log: Annotated[
         Path | None,
         typer.Option(
-            "--log", metavar="FILE", help="Read a bus log (.log, .asc, .blf, .trc, .mf4) instead of the bus."
+            "--log", metavar="FILE", help="Read a bus log (.log, .asc, .blf, .trc, .mf4) in place of the bus."
         ),
     ] = None,
     json_file: JsonOption = None,

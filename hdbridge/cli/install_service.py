@@ -22,14 +22,12 @@ def register(app: typer.Typer) -> None:
 def install_service(
     machine: MachineArgument,
     yes: Annotated[bool, typer.Option("--yes", help="Write the files; else they are only shown.")] = False,
-    remove: Annotated[bool, typer.Option("--remove", help="Remove what was written before.")] = False,
-    user: Annotated[
-        bool, typer.Option("--user", help="For your own service manager, without the rights of root.")
-    ] = False,
+    remove: Annotated[bool, typer.Option("--remove", help="Remove the files.")] = False,
+    user: Annotated[bool, typer.Option("--user", help="For your own service manager, without root.")] = False,
     account: Annotated[
         str | None,
         typer.Option(
-            "--account", metavar="NAME", help="Run as this user; else as who owns the machine file."
+            "--account", metavar="NAME", help="User of the service; else the owner of the machine file."
         ),
     ] = None,
 ) -> None:

@@ -25,7 +25,7 @@ def latency(
     ] = 10.0,
     cycle_ms: Annotated[
         list[float] | None,
-        typer.Option("--cycle-ms", min=0.1, max=1000, help="Only this cycle time; may stand several times."),
+        typer.Option("--cycle-ms", min=0.1, max=1000, help="Only this cycle time; may be repeated."),
     ] = None,
     realtime: Annotated[
         bool, typer.Option(help="Ask for real-time priority and locked memory, as the control loop does.")

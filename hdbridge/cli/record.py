@@ -32,7 +32,7 @@ OutOption = Annotated[
     typer.Option(
         "--out",
         metavar="FOLDER|FILE.csv",
-        help="Folder of a recording, new or empty; or a CSV file, .csv or .csv.gz.",
+        help="New or empty folder of a recording, or a file .csv or .csv.gz.",
     ),
 ]
 AllStatesOption = Annotated[
@@ -56,7 +56,7 @@ def register(app: typer.Typer) -> None:
 
 
 def overviews(flights: FlightsArgument, json_file: JsonOption = None) -> None:
-    """List recordings: from when to when, how large, and what stopped an axis in them."""
+    """List recordings: period, size, and stops in them."""
     need_reader()
     from hdbridge.daemon.recorder.reading import each_flight, overview
 
@@ -77,7 +77,7 @@ def overviews(flights: FlightsArgument, json_file: JsonOption = None) -> None:
 
 
 def info(
-    flight: Annotated[Path, typer.Argument(metavar="FILE.mcap", help="A flight recording.")],
+    flight: Annotated[Path, typer.Argument(metavar="FILE.mcap", help="Flight recording.")],
     json_file: JsonOption = None,
 ) -> None:
     """Report the content of a recording: machine, axes, models, missing cycles, events."""
@@ -157,7 +157,7 @@ def export(
     model: Annotated[
         Path | None,
         typer.Option(
-            "--model-out", metavar="MODEL.yaml", help="Write the model that the axis used at the end, too."
+            "--model-out", metavar="MODEL.yaml", help="Also write the model that the axis used at the end."
         ),
         Kind.MODEL,
     ] = None,
@@ -180,9 +180,9 @@ def export(
 def import_(
     log: Annotated[
         Path,
-        typer.Argument(metavar="LOG", help="A bus log: candump (.log), .asc, .blf, .trc, .mf4; also .gz."),
+        typer.Argument(metavar="LOG", help="Bus log: candump (.log), .asc, .blf, .trc, .mf4; also .gz."),
     ],
-    profile: Annotated[str, typer.Argument(metavar="PROFILE", help="The axis that was on the bus.")],
+    profile: Annotated[str, typer.Argument(metavar="PROFILE", help="Axis that was on the bus.")],
     out: OutOption = None,
     channel: Annotated[
         str | None,

@@ -159,7 +159,7 @@ def _borrow(bus: BusConfig) -> None:
             if (machine.bus.interface, machine.bus.channel) == (bus.interface, str(bus.channel)):
                 break
     else:
-        return  # opening the bus names its holder
+        return  # opening the bus reports its holder
     names = ", ".join(each.name for each in machine.axes)
     with Client(address.socket, name="hdbridge --borrow") as client:
         client.lend_bus()

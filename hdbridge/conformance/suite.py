@@ -58,7 +58,7 @@ def run(
 
 
 def run_one(tester: NodeTester, check: Check) -> Result:
-    """Runs one check and undoes what it has changed."""
+    """Runs one check and undoes its changes."""
     verdict, found, expected = Verdict.PASS, "", ""
     begun_s = tester.now
     tester.prepare(moves=check.moves)

@@ -30,7 +30,7 @@ def blind(tmp_path: Path) -> Path:
 
 
 def ripples(profile: Path, *models: TransmissionModel) -> list[float]:
-    """Ripple of the load at 76 deg/s, arcsec rms; the encoder at the load sees it."""
+    """Ripple of the load at 76 deg/s, arcsec rms; load encoder sees it."""
     with simulated(AxisConfig.load(profile)) as drive:
         drive.boot()
         runs = [Bench(drive, each).run(EvenSpeed((76.0,))).outcome for each in models]

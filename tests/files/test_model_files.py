@@ -85,7 +85,7 @@ def axis(tmp_path) -> AxisConfig:
         ("uncertainty: {offset_arcsec: 0.2}", "uncertainty: {offset_arcsec: -1}", "10:34: effects[1].uncertainty.offset_arcsec: found -1; expected a half width of at least 0"),
         ("ratio: 50", "ratio: 0", "2:8: ratio: found 0; expected a number above 0, at most 1000 (N: motor turns per load turn)"),
         ("ratio: 50\n", "", "1:1: key 'ratio' is missing; expected a number above 0, at most 1000 (N: motor turns per load turn)"),
-        ("axis: test", "axis: 5", "12:9: provenance.axis: found 5; expected text (name of the axis that it was measured on)"),
+        ("axis: test", "axis: 5", "12:9: provenance.axis: found 5; expected text (name of the axis)"),
         ("axis: test", "drive: {vendor: 1}", "12:11: provenance.drive.vendor: unknown key; did you mean 'vendor_id'?"),
         ("hdbridge.model/1", "hdbridge.model/2", "1:9: schema: found 'hdbridge.model/2'; expected 'hdbridge.model/1' (kind and version of this file); did you mean 'hdbridge.model/1'?"),
     ],

@@ -49,11 +49,11 @@ HERE = Path(__file__).resolve().parents[2]
 
 
 class Busy(Exception):  # noqa: N818 - what happened
-    """The machine stalled within a block, and the cycle made a fault of it."""
+    """Raised if the machine stalled within a block, which the cycle reported as a fault."""
 
 
 class Axes:
-    """Some axes on one bus, enabled, each on its own slow sine."""
+    """Enabled axes on one bus, each on its own slow sine."""
 
     def __init__(self, bus: Any, count: int, model: TransmissionModel, clock: Clock | None = None) -> None:
         # Only here: the checkout before the change may not have them.
@@ -83,7 +83,7 @@ class Axes:
         return lambda feedback: counts_for(command(2.0 * sin(feedback.time_s + phase)))
 
     def start(self, kind: str) -> None:
-        """Before a block: everything released, power on."""
+        """Prepares a block: latches released, power on."""
         while self.bus.recv(0.0) is not None:
             pass
         for axis, answer in zip(self.cycle.axes, self.answers, strict=True):
@@ -99,13 +99,13 @@ class Axes:
             axis.image.power.go(State.OPERATION_ENABLED)
 
     def check(self) -> None:
-        """Raise `Busy` where an axis was stopped within the block."""
+        """Raises `Busy` if an axis was stopped within the block."""
         if any(axis.supervision.stop is not None for axis in self.cycle.axes):
             raise Busy
 
 
 def _bus(interface: str, count: int) -> tuple[Any, Callable[[], object]]:
-    """A bus on which so many drives answer, and what answering costs by itself."""
+    """Returns a bus on which ``count`` drives answer, and the cost of answering."""
     node_ids = range(1, count + 1)
     if interface == "virtual":
         bus = AnsweringBus(*node_ids)
@@ -124,7 +124,7 @@ class Worker:
         self.several: dict[tuple[str, int], tuple[Axes, Callable[[], object]]] = {}
 
     def block(self, interface: str, count: int, kind: str, cycles: int) -> float:
-        """Own cost of one cycle, us; ``count`` 0 is one axis through `Cycle`."""
+        """Returns the net cost of one cycle, us; ``count`` 0 is one axis through `Cycle`."""
         for _ in range(20):
             with suppress(SafetyStop, Busy):
                 return (
@@ -164,7 +164,7 @@ class Worker:
         return cost_us
 
     def serve(self) -> None:
-        """A line of JSON in, a line out, to the end of the input."""
+        """Answers each line of JSON with a line, to the end of the input."""
         for line in sys.stdin:
             print(json.dumps(self.block(*json.loads(line))), flush=True)
 
@@ -193,7 +193,7 @@ class Checkout:
 
 
 def measure(interface: str, options: argparse.Namespace) -> dict[str, dict[str, float]]:
-    """Medians by kind and variant, and of the ratios of neighbouring blocks; us."""
+    """Returns medians by kind and variant, and medians of the ratios of neighbouring blocks; us."""
     # A worker of its own for the single axis of each side: they shall share the processor's caches alike.
     now, several = Checkout(HERE), Checkout(HERE)
     before = Checkout(options.before) if options.before is not None else None

@@ -58,7 +58,7 @@ NODES_HEARTBEAT_TURNS = 12
 
 
 class AnsweringNodes(VirtualBus):
-    """The master's end of a virtual bus, with nodes on it that answer SYNC at once and stand at zero."""
+    """Master's end of a virtual bus whose nodes answer SYNC at once with position zero."""
 
     def __init__(self, nodes: int) -> None:
         super().__init__(channel=self)
@@ -106,7 +106,7 @@ def bench_cycle(
     clock: Clock | None = None,
     image: ProcessImage | None = None,
 ) -> tuple[Callable[[], None], Cycle]:
-    """The bench's own cycle: `Bench._leg` without what keeps the samples; by default it never sleeps.
+    """Returns the bench's cycle: `Bench._leg` without the storage of samples; by default it never sleeps.
 
     ``image`` is that of a drive that was made ready for power.
     """
@@ -142,7 +142,7 @@ def bench_cycle(
             goal = -goal
         target_deg = set_point.step()
         feedback = cycle.tick(answer)
-        # What the bench keeps of each cycle, as numbers.
+        # Numbers that the bench stores per cycle.
         image.motor_deg(feedback.demand_counts)
         image.motor_deg(feedback.motor_counts)
         image.load_deg(feedback.load_counts)
@@ -153,7 +153,9 @@ def bench_cycle(
 def controller_of(
     bus: can.BusABC, memory: Memory, model: TransmissionModel, *, followed: int = 0
 ) -> Controller:
-    """A loop whose axes are enabled and on their way; ``followed``: set-points of a gateway for the first."""
+    """Returns a loop whose axes are enabled and in motion; ``followed``: the first follows a gateway's
+    set-points.
+    """
     configs = configs_of(memory.axes)
     cycle = BusCycle(Link(bus, NeverSleeping()), NeverSleeping(), memory.period_s, bitrate_bps=1_000_000)
     setups = [AxisSetup(each, compensation_for(each, model.bound_to(each))) for each in configs]
@@ -173,7 +175,7 @@ def controller_of(
 
 
 def follow(controller: Controller, memory: Memory, turns: int) -> None:
-    """Have the axis follow a ramp of so many turns from the gateway's ring; another process would fill it."""
+    """Makes the axis follow a ramp from the gateway's ring, which another process normally fills."""
     memory.commands.post(CommandKind.FOLLOW, 0, a=1.0, j=1)
     begin_s, begin_deg = controller.cycle.due_s, controller.axes[0].set_point.position_deg
     for turn in range(turns):
@@ -183,7 +185,7 @@ def follow(controller: Controller, memory: Memory, turns: int) -> None:
 
 
 def loop_block(count: int, model: TransmissionModel, cycles: int, *, followed: bool = False) -> float:
-    """CPU time of a turn for so many axes, us; begun anew when a busy machine has stopped an axis in it."""
+    """Returns the CPU time of a turn, us; repeats the block if a busy machine stopped an axis in it."""
     for _ in range(20):
         with AnsweringNodes(count) as bus, Memory.create(count, 0.004) as memory:
             controller = controller_of(bus, memory, model, followed=cycles + 100 if followed else 0)
@@ -195,7 +197,7 @@ def loop_block(count: int, model: TransmissionModel, cycles: int, *, followed: b
 
 
 def bench_block(model: TransmissionModel, cycles: int) -> float:
-    """The same of the bench's cycle."""
+    """Returns the same for the bench's cycle."""
     for _ in range(20):
         with suppress(SafetyStop), AnsweringNodes(1) as bus:
             turn, _ = bench_cycle(bus, model)
@@ -206,7 +208,7 @@ def bench_block(model: TransmissionModel, cycles: int) -> float:
 
 
 def measure(counts: list[int], blocks: int, cycles: int) -> dict[str, float]:
-    """Median CPU time of one cycle of each, us, without the answering nodes."""
+    """Returns the median CPU time of one cycle of each, us, without the answering nodes."""
     model = TransmissionModel.load(PROFILE / "model.yaml")
     times: dict[str, list[float]] = {}
     for _ in range(blocks):
@@ -232,7 +234,7 @@ def report(result: dict[str, float]) -> str:
 
 
 def growth(hours: float) -> None:
-    """Axis time on a simulated drive, moving, with a service that reads; what has grown."""
+    """Runs a moving axis with a reading service; returns the growth of the process."""
     sys.path.append(str(Path(__file__).resolve().parents[2] / "tests"))
     from support.daemon import stepped_daemon  # noqa: PLC0415
 

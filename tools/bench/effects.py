@@ -16,7 +16,7 @@ RATIO = 50.0
 
 
 def main() -> None:
-    """Print one line per effect."""
+    """Prints one line per effect."""
     base = [CATALOGUE["synchronous"].candidate(RATIO), CATALOGUE["hysteresis"].candidate(RATIO)]
     count = 1_000_000
     time_s = np.arange(count) * 0.004

@@ -50,10 +50,9 @@ class HysteresisMemory(ElasticLoop):
         "back at the angle "
         "of the reversal before, both are forgotten and the outer branch goes on",
         signature="nested loops close; the plain law misses by 10 to 30 arcsec after small back-steps",
-        consequence="after a small move back and forth within the width, the load is not where the plain "
-        "law says",
-        remedy="use this law in place of the plain one; it costs nothing more",
-        experiment="first-order reversal curves: back-steps of growing size within the width, each undone",
+        consequence="after a small move back and forth the plain law predicts another position",
+        remedy="use this law in place of the plain one",
+        experiment="first-order reversal curves: back-steps of growing size, each undone",
         aliases=("hysteresis_parameters", "backlash"),
         source="G. Masing 1926; return-point memory of Prandtl-Ishlinskii and Preisach operators",
         size="10-27 arcsec from the plain law, for a loop of 80",
@@ -161,7 +160,7 @@ class _Memory:
         nothing.
         """
         depth = len(self._points)
-        if sign == -self._sign:  # a reversal: first its own branch, which closes where the last one began
+        if sign == -self._sign:  # a reversal starts a branch that closes at the start of the last one
             if depth > _DEPTH:
                 depth -= 2
             closing = self._points[depth - 1][0] if depth else 2.0 * self._origin - last
