@@ -268,7 +268,9 @@ def report(
 
 
 def simulate(
-    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="Write the fleet here: a new folder."), Kind.FOLDER],
+    folder: Annotated[
+        Path, typer.Argument(metavar="FOLDER", help="Write the fleet here: a new folder."), Kind.FOLDER
+    ],
     joints: Annotated[int, typer.Option("--joints", min=4, max=100_000, help="Number of joints.")] = 12,
     recordings: Annotated[
         int, typer.Option("--recordings", min=3, max=1000, help="Recordings per joint.")
