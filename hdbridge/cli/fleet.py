@@ -354,7 +354,7 @@ def _with_pages(folder: Path, latest: Mapping[str, Row], wanted: Collection[str]
             for each in bar.track(missing, description="pages of joints"):
                 try:
                     write_page(folder, latest[each])
-                except InputError as problem:  # such as a recording that was removed
+                except InputError as problem:  # for example a removed recording
                     _note(f"no page of {each}: {problem}")
         there = links(folder, latest)
     return there
