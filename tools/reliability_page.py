@@ -66,7 +66,7 @@ def rows() -> list[tuple[str, str, str]]:
 
 
 def rows_of_page(text: str) -> list[tuple[str, str, str]]:
-    """Returns the same of the results on a page."""
+    """Returns fault, required reaction and allowed cycles of each result on a page."""
     tables = "".join(match[0] for match in _BLOCK.finditer(text))
     lines = [
         line for line in tables.splitlines() if line.startswith("| ") and not line.startswith("| faults |")

@@ -243,7 +243,7 @@ class RealtimeConfig(_Part):
     def _each_once(cls, cpus: tuple[int, ...]) -> tuple[int, ...]:
         for place, cpu in enumerate(cpus):
             if cpu in cpus[:place]:
-                raise wrong(f"processor {cpu} stands twice; expected it once", place)
+                raise wrong(f"processor {cpu} appears twice; expected it once", place)
         return cpus
 
 

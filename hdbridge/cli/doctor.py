@@ -118,7 +118,7 @@ def doctor(
         first = failures[0]
         raise first.verdict.error(
             f"{files.axis}: {len(failures)} of {len(rows)} checks failed, first '{first.check.title}'; "
-            "the lines under each say what to change"
+            "the lines below each give the remedy"
         )
     if refused:
         raise DriveError(f"{files.axis}: {DECLINED}")

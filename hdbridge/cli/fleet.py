@@ -122,7 +122,7 @@ class Fleet:
             )
         if self.scheduler is not None and self.workers is not None:
             raise InputError(
-                "--workers: a cluster that exists has its own workers; leave out --workers or --scheduler"
+                "--workers: a running cluster has its own workers; leave out --workers or --scheduler"
             )
         _check_memory(self.memory)
         if self.scheduler == "":
@@ -247,7 +247,7 @@ def report(
     out: OutArgument,
     html_file: Annotated[
         Path | None,
-        typer.Option("--html", metavar="PAGE", help="Page; else OUT/fleet.html."),
+        typer.Option("--html", metavar="PAGE", help="Write the page here; else OUT/fleet.html."),
         Kind.PAGE,
     ] = None,
     json_file: JsonOption = None,
@@ -268,7 +268,9 @@ def report(
 
 
 def simulate(
-    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="New folder of the fleet."), Kind.FOLDER],
+    folder: Annotated[
+        Path, typer.Argument(metavar="FOLDER", help="Write the fleet here: a new folder."), Kind.FOLDER
+    ],
     joints: Annotated[int, typer.Option("--joints", min=4, max=100_000, help="Number of joints.")] = 12,
     recordings: Annotated[
         int, typer.Option("--recordings", min=3, max=1000, help="Recordings per joint.")
@@ -352,7 +354,7 @@ def _with_pages(folder: Path, latest: Mapping[str, Row], wanted: Collection[str]
             for each in bar.track(missing, description="pages of joints"):
                 try:
                     write_page(folder, latest[each])
-                except InputError as problem:  # such as a recording that was removed
+                except InputError as problem:  # for example a removed recording
                     _note(f"no page of {each}: {problem}")
         there = links(folder, latest)
     return there

@@ -83,7 +83,7 @@ def command(
     files, axis = session.files, session.axis
     active = _active(files)
     if given and resume is not None:
-        raise InputError("--from measures nothing that --resume could go on with: leave one of them out")
+        raise InputError("--from and --resume exclude each other: leave one of them out")
     recordings = load_recordings(given or (), columns, units, unwrap)  # refused before anything is connected
     work = Measurement.asked(axis, plan, out, resume)
     trial = f"{trial_s(work.plan, axis, active) / 60:.1f} min to step with both models, if something is found"

@@ -40,7 +40,7 @@ def install_service(
     from hdbridge.daemon.systemd import service_files
 
     if user and account is not None:
-        raise InputError("--account is for the system's manager; yours runs the daemon as you: leave it out")
+        raise InputError("--account does not apply to your own service manager: leave it out")
     held = Machine.find(machine)
     if held.bus.interface == "virtual":
         raise InputError(

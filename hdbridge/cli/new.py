@@ -104,5 +104,5 @@ def _chosen(bus: str, nodes: tuple[Node, ...], node_id: int | None) -> Node:
         return usable[0]
     there = ", ".join(f"{each.node_id} ({each.kind})" for each in nodes) or "none"
     if not usable:
-        raise DriveError(f"{bus}: no CiA-402 drive with CSP is there; found nodes: {there}")
-    raise InputError(f"{bus}: several drives are there: {there}; say which one by --node")
+        raise DriveError(f"{bus}: no CiA-402 drive with CSP answers; found nodes: {there}")
+    raise InputError(f"{bus}: several drives answer: {there}; choose one with --node")

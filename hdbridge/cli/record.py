@@ -157,7 +157,7 @@ def export(
     model: Annotated[
         Path | None,
         typer.Option(
-            "--model-out", metavar="MODEL.yaml", help="Also write the model that the axis used at the end."
+            "--model-out", metavar="MODEL.yaml", help="Write the model that the axis used at the end."
         ),
         Kind.MODEL,
     ] = None,

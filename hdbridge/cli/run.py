@@ -101,7 +101,7 @@ def _simulation(machine: Machine, truths: list[Path], seed: int, speed: float) -
 
     if truths and len(truths) != len(machine.axes):
         names = ", ".join(axis.name for axis in machine.axes)
-        raise InputError(f"--truth stands {len(truths)} times; expected once for each of the axes {names}")
+        raise InputError(f"--truth: given {len(truths)} times; expected once for each of the axes {names}")
     paths = tuple(path.absolute() for path in truths) or tuple(
         simulated_by(axis.profile, None) for axis in machine.axes
     )

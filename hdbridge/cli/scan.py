@@ -153,7 +153,7 @@ def _judge(name: str, found: Scan, axis: AxisConfig | None, matches: bool) -> No
             "CAN_H and CAN_L) and that every node has the same bit rate"
         )
     if axis is not None and not matches:
-        raise DriveError(f"{name}: the drive of {axis.path} is not among the nodes; the lines above say why")
+        raise DriveError(f"{name}: the drive of {axis.path} is not among the nodes; see the lines above")
 
 
 def _as_dict(name: str, found: Scan) -> dict[str, Any]:

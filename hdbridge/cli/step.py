@@ -58,7 +58,7 @@ def step(
     html_file: HtmlOption = None,
     record: Annotated[
         Path | None,
-        typer.Option("--record", metavar="FOLDER", help="Keep the records: one CSV file per scheme."),
+        typer.Option("--record", metavar="FOLDER", help="Keep what was measured: one CSV file per scheme."),
         Kind.FOLDER,
     ] = None,
 ) -> None:

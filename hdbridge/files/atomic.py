@@ -86,7 +86,7 @@ def check_writable(path: Path | str) -> None:
     except OSError as problem:
         raise InputError(f"{path}: cannot be written: {problem.strerror}") from None
     except RuntimeError:  # Python 3.11 and 3.12 report it this way
-        raise InputError(f"{path}: cannot be written: its links go round in a circle") from None
+        raise InputError(f"{path}: cannot be written: its symbolic links form a loop") from None
 
 
 def _try_out(target: Path) -> None:

@@ -82,7 +82,7 @@ TEETH = GOOD + "gear:\n  ratio: {}\n  teeth: {{flexspline: {}, circular_spline: 
         ("cycle_ms: 4", "cycle_ms: 40", "5:3: drive: a heartbeat of 50 ms does not go with a cycle of 40 ms; expected heartbeat_ms of at least 80"),
         ("limits:", "realtime: {priority: 100}\nlimits:", "15:22: realtime.priority: found 100; expected an integer from 0 to 99 (SCHED_FIFO priority of the control loop; 0: none)"),
         ("limits:", "realtime: {cpus: [0, -1]}\nlimits:", "15:22: realtime.cpus[1]: found -1; expected an integer from 0 to 4095"),
-        ("limits:", "realtime: {cpus: [3, 2, 3]}\nlimits:", "15:25: realtime.cpus[2]: processor 3 stands twice; expected it once"),
+        ("limits:", "realtime: {cpus: [3, 2, 3]}\nlimits:", "15:25: realtime.cpus[2]: processor 3 appears twice; expected it once"),
         ("cycle_ms: 4", "cycle_sm: 4", "8:3: drive.cycle_sm: unknown key; did you mean 'cycle_ms'?"),
         ("cycle_ms: 4", "master_node_id: 1\n  cycle_ms: 4", "8:19: drive.master_node_id: node 1 is the drive (drive.node_id); expected another"),
         ("node_id: 1", "node_id: 0", "5:12: drive.node_id: found 0; expected an integer from 1 to 127 (CANopen node id of the drive)"),

@@ -71,7 +71,7 @@ def axis(tmp_path) -> AxisConfig:
     ("wanted", "given", "expected"),
     [
         ("effect: hysteresis", "effect: hysteresys", "8:13: effects[1].effect: no effect is called 'hysteresys'; expected one of {catalogue}; did you mean 'hysteresis'?"),
-        ("effect: hysteresis", "effect: synchronous", "8:13: effects[1].effect: 'synchronous' stands twice; expected each effect once"),
+        ("effect: hysteresis", "effect: synchronous", "8:13: effects[1].effect: 'synchronous' appears twice; expected each effect once"),
         ("width_deg", "width", "9:37: effects[1].parameters.width: unknown key; did you mean 'width_deg'?"),
         ("width_deg: 20, ", "", "9:17: effects[1].parameters: key 'width_deg' is missing; expected {width_deg}"),
         ("exponent: 1.6", "exponent: 1", "9:62: effects[1].parameters.exponent: found 1; expected {exponent}"),
@@ -79,7 +79,7 @@ def axis(tmp_path) -> AxisConfig:
         ("offset_arcsec: 40", "offset_arcsec: .nan", "9:33: effects[1].parameters.offset_arcsec: found .nan; expected {offset_arcsec}"),
         ("order: 1,", "order: 1.5,", "7:19: effects[0].parameters.orders[0].order: found 1.5; expected {order}"),
         ("amplitude_arcsec", "amplitude_arcmin", "7:22: effects[0].parameters.orders[0].amplitude_arcmin: unknown key; did you mean 'amplitude_arcsec'?"),
-        ("-126.8}", "-126.8}\n        - {order: 1, amplitude_arcsec: 1, phase_deg: 0}", "7:9: effects[0].parameters.orders: each order may stand only once"),
+        ("-126.8}", "-126.8}\n        - {order: 1, amplitude_arcsec: 1, phase_deg: 0}", "7:9: effects[0].parameters.orders: each order may appear only once"),
         ("    parameters: {offset", "    parametres: {offset", "9:5: effects[1].parametres: unknown key; did you mean 'parameters'?"),
         ("uncertainty: {offset_arcsec: 0.2}", "uncertainty: {offset: 0.2}", "10:19: effects[1].uncertainty.offset: unknown parameter of hysteresis; did you mean 'offset_arcsec'?"),
         ("uncertainty: {offset_arcsec: 0.2}", "uncertainty: {offset_arcsec: -1}", "10:34: effects[1].uncertainty.offset_arcsec: found -1; expected a half width of at least 0"),

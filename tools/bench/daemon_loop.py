@@ -197,7 +197,7 @@ def loop_block(count: int, model: TransmissionModel, cycles: int, *, followed: b
 
 
 def bench_block(model: TransmissionModel, cycles: int) -> float:
-    """Returns the same for the bench's cycle."""
+    """Returns the CPU time of the bench's cycle, us."""
     for _ in range(20):
         with suppress(SafetyStop), AnsweringNodes(1) as bus:
             turn, _ = bench_cycle(bus, model)

@@ -86,7 +86,7 @@ def as_recorded(samples: Any, rate: int, folder: Path) -> tuple[float, int]:
 
 
 def as_json(samples: Any, rate: int, path: Path) -> tuple[float, int]:
-    """Returns the same with JSON messages."""
+    """Returns processor time and bytes of a recorder with JSON messages."""
     axes = samples["axes"].shape[1]
     names = AXIS_SAMPLE.names or ()
     begun = time.thread_time()

@@ -38,7 +38,7 @@ class MotorOrders(OrderSeries):
     usual: ClassVar[int] = 4
     """A worn wave generator bearing has several."""
     drifting: ClassVar[tuple[str, ...]] = ("orders",)
-    """The same as for the synchronous part."""
+    """Orders, which change with the wear of teeth and bearing."""
 
     def turns_per_motor_turn(self) -> float:
         """One, because the orders refer to the motor angle itself."""

@@ -61,7 +61,7 @@ class OrderSeries(Effect):
     def _distinct(cls, orders: tuple[MotorOrder, ...]) -> tuple[MotorOrder, ...]:
         numbers = [each.order for each in orders]
         if len(set(numbers)) != len(numbers):
-            raise ValueError("each order may stand only once")
+            raise ValueError("each order may appear only once")
         if cls.few and not cls.few.issuperset(numbers):
             raise ValueError(f"only orders {', '.join(map(str, sorted(cls.few)))} are of this cause")
         return orders

@@ -140,7 +140,7 @@ def _effect(document: Document, number: int, entry: EffectEntry, before: list[st
             f"no effect is called '{entry.effect}'; expected one of {', '.join(CATALOGUE)}{hint}",
         )
     if entry.effect in before:
-        raise document.error((*at, "effect"), f"'{entry.effect}' stands twice; expected each effect once")
+        raise document.error((*at, "effect"), f"'{entry.effect}' appears twice; expected each effect once")
     for name, value in entry.uncertainty.items():
         where = (*at, "uncertainty", name)
         if name not in kind.model_fields:

@@ -61,7 +61,7 @@ def adapt(
 ) -> None:
     """Set the adaptation of model parameters to the load encoder."""
     if back == (mode is not None):
-        raise InputError("expected a mode, or --back: one of the two")
+        raise InputError("expected either a mode or --back")
     with moving(at, axis, force=force) as moved:
         tell(moved.adaptation_back() if mode is None else moved.adapt(mode.value), json_file)
 

@@ -187,7 +187,7 @@ def queue(
     from hdbridge.client.messages import QueueItem
 
     if clear == bool(angles_deg):
-        raise InputError("expected angles, or --clear: one of the two")
+        raise InputError("expected either angles or --clear")
     if clear:
         with connected(at) as client, client.lease(force=force):
             tell(client.axis(axis).clear_queue(), json_file)
