@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import math
+import shutil
 import struct
 
 import numpy as np
 import pytest
+from support.daemon import PROFILE
 from support.gateway import COUNTS_PER_DEG, NODE, GatewayBench, gateway_bench
+from support.raised import without_load_encoder
 from support.service import play
 
 from hdbridge.daemon.memory import CommandKind
@@ -515,3 +518,18 @@ def test_a_fault_of_one_axis_leaves_the_other_in_motion(tmp_path):
         assert first.statusword & STATE == ENABLED
 
     scene(tmp_path, scenario, axes=2)
+
+
+def test_without_a_load_encoder_it_reports_the_predicted_load_angle(tmp_path):
+    async def scenario(bench):
+        await bench.enable()
+        await swing(bench, amplitude_deg=10.0)
+        await bench.wait(3.0)
+        bench.plc.plan = lambda cycle: None
+        await bench.wait(0.5)
+        await stands(bench)
+        off_deg = bench.plc.position / COUNTS_PER_DEG - bench.load_deg
+        assert abs(off_deg * 3600.0) < 5.0  # the motor's angle alone would be off by 40 arcsec
+
+    profile = without_load_encoder(shutil.copytree(PROFILE, tmp_path / "profile"))
+    scene(tmp_path, scenario, profile=profile)

@@ -28,6 +28,11 @@ RAISED = {
     "maximum_arcsec": "600",
     "slew_arcsec_s": "100000",
 }
+REMOVED = {
+    "counts_per_turn: 2880000": "counts_per_turn: 400000",
+    "{index: 0x60E4, subindex: 1": "{index: 0x6064, subindex: 0",
+}
+"""The load encoder's reading is that of the motor, 50 turns to one."""
 
 RUNS = EvenSpeed((123.5, 104.0, 83.2, 65.0, 49.4, 36.4, 23.4), window_s=0.6)
 
@@ -45,6 +50,16 @@ def raised_profile(folder: Path) -> Path:
     """Copies the article's profile to a new folder, with raised limits."""
     shutil.copytree(ARTICLE, folder)
     (folder / "axis.yaml").write_text(raised_axis(), encoding="utf-8")
+    return folder
+
+
+def without_load_encoder(folder: Path) -> Path:
+    """Removes the load encoder from a profile."""
+    text = (folder / "axis.yaml").read_text(encoding="utf-8")
+    for old, new in REMOVED.items():
+        assert old in text
+        text = text.replace(old, new)
+    (folder / "axis.yaml").write_text(text, encoding="utf-8")
     return folder
 
 
