@@ -13,6 +13,7 @@ from support.gateway import COUNTS_PER_DEG, NODE, GatewayBench, gateway_bench
 from support.raised import without_load_encoder
 from support.service import play
 
+from hdbridge.daemon.loop.states import AxisState
 from hdbridge.daemon.memory import CommandKind
 from hdbridge.motion import MotionMode
 
@@ -443,8 +444,30 @@ def client_by_force(bench):
     bench.bridge.lease.take("a person", force=True)
 
 
-@pytest.mark.parametrize("withdraw", [nmt_stop, disable_voltage, lost_sync, client_by_force])
-def test_a_request_for_power_that_is_withdrawn_meanwhile_is_not_followed(tmp_path, withdraw):
+def client_for_a_moment(bench):
+    """A client takes the lease by force and releases it before the service has looked."""
+    lease = bench.bridge.lease
+    lease.release(lease.take("a person", force=True))
+
+
+def test_a_client_that_takes_the_axis_for_a_moment_ends_the_motion_of_the_gateway(tmp_path):
+    async def scenario(bench):
+        await bench.enable()
+        await swing(bench)
+        await bench.wait(0.6)
+        client_for_a_moment(bench)
+        await faulted(bench, 0xFF01)
+        await stands(bench)
+        await reset(bench)
+
+    scene(tmp_path, scenario)
+
+
+@pytest.mark.parametrize("seen", ["ENABLING", "ENABLED"])
+@pytest.mark.parametrize(
+    "withdraw", [nmt_stop, disable_voltage, lost_sync, client_by_force, client_for_a_moment]
+)
+def test_a_request_for_power_that_is_withdrawn_meanwhile_is_not_followed(tmp_path, withdraw, seen):
     async def scenario(bench):
         plc = bench.plc
         plc.begin()
@@ -453,11 +476,15 @@ def test_a_request_for_power_that_is_withdrawn_meanwhile_is_not_followed(tmp_pat
             await bench.until(lambda bits=bits: plc.statusword & STATE == bits)
         reader = bench.daemon.memory.reader()
         plc.controlword = 0x0F
-        await bench.until(lambda: bench.daemon.states[0].name == "ENABLING")
+        plc.target += round(COUNTS_PER_DEG)
+        await bench.until(lambda: bench.daemon.states[0].name == seen)
         withdraw(bench)
         await bench.wait(1.0)
-        samples, _ = reader.read()
-        assert not any(samples["axes"][:, 0]["mode"] == MotionMode.FOLLOW)
+        axis = reader.read()[0]["axes"][:, 0]
+        if seen == "ENABLING":
+            assert not any(axis["mode"] == MotionMode.FOLLOW)
+        driven = axis["load_target_deg"][axis["state"] == AxisState.ENABLED]
+        assert np.ptp(driven) < 0.01  # the target begins at the load encoder; 1 degree was asked for
         await stands(bench)
         if withdraw is not client_by_force:  # who has it now, and at rest
             assert bench.daemon.states[0].name == "DISABLED"
