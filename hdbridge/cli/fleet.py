@@ -195,8 +195,8 @@ class Fleet:
 def run(fleet: Fleet) -> None:
     """Diagnose every recording that is not in FOLDER yet, and write Parquet and a page there.
 
-    A joint without a model gets one fitted to its earliest recording. A recording that cannot be used is a
-    row with the reason. Ctrl-C keeps what is done; the same command continues.
+    A joint without a model gets one fitted to its earliest recording. An unusable recording is a row with the
+    reason. Ctrl-C keeps finished results; the same command continues.
     """
     found = fleet.find(fleet.dataset.stored())
     fleet.dataset.create()
@@ -223,8 +223,8 @@ def watch(
 ) -> None:
     """Diagnose new recordings as they arrive, and update Parquet and page in FOLDER.
 
-    A recording is ready when its size and time are the same in two listings; one that is still being written
-    waits for the next round. Ctrl-C ends it and keeps what is done (exit status 0).
+    A recording is ready when its size and time are the same in two listings. Ctrl-C ends the command and
+    keeps finished results (exit status 0).
     """
     from hdbridge.fleet.engine import watch as watch_fleet
 

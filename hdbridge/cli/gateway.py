@@ -60,8 +60,8 @@ def simulate(
 ) -> None:
     """Run an ideal drive in place of the gateway, in real time, until Ctrl-C.
 
-    It has the bus, node id and objects of the gateway, and its load is where it was asked for. It needs no
-    daemon and no other drive, so it serves the tests of another master's program.
+    It has the bus, node id and objects of the gateway, and needs no daemon: for tests of another master's
+    program.
     """
     from hdbridge.cli.interrupt import deferred_interrupt
     from hdbridge.clock import MonotonicClock
@@ -104,11 +104,11 @@ def doctor(
     ] = None,
     json_file: JsonOption = None,
 ) -> None:
-    """Listen to the other master: what it has configured, what it does, and what it gets wrong, with reasons.
+    """Listen to the other master; report its configuration, its commands and its mistakes, with reasons.
 
-    It sends nothing, so it may run next to the daemon. A mistake is followed by what to do instead.
+    Sends nothing, so it may run next to the daemon. A mistake is followed by the correction.
 
-    Exit status 4 when the master made a mistake, or nothing of the axis was heard.
+    Exit status 4 if the master made a mistake, or nothing of the axis was heard.
     """
     from hdbridge.daemon.gateway.trace import Trace
 

@@ -62,8 +62,8 @@ def home(
 ) -> None:
     """Home the drive by one of its own methods (CiA 402, mode HM); print the position of the axis.
 
-    The drive plans the motion, within the given speeds. Ctrl-C stops it (exit status 130). A model belongs to
-    the zero that the axis had when it was calibrated: an absolute encoder needs no homing.
+    The drive plans the motion. Ctrl-C stops it (exit status 130). A model belongs to the zero of its
+    calibration. An absolute encoder needs no homing.
     """
     from hdbridge.drive.modes import Homing
 

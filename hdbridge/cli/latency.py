@@ -34,7 +34,7 @@ def latency(
 ) -> None:
     """Measure timer latency; print its histogram and the shortest cycle that this computer sustains.
 
-    Run it on the computer that will control the axis, under its usual load, for minutes rather than seconds.
+    Run it on the control computer under its usual load, for minutes.
     """
     from hdbridge.control.latency import CANDIDATES_S, measure
     from hdbridge.control.realtime import prepare_realtime

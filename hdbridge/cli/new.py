@@ -50,9 +50,8 @@ def new(
 ) -> None:
     """Make the folder of an axis: a copy of a bundled profile, or from the data of a drive on the bus.
 
-    With `--from scan --interface socketcan --channel can0` the axis file has the drive's identity, encoders
-    and gear, as far as it reports them; missing values are marked, and `hdbridge check` stops there.
-    Nothing is moved. An existing folder with files in it is refused.
+    With `--from scan --interface socketcan --channel can0` the axis file has the identity, encoders and gear
+    that the drive reports; missing values are marked, and `hdbridge check` stops there. Nothing moves.
     """
     from hdbridge.axis import AxisConfig
     from hdbridge.commissioning.bringup.newprofile import copy_bundled

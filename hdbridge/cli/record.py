@@ -131,7 +131,7 @@ def info(
 def mend(flights: FlightsArgument) -> None:
     """Repair recordings that were cut off (kill, power): complete up to their last second.
 
-    The daemon does this itself when it starts. One that is being written is refused.
+    The daemon does this when it starts. A recording that is being written is refused.
     """
     need_reader()
     from hdbridge.daemon.recorder import mend as mending
@@ -164,8 +164,8 @@ def export(
 ) -> None:
     """Make a record of one axis, as `fit` and `diagnose` read it.
 
-    Nothing is rounded or interpolated. A new part begins if cycles are missing or the axis was not enabled:
-    a recording folder has a file for each part, and a CSV file can hold only one.
+    Nothing is rounded or interpolated. Missing cycles or a disabled axis begin a new part; a recording
+    folder has a file for each part, a CSV file only one.
     """
     out = _checked_out(out)
     recording, used = read_flights(flights, axis, begin, end, all_states=all_states)
@@ -192,8 +192,8 @@ def import_(
 ) -> None:
     """Make a record of a bus log, as `fit` and `diagnose` read it. Any master may have driven the axis.
 
-    The PDO mapping comes from the SDO traffic in the log, else from the axis file. Log from the drive's
-    boot-up on, so that the mapping is in it. Nothing is sent, and nothing is interpolated.
+    The PDO mapping comes from the SDO traffic in the log (log from the drive's boot-up on), else from the
+    axis file. Nothing is sent or interpolated.
     """
     from hdbridge.axis import AxisConfig
     from hdbridge.control.buslog import import_log

@@ -142,7 +142,7 @@ class LoadLoop:
         """During a doubt about the encoder: sum of its moves at rest, the greatest such sum, and the
         greatest disagreement."""
         self._agreeing = 0
-        """Number of readings since that sum became small."""
+        """Number of readings since the sum of moves at rest became small."""
         self._agreed = frozenset[int]()
         """Directions of motion after which the encoders have agreed again."""
 

@@ -471,8 +471,8 @@ class DriveNode:
     def _lose_sync(self) -> None:
         """Discards pending set-points when SYNC is overdue, and stops an axis that follows the bus.
 
-        The period is that of 60C2h again, because an axis that runs on its own clock needs one shorter than
-        sparse SYNCs may have measured.
+        The period is reset to 60C2h, because the measured period of sparse SYNCs is too long for an axis on
+        its own clock.
         """
         self._sync_due_s = _NEVER
         self._period_s = self._own_period_s()

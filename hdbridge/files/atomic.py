@@ -69,7 +69,7 @@ def check_writable(path: Path | str) -> None:
                 if number is None
                 else fcntl.fcntl(number, fcntl.F_GETFL) & os.O_ACCMODE == os.O_RDONLY
             ):
-                raise InputError(f"{path}: cannot be written: it does not permit it")
+                raise InputError(f"{path}: cannot be written: no permission")
             return
         target = Path(path).resolve()
         if target.is_dir():

@@ -16,7 +16,7 @@ Z95 = 1.959964
 EFFECTS = ((0.0, 0.3), (0.3, 1.0), (1.0, 3.0), (3.0, math.inf))
 """Bin edges: rms of a cause over the noise of a reading."""
 LONG = 30_000
-"""Number of samples from which the start of the program does not matter to the run time."""
+"""Number of samples from which the program start is a negligible part of the run time."""
 Test = Callable[[Verdict], bool]
 
 
