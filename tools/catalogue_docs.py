@@ -8,14 +8,14 @@ from __future__ import annotations
 import re
 import sys
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any, get_args, get_origin
 
+import generated
 from pydantic import BaseModel
 
 from hdbridge.axis.effects import CATALOGUE, Effect, aliases_of
 
-PAGE = Path(__file__).resolve().parents[1] / "docs" / "causes.md"
+PAGE = generated.DOCS / "causes.md"
 
 _INTRODUCTION = """# Causes of transmission error
 
@@ -134,19 +134,5 @@ def _cell(text: str) -> str:
     return text.replace("|", "\\|")
 
 
-def main(arguments: list[str]) -> int:
-    """Writes the page, or with `--check` reports if it is up to date."""
-    text = page()
-    if "--check" in arguments:
-        same = PAGE.exists() and PAGE.read_text(encoding="utf-8") == text
-        if not same:
-            print(
-                f"{PAGE} is not what the catalogue says: run python tools/catalogue_docs.py", file=sys.stderr
-            )
-        return 0 if same else 1
-    PAGE.write_text(text, encoding="utf-8")
-    return 0
-
-
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    sys.exit(generated.main({PAGE: page()}))

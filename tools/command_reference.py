@@ -17,11 +17,12 @@ from pathlib import Path
 from types import NoneType, UnionType
 from typing import Any
 
+import generated
 from typer.models import ArgumentInfo, OptionInfo
 
 from hdbridge.cli import PANELS, load
 
-PAGE = Path(__file__).resolve().parents[1] / "docs" / "commands.md"
+PAGE = generated.DOCS / "commands.md"
 
 _INTRODUCTION = """# Commands
 
@@ -257,16 +258,5 @@ def refused(line: str) -> str | None:
     return None
 
 
-def main(arguments: list[str]) -> int:
-    """Rewrites the page, or compares it with ``--check``."""
-    new = page()
-    if "--check" in arguments:
-        same = PAGE.exists() and PAGE.read_text(encoding="utf-8") == new
-        print("up to date" if same else f"{PAGE} lags behind: run python tools/command_reference.py")
-        return int(not same)
-    PAGE.write_text(new, encoding="utf-8")
-    return 0
-
-
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    sys.exit(generated.main({PAGE: page()}))

@@ -1,5 +1,6 @@
 """Writes the tables of docs/files.md and of plans (docs/calibration.md) from the models that read the files,
-that of faults (docs/reliability.md) from the fault table, and that of docs/twin.md from the translation.
+those of faults (docs/reliability.md, docs/ci.md) from the fault tables, and that of docs/twin.md from the
+translation.
 
 python tools/file_reference.py           rewrite the tables
 python tools/file_reference.py --check   report if they are up to date (exit status 1 if not)
@@ -12,9 +13,9 @@ import sys
 from collections.abc import Iterator, Mapping
 from enum import Enum
 from functools import cache
-from pathlib import Path
 from typing import Any, get_args
 
+import generated
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
@@ -40,16 +41,11 @@ from hdbridge.motion.procedures.plan import (
 )
 from hdbridge.records.record import OPTIONAL, REQUIRED
 from hdbridge.records.recording import RecordingFile
+from hdbridge.testing.faulttable import sentences
 from hdbridge.twin.translate import TABLE as TRANSLATED
 
-DOCS = Path(__file__).resolve().parent.parent / "docs"
-PAGES = (
-    DOCS / "files.md",
-    DOCS / "calibration.md",
-    DOCS / "reliability.md",
-    DOCS / "fleet.md",
-    DOCS / "twin.md",
-    DOCS / "ci.md",
+PAGES = tuple(
+    generated.DOCS / f"{name}.md" for name in ("files", "calibration", "reliability", "fleet", "twin", "ci")
 )
 _BLOCK = re.compile(r"(<!-- generated: (?P<name>[a-z-]+) -->\n).*?(<!-- end -->)", re.DOTALL)
 
@@ -160,6 +156,12 @@ def manifest_list() -> str:
     return "".join(_item(f"`{name}`", "", about) for name, about in MANIFEST.items())
 
 
+def fault_names() -> str:
+    """Returns the list of the faults that a simulated drive can be given."""
+    rows = [f"- `{name}({arguments})`: {what}" for name, arguments, what in sentences()]
+    return "\n" + "\n".join(rows) + "\n\n"
+
+
 BLOCKS: Mapping[str, Any] = {
     "axis": lambda: key_list(AxisConfig),
     "machine": lambda: key_list(MachineFile),
@@ -175,6 +177,7 @@ BLOCKS: Mapping[str, Any] = {
     "fleet-recordings": lambda: fleet_list("recordings"),
     "fleet-findings": lambda: fleet_list("findings"),
     "manifest": manifest_list,
+    "fault-names": fault_names,
 }
 
 
@@ -260,22 +263,5 @@ def _default(key: str, info: FieldInfo) -> str:
     return f"= `{value:g}`" if isinstance(value, float) else f"= `{value}`"
 
 
-def main(arguments: list[str]) -> int:
-    """Rewrites the tables, or compares them with ``--check``."""
-    behind = []
-    for path in PAGES:
-        page = path.read_text(encoding="utf-8")
-        new = updated(page)
-        if new != page:
-            behind.append(path.name)
-        if "--check" not in arguments:
-            path.write_text(new, encoding="utf-8")
-    if "--check" not in arguments:
-        return 0
-    words = f"{', '.join(behind)}: not up to date; run python tools/file_reference.py"
-    print(words if behind else "up to date")
-    return int(bool(behind))
-
-
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    sys.exit(generated.main({path: updated(path.read_text(encoding="utf-8")) for path in PAGES}))

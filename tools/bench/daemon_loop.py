@@ -10,27 +10,20 @@ One run measures, in interleaved blocks, the CPU time of the thread (`time.threa
 
 all on the same path, and prints medians, the ratio to the bench, and the cost per axis. The answering nodes
 run in the same thread; what they cost is measured in the same blocks and subtracted. Nobody sleeps.
-``--growth HOURS`` moves one simulated axis for so much axis time instead, and prints by how much the process
-and its Python objects have grown.
 """
 
 from __future__ import annotations
 
 import argparse
-import gc
 import json
-import resource
 import statistics
-import sys
-import tracemalloc
 import warnings
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 
 import can
-from can.interfaces.virtual import VirtualBus
-from cycle import PROFILE, NeverSleeping, answers, block_us
+from cycle import PROFILE, AnsweringBus, NeverSleeping, block_us
 
 from hdbridge.axis import AxisConfig
 from hdbridge.axis.effects import Moment, Observer
@@ -54,49 +47,14 @@ from hdbridge.motion import SetPoint
 
 GOAL = 1.3
 STATUS_OFF, STATUS_READY, STATUS_ON = 0x0250, 0x0231, 0x0233
-NODES_HEARTBEAT_TURNS = 12
 
 
-class AnsweringNodes(VirtualBus):
-    """Master's end of a virtual bus whose nodes answer SYNC at once with position zero."""
-
-    def __init__(self, nodes: int) -> None:
-        super().__init__(channel=self)
-        self.listener = VirtualBus(channel=self)
-        self.replies = [reply for node in range(1, nodes + 1) for reply in answers(node)]
-        self.heartbeats = [
-            can.Message(arbitration_id=0x700 + node, is_extended_id=False, data=b"\x05")
-            for node in range(1, nodes + 1)
-        ]
-        self.count = 0
-
-    def answer(self) -> None:
-        self.count += 1
-        if self.count % NODES_HEARTBEAT_TURNS == 0:
-            for heartbeat in self.heartbeats:
-                self.queue.put(heartbeat)
-        for reply in self.replies:
-            self.queue.put(reply)
-        self.listener.queue.queue.clear()
-
-    def send(self, msg: can.Message, timeout: float | None = None) -> None:
-        super().send(msg, timeout)
-        if msg.arbitration_id == 0x80:
-            self.answer()
-
-    def shutdown(self) -> None:
-        self.listener.shutdown()
-        super().shutdown()
-
-
-def configs_of(count: int) -> list[AxisConfig]:
+def configs_of(count: int, cycle_ms: float | None = None) -> list[AxisConfig]:
+    """Returns several of the article's axis on one bus, by default with its cycle."""
     first = AxisConfig.load(PROFILE)
-    return [
-        first.model_copy(
-            update={"name": f"axis{node}", "drive": first.drive.model_copy(update={"node_id": node})}
-        )
-        for node in range(1, count + 1)
-    ]
+    cycle = {} if cycle_ms is None else {"cycle_ms": cycle_ms}
+    drives = [first.drive.model_copy(update={"node_id": node, **cycle}) for node in range(1, count + 1)]
+    return [first.model_copy(update={"name": f"axis{drive.node_id}", "drive": drive}) for drive in drives]
 
 
 def bench_cycle(
@@ -187,7 +145,7 @@ def follow(controller: Controller, memory: Memory, turns: int) -> None:
 def loop_block(count: int, model: TransmissionModel, cycles: int, *, followed: bool = False) -> float:
     """Returns the CPU time of a turn, us; repeats the block if a busy machine stopped an axis in it."""
     for _ in range(20):
-        with AnsweringNodes(count) as bus, Memory.create(count, 0.004) as memory:
+        with AnsweringBus(*range(1, count + 1)) as bus, Memory.create(count, 0.004) as memory:
             controller = controller_of(bus, memory, model, followed=cycles + 100 if followed else 0)
             block_us(controller.turn, 50)
             own = block_us(controller.turn, cycles)
@@ -199,7 +157,7 @@ def loop_block(count: int, model: TransmissionModel, cycles: int, *, followed: b
 def bench_block(model: TransmissionModel, cycles: int) -> float:
     """Returns the CPU time of the bench's cycle, us."""
     for _ in range(20):
-        with suppress(SafetyStop), AnsweringNodes(1) as bus:
+        with suppress(SafetyStop), AnsweringBus(1) as bus:
             turn, _ = bench_cycle(bus, model)
             block_us(turn, 50)
             own = block_us(turn, cycles)
@@ -233,45 +191,6 @@ def report(result: dict[str, float]) -> str:
     return "\n".join(lines)
 
 
-def growth(hours: float) -> None:
-    """Runs a moving axis with a reading service; returns the growth of the process."""
-    sys.path.append(str(Path(__file__).resolve().parents[2] / "tests"))
-    from support.daemon import stepped_daemon  # noqa: PLC0415
-
-    with stepped_daemon() as daemon:
-        daemon.verify()
-        daemon.enable()
-        goal = 5.0
-
-        def run(turns: int) -> None:
-            nonlocal goal
-            for turn in range(turns):
-                if turn % 500 == 0:
-                    daemon.post(CommandKind.MOVE, 0, a=goal, b=float("nan"), c=float("nan"))
-                    goal = -goal
-                daemon.turn()
-                if turn % 100 == 0:
-                    daemon.samples.read()
-
-        run(20_000)
-        gc.collect()
-        rss = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-        turns = round(3600.0 * hours / daemon.period_s)
-        run(turns - 5000)
-        tracemalloc.start()
-        run(2000)
-        before, _ = tracemalloc.get_traced_memory()
-        run(3000)
-        after, _ = tracemalloc.get_traced_memory()
-        tracemalloc.stop()
-        grown = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - rss
-        print(f"{hours:g} h of axis time, {turns} turns, states {daemon.states}")
-        print(
-            f"  resident set {grown:+d} KiB; Python objects in the last 3000 turns {after - before:+d} bytes"
-        )
-        print(f"  skipped periods: {daemon.controller.cycle.skipped}")
-
-
 def main() -> int:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -279,13 +198,9 @@ def main() -> int:
     parser.add_argument("--axes", default="1,2,6", help="numbers of axes, comma-separated")
     parser.add_argument("--blocks", type=int, default=21, help="blocks per variant")
     parser.add_argument("--cycles", type=int, default=500, help="cycles per block")
-    parser.add_argument("--growth", type=float, metavar="HOURS", help="look for growth of memory instead")
     parser.add_argument("--json", type=Path)
     options = parser.parse_args()
     warnings.simplefilter("ignore")
-    if options.growth is not None:
-        growth(options.growth)
-        return 0
     result = measure([int(each) for each in options.axes.split(",")], options.blocks, options.cycles)
     print(report(result))
     if options.json is not None:

@@ -37,10 +37,9 @@ from typing import Any
 import can
 import numpy as np
 from cycle import PROFILE, answering_kernel
-from daemon_loop import bench_cycle
+from daemon_loop import bench_cycle, configs_of
 from realtime_cycle import WARM_UP, Figures, Waking, table
 
-from hdbridge.axis import AxisConfig
 from hdbridge.axis.model import TransmissionModel
 from hdbridge.commissioning.evaluation.stepping import Scheme
 from hdbridge.control.bench import compensation_for
@@ -199,15 +198,6 @@ def service(memory: Memory) -> Iterator[subprocess.Popen[str]]:
 
 
 # -------------------------------------------------------------------- the loop
-
-
-def configs_of(axes: int, cycle_ms: float) -> list[AxisConfig]:
-    """Returns ``axes`` copies of the article's axis on one bus."""
-    first = AxisConfig.load(PROFILE)
-    drives = [
-        first.drive.model_copy(update={"node_id": node, "cycle_ms": cycle_ms}) for node in range(1, axes + 1)
-    ]
-    return [first.model_copy(update={"name": f"axis{drive.node_id}", "drive": drive}) for drive in drives]
 
 
 def enabled(controller: Controller, memory: Memory) -> None:
