@@ -127,7 +127,7 @@ CHANGES = {
 
 
 def print_checks(foreign: Foreign, axis: AxisConfig, twin: Truth, seed: int, workers: int) -> None:
-    """Changes the axis, records it again with other noise, and prints what a check says of it."""
+    """Changes the axis, records it again with other noise, and prints the result of a check."""
     for name, (cause, change) in CHANGES.items():
         try:
             recording = bench(replace(change(foreign), seed=seed + 3000), Plan.load("dynamics"))

@@ -38,7 +38,7 @@ HELD, COMPENSATED = "held", "compensated"
 
 
 class Axes:
-    """Some axes on one bus, enabled, each on its own slow sine."""
+    """Enabled axes on one bus, each on its own slow sine."""
 
     def __init__(self, bus: Any, count: int, model: TransmissionModel, clock: Clock | None = None) -> None:
         self.bus = bus
@@ -64,7 +64,7 @@ class Axes:
         return lambda feedback: counts_for(command(2.0 * sin(feedback.time_s + phase)))
 
     def start(self, kind: str) -> None:
-        """Before a block: everything released, power on."""
+        """Prepares a block: latches released, power on."""
         while self.bus.recv(0.0) is not None:
             pass
         for axis, answer in zip(self.cycle.axes, self.answers, strict=True):
@@ -80,13 +80,13 @@ class Axes:
             axis.image.power.go(State.OPERATION_ENABLED)
 
     def check(self) -> None:
-        """Raise `Busy` where an axis was stopped within the block."""
+        """Raises `Busy` if an axis was stopped within the block."""
         if any(axis.supervision.stop is not None for axis in self.cycle.axes):
             raise Busy
 
 
 def _bus(interface: str, count: int) -> tuple[Any, Callable[[], object]]:
-    """A bus on which so many drives answer, and what answering costs by itself."""
+    """Returns a bus on which ``count`` drives answer, and the cost of answering."""
     node_ids = range(1, count + 1)
     if interface == "virtual":
         bus = AnsweringBus(*node_ids)
@@ -105,7 +105,7 @@ class Worker:
         self.several: dict[tuple[str, int], tuple[Axes, Callable[[], object]]] = {}
 
     def block(self, interface: str, count: int, kind: str, cycles: int) -> float:
-        """Own cost of one cycle, us; ``count`` 0 is one axis through `Cycle`."""
+        """Returns the net cost of one cycle, us; ``count`` 0 is one axis through `Cycle`."""
         if not count:
             return undisturbed(lambda: self._single(interface, kind, cycles))
         return undisturbed(lambda: self._bus(interface, count, kind, cycles))

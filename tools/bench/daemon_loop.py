@@ -60,7 +60,7 @@ def bench_cycle(
     clock: Clock | None = None,
     image: ProcessImage | None = None,
 ) -> tuple[Callable[[], None], Cycle]:
-    """The bench's own cycle: `Bench._leg` without what keeps the samples; by default it never sleeps.
+    """Returns the bench's cycle: `Bench._leg` without the storage of samples; by default it never sleeps.
 
     ``image`` is that of a drive that was made ready for power.
     """
@@ -96,7 +96,7 @@ def bench_cycle(
             goal = -goal
         target_deg = set_point.step()
         feedback = cycle.tick(answer)
-        # What the bench keeps of each cycle, as numbers.
+        # Numbers that the bench stores per cycle.
         image.motor_deg(feedback.demand_counts)
         image.motor_deg(feedback.motor_counts)
         image.load_deg(feedback.load_counts)
@@ -107,7 +107,9 @@ def bench_cycle(
 def controller_of(
     bus: can.BusABC, memory: Memory, model: TransmissionModel, *, followed: int = 0
 ) -> Controller:
-    """A loop whose axes are enabled and on their way; ``followed``: set-points of a gateway for the first."""
+    """Returns a loop whose axes are enabled and in motion; ``followed``: the first follows a gateway's
+    set-points.
+    """
     configs = configs_of(memory.axes)
     cycle = BusCycle(Link(bus, NeverSleeping()), NeverSleeping(), memory.period_s, bitrate_bps=1_000_000)
     setups = [AxisSetup(each, compensation_for(each, model.bound_to(each))) for each in configs]
@@ -127,7 +129,7 @@ def controller_of(
 
 
 def follow(controller: Controller, memory: Memory, turns: int) -> None:
-    """Have the axis follow a ramp of so many turns from the gateway's ring; another process would fill it."""
+    """Makes the axis follow a ramp from the gateway's ring, which another process normally fills."""
     memory.commands.post(CommandKind.FOLLOW, 0, a=1.0, j=1)
     begin_s, begin_deg = controller.cycle.due_s, controller.axes[0].set_point.position_deg
     for turn in range(turns):
@@ -148,7 +150,7 @@ def loop_block(count: int, model: TransmissionModel, cycles: int, *, followed: b
 
 
 def bench_block(model: TransmissionModel, cycles: int) -> float:
-    """The same of the bench's cycle."""
+    """Returns the CPU time of the bench's cycle, us."""
     with AnsweringBus(1) as bus:
         turn, _ = bench_cycle(bus, model)
         block_us(turn, 50)
@@ -157,7 +159,7 @@ def bench_block(model: TransmissionModel, cycles: int) -> float:
 
 
 def measure(counts: list[int], blocks: int, cycles: int) -> dict[str, float]:
-    """Median CPU time of one cycle of each, us, without the answering nodes."""
+    """Returns the median CPU time of one cycle of each, us, without the answering nodes."""
     model = TransmissionModel.load(PROFILE / "model.yaml")
     variants = {
         "bench": partial(bench_block, model, cycles),

@@ -18,7 +18,7 @@ ATTEMPTS = 20
 
 
 class Busy(Exception):  # noqa: N818 - what happened
-    """The machine stalled within a block, and the cycle made a fault of it."""
+    """Raised if the machine stalled within a block, which the cycle reported as a fault."""
 
 
 def parser(text: str | None, *, blocks: int = 0, cycles: int = 0) -> argparse.ArgumentParser:

@@ -43,12 +43,10 @@ def job(
     kind: Annotated[JobKind, typer.Argument(metavar="KIND", help="`step`, `calibrate` or `improve`.")],
     options: Annotated[
         list[str] | None,
-        typer.Option(
-            "--set", metavar="NAME=VALUE", help="An option of that command; may stand several times."
-        ),
+        typer.Option("--set", metavar="NAME=VALUE", help="Option of that command; may be repeated."),
     ] = None,
     wait: Annotated[
-        bool, typer.Option("--wait/--no-wait", help="Wait until it is done; else print its name at once.")
+        bool, typer.Option("--wait/--no-wait", help="Wait for the end; else print the job's name at once.")
     ] = True,
     at: AtOption = None,
     force: TakeOption = False,

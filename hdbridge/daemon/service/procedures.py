@@ -304,6 +304,8 @@ class DaemonBench:
         axis = rows["axes"][:, self._rig.index]
         cycles = rows["cycle"].tolist()
         times = [cycle * self._period_s for cycle in cycles]
+        if self._axis.load_encoder.is_motor_encoder:  # read twice, as by a bench
+            axis["load_position_deg"] = axis["motor_position_deg"] / self._axis.gear.ratio
         columns = [times, *(axis[name].tolist() for name in _COLUMNS)]
         readings: list[list[float | None]] = []
         for place in range(len(self._axis.channels)):
