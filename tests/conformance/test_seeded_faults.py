@@ -56,6 +56,32 @@ def fault(check: str, text: str) -> Callable[[Seed], Seed]:
     return add
 
 
+def entry(check: str, text: str, index: int, sub: int, **changes: Any) -> None:
+    """A fault of an entry of the dictionary: another value or guard."""
+
+    @fault(check, text)
+    def _(patch, node, bus):
+        for name, value in changes.items():
+            setattr(node.dictionary[index, sub], name, value)
+
+
+def replace_entry(node: DriveNode, index: int, sub: int = 0, **changes: Any) -> None:
+    """Put another entry with changed attributes in the place of one."""
+    old = node.dictionary[index, sub]
+    new = object.__new__(type(old))
+    for name in type(old).__slots__:
+        object.__setattr__(new, name, changes.get(name, getattr(old, name)))
+    node.dictionary._entries[index, sub] = new
+
+
+def another(check: str, text: str, index: int, **changes: Any) -> None:
+    """A fault of the description of an entry."""
+
+    @fault(check, text)
+    def _(patch, node, bus):
+        replace_entry(node, index, **changes)
+
+
 def sends(check: str, text: str, change: Callable[[int, bytes], list[Frame]]) -> None:
     """A fault of the frames that the node sends."""
 
@@ -344,18 +370,7 @@ def _(patch, node, bus):
     patch.setattr(node._sdo, "_acknowledged", lambda number, size: acknowledged(node._sdo._sequence, size))
 
 
-@fault("sdo.abort.read-only", "1000h can be written")
-def _(patch, node, bus):
-    replace_entry(node, 0x1000, writable=True)
-
-
-def replace_entry(node: DriveNode, index: int, sub: int = 0, **changes: Any) -> None:
-    """Put another entry with changed attributes in the place of one."""
-    old = node.dictionary[index, sub]
-    new = object.__new__(type(old))
-    for name in type(old).__slots__:
-        object.__setattr__(new, name, changes.get(name, getattr(old, name)))
-    node.dictionary._entries[index, sub] = new
+another("sdo.abort.read-only", "1000h can be written", 0x1000, writable=True)
 
 
 @fault("sdo.abort.too-long", "the length of a download is not checked")
@@ -455,19 +470,9 @@ def _always_valid(patch, pdos):
             pdo._dictionary[pdo._mapping, sub].guard = None
 
 
-@fault("tpdo.mapping.valid", "a mapping can be changed while the PDO exists")
-def _(patch, node, bus):
-    node.dictionary[0x1A00, 0].guard = None
-
-
-@fault("rpdo.identifier.fixed", "the identifier can be changed while the PDO exists")
-def _(patch, node, bus):
-    node.dictionary[0x1400, 1].guard = None
-
-
-@fault("tpdo.type.241", "reserved transmission types are accepted")
-def _(patch, node, bus):
-    node.dictionary[0x1800, 2].guard = None
+entry("tpdo.mapping.valid", "a mapping can be changed while the PDO exists", 0x1A00, 0, guard=None)
+entry("rpdo.identifier.fixed", "the identifier can be changed while the PDO exists", 0x1400, 1, guard=None)
+entry("tpdo.type.241", "reserved transmission types are accepted", 0x1800, 2, guard=None)
 
 
 @fault("rpdo.mapping.read-only", "read-only objects can be received")
@@ -604,19 +609,9 @@ def _(patch, node, bus):
         node.dictionary[0x1003, sub].bind(lambda sub=sub: history[-sub] if sub <= len(history) else 0)
 
 
-@fault("emcy.history.write", "anything can be written to 1003h:00")
-def _(patch, node, bus):
-    node.dictionary[0x1003, 0].guard = None
-
-
-@fault("store.1010.signature", "1010h takes any signature")
-def _(patch, node, bus):
-    node.dictionary[0x1010, 1].guard = lambda value: None
-
-
-@fault("store.save", "1010h saves nothing")
-def _(patch, node, bus):
-    node.dictionary[0x1010, 1].guard = lambda value: None
+entry("emcy.history.write", "anything can be written to 1003h:00", 0x1003, 0, guard=None)
+entry("store.1010.signature", "1010h takes any signature", 0x1010, 1, guard=lambda value: None)
+entry("store.save", "1010h saves nothing", 0x1010, 1, guard=lambda value: None)
 
 
 @fault("store.load.later", "1011h restores at once")
@@ -628,24 +623,10 @@ def _(patch, node, bus):
     node.dictionary[0x1011, 1].guard = at_once
 
 
-@fault("store.load", "1011h restores nothing")
-def _(patch, node, bus):
-    node.dictionary[0x1011, 1].guard = lambda value: None
-
-
-@fault("identity.eds.revision", "another revision than in the EDS")
-def _(patch, node, bus):
-    node.dictionary[0x1018, 3].value = 0x10001
-
-
-@fault("identity.vendor", "no vendor id")
-def _(patch, node, bus):
-    node.dictionary[0x1018, 1].value = 0
-
-
-@fault("eds.upper", "the limits of the EDS are not kept")
-def _(patch, node, bus):
-    replace_entry(node, 0x605A, high=None)
+entry("store.load", "1011h restores nothing", 0x1011, 1, guard=lambda value: None)
+entry("identity.eds.revision", "another revision than in the EDS", 0x1018, 3, value=0x10001)
+entry("identity.vendor", "no vendor id", 0x1018, 1, value=0)
+another("eds.upper", "the limits of the EDS are not kept", 0x605A, high=None)
 
 
 @fault("eds.objects", "an object of the EDS is missing")
@@ -659,14 +640,8 @@ def _(patch, node, bus):
     node.dictionary._indices.add(0x1006)
 
 
-@fault("eds.read-only", "a read-only object can be written")
-def _(patch, node, bus):
-    replace_entry(node, 0x6502, writable=True)
-
-
-@fault("eds.mapping.none", "an object that is not mappable can be mapped")
-def _(patch, node, bus):
-    replace_entry(node, 0x6065, mappable=True)
+another("eds.read-only", "a read-only object can be written", 0x6502, writable=True)
+another("eds.mapping.none", "an object that is not mappable can be mapped", 0x6065, mappable=True)
 
 
 # ---------------------------------------------------------------- power states
@@ -960,14 +935,8 @@ def _(patch, node, bus):
     node.dictionary[0x60F4, 0].bind(lambda: 1000)
 
 
-@fault("402.option.605D.reserved", "reserved option codes are accepted")
-def _(patch, node, bus):
-    replace_entry(node, 0x605D, high=None)
-
-
-@fault("402.homing.reserved", "any homing method is accepted")
-def _(patch, node, bus):
-    node.dictionary[0x6098, 0].guard = None
+another("402.option.605D.reserved", "reserved option codes are accepted", 0x605D, high=None)
+entry("402.homing.reserved", "any homing method is accepted", 0x6098, 0, guard=None)
 
 
 def test_there_are_many_faults_and_their_checks_exist():
