@@ -21,6 +21,24 @@ class Busy(Exception):  # noqa: N818 - what happened
     """Raised if the machine stalled within a block, which the cycle reported as a fault."""
 
 
+class Waking:
+    """Machine's clock, which records time and lateness of its last waking."""
+
+    now = staticmethod(time.monotonic)
+
+    def __init__(self) -> None:
+        self.woke_s = 0.0
+        self.late_s = 0.0
+
+    def sleep_until(self, deadline_s: float) -> None:
+        """Sleeps until the absolute deadline."""
+        delay_s = deadline_s - time.monotonic()
+        if delay_s > 0.0:
+            time.sleep(delay_s)
+        self.woke_s = time.monotonic()
+        self.late_s = self.woke_s - deadline_s
+
+
 def parser(text: str | None, *, blocks: int = 0, cycles: int = 0) -> argparse.ArgumentParser:
     """Returns the options of a benchmark; ``blocks`` and ``cycles`` are defaults, 0: it has none."""
     made = argparse.ArgumentParser(description=text, formatter_class=argparse.RawDescriptionHelpFormatter)

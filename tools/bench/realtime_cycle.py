@@ -27,7 +27,7 @@ import can
 import numpy as np
 from buscycle import COMPENSATED, Axes
 from cycle import Variants, answering_kernel
-from harness import PROFILE, keep, parser
+from harness import PROFILE, Waking, keep, parser
 
 from hdbridge.axis import AxisConfig
 from hdbridge.axis.model import TransmissionModel
@@ -36,24 +36,6 @@ from hdbridge.control.realtime import prepare_realtime
 WARM_UP = 50
 AXES = 6
 KINDS = ("bare", "cycle", "compensated", "canopen", "axes")
-
-
-class Waking:
-    """Machine's clock, which records time and lateness of its last waking."""
-
-    now = staticmethod(time.monotonic)
-
-    def __init__(self) -> None:
-        self.woke_s = 0.0
-        self.late_s = 0.0
-
-    def sleep_until(self, deadline_s: float) -> None:
-        """Sleeps until the absolute deadline."""
-        delay_s = deadline_s - time.monotonic()
-        if delay_s > 0.0:
-            time.sleep(delay_s)
-        self.woke_s = time.monotonic()
-        self.late_s = self.woke_s - deadline_s
 
 
 @dataclass(frozen=True)

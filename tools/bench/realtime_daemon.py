@@ -37,8 +37,8 @@ import can
 import numpy as np
 from cycle import answering_kernel
 from daemon_loop import bench_cycle, configs_of
-from harness import PROFILE, keep, parser
-from realtime_cycle import WARM_UP, Figures, Waking, table
+from harness import PROFILE, Waking, keep, parser
+from realtime_cycle import WARM_UP, Figures, table
 
 from hdbridge.axis.model import TransmissionModel
 from hdbridge.commissioning.evaluation.stepping import Scheme
