@@ -118,7 +118,8 @@ def commands() -> Iterator[Command]:
             for group in loaded.registered_groups:
                 assert group.typer_instance is not None
                 for registered in group.typer_instance.registered_commands:
-                    yield _command(f"{name} ", registered)
+                    if not registered.hidden:
+                        yield _command(f"{name} ", registered)
 
 
 def page() -> str:

@@ -20,7 +20,6 @@ from hdbridge.cli.options import (
 from hdbridge.cli.session import Session, on_axis
 from hdbridge.errors import InputError
 from hdbridge.files.outputs import Kind
-from hdbridge.files.profile import Profile
 
 if TYPE_CHECKING:
     from hdbridge.commissioning.calibration import Calibration
@@ -68,11 +67,11 @@ def command(
                 interrupted=interrupted,
                 tell=lambda line: notes.print(escape(line)),
             )
-    report(result, work.folder, files, json_file, html_file)
+    report(result, work.folder, session, json_file, html_file)
 
 
 def report(
-    result: Calibration, folder: Path, files: Profile, json_file: Path | None, html_file: Path | None
+    result: Calibration, folder: Path, session: Session, json_file: Path | None, html_file: Path | None
 ) -> None:
     """Writes and prints the result and the next steps."""
     from hdbridge.cli.calibration_output import (
@@ -88,4 +87,4 @@ def report(
     print_calibration(result)
     console.print(f"\nrecording: {folder}", soft_wrap=True)
     print_page(page)
-    print_next(result.offer, files)
+    print_next(result.offer, session)

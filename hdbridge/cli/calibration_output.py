@@ -10,9 +10,9 @@ from rich.markup import escape
 from rich.table import Table
 
 from hdbridge.cli.options import console, print_table, write_result
-from hdbridge.files.profile import Profile
 
 if TYPE_CHECKING:
+    from hdbridge.cli.session import Session
     from hdbridge.commissioning.calibration import Calibration, Stepped, Validation
     from hdbridge.commissioning.calibration.result import Offer
 
@@ -96,12 +96,14 @@ def print_page(path: Path) -> None:
     console.print(f"report: {path}", soft_wrap=True)
 
 
-def print_next(offer: Offer | None, profile: Profile) -> None:
-    """Prints the commands for a pending model."""
+def print_next(offer: Offer | None, session: Session) -> None:
+    """Prints the commands for a pending model. The daemon that lent its bus commits it, and uses it."""
     if offer is not None and offer.made:
+        folder = session.files.axis.parent
+        daemon = f"hdbridge ctl model {session.axis.name} pending"
+        use = daemon if session.borrow else f"hdbridge model commit {folder}"
         console.print(
-            f"pending: {offer.pending}\nreview it: hdbridge model diff {profile.axis.parent}\n"
-            f"use it: hdbridge model commit {profile.axis.parent}",
+            f"pending: {offer.pending}\nreview it: hdbridge model diff {folder}\nuse it: {use}",
             soft_wrap=True,
         )
 

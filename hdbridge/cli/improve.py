@@ -105,11 +105,11 @@ def command(
                 interrupted=interrupted,
                 tell=lambda line: notes.print(escape(line), soft_wrap=True),
             )
-    report(result, work.folder, files, json_file, html_file)
+    report(result, work.folder, session, json_file, html_file)
 
 
 def report(
-    result: Improvement, folder: Path, files: Profile, json_file: Path | None, html_file: Path | None
+    result: Improvement, folder: Path, session: Session, json_file: Path | None, html_file: Path | None
 ) -> None:
     """Writes and prints the result and the next steps."""
     from hdbridge.cli.calibration_output import (
@@ -152,7 +152,7 @@ def report(
     console.print(f"\nrecordings: {', '.join(result.recordings)}", soft_wrap=True)
     if page is not None:
         print_page(page)
-    print_next(result.offer, files)
+    print_next(result.offer, session)
 
 
 def write_page(path: Path, result: Improvement) -> None:

@@ -17,7 +17,6 @@ from __future__ import annotations
 import asyncio  # async only
 
 # sync: import threading
-# sync: import time
 # sync: import weakref
 from collections.abc import AsyncIterator, Mapping, Sequence
 from contextlib import AsyncExitStack, asynccontextmanager, suppress
@@ -31,12 +30,10 @@ from websockets.asyncio.client import ClientConnection, connect, unix_connect
 from hdbridge.client import sockets, transport
 from hdbridge.client.address import Address, find
 from hdbridge.client.aioaxis import AsyncAxis
-from hdbridge.client.calls import POLL_S, RENEWALS, A, Call, M, MachineCalls
+from hdbridge.client.calls import RENEWALS, A, Call, M, MachineCalls
 from hdbridge.client.messages import (
     Event,
     Events,
-    Job,
-    JobState,
     LeaseGrant,
     LeaseState,
     LiveOptions,
@@ -124,26 +121,6 @@ class AsyncClient:
     ) -> MachineState:
         """Moves axes so that all begin and end together; ``speed`` is a share of their limits."""
         return await self.do(MachineCalls.coordinated(targets_deg, speed, wait))
-
-    async def jobs(self) -> list[Job]:
-        """Returns the running and the last finished jobs."""
-        return await self.do(MachineCalls.jobs())
-
-    async def job(self, id_: str) -> Job:
-        """Returns one job."""
-        return await self.do(MachineCalls.job(id_))
-
-    async def cancel_job(self, id_: str) -> Job:
-        """Cancels a job: its axis brakes to rest, its measurements are kept."""
-        return await self.do(MachineCalls.cancel_job(id_))
-
-    async def wait_for_job(self, id_: str) -> Job:
-        """Waits for a job and returns it when it has ended; raises its error if it failed."""
-        while (found := await self.job(id_)).state is JobState.RUNNING:
-            await asyncio.sleep(POLL_S)
-        if found.problem is not None:
-            raise found.problem.error()
-        return found
 
     async def lease_state(self) -> LeaseState:
         """Returns the state of the lease."""

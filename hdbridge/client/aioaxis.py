@@ -6,7 +6,7 @@ import asyncio  # async only
 import time
 from collections.abc import AsyncIterator, Iterable, Sequence
 from contextlib import asynccontextmanager
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from pydantic import BaseModel
 
@@ -15,8 +15,6 @@ from hdbridge.client.calls import JOG_S, POLL_S, AxisCalls, given
 from hdbridge.client.messages import (
     AdaptationMode,
     AxisState,
-    Job,
-    JobKind,
     QueueItem,
     Scheme,
     SdoValue,
@@ -157,11 +155,6 @@ class AsyncAxis:
     async def write(self, object_: str, value: int | float | str) -> SdoValue:
         """Writes an object of the drive; refused while the axis is enabled."""
         return await self.client.do(self._calls.write(object_, str(value)))
-
-    async def job(self, kind: JobKind | str, *, wait: bool = True, **options: Any) -> Job:
-        """Runs a job: ``step``, ``calibrate`` or ``improve``, with the options of that command."""
-        begun = await self.client.do(self._calls.job(kind, options))
-        return await self.client.wait_for_job(begun.id) if wait else begun
 
     def _need_lease(self, what: str) -> None:
         if not self.client.holds_lease:

@@ -6,7 +6,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from pydantic import BaseModel
 
@@ -15,8 +15,6 @@ from hdbridge.client.calls import JOG_S, POLL_S, AxisCalls, given
 from hdbridge.client.messages import (
     AdaptationMode,
     AxisState,
-    Job,
-    JobKind,
     QueueItem,
     Scheme,
     SdoValue,
@@ -157,11 +155,6 @@ class Axis:
     def write(self, object_: str, value: int | float | str) -> SdoValue:
         """Writes an object of the drive; refused while the axis is enabled."""
         return self.client.do(self._calls.write(object_, str(value)))
-
-    def job(self, kind: JobKind | str, *, wait: bool = True, **options: Any) -> Job:
-        """Runs a job: ``step``, ``calibrate`` or ``improve``, with the options of that command."""
-        begun = self.client.do(self._calls.job(kind, options))
-        return self.client.wait_for_job(begun.id) if wait else begun
 
     def _need_lease(self, what: str) -> None:
         if not self.client.holds_lease:

@@ -129,18 +129,6 @@ class MachineCalls:
         body = given(messages.Coordinated, targets_deg=dict(targets_deg), speed=speed, wait=wait)
         return Call("POST", "/coordinated", messages.MachineState, body, moving=True, waits=True)
 
-    @staticmethod
-    def jobs() -> Call[list[messages.Job]]:
-        return Call("GET", "/jobs", list[messages.Job])
-
-    @staticmethod
-    def job(id_: str) -> Call[messages.Job]:
-        return Call("GET", f"/jobs/{quote(id_, safe='')}", messages.Job)
-
-    @staticmethod
-    def cancel_job(id_: str) -> Call[messages.Job]:
-        return Call("DELETE", f"/jobs/{quote(id_, safe='')}", messages.Job, moving=True)
-
 
 class AxisCalls:
     """Requests of one axis."""
@@ -225,7 +213,3 @@ class AxisCalls:
     def write(self, name: str, value: str) -> Call[messages.SdoValue]:
         path = f"{self.path}/objects/{quote(name, safe='')}"
         return Call("PUT", path, messages.SdoValue, given(messages.SdoWrite, value=value), moving=True)
-
-    def job(self, kind: messages.JobKind | str, options: Mapping[str, Any]) -> Call[messages.Job]:
-        body = given(messages.JobRequest, kind=kind, options=dict(options))
-        return Call("POST", f"{self.path}/jobs", messages.Job, body, moving=True)

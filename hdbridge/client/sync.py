@@ -16,7 +16,6 @@ holds it already. Every error is one of `hdbridge.errors`.
 from __future__ import annotations
 
 import threading
-import time
 import weakref
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
@@ -30,12 +29,10 @@ from websockets.sync.client import ClientConnection, connect, unix_connect
 from hdbridge.client import sockets, transport
 from hdbridge.client.address import Address, find
 from hdbridge.client.axis import Axis
-from hdbridge.client.calls import POLL_S, RENEWALS, A, Call, M, MachineCalls
+from hdbridge.client.calls import RENEWALS, A, Call, M, MachineCalls
 from hdbridge.client.messages import (
     Event,
     Events,
-    Job,
-    JobState,
     LeaseGrant,
     LeaseState,
     LiveOptions,
@@ -123,26 +120,6 @@ class Client:
     ) -> MachineState:
         """Moves axes so that all begin and end together; ``speed`` is a share of their limits."""
         return self.do(MachineCalls.coordinated(targets_deg, speed, wait))
-
-    def jobs(self) -> list[Job]:
-        """Returns the running and the last finished jobs."""
-        return self.do(MachineCalls.jobs())
-
-    def job(self, id_: str) -> Job:
-        """Returns one job."""
-        return self.do(MachineCalls.job(id_))
-
-    def cancel_job(self, id_: str) -> Job:
-        """Cancels a job: its axis brakes to rest, its measurements are kept."""
-        return self.do(MachineCalls.cancel_job(id_))
-
-    def wait_for_job(self, id_: str) -> Job:
-        """Waits for a job and returns it when it has ended; raises its error if it failed."""
-        while (found := self.job(id_)).state is JobState.RUNNING:
-            time.sleep(POLL_S)
-        if found.problem is not None:
-            raise found.problem.error()
-        return found
 
     def lease_state(self) -> LeaseState:
         """Returns the state of the lease."""

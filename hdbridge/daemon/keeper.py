@@ -408,7 +408,7 @@ class Keeper:
             return
         if self._loan is not None and self._loan.asked_s is not None:
             self._loan.begin(now_s)
-            self._memory.status.set(Cell.BUS_LENT, 1)
+            self._memory.status.set(Cell.BUS_LENT, time.monotonic_ns())
             _log.info("the bus is lent", {"how": how})
             return
         _log.error("control process died", {"how": how, "lived_s": round(now_s - child.started_s, 1)})

@@ -69,10 +69,7 @@ async def serve(start: Start, memory: Memory) -> None:
         clock = SimulatedClock(lambda: memory.status.loop_count, machine.cycle_s) if simulated else None
         timing = RealTiming(THREADS_PER_AXIS * len(machine.axes) + SPARE_THREADS, clock)
         stack.callback(timing.close)
-        bridge = ServiceBridge(
-            machine, memory, timing, simulated=simulated, forced=start.force,
-            recordings=lambda port: machine.axis_folder(port.axis, "recordings"),
-        )  # fmt: skip
+        bridge = ServiceBridge(machine, memory, timing, simulated=simulated, forced=start.force)
         metrics = Metrics()
         recording = Recording(machine, bridge)
         stack.callback(recording.close)

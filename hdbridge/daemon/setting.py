@@ -26,7 +26,7 @@ class CompensationSetting:
     version: int | None = None
     """Number of the model in the profile's history; None without one."""
     file: Path | None = None
-    """File of the model; None for a model made by a job."""
+    """File of the model; None without one."""
     load_loop: bool = False
     """True if the load loop is on."""
     adapted: TransmissionModel | None = None

@@ -13,7 +13,7 @@ from support.api import served
 from support.fake_bridge import FakeBridge
 from support.patience import PATIENCE_S, until
 
-from hdbridge import Client, SafetyStop
+from hdbridge import Client
 from hdbridge.client import messages
 
 
@@ -61,10 +61,6 @@ def ctl(hdbridge, machine):
         ("adapt joint-1 --back", ("joint-1", "adaptation back")),
         ("load-loop joint-1 --on", ("joint-1", "load loop", True)),
         ("set joint-1 6041h 1", ("joint-1", "write", "6041h", "1")),
-        (
-            "job joint-1 step --set count=60 --set scheme=both --no-wait",
-            ("joint-1", "job", "step", {"count": 60, "scheme": "both"}),
-        ),
     ],
 )
 def test_a_command_asks_the_daemon_for_what_it_says(ctl, machine, line, asked):
@@ -139,8 +135,8 @@ def test_whoever_has_the_right_to_move_is_named_and_can_be_overruled(ctl, machin
         ("compensate joint-1 bth", 2, "did you mean both?"),
         ("model joint-1 newest", 2, "pending or active"),
         ("get joint-1 9999h", 2, "no such object"),
-        ("cancel step-9", 2, "no job"),
-        ("job joint-1 step --set count", 2, "NAME=VALUE"),
+        ("job joint-1 step --set count=60 --no-wait", 7, "run 'hdbridge step profiles/joint-1 --simulate'"),
+        ("job joint-1 stp", 2, "calibrate, step, improve"),
         ("status --at http://", 2, "expected"),
         ("status --at /nowhere/cell.sock", 7, "hdbridge run"),
     ],
@@ -167,22 +163,6 @@ def test_watch_looks_again_and_again(ctl):
     assert "joint-2" in ctl("watch", "--count", 2, "--every", 0.05)
 
 
-def test_a_job_is_followed_and_its_failure_is_the_commands(ctl, machine, monkeypatch):
-    problem = messages.Problem.of(SafetyStop("cycle 7: lost; check the cable"))
-    looked = 0
-
-    def jobs():
-        nonlocal looked
-        looked += 1
-        if looked < 3:
-            return machine.ran
-        failed = {"state": messages.JobState.FAILED, "problem": problem}
-        return [each.model_copy(update=failed) for each in machine.ran]
-
-    monkeypatch.setattr(machine, "jobs", jobs)
-    assert "check the cable" in ctl("job", "joint-1", "step", status=5)
-
-
 def test_a_refusal_names_client_user_and_process_and_its_advice_works(ctl, machine, place):
     user = pwd.getpwuid(os.getuid()).pw_name
     with Client(place.socket, name="cell controller") as other, other.lease():
@@ -194,9 +174,7 @@ def test_a_refusal_names_client_user_and_process_and_its_advice_works(ctl, machi
     assert machine.moved == [("joint-1", "move", 1.0, None)]
 
 
-@pytest.mark.parametrize(
-    "line", ["enable joint-1", "stop", "get joint-1 6041h", "lease", "jobs", "mark words"]
-)
+@pytest.mark.parametrize("line", ["enable joint-1", "stop", "get joint-1 6041h", "lease", "mark words"])
 def test_the_machine_is_named_if_it_was_not_given(hdbridge, machine, place, monkeypatch, line):
     done = hdbridge("ctl", *line.split())
     assert done.stderr == f"machine 'cell' at {place.socket} (from HDBRIDGE_SOCKET)\n"
@@ -212,7 +190,7 @@ def test_the_machine_is_named_if_it_was_not_given(hdbridge, machine, place, monk
 
 
 @pytest.mark.parametrize("width", [60, 80, 120])
-@pytest.mark.parametrize("line", ["status", "watch --count 1", "jobs"])
+@pytest.mark.parametrize("line", ["status", "watch --count 1"])
 def test_tables_are_whole_at_any_width(ctl, process, machine, monkeypatch, line, width):
     shown = (
         machine.axes["joint-2"]
@@ -230,7 +208,6 @@ def test_tables_are_whole_at_any_width(ctl, process, machine, monkeypatch, line,
         )
     )
     monkeypatch.setattr(machine.axes["joint-2"], "state", lambda: shown)
-    ctl("job", "joint-1", "step", "--no-wait")
     for name, value in (("COLUMNS", str(width)), ("FORCE_COLOR", "1"), ("TERM", "xterm")):
         monkeypatch.setenv(name, value)
     lines = (
@@ -242,37 +219,12 @@ def test_tables_are_whole_at_any_width(ctl, process, machine, monkeypatch, line,
     assert rows
     assert max(map(len, rows)) <= width
     cells = {cell.strip() for row in rows for cell in re.split("[│┃]", row)}
-    whole = {"step-1", "joint-1", "running", "0 %"} if line == "jobs" else {
+    whole = {
         "joint-2", "-1234.5678", "-1234.5679", "-98765.43", "12345.67", "extended",
         "disabled, goto, 17 wait", "correction, arcsec",
     }  # fmt: skip
     assert whole <= cells
     assert "…" not in "".join(lines)
-
-
-@pytest.mark.parametrize(
-    ("kind", "result", "said"),
-    [
-        (
-            "step",
-            {
-                "none": {"pooled": {"three_sigma_arcsec": 101.842}},
-                "quantisation_floor_arcsec": 2.806,
-                "survived": [],
-            },
-            "pooled 3 sigma in arcsec: none 101.84; quantisation floor 2.81",
-        ),
-        (
-            "calibrate",
-            {"reason": "101.50 to 2.92", "pending": "p.yaml"},
-            "hdbridge ctl model joint-1 pending",
-        ),
-    ],
-)
-def test_what_came_out_of_a_job_is_told(ctl, machine, monkeypatch, kind, result, said):
-    done = {"state": messages.JobState.DONE, "share": 1.0, "result": result}
-    monkeypatch.setattr(machine, "jobs", lambda: [each.model_copy(update=done) for each in machine.ran])
-    assert said in ctl("job", "joint-1", kind)
 
 
 def test_an_object_is_read(ctl):

@@ -32,7 +32,7 @@ UNWRITABLE = {
 RIGHT = {
     "PROFILE": "axis", "MACHINE": "axis", "NAME": "fresh", "RECORD": "record.csv", "RECORDING": "record.csv",
     "LOG": "bus.log", "OBJECT": "6064h", "VALUE": "1", "ANGLE": "1", "AXIS": "joint-1",
-    "SPEED": "1", "JOB": "step-1",
+    "SPEED": "1",
     "TEXT": "words", "VERSION": "1", "FILE.mcap": "flight.mcap", "FILE.mcap|FOLDER": "flight.mcap",
     "SCHEME": "both", "KIND": "step", "BEFORE": "active", "AFTER": "active", "MODE": "on",
     "--method": "35", "--model": "axis/model.yaml", "--on": "", "--out": "out", "--manifest": "fleet.csv",

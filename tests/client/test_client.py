@@ -128,7 +128,6 @@ def test_threads_share_the_lease_of_a_client(api):
         (lambda c: c.axis("../../lease").state(), InputError, "joint-1, joint-2|Not Found"),
         (lambda c: c.axis("joint-1").jog(1.0), LeaseError, "client.lease"),
         (lambda c: c.axis("joint-1").queue([1.0], wait=False), LeaseError, "client.lease"),
-        (lambda c: c.job("step-9"), InputError, "no job"),
     ],
 )
 def test_what_is_refused_is_the_error_that_it_is_in_the_library(client, api, call, error, words):
@@ -204,27 +203,6 @@ def test_samples_are_read_as_they_come(client):
         if len(cycles) > 10:
             break
     assert all(each % 5 == 0 for each in cycles)
-
-
-def test_a_job_is_waited_for_and_its_failure_raised(client, api):
-    problem = messages.Problem.of(SafetyStop("cycle 7: a TPDO is missing; check the cable"))
-
-    def end(**how):
-        while not api.bridge.ran:
-            time.sleep(0.01)
-        api.bridge.ran[-1] = api.bridge.ran[-1].model_copy(update=how)
-
-    for how in ({"state": messages.JobState.DONE}, {"state": messages.JobState.FAILED, "problem": problem}):
-        api.bridge.ran.clear()
-        ending = threading.Thread(target=end, kwargs=how)
-        ending.start()
-        if "problem" in how:
-            with pytest.raises(SafetyStop, match="check the cable"):
-                client.axis("joint-1").job("step", count=60)
-        else:
-            assert client.axis("joint-1").job("step", count=60).state is messages.JobState.DONE
-        ending.join()
-    assert api.bridge.moved[0] == ("joint-1", "job", "step", {"count": 60})
 
 
 def test_without_a_daemon_it_says_how_to_start_one(tmp_path, monkeypatch):

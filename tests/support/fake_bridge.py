@@ -42,7 +42,6 @@ class FakeAxis:
         self.at = messages.ControlState.DISABLED
         self.target_deg = 0.0
         self.scheme = messages.Scheme.NONE
-        self.running: messages.Job | None = None
         self.model: messages.ModelInUse | None = None
         self.load_loop = messages.LoadLoopState(configured=True)
         self.queued: list[WayPoint] = []
@@ -62,7 +61,7 @@ class FakeAxis:
             load_position_deg=self.target_deg + 1 / 3600, error_arcsec=1.0, scheme=self.scheme,
             compensating=self.scheme is not messages.Scheme.NONE, memory_known=True, limits=LIMITS,
             fault=fault, model=self.model, load_loop=self.load_loop,
-            adaptation=messages.AdaptationState(), queued=len(self.queued), job=self.running,
+            adaptation=messages.AdaptationState(), queued=len(self.queued),
         )  # fmt: skip
 
     def _moved(self, holder: str, what: str, *given: Any) -> None:
@@ -170,17 +169,6 @@ class FakeAxis:
         self._moved(holder, "write", object_, value)
         return found
 
-    async def job(
-        self, holder: str, kind: messages.JobKind, options: Mapping[str, Any] | None = None
-    ) -> messages.Job:
-        self._moved(holder, "job", kind.value, dict(options or {}))
-        job = messages.Job(
-            id=f"{kind.value}-{len(self._bridge.ran) + 1}", kind=kind, axis=self.name,
-            state=messages.JobState.RUNNING, started=BEGAN,
-        )  # fmt: skip
-        self._bridge.ran.append(job)
-        return job
-
 
 class FakeStream:
     """Records the points of a stream; refuses a point outside the limits."""
@@ -221,7 +209,6 @@ class FakeBridge:
         self.moved: list[tuple[Any, ...]] = []
         self.stopped: list[tuple[str, str]] = []
         self.streams: list[FakeStream] = []
-        self.ran: list[messages.Job] = []
         self.told: list[messages.Event] = []
         self.alive = True
         self.batch_s = 0.005
@@ -239,15 +226,12 @@ class FakeBridge:
             lease=messages.LeaseState(
                 held=holder is not None, client=holder and holder.client, timeout_s=self.lease.timeout_s
             ),
-            recorder=messages.RecorderState(on=False), jobs=self.ran,
+            recorder=messages.RecorderState(on=False),
         )  # fmt: skip
 
     def events(self, since: int = 0) -> messages.Events:
         newest = self.told[-1].sequence if self.told else 0
         return messages.Events(events=[each for each in self.told if each.sequence > since], newest=newest)
-
-    def jobs(self) -> list[messages.Job]:
-        return self.ran
 
     async def lend_bus(self, holder: str) -> None:
         self.lease.check(holder)
@@ -304,11 +288,6 @@ class FakeBridge:
         found["axes"]["reading0"] = np.nan
         found["axes"]["state"] = 3
         return found
-
-    async def cancel_job(self, holder: str, job_id: str) -> None:
-        self.lease.check(holder)
-        cancelled = {"state": messages.JobState.CANCELLED}
-        self.ran = [each.model_copy(update=cancelled) if each.id == job_id else each for each in self.ran]
 
     def mark(self, text: str) -> None:
         number = len(self.told) + 1

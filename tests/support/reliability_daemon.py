@@ -166,7 +166,7 @@ class DaemonBench:
 
 
 def free(axis: ServiceAxis) -> bool:
-    """Returns True if no job or client has exclusive use of the drive."""
+    """Returns True if no client has exclusive use of the drive."""
     try:
         axis.check_free()
     except RefusedError:

@@ -17,9 +17,6 @@ from hdbridge.axis.model import TransmissionModel
 from hdbridge.clock import Clock
 from hdbridge.daemon.machine import Axis, Machine
 from hdbridge.daemon.service.bridge import ServiceBridge
-from hdbridge.daemon.service.joborder import Told, Work
-from hdbridge.daemon.service.jobwork import run
-from hdbridge.daemon.service.rigs import DaemonRig
 from hdbridge.files.profile import Profile
 from support.characters import FRIENDLY, Character
 from support.daemon import PROFILE, SteppedDaemon, stepped_daemon
@@ -46,20 +43,6 @@ class SteppedTiming:
         self, function: Callable[Params, Result], *args: Params.args, **kwargs: Params.kwargs
     ) -> Result:
         return function(*args, **kwargs)
-
-
-class AtOnce(Executor):
-    """Runs each call in the caller's thread."""
-
-    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
-        done: Future[Any] = Future()
-        done.set_result(fn(*args, **kwargs))
-        return done
-
-
-def in_this_thread(work: Work, rig: DaemonRig, told: Told) -> dict[str, Any]:
-    """Runs a job without a process of its own."""
-    return run(work, rig, told)
 
 
 def article_profiles(folder: Path, count: int, profile: Path = PROFILE) -> list[Profile]:
@@ -91,7 +74,6 @@ class Service:
 
     def bridge(self, **options: Any) -> ServiceBridge:
         """Returns a new service."""
-        options = {"runner": in_this_thread, **options}
         return ServiceBridge(self.machine, self.daemon.memory, self.timing, **options)
 
     @asynccontextmanager

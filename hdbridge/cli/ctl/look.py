@@ -121,11 +121,6 @@ def _machine(state: MachineState) -> list[str]:
 def _concerns(state: MachineState) -> list[str]:
     found = [line for each in state.axes for line in concerns(each)]
     found += [
-        f"axis '{each.job.axis}': {each.job.kind} {100 * each.job.share:.0f} % {each.job.text}".rstrip()
-        for each in state.axes
-        if each.job is not None
-    ]
-    found += [
         f"axis '{each.name}': node {outer.node_id} of another master, statusword {outer.statusword:04X}h, "
         + ("no SYNC" if outer.period_s is None else f"SYNC every {1e3 * outer.period_s:.3f} ms")
         if outer.alive

@@ -4,7 +4,6 @@
     state.py     state of the machine and its axes
     requests.py  requests of a client
     lease.py     the lease
-    jobs.py      procedures that run through the daemon
     live.py      live samples and events
     problem.py   errors (RFC 9457) and their conversion to `hdbridge.errors`
 
@@ -12,7 +11,6 @@ Angles are degrees at the load unless the name says ``motor``; errors and correc
 load. A request refuses unknown keys, NaN and infinity; a report ignores keys that a newer daemon adds.
 """
 
-from hdbridge.client.messages.jobs import Job, JobKind, JobRequest, JobState
 from hdbridge.client.messages.lease import LeaseGrant, LeaseRequest, LeaseState
 from hdbridge.client.messages.live import (
     AxisColumns,
@@ -43,6 +41,7 @@ from hdbridge.client.messages.requests import (
     SwitchLoadLoop,
 )
 from hdbridge.client.messages.state import (
+    PROCEDURES,
     AdaptationState,
     AxisState,
     BusState,
@@ -64,6 +63,7 @@ from hdbridge.client.messages.values import (
 )
 
 __all__ = [
+    "PROCEDURES",
     "ActivateModel",
     "Adapt",
     "AdaptationMode",
@@ -80,10 +80,6 @@ __all__ = [
     "Events",
     "Fault",
     "Home",
-    "Job",
-    "JobKind",
-    "JobRequest",
-    "JobState",
     "Jog",
     "LeaseGrant",
     "LeaseRequest",

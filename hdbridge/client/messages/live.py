@@ -34,7 +34,7 @@ class EventKind(StrEnum):
     ENDING = "ending"
     LOAD_LOOP = "load-loop"
     NOTE = "note"
-    """Note of the service: about a lease, a job, the recorder, the watch or the adaptation."""
+    """Note of the service: about a lease, the recorder, the watch or the adaptation."""
 
 
 class Event(Report):

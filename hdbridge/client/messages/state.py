@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import shlex
 from datetime import datetime
+from typing import Final
 
 from pydantic import Field
 
-from hdbridge.client.messages.jobs import Job
 from hdbridge.client.messages.lease import LeaseState
 from hdbridge.client.messages.values import (
     AdaptationMode,
@@ -17,6 +18,9 @@ from hdbridge.client.messages.values import (
     Report,
     Scheme,
 )
+
+PROCEDURES: Final = ("calibrate", "step", "improve")
+"""Commands that a daemon once ran as jobs."""
 
 
 class Fault(Report):
@@ -143,7 +147,15 @@ class AxisState(Report):
         examples=[["recalibrate: the residual left what the model's intervals allow"]],
     )
     queued: int = Field(0, ge=0, description="way points that wait")
-    job: Job | None = Field(None, description="the procedure that moves it")
+
+    def in_place_of_job(self, kind: str, *, simulated: bool) -> str:
+        """Explains how to run a procedure, which is a command and no longer a job of the daemon."""
+        option = "--simulate" if simulated else "--borrow"
+        return (
+            f"axis '{self.name}': the daemon runs no jobs: run 'hdbridge {kind} {shlex.quote(self.profile)} "
+            f"{option}' on its computer; a model that it offers is committed by 'hdbridge ctl model "
+            f"{self.name} pending'"
+        )
 
 
 class BusState(Report):
@@ -153,6 +165,7 @@ class BusState(Report):
     channel: str = Field(examples=["can0"])
     up: bool
     lent_to: str | None = Field(None, description="program that has borrowed the bus; the axes are disabled")
+    lent_s: float | None = Field(None, ge=0, description="since it was lent, seconds", examples=[63.0])
     load: float | None = Field(None, description="share of the bus's time that is in use", examples=[0.31])
 
 
@@ -189,5 +202,4 @@ class MachineState(Report):
     cycle: CycleState
     lease: LeaseState
     recorder: RecorderState
-    jobs: list[Job] = Field(default=[], description="newest last")
     warnings: list[str] = Field(default=[], description="what a person should look at")

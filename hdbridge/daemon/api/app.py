@@ -33,7 +33,6 @@ TAGS: Final = (
     ),
     ("Move", "Targets are load angles in degrees, within the axis's limits."),
     ("Compensate", "Model and the part of it that compensates; adaptation to the load encoder."),
-    ("Jobs", "Procedures that run through the daemon while it holds the bus."),
     ("Drive", "Objects of the drive's dictionary, by SDO."),
 )
 _ABOUT: Final = (

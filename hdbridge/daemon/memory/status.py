@@ -26,7 +26,7 @@ class Cell(IntEnum):
     BUS_WANTED = 9
     """Service: 1 while it waits for the bus to be released to another program."""
     BUS_LENT = 10
-    """Keeper: 1 while the interface is released to another program and no control process runs."""
+    """Keeper: when it released the interface to another program (``time.monotonic_ns``); 0 if it did not."""
 
 
 _LOOP_COUNT: Final = Cell.LOOP_COUNT * _STRIDE

@@ -1,1 +1,1 @@
-"""The service process's work for clients: lease, motion queue, commissioning, jobs."""
+"""The service process's work for clients: lease, motion queue, SDO access, loan of the bus."""

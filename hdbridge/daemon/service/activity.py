@@ -14,11 +14,10 @@ class Kind(Enum):
     QUEUE = "a queue of moves"
     STREAM = "a stream"
     COORDINATED = "a coordinated move"
-    JOB = "a job"
 
 
 ENDS_WITH_LEASE = frozenset({Kind.JOG, Kind.QUEUE, Kind.STREAM})
-"""Activities that are stopped when the lease under which they began ends. Moves and jobs end on their own."""
+"""Activities that are stopped when the lease under which they began ends. Moves end on their own."""
 
 
 @dataclass(slots=True, eq=False)

@@ -8,22 +8,21 @@ never enabled automatically.
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncIterator, Callable, Mapping, Sequence
+from collections.abc import AsyncIterator, Callable, Sequence
 from contextlib import asynccontextmanager, suppress
 from datetime import UTC, datetime
-from typing import TYPE_CHECKING, Any, Final, Literal
+from typing import TYPE_CHECKING, Final, Literal
 
 from hdbridge.client import messages
 from hdbridge.commissioning.evaluation.stepping import Scheme
 from hdbridge.daemon.loop.states import AxisState
 from hdbridge.daemon.memory import CommandKind, EventKind
-from hdbridge.daemon.service.activity import Activity, Kind
+from hdbridge.daemon.service.activity import Kind
 from hdbridge.daemon.service.axislink import AxisLink
 from hdbridge.daemon.service.commissioning import Commissioning, HomingRun
 from hdbridge.daemon.service.core import ANSWER_S
 from hdbridge.daemon.service.models import AxisModels
 from hdbridge.daemon.service.moves import AxisMotion, WayPoint
-from hdbridge.daemon.service.reports import job_words
 from hdbridge.daemon.service.streams import ServiceStream
 from hdbridge.drive.states import State
 from hdbridge.drive.values import Object, Value
@@ -55,26 +54,23 @@ class ServiceAxis:
         index: int,
         axis: Axis,
         core: Core,
-        begin_job: Callable[[ServiceAxis, str, messages.JobKind, Mapping[str, Any]], messages.Job],
         report: Callable[[str], messages.AxisState],
     ) -> None:
-        """``begin_job`` begins a job for the lease's holder, ``report`` returns the state of an axis."""
+        """``report`` returns the state of an axis."""
         self.axis = axis
         self.name = axis.name
         self.core = core
         self.link = AxisLink(core, index, axis.config)
-        self.commissioning = Commissioning(axis.config, core.memory, core.timing.clock)
+        self.commissioning = Commissioning(axis.config, core)
         self.models = AxisModels(axis, core.memory.settings[index])
         self.is_prepared = False
         """True if all SDO work that precedes power is done, and no SDO transfer has followed."""
         self.motion = AxisMotion(self.link, axis.config.limits)
         self.following: Following | None = None
         """Watch and adaptation."""
-        self._begin_job = begin_job
         self._report = report
         self._work = core.timing.work
         self._changing = asyncio.Lock()
-        self._job_runs = False
         self._doing = ""
         """Client request that has exclusive use of the drive, in words; empty if none."""
         self._drive = asyncio.Lock()
@@ -87,10 +83,8 @@ class ServiceAxis:
         return self._report(self.name)
 
     def check_may(self, holder: str) -> None:
-        """Raises LeaseError unless ``holder`` has the lease, RefusedError if a job or request uses it."""
+        """Raises LeaseError unless ``holder`` has the lease, RefusedError if a request uses the drive."""
         self.core.lease.check(holder)
-        if self.motion.busy(Kind.JOB):
-            raise self._job_refusal()
         self.check_free()
 
     def check_free(self) -> None:
@@ -100,11 +94,6 @@ class ServiceAxis:
                 f"{self.name}: {self._doing}; wait for its end, or end it with "
                 f"'hdbridge ctl stop {self.name}'"
             )
-
-    def _job_refusal(self) -> RefusedError:
-        job = self.state().job
-        words = "a job ends on this axis" if job is None else job_words(job)
-        return RefusedError(f"{self.name}: {words}, or wait for its end")
 
     @asynccontextmanager
     async def _alone(self, doing: str) -> AsyncIterator[None]:
@@ -155,7 +144,7 @@ class ServiceAxis:
                 self.is_prepared = True
 
     async def disable(self, holder: str) -> None:
-        """Brakes to rest, then switches power off. Cancels the axis's job."""
+        """Brakes to rest, then switches power off."""
         self.core.lease.check(holder)
         self.motion.replace(None, "the axis was disabled")
         async with self._alone("the axis is being disabled"):
@@ -173,7 +162,7 @@ class ServiceAxis:
         await self.link.do(CommandKind.QUICK_STOP)
 
     async def stop(self) -> None:
-        """Brakes to rest and stays enabled. Cancels queue, stream and job. Requires no lease."""
+        """Brakes to rest and stays enabled. Cancels queue and stream. Requires no lease."""
         self.give_up("it was stopped by a client")
         await self.link.do(CommandKind.STOP)
 
@@ -333,8 +322,8 @@ class ServiceAxis:
 
     @property
     def unsettled(self) -> bool:
-        """True if the control process does not use the chosen setting, and no job is the reason."""
-        return not self.models.settled and not self._job_runs
+        """True if the control process does not use the chosen setting."""
+        return not self.models.settled
 
     async def settle(self) -> None:
         """Has the control process compensate by the chosen setting, if it does not."""
@@ -371,8 +360,6 @@ class ServiceAxis:
 
     async def _use(self, setting: CompensationSetting) -> None:
         """Sends a setting to the control process and waits until it is in effect."""
-        if self._job_runs:
-            raise self._job_refusal()
         log, index = self.core.log, self.link.index
         since = log.newest
         await self.link.do(CommandKind.CHANGE, i=self.models.send(setting))
@@ -381,7 +368,7 @@ class ServiceAxis:
             lambda: any(each.kind is EventKind.CHANGED for each in log.of_axis(index, since)), CHANGE_S
         )
 
-    # ---------------------------------------------------------------- objects of the drive, jobs
+    # ---------------------------------------------------------------- objects of the drive
 
     async def sdo_read(self, object_: str) -> tuple[Object, Value]:
         """Reads an object of the drive by its number (``6064h``, ``0x1018:4``) or EDS name."""
@@ -395,24 +382,6 @@ class ServiceAxis:
                 f"{self.name}: no object is written while the axis is enabled; disable it first"
             )
         return await self._work(self.commissioning.write, object_, value)
-
-    async def job(
-        self, holder: str, kind: messages.JobKind, options: Mapping[str, Any] | None = None
-    ) -> messages.Job:
-        """Begins a job with the options of the command of that name."""
-        self.check_may(holder)
-        return self._begin_job(self, holder, kind, options or {})
-
-    def occupy(self, activity: Activity) -> None:
-        """Reserves the axis and its compensation for a job, until `vacate`."""
-        self.motion.replace(activity, "a job took its place")
-        self._job_runs = True
-
-    async def vacate(self) -> None:
-        """Releases the axis after a job and restores its compensation."""
-        self._job_runs = False
-        with suppress(HdbridgeError):  # the bridge tries again
-            await self.settle()
 
     async def close(self) -> None:
         """Ends queue and SDO access; the axis completes its present motion."""

@@ -1,4 +1,4 @@
-"""The machine as the API sees it: axes, lease, coordinated moves, jobs, state and events.
+"""The machine as the API sees it: axes, lease, coordinated moves, loan of the bus, state and events.
 
     async with ServiceBridge(machine, memory, timing) as bridge:
         ...
@@ -10,7 +10,7 @@ Angles are load angles in degrees, speeds in deg/s. ``holder`` is the lease toke
 and axes raise an `HdbridgeError` whose text is one line with the cause and the remedy:
 
     InputError      a value is invalid: outside the limits, not finite, no such model or object
-    RefusedError    not possible in this state: not enabled, in motion, a job runs, a fault is latched
+    RefusedError    not possible in this state: not enabled, in motion, the bus is lent, a fault is latched
     LeaseError      ``holder`` is not the token of the present lease
     DriveError      the drive refuses the request or does not answer
     SafetyStop      the supervision stopped the axis during the call
@@ -25,7 +25,6 @@ import time
 from collections.abc import Callable, Coroutine, Mapping
 from datetime import UTC, datetime
 from importlib.metadata import version
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Self
 
 from hdbridge.client import messages
@@ -35,13 +34,12 @@ from hdbridge.daemon.service.axis import UNKNOWN, ServiceAxis
 from hdbridge.daemon.service.coordination import run_together
 from hdbridge.daemon.service.core import ANSWER_S, Core
 from hdbridge.daemon.service.eventlog import Entry
-from hdbridge.daemon.service.jobs import JobBook, Runner, in_own_process
 from hdbridge.daemon.service.lending import Lending
 from hdbridge.daemon.service.observer import PERIOD_S, Subscription
 from hdbridge.daemon.service.outermaster import OuterMaster
 from hdbridge.daemon.service.reports import LATCHED
 from hdbridge.daemon.service.timing import Timing
-from hdbridge.errors import HdbridgeError, InputError, RefusedError
+from hdbridge.errors import HdbridgeError, InputError
 
 if TYPE_CHECKING:
     from hdbridge.daemon.machine import Machine
@@ -65,24 +63,18 @@ class ServiceBridge:
         memory: Memory,
         timing: Timing,
         *,
-        recordings: Callable[[ServiceAxis], Path] = lambda axis: axis.axis.profile.folder / "recordings",
-        runner: Runner = in_own_process,
         simulated: bool = False,
         forced: bool = False,
     ) -> None:
-        """``recordings`` returns the folder for recordings of an axis's jobs; ``runner`` runs a job.
-
-        ``forced`` says that the daemon does not hold the lock of its interface.
-        """
+        """``forced`` says that the daemon does not hold the lock of its interface."""
         self.machine = machine
         self.core = Core(memory, timing, machine.lease_s)
         against = "the daemon was started with --force and does not hold the interface" if forced else ""
         if simulated:
             against = "its axes are simulated; a command has a simulated axis of its own with --simulate"
         self.lending = Lending(self.core, machine.bus, against)
-        self.book = JobBook(self.core, recordings, runner)
         self.axes: dict[str, ServiceAxis] = {
-            axis.name: ServiceAxis(index, axis, self.core, self.book.begin, self.axis_state)
+            axis.name: ServiceAxis(index, axis, self.core, self.axis_state)
             for index, axis in enumerate(machine.axes)
         }
         self.recorder: Callable[[], messages.RecorderState] = lambda: messages.RecorderState(on=False)
@@ -103,15 +95,11 @@ class ServiceBridge:
         self.core.lease.doing = self._doing
 
     def _doing(self) -> str:
-        """Returns the present jobs and motions in words, for a client without the lease."""
+        """Returns the present motions in words, for a client without the lease."""
         states = [axis.state() for axis in self.axes.values()]
-        jobs = [reports.job_words(each.job, " --force") for each in states if each.job is not None]
-        moving = [
-            f"axis '{each.name}' is in motion ({each.mode})"
-            for each in states
-            if each.job is None and each.mode != "hold"
-        ]
-        return "; ".join((*jobs, *moving))
+        return "; ".join(
+            f"axis '{each.name}' is in motion ({each.mode})" for each in states if each.mode != "hold"
+        )
 
     @property
     def lease(self) -> Lease:
@@ -143,8 +131,7 @@ class ServiceBridge:
         return self
 
     async def __aexit__(self, *_: object) -> None:
-        """Cancels jobs and stops monitoring; the axes complete the commands they have."""
-        await self.book.close()
+        """Stops monitoring; the axes complete the commands they have."""
         for task in tuple(self._tasks):
             task.cancel()
         await asyncio.gather(*self._tasks, return_exceptions=True)
@@ -257,6 +244,7 @@ class ServiceBridge:
                 channel=str(self.machine.bus.channel),
                 up=self._bus_up,
                 lent_to=self.lending.borrower,
+                lent_s=self.lending.lent_s,
                 load=float(head["bus_load"]) if head is not None else None,
             ),
             cycle=messages.CycleState(
@@ -270,7 +258,6 @@ class ServiceBridge:
             ),
             lease=reports.lease_state(core.lease, core.timing.clock.now()),
             recorder=self.recorder(),
-            jobs=self.book.all(),
             warnings=self._warnings(),
         )
 
@@ -281,7 +268,6 @@ class ServiceBridge:
             self._axis(name),
             self._stopped.get(name),
             self._loop_doubts.get(name, "the reason is in the log of an earlier service"),
-            self.book.of_axis(name),
             self._outer(name),
         )
 
@@ -297,7 +283,10 @@ class ServiceBridge:
         core = self.core
         warnings = []
         if (borrower := self.lending.borrower) is not None:
-            warnings.append(f"the bus is lent to {borrower}; the axes come back disabled when it ends")
+            warnings.append(
+                f"the bus is lent to {borrower}, for {self.lending.lent_s or 0.0:.0f} s now; the axes come "
+                "back disabled when it ends"
+            )
         elif not core.observer.alive:
             warnings.append(
                 "the control process does not turn: it hangs or is gone, and is started again by itself"
@@ -329,10 +318,6 @@ class ServiceBridge:
         newest = entries[-1].number if entries else self.core.log.newest_told
         return [reports.event_message(each, self._names) for each in entries], newest
 
-    def jobs(self) -> list[messages.Job]:
-        """Returns the running jobs and the last finished ones, newest last."""
-        return self.book.all()
-
     # ---------------------------------------------------------------- requests
 
     async def quick_stop(self) -> None:
@@ -344,10 +329,6 @@ class ServiceBridge:
     async def lend_bus(self, holder: str) -> None:
         """Stops the axes, switches them off and releases the bus to another program of this computer."""
         self.core.lease.check(holder)
-        if running := [each.id for each in self.book.all() if each.state is messages.JobState.RUNNING]:
-            raise RefusedError(
-                f"the bus cannot be lent: {', '.join(running)} has not ended; wait, or cancel it"
-            )
         await self.lending.lend()
 
     async def coordinated(
@@ -358,11 +339,6 @@ class ServiceBridge:
             raise InputError("a coordinated move of no axis; expected a target for at least one")
         axes = [self._axis(name) for name in moves]
         await run_together(holder, axes, moves, speed, wait=wait)
-
-    async def cancel_job(self, holder: str, job_id: str) -> None:
-        """Cancels a job and brakes its axis to rest; its measurements are kept."""
-        self.core.lease.check(holder)
-        self.book.cancel(job_id)
 
     def mark(self, text: str) -> None:
         """Adds a remark to the event log and the flight recorder, at the present cycle."""

@@ -13,9 +13,7 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING, NamedTuple
 
 from hdbridge.axis import AxisConfig, Identity
-from hdbridge.clock import Clock
-from hdbridge.daemon.memory import Memory
-from hdbridge.daemon.service.core import Arguments
+from hdbridge.daemon.service.core import Arguments, Core
 from hdbridge.daemon.service.relaybus import RelayBus
 from hdbridge.drive.drive import Drive, Positions
 from hdbridge.drive.states import State
@@ -58,11 +56,11 @@ class HomingRun(NamedTuple):
 class Commissioning:
     """The drive of one axis, as the service sees it."""
 
-    def __init__(self, axis: AxisConfig, memory: Memory, clock: Clock) -> None:
+    def __init__(self, axis: AxisConfig, core: Core) -> None:
         source = axis.load_encoder.source.node
         nodes = {axis.drive.node_id} | ({source} if source is not None else set())
-        self.bus = RelayBus(memory, clock, nodes, f"{axis.bus.interface}:{axis.bus.channel}")
-        self._drive = Drive(self.bus, axis, clock, force=True)
+        self.bus = RelayBus(core, nodes, f"{axis.bus.interface}:{axis.bus.channel}")
+        self._drive = Drive(self.bus, axis, core.timing.clock, force=True)
         self._busy = threading.Lock()
         self._doing = ""
 

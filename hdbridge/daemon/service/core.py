@@ -41,8 +41,8 @@ class Core:
         self.log = EventLog(memory.event_reader())
         self.observer = Observer(memory, self.log, timing.clock)
         self.lease = Lease(lease_s, timing.clock.now)
-        self.refuse: Callable[[CommandKind], None] = lambda _: None
-        """Raises RefusedError if the control process cannot take a command, because the bus is lent."""
+        self.refuse: Callable[[CommandKind | None], None] = lambda _: None
+        """Raises RefusedError if no command (None: no frame) can be sent, because the bus is lent."""
         # From the present time on, so that the streams of an earlier service have other numbers.
         self._streams = count(int(1000.0 * timing.clock.now()) + 1)
 
@@ -65,20 +65,6 @@ class Core:
         while (answer := self._answer(command_id)) is None:
             self._check(kind, loop_pid, deadline_s, within_s)
             await self.timing.sleep(POLL_S)
-        return answer
-
-    def do_now(
-        self, kind: CommandKind, axis: int = -1, within_s: float = ANSWER_S, **arguments: Unpack[Arguments]
-    ) -> Event:
-        """Does the same as `do`, for blocking code."""
-        self.refuse(kind)
-        clock = self.timing.clock
-        loop_pid = self.memory.status.loop_pid
-        command_id = self.memory.commands.post(kind, axis, **arguments)
-        deadline_s = clock.now() + within_s
-        while (answer := self._answer(command_id)) is None:
-            self._check(kind, loop_pid, deadline_s, within_s)
-            clock.sleep_until(clock.now() + POLL_S)
         return answer
 
     def _answer(self, command_id: int) -> Event | None:

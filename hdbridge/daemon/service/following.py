@@ -22,7 +22,6 @@ from hdbridge.daemon.following.statefile import AdaptationFiles
 from hdbridge.daemon.memory import Event, SampleArray
 from hdbridge.daemon.recorder.autodiagnosis import AutoDiagnosis
 from hdbridge.daemon.recorder.recorder import FlightRecorder
-from hdbridge.daemon.service.activity import Kind
 from hdbridge.daemon.service.axis import ServiceAxis
 from hdbridge.errors import HdbridgeError
 
@@ -88,15 +87,12 @@ class Following:
         await self.apply()
 
     async def apply(self) -> None:
-        """Has the control process compensate with the adapted model, if it does not yet.
-
-        Waits for the end of a job, because a job measures with one model.
-        """
+        """Has the control process compensate with the adapted model, if it does not yet."""
         chosen, follower = self._axis.models.chosen, self._follower
         if follower is None or follower.adaptation is None or chosen.model is not follower.model:
             return
         model = follower.adaptation.model
-        if model.effects == (chosen.adapted or chosen.model).effects or self._axis.motion.busy(Kind.JOB):
+        if model.effects == (chosen.adapted or chosen.model).effects:
             return
         try:
             await self._axis.follow(model)

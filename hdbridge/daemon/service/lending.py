@@ -47,6 +47,12 @@ class Lending:
         number = self._lock.holder
         return process_words(number) if number else "the program that asked for it"
 
+    @property
+    def lent_s(self) -> float | None:
+        """Seconds since the bus was lent; None if it is not."""
+        since_ns = self._status.get(Cell.BUS_LENT)
+        return 1e-9 * (time.monotonic_ns() - since_ns) if since_ns else None
+
     async def lend(self) -> None:
         """Stops the axes and releases the interface. Raises RefusedError if the bus cannot be lent.
 

@@ -1,6 +1,6 @@
 """Model that compensates an axis: the one that clients chose and the one that the control process uses.
 
-They differ after a restart of the control process and during a job. `AxisModels.in_use` follows the
+They differ after a restart of the control process. `AxisModels.in_use` follows the
 acknowledgement of the control process, so clients never see a model that is not in effect. While
 `AxisModels.settled` is False, the service sends the chosen setting again.
 """
@@ -54,16 +54,6 @@ class AxisModels:
         in_use = self._slot.in_use
         self._sent = {in_use: self._sent.get(in_use, self._none), number: setting}
         return number
-
-    def send_for_job(self, model: TransmissionModel) -> int:
-        """Stores the setting of a job's model, without the load loop; returns the argument of CHANGE."""
-        setting = CompensationSetting(model, Scheme.EXTENDED if model.effects else Scheme.NONE)
-        for scheme in Scheme:
-            known = replace(self.chosen, scheme=scheme, load_loop=False)
-            if model.effects and known.compensating == model:
-                setting = known
-                break
-        return self.send(setting)
 
     def check_drive(self, identity: Identity) -> None:
         """Raises InputError if the chosen model belongs to another drive than ``identity``."""

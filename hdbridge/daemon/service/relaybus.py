@@ -10,14 +10,16 @@ from __future__ import annotations
 import threading
 from collections import deque
 from collections.abc import Container
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import can
 
-from hdbridge.clock import Clock
-from hdbridge.daemon.memory import Cell, Memory, RelayedFrame
+from hdbridge.daemon.memory import RelayedFrame
 from hdbridge.drive import objects
-from hdbridge.errors import DaemonError, RefusedError
+from hdbridge.errors import DaemonError
+
+if TYPE_CHECKING:
+    from hdbridge.daemon.service.core import Core
 
 POLL_S: Final = 0.001
 """Interval between checks for a frame; shorter than any cycle."""
@@ -27,19 +29,19 @@ _FROM_NODES: Final = frozenset({objects.COB_EMCY, objects.COB_SDO_ANSWER, object
 
 
 class RelayBus(can.BusABC):
-    """The bus of one axis for blocking code; `recv` waits on the clock that is passed in.
+    """The bus of one axis for blocking code; `recv` waits on the service's clock.
 
     ``nodes`` are those of the axis: the drive, and an encoder with its own node. One thread uses it;
     `interrupt` may be called from any.
     """
 
-    def __init__(self, memory: Memory, clock: Clock, nodes: Container[int], name: str) -> None:
+    def __init__(self, core: Core, nodes: Container[int], name: str) -> None:
         super().__init__(channel=name)
         self.channel_info = name
-        self._clock = clock
-        self._status = memory.status
-        self._outgoing = memory.outgoing
-        self._incoming = memory.incoming_reader()
+        self._clock = core.timing.clock
+        self._core = core
+        self._outgoing = core.memory.outgoing
+        self._incoming = core.memory.incoming_reader()
         self._nodes = nodes
         self._waiting: deque[RelayedFrame] = deque()
         self._interrupted = threading.Event()
@@ -56,8 +58,7 @@ class RelayBus(can.BusABC):
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
         """Sends a frame. Drops the master's heartbeat, which the control process sends."""
-        if self._status.get(Cell.BUS_LENT):
-            raise RefusedError("the bus is lent to another program: nothing is sent until it is returned")
+        self._core.refuse(None)
         can_id = msg.arbitration_id
         function, node = can_id & _FUNCTION, can_id & _NODE
         if function == objects.COB_HEARTBEAT:

@@ -108,15 +108,6 @@ def lease_state(lease: Lease, now_s: float) -> messages.LeaseState:
     )
 
 
-def job_words(job: messages.Job, options: str = "") -> str:
-    """Describes a running job: its progress, its client, and the command (with ``options``) that ends it."""
-    begun = f", begun by '{job.client}'" if job.client else ""
-    return (
-        f"job {job.id} runs on axis '{job.axis}' ({100 * job.share:.0f} % done{begun}); "
-        f"'hdbridge ctl cancel {job.id}{options}' ends it"
-    )
-
-
 def model_in_use(in_use: CompensationSetting) -> messages.ModelInUse | None:
     """Returns the model in use and its age; None if there is no model."""
     if not in_use.model.effects:
@@ -161,7 +152,6 @@ def axis_state(
     axis: ServiceAxis,
     stopped: Entry | None,
     loop_doubt: str,
-    job: messages.Job | None,
     outer: messages.OuterState | None = None,
 ) -> messages.AxisState:
     """Returns the state of an axis.
@@ -219,7 +209,6 @@ def axis_state(
         outer=outer,
         advice=list(axis.following.advice) if axis.following else [],
         queued=axis.motion.queued,
-        job=job,
     )
 
 

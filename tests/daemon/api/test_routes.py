@@ -36,7 +36,6 @@ def test_a_move_waits_and_tells_where_the_axis_is(leased, api):
         ("POST", "load-loop", {"on": True}, ("load loop", True)),
         ("POST", "adaptation", {"mode": "observe"}, ("adapt", "observe")),
         ("DELETE", "adaptation", None, ("adaptation back",)),
-        ("POST", "jobs", {"kind": "step", "options": {"count": 60}}, ("job", "step", {"count": 60})),
         ("PUT", "objects/6041h", {"value": "1"}, ("write", "6041h", "1")),
     ],
 )
@@ -88,7 +87,7 @@ def test_nothing_is_moved_by_looking(api, leased):
     schema = leased.get("/openapi.json").json()
     for path, methods in schema["paths"].items():
         if "get" in methods:
-            leased.get(path.removeprefix("/api/v1").format(axis="joint-1", name="6041h", job_id="step-1"))
+            leased.get(path.removeprefix("/api/v1").format(axis="joint-1", name="6041h"))
     assert api.bridge.moved == []
     assert api.bridge.stopped == []
 
@@ -143,14 +142,14 @@ def test_a_move_that_is_waited_for_keeps_the_lease(api):
         assert bridge.lease.ended() == ()
 
 
-def test_jobs_are_listed_looked_at_and_cancelled(api, leased):
-    job = leased.post("/axes/joint-1/jobs", json={"kind": "calibrate"}).json()
-    assert [each["id"] for each in leased.get("/jobs").json()] == [job["id"]]
-    assert leased.get(f"/jobs/{job['id']}").json()["state"] == "running"
-    with api.over_socket() as stranger:
-        assert stranger.delete(f"/jobs/{job['id']}").status_code == 423
-    assert leased.delete(f"/jobs/{job['id']}").json()["state"] == "cancelled"
-    assert leased.get("/jobs/step-99").status_code == 404
+@pytest.mark.parametrize("body", [{"kind": "step", "options": {"count": 60}}, {}, {"kind": 7}, None])
+def test_an_old_client_that_asks_for_a_job_learns_the_command(api, leased, body):
+    refused = leased.post("/axes/joint-1/jobs", json=body)
+    assert refused.status_code == 409
+    kind = "step" if body and body.get("kind") == "step" else "calibrate"
+    assert f"'hdbridge {kind} profiles/joint-1 --simulate'" in refused.json()["detail"]
+    assert "'hdbridge ctl model joint-1 pending'" in refused.json()["detail"]
+    assert api.bridge.moved == []
 
 
 def test_an_object_is_read_without_a_lease(api):

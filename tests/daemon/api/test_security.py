@@ -99,7 +99,7 @@ def test_over_tcp_nothing_is_shown_or_done_without_the_token(api, authorization)
             path: [each.upper() for each in methods] for path, methods in client_schema(api)["paths"].items()
         }
         for path, methods in {**paths, "/metrics": ["GET"], "/api/v1/openapi.json": ["GET"]}.items():
-            url = str(client.base_url).replace("/api/v1/", path.format(axis="joint-1", name="x", job_id="y"))
+            url = str(client.base_url).replace("/api/v1/", path.format(axis="joint-1", name="x"))
             for method in methods:
                 answer = client.request(method, url, json={"target_deg": 1.0})
                 assert answer.status_code == 401, (method, path)

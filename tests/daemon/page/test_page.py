@@ -10,7 +10,7 @@ from support.browser import browser
 from support.fake_bridge import FakeBridge
 from support.patience import until
 
-from hdbridge.client.messages import Event, EventKind, Job
+from hdbridge.client.messages import Event, EventKind
 from hdbridge.daemon.page import page_file, page_files
 
 NOON = "2025-01-31T12:00:00Z"
@@ -126,21 +126,10 @@ def test_anybody_may_stop_and_the_fault_says_what_to_do(bridge, page):
     assert eventually(lambda: asked(bridge, "reset")) == [("joint-1", "reset")]
 
 
-def test_a_job_that_moves_the_axis_is_shown_with_its_progress(bridge, page):
-    assert page.evaluate("document.querySelector('#job').hidden")
-    bridge.axes["joint-1"].running = Job(
-        id="step-3",
-        kind="step",
-        axis="joint-1",
-        state="running",
-        share=0.42,
-        text="sweep 2 of 3",
-        started=NOON,
-    )
-    page.until("!document.querySelector('#job').hidden")
-    assert page.text("#job") == "step-3 moves this axis: sweep 2 of 3, 42 %. Stop ends it."
-    bridge.axes["joint-1"].running = None
-    page.until("document.querySelector('#job').hidden")
+def test_the_page_offers_the_commands_of_procedures_to_copy(bridge, page):
+    lines = page.text("#commands").splitlines()
+    assert lines[0] == "hdbridge calibrate profiles/joint-1 --simulate"
+    assert lines[-1] == "hdbridge ctl model joint-1 pending"
 
 
 def test_an_axis_without_a_model_is_not_called_compensated(bridge, page):

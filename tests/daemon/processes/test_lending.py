@@ -10,12 +10,15 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from datetime import UTC, datetime
 from pathlib import Path
 
+import httpx
 import pytest
 import yaml
 from support.running import Daemon, running
 
+from hdbridge.axis.model import TransmissionModel, store
 from hdbridge.drive.interfacelock import InterfaceLock
 from hdbridge.files.bundled import bundled_profile
 from tests.support.patience import until
@@ -104,6 +107,7 @@ def test_others_see_who_has_the_bus_and_can_stop_it(daemon: Daemon) -> None:
         state = daemon.state() or {}
         assert f"process {borrower.pid} of " in state["bus"]["lent_to"]
         assert f"the bus is lent to process {borrower.pid}" in state["warnings"][0]
+        assert 0.0 < state["bus"]["lent_s"] <= (daemon.state() or {})["bus"]["lent_s"]
         lease = daemon.client.post("/lease", json={"client": "test", "force": True}).json()["token"]
         refused = daemon.client.post("/axes/article/enable", headers={"X-Lease": lease})
         assert refused.status_code == 409, refused.text
@@ -113,6 +117,34 @@ def test_others_see_who_has_the_bus_and_can_stop_it(daemon: Daemon) -> None:
         assert "it was asked to stop its axis and to end" in stop.text
         assert borrower.wait() != 0
     until_taken_back(daemon, loops)
+
+
+def test_the_daemon_commits_the_model_that_a_borrower_proposed(daemon: Daemon) -> None:
+    folder, loops = daemon.folder, len(daemon.pids("control"))
+    before = (daemon.state() or {})["axes"][0]["model"]
+
+    def committed() -> httpx.Response:
+        lease = daemon.client.post("/lease", json={"client": "test", "force": True}).json()["token"]
+        held = {"X-Lease": lease}
+        done = daemon.client.post("/axes/article/model", json={"version": "pending"}, headers=held)
+        daemon.client.delete("/lease", headers=held)
+        return done
+
+    with started(folder, *LISTENING, folder) as borrower:
+        until_borrowed(daemon, borrower.pid)
+        model = TransmissionModel.load(folder / "model.yaml")
+        pending = store.propose(folder, model, "calibration", datetime(2026, 3, 1, tzinfo=UTC))
+        assert committed().status_code == 409
+        assert pending.exists()
+        borrower.terminate()
+        borrower.wait()
+    until_taken_back(daemon, loops)
+    assert (daemon.state() or {})["axes"][0]["model"]["reason"] == before["reason"] != "calibration"
+    # A request that meets the control process as it begins is refused, and nothing of it is done.
+    until(lambda: committed().status_code == 200, lambda: str(daemon.state()))
+    in_use = (daemon.state() or {})["axes"][0]["model"]
+    assert (in_use["reason"], in_use["version"]) == ("calibration", store.find(folder, store.ACTIVE).number)
+    assert not pending.exists()
 
 
 def test_a_killed_borrower_leaves_a_disabled_axis(daemon: Daemon) -> None:

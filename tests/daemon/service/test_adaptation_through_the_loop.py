@@ -140,7 +140,7 @@ def test_a_load_encoder_that_stands_still_freezes_it(service: Service) -> None:
     play(story())
 
 
-def test_what_was_adapted_stays_with_another_part_of_the_model_and_after_a_job(service: Service) -> None:
+def test_what_was_adapted_stays_with_another_part_of_the_model_and_a_new_loop(service: Service) -> None:
     async def story() -> None:
         async with adapting(service) as (bridge, token, made):
             await work(bridge, token, 50)

@@ -9,15 +9,11 @@ from support.raised import measured_response, raised_profile, ripple_arcsec
 from support.service import Service, play, stepped_service, until
 
 from hdbridge import TransmissionModel
-from hdbridge.analysis.response import harmonics
 from hdbridge.commissioning.evaluation.stepping import Scheme
-from hdbridge.control.bench import axis_view, compensation_for
-from hdbridge.daemon.service.activity import Activity, Kind
+from hdbridge.control.bench import axis_view
 from hdbridge.daemon.service.bridge import ServiceBridge
 from hdbridge.daemon.service.moves import WayPoint
-from hdbridge.daemon.service.rigs import DaemonRig
 from hdbridge.daemon.service.streams import StreamPoint
-from hdbridge.motion.procedures.even_speed import EvenSpeed
 from hdbridge.motion.procedures.moves import MoveTo
 
 SPEED_DEG_S = 76.0
@@ -90,25 +86,3 @@ def test_it_removes_the_ripple(motion, profile: Path, tmp_path: Path) -> None:
     with stepped_service(tmp_path, axes=1 + (motion is coordinated), profile=profile) as service:
         none, left = play(story(service))
     assert left < 0.1 * none, (none, left)
-
-
-def test_a_job_compensates_with_the_model_it_was_given(profile: Path, tmp_path: Path) -> None:
-    """The active model with another response, or without one, is another model."""
-
-    async def story(service: Service) -> list[float]:
-        model = TransmissionModel.load(service.machine.axes[0].profile.model)
-        async with service.ready() as bridge:
-            axis = bridge.axes["axis1"]
-            activity = Activity(Kind.JOB, "a test")
-            axis.occupy(activity)
-            rig = DaemonRig(axis, activity)
-            found = []
-            for used in (model.only(()), replace(model, response=None), model):
-                outcome = rig.bench(compensation_for(rig.axis, used)).run(EvenSpeed((SPEED_DEG_S,))).outcome
-                found.append(max(harmonics(each, (1, 2, 4), model.ratio).ripple_arcsec for each in outcome))
-            return found
-
-    with stepped_service(tmp_path, profile=profile) as service:
-        none, static, filtered = play(story(service))
-    assert static > 0.5 * none
-    assert filtered < 0.1 * none

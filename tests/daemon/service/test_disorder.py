@@ -1,4 +1,4 @@
-"""Clients in disorder: leases, moves, queues, streams, jobs, stops in any order move nothing that may not."""
+"""Clients in disorder: leases, moves, queues, streams, stops in any order move nothing that may not."""
 
 import asyncio
 import tempfile
@@ -14,7 +14,6 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
 from support.service import stepped_service, until
 
-from hdbridge.client.messages import JobKind
 from hdbridge.daemon.loop.states import AxisState
 from hdbridge.daemon.service.moves import WayPoint
 from hdbridge.daemon.service.streams import StreamPoint
@@ -139,24 +138,6 @@ class Disorder(RuleBasedStateMachine):
                 await stream.end()
 
         self.ask(self.of(which), streamed)
-
-    @rule(which=token)
-    def job(self, which: int) -> None:
-        before = self.may_have_power
-        self.may_have_power = True
-
-        async def worked(token: str) -> None:
-            await self.axis.job(token, JobKind.STEP, {"count": 2, "scheme": "none"})
-            await asyncio.sleep(0)
-
-        if not self.ask(self.of(which), worked):
-            self.may_have_power = before
-
-    @rule(which=token)
-    def cancel(self, which: int) -> None:
-        jobs = self.bridge.jobs()
-        if jobs:
-            self.ask(self.of(which), lambda token: self.bridge.cancel_job(token, jobs[-1].id))
 
     @rule()
     def stop(self) -> None:

@@ -1,4 +1,4 @@
-"""Clients receive the newest events, however many legs a job has ended meanwhile."""
+"""Clients receive the newest events, however many legs of streams have ended meanwhile."""
 
 from __future__ import annotations
 

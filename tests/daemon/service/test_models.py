@@ -13,7 +13,6 @@ from support.service import Service, play, stepped_service, until
 
 from hdbridge.axis.effects import Hysteresis
 from hdbridge.axis.model import TransmissionModel, store
-from hdbridge.client.messages import JobKind
 from hdbridge.commissioning.evaluation.stepping import Scheme
 from hdbridge.control.bench import compensation_for
 from hdbridge.control.switchover import Correction
@@ -328,32 +327,6 @@ def test_a_setting_reads_back_exactly(data: st.DataObject) -> None:
         data.draw(st.none() | st.just(replace(model, ratio=50.0))),
     )  # fmt: skip
     assert CompensationSetting.from_json(setting.to_json()) == setting
-
-
-def test_during_a_job_the_model_of_the_job_is_reported(pair: Service) -> None:
-    seen = set()
-
-    async def story() -> None:
-        async with pair.ready() as bridge:
-            token = bridge.lease.take("test")
-            await choose(bridge, token)
-            turn = pair.daemon.turn
-
-            def looked(turns: int = 1) -> None:
-                turn(turns)
-                state = bridge.axes["axis2"].state()
-                effects = tuple(state.model.effects) if state.model is not None else ()
-                seen.add((state.scheme.value, effects, state.load_loop.on, tuple(used(pair)[1])))
-
-            pair.daemon.turn = looked
-            job = await bridge.axes["axis2"].job(token, JobKind.STEP, {"count": 2, "scheme": "both"})
-            await until(bridge, lambda: bridge.jobs()[-1].state != "running")
-            assert bridge.jobs()[-1].state == "done", job.problem
-            await until(bridge, lambda: settled(bridge))
-
-    play(story())
-    both = ("synchronous", "hysteresis")
-    assert seen == {("hysteresis", both, True, ("hysteresis",)), ("both", both, False, both)}
 
 
 def test_a_load_loop_that_does_not_act_says_why_in_state_and_events(tmp_path: Path) -> None:

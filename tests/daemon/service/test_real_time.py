@@ -1,4 +1,4 @@
-"""The service as it runs: event loop, worker threads, a job's process; the control loop in a thread."""
+"""The service as it runs: event loop, worker threads; the control loop in a thread."""
 
 import asyncio
 import math
@@ -11,7 +11,6 @@ from pathlib import Path
 import pytest
 from support.service import Service, stepped_service
 
-from hdbridge.client.messages import JobKind
 from hdbridge.daemon.service.bridge import ServiceBridge
 from hdbridge.daemon.service.moves import WayPoint
 from hdbridge.daemon.service.streams import StreamPoint
@@ -82,11 +81,6 @@ def test_many_things_at_once(tmp_path: Path, slower: int) -> None:
                     await stream.put([StreamPoint(0.02 * number, -2.0 + 0.001 * number)])
             await bridge.coordinated(token, {"axis1": 2.0, "axis2": 0.0})
 
-            job = await first.job(token, JobKind.STEP, {"count": 2, "scheme": "none"})
-            while (known := {each.id: each for each in bridge.jobs()}[job.id]).state == "running":
-                await second.move(token, 1.0)
-                await second.move(token, 0.0)
-            assert known.state == "done", known.problem
             await second.disable(token)
         timing.close()
 

@@ -23,7 +23,7 @@ from hdbridge.daemon.service.moves import WayPoint
 
 
 def axis_routes(bridge: ServiceBridge) -> APIRouter:
-    """Returns all routes below ``/axes/{axis}`` except stream and jobs."""
+    """Returns all routes below ``/axes/{axis}`` except the stream."""
     routes = APIRouter(prefix="/axes/{axis}")
     _add_power(routes, bridge)
     _add_motion(routes, bridge)
@@ -69,7 +69,7 @@ def _add_power(routes: APIRouter, bridge: ServiceBridge) -> None:
 
     @routes.post("/stop", tags=["Stop"], responses=refusals(STOPPING))
     async def stop(axis: AxisName) -> messages.AxisState:
-        """Brake to rest and stay enabled; ends jog, queue, stream and job. Needs no lease."""
+        """Brake to rest and stay enabled; ends jog, queue and stream. Needs no lease."""
         found = port(bridge, axis)
         await found.stop()
         return found.state()

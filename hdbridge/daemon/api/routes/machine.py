@@ -1,15 +1,13 @@
-"""Routes of the machine: state, events, lease, motion of all axes, jobs, remarks."""
+"""Routes of the machine: state, events, lease, motion of all axes, loan of the bus, remarks."""
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Any
 
-from fastapi import APIRouter, Query, Request
+from fastapi import APIRouter, Body, Query, Request
 
 from hdbridge.client import messages
-from hdbridge.daemon.api.problems import UnknownError
 from hdbridge.daemon.api.routes.parts import (
-    LOOKING,
     MOVING,
     STOPPING,
     AxisName,
@@ -21,15 +19,16 @@ from hdbridge.daemon.api.routes.parts import (
 )
 from hdbridge.daemon.service.bridge import ServiceBridge
 from hdbridge.drive.interfacelock import user_name
+from hdbridge.errors import RefusedError
 
 
 def machine_routes(bridge: ServiceBridge) -> APIRouter:
-    """Returns the routes that concern no single axis, and those of jobs."""
+    """Returns the routes that concern no single axis."""
     routes = APIRouter()
     _add_looking(routes, bridge)
     _add_lease(routes, bridge)
     _add_motion(routes, bridge)
-    _add_jobs(routes, bridge)
+    _add_loan(routes, bridge)
     return routes
 
 
@@ -111,6 +110,8 @@ def _add_motion(routes: APIRouter, bridge: ServiceBridge) -> None:
         await kept(bridge, holder, request, motion)
         return bridge.state()
 
+
+def _add_loan(routes: APIRouter, bridge: ServiceBridge) -> None:
     @routes.post("/bus/lend", tags=["Move"], responses=refusals(MOVING))
     async def lend_bus(request: Request, holder: Holder = "") -> messages.MachineState:
         """Stop all axes, switch them off, and release the bus to another program of the daemon's computer.
@@ -121,35 +122,13 @@ def _add_motion(routes: APIRouter, bridge: ServiceBridge) -> None:
         await kept(bridge, holder, request, bridge.lend_bus(holder))
         return bridge.state()
 
-
-def _add_jobs(routes: APIRouter, bridge: ServiceBridge) -> None:
-    def job(id_: str) -> messages.Job:
-        for each in bridge.jobs():
-            if each.id == id_:
-                return each
-        raise UnknownError(f"there is no job {id_[:80]!a}; GET /api/v1/jobs ('hdbridge ctl jobs') lists them")
-
-    @routes.get("/jobs", tags=["Jobs"])
-    async def get_jobs() -> list[messages.Job]:
-        """List the running jobs and the last finished ones, newest last."""
-        return bridge.jobs()
-
-    @routes.get("/jobs/{job_id}", tags=["Jobs"], responses=refusals(LOOKING))
-    async def get_job(job_id: str) -> messages.Job:
-        """Report the progress and result of a job."""
-        return job(job_id)
-
-    @routes.delete("/jobs/{job_id}", tags=["Jobs"], responses=refusals(MOVING))
-    async def cancel_job(job_id: str, holder: Holder = "") -> messages.Job:
-        """Cancel a job: its axis brakes to rest, its measurements are kept."""
-        job(job_id)
-        await bridge.cancel_job(holder, job_id)
-        return job(job_id)
-
-    @routes.post("/axes/{axis}/jobs", tags=["Jobs"], status_code=201, responses=refusals(MOVING))
-    async def start_job(axis: AxisName, wanted: messages.JobRequest, holder: Holder = "") -> messages.Job:
-        """Start a job on an axis: step, calibrate or improve. Answers at once."""
-        return await port(bridge, axis).job(holder, wanted.kind, wanted.options)
+    @routes.post("/axes/{axis}/jobs", include_in_schema=False)
+    async def start_job(axis: AxisName, wanted: Annotated[dict[str, Any] | None, Body()] = None) -> None:
+        """Refuse a client of an earlier version: name the command that runs the procedure."""
+        kinds, kind = messages.PROCEDURES, (wanted or {}).get("kind")
+        command = kind if isinstance(kind, str) and kind in kinds else kinds[0]
+        state = port(bridge, axis).state()
+        raise RefusedError(state.in_place_of_job(command, simulated=bridge.state().simulated))
 
 
 def _who(request: Request, name: str) -> str:

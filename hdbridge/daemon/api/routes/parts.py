@@ -36,7 +36,7 @@ AxisName = Annotated[str, Path(description="name of the axis, as in its file", e
 
 _WORDS: Final = {
     400: "The body is not JSON, or nests too deeply",
-    404: "There is no such axis, job or object",
+    404: "There is no such axis or object",
     409: "Not possible in this state: not enabled, busy, or stopped by the supervision",
     422: "A value is missing, not a number or outside its range or the axis's limits; nothing moved",
     423: "Another client holds the lease, or nobody does; the answer names the holder",

@@ -37,7 +37,7 @@ const shown = () => machine?.axes.find((each) => each.name === chosen);
 function choose(name) {
   chosen = name;
   view.tabs(machine.axes.map((each) => each.name), chosen, choose);
-  view.axis(shown());
+  view.axis(shown(), machine.simulated);
   draw();
   drawSlow();
 }
@@ -54,7 +54,7 @@ async function refresh() {
   if (!shown()) chosen = machine.axes[0]?.name ?? null;
   view.tabs(machine.axes.map((each) => each.name), chosen, choose);
   view.machine(machine);
-  if (shown()) view.axis(shown());
+  if (shown()) view.axis(shown(), machine.simulated);
   if (!feed) await begin();
 }
 

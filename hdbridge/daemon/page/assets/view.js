@@ -4,6 +4,7 @@ import { holdsLease } from "./api.js";
 
 const at = (id) => document.getElementById(id);
 const EVENTS_SHOWN = 100;
+const PROCEDURES = ["calibrate", "step", "improve"];
 const GRAVE = new Set(["stopped", "bus-down", "refused", "stream-refused"]);
 const number = (value, digits) => (value === null || value === undefined ? "-" : value.toFixed(digits).replace("-", "\u2212"));
 
@@ -89,17 +90,17 @@ export function machine(state) {
   at("warnings").replaceChildren(...warnings.map((text) => Object.assign(document.createElement("li"), { textContent: text })));
 }
 
-export function axis(state) {
+/** A path as one word of a shell. */
+const quoted = (path) => (/^[\w@%+=:,./-]+$/.test(path) ? path : `'${path.replaceAll("'", "'\"'\"'")}'`);
+
+export function axis(state, simulated) {
   at("state").textContent = state.state;
   at("mode").textContent = state.state === "enabled" ? state.mode : state.power;
   const lag = state.motor_target_deg === null || state.motor_position_deg === null ? null : state.motor_target_deg - state.motor_position_deg;
   at("following").textContent = number(lag, 3);
   at("torque").textContent = number(state.motor_torque_nm, 3);
   at("compensation").textContent = compensation(state);
-  at("job").hidden = !(state.job || state.state === "lent");
-  at("job").textContent = state.job
-    ? `${state.job.id} moves this axis: ${state.job.text || state.job.kind}, ${Math.round(100 * state.job.share)} %. Stop ends it.`
-    : "The drive homes this axis; the loop sends it no targets meanwhile.";
+  at("lent").hidden = state.state !== "lent";
   at("fault").hidden = !state.fault;
   if (state.fault) {
     at("fault-text").textContent = state.fault.text;
@@ -130,6 +131,9 @@ export function axis(state) {
     ["adaptation", adaptation(state.adaptation)],
   );
   facts(at("model"), rows);
+  const lines = PROCEDURES.map((name) => `hdbridge ${name} ${quoted(state.profile)} ${simulated ? "--simulate" : "--borrow"}`);
+  const text = [...lines, `hdbridge ctl model ${state.name} pending`].join("\n");
+  if (at("commands").textContent !== text) at("commands").textContent = text;
 }
 
 function compensation(state) {

@@ -1,0 +1,73 @@
+"""Objects of a daemon's drives; the commands that run procedures in place of its former jobs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from hdbridge.cli.ctl.common import (
+    AtOption,
+    AxisArgument,
+    TakeOption,
+    connected,
+    document,
+    moving,
+)
+from hdbridge.cli.options import JsonOption, console, write_json
+from hdbridge.errors import InputError, RefusedError
+
+if TYPE_CHECKING:
+    from hdbridge.client.messages import SdoValue
+
+ObjectArgument = Annotated[
+    str,
+    typer.Argument(
+        metavar="OBJECT", help="Its number (6064h, 0x1018:4, 60C2h:01; hexadecimal) or its name in the EDS."
+    ),
+]
+
+
+def job(
+    axis: AxisArgument, kind: Annotated[str, typer.Argument(metavar="KIND")], at: AtOption = None
+) -> None:
+    """Name the command that runs a procedure, which the daemon no longer runs as a job."""
+    from hdbridge.client.messages import PROCEDURES
+
+    if kind not in PROCEDURES:
+        raise InputError(f"KIND: found {kind!r}; expected one of: {', '.join(PROCEDURES)}")
+    with connected(at) as client:
+        state = client.axis(axis).state()
+        raise RefusedError(state.in_place_of_job(kind, simulated=client.state().simulated))
+
+
+def get(
+    axis: AxisArgument, object_: ObjectArgument, at: AtOption = None, json_file: JsonOption = None
+) -> None:
+    """Read an object of the drive by SDO, between the cycles."""
+    with connected(at) as client:
+        _print_object(client.axis(axis).read(object_), json_file)
+
+
+def put(
+    axis: AxisArgument,
+    object_: ObjectArgument,
+    value: Annotated[
+        str, typer.Argument(metavar="VALUE", help="Decimal or 0x...; text, or bytes in hexadecimal.")
+    ],
+    at: AtOption = None,
+    force: TakeOption = False,
+    json_file: JsonOption = None,
+) -> None:
+    """Write an object of the drive by SDO, and read it back; refused while the axis is enabled."""
+    with moving(at, axis, force=force) as moved:
+        _print_object(moved.write(object_, value), json_file)
+
+
+def _print_object(found: SdoValue, json_file: Path | None) -> None:
+    write_json(json_file, document("ctl-object", found))
+    number = f"{found.index:04X}h:{found.subindex:02X}"
+    whole = isinstance(found.value, int) and not isinstance(found.value, bool) and found.value >= 0
+    also = f" ({found.value:#x})" if whole else ""
+    console.print(f"{number} '{found.name}': {found.value}{also}  {found.type}", markup=False, soft_wrap=True)
