@@ -144,39 +144,6 @@ def test_a_jump_of_the_target_stays_within_the_limits(tmp_path):
     scene(tmp_path, scenario)
 
 
-def test_a_lost_sync_stops_the_axis_and_its_return_moves_nothing(tmp_path):
-    async def scenario(bench):
-        plc = bench.plc
-        await bench.enable()
-        await swing(bench)
-        await bench.wait(0.6)
-        plc.cycling = False
-        await bench.wait(1.0)
-        plc.listen()
-        assert 0x8700 in plc.emergencies
-        assert bench.daemon.nodes[0].firmware.state.name != "OPERATION_ENABLED"
-        plc.begin()  # the same controlword as before, and targets far away
-        await stands(bench)
-        assert plc.statusword & 0x4F == FAULT
-        await reset(bench)
-
-    scene(tmp_path, scenario)
-
-
-def test_one_lost_sync_is_survived(tmp_path):
-    async def scenario(bench):
-        plc = bench.plc
-        await bench.enable()
-        await swing(bench)
-        await bench.wait(0.6)
-        plc._next_s += plc.period_s
-        await bench.wait(1.0)
-        assert plc.statusword & STATE == ENABLED
-        assert plc.emergencies == []
-
-    scene(tmp_path, scenario)
-
-
 def fault_of_the_drive(bench):
     bench.daemon.nodes[0].faults.raise_error(0x4310)
 
@@ -253,67 +220,6 @@ async def reset_and_go(bench):
     await bench.wait(0.5)
     assert bench.plc.statusword & STATE == ENABLED
     assert bench.plc.emergencies == []
-
-
-@pytest.mark.parametrize(
-    "frame",
-    [
-        (0x000, bytes((2, NODE))),
-        (0x000, bytes((128, NODE))),
-        (0x000, bytes((129, NODE))),
-        (0x000, bytes((130, NODE))),
-    ],
-    ids=["stop", "pre-operational", "reset node", "reset communication"],
-)
-def test_an_nmt_command_stops_the_axis(tmp_path, frame):
-    async def scenario(bench):
-        plc = bench.plc
-        await bench.enable()
-        await swing(bench)
-        await bench.wait(0.6)
-        plc.send(*frame)
-        await bench.until(lambda: bench.daemon.nodes[0].firmware.state.name != "OPERATION_ENABLED", 2.0)
-        await bench.wait(0.5)
-        plc.send(0, bytes((1, NODE)))
-        await stands(bench)
-        assert not any(node.firmware.state.name == "OPERATION_ENABLED" for node in bench.daemon.nodes)
-
-    scene(tmp_path, scenario)
-
-
-def test_a_lost_heartbeat_of_the_master_stops_the_axis(tmp_path):
-    async def scenario(bench):
-        plc = bench.plc
-        await bench.write(0x1016, 1, 127 << 16 | 100, 4)
-        await bench.enable()
-        await swing(bench)
-        plc.send(0x77F, b"\x05")
-        await bench.until(lambda: bench.daemon.states[0].name == "DISABLED", 1.0)
-        assert 0x8130 in plc.emergencies
-        plc.send(0, bytes((1, NODE)))
-        await stands(bench)
-        assert plc.statusword & 0x4F == FAULT
-
-    scene(tmp_path, scenario)
-
-
-def test_a_dead_gateway_leaves_a_disabled_axis(tmp_path):
-    async def scenario(bench):
-        plc = bench.plc
-        await bench.enable()
-        await swing(bench)
-        await bench.wait(0.6)
-        bench.daemon.clock.nodes.remove(bench.gateway)
-        await bench.until(lambda: bench.daemon.states[0].name == "DISABLED", 1.0)
-        bench.daemon.clock.nodes.append(bench.gateway)
-        plc.heartbeats.clear()
-        bench.restart_gateway()
-        plc.send(0, bytes((1, NODE)))
-        await stands(bench, 0.5)  # the PLC sends 000Fh and targets all the time
-        assert bench.daemon.states[0].name == "DISABLED"
-        assert plc.heartbeats.count(0) == 1  # the boot-up message
-
-    scene(tmp_path, scenario)
 
 
 def test_a_dead_control_process_is_a_fault(tmp_path):
