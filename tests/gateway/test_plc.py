@@ -127,6 +127,26 @@ def test_it_points_where_the_master_asks(tmp_path):
     scene(tmp_path, scenario)
 
 
+def test_the_state_of_the_axis_has_period_and_jitter_of_the_outer_sync(tmp_path):
+    async def scenario(bench):
+        bench.plc.begin()
+        await bench.wait(1.0)
+        outer = bench.bridge.axes["axis1"].state().outer
+        assert (outer.node_id, outer.nmt) == (NODE, 5)
+        assert outer.period_s == pytest.approx(bench.plc.period_s, rel=1e-6)
+        assert outer.jitter_s < 1e-6
+        bench.plc.late_s = lambda cycle: 0.001 * (cycle % 2)
+        await bench.wait(1.0)
+        outer = bench.bridge.axes["axis1"].state().outer
+        assert outer.jitter_s == pytest.approx(0.0005, rel=0.2)  # of a mean time between the two
+        bench.plc.cycling = False
+        await bench.wait(0.5)
+        outer = bench.bridge.axes["axis1"].state().outer
+        assert (outer.period_s, outer.jitter_s) == (None, None)
+
+    scene(tmp_path, scenario)
+
+
 def test_a_jump_of_the_target_stays_within_the_limits(tmp_path):
     async def scenario(bench):
         await bench.enable()

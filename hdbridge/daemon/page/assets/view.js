@@ -129,7 +129,17 @@ export function axis(state) {
     ["load-side loop", loadLoop(state.load_loop)],
     ["adaptation", adaptation(state.adaptation)],
   );
+  if (state.outer) rows.push(["other master", otherMaster(state.outer)]);
   facts(at("model"), rows);
+}
+
+const NMT = { 4: "stopped", 5: "operational", 127: "pre-operational" };
+
+function otherMaster(outer) {
+  if (!outer.alive) return `node ${outer.node_id}: the gateway process does not run`;
+  const word = outer.statusword.toString(16).toUpperCase().padStart(4, "0");
+  const sync = outer.period_s === null ? "no SYNC" : `SYNC every ${number(1e3 * outer.period_s, 3)} ms, jitter ${number(1e6 * outer.jitter_s, 0)} \u00b5s`;
+  return `node ${outer.node_id}, ${NMT[outer.nmt] || "starting"}, 6041h = ${word}h, ${sync}`;
 }
 
 function compensation(state) {
