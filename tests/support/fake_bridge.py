@@ -45,6 +45,7 @@ class FakeAxis:
         self.running: messages.Job | None = None
         self.model: messages.ModelInUse | None = None
         self.load_loop = messages.LoadLoopState(configured=True)
+        self.outer: messages.OuterState | None = None
         self.queued: list[WayPoint] = []
         self.moving_s = 0.0
         """Duration of a move."""
@@ -63,6 +64,7 @@ class FakeAxis:
             compensating=self.scheme is not messages.Scheme.NONE, memory_known=True, limits=LIMITS,
             fault=fault, model=self.model, load_loop=self.load_loop,
             adaptation=messages.AdaptationState(), queued=len(self.queued), job=self.running,
+            outer=self.outer,
         )  # fmt: skip
 
     def _moved(self, holder: str, what: str, *given: Any) -> None:
