@@ -162,6 +162,11 @@ class DriveNode:
         """The period of 60C2h, or of SYNC if the drive measures it."""
         return self._period_s
 
+    @property
+    def jitter_s(self) -> float:
+        """Mean deviation of SYNC from its regular time; 0 unless the drive measures the period."""
+        return self._sync.jitter_s
+
     def _watch_heartbeat(self) -> None:
         """Evaluates object 1016h:01; supervision begins with the first heartbeat (CiA 301)."""
         word = self.dictionary.value(0x1016, 1)

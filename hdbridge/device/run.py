@@ -28,6 +28,40 @@ class Served(Protocol):
     def bus_failed(self) -> None: ...
 
 
+class Server:
+    """Serves a node on a bus whose interface may fail."""
+
+    def __init__(self, bus: can.BusABC, node: Served, clock: Clock) -> None:
+        self._bus, self._node, self._clock = bus, node, clock
+        self._failing_since_s: float | None = None
+
+    def poll(self, wait_s: float | None = None) -> bool:
+        """Waits for a frame for at most ``wait_s``, then handles all that is due; False if reading failed.
+
+        A failure of the interface stops the axis as 6007h says, and the node continues on its own clock.
+        Raises BusError when reading has failed for ``PATIENCE_S``.
+        """
+        node, now = self._node, self._clock.now
+        try:
+            if wait_s is not None and (message := self._bus.recv(wait_s)) is not None:
+                node.handle(message, now() - _age_s(message))
+            node.poll(now())
+        except can.CanError as error:
+            now_s = now()
+            if self._failing_since_s is None:
+                self._failing_since_s = now_s
+                node.bus_failed()
+            if now_s - self._failing_since_s > PATIENCE_S:
+                raise BusError(
+                    f"{self._bus.channel_info}: cannot be read ({error}); bring the interface up and start "
+                    "again"
+                ) from error
+            node.run_until(now_s)
+            return False
+        self._failing_since_s = None
+        return True
+
+
 def run(
     bus: can.BusABC,
     node: Served,
@@ -37,30 +71,14 @@ def run(
 ) -> None:
     """Serves ``node``, whose bus is ``bus``, until ``should_stop`` returns True.
 
-    ``longest_wait_s`` is the maximum delay until a new event of the node is noticed. A failure of the
-    interface stops the axis as 6007h says, and the node continues on its own clock. Raises BusError when
-    reading has failed for ``PATIENCE_S``.
+    ``longest_wait_s`` is the maximum delay until a new event of the node is noticed. Raises BusError as
+    `Server.poll` does.
     """
-    failing_since_s: float | None = None
+    server = Server(bus, node, clock)
     while not should_stop():
-        try:
-            wait_s = min(node.next_event_s() - clock.now(), longest_wait_s)
-            message = bus.recv(max(wait_s, 0.0))
-            if message is not None:
-                node.handle(message, clock.now() - _age_s(message))
-            node.poll(clock.now())
-            failing_since_s = None
-        except can.CanError as error:
-            now_s = clock.now()
-            if failing_since_s is None:
-                failing_since_s = now_s
-                node.bus_failed()
-            if now_s - failing_since_s > PATIENCE_S:
-                raise BusError(
-                    f"{bus.channel_info}: cannot be read ({error}); bring the interface up and start again"
-                ) from error
-            node.run_until(now_s)
-            clock.sleep_until(now_s + LONGEST_WAIT_S)
+        wait_s = min(node.next_event_s() - clock.now(), longest_wait_s)
+        if not server.poll(max(wait_s, 0.0)):
+            clock.sleep_until(clock.now() + LONGEST_WAIT_S)
 
 
 def _age_s(message: can.Message) -> float:

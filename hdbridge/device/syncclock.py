@@ -21,12 +21,13 @@ class SyncClock:
     It begins with a least-squares line through all SYNCs and ends with fixed gains.
     """
 
-    __slots__ = ("_agreeing", "_count", "_interval_s", "_received_s", "period_s", "time_s")
+    __slots__ = ("_agreeing", "_count", "_interval_s", "_received_s", "jitter_s", "period_s", "time_s")
 
     def __init__(self, period_s: float) -> None:
         self.period_s = period_s
         self.time_s = self._received_s = -float("inf")
-        self._interval_s = 0.0
+        self._interval_s = self.jitter_s = 0.0
+        """Mean deviation of a SYNC from its time without jitter, over the last 20 or so."""
         self._count = self._agreeing = 0
 
     def take(self, now_s: float) -> None:
@@ -47,6 +48,7 @@ class SyncClock:
             self._count, self._agreeing = 2, 0
             return
         error_s = now_s - self.time_s - self.period_s
+        self.jitter_s += _GAIN * (abs(error_s) - self.jitter_s)
         if abs(error_s) > _ASTRAY * self.period_s:
             self.time_s = now_s
             return

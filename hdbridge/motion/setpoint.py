@@ -311,6 +311,11 @@ class SetPoint:
         knots brake against a limit with more jerk than the axis may have.
         """
         now, bounds = self._state(), self._bounds_here()
+        if self._stream is not None or self._pursuit is not None:
+            # Their jerk is not limited. At the acceleration of a reversal, a stop would turn the axis round.
+            most = math.sqrt(2.0 * self._limits.jerk_deg_s3 * abs(now.velocity_deg_s))
+            most = min(most, self._limits.acceleration_deg_s2)
+            now = now._replace(acceleration_deg_s2=min(max(now.acceleration_deg_s2, -most), most))
         path = (
             self._generator.to_rest(now, bounds)
             or self._generator.to_position(now, now.position_deg, bounds)

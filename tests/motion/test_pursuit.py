@@ -45,6 +45,25 @@ def test_the_limits_hold_whatever_is_aimed_at(goals):
     assert point.at_rest
 
 
+@given(
+    goals=st.lists(st.tuples(st.floats(-30, 30), st.integers(1, 40)), min_size=1, max_size=8),
+    spacing_s=st.sampled_from([0.0, 0.02]),
+)
+def test_a_stop_does_not_turn_the_axis_round(goals, spacing_s):
+    point = following()
+    for goal, turns in goals:
+        for _ in range(turns):
+            point.aim(goal, spacing_s)
+            point.step()
+    before, velocity = point.position_deg, point.velocity_deg_s
+    point.stop()
+    while not point.at_rest:
+        speed = (point.step() - before) / PERIOD_S
+        assert speed * velocity >= -1e-6
+        assert abs(speed) <= 2.0 * abs(velocity) + 1e-6  # it may still accelerate, with limited jerk
+        before = point.position_deg
+
+
 @pytest.mark.parametrize("spacing_s", [0.001, 0.004, 0.02])
 def test_a_path_within_the_limits_is_followed_exactly(spacing_s):
     """A swing whose acceleration is 95 % of the limit, interpolated linearly between set-points."""

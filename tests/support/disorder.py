@@ -130,10 +130,9 @@ async def happen(bench: GatewayBench, laws: Laws, kind: str, value) -> None:
         await rest(bench, laws, 1e-3 * value)
         plc.begin()
     elif kind == "gateway":
-        daemon.clock.nodes.remove(bench.gateway)
+        bench.kill_gateway()
         await rest(bench, laws, 1e-3 * value)
-        daemon.clock.nodes.append(bench.gateway)
-        bench.restart_gateway()
+        bench.start_gateway()
         laws.disturbed_s = bench.now_s  # until then the loop cannot know
         plc.send(0, bytes((1, NODE)))
     elif kind == "loop":

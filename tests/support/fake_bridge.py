@@ -44,6 +44,7 @@ class FakeAxis:
         self.scheme = messages.Scheme.NONE
         self.model: messages.ModelInUse | None = None
         self.load_loop = messages.LoadLoopState(configured=True)
+        self.outer: messages.OuterState | None = None
         self.queued: list[WayPoint] = []
         self.moving_s = 0.0
         """Duration of a move."""
@@ -61,7 +62,7 @@ class FakeAxis:
             load_position_deg=self.target_deg + 1 / 3600, error_arcsec=1.0, scheme=self.scheme,
             compensating=self.scheme is not messages.Scheme.NONE, memory_known=True, limits=LIMITS,
             fault=fault, model=self.model, load_loop=self.load_loop,
-            adaptation=messages.AdaptationState(), queued=len(self.queued),
+            adaptation=messages.AdaptationState(), queued=len(self.queued), outer=self.outer,
         )  # fmt: skip
 
     def _moved(self, holder: str, what: str, *given: Any) -> None:

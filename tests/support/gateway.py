@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import struct
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
@@ -17,6 +18,7 @@ from hdbridge.axis import BusConfig
 from hdbridge.daemon.gateway.objects import eds
 from hdbridge.daemon.gateway.slave import Gateway
 from hdbridge.daemon.machinefile import GatewaySettings
+from hdbridge.device.run import LONGEST_WAIT_S, Server
 from support.service import Service, stepped_service
 
 NODE = 5
@@ -107,29 +109,60 @@ class Plc:
         return self._answers.pop(0) if self._answers else None
 
 
+class OuterBus(VirtualBus):
+    """The gateway's end of the outer bus: an interface that can fail."""
+
+    down: int | None = None
+    """Error number of every call while the interface is down (ENETDOWN) or deleted (ENODEV)."""
+
+    def send(self, msg: can.Message, timeout: float | None = None) -> None:
+        if self.down is not None:
+            raise can.CanOperationError(os.strerror(self.down), self.down)
+        super().send(msg, timeout)
+
+    def recv(self, timeout: float | None = None) -> can.Message | None:
+        if self.down is not None:
+            raise can.CanOperationError(os.strerror(self.down), self.down)
+        return super().recv(timeout)
+
+
+class GatewayProcess:
+    """The gateway process as a node of the virtual clock."""
+
+    def __init__(self, bus: OuterBus, gateway: Gateway, clock: Any) -> None:
+        self.gateway, self._clock = gateway, clock
+        self._server, self._again_s = Server(bus, gateway, clock), 0.0
+
+    def next_event_s(self) -> float:
+        return max(self.gateway.next_event_s(), self._again_s)
+
+    def poll(self, now_s: float) -> None:
+        if now_s >= self._again_s and not self._server.poll():
+            self._again_s = now_s + LONGEST_WAIT_S
+
+
 class GatewayBench:
     """Everything between the outer master and the simulated drive."""
 
     def __init__(
-        self, service: Service, channel: str, gateway: Callable[[], Gateway], plcs: list[Plc]
+        self, service: Service, bus: OuterBus, gateway: Callable[[], Gateway], plcs: list[Plc]
     ) -> None:
         self.service, self.daemon, self.plcs = service, service.daemon, plcs
         self.plc = plcs[0]
         """The master of the axis that the methods are about."""
-        self.channel = channel
-        self._made = gateway
-        self.gateway = gateway()
-        self.daemon.clock.nodes += [
-            *reversed(plcs),
-            self.gateway,
-        ]  # in this order: a frame arrives when it is sent
+        self.bus, self._made = bus, gateway
+        self.daemon.clock.nodes += reversed(plcs)  # before the gateway: a frame arrives when it is sent
+        self.start_gateway()
 
-    def restart_gateway(self) -> None:
-        """The process was killed, and another takes its place."""
-        nodes = self.daemon.clock.nodes
-        nodes.remove(self.gateway)
+    def start_gateway(self) -> None:
+        """The keeper starts the gateway process."""
         self.gateway = self._made()
-        nodes.append(self.gateway)
+        self._process = GatewayProcess(self.bus, self.gateway, self.daemon.clock)
+        self.daemon.clock.nodes.append(self._process)
+
+    def kill_gateway(self) -> None:
+        """The gateway process is gone."""
+        self.daemon.clock.nodes.remove(self._process)
 
     async def wait(self, duration_s: float) -> None:
         await self.service.timing.sleep(duration_s)
@@ -232,7 +265,7 @@ def gateway_bench(
             path.write_text(eds(axis, settings))
             return path
 
-        outer = stack.enter_context(VirtualBus(channel))
+        outer = stack.enter_context(OuterBus(channel))
 
         def gateway() -> Gateway:
             return Gateway(outer, configs, settings, service.daemon.memory, clock, eds_of)
@@ -240,4 +273,4 @@ def gateway_bench(
         plcs = [Plc(channel, clock, period_s, drift_ppm, node, syncs=node == NODE) for node in nodes.values()]
         for plc in plcs:
             stack.callback(plc.bus.shutdown)
-        yield GatewayBench(service, channel, gateway, plcs)
+        yield GatewayBench(service, outer, gateway, plcs)

@@ -38,7 +38,7 @@ class SteppedBus(VirtualBus):
     """The outer bus of a tester in a thread that runs only while the clock of the bench polls it."""
 
     def __init__(self, bench: GatewayBench) -> None:
-        super().__init__(bench.channel)
+        super().__init__(bench.bus.channel_id)
         self._bench, self._wake_s = bench, 0.0
         self._turn, self._back = Semaphore(0), Semaphore(0)
         self.is_done = False

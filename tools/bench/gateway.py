@@ -1,16 +1,18 @@
 """Stepping through the gateway by another master, next to the same steps of a client of the daemon.
 
-    python tools/bench/gateway.py [--steps 60] [--outer-ms 4,10]
+    python tools/bench/gateway.py [--steps 60] [--outer-ms 4,10] [--faults]
 
 Both step the simulated axis of the article, compensated by its model, in simulated time, from the same seed.
 The master is the PLC-like one of the tests; it sends a jerk-limited path in cyclic synchronous position mode.
 Prints 3 sigma and mean of the load's error at rest in each direction, their ratio, the answer to 'enable
-operation', and by how much the set-point of the loop lags that of an ideal drive.
+operation', and by how much the set-point of the loop lags that of an ideal drive. ``--faults`` prints the
+table of faults on the outer bus instead, with the time to stop.
 """
 
 from __future__ import annotations
 
 import argparse
+import math
 import sys
 import tempfile
 from pathlib import Path
@@ -20,6 +22,7 @@ import numpy as np
 
 sys.path.append(str(Path(__file__).resolve().parents[2] / "tests"))
 from support.gateway import COUNTS_PER_DEG, GatewayBench, gateway_bench
+from support.gateway_faults import ROWS, measure
 from support.service import play
 
 from hdbridge.control.bench import axis_view
@@ -109,13 +112,29 @@ def lag(bench: GatewayBench, reader: Any, begun: int) -> float:
     return float(delays[int(np.argmin(misfit))])
 
 
+def print_faults() -> None:
+    def ms(time_s: float) -> str:
+        return f"{1e3 * time_s:.0f}" if math.isfinite(time_s) else "-"
+
+    print("| fault | EMCY | stands, ms | no power, ms |\n|---|---|---|---|")
+    for row in ROWS:
+        with tempfile.TemporaryDirectory() as folder:
+            seen = measure(Path(folder), row)
+        codes = ", ".join(f"{each:04X}h" for each in seen.codes) or "-"
+        print(f"| {row.name} | {codes} | {ms(seen.stands_s)} | {ms(seen.unpowered_s)} |", flush=True)
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--steps", type=int, default=60)
     parser.add_argument("--outer-ms", default="4,10")
+    parser.add_argument("--faults", action="store_true")
     given = parser.parse_args()
+    if given.faults:
+        print_faults()
+        return 0
     reference = 0.0
     for outer_ms in (None, *map(float, given.outer_ms.split(","))):
         with (

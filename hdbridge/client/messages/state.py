@@ -96,6 +96,9 @@ class OuterState(Report):
     nmt: int = Field(description="NMT state of the node as in a heartbeat", examples=[5])
     statusword: int = Field(description="6041h as that master sees it", examples=[0x1237])
     period_s: float | None = Field(None, description="period of that master's SYNC", examples=[0.004])
+    jitter_s: float | None = Field(
+        None, description="mean deviation of that SYNC from its regular time", examples=[2e-5]
+    )
 
 
 class AxisState(Report):

@@ -119,6 +119,11 @@ _OUTER: Final[Sequence[tuple[str, str, Any]]] = (
         "Period of the other master's SYNC.",
         lambda a: a.outer and a.outer.period_s,
     ),
+    (
+        "outer_sync_jitter_seconds",
+        "Mean deviation of the other master's SYNC from its regular time.",
+        lambda a: a.outer and a.outer.jitter_s,
+    ),
 )
 _AXIS: Final[Sequence[tuple[str, str, Any]]] = (
     ("load_target_degrees", "Load target.", lambda a: a.load_target_deg),

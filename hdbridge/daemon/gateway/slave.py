@@ -180,6 +180,7 @@ class LoadAxis(PowerStage):
         cells[OuterCell.STATUSWORD] = node.firmware.statusword()
         cells[OuterCell.NMT] = int(node.nmt)
         cells[OuterCell.PERIOD_NS] = round(1e9 * node.period_s) if node.has_sync else 0
+        cells[OuterCell.JITTER_NS] = round(1e9 * node.jitter_s)
 
     # ---------------------------------------------------------------- the plant
 

@@ -203,6 +203,8 @@ class OuterCell(IntEnum):
     """Gateway: period of the outer SYNC; 0: none comes."""
     HELD = 8
     """Service: 1 while the outer master holds the lease."""
+    JITTER_NS = 9
+    """Gateway: mean deviation of the outer SYNC from its regular time."""
 
 
 class Axis(NamedTuple):

@@ -145,6 +145,7 @@ def outer_state(cells: OuterCells, node_id: int, alive_ns: int) -> messages.Oute
         nmt=cells[OuterCell.NMT],
         statusword=cells[OuterCell.STATUSWORD],
         period_s=period_s or None,
+        jitter_s=1e-9 * cells[OuterCell.JITTER_NS] if period_s else None,
     )
 
 

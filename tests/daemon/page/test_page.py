@@ -10,6 +10,7 @@ from support.browser import browser
 from support.fake_bridge import FakeBridge
 from support.patience import until
 
+from hdbridge.client import messages
 from hdbridge.client.messages import Event, EventKind
 from hdbridge.daemon.page import page_file, page_files
 
@@ -198,6 +199,18 @@ def test_without_its_token_the_page_asks_for_it(place, bridge, chromium):
     chromium.evaluate(f"document.querySelector('#token').value = {json.dumps(TOKEN)}")
     chromium.evaluate("document.querySelector('#token-form').requestSubmit()")
     chromium.until("document.querySelector('#connection').className === 'live'")
+
+
+def test_it_shows_the_axis_as_the_other_master_sees_it(place, bridge, page):
+    outer = {"node_id": 5, "nmt": 5, "statusword": 0x1237}
+    axis = next(iter(bridge.axes.values()))
+    axis.outer = messages.OuterState(**outer, alive=True, period_s=0.004, jitter_s=2e-5)
+    page.until("document.querySelector('#model').innerText.includes('jitter 20 \u00b5s')")
+    assert "node 5, operational, 6041h = 1237h, SYNC every 4.000 ms" in page.text("#model")
+    axis.outer = messages.OuterState(**outer, alive=True)
+    page.until("document.querySelector('#model').innerText.includes('no SYNC')")
+    axis.outer = messages.OuterState(**outer, alive=False)
+    page.until("document.querySelector('#model').innerText.includes('the gateway process does not run')")
 
 
 @pytest.mark.parametrize("dark", [False, True])

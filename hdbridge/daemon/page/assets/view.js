@@ -130,10 +130,20 @@ export function axis(state, simulated) {
     ["load-side loop", loadLoop(state.load_loop)],
     ["adaptation", adaptation(state.adaptation)],
   );
+  if (state.outer) rows.push(["other master", otherMaster(state.outer)]);
   facts(at("model"), rows);
   const lines = PROCEDURES.map((name) => `hdbridge ${name} ${quoted(state.profile)} ${simulated ? "--simulate" : "--borrow"}`);
   const text = [...lines, `hdbridge ctl model ${state.name} pending`].join("\n");
   if (at("commands").textContent !== text) at("commands").textContent = text;
+}
+
+const NMT = { 4: "stopped", 5: "operational", 127: "pre-operational" };
+
+function otherMaster(outer) {
+  if (!outer.alive) return `node ${outer.node_id}: the gateway process does not run`;
+  const word = outer.statusword.toString(16).toUpperCase().padStart(4, "0");
+  const sync = outer.period_s === null ? "no SYNC" : `SYNC every ${number(1e3 * outer.period_s, 3)} ms, jitter ${number(1e6 * outer.jitter_s, 0)} \u00b5s`;
+  return `node ${outer.node_id}, ${NMT[outer.nmt] || "starting"}, 6041h = ${word}h, ${sync}`;
 }
 
 function compensation(state) {
