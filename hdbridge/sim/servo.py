@@ -1,7 +1,8 @@
 """Servo loops of the drive: demand filters, position and velocity cascade with feed-forward, torque filters.
 
 The blocks in their order: moving average and two lags of the demand, position P, velocity PI on the filtered
-speed (whose integral may sum the position error instead: PIV), feed-forwards, notch, torque filter, limit.
+speed (whose integral may sum the position error instead: PIV), feed-forwards, disturbance observer, notch,
+torque filter, limit.
 
 Like real drives of this class it closes its loops on an interpolated encoder: a settled motor stands at the
 middle of the commanded count, not anywhere within it.
@@ -115,7 +116,11 @@ class Servo:
     _load_model: Transition
     _load_speed: float
     _measured: float
+    _momentum: float
     _notch: Notch
+    _observed_nm: float
+    _observed_share: float
+    _observer_share: float
     _position_gain: float
     _reference: float
     _reference_speed: float
@@ -142,6 +147,11 @@ class Servo:
         self._torque_share = _share(servo.torque_filter_ms / 1000.0, dt)
         self._notch = Notch(servo.notch, dt)
         self._filtered_nm = 0.0
+        observer = servo.observer
+        rate = math.tau * observer.frequency_hz if observer else 0.0
+        self._observer_share = -math.expm1(-rate * dt)
+        self._observed_share = observer.share if observer else 0.0
+        self._momentum = rate * observer.inertia_kg_m2 * RAD_PER_DEG if observer else 0.0
         self._sums_position = servo.integral_of == "position"
         self._decay = math.exp(-self._filter * dt)
         self._position_gain = servo.position_gain_per_s
@@ -170,6 +180,7 @@ class Servo:
         self._load_ahead = 0.0
         self._load_speed = motor_deg_s
         self._integral = 0.0
+        self._observed_nm = self._momentum * motor_deg_s
         self._direction = 0.0
         self._average.start_at(self._measured)
         self._filtered_speed = motor_deg_s
@@ -178,8 +189,9 @@ class Servo:
         return self._measured
 
     def shift(self, torque_nm: float) -> None:
-        """Adds ``torque_nm`` to the integral."""
-        self._integral += torque_nm
+        """Adds ``torque_nm`` as a constant disturbance to integral and observer."""
+        self._integral += (1.0 - self._observed_share) * torque_nm
+        self._observed_nm += torque_nm
         if self._with_filters:
             self._filtered_nm += torque_nm
             self._notch.rest_at(self._filtered_nm)
@@ -222,7 +234,8 @@ class Servo:
         if not rests and new_speed * self._direction <= 0.0:
             integral = self._turn(1.0 if new_speed > 0.0 else -1.0)
         short = error * self._direction
-        if not rests or short > self._dead_band or short < -self._hunting_band:
+        awake = not rests or short > self._dead_band or short < -self._hunting_band
+        if awake:
             integral += self._integral_rate * (
                 self._position_gain * error if self._sums_position else speed_error
             )
@@ -233,12 +246,17 @@ class Servo:
             + self._viscous * new_speed
             + self._friction * self._direction
         )
+        momentum = self._momentum * measured_speed
+        torque += self._observed_share * (self._observed_nm - momentum)
         if self._load_known:
             torque += self._load_torque((self._reference - reference) / dt)
         if self._with_filters:
             self._filtered_nm += self._torque_share * (self._notch.notched_nm(torque) - self._filtered_nm)
             torque = self._filtered_nm
         limit = self.limit_nm
+        if awake:
+            given = min(max(torque, -limit), limit)
+            self._observed_nm += self._observer_share * (given + momentum - self._observed_nm)
         if torque > limit:
             # At the limit the integral may only decrease.
             self._integral = min(integral, self._integral)

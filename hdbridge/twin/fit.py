@@ -27,7 +27,7 @@ from hdbridge.axis.effects import FloatArray
 from hdbridge.sim.hysteresis_laws import law_of
 from hdbridge.sim.truth import Truth
 from hdbridge.sim.truth.hysteresis import Hysteresis, MaxwellSlip
-from hdbridge.sim.truth.motor import TrueNotch
+from hdbridge.sim.truth.motor import TrueNotch, TrueObserver
 from hdbridge.twin.misfit import (
     CHANNELS,
     FINE,
@@ -736,6 +736,9 @@ SERVOS: Final = (
     "servo dead time", "speed filter", "torque filter", "load encoder delay",
 )  # fmt: skip
 NOTCH: Final = ("notch frequency", "notch depth", "notch width")
+OBSERVER: Final = ("observer frequency", "observer share", "observer inertia")
+OBSERVERS_HZ: Final = (30.0, 100.0)
+"""Start values of the observer's frequency: one to three velocity loops, 20 to 150 Hz."""
 PLACES: Final = (0.7, 1.0, 1.4)
 """Start values of the notch frequency, relative to the resonance of motor and load."""
 
@@ -860,6 +863,13 @@ def more_blocks(best: Fitted) -> Iterator[Fitting]:
             notched = servo.model_copy(update={"notch": notch})
             parameters = (*best.parameters, *(BY_NAME[each] for each in NOTCH))
             yield begun_at(truth.model_copy(update={"servo": notched}), parameters)
+    if servo.observer is None:
+        whole = truth.motor.inertia_kg_m2 + truth.load_.whole_inertia_kg_m2 / truth.gear.ratio**2
+        for hz in OBSERVERS_HZ:
+            observer = TrueObserver(frequency_hz=hz, share=0.5, inertia_kg_m2=whole)
+            observed = servo.model_copy(update={"observer": observer})
+            parameters = (*best.parameters, *(BY_NAME[each] for each in OBSERVER))
+            yield begun_at(truth.model_copy(update={"servo": observed}), parameters)
     if BY_NAME["moving average"] not in best.parameters:
         lag_ms = min(max(2.0 * servo.command_filter_ms, 0.5), 3.0)
         averaged = servo.model_copy(update={"moving_average_ms": 2.0 * lag_ms, "command_filter_ms": SHORT_MS})

@@ -14,7 +14,7 @@ from typing import Any, Final
 from hdbridge.axis import AxisConfig
 from hdbridge.sim.truth import Truth
 from hdbridge.sim.truth.encoder import TrueCoupling
-from hdbridge.sim.truth.motor import TrueNotch
+from hdbridge.sim.truth.motor import TrueNotch, TrueObserver
 from hdbridge.sim.truth.resonance import Resonance
 
 # ----------------------------------------------------------------
@@ -153,6 +153,18 @@ PARAMETERS: Final[tuple[Parameter, ...]] = (
     Parameter(
         "notch width", ("servo", "notch", "width"), "", 0.05, 5.0, 0.7, SERVO,
         (TORQUE, FOLLOWING), _STEPS, 0.4,
+    ),
+    Parameter(
+        "observer frequency", ("servo", "observer", "frequency_hz"), "Hz", 1.0, 300.0, 0.7, SERVO,
+        (TORQUE, FOLLOWING), _REVERSALS, 0.3,
+    ),
+    Parameter(
+        "observer share", ("servo", "observer", "share"), "", 0.0, 1.0, 0.3, SERVO,
+        (TORQUE, FOLLOWING), _REVERSALS, 0.2, linear=True,
+    ),
+    Parameter(
+        "observer inertia", ("servo", "observer", "inertia_kg_m2"), "kg m2", 1e-9, 10.0, 0.7, SERVO,
+        (TORQUE, FOLLOWING), _STEPS, 0.3,
     ),
     Parameter(
         "velocity feed-forward", ("servo", "velocity_feedforward"), "", 0.0, 1.5, 0.1, FEEDFORWARD,
@@ -332,6 +344,7 @@ COUPLING_DAMPING: Final = Usual(
     0.1, "", "metal bellows couplings: 0.05 to 0.2 with the bearings of the encoder"
 )
 NOTCH_HZ: Final = Usual(100.0, "Hz", "a notch on the resonance of motor and load: 40 to 200 Hz")
+OBSERVER_HZ: Final = Usual(50.0, "Hz", "disturbance observers: one to three velocity loops, 20 to 150 Hz")
 SHORTEST_FILTER_MS: Final = Usual(0.02, "ms", "a filter that is as good as none: a tenth of a short substep")
 BRAKE_SHARE: Final = Usual(
     3.0, "of the rated torque", "holding brakes are built for more than the motor gives"
@@ -411,6 +424,11 @@ def with_sections(truth: Truth, parameters: Iterable[Parameter]) -> Truth:
     servo: dict[str, Any] = {}
     if truth.servo.notch is None and "notch" in wanted:
         servo["notch"] = TrueNotch(frequency_hz=NOTCH_HZ.value, depth=1.0, width=1.0)
+    if truth.servo.observer is None and "observer" in wanted:
+        inertia_kg_m2 = truth.motor.inertia_kg_m2
+        servo["observer"] = TrueObserver(
+            frequency_hz=OBSERVER_HZ.value, share=0.0, inertia_kg_m2=inertia_kg_m2
+        )
     for name in ("speed_filter_ms", "torque_filter_ms"):
         if name in wanted and not getattr(truth.servo, name):
             servo[name] = SHORTEST_FILTER_MS.value

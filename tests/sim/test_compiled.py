@@ -166,6 +166,7 @@ SOMETIMES = {
     "servo__torque_filter_ms": numbers(0.0, 2.0),
     "servo__integral_of": st.sampled_from(["speed", "position"]),
     "servo__notch": st.just({"frequency_hz": 80.0, "depth": 0.2, "width": 0.7}),
+    "servo__observer": st.just({"frequency_hz": 60.0, "share": 0.8, "inertia_kg_m2": 3e-5}),
     "servo__load_feedforward": st.none(),
     "servo__torque_limit_percent": numbers(20.0, 300.0),
     "temperature__copper_loss_w": numbers(0.0, 50.0),

@@ -364,12 +364,12 @@ def test_the_gear_has_the_hysteresis_law_of_the_truth_file(law: dict[str, Any] |
 
 
 def following_error_ms(**changes: Any) -> float:
-    """Following error at a constant speed over that speed, of an axis without friction."""
-    known = truth(
-        motor__coulomb_nm=0.0, motor__viscous_nm_s_per_rad=0.0, gear__motor_orders=(), gear__hysteresis=None,
-        load__coulomb_nm=0.0, load__viscous_nm_s_per_rad=0.0,
-        **changes,
-    )  # fmt: skip
+    """Following error at a constant speed over that speed, of an axis that has no friction by default."""
+    smooth: dict[str, Any] = {
+        "motor__coulomb_nm": 0.0, "motor__viscous_nm_s_per_rad": 0.0, "gear__motor_orders": (),
+        "gear__hysteresis": None, "load__coulomb_nm": 0.0, "load__viscous_nm_s_per_rad": 0.0,
+    }  # fmt: skip
+    known = truth(**(smooth | changes))
     machine, errors = Machine(known, 1), []
     for cycle in range(500):
         machine.follow(100.0 * cycle, 100.0 * (cycle + 1), round(CYCLE_S / machine.dt_s))
@@ -386,6 +386,24 @@ def test_filters_on_speed_and_torque_make_no_following_error_at_a_constant_speed
     notch = {"frequency_hz": 300.0, "depth": 0.3, "width": 0.5}
     filtered = following_error_ms(servo__speed_filter_ms=0.3, servo__torque_filter_ms=0.2, servo__notch=notch)
     assert filtered == pytest.approx(following_error_ms(), abs=0.02)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.5, 1.0])
+def test_a_disturbance_observer_supplies_its_share_of_the_friction(share: float) -> None:
+    """What it does not supply is left to the position error, if the integral is slow."""
+    slow = {"servo__integral_time_ms": 1e4}
+    rubs, slides = (
+        following_error_ms(
+            **slow,
+            motor__coulomb_nm=friction_nm,
+            servo__observer={"frequency_hz": 40.0, "share": share, "inertia_kg_m2": 3e-5},
+        )
+        for friction_nm in (0.03, 0.0)
+    )
+    without = following_error_ms(**slow, motor__coulomb_nm=0.03)
+    without -= following_error_ms(**slow, motor__coulomb_nm=0.0)
+    assert without > 0.1
+    assert rubs - slides == pytest.approx((1.0 - share) * without, abs=0.05 * without)
 
 
 def test_an_integral_of_the_position_error_needs_no_feed_forward_at_a_constant_speed() -> None:

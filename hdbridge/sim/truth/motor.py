@@ -51,6 +51,14 @@ class TrueNotch(Part):
     width: float = Field(gt=0, le=10, description="bandwidth over the frequency")
 
 
+class TrueObserver(Part):
+    """Disturbance observer: the lagged difference between the torque and what accelerates the inertia."""
+
+    frequency_hz: float = Field(gt=0, le=500, description="corner frequency of the estimate")
+    share: float = Field(ge=0, le=1, description="part of the estimate that is added to the torque")
+    inertia_kg_m2: float = Field(gt=0, le=100, description="inertia that the observer assumes, at the motor")
+
+
 class TrueResponse(Part):
     """Measured response in addition to the loops, by cycle: the latest one first."""
 
@@ -98,6 +106,7 @@ class TrueServo(Part):
     )
     torque_filter_ms: float = Field(0.0, ge=0, le=100, description="time constant of the lag on the torque")
     notch: TrueNotch | None = Field(None, description="notch on the torque; without it: none")
+    observer: TrueObserver | None = Field(None, description="disturbance observer; without it: none")
     velocity_feedforward: float = Field(1.0, ge=0, le=1.5, description="part of the demanded speed")
     inertia_feedforward_kg_m2: float = Field(
         0.0, ge=0, le=100, description="torque per demanded acceleration, for the motor itself"
