@@ -157,12 +157,9 @@ def main() -> None:
         for structure in options.structures:
             foreign = draw(seed, structure)
             axis = axis_of(foreign)
-            if (
-                min(
-                    (limit for limit, _ in getattr(foreign.mechanics.hysteresis, "elements", ())), default=0.0
-                )
-                < 0
-            ):
+            law = foreign.mechanics.hysteresis
+            limits = [law.offset_arcsec] if isinstance(law, BoucWen) else [limit for limit, _ in law.elements]
+            if min(limits, default=0.0) < 0.0:
                 print(f"{structure} {seed}: left out: its gear winds up backwards, which no truth file has")
                 continue
             try:

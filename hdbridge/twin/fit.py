@@ -739,6 +739,8 @@ NOTCH: Final = ("notch frequency", "notch depth", "notch width")
 OBSERVER: Final = ("observer frequency", "observer share", "observer inertia")
 OBSERVERS_HZ: Final = (30.0, 100.0)
 """Start values of the observer's frequency: one to three velocity loops, 20 to 150 Hz."""
+MOST_DEAD_CYCLES: Final = 2.0
+"""Maximum dead time in SYNC cycles: one to take over the demand, one to execute it (CiA 402)."""
 PLACES: Final = (0.7, 1.0, 1.4)
 """Start values of the notch frequency, relative to the resonance of motor and load."""
 
@@ -816,19 +818,31 @@ def starts(truth: Truth, cycle_ms: float) -> Iterator[Fitting]:
     """Yields the servos at which a fit starts.
 
     An acceleration feed-forward uses the filtered demand, or differences over whole SYNC cycles, which is a
-    moving average of one cycle.
+    moving average of one cycle. A lag beyond the longest possible dead time is the command filter's.
     """
-    lag_ms = truth.servo.dead_time_ms + 2.0 * truth.servo.command_filter_ms
+    longest_ms = min(MOST_DEAD_CYCLES * cycle_ms, DEAD_TIME.most)
+    known = {each: BY_NAME[each] for each in (*MECHANICS, *SERVOS)}
+    known[DEAD_TIME.name] = replace(DEAD_TIME, most=longest_ms)
+    filtered_ms = truth.servo.command_filter_ms
     averaged_ms = min(cycle_ms, BY_NAME["moving average"].most)
-    averaged = {
-        "moving_average_ms": averaged_ms,
-        "command_filter_ms": SHORT_MS,
-        "dead_time_ms": max(lag_ms - 0.5 * averaged_ms, 0.0),
-    }
+    late_ms = max(_lag_ms(truth) - 0.5 * averaged_ms, 0.0)
+
+    def split(dead_time_ms: float, filter_ms: float) -> dict[str, float]:
+        """Returns the dead time within its limit, and the filter with the rest of the lag."""
+        dead_ms = min(dead_time_ms, longest_ms)
+        return {
+            "dead_time_ms": dead_ms,
+            "command_filter_ms": filter_ms + 0.5 * (dead_time_ms - dead_ms),
+        }
+
+    plain = split(truth.servo.dead_time_ms, filtered_ms)
+    averaged = {"moving_average_ms": averaged_ms, **split(max(late_ms - 2.0 * SHORT_MS, 0.0), SHORT_MS)}
     whole = truth.motor.inertia_kg_m2 + truth.load_.whole_inertia_kg_m2 / truth.gear.ratio**2
     fastest = VELOCITY_BANDWIDTH_RAD_S.value * truth.motor.inertia_kg_m2
     for gain, rate in BANDWIDTHS:
-        for (forward, command), integral in product(((0.0, {}), (whole, {}), (whole, averaged)), INTEGRALS):
+        for (forward, command), integral in product(
+            ((0.0, plain), (whole, plain), (whole, averaged)), INTEGRALS
+        ):
             servo = truth.servo.model_copy(
                 update={
                     "position_gain_per_s": gain,
@@ -845,9 +859,10 @@ def starts(truth: Truth, cycle_ms: float) -> Iterator[Fitting]:
                     **command,
                 }
             )
-            more = (("inertia feed-forward",) if forward else ()) + (("moving average",) if command else ())
-            names = (*MECHANICS, *SERVOS, *more)
-            parameters = tuple(BY_NAME[each] for each in names)
+            more = (("inertia feed-forward",) if forward else ()) + (
+                ("moving average",) if command is averaged else ()
+            )
+            parameters = (*known.values(), *(BY_NAME[each] for each in more))
             yield begun_at(with_sections(truth.model_copy(update={"servo": servo}), parameters), parameters)
 
 

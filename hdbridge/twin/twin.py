@@ -38,7 +38,7 @@ from hdbridge.twin.compare import (
     Comparison,
     compare,
 )
-from hdbridge.twin.fit import FIT_S, Fitted, by_law_of, fit, fitted_rows, legs_of_rows
+from hdbridge.twin.fit import FIT_S, MOST_DEAD_CYCLES, Fitted, by_law_of, fit, fitted_rows, legs_of_rows
 from hdbridge.twin.misfit import (
     CHANNELS,
     NOISE_LEVEL,
@@ -120,8 +120,6 @@ WORSE: Final = 1.1
 DECADE: Final = 10.0
 """Maximum ratio of a motor's inertia to the usual one for its rated torque, and of load and motor inertia
 seen by the motor. Servo motors of equal torque differ by a factor of three to five (catalogues)."""
-MOST_DEAD_CYCLES: Final = 2.0
-"""Maximum dead time in SYNC cycles: one to take over the demand, one to execute it (CiA 402)."""
 
 
 def impossible(truth: Truth, axis: AxisConfig, cycle_s: float) -> tuple[str, ...]:

@@ -19,7 +19,7 @@ from hdbridge.motion.procedures.plan import Plan
 from hdbridge.records.recording import Recording
 from hdbridge.sim.truth import Truth
 from hdbridge.twin.compare import compare
-from hdbridge.twin.fit import Fitted, in_best_structure, start_of
+from hdbridge.twin.fit import MOST_DEAD_CYCLES, Fitted, in_best_structure, start_of, starts
 from hdbridge.twin.misfit import (
     CHANNELS,
     Data,
@@ -33,7 +33,7 @@ from hdbridge.twin.misfit import (
     values_of,
     what_is_left,
 )
-from hdbridge.twin.parameters import BY_NAME, at_coordinates, coordinates, default_truth
+from hdbridge.twin.parameters import BY_NAME, at_coordinates, coordinates, default_truth, with_values
 from hdbridge.twin.replay import replay
 
 MOTION = """
@@ -147,6 +147,22 @@ def shares(recorded: Recorded, truth: Truth) -> dict[str, float]:
     told = compare(recorded.other.record, again, recorded.other.segments, recorded.axis.gear.ratio)
     rows = {name: told.row(name) for name in ("following_error", "motor_torque")}
     return {name: row.share for name, row in rows.items() if row is not None}
+
+
+@pytest.mark.parametrize("cycle_ms", [1.0, 4.0])
+@pytest.mark.parametrize("dead_time_ms", [0.5, 15.0])
+def test_a_start_has_the_lag_that_was_read_off_and_a_dead_time_that_is_possible(
+    cycle_ms: float, dead_time_ms: float
+) -> None:
+    usual = default_truth(AxisConfig.load(Path(__file__).parents[2] / "profiles" / "demo"))
+    late = with_values(usual, {"servo dead time": dead_time_ms, "command filter": 2.0})
+    for start in starts(late, cycle_ms):
+        servo = start.truth.servo
+        assert servo.dead_time_ms <= MOST_DEAD_CYCLES * cycle_ms
+        lag_ms = servo.dead_time_ms + 2.0 * servo.command_filter_ms + 0.5 * servo.moving_average_ms
+        assert lag_ms == pytest.approx(dead_time_ms + 4.0, abs=1e-6)
+        (dead,) = (each for each in start.parameters if each.name == "servo dead time")
+        assert dead.most <= MOST_DEAD_CYCLES * cycle_ms
 
 
 @pytest.mark.slow
