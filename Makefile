@@ -7,7 +7,7 @@ PROCESSORS := $(shell nproc 2>/dev/null || echo 2)
 # The tests begin hundreds of processes: without bytecode on disk, each compiles the package anew.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: help demo test unit check format unit-as-it-goes compiled test-socketcan test-slow coverage blind bench-realtime docs dist clean
+.PHONY: help demo test unit check format unit-as-it-goes compiled test-socketcan test-slow coverage mutants blind bench-realtime docs dist clean
 
 help:            ## this list
 	@grep -E '^[a-z-]+: .*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/' | expand -t 18
@@ -102,6 +102,10 @@ $(VENV)/.release: $(READY)
 coverage: $(VENV)/.release compiled  ## lines and branches that the tests on the virtual bus reach, into build/coverage
 	$(UNIT) -m "not slow" -p pytest_cov --cov hdbridge --cov-branch --cov-report term:skip-covered \
 		--cov-report html:build/coverage
+
+MUTANTS ?= --sample 100 --minutes 15
+mutants: $(VENV)/.release compiled  ## the share of small changes to the pure modules that the tests notice (MUTANTS="--seed 2 --only motion")
+	nice $(BIN)/python tools/mutants.py $(MUTANTS)
 
 # The wheel is tried in an environment that has nothing else; what is installed there is its bill of materials.
 dist: $(VENV)/.release  ## wheel, sdist and bill of materials (CycloneDX) into dist, the wheel tried in an empty environment

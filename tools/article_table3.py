@@ -166,7 +166,7 @@ def _about_table_3(computed: Mapping[str, Parts]) -> dict[str, Any]:
 
 
 def _about_the_test(model: TransmissionModel, law: Hysteresis) -> dict[str, Any]:
-    """Returns what the stepping test samples and what it misses."""
+    """Returns the angles that the stepping test samples and misses."""
     turn = np.linspace(0.0, 360.0, 100_001)
     stops = np.concatenate([np.arange(COUNT + 1), np.arange(COUNT - 1, -1, -1)]) * STEP_DEG
     reached = law.predict(Motion(stops), Start.FORWARD)[1:]

@@ -11,30 +11,22 @@ best possible with the axis's counts and noise, and the speed relative to real t
 
 from __future__ import annotations
 
-import argparse
-import os
 import sys
 import tempfile
 import time
-from datetime import UTC, datetime
 from multiprocessing import Pool
 from pathlib import Path
 from typing import Any, NamedTuple
 
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # the matrices are small, so threads only cost time
-
 import numpy as np
 import yaml
+from random_axes import DEMO, calibrated, parser, seeds
 
 from hdbridge.axis import AxisConfig
-from hdbridge.commissioning.calibration import Calibration, calibrate, start_journal
-from hdbridge.drive.drive import Drive
-from hdbridge.motion.procedures.plan import Plan
-from hdbridge.sim.lockstep import simulated_bench
+from hdbridge.commissioning.calibration import Calibration
+from hdbridge.sim.truth import Truth
 
-DEMO = Path(__file__).parents[1] / "profiles" / "demo"
 ARCSEC_PER_RAD = 180.0 * 3600.0 / np.pi
-DATE = datetime(2026, 1, 1, tzinfo=UTC)
 
 
 class Outcome(NamedTuple):
@@ -126,22 +118,10 @@ def one(job: tuple[int, str, Path | None, float]) -> Outcome:
     with tempfile.TemporaryDirectory() as name:
         folder = kept / f"axis-{seed}" if kept else Path(name)
         folder.mkdir(parents=True, exist_ok=True)
-        for file, data in (("axis.yaml", axis_data), ("truth.yaml", truth)):
-            (folder / file).write_text(yaml.safe_dump(data))
-        axis = AxisConfig.load(folder)
+        (folder / "truth.yaml").write_text(yaml.safe_dump(truth))
+        axis = AxisConfig.from_text(yaml.safe_dump(axis_data), DEMO / "axis.yaml")
         wall, cpu = time.perf_counter(), time.process_time()
-        with (
-            simulated_bench(folder / "truth.yaml", axis.eds_path, axis.drive.node_id, seed) as (
-                bus,
-                clock,
-                _,
-            ),
-            Drive(bus, axis, clock) as drive,
-        ):
-            drive.boot()
-            journal = start_journal(folder / "recording", axis, Plan.load(plan), DATE, drive.identity)
-            result = calibrate(drive, journal, folder, DATE)
-            axis_s = clock.now()
+        result, axis_s = calibrated(axis, Truth.load(folder / "truth.yaml"), plan, seed, folder)
         wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
     return judge(seed, axis, truth, result, axis_s, wall, cpu)
 
@@ -215,29 +195,24 @@ HEAD = (
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--axes", type=int, default=20)
-    parser.add_argument("--first", type=int, default=1, help="seed of the first axis")
-    parser.add_argument("--plan", default="quick")
-    parser.add_argument("--workers", type=int, default=1)
-    parser.add_argument(
+    options = parser(__doc__, axes=20, workers=1)
+    options.add_argument("--plan", default="quick")
+    options.add_argument(
         "--presliding",
         type=float,
         default=0.0,
         help="arcsec of friction at the load that yields before it slips",
     )
-    parser.add_argument("--keep", type=Path, help="folder for the axes' files and recordings")
-    options = parser.parse_args()
-    further = options.plan, options.keep, options.presliding
-    jobs = [(seed, *further) for seed in range(options.first, options.first + options.axes)]
+    options.add_argument("--keep", type=Path, help="folder for the axes' files and recordings")
+    given = options.parse_args()
+    further = given.plan, given.keep, given.presliding
+    jobs = [(seed, *further) for seed in seeds(given)]
     print(HEAD)
     print(
         "worst: largest amplitude error over its tolerance (0.15 arcsec or 2 %); !: outside its 95 % interval"
     )
     found = []
-    with Pool(options.workers) as pool:
+    with Pool(given.workers) as pool:
         for each in pool.imap(one, jobs):
             found.append(each)
             print(row(each), flush=True)

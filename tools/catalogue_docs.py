@@ -5,36 +5,34 @@ python tools/catalogue_docs.py
 
 from __future__ import annotations
 
+import re
 import sys
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any, get_args, get_origin
 
+import generated
 from pydantic import BaseModel
 
 from hdbridge.axis.effects import CATALOGUE, Effect, aliases_of
 
-PAGE = Path(__file__).resolve().parents[1] / "docs" / "causes.md"
+PAGE = generated.DOCS / "causes.md"
 
 _INTRODUCTION = """# Causes of transmission error
 
 <!-- Written by tools/catalogue_docs.py from hdbridge/axis/effects; do not edit. -->
 
-The catalogue: how each cause shows in a record, and what to do about it. The names are those of findings and
-of the model file's `effects`. The error is how far the load is ahead of motor angle / N, in arcsec at the
-load.
+The names are those of findings and of the model file's `effects`. The error is how far the load is ahead of
+motor angle / N, in arcsec at the load. Permitted ranges are in the file of each effect.
 
-- **Separate it**: the measurement that distinguishes a cause from its look-alikes.
+- **Separate it**: the measurement that distinguishes a cause from its look-alikes (**taken for**).
 - **Compensated**: yes, unless stated otherwise. An error of the measurement is not, because that would move
   the load away from its target; neither is what cannot be predicted.
-- **Needs**: columns of the record in addition to `motor_position_deg`. Speed, acceleration and direction are
-  derived from the commanded motor angle by backward differences; the direction is held at rest. `load_deg`
-  is the predicted load angle.
-- Parameters: the name ends in the unit. In brackets: the permitted range; *sought* is the range of the
-  search for a parameter that enters non-linearly; = is the default. `orders` are a list of `{order,
-  amplitude_arcsec, phase_deg}`. A `loop` (or `base`) is a copy of the model's loop: `{offset_arcsec,
-  width_deg, exponent, memory}`. `ratio` is N of the model. Beyond a `limit_*` of its input an effect is
-  held, so that a faulty sensor cannot move the axis far.
+- **Needs**: columns in addition to `motor_position_deg`. Speed, acceleration and direction are derived from
+  the commanded motor angle; the direction is held at rest. `load_deg` is the predicted load angle.
+- **Parameters**: names end in the unit; = is the default. `orders` are a list of `{order, amplitude_arcsec,
+  phase_deg}`. A `loop` (or `base`) is a copy of the model's loop: `{offset_arcsec, width_deg, exponent,
+  memory}`. `ratio` is N of the model. Beyond a `limit_*` of its input an effect is held, so that a faulty
+  sensor cannot move the axis far.
 """
 
 
@@ -98,7 +96,7 @@ def _once(kind: type[Effect]) -> Iterator[str]:
     same: dict[str, list[str]] = {}
     for each in _parameters(kind, kind):
         if ":" in each and each in first:
-            same.setdefault(first[each], []).append(each.split(" (")[0])
+            same.setdefault(first[each], []).append(re.split(r" \(|:", each)[0])
         else:
             yield each
     for name, names in same.items():
@@ -106,7 +104,6 @@ def _once(kind: type[Effect]) -> Iterator[str]:
 
 
 def _parameters(kind: type[Effect], model: type[BaseModel], within: str = "") -> Iterator[str]:
-    shapes = {} if within else {each.name: each for each in kind.shape}
     for name, field in model.model_fields.items():
         inner = _model(field.annotation)
         if name in {"orders", "loop", "base", "ratio"} and not within:
@@ -115,15 +112,15 @@ def _parameters(kind: type[Effect], model: type[BaseModel], within: str = "") ->
             yield f"`{name}`: {field.description or ''}"
             yield from _parameters(kind, inner, f"{name}.")
         else:
-            bounds = [_range(field.annotation, field.metadata)]
-            if name in shapes:
-                bounds.append(f"*sought* {shapes[name].lower:g} to {shapes[name].upper:g}")
+            values = (
+                [f"`{each}`" for each in get_args(field.annotation)] if get_origin(field.annotation) else []
+            )
             if not field.is_required():
                 default = field.default
-                bounds.append(f"= {f'{default:g}' if isinstance(default, float) else str(default).lower()}")
-            limits = ", ".join(each for each in bounds if each)
+                values.append(f"= {f'{default:g}' if isinstance(default, float) else str(default).lower()}")
+            shown = f" ({', '.join(values)})" if values else ""
             about = "" if name.startswith("limit_") else f": {field.description or ''}"
-            yield f"`{within}{name}` ({limits}){about}"
+            yield f"`{within}{name}`{shown}{about}"
 
 
 def _model(annotation: Any) -> type[BaseModel] | None:
@@ -133,40 +130,9 @@ def _model(annotation: Any) -> type[BaseModel] | None:
     return None
 
 
-def _range(annotation: Any, metadata: list[Any]) -> str:
-    if get_origin(annotation) is not None:
-        return ", ".join(f"`{each}`" for each in get_args(annotation))
-    if annotation is bool:
-        return "true, false"
-    limits = {
-        limit: getattr(each, limit)
-        for each in metadata
-        for limit in ("gt", "ge", "le")
-        if hasattr(each, limit)
-    }
-    low = f"above {limits['gt']:g}" if "gt" in limits else ""
-    low = f"{limits['ge']:g}" if "ge" in limits else low
-    high = f"to {limits['le']:g}" if "le" in limits else ""
-    return f"{low} {high}".strip()
-
-
 def _cell(text: str) -> str:
     return text.replace("|", "\\|")
 
 
-def main(arguments: list[str]) -> int:
-    """Writes the page, or with `--check` reports if it is up to date."""
-    text = page()
-    if "--check" in arguments:
-        same = PAGE.exists() and PAGE.read_text(encoding="utf-8") == text
-        if not same:
-            print(
-                f"{PAGE} is not what the catalogue says: run python tools/catalogue_docs.py", file=sys.stderr
-            )
-        return 0 if same else 1
-    PAGE.write_text(text, encoding="utf-8")
-    return 0
-
-
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    sys.exit(generated.main({PAGE: page()}))

@@ -17,47 +17,59 @@ from pathlib import Path
 from types import NoneType, UnionType
 from typing import Any
 
+import generated
 from typer.models import ArgumentInfo, OptionInfo
 
 from hdbridge.cli import PANELS, load
 
-PAGE = Path(__file__).resolve().parents[1] / "docs" / "commands.md"
+PAGE = generated.DOCS / "commands.md"
 
 _INTRODUCTION = """# Commands
 
-Made from the command line by `python tools/command_reference.py`; `hdbridge COMMAND --help` says the same.
-Formats of what is read and written: [files](files.md).
+Made from the command line by `python tools/command_reference.py`; `hdbridge COMMAND --help` adds the ranges.
+Formats: [files](files.md).
 
-Tables and results go to standard output, progress and remarks to standard error. Every output is checked
-before anything is read or moves: a result replaces only a result of its kind, never an input or a file of a
-profile or a recording; a folder for measurements is new or empty. A proposed model is `PROFILE/pending.yaml`
-until `hdbridge model commit`. `-` is standard output; text for people then goes to standard error.
+Results go to standard output, progress and remarks to standard error. Outputs are checked before anything is
+read or moves: a result replaces only a result of its kind, never an input or a file of a profile or a
+recording; a folder for measurements is new or empty. A proposed model is `PROFILE/pending.yaml` until
+`hdbridge model commit`.
 
 Options before the command: `-v` logs the bus traffic to standard error (`-vv`: every SDO transfer), `--log
-FILE` appends the log as JSON lines (`date`, `level`, `where`, `event` and its facts; none during the control
-cycle), `--install-completion` sets up your shell, `--version`.
+FILE` appends the log as JSON lines (`date`, `level`, `where`, `event`, facts; none during the control cycle),
+`--install-completion`, `--version`.
 
-**Ctrl-C** (SIGTERM, SIGQUIT, SIGHUP) ends the control cycle at its next period and stops the axis; what was
-measured is kept. The third one ends the program at once.
+**Ctrl-C** (SIGTERM, SIGQUIT, SIGHUP) stops the axis from the next period on; what was measured is kept, and
+`--resume` continues. The third one ends the program at once.
 
 | exit status | |
 |---|---|
 | 0 | done |
 | 1 | an error in hdbridge itself |
-| 2 | bad input: a file, option or value; nothing was written, nothing moved |
+| 2 | bad input; nothing was written, nothing moved |
 | 3 | the bus: cannot be opened, or went away |
 | 4 | the drive: absent, refuses, not the one expected, reports a fault |
 | 5 | the supervision stopped the axis while it moved |
-| 6 | a result could not be written (full disk, for example); what was measured is printed |
-| 7 | the daemon: not reached, or does not do this for this client now; nothing moved for it |
+| 6 | a result could not be written, for example to a full disk; it is printed |
+| 7 | the daemon: not reached, or refused; nothing moved |
 | 130 | Ctrl-C: the axis was stopped, the record kept |
 
 ## Arguments and options of several commands
 
 """
 
-_COMMON = 3
+_COMMON = 2
 """Number of commands from which an option is described once, for all of them."""
+
+_MANY = 4
+"""Number of commands from which the commands with an option are not listed."""
+
+_SETS = {
+    "daemon options": ("--at", "--force", "--json"),
+    "bus options": ("--interface", "--channel", "--force", "--borrow"),
+    "simulation options": ("--simulate", "--truth", "--seed"),
+    "CSV options": ("--columns", "--units", "--unwrap"),
+}
+"""Options that stand together in many commands, by the name of the set."""
 
 _VALUES = {int: "INTEGER", float: "NUMBER", str: "TEXT", Path: "FILE"}
 
@@ -119,7 +131,8 @@ def page() -> str:
             users.setdefault(each, []).append(command.name)
     common = {each: names for each, names in users.items() if len(names) >= _COMMON}
     shared = sorted(common.items(), key=lambda item: (item[0].is_option, item[0].names[0].lstrip("-")))
-    parts = [_INTRODUCTION + "\n".join(_common_item(*each) for each in shared) + "\n"]
+    sets = "; ".join(f"*{name}*: `{'`, `'.join(members)}`" for name, members in _SETS.items())
+    parts = [_INTRODUCTION + "\n".join(_common_item(*each) for each in shared) + f"\n\nSets: {sets}.\n"]
     for panel, names in PANELS.items():
         parts.append(f"## {panel}\n")
         for name in names:
@@ -130,15 +143,22 @@ def page() -> str:
 def _section(command: Command, common: Container[Parameter]) -> str:
     lines = [f"### `{command.usage}`", "", command.text, ""]
     own = [_item(each) for each in command.parameters if each not in common]
-    shared = [f"`{each.names[0]}`" for each in command.parameters if each in common and each.is_option]
-    if shared:
-        own.append(f"- {'also ' if own else ''}{', '.join(shared)}")
+    shared = [each.names[0] for each in command.parameters if each in common and each.is_option]
+    also = [name for name, members in _SETS.items() if set(members) <= set(shared)]
+    in_sets = {each for name in also for each in _SETS[name]}
+    also = [*(f"`{each}`" for each in shared if each not in in_sets), *also]
+    if also:
+        own.append(f"- {'also ' if own else ''}{', '.join(also)}")
     return "\n".join([*lines, *own]) + ("\n" if own else "")
 
 
 def _common_item(parameter: Parameter, names: list[str]) -> str:
     groups = {name.split()[0] for name in names}
-    return _item(parameter, f" of `hdbridge {groups.pop()}`" if len(groups) == 1 else "")
+    if len(groups) == 1:
+        owner = f" of `{groups.pop()}`"
+    else:
+        owner = f" of `{'`, `'.join(names)}`" if len(names) < _MANY else ""
+    return _item(parameter, owner)
 
 
 def _item(parameter: Parameter, owner: str = "") -> str:
@@ -182,7 +202,7 @@ def _parameter(name: str, hint: Any, default: Any) -> Parameter:
     shown = "" if kind is bool else shown
     if kind is bool and default is True:
         shown = f"`{names[0]}`"
-    return Parameter(names, value, (info.help or "") + _range(info), shown, True, required, many)
+    return Parameter(names, value, info.help or "", shown, True, required, many)
 
 
 def _plain(kind: Any) -> tuple[Any, bool]:
@@ -198,19 +218,6 @@ def _value(kind: Any) -> str:
     if isinstance(kind, type) and issubclass(kind, Enum):
         return "|".join(str(each.value) for each in kind)
     return _VALUES[kind]
-
-
-def _range(info: OptionInfo) -> str:
-    low, high = info.min, info.max
-    if low is None and high is None:
-        return ""
-    if high is None:
-        return (
-            f" At least {low:,.10g}."
-            if low is not None and low > 1e-6
-            else f" {'Above' if low else 'From'} 0."
-        )
-    return f" {low:,.10g} to {high:,.10g}."
 
 
 def _text(default: Any) -> str:
@@ -252,16 +259,5 @@ def refused(line: str) -> str | None:
     return None
 
 
-def main(arguments: list[str]) -> int:
-    """Rewrites the page, or compares it with ``--check``."""
-    new = page()
-    if "--check" in arguments:
-        same = PAGE.exists() and PAGE.read_text(encoding="utf-8") == new
-        print("up to date" if same else f"{PAGE} lags behind: run python tools/command_reference.py")
-        return int(not same)
-    PAGE.write_text(new, encoding="utf-8")
-    return 0
-
-
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    sys.exit(generated.main({PAGE: page()}))

@@ -1,5 +1,6 @@
 """Writes the tables of docs/files.md and of plans (docs/calibration.md) from the models that read the files,
-that of faults (docs/reliability.md) from the fault table, and that of docs/twin.md from the translation.
+those of faults (docs/reliability.md, docs/ci.md) from the fault tables, and that of docs/twin.md from the
+translation.
 
 python tools/file_reference.py           rewrite the tables
 python tools/file_reference.py --check   report if they are up to date (exit status 1 if not)
@@ -12,9 +13,9 @@ import sys
 from collections.abc import Iterator, Mapping
 from enum import Enum
 from functools import cache
-from pathlib import Path
 from typing import Any, get_args
 
+import generated
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
@@ -40,16 +41,11 @@ from hdbridge.motion.procedures.plan import (
 )
 from hdbridge.records.record import OPTIONAL, REQUIRED
 from hdbridge.records.recording import RecordingFile
+from hdbridge.testing.faulttable import sentences
 from hdbridge.twin.translate import TABLE as TRANSLATED
 
-DOCS = Path(__file__).resolve().parent.parent / "docs"
-PAGES = (
-    DOCS / "files.md",
-    DOCS / "calibration.md",
-    DOCS / "reliability.md",
-    DOCS / "fleet.md",
-    DOCS / "twin.md",
-    DOCS / "ci.md",
+PAGES = tuple(
+    generated.DOCS / f"{name}.md" for name in ("files", "calibration", "reliability", "fleet", "twin", "ci")
 )
 _BLOCK = re.compile(r"(<!-- generated: (?P<name>[a-z-]+) -->\n).*?(<!-- end -->)", re.DOTALL)
 
@@ -69,33 +65,34 @@ ENTRIES: tuple[type[BaseModel], ...] = (
 )
 
 
-def key_table(model: type[BaseModel]) -> str:
-    """Returns every key of a file with its expected value and its meaning."""
-    lines = ["| key: value | meaning |", "|---|---|"]
-    lines += (
-        f"| {key}{what and ': '}{what} | {about} |"
-        for key, what, about in _rows(model)
+def key_list(model: type[BaseModel]) -> str:
+    """Returns every key of a file with its expected value and its meaning, nested as in the file."""
+    return "".join(
+        f"{'    ' * depth}{_item(key, what, about)}"
+        for depth, key, what, about in _rows(model)
         if key != "**`schema`**"
     )
-    return "\n".join(lines) + "\n"
 
 
-def column_table() -> str:
-    """Returns the columns of a record."""
-    lines = ["| column | required | meaning |", "|---|---|---|"]
-    for columns, needed in ((REQUIRED, "yes"), (OPTIONAL, "no")):
-        lines += (f"| `{name}` | {needed} | {about} |" for name, about in columns.items())
-    return "\n".join(lines) + "\n"
+def column_list() -> str:
+    """Returns the columns of a record; required ones are bold."""
+    required = (_item(f"**`{name}`**", "", about) for name, about in REQUIRED.items())
+    optional = (_item(f"`{name}`", "", about) for name, about in OPTIONAL.items())
+    return "".join([*required, *optional])
 
 
-def procedure_table() -> str:
+def procedure_list() -> str:
     """Returns the procedures of a plan, with the keys of each."""
-    lines = ["| procedure | key | value | meaning |", "|---|---|---|---|"]
+    lines = []
     for entry in ENTRIES:
         _, *keys = _rows(entry)
-        procedure = entry.model_fields["procedure"].annotation
-        lines += (f"| `{get_args(procedure)[0]}` | {key} | {what} | {about} |" for key, what, about in keys)
-    return "\n".join(lines) + "\n"
+        lines.append(f"- `{get_args(entry.model_fields['procedure'].annotation)[0]}`\n")
+        lines += (f"    {_item(key, what, about)}" for _, key, what, about in keys)
+    return "".join(lines)
+
+
+def _item(name: str, value: str, about: str) -> str:
+    return f"- {name}{value and f' ({value})'}: {about}\n"
 
 
 SEEN_BY: Mapping[Fault, str] = {
@@ -127,11 +124,11 @@ SEEN_BY: Mapping[Fault, str] = {
 
 def fault_table() -> str:
     """Returns the reactions to each fault, and the advice."""
-    lines = ["| fault | at once | in the next cycle | seen by | what to do |", "|---|---|---|---|---|"]
+    lines = ["| fault | reaction; in the next cycle | seen by | what to do |", "|---|---|---|---|"]
     for row in TABLE:
-        later = REACTION_WORDS[row.then] if row.then is not row.first else ""
-        first = REACTION_WORDS[row.first]
-        lines.append(f"| {row.fault.value} | {first} | {later} | {SEEN_BY[row.fault]} | {row.hint} |")
+        later = f"; {REACTION_WORDS[row.then]}" if row.then is not row.first else ""
+        reaction = REACTION_WORDS[row.first] + later
+        lines.append(f"| {row.fault.value} | {reaction} | {SEEN_BY[row.fault]} | {row.hint} |")
     return "\n".join(lines) + "\n"
 
 
@@ -144,38 +141,43 @@ def translation_table() -> str:
     return "\n".join(lines) + "\n"
 
 
-def fleet_table(name: str) -> str:
-    """The columns of a data set of a fleet."""
-    lines = ["| column | type | meaning |", "|---|---|---|"]
+def fleet_list(name: str) -> str:
+    """Returns the columns of a data set of a fleet."""
+    lines = []
     for column, (kind, about) in FLEET_COLUMNS[name].items():
         parts = NESTED.get(kind)
-        words = f"list of ({', '.join(parts)})" if parts else kind.replace("texts", "list of text")
-        lines.append(f"| `{column}` | {words} | {about} |")
-    return "\n".join(lines) + "\n"
+        words = f"list of {{{', '.join(parts)}}}" if parts else kind.replace("texts", "list of text")
+        lines.append(_item(f"`{column}`", words, about))
+    return "".join(lines)
 
 
-def manifest_table() -> str:
-    """The columns of a manifest."""
-    lines = ["| column | meaning |", "|---|---|"]
-    lines += (f"| `{name}` | {about} |" for name, about in MANIFEST.items())
-    return "\n".join(lines) + "\n"
+def manifest_list() -> str:
+    """Returns the columns of a manifest."""
+    return "".join(_item(f"`{name}`", "", about) for name, about in MANIFEST.items())
+
+
+def fault_names() -> str:
+    """Returns the list of the faults that a simulated drive can be given."""
+    rows = [f"- `{name}({arguments})`: {what}" for name, arguments, what in sentences()]
+    return "\n" + "\n".join(rows) + "\n\n"
 
 
 BLOCKS: Mapping[str, Any] = {
-    "axis": lambda: key_table(AxisConfig),
-    "machine": lambda: key_table(MachineFile),
-    "model": lambda: key_table(ModelFile),
-    "columns": column_table,
-    "recording": lambda: key_table(RecordingFile),
-    "firmware": lambda: key_table(Behaviour),
-    "history": lambda: key_table(LogFile),
+    "axis": lambda: key_list(AxisConfig),
+    "machine": lambda: key_list(MachineFile),
+    "model": lambda: key_list(ModelFile),
+    "columns": column_list,
+    "recording": lambda: key_list(RecordingFile),
+    "firmware": lambda: key_list(Behaviour),
+    "history": lambda: key_list(LogFile),
     "faults": fault_table,
-    "plan": lambda: key_table(Plan),
-    "procedures": procedure_table,
+    "plan": lambda: key_list(Plan),
+    "procedures": procedure_list,
     "translation": translation_table,
-    "fleet-recordings": lambda: fleet_table("recordings"),
-    "fleet-findings": lambda: fleet_table("findings"),
-    "manifest": manifest_table,
+    "fleet-recordings": lambda: fleet_list("recordings"),
+    "fleet-findings": lambda: fleet_list("findings"),
+    "manifest": manifest_list,
+    "fault-names": fault_names,
 }
 
 
@@ -192,6 +194,7 @@ _SHORTER = (
     (r"\b(of at least|at least)\b", "from"),
     (r", at most\b", " to"),
     (r"\bat most\b", "to"),
+    (r"\b(text|list), not empty", r"\1"),
     (r"integer 0 to 4294967295", "32-bit integer"),
     (r" or '", ", '"),
     (r"'([^']*)'", r"`\1`"),
@@ -201,8 +204,8 @@ _SHORTER = (
 
 def _rows(
     model: type[BaseModel], prefix: str = "", shown: dict[type[BaseModel], str] | None = None
-) -> Iterator[tuple[str, str, str]]:
-    """Yields key (bold if required), expected value (default) and meaning.
+) -> Iterator[tuple[int, str, str, str]]:
+    """Yields depth, key (bold if required), expected value with default, and meaning.
 
     A mapping that was ``shown`` before is a reference to it.
     """
@@ -216,12 +219,9 @@ def _rows(
         for pattern, shorter in _SHORTER:
             what = re.sub(pattern, shorter, what)
         same = f"as {shown[inner]}" if inner in shown else ""
-        value = " ".join(each for each in (what, same, _default(key, info)) if each)
-        yield (
-            f"**`{prefix}{key}`**" if info.is_required() else f"`{prefix}{key}`",
-            value.replace("|", "\\|"),
-            place.description.replace("|", "\\|"),
-        )
+        value = ", ".join(each for each in (what, same, _default(key, info)) if each)
+        shown_key = f"**`{key}`**" if info.is_required() else f"`{key}`"
+        yield prefix.count("."), shown_key, value, place.description
         if inner is not None and inner not in shown:
             shown[inner] = f"`{prefix}{key}`"
             yield from _rows(inner, f"{prefix}{key}{'[]' if many else ''}.", shown)
@@ -255,30 +255,13 @@ def _default(key: str, info: FieldInfo) -> str:
     if isinstance(value, Enum):
         value = value.value
     if key == "index":
-        return f"(`{value:#x}`)"
+        return f"= `{value:#x}`"
     if isinstance(value, bool):
-        return f"(`{value}`)".lower()
+        return f"= `{value}`".lower()
     if isinstance(value, tuple):
-        return f"(`{[*value]}`)".replace(".0", "")
-    return f"(`{value:g}`)" if isinstance(value, float) else f"(`{value}`)"
-
-
-def main(arguments: list[str]) -> int:
-    """Rewrites the tables, or compares them with ``--check``."""
-    behind = []
-    for path in PAGES:
-        page = path.read_text(encoding="utf-8")
-        new = updated(page)
-        if new != page:
-            behind.append(path.name)
-        if "--check" not in arguments:
-            path.write_text(new, encoding="utf-8")
-    if "--check" not in arguments:
-        return 0
-    words = f"{', '.join(behind)}: not up to date; run python tools/file_reference.py"
-    print(words if behind else "up to date")
-    return int(bool(behind))
+        return f"= `{[*value]}`".replace(".0", "")
+    return f"= `{value:g}`" if isinstance(value, float) else f"= `{value}`"
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    sys.exit(generated.main({path: updated(path.read_text(encoding="utf-8")) for path in PAGES}))

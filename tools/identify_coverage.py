@@ -10,18 +10,15 @@ exponent 0.04) and within tolerance or interval, and the false and missed orders
 
 from __future__ import annotations
 
-import argparse
 import json
-import sys
 import time
 from collections import defaultdict
 from multiprocessing import Pool
 from pathlib import Path
 
 import numpy as np
-
-sys.path.insert(0, str(Path(__file__).parent))
 from identify_records import draw, plan, record, recording
+from random_axes import parser, seeds
 
 from hdbridge.analysis.identification import FitOptions
 from hdbridge.analysis.identify import fit
@@ -74,18 +71,13 @@ def one(job: tuple[int, int, float]) -> dict[str, object]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--axes", type=int, default=100)
-    parser.add_argument("--first", type=int, default=1000, help="seed of the first axis")
-    parser.add_argument("--every", type=int, default=5, help="keep every so many samples of 250 Hz")
-    parser.add_argument("--speed", type=float, default=4.0, help="of the sweeps, load degrees per second")
-    parser.add_argument("--jobs", type=int, default=2)
-    parser.add_argument("--json", type=Path)
-    options = parser.parse_args()
-    jobs = [(options.first + index, options.every, options.speed) for index in range(options.axes)]
-    with Pool(options.jobs) as pool:
+    given = parser(__doc__, axes=100, first=1000, workers=2)
+    given.add_argument("--every", type=int, default=5, help="keep every so many samples of 250 Hz")
+    given.add_argument("--speed", type=float, default=4.0, help="of the sweeps, load degrees per second")
+    given.add_argument("--json", type=Path)
+    options = given.parse_args()
+    jobs = [(seed, options.every, options.speed) for seed in seeds(options)]
+    with Pool(options.workers) as pool:
         axes = list(pool.imap_unordered(one, jobs))
     gathered: dict[str, list[tuple[float, float, float, float]]] = defaultdict(list)
     for axis in axes:

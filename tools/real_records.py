@@ -136,7 +136,7 @@ def held_against(recording: Recording, truth: Truth) -> Comparison:
 
 
 def _twins(folder: Path) -> None:
-    """Prints the errors of a twin of three recordings in the fourth."""
+    """Prints the errors of a twin, fitted to three recordings, on the fourth."""
     for joint in (4, 5):
         recordings = joint_recordings(folder, joint)
         left: dict[tuple[str, str], list[float]] = {}
@@ -193,7 +193,7 @@ def left_out(records: Sequence[Record]) -> list[float]:
 
 
 def regressed(records: Sequence[Record]) -> list[float]:
-    """Returns the same by least squares: orders 1 and 2 of the motor, its speed, and the load torque."""
+    """Returns the error left by a least-squares fit of motor orders 1 and 2, motor speed and load torque."""
     columns, errors = [], []
     for record in records:
         motor = record.motor_position_deg

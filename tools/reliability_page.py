@@ -1,4 +1,4 @@
-"""Writes the tables of docs/reliability.md: results of every fault of the suite, wherever it is tried.
+"""Writes the tables of docs/reliability.md: results of every fault of the suite, at every place.
 
 python tools/reliability_page.py            try them (minutes; vcan by tools/socketcan.sh), write the page
 python tools/reliability_page.py --check    only report if the page has the suite's rows
@@ -12,7 +12,9 @@ import re
 import subprocess
 import sys
 import tempfile
+from collections.abc import Iterable
 from pathlib import Path
+from typing import NamedTuple
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
@@ -39,25 +41,49 @@ PAGE = ROOT / "docs" / "reliability.md"
 DAEMON_TESTS = sorted(Path("tests/daemon/loop").glob("test_reliability*.py"))
 SOCKETCAN_TESTS = ("tests/socketcan/test_reliability.py", "tests/socketcan/test_daemon.py")
 _BLOCK = re.compile(r"(<!-- tried: (?P<name>[a-z-]+) -->\n).*?(<!-- end -->)", re.DOTALL)
-HEAD = "| fault | expected | within | bench | bench, vcan | daemon |\n|---|---|---|---|---|---|\n"
-FURTHER_HEAD = "| fault | expected | within | taken |\n|---|---|---|---|\n"
-DAEMON_VCAN_HEAD = "| fault | expected | within | cycles |\n|---|---|---|---|\n"
+HEAD = "| faults | expected | within | cycles |\n|---|---|---|---|\n"
+_BETWEEN = "; "
+PLACES = {VIRTUAL: "bench", VCAN: "vcan", DAEMON: "daemon"}
+"""Places of the suite in the order of the page, as the page names them."""
 
 
-def rows() -> list[str]:
-    """Returns the required first three columns of each row."""
-    further = [f"| {each.name} | {each.expected} | {each.allowed:g} |" for each in FURTHER]
-    processes = [f"| {each.name} | {each.expected} | {each.within} |" for each in DAEMON_ROWS]
-    return [*(f"| {row.name} | {_expected(row)} | {_within(row)} |" for row in ROWS), *further, *processes]
+class Result(NamedTuple):
+    """Row of the suite with its required reaction, the allowed cycles and the measured ones."""
+
+    fault: str
+    expected: str
+    within: str
+    cycles: str
 
 
-def rows_of_page(text: str) -> list[str]:
-    """Returns the first three columns of each row of a page's results."""
+def rows() -> list[tuple[str, str, str]]:
+    """Returns fault, required reaction and allowed cycles of each row of the suite."""
+    return [
+        *((row.name, _expected(row), _within(row)) for row in ROWS),
+        *((each.name, each.expected, f"{each.allowed:g}") for each in FURTHER),
+        *((each.name, each.expected, str(each.within)) for each in DAEMON_ROWS),
+    ]
+
+
+def rows_of_page(text: str) -> list[tuple[str, str, str]]:
+    """Returns fault, required reaction and allowed cycles of each result on a page."""
     tables = "".join(match[0] for match in _BLOCK.finditer(text))
     lines = [
-        line for line in tables.splitlines() if line.startswith("| ") and not line.startswith("| fault |")
+        line for line in tables.splitlines() if line.startswith("| ") and not line.startswith("| faults |")
     ]
-    return ["|".join(line.split("|")[:4]) + "|" for line in lines]
+    cells = [[cell.strip() for cell in line.strip("|").split(" | ")] for line in lines]
+    return [
+        (fault, expected, within) for faults, expected, within, _ in cells for fault in faults.split(_BETWEEN)
+    ]
+
+
+def table(results: Iterable[Result]) -> str:
+    """Returns results as a table; faults with the same reaction, limit and result share a line."""
+    groups: dict[tuple[str, str, str], list[str]] = {}
+    for each in results:
+        groups.setdefault((each.expected, each.within, each.cycles), []).append(each.fault)
+    lines = (f"| {_BETWEEN.join(faults)} | {' | '.join(key)} |\n" for key, faults in groups.items())
+    return HEAD + "".join(lines)
 
 
 def page(seen: list[Seen]) -> str:
@@ -78,28 +104,34 @@ def page(seen: list[Seen]) -> str:
         ]
         return taken[0] if len({*taken}) == 1 else " ".join(taken)
 
-    lines = []
+    results = []
     for row in ROWS:
-        cells = " | ".join(cell(row, place) for place in (VIRTUAL, VCAN, DAEMON))
-        lines.append(f"| {row.name} | {_expected(row)} | {_within(row)} | {cells} |")
+        cells = {name: cell(row, place) for place, name in PLACES.items()}
+        results.append(Result(row.name, _expected(row), _within(row), together(cells)))
     blocks = {
         "drives": "".join(f"* *{each}*: {_behaviour(each)}\n" for each in CHARACTERS),
-        "axis": HEAD + "\n".join(lines) + "\n",
-        "daemon": FURTHER_HEAD + "".join(_further(each, seen_of(each.name, DAEMON)) for each in FURTHER),
-        "processes": DAEMON_VCAN_HEAD
-        + "".join(_whole(row, seen_of(row.name, DAEMON_VCAN)) for row in DAEMON_ROWS),
+        "axis": table(results),
+        "daemon": table(_further(each, seen_of(each.name, DAEMON)) for each in FURTHER),
+        "processes": table(_whole(row, seen_of(row.name, DAEMON_VCAN)) for row in DAEMON_ROWS),
     }
     return _BLOCK.sub(
         lambda match: match[1] + blocks[match["name"]] + match[3], PAGE.read_text(encoding="utf-8")
     )
 
 
-def _further(row: Further, seen: Seen) -> str:
-    return f"| {row.name} | {row.expected} | {row.allowed:g} | {seen.taken:g} |\n"
+def together(cells: dict[str, str]) -> str:
+    """Returns the results of a row at all places as one cell; a single result if they agree."""
+    if len({*cells.values()}) == 1:
+        return next(iter(cells.values()))
+    return ", ".join(f"{place} {taken}" for place, taken in cells.items() if taken != "–")
 
 
-def _whole(row: DaemonRow, seen: Seen) -> str:
-    return f"| {row.name} | {row.expected} | {row.within} | {seen.taken:g} |\n"
+def _further(row: Further, seen: Seen) -> Result:
+    return Result(row.name, row.expected, f"{row.allowed:g}", f"{seen.taken:g}")
+
+
+def _whole(row: DaemonRow, seen: Seen) -> Result:
+    return Result(row.name, row.expected, str(row.within), f"{seen.taken:g}")
 
 
 def _behaviour(character: Character) -> str:
@@ -137,7 +169,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--check", action="store_true")
     if parser.parse_args().check:
-        if rows_of_page(PAGE.read_text(encoding="utf-8")) != rows():
+        if sorted(rows_of_page(PAGE.read_text(encoding="utf-8"))) != sorted(rows()):
             raise SystemExit(
                 "docs/reliability.md lags behind the fault suite: python tools/reliability_page.py"
             )

@@ -13,7 +13,9 @@ import subprocess
 import sys
 from pathlib import Path
 
-CLIENT = Path(__file__).resolve().parent.parent / "hdbridge" / "client"
+import generated
+
+CLIENT = generated.ROOT / "hdbridge" / "client"
 MADE = {"aioaxis.py": "axis.py", "aio.py": "sync.py"}
 NOTE = "# Made by tools/synchronous_client.py from {}: edit that file.\n"
 REPLACED = [
@@ -53,15 +55,5 @@ def synchronous(name: str) -> str:
     return NOTE.format(name) + text
 
 
-def main(arguments: list[str]) -> int:
-    """Writes both modules, or checks them."""
-    old = [new for name, new in MADE.items() if (CLIENT / new).read_text("utf-8") != synchronous(name)]
-    if "--check" in arguments:
-        return 1 if old else 0
-    for name, new in MADE.items():
-        (CLIENT / new).write_text(synchronous(name), encoding="utf-8")
-    return 0
-
-
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    sys.exit(generated.main({CLIENT / new: synchronous(name) for name, new in MADE.items()}))

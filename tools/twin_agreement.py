@@ -10,47 +10,33 @@ compensation, the offset of the loop, and the differences of the orders.
 
 from __future__ import annotations
 
-import argparse
 import sys
 import tempfile
 import time
-from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
-import yaml
+from random_axes import calibrated, parser, seeds
 from twin_random_axes import bench, draw
 
 from hdbridge.axis import AxisConfig
 from hdbridge.axis.effects import Hysteresis, HysteresisMemory, Synchronous
 from hdbridge.axis.model import TransmissionModel
-from hdbridge.commissioning.calibration import Calibration, calibrate, start_journal
-from hdbridge.drive.drive import Drive
+from hdbridge.commissioning.calibration import Calibration
 from hdbridge.errors import SafetyStop
 from hdbridge.motion.procedures.plan import Plan
-from hdbridge.sim.lockstep import simulated_bench
 from hdbridge.sim.truth import Truth
 from hdbridge.twin.translate import translate
 from hdbridge.twin.twin import fit_twin
 
-DATE = datetime(2026, 1, 1, tzinfo=UTC)
 STEPPING, ORDERS_ARCSEC, OFFSET = 0.05, 0.3, 0.02
 """Tolerances of a twin: a share of 3 sigma, each order's phasor, a share of the offset."""
 
 
-def calibrated(axis: AxisConfig, truth: Truth, plan: str, seed: int) -> Calibration:
+def calibration(axis: AxisConfig, truth: Truth, plan: str, seed: int) -> Calibration:
     """Calibrates an axis without a model, with its stepping test."""
-    with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
-        content = axis.model_dump(mode="json", by_alias=True, exclude_none=True)
-        (folder / "axis.yaml").write_text(yaml.safe_dump(content))
-        with (
-            simulated_bench(truth, axis.eds_path, axis.drive.node_id, seed) as (bus, clock, _),
-            Drive(bus, axis, clock) as drive,
-        ):
-            drive.boot()
-            journal = start_journal(folder / "recording", axis, Plan.load(plan), DATE, drive.identity)
-            return calibrate(drive, journal, folder, DATE)
+    with tempfile.TemporaryDirectory() as folder:
+        return calibrated(axis, truth, plan, seed, Path(folder))[0]
 
 
 def three_sigma_arcsec(found: Calibration) -> float:
@@ -79,11 +65,11 @@ def one(seed: int, plan: str, workers: int) -> str:
     """Runs one axis; returns one line."""
     began_s = time.perf_counter()
     axis, truth = draw(seed)
-    own = calibrated(axis, truth, plan, seed)
+    own = calibration(axis, truth, plan, seed)
     recording = bench(axis, truth, Plan.load("dynamics"), seed + 1000)
     start = translate(axis, own.model).truth
     twin = fit_twin([recording], axis, start, workers=workers).truth
-    again = calibrated(axis, twin, plan, seed + 2000)
+    again = calibration(axis, twin, plan, seed + 2000)
     law = truth.gear.hysteresis.law if truth.gear.hysteresis else "none"
     return f"{seed:4d} {law:16s} | {compared(own, again)} | {time.perf_counter() - began_s:.0f} s"
 
@@ -110,16 +96,12 @@ def compared(own: Calibration, again: Calibration) -> str:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--axes", type=int, default=4)
-    parser.add_argument("--first", type=int, default=1, help="seed of the first axis")
-    parser.add_argument("--plan", default="quick", help="of the calibrations")
-    parser.add_argument("--workers", type=int, default=2)
-    options = parser.parse_args()
+    given = parser(__doc__, axes=4, workers=2)
+    given.add_argument("--plan", default="quick", help="of the calibrations")
+    given.add_argument("--workers", type=int, default=2)
+    options = given.parse_args()
     print("the axis, its twin (how far that is off)")
-    for seed in range(options.first, options.first + options.axes):
+    for seed in seeds(options):
         try:
             print(one(seed, options.plan, options.workers), flush=True)
         except SafetyStop as stop:

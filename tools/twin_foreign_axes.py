@@ -11,15 +11,11 @@ each axis is changed, recorded again and held against its twin.
 
 from __future__ import annotations
 
-import argparse
-import os
 import sys
 import tempfile
 import time
 from dataclasses import replace
 from pathlib import Path
-
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # the matrices are small, so threads only cost time
 
 import yaml
 from foreign.bench import bench_of
@@ -27,10 +23,10 @@ from foreign.draw import Truth as Foreign
 from foreign.draw import draw
 from foreign.mechanics import BoucWen
 from foreign.servos import STRUCTURES
+from random_axes import parser, recorded, seeds
 from twin_random_axes import ANOTHER, without_noise
 
 from hdbridge.axis import AxisConfig
-from hdbridge.control.bench import Bench
 from hdbridge.drive.drive import Drive
 from hdbridge.errors import HdbridgeError
 from hdbridge.motion.procedures.plan import Plan
@@ -47,18 +43,13 @@ from hdbridge.twin.twin import fit_twin, judge
 
 def bench(foreign: Foreign, plan: Plan) -> Recording:
     """Runs a plan on the foreign axis, over frames, task by task."""
-    parts = []
     with (
         tempfile.TemporaryDirectory() as folder,
         bench_of(foreign, Path(folder)) as axis,
         Drive(axis.bus, axis.axis, axis.clock) as drive,
     ):
         drive.boot()
-        place = Bench(drive)
-        for task in plan.tasks(place.view).tasks:
-            run = place.run(task.procedure)
-            parts.append(Recording(run.record, run.segments, run.axis, run.ratio))
-    return Recording.joined(parts)
+        return recorded(drive, plan)
 
 
 def axis_of(foreign: Foreign) -> AxisConfig:
@@ -133,7 +124,7 @@ CHANGES = {
 
 
 def print_checks(foreign: Foreign, axis: AxisConfig, twin: Truth, seed: int, workers: int) -> None:
-    """Changes the axis, records it again with other noise, and prints what a check says of it."""
+    """Changes the axis, records it again with other noise, and prints the result of a check."""
     for name, (cause, change) in CHANGES.items():
         try:
             recording = bench(replace(change(foreign), seed=seed + 3000), Plan.load("dynamics"))
@@ -153,18 +144,13 @@ def print_checks(foreign: Foreign, axis: AxisConfig, twin: Truth, seed: int, wor
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--structures", nargs="+", default=list(STRUCTURES), choices=list(STRUCTURES))
-    parser.add_argument("--axes", type=int, default=2)
-    parser.add_argument("--first", type=int, default=1, help="seed of the first axis")
-    parser.add_argument("--workers", type=int, default=1)
-    parser.add_argument("--checks", action="store_true", help="change the axes, and check the twins")
-    parser.add_argument("--servo-only", action="store_true", help="only the fit of servo structures")
-    options = parser.parse_args()
+    given = parser(__doc__, axes=2, workers=1)
+    given.add_argument("--structures", nargs="+", default=list(STRUCTURES), choices=list(STRUCTURES))
+    given.add_argument("--checks", action="store_true", help="change the axes, and check the twins")
+    given.add_argument("--servo-only", action="store_true", help="only the fit of servo structures")
+    options = given.parse_args()
     another = Plan.model_validate(yaml.safe_load(ANOTHER))
-    for seed in range(options.first, options.first + options.axes):
+    for seed in seeds(options):
         for structure in options.structures:
             foreign = draw(seed, structure)
             axis = axis_of(foreign)
@@ -190,16 +176,18 @@ def main() -> None:
             twin = fit_twin([recording], axis, start(axis, foreign), workers=options.workers)
             took_s = time.process_time() - began_s
             true = foreign.by_place()
-            given = {place: pair for place, pair in twin.intervals.items() if place in true}
-            held = [place for place, (low, high) in given.items() if low <= true[place] <= high]
+            inside = {place: pair for place, pair in twin.intervals.items() if place in true}
+            held = [place for place, (low, high) in inside.items() if low <= true[place] <= high]
             figures = shares(other, axis, twin.truth, seed)
-            print(f"{structure} {seed}: {figures}; {len(held)} of {len(given)} intervals; ", end="")
+            print(f"{structure} {seed}: {figures}; {len(held)} of {len(inside)} intervals; ", end="")
             print(f"{took_s:.0f} s\n    {judge(twin).text}")
             for each in twin.unexplained:
                 print(f"    unexplained: {each}")
             for place in true:
                 if place.startswith(("motor.", "load.", "gear.s", "gear.d", "servo.")):
-                    print(f"    {place}: {true[place]:.4g}, {_now(twin.truth, place)} {given.get(place, '')}")
+                    print(
+                        f"    {place}: {true[place]:.4g}, {_now(twin.truth, place)} {inside.get(place, '')}"
+                    )
             sys.stdout.flush()
             if options.checks:
                 print_checks(foreign, axis, twin.truth, seed, options.workers)

@@ -15,30 +15,24 @@ that): this tool measures the rest.
 
 from __future__ import annotations
 
-import argparse
 import math
-import os
 import sys
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from itertools import combinations
-from pathlib import Path
 from typing import Any
 
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # the matrices are small, so threads only cost time
-
 import numpy as np
+import random_axes
 import yaml
-from scipy.stats import beta
+from proportions import proportion
+from random_axes import DEMO, parser, seeds, simulated
 
 from hdbridge.axis import AxisConfig
-from hdbridge.control.bench import Bench
-from hdbridge.drive.drive import Drive
 from hdbridge.errors import SafetyStop
 from hdbridge.motion.procedures.plan import Plan
 from hdbridge.records.recording import Recording
-from hdbridge.sim.lockstep import simulated_bench
 from hdbridge.sim.truth import Truth
 from hdbridge.twin.check import check
 from hdbridge.twin.compare import compare
@@ -46,7 +40,6 @@ from hdbridge.twin.parameters import BY_NAME, default_truth, value_in, with_valu
 from hdbridge.twin.replay import replay
 from hdbridge.twin.twin import fit_twin
 
-DEMO = Path(__file__).parents[1] / "profiles" / "demo"
 LAWS = ("rolling_friction", "maxwell_slip", "bouc_wen", "dahl")
 ANOTHER = """
 schema: hdbridge.plan/1
@@ -209,21 +202,12 @@ def without_noise(truth: Truth) -> Truth:
 
 
 def bench(axis: AxisConfig, truth: Truth, plan: Plan, seed: int) -> Recording:
-    """Runs a plan on the bench, over frames, task by task."""
-    parts = []
-    with (
-        simulated_bench(truth, axis.eds_path, axis.drive.node_id, seed) as (bus, clock, _),
-        Drive(bus, axis, clock) as drive,
-    ):
-        drive.boot()
-        place = Bench(drive)
-        for task in plan.tasks(place.view).tasks:
-            run = place.run(task.procedure)
-            parts.append(Recording(run.record, run.segments, run.axis, run.ratio))
-    return Recording.joined(parts)
+    """Runs a plan on the simulated drive."""
+    with simulated(axis, truth, seed) as (drive, _):
+        return random_axes.recorded(drive, plan)
 
 
-def recorded(seed: int, axis: AxisConfig, truth: Truth) -> tuple[Recording, Recording] | None:
+def both_motions(seed: int, axis: AxisConfig, truth: Truth) -> tuple[Recording, Recording] | None:
     """Records an axis on both plans; returns None if its drive cannot follow them and stops."""
     another = Plan.model_validate(yaml.safe_load(ANOTHER))
     try:
@@ -311,32 +295,18 @@ def line(each: Outcome) -> str:
     return f"{each.seed:4d} {each.about} | {told} | {each.held}/{each.intervals} | {each.fit_s:.0f} s"
 
 
-def bounds(hits: int, n: int) -> str:
-    """Formats a count with its 95 % interval (Clopper-Pearson)."""
-    if not n:
-        return "none tried"
-    low = float(beta.ppf(0.025, hits, n - hits + 1)) if hits else 0.0
-    high = float(beta.ppf(0.975, hits + 1, n - hits)) if hits < n else 1.0
-    return f"{hits} of {n} ({100 * low:.0f} to {100 * high:.0f} %)"
-
-
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--axes", type=int, default=20)
-    parser.add_argument("--first", type=int, default=1, help="seed of the first axis")
-    parser.add_argument("--workers", type=int, default=2)
-    parser.add_argument("--sticking", action="store_true", help="friction that is higher near rest, too")
-    parser.add_argument("--checks", action="store_true", help="change the plants, and check the twins")
-    options = parser.parse_args()
+    given = parser(__doc__, axes=20, workers=2)
+    given.add_argument("--sticking", action="store_true", help="friction that is higher near rest, too")
+    given.add_argument("--checks", action="store_true", help="change the plants, and check the twins")
+    options = given.parse_args()
     print(
         "on another motion: difference / measured, difference / noise; intervals that hold; time of the fit"
     )
     found = []
-    for seed in range(options.first, options.first + options.axes):
+    for seed in seeds(options):
         drawn = draw(seed, sticking=options.sticking)
-        both = recorded(seed, *drawn)
+        both = both_motions(seed, *drawn)
         if both is None:
             continue
         each = one(seed, *drawn, *both, checks=options.checks, workers=options.workers)
@@ -349,17 +319,17 @@ def main() -> None:
             print(f"       {what}: {', '.join(sorted(named)) or 'nothing'} [{verdict}]", flush=True)
     for name in ("following_error", "motor_torque"):
         good = [o.channels[name][0] <= 0.10 or o.channels[name][1] <= 1.3 for o in found]
-        print(f"{name} within 10 % or 1.3 x noise: {bounds(sum(good), len(good))}")
+        print(f"{name} within 10 % or 1.3 x noise: {proportion(sum(good), len(good))}")
     settled = [o.channels["settling_time"] for o in found if "settling_time" in o.channels]
     for what, good in (
-        ("10 %", [share <= 0.10 for share, _ in settled]),
-        ("10 % or 1.3 x noise", [share <= 0.10 or noise <= 1.3 for share, noise in settled]),
+        ("10 %", [off <= 0.10 for off, _ in settled]),
+        ("10 % or 1.3 x noise", [off <= 0.10 or noise <= 1.3 for off, noise in settled]),
     ):
-        print(f"settling time within {what}: {bounds(sum(good), len(good))}")
+        print(f"settling time within {what}: {proportion(sum(good), len(good))}")
     near = [o.channels["load_error"][1] <= 1.3 for o in found]
-    print(f"load error within 1.3 x noise: {bounds(sum(near), len(near))}")
+    print(f"load error within 1.3 x noise: {proportion(sum(near), len(near))}")
     held, intervals = sum(o.held for o in found), sum(o.intervals for o in found)
-    print(f"intervals that hold the truth: {bounds(held, intervals)}")
+    print(f"intervals that hold the truth: {proportion(held, intervals)}")
     cases = [case for o in found for case in o.checks]
     for what, some in (
         ("one change named, and nothing else", [c for c in cases if len(c[1]) == 1]),
@@ -367,10 +337,9 @@ def main() -> None:
         ("two changes named, and nothing else", [c for c in cases if len(c[1]) == 2]),
     ):
         if some:
-            print(f"{what}: {bounds(sum(c[1] == c[2] for c in some), len(some))}")
-            print(
-                f"    what changed is among the named: {bounds(sum(c[1] <= c[2] for c in some), len(some))}"
-            )
+            print(f"{what}: {proportion(sum(c[1] == c[2] for c in some), len(some))}")
+            among = sum(c[1] <= c[2] for c in some)
+            print(f"    what changed is among the named: {proportion(among, len(some))}")
 
 
 if __name__ == "__main__":

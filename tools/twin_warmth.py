@@ -11,12 +11,11 @@ random by the uncertainty of a fit: half a per cent (Coulomb) and three per cent
 
 from __future__ import annotations
 
-import argparse
 import math
-from pathlib import Path
 
 import numpy as np
-from scipy.stats import beta
+from proportions import proportion
+from random_axes import DEMO, parser, seeds
 
 from hdbridge.axis import AxisConfig
 from hdbridge.records.record import Record
@@ -29,7 +28,6 @@ from hdbridge.twin.misfit import Scales
 from hdbridge.twin.parameters import BY_NAME, at_coordinates, coordinates
 from hdbridge.twin.thermal import THERMAL, with_warmth
 
-DEMO = Path(__file__).parents[1] / "profiles" / "demo"
 AXIS, TRUTH = AxisConfig.load(DEMO), Truth.load(DEMO)
 STEP_K = 0.1
 FRICTION = {"Coulomb friction": 0.005, "viscous friction": 0.03}
@@ -91,15 +89,11 @@ def fitted(rng: np.random.Generator) -> Fitted:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--axes", type=int, default=30)
-    parser.add_argument("--first", type=int, default=1, help="seed of the first axis")
-    parser.add_argument("--minutes", type=float, default=30.0, help="length of a recording")
-    options = parser.parse_args()
+    given = parser(__doc__, axes=30)
+    given.add_argument("--minutes", type=float, default=30.0, help="length of a recording")
+    options = given.parse_args()
     held, named = np.zeros(len(THERMAL), dtype=np.int64), 0
-    for seed in range(options.first, options.first + options.axes):
+    for seed in seeds(options):
         rng = np.random.default_rng(seed)
         truth = draw(rng)
         recording, fit = recorded(truth, rng, options.minutes), fitted(rng)
@@ -119,9 +113,7 @@ def main() -> None:
         *((each.name, int(n), options.axes) for each, n in zip(THERMAL, held, strict=True)),
         ("all", int(held.sum()), options.axes * len(THERMAL)),
     ):
-        low = float(beta.ppf(0.025, hits, count - hits + 1)) if hits else 0.0
-        high = float(beta.ppf(0.975, hits + 1, count - hits)) if hits < count else 1.0
-        print(f"{name}: {hits} of {count} intervals hold ({100 * low:.0f} to {100 * high:.0f} %)")
+        print(f"{name}: intervals that hold {proportion(hits, count)}")
 
 
 if __name__ == "__main__":

@@ -18,6 +18,7 @@ from hdbridge.analysis.prepared import Samples
 from hdbridge.analysis.regressors import Regressors
 from hdbridge.axis.effects import BoolArray, Effect, FloatArray, IntArray, Start
 from hdbridge.axis.effects.base import Memoryless
+from hdbridge.axis.effects.orders import waves
 from hdbridge.axis.effects.path import branches
 from hdbridge.units import ARCSEC_PER_DEG
 
@@ -270,8 +271,8 @@ def harmonics(design: Design, orders: Sequence[float]) -> FloatArray:
 
     Orders need not be integers: 1 / N is the load turn, k (1 + 1/N) the flexspline.
     """
-    angles = (np.deg2rad(each) * design.samples.motor_deg for each in orders)
-    parts = [design.blocks.mean(np.stack([np.cos(each), np.sin(each)], axis=1)) for each in angles]
+    found = waves(np.deg2rad(design.samples.motor_deg), orders)
+    parts = [design.blocks.mean(each.view(np.float64).reshape(-1, 2)) for each in found]
     return side_by_side(parts, len(design.blocks))
 
 

@@ -10,7 +10,7 @@ has the right gain and phase at every speed.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -181,7 +181,9 @@ def following_lag_s(runs: Iterable[Harmonics]) -> float:
     return float(np.linalg.lstsq(design, mean, rcond=None)[0][0])
 
 
-class _Found(NamedTuple):
+class Found(NamedTuple):
+    """Response at one frequency."""
+
     frequency_hz: float
     response: complex
     """Load per correction and transmission error."""
@@ -237,9 +239,9 @@ def _found(
     ratio: float,
     cycle_s: float,
     lag_s: float,
-) -> list[_Found]:
+) -> list[Found]:
     """Returns the response per order and speed from every trial that shows it, sorted by frequency."""
-    found: list[_Found] = []
+    found: list[Found] = []
     for trial in trials:
         for before, after in zip(none, trial.runs, strict=True):
             hertz = order_hz(orders, before.speed_deg_s, ratio)
@@ -254,13 +256,13 @@ def _found(
                 share = np.hypot(before.deviations, after.deviations) / abs(applied * error)
                 deviation = np.hypot(share, abs(answer) * before.deviations / abs(error))
             rows = zip(hertz[clear].tolist(), answer[clear].tolist(), deviation[clear].tolist(), strict=True)
-            found += [_Found(at, value, max(each, MIN_DEVIATION * abs(value))) for at, value, each in rows]
+            found += [Found(at, value, max(each, MIN_DEVIATION * abs(value))) for at, value, each in rows]
     return sorted(found, key=lambda each: each.frequency_hz)
 
 
-def _merged(found: Sequence[_Found]) -> list[_Found]:
+def _merged(found: Sequence[Found]) -> list[Found]:
     """Merges neighbouring points; scatter beyond the noise increases their deviation."""
-    groups: list[list[_Found]] = []
+    groups: list[list[Found]] = []
     for each in found:
         first_hz = groups[-1][0].frequency_hz if groups else -math.inf
         if each.frequency_hz > first_hz + max(BIN_HZ, BIN_SHARE * first_hz):
@@ -269,23 +271,23 @@ def _merged(found: Sequence[_Found]) -> list[_Found]:
     return [_mean(group) for group in groups]
 
 
-def _mean(group: Sequence[_Found]) -> _Found:
+def _mean(group: Sequence[Found]) -> Found:
     values = np.array([each.response for each in group])
     hertz = np.array([each.frequency_hz for each in group])
     weight = np.array([each.deviation for each in group]) ** -2.0
     total = float(weight.sum())
     mean = complex(weight @ values) / total
     scatter = float(weight @ abs(values - mean) ** 2) / total / max(len(group) - 1, 1)
-    return _Found(float(weight @ hertz) / total, mean, math.sqrt(max(1.0 / total, scatter)))
+    return Found(float(weight @ hertz) / total, mean, math.sqrt(max(1.0 / total, scatter)))
 
 
-def _known(points: Sequence[_Found], highest_hz: float, max_gap_hz: float, limits: Limits) -> list[_Found]:
+def _known(points: Sequence[Found], highest_hz: float, max_gap_hz: float, limits: Limits) -> list[Found]:
     """Returns the points from zero up to the first gap; the last one may lie above ``highest_hz``.
 
     Uncertain points are skipped. If the inverse of a response would exceed the limits, the response is
     raised, so that the order is corrected in part.
     """
-    kept: list[_Found] = []
+    kept: list[Found] = []
     before_hz = 0.0
     for each in points:
         hertz = each.frequency_hz
@@ -301,13 +303,30 @@ def _known(points: Sequence[_Found], highest_hz: float, max_gap_hz: float, limit
 def difference(one: Response, other: Response) -> float:
     """Returns the rms relative difference of two responses over their range, less their noise."""
     hertz = np.array([each for each in other.frequency_hz if each <= min(one.known_to_hz, other.known_to_hz)])
-    if not hertz.size:
-        return 0.0
     (first, first_noise), (second, second_noise) = (_at(each, hertz) for each in (one, other))
-    square = abs(first / second - 1.0) ** 2
-    variance = 0.25 * (first_noise**2 + second_noise**2)
-    weight = 1.0 / (DIFFERENT**2 + variance)
-    return math.sqrt(max(0.0, float(weight @ (square - variance) / weight.sum())))
+    return _rms_difference(first / second, 0.25 * (first_noise**2 + second_noise**2))
+
+
+def difference_seen(
+    stored: Response, seen: Iterable[Sequence[Found]], amplitudes_arcsec: Iterable[float]
+) -> float:
+    """Returns the same from relative responses of `answers`, as a share of the ripple.
+
+    Each group of ``seen`` has one order and about one frequency, and ``amplitudes_arcsec`` has the amplitudes
+    of these orders. Each group counts once, so that many slow runs do not hide what a few fast ones show.
+    """
+    means = [_mean(each) for each in seen]
+    hertz, values, deviations = (np.array([each[at] for each in means]) for at in range(3))
+    variance = deviations**2 + 0.25 * _at(stored, hertz.real)[1] ** 2
+    return _rms_difference(values, variance, np.fromiter(amplitudes_arcsec, float))
+
+
+def _rms_difference(relative: ComplexArray, variance: FloatArray, sizes: ArrayLike = 1.0) -> float:
+    if not relative.size:
+        return 0.0
+    weight = np.square(sizes) / (DIFFERENT**2 + variance)
+    square = abs(relative - 1.0) ** 2 - variance
+    return math.sqrt(max(0.0, float(np.sum(weight * square) / weight.sum())))
 
 
 def agree(one: Response, other: Response) -> bool:
@@ -320,37 +339,39 @@ def lags_agree(one_ms: float, other_ms: float) -> bool:
     return abs(one_ms - other_ms) <= max(DIFFERENT_LAG * max(abs(one_ms), abs(other_ms)), LAG_NOISE_MS)
 
 
-class Left(NamedTuple):
-    """Orders that the filtered correction leaves in a run, against those that the stored response allows."""
+def answers(
+    stored: Response,
+    speed_deg_s: float,
+    lag_s: float,
+    target_deg: FloatArray,
+    issued_deg: FloatArray,
+    motor_deg: FloatArray,
+    orders: Sequence[int],
+    ratio: float,
+) -> Iterator[tuple[int, Found]]:
+    """Yields the motor's responses to its set-points in a run, relative to the stored one, by index of order.
 
-    square: float
-    """Sum of the squares of their amplitudes, less the noise; arcsec^2."""
-    allowed: float
-    """The same for a response that is as different as `DIFFERENT`, filter error and intervals included."""
-
-
-def left_by_filter(
-    stored: Response, run: Harmonics, orders: Sequence[int], amplitudes_arcsec: Sequence[float], ratio: float
-) -> Left:
-    """Returns what the filtered correction leaves of the corrected orders in a run.
-
-    ``run`` is that of the load angle predicted from the motor encoder, so that a change of the gear does not
-    show; ``amplitudes_arcsec`` are those of the model. Orders beyond the known range count nothing.
+    All angles have the shape (n,); ``issued_deg`` are set-points of the motor. Neither the gear's error nor
+    the model's matters. A change of the following lag, ``lag_s``, alone changes nothing: the transmission
+    error is late by it as well as the correction. Orders beyond the known range and unclear ones are left
+    out.
     """
-    hertz = order_hz(orders, run.speed_deg_s, ratio)
-    known = np.array(stored.frequency_hz)
-    values, _ = _at(stored, known)
-    late = np.exp(-2j * math.pi * known * stored.following_lag_ms / 1000.0)
-    own = abs(1.0 - gain(stored.filter, known, stored.cycle_ms / 1000.0) * values / late)
-    share = (
-        DIFFERENT**2 + np.interp(hertz, known, own) ** 2 + np.interp(hertz, known, stored.uncertainty) ** 2
+    issued, motor = (
+        harmonics_of(speed_deg_s, target_deg, ARCSEC_PER_DEG * (each / ratio - target_deg), orders, ratio)
+        for each in (issued_deg, motor_deg)
     )
-    corrected = hertz <= stored.known_to_hz
-    noise = 2.0 * run.deviations**2
-    return Left(
-        float(np.sum((abs(run.amplitudes) ** 2 - noise)[corrected])),
-        float(np.sum((np.array(amplitudes_arcsec) ** 2 * share)[corrected])),
-    )
+    hertz = order_hz(orders, speed_deg_s, ratio)
+    late_s = lag_s - stored.following_lag_ms / 1000.0
+    with np.errstate(divide="ignore", invalid="ignore"):
+        answer = motor.amplitudes / issued.amplitudes
+        if speed_deg_s < 0.0:  # the angle decreases with time
+            answer = answer.conj()
+        relative = answer * np.exp(2j * math.pi * hertz * late_s) / _at(stored, hertz)[0]
+        noise = abs(relative) * math.sqrt(2.0) * motor.deviations / abs(motor.amplitudes)
+    deviation = np.hypot(noise, MIN_DEVIATION * abs(relative))
+    clear = (hertz <= stored.known_to_hz) & (2.0 * deviation < MAX_UNCERTAINTY * abs(relative))
+    for place in np.flatnonzero(clear).tolist():
+        yield place, Found(float(hertz[place]), complex(relative[place]), float(deviation[place]))
 
 
 def _at(response: Response, hertz: FloatArray) -> tuple[ComplexArray, FloatArray]:
@@ -380,7 +401,7 @@ def _denominator(hertz: FloatArray, feedback: FloatArray, cycle_s: float) -> Com
 
 
 def _filter(
-    kept: Sequence[_Found], edge_hz: float, lag_s: float, cycle_s: float, fastest_hz: float, limits: Limits
+    kept: Sequence[Found], edge_hz: float, lag_s: float, cycle_s: float, fastest_hz: float, limits: Limits
 ) -> LeadFilter:
     """Fits the filter by least squares on the relative error: the inverse response to ``edge_hz``, 0 beyond.
 

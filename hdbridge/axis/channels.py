@@ -14,10 +14,10 @@ from hdbridge.axis.effects.base import MEASURED
 from hdbridge.files.yamlfile import wrong
 from hdbridge.strictness import Strict
 
-EveryCycles = Annotated[int, Field(ge=1, le=240, description="it comes with every n-th SYNC")]
+EveryCycles = Annotated[int, Field(ge=1, le=240, description="reading with every n-th SYNC")]
 HoldMs = Annotated[
     float,
-    Field(gt=0, le=600_000, description="how long the last reading is held when none comes; then it is lost"),
+    Field(gt=0, le=600_000, description="time for which the last reading is held"),
 ]
 
 
@@ -38,7 +38,7 @@ class ChannelSource(Strict):
     type: Literal["int32", "uint32", "int16", "uint16", "int8", "uint8"] = Field(
         description="type of the object"
     )
-    via: Literal["tpdo"] = Field("tpdo", description="how it comes; an SDO is too slow for the cycle")
+    via: Literal["tpdo"] = Field("tpdo", description="by PDO")
 
 
 class LoadTorque(Strict):
@@ -46,12 +46,8 @@ class LoadTorque(Strict):
 
     source: ChannelSource = Field(description="object with the reading")
     newton_metres_per_count: float = Field(gt=0, le=1e6, description="torque at the load per count")
-    direction: Literal[1, -1] = Field(
-        1, description="-1 if it counts down when the torque pushes the load forward"
-    )
-    maximum_nm: float = Field(
-        1000.0, gt=0, le=1e6, description="torque in either direction beyond which a reading is not believed"
-    )
+    direction: Literal[1, -1] = Field(1, description="-1 if it counts down when the torque pushes forward")
+    maximum_nm: float = Field(1000.0, gt=0, le=1e6, description="largest plausible torque, either direction")
     every_cycles: EveryCycles = 1
     hold_ms: HoldMs = 100.0
 
@@ -70,12 +66,8 @@ class Temperature(Strict):
     celsius_at_zero: float = Field(
         0.0, ge=-1000, le=1000, description="temperature at a reading of zero (-273.15 for kelvin)"
     )
-    minimum_celsius: float = Field(
-        -40.0, ge=-273.15, le=1000, description="temperature below which a reading is not believed"
-    )
-    maximum_celsius: float = Field(
-        150.0, ge=-273.15, le=1000, description="temperature above which a reading is not believed"
-    )
+    minimum_celsius: float = Field(-40.0, ge=-273.15, le=1000, description="lowest plausible temperature")
+    maximum_celsius: float = Field(150.0, ge=-273.15, le=1000, description="highest plausible temperature")
     every_cycles: EveryCycles = 25
     hold_ms: HoldMs = 5000.0
 

@@ -57,63 +57,57 @@ class DriveConfig(_Part):
     """The servo drive: a CiA-402 node."""
 
     node_id: NodeId = Field(description="CANopen node id of the drive")
-    eds: str = Field(
-        min_length=1, description="EDS file: relative to this file, else one of those that come with hdbridge"
-    )
-    identity: Identity = Field(description="which drive it must be")
+    eds: str = Field(min_length=1, description="EDS file, relative to this file, or a bundled one")
+    identity: Identity = Field(description="identity of the drive; what is left out is not compared")
     mode: Literal["csp", "ip"] = Field(
         "csp",
-        description="mode of the control cycle: cyclic synchronous position (8) or interpolated position (7)",
+        description="cyclic synchronous position (8) or interpolated position (7)",
     )
-    cycle_ms: float = Field(
-        ge=0.5, le=255, description="SYNC period; 60C2h must express it: whole or with one decimal"
-    )
+    cycle_ms: float = Field(ge=0.5, le=255, description="SYNC period")
     heartbeat_ms: int = Field(
-        50, ge=5, le=10_000, description="heartbeat period, of the drive (1017h) and of the master (1016h)"
+        50, ge=5, le=10_000, description="heartbeat period of drive (1017h) and master (1016h)"
     )
-    master_node_id: NodeId = Field(127, description="node id under which the master sends its heartbeat")
+    master_node_id: NodeId = Field(127, description="node id of the master's heartbeat")
     following_error_deg: float = Field(
         gt=0,
         le=360,
-        description="following error window, 6065h, in degrees of the motor; it cannot be switched off",
+        description="following error window (6065h), motor degrees; cannot be switched off",
     )
-    following_error_time_ms: int = Field(20, ge=0, le=1000, description="following error time-out, 6066h")
+    following_error_time_ms: int = Field(20, ge=0, le=1000, description="following error time-out (6066h)")
     quick_stop_option: int = Field(
         2,
         ge=1,
         le=8,
-        description="605Ah: 1 to 4 end in SWITCH ON DISABLED, power off; 5 to 8 stay in QUICK STOP ACTIVE, "
-        "power on (an axis that would sink without power and has no brake)",
+        description="605Ah: 1 to 4 end without power; 5 to 8 stay in QUICK STOP ACTIVE under power, for an "
+        "axis that sinks and has no brake",
     )
     feed_scales: bool = Field(
         True,
-        description="6092h (feed) scales positions, as in CiA 402; false if it only informs",
+        description="6092h (feed) scales positions, as in CiA 402",
     )
     halt_option: int = Field(1, ge=1, le=4, description="605Dh: how a halt brakes")
     shutdown_option: int = Field(
-        0, ge=-32768, le=32767, description="605Bh: what 'shutdown' does under power; 0 switches it off"
+        0, ge=-32768, le=32767, description="605Bh: reaction to 'shutdown' under power; 0 switches it off"
     )
     disable_option: int = Field(
-        1, ge=-32768, le=32767, description="605Ch: what 'disable operation' does; 1 brakes first"
+        1, ge=-32768, le=32767, description="605Ch: reaction to 'disable operation'; 1 brakes first"
     )
     fault_reaction_option: int = Field(
-        2, ge=-32768, le=32767, description="605Eh: what a fault does; 2 brakes on the quick-stop ramp"
+        2, ge=-32768, le=32767, description="605Eh: reaction to a fault; 2 brakes on the quick-stop ramp"
     )
     abort_connection_option: int = Field(
         3,
         ge=-32768,
         le=32767,
-        description="6007h: what the drive does when its master is lost: 1 fault, 2 power off, 3 quick stop",
+        description="6007h, master lost: 1 fault, 2 power off, 3 quick stop",
     )
     communication_error_option: int = Field(
         0,
         ge=0,
         le=255,
-        description="1029h:01: NMT state when the master is lost: 0 pre-operational, 1 as it was, 2 stopped",
+        description="1029h:01, master lost: 0 pre-operational, 1 no change, 2 stopped",
     )
-    rated_torque_nm: float = Field(
-        gt=0, le=10_000, description="rated torque of the motor, 6076h; unit of 6077h"
-    )
+    rated_torque_nm: float = Field(gt=0, le=10_000, description="rated motor torque (6076h)")
 
     @field_validator("cycle_ms")
     @classmethod
@@ -159,7 +153,7 @@ class Teeth(_Part):
     flexspline: int = Field(ge=10, le=10_000, description="teeth of the flexspline, zf")
     circular_spline: int = Field(ge=11, le=10_000, description="teeth of the circular spline, zc")
     output: Literal["flexspline", "circular_spline"] = Field(
-        "flexspline", description="which of the two turns the load; the other is held"
+        "flexspline", description="the one that turns the load"
     )
 
     @model_validator(mode="after")
@@ -183,9 +177,9 @@ class Gear(_Part):
     """The harmonic gear."""
 
     ratio: float = Field(
-        ge=1, le=1000, description="N: motor turns per load turn; a reversing gear: a direction of -1"
+        ge=1, le=1000, description="N, motor turns per load turn; a reversing gear has a direction of -1"
     )
-    teeth: Teeth | None = Field(None, description="numbers of teeth; checked against the ratio")
+    teeth: Teeth | None = Field(None, description="numbers of teeth")
 
     @field_validator("teeth")
     @classmethod
@@ -209,7 +203,7 @@ class Limits(_Part):
     velocity_deg_s: float = Field(gt=0, le=100_000, description="highest speed")
     acceleration_deg_s2: float = Field(gt=0, le=1e7, description="highest acceleration")
     jerk_deg_s3: float = Field(gt=0, le=1e9, description="highest jerk")
-    torque_percent: float = Field(gt=0, le=500, description="highest motor torque, of the rated one (6072h)")
+    torque_percent: float = Field(gt=0, le=500, description="highest motor torque (6072h), of the rated one")
 
     @model_validator(mode="after")
     def _ordered(self) -> Self:
@@ -233,17 +227,15 @@ class CompensationConfig(_Part):
     slew_arcsec_s: float = Field(
         20_000.0, gt=0, le=1e7, description="fastest change of the correction, at the load"
     )
-    ramp_s: float = Field(0.5, gt=0, le=60, description="time in which it is switched on or off")
+    ramp_s: float = Field(0.5, gt=0, le=60, description="time of switching it on or off")
 
 
 class RealtimeConfig(_Part):
     """Scheduling of the master's process while it moves the axis over a real bus."""
 
-    priority: int = Field(
-        50, ge=0, le=99, description="SCHED_FIFO priority of the control loop; 0: that of ordinary work"
-    )
+    priority: int = Field(50, ge=0, le=99, description="SCHED_FIFO priority of the control loop; 0: none")
     cpus: tuple[Annotated[int, Field(ge=0, le=4095)], ...] = Field(
-        (), description="numbers of the processors that the control loop may run on; none: any"
+        (), description="processors of the control loop; by default any"
     )
 
     @field_validator("cpus")
@@ -251,7 +243,7 @@ class RealtimeConfig(_Part):
     def _each_once(cls, cpus: tuple[int, ...]) -> tuple[int, ...]:
         for place, cpu in enumerate(cpus):
             if cpu in cpus[:place]:
-                raise wrong(f"processor {cpu} stands twice; expected it once", place)
+                raise wrong(f"processor {cpu} appears twice; expected it once", place)
         return cpus
 
 
@@ -262,22 +254,18 @@ class AxisConfig(OtherChannels):
     name: str = Field(
         pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$", description="name: letters, digits, '.', '_', '-'"
     )
-    bus: BusConfig = Field(description="the CAN bus")
-    drive: DriveConfig = Field(description="the servo drive")
-    motor_encoder: MotorEncoder = Field(description="the encoder of the motor")
-    load_encoder: LoadEncoder = Field(description="the encoder at the load")
-    gear: Gear = Field(description="the gear between them")
-    load_torque: LoadTorque | None = Field(None, description="torque on the load, if the drive reports it")
-    temperature: Temperature | None = Field(
-        None, description="temperature of the gear, if the drive reports it"
-    )
-    limits: Limits = Field(description="what the axis may do")
+    bus: BusConfig = Field(description="CAN bus")
+    drive: DriveConfig = Field(description="servo drive")
+    motor_encoder: MotorEncoder = Field(description="motor encoder")
+    load_encoder: LoadEncoder = Field(description="load encoder")
+    gear: Gear = Field(description="gear")
+    load_torque: LoadTorque | None = Field(None, description="torque on the load, if reported")
+    temperature: Temperature | None = Field(None, description="temperature of the gear, if reported")
+    limits: Limits = Field(description="limits of the axis")
     compensation: CompensationConfig = Field(
-        default_factory=CompensationConfig, description="how far and how fast the compensation may act"
+        default_factory=CompensationConfig, description="limits of the compensation"
     )
-    realtime: RealtimeConfig = Field(
-        default_factory=RealtimeConfig, description="how the master runs on its machine"
-    )
+    realtime: RealtimeConfig = Field(default_factory=RealtimeConfig, description="scheduling of the master")
 
     _document: Document | None = PrivateAttr(None)
     _eds_path: Path | None = PrivateAttr(None)

@@ -38,9 +38,9 @@ class Encoder(Strict):
     """An encoder: counts per turn and direction."""
 
     counts_per_turn: int = Field(
-        ge=1, le=INT32_MAX, description="counts per turn of its own shaft, after multiplication"
+        ge=1, le=INT32_MAX, description="counts per turn of its shaft, after multiplication"
     )
-    direction: Direction = Field(1, description="-1 if it counts down while the axis turns forward")
+    direction: Direction = Field(1, description="-1 if it counts down when the axis turns forward")
 
     @property
     def scale(self) -> Scale:
@@ -73,16 +73,16 @@ class Source(Strict):
     index: int = Field(0x60E4, ge=0x1000, le=0xFFFF, description="index of the object")
     subindex: int = Field(1, ge=0, le=255, description="sub-index of the object")
     type: Literal["int32", "uint32", "int16", "uint16"] = Field("int32", description="type of the object")
-    via: Literal["tpdo"] = Field("tpdo", description="how it comes; an SDO is too slow for the cycle")
+    via: Literal["tpdo"] = Field("tpdo", description="by PDO")
     node: NodeId | None = Field(
-        None, description="node id of an encoder with a node of its own (CiA 406, 6004h)"
+        None, description="node id of an encoder that is a node of its own (CiA 406, 6004h)"
     )
     range_counts: int | None = Field(
         None,
         ge=2,
         le=2**32,
-        description="reading at which it wraps to zero (single-turn encoder: its counts per turn); "
-        "without it the whole range of the type",
+        description="reading at which it wraps to zero (single-turn encoder: counts per turn); by default "
+        "the range of the type",
     )
 
     @model_validator(mode="after")

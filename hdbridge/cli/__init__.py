@@ -36,8 +36,7 @@ PANELS: Final = {
         "bus.",
         "check": "Check the files of an axis or of a machine; report what they mean, or what is wrong and "
         "where.",
-        "scan": "List the nodes on a CAN bus: what they are, their identity, their state, and lines for an "
-        "axis file.",
+        "scan": "List the nodes on a CAN bus: type, identity, state, and lines for an axis file.",
         "doctor": "Check an axis before its first long motion: files, bus, drive, encoders, directions, "
         "ratio, stops.",
         "conform": "Check a node against CiA 301 and CiA 402: NMT, SDO, PDO, SYNC, EMCY, its EDS, the drive "
@@ -50,7 +49,7 @@ PANELS: Final = {
         "calibrate": "Measure an axis by a plan, fit its model, test it on the axis, and keep it as pending.",
         "measure": "Move an axis by a plan and keep the recording, for diagnose, twin and fit.",
         "fit": "Fit a model to recordings; report parameter intervals and what the data cannot determine.",
-        "report": "Fit a recording again and report the result; needs no axis and moves nothing.",
+        "report": "Fit a recording again and report the result; nothing moves.",
         "diagnose": "Compare records with a model; name the causes that it lacks and those that cannot be "
         "separated.",
         "improve": "Diagnose the active model, extend it, step with both, and keep the better one as "

@@ -34,17 +34,14 @@ def command(
     session: Session,
     plan: PlanOption = "quick",
     out: Annotated[Path | None, out_option("Where the recording goes"), Kind.FOLDER] = None,
-    resume: Annotated[
-        Path | None, resume_option("Go on with an interrupted calibration: what its plan still lacks.")
-    ] = None,
+    resume: Annotated[Path | None, resume_option("Continue an interrupted calibration.")] = None,
     json_file: JsonOption = None,
     html_file: HtmlOption = None,
 ) -> None:
     """Measure an axis by a plan, fit its model, test it on the axis, and keep it as pending.
 
-    The axis moves within the limits of its axis file, without compensation. Everything measured is kept;
-    Ctrl-C stops the axis, and --resume continues. The model is pending until `hdbridge model commit PROFILE`.
-    A model that does not improve on held-out data is not offered.
+    The axis moves within the limits of its axis file, without compensation. Ctrl-C stops it and keeps what
+    was measured. A model that does not improve on held-out data is not offered.
     """
     from hdbridge.cli.measuring import Measurement, phases
     from hdbridge.commissioning.calibration import calibrate

@@ -19,8 +19,8 @@ CheckedArgument = Annotated[
     str,
     typer.Argument(
         metavar="PROFILE",
-        help="A folder with axis.yaml (and model.yaml), an axis file, a machine file, or one that comes with "
-        "hdbridge: article, demo, cell.",
+        help="Folder with axis.yaml (and model.yaml), axis file, machine file, or a bundled one: "
+        "article, demo, cell.",
     ),
 ]
 

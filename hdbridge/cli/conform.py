@@ -38,8 +38,8 @@ def conform(
         str | None,
         typer.Argument(
             metavar="PROFILE",
-            help="Axis whose drive is checked, or machine whose gateway is. Without it: --channel, --node "
-            "and --eds.",
+            help="Axis whose drive is checked, or machine whose gateway is checked. Without it: --channel, "
+            "--node and --eds.",
         ),
     ] = None,
     interface: Annotated[
@@ -51,7 +51,7 @@ def conform(
     ] = None,
     bitrate_bps: Annotated[
         int | None,
-        typer.Option("--bitrate", min=10_000, max=1_000_000, help="Bit rate, where the interface sets it."),
+        typer.Option("--bitrate", min=10_000, max=1_000_000, help="Bit rate, if the interface sets it."),
     ] = None,
     node_id: Annotated[
         int | None, typer.Option("--node", min=1, max=127, help="Node id; else the axis file's.")
@@ -63,11 +63,14 @@ def conform(
         ),
     ] = None,
     axis: Annotated[
-        str | None, typer.Option("--axis", help="Which axis, if the gateway has several.", show_default=False)
+        str | None,
+        typer.Option(
+            "--axis", help="Name of the axis; needed if the gateway has several.", show_default=False
+        ),
     ] = None,
     motion: Annotated[
         bool,
-        typer.Option("--motion", help="Also switch power on and move the axis; without it power stays off."),
+        typer.Option("--motion", help="Also switch power on and move the axis; else power stays off."),
     ] = False,
     store: Annotated[
         bool,
@@ -102,11 +105,10 @@ def conform(
 
     hdbridge conform --channel can0 --node 5 --eds drive.eds
 
-    It listens first and sends nothing if another master is heard. The node is reset several times, and what a
-    check changes is changed back; in the end it is PRE-OPERATIONAL without power. Without --motion power is
-    never switched on. With it, the axis must be free to move.
+    Listens first, and sends nothing if another master is heard. Resets the node several times and undoes each
+    change; in the end the node is PRE-OPERATIONAL without power. With --motion the axis must be free to move.
 
-    Exit status 4 when a check failed, or when the node does not answer or is not without power.
+    Exit status 4 if a check failed, or the node does not answer or is under power.
     """  # fmt: skip
     from hdbridge.axis import BusConfig
     from hdbridge.cli.gateway import eds_of, gateway_axis

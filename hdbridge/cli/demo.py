@@ -32,8 +32,7 @@ def demo(
 ) -> None:
     """Step a simulated axis 240 times each way under four compensation schemes.
 
-    A CANopen master boots and enables a simulated CiA-402 drive over python-can's virtual bus and steps it
-    in a SYNC-driven loop; the load encoder shows the positioning error. It takes half a minute to two. Table,
+    The drive is a simulated CiA-402 drive on python-can's virtual bus. Takes half a minute to two. Table,
     JSON, records and a page go to FOLDER.
     """
     from hdbridge.axis.model import TransmissionModel

@@ -138,7 +138,7 @@ def run(
         known = TransmissionModel.load(path)
     if plan is not None:
         if records:
-            raise InputError("--plan looks at a plan before anything is measured; leave the records out")
+            raise InputError("--plan needs no records; leave them out")
         report = plan_report(Plan.load(plan), known)
         write_json(json_file, report)
         _print_plan(report)
@@ -185,7 +185,7 @@ def _prior(path: Path | None, groups: Sequence[str]) -> Prior | None:
     """Reads the prior for a joint of these groups."""
     if path is None:
         if groups:
-            raise InputError("--group says what a joint has in common with a fleet; name that with --prior")
+            raise InputError("--group needs --prior with the fleet of these groups")
         return None
     need_extra("a prior needs", ("pyarrow",), "fleet")
     from hdbridge.fleet.prior import GROUPS, read_prior
@@ -222,7 +222,7 @@ def print_diagnosis(result: Diagnosis) -> None:
 
 
 def _details(finding: Finding) -> Iterator[str]:
-    """Yields what is known of a finding beyond its line in the table."""
+    """Yields the details of a finding that its line in the table omits."""
     said = [f"{name} {_number(each)}" for name, each in finding.parameters.items()]
     if finding.aliases:
         said.insert(0, f"it may also be: {', '.join(finding.aliases)}")

@@ -53,30 +53,30 @@ def doctor(
             "--torque-percent",
             min=1.0,
             max=500.0,
-            help="Most motor torque, of the rated one; never above limits.torque_percent.",
+            help="Highest motor torque, of the rated one; never above limits.torque_percent.",
         ),
     ] = TORQUE_PERCENT,
     yes: Annotated[bool, typer.Option("--yes", help="Move the axis without asking.")] = False,
     motion: Annotated[
-        bool, typer.Option("--motion/--no-motion", help="Without: only what can be checked unpowered.")
+        bool, typer.Option("--motion/--no-motion", help="--no-motion: only checks without power.")
     ] = True,
     servo: Annotated[
         bool,
         typer.Option(
             "--servo",
-            help="Also run the axis up to 64 % of its speed limit, in the middle of its travel, and compare "
-            "the servo with the model's response in motion.",
+            help="Also run at up to 64 % of the speed limit and compare the servo with the model's response "
+            "in "
+            "motion.",
         ),
     ] = False,
     json_file: JsonOption = None,
 ) -> None:
     """Check an axis before its first long motion: files, bus, drive, encoders, directions, ratio, stops.
 
-    Each line is one check. Under a failed check stands the line of the axis file to change, or what to do.
+    A failed check is followed by the line of the axis file to change, or what to do.
 
-    Exit status 0 when all checks passed, 4 when one failed or motion was not confirmed; 2 when the first
-    failure is a file, 3 when it is the bus. This is not a safety function: the emergency stop must be in
-    hardware.
+    Exit status 0 if all checks passed, 4 if one failed or motion was not confirmed, 2 if the first failure
+    is a file, 3 if it is the bus. This is not a safety function: the emergency stop must be in hardware.
     """
     from hdbridge.cli.servo import SERVO
     from hdbridge.commissioning.bringup.checks import run_checks
@@ -118,7 +118,7 @@ def doctor(
         first = failures[0]
         raise first.verdict.error(
             f"{files.axis}: {len(failures)} of {len(rows)} checks failed, first '{first.check.title}'; "
-            "the lines under each say what to change"
+            "the lines below each give the remedy"
         )
     if refused:
         raise DriveError(f"{files.axis}: {DECLINED}")

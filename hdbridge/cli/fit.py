@@ -32,9 +32,7 @@ def register(app: typer.Typer) -> None:
 def command(
     records: Annotated[
         list[Path],
-        typer.Argument(
-            metavar="RECORD...", help="Recording folders or CSV files, in the order of their time."
-        ),
+        typer.Argument(metavar="RECORD...", help="Recording folders or CSV files, in order of time."),
     ],
     ratio: Annotated[
         float | None,

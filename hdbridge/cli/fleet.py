@@ -1,4 +1,4 @@
-"""``hdbridge fleet``: many joints at once, from their recordings to whom to look at first."""
+"""``hdbridge fleet``: diagnoses many joints and ranks them."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ LimitOption = Annotated[
         metavar="ARCSEC",
         min=0.1,
         max=3600.0,
-        help="Peak of a cause that a joint may reach; the page says in how many hours it will.",
+        help="Limit on the peak of a cause; the page predicts the hours until then.",
     ),
 ]
 JoinsOption = Annotated[
@@ -52,27 +52,23 @@ JoinsOption = Annotated[
 ]
 OutOption = Annotated[
     Path | None,
-    typer.Option("--out", metavar="FOLDER", help="Folder of the results; a run resumes what is there."),
+    typer.Option("--out", metavar="FOLDER", help="Folder of the results; an earlier run in it is continued."),
 ]
 ManifestOption = Annotated[
     Path | None,
-    typer.Option(
-        "--manifest", metavar="M.csv|M.parquet", help="What is known of each recording: docs/fleet.md."
-    ),
+    typer.Option("--manifest", metavar="M.csv|M.parquet", help="Table of the recordings: docs/fleet.md."),
 ]
 ModelOption = Annotated[
     Path | None,
-    typer.Option("--model", metavar="MODEL.yaml", help="Model of each joint that has none of its own."),
+    typer.Option("--model", metavar="MODEL.yaml", help="Model of joints without one of their own."),
 ]
 ModelsOption = Annotated[
     Path | None,
-    typer.Option("--models", metavar="FOLDER", help="Folder with the model of each joint, JOINT.yaml."),
+    typer.Option("--models", metavar="FOLDER", help="Folder with a model per joint, JOINT.yaml."),
 ]
 SchedulerOption = Annotated[
     str | None,
-    typer.Option(
-        "--scheduler", metavar="ADDRESS", help="A Dask scheduler that runs already: tcp://HOST:8786."
-    ),
+    typer.Option("--scheduler", metavar="ADDRESS", help="Running Dask scheduler: tcp://HOST:8786."),
 ]
 WorkersOption = Annotated[
     int | None,
@@ -80,9 +76,9 @@ WorkersOption = Annotated[
 ]
 PagesOption = Annotated[
     bool,
-    typer.Option("--pages", help="Write the page of each joint in the list too, into OUT/pages."),
+    typer.Option("--pages", help="Also write the page of each listed joint, into OUT/pages."),
 ]
-MemoryOption = Annotated[str, typer.Option("--memory", metavar="SIZE", help="Memory limit of each of them.")]
+MemoryOption = Annotated[str, typer.Option("--memory", metavar="SIZE", help="Memory limit of each process.")]
 
 
 def register(app: typer.Typer) -> None:
@@ -126,7 +122,7 @@ class Fleet:
             )
         if self.scheduler is not None and self.workers is not None:
             raise InputError(
-                "--workers: a cluster that exists has its own workers; leave out --workers or --scheduler"
+                "--workers: a running cluster has its own workers; leave out --workers or --scheduler"
             )
         _check_memory(self.memory)
         if self.scheduler == "":
@@ -188,7 +184,7 @@ class Fleet:
         )
 
     def summarise(self) -> None:
-        """Prints and writes what the data set says."""
+        """Prints and writes the summary of the data set."""
         _summarise(self.dataset, self.limit_arcsec, pages=self.pages)
 
     def say_interrupted(self) -> None:
@@ -199,8 +195,8 @@ class Fleet:
 def run(fleet: Fleet) -> None:
     """Diagnose every recording that is not in FOLDER yet, and write Parquet and a page there.
 
-    A joint without a model gets one fitted to its earliest recording. A recording that cannot be used is a
-    row with the reason. Ctrl-C keeps what is done; the same command continues.
+    A joint without a model gets one fitted to its earliest recording. An unusable recording is a row with the
+    reason. Ctrl-C keeps finished results; the same command continues.
     """
     found = fleet.find(fleet.dataset.stored())
     fleet.dataset.create()
@@ -218,7 +214,7 @@ def watch(
     interval_s: Annotated[
         float,
         typer.Option(
-            "--interval", metavar="SECONDS", min=0.1, max=86_400.0, help="Time between two listings."
+            "--interval", metavar="SECONDS", min=0.1, max=86_400.0, help="Time between two listings, s."
         ),
     ] = 60.0,
     once: Annotated[
@@ -227,8 +223,8 @@ def watch(
 ) -> None:
     """Diagnose new recordings as they arrive, and update Parquet and page in FOLDER.
 
-    A recording is ready when its size and time are the same in two listings; one that is still being written
-    waits for the next round. Ctrl-C ends it and keeps what is done (exit status 0).
+    A recording is ready when its size and time are the same in two listings. Ctrl-C ends the command and
+    keeps finished results (exit status 0).
     """
     from hdbridge.fleet.engine import watch as watch_fleet
 
@@ -251,7 +247,7 @@ def report(
     out: OutArgument,
     html_file: Annotated[
         Path | None,
-        typer.Option("--html", metavar="PAGE", help="Write the page here; without it OUT/fleet.html."),
+        typer.Option("--html", metavar="PAGE", help="Write the page here; else OUT/fleet.html."),
         Kind.PAGE,
     ] = None,
     json_file: JsonOption = None,
@@ -259,7 +255,7 @@ def report(
     pages: PagesOption = False,
     joints: Annotated[
         list[str] | None,
-        typer.Option("--joint", metavar="NAME", help="Joint whose page is made, too."),
+        typer.Option("--joint", metavar="NAME", help="Also write the page of this joint."),
     ] = None,
 ) -> None:
     """Write the page of a run again, and print which joints to look at first."""
@@ -275,9 +271,11 @@ def simulate(
     folder: Annotated[
         Path, typer.Argument(metavar="FOLDER", help="Write the fleet here: a new folder."), Kind.FOLDER
     ],
-    joints: Annotated[int, typer.Option("--joints", min=4, max=100_000, help="How many joints.")] = 12,
-    recordings: Annotated[int, typer.Option("--recordings", min=3, max=1000, help="Recordings of each.")] = 4,
-    seed: Annotated[int, typer.Option("--seed", help="Another seed draws another fleet.")] = 0,
+    joints: Annotated[int, typer.Option("--joints", min=4, max=100_000, help="Number of joints.")] = 12,
+    recordings: Annotated[
+        int, typer.Option("--recordings", min=3, max=1000, help="Recordings per joint.")
+    ] = 4,
+    seed: Annotated[int, typer.Option("--seed", help="Seed of the fleet.")] = 0,
 ) -> None:
     """Make recordings of a simulated fleet: known causes that grow over a year, damaged files, exchanged
     joints.
@@ -301,7 +299,7 @@ def _summarise(
     pages: bool = False,
     joints: Sequence[str] = (),
 ) -> None:
-    """Prints and writes what the data set says; also the pages of these joints, and of all of the list."""
+    """Prints and writes the summary, the pages of these joints, and those of all listed joints."""
     from rich.table import Table
 
     from hdbridge.fleet.prior import write_prior
@@ -356,7 +354,7 @@ def _with_pages(folder: Path, latest: Mapping[str, Row], wanted: Collection[str]
             for each in bar.track(missing, description="pages of joints"):
                 try:
                     write_page(folder, latest[each])
-                except InputError as problem:  # such as a recording that was removed
+                except InputError as problem:  # for example a removed recording
                     _note(f"no page of {each}: {problem}")
         there = links(folder, latest)
     return there

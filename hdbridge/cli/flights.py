@@ -77,7 +77,7 @@ def read_flights(
 
 
 def remarks(recording: Recording) -> Iterator[str]:
-    """Yields what a user should know of a recording that was read from flights or a bus log."""
+    """Yields remarks on a recording from flights or a bus log."""
     about = recording.notes
     if count := about.get("cycles_missing_within_parts"):
         yield f"{count} cycles are missing within parts: the time goes on over them"

@@ -35,7 +35,8 @@ def register(app: typer.Typer) -> None:
 
 
 AxisOption = Annotated[
-    str | None, typer.Option("--axis", help="Which axis, if the gateway has several.", show_default=False)
+    str | None,
+    typer.Option("--axis", help="Name of the axis; needed if the gateway has several.", show_default=False),
 ]
 
 
@@ -54,13 +55,13 @@ def simulate(
     axis: AxisOption = None,
     duration_s: Annotated[
         float | None,
-        typer.Option("--duration", min=0.0, help="Stop after this many seconds; without it at Ctrl-C."),
+        typer.Option("--duration", min=0.0, help="Stop after this time, s; else at Ctrl-C."),
     ] = None,
 ) -> None:
     """Run an ideal drive in place of the gateway, in real time, until Ctrl-C.
 
-    It has the bus, node id and objects of the gateway, and its load is where it was asked for. It needs no
-    daemon and no other drive, so it serves the tests of another master's program.
+    It has the bus, node id and objects of the gateway, and needs no daemon: for tests of another master's
+    program.
     """
     from hdbridge.cli.interrupt import deferred_interrupt
     from hdbridge.clock import MonotonicClock
@@ -93,21 +94,21 @@ def doctor(
     axis: AxisOption = None,
     duration_s: Annotated[
         float,
-        typer.Option("--duration", min=0.1, max=86_400.0, help="Seconds to listen; Ctrl-C ends sooner."),
+        typer.Option("--duration", min=0.1, max=86_400.0, help="Time to listen, s; Ctrl-C ends it earlier."),
     ] = 10.0,
     log: Annotated[
         Path | None,
         typer.Option(
-            "--log", metavar="FILE", help="Read a bus log (.log, .asc, .blf, .trc, .mf4) instead of the bus."
+            "--log", metavar="FILE", help="Read a bus log (.log, .asc, .blf, .trc, .mf4) in place of the bus."
         ),
     ] = None,
     json_file: JsonOption = None,
 ) -> None:
-    """Listen to the other master: what it has configured, what it does, and what it gets wrong, with reasons.
+    """Listen to the other master; report its configuration, its commands and its mistakes, with reasons.
 
-    It sends nothing, so it may run next to the daemon. A mistake is followed by what to do instead.
+    Sends nothing, so it may run next to the daemon. A mistake is followed by the correction.
 
-    Exit status 4 when the master made a mistake, or nothing of the axis was heard.
+    Exit status 4 if the master made a mistake, or nothing of the axis was heard.
     """
     from hdbridge.daemon.gateway.trace import Trace
 

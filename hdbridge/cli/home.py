@@ -35,7 +35,7 @@ def home(
         typer.Option(
             "--switch-velocity",
             min=1e-6,
-            help="Towards the switch, degrees of the load per second; else a tenth of the axis's limit.",
+            help="Speed towards the switch, deg/s of the load; else a tenth of the axis's limit.",
         ),
     ] = None,
     zero_velocity_deg_s: Annotated[
@@ -43,25 +43,27 @@ def home(
         typer.Option(
             "--zero-velocity",
             min=1e-6,
-            help="Towards the zero, degrees of the load per second; else a fiftieth of the axis's limit.",
+            help="Speed towards the zero, deg/s of the load; else a fiftieth of the axis's limit.",
         ),
     ] = None,
     acceleration_deg_s2: Annotated[
         float | None,
-        typer.Option("--acceleration", min=1e-6, help="Of the load, deg/s2; else the axis's limit."),
+        typer.Option(
+            "--acceleration", min=1e-6, help="Acceleration of the load, deg/s2; else the axis's limit."
+        ),
     ] = None,
     offset_deg: Annotated[
-        float, typer.Option("--offset", help="Load angle that the home position gets (607Ch).")
+        float, typer.Option("--offset", help="Load angle of the home position (607Ch).")
     ] = 0.0,
     timeout_s: Annotated[
-        float, typer.Option("--timeout", min=0.1, max=3600.0, help="Seconds that it may take.")
+        float, typer.Option("--timeout", min=0.1, max=3600.0, help="Longest time, s.")
     ] = 60.0,
     json_file: JsonOption = None,
 ) -> None:
     """Home the drive by one of its own methods (CiA 402, mode HM); print the position of the axis.
 
-    The drive plans the motion, within the given speeds. Ctrl-C stops it (exit status 130). A model belongs to
-    the zero that the axis had when it was calibrated: an absolute encoder needs no homing.
+    The drive plans the motion. Ctrl-C stops it (exit status 130). A model belongs to the zero of its
+    calibration. An absolute encoder needs no homing.
     """
     from hdbridge.drive.modes import Homing
 

@@ -49,35 +49,32 @@ def command(
         typer.Option(
             "--from",
             metavar="RECORDING",
-            help="Measure nothing, diagnose this; may stand several times, in their order.",
+            help="Diagnose this and measure nothing; may be repeated, in order of time.",
         ),
     ] = None,
     independent_zeros: Annotated[
         bool,
-        typer.Option("--independent-zeros", help="The encoders' zeros were lost between the recordings."),
+        typer.Option("--independent-zeros", help="The encoders' zeros were lost between the records."),
     ] = False,
     columns: ColumnsOption = None,
     units: UnitsOption = None,
     unwrap: UnwrapOption = None,
     auto: Annotated[
         bool,
-        typer.Option("--auto", help="Let the axis run further experiments if causes cannot be separated."),
+        typer.Option("--auto", help="Run further experiments if causes cannot be separated."),
     ] = False,
     rounds: Annotated[
         int, typer.Option("--rounds", min=1, max=20, help="With --auto: maximum number of experiments.")
     ] = 3,
     out: Annotated[Path | None, out_option("Where the recordings go"), Kind.FOLDER] = None,
-    resume: Annotated[
-        Path | None, resume_option("Go on with an interrupted improvement: what it still lacks.")
-    ] = None,
+    resume: Annotated[Path | None, resume_option("Continue an interrupted improvement.")] = None,
     json_file: JsonOption = None,
     html_file: HtmlOption = None,
 ) -> None:
     """Diagnose the active model, extend it, step with both, and keep the better one as pending.
 
-    The axis moves within the limits of its axis file; everything measured is kept, Ctrl-C stops the axis.
-    No model is proposed if nothing is found, if nothing found can be compensated, or if the extended model
-    does not improve positioning. The model is used after `hdbridge model commit PROFILE`.
+    The axis moves within the limits of its axis file. Ctrl-C stops it and keeps what was measured. No model
+    is proposed if nothing that can be compensated is found, or if positioning does not improve.
     """
     from hdbridge.cli.measuring import Measurement, phases
     from hdbridge.commissioning.improvement import Source, improve
@@ -86,7 +83,7 @@ def command(
     files, axis = session.files, session.axis
     active = _active(files)
     if given and resume is not None:
-        raise InputError("--from measures nothing that --resume could go on with: leave one of them out")
+        raise InputError("--from and --resume exclude each other: leave one of them out")
     recordings = load_recordings(given or (), columns, units, unwrap)  # refused before anything is connected
     work = Measurement.asked(axis, plan, out, resume)
     trial = f"{trial_s(work.plan, axis, active) / 60:.1f} min to step with both models, if something is found"

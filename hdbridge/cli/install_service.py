@@ -22,27 +22,25 @@ def register(app: typer.Typer) -> None:
 def install_service(
     machine: MachineArgument,
     yes: Annotated[bool, typer.Option("--yes", help="Write the files; else they are only shown.")] = False,
-    remove: Annotated[bool, typer.Option("--remove", help="Remove what was written before.")] = False,
-    user: Annotated[
-        bool, typer.Option("--user", help="For your own service manager, without the rights of root.")
-    ] = False,
+    remove: Annotated[bool, typer.Option("--remove", help="Remove the files.")] = False,
+    user: Annotated[bool, typer.Option("--user", help="For your own service manager, without root.")] = False,
     account: Annotated[
         str | None,
         typer.Option(
-            "--account", metavar="NAME", help="Run as this user; else as who owns the machine file."
+            "--account", metavar="NAME", help="User of the service; else the owner of the machine file."
         ),
     ] = None,
 ) -> None:
     """Show, write or remove the systemd files that run a machine's daemon from the start of the computer.
 
-    They are a unit and, for SocketCAN with a `bitrate_bps`, a file with which systemd-networkd sets the CAN
-    interface up. Nothing is started: what to type for that is printed.
+    They are a unit and, for SocketCAN with a `bitrate_bps`, a file for systemd-networkd. Nothing is started;
+    the commands for that are printed.
     """
     from hdbridge.daemon.machine import Machine
     from hdbridge.daemon.systemd import service_files
 
     if user and account is not None:
-        raise InputError("--account is for the system's manager; yours runs the daemon as you: leave it out")
+        raise InputError("--account does not apply to your own service manager: leave it out")
     held = Machine.find(machine)
     if held.bus.interface == "virtual":
         raise InputError(

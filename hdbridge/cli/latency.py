@@ -25,7 +25,7 @@ def latency(
     ] = 10.0,
     cycle_ms: Annotated[
         list[float] | None,
-        typer.Option("--cycle-ms", min=0.1, max=1000, help="Only this cycle time; may stand several times."),
+        typer.Option("--cycle-ms", min=0.1, max=1000, help="Only this cycle time; may be repeated."),
     ] = None,
     realtime: Annotated[
         bool, typer.Option(help="Ask for real-time priority and locked memory, as the control loop does.")
@@ -34,7 +34,7 @@ def latency(
 ) -> None:
     """Measure timer latency; print its histogram and the shortest cycle that this computer sustains.
 
-    Run it on the computer that will control the axis, under its usual load, for minutes rather than seconds.
+    Run it on the control computer under its usual load, for minutes.
     """
     from hdbridge.control.latency import CANDIDATES_S, measure
     from hdbridge.control.realtime import prepare_realtime

@@ -32,14 +32,11 @@ def command(
         ),
     ] = "quick",
     out: Annotated[Path | None, out_option("Where the recording goes"), Kind.FOLDER] = None,
-    resume: Annotated[
-        Path | None, resume_option("Go on with an interrupted recording: what its plan still lacks.")
-    ] = None,
+    resume: Annotated[Path | None, resume_option("Continue an interrupted recording.")] = None,
 ) -> None:
     """Move an axis by a plan and keep the recording, for diagnose, twin and fit.
 
-    The axis moves as in a calibration, within the limits of its axis file and without compensation. No model
-    is fitted or changed. Ctrl-C stops the axis, and --resume continues.
+    The axis moves as in a calibration, without compensation. No model is fitted or changed.
     """
     from hdbridge.cli.measuring import Measurement, phases
     from hdbridge.commissioning.calibration import measure

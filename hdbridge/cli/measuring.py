@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 PlanOption = Annotated[
     str,
-    typer.Option("--plan", metavar="quick|full|FILE", help="What is measured: a bundled plan, or a file."),
+    typer.Option("--plan", metavar="quick|full|FILE", help="Bundled plan or plan file."),
 ]
 
 

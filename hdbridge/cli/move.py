@@ -48,7 +48,7 @@ def move(
     ] = False,
     velocity_deg_s: Annotated[
         float | None,
-        typer.Option("--velocity", min=1e-6, help="Degrees of the load per second; else the axis's limit."),
+        typer.Option("--velocity", min=1e-6, help="Speed of the load, deg/s; else the axis's limit."),
     ] = None,
     hold_s: Annotated[
         float | None,
@@ -67,9 +67,8 @@ def move(
 ) -> None:
     """Move the load to one angle or to several, compensated by the active model, and hold the last.
 
-    Each move is limited in speed, acceleration and jerk by the axis file, and refused before anything moves
-    if it would leave the limits. Ctrl-C on the way stops the axis (exit status 130); while it holds, it
-    ends the command in good order. Power is then switched off: a suspended load needs a brake.
+    A move outside the limits of the axis file is refused before anything moves. Ctrl-C stops the axis (exit
+    status 130), or ends the hold. Power is then switched off: a suspended load needs a brake.
     """
     from hdbridge.control.bench import Bench, axis_view, compensation_for
     from hdbridge.motion.procedures.rehearsal import rehearse

@@ -30,31 +30,28 @@ def register(app: typer.Typer) -> None:
 
 
 def new(
-    name: Annotated[Path, typer.Argument(metavar="NAME", help="The new folder; its name is the axis's.")],
+    name: Annotated[Path, typer.Argument(metavar="NAME", help="New folder; its name is the axis's.")],
     source: Annotated[
         Source,
-        typer.Option("--from", help="A bundled profile to copy, or the drive that answers on a bus."),
+        typer.Option("--from", help="Bundled profile to copy, or the drive that answers on a bus."),
     ] = Source.DEMO,
     interface: InterfaceOption = None,
     channel: ChannelOption = None,
     bitrate_bps: Annotated[
         int | None,
-        typer.Option("--bitrate", min=10_000, max=1_000_000, help="Bit rate, where the interface sets it."),
+        typer.Option("--bitrate", min=10_000, max=1_000_000, help="Bit rate, if the interface sets it."),
     ] = None,
     node_id: Annotated[
         int | None,
-        typer.Option("--node", min=1, max=127, help="Of a scan: which of several nodes."),
+        typer.Option("--node", min=1, max=127, help="Node id, if several drives answer."),
     ] = None,
-    eds: Annotated[
-        Path | None, typer.Option("--eds", metavar="FILE", help="Of a scan: the drive's EDS file, copied.")
-    ] = None,
+    eds: Annotated[Path | None, typer.Option("--eds", metavar="FILE", help="The drive's EDS file.")] = None,
     json_file: JsonOption = None,
 ) -> None:
     """Make the folder of an axis: a copy of a bundled profile, or from the data of a drive on the bus.
 
-    With `--from scan --interface socketcan --channel can0` the axis file has the drive's identity, encoders
-    and gear, as far as it reports them; missing values are marked, and `hdbridge check` stops there.
-    Nothing is moved. An existing folder with files in it is refused.
+    With `--from scan --interface socketcan --channel can0` the axis file has the identity, encoders and gear
+    that the drive reports; missing values are marked, and `hdbridge check` stops there. Nothing moves.
     """
     from hdbridge.axis import AxisConfig
     from hdbridge.commissioning.bringup.newprofile import copy_bundled
@@ -106,5 +103,5 @@ def _chosen(bus: str, nodes: tuple[Node, ...], node_id: int | None) -> Node:
         return usable[0]
     there = ", ".join(f"{each.node_id} ({each.kind})" for each in nodes) or "none"
     if not usable:
-        raise DriveError(f"{bus}: no CiA-402 drive with CSP is there; found nodes: {there}")
-    raise InputError(f"{bus}: several drives are there: {there}; say which one by --node")
+        raise DriveError(f"{bus}: no CiA-402 drive with CSP answers; found nodes: {there}")
+    raise InputError(f"{bus}: several drives answer: {there}; choose one with --node")

@@ -47,15 +47,16 @@ ProfileArgument = Annotated[
     str,
     typer.Argument(
         metavar="PROFILE",
-        help="A folder with axis.yaml (and model.yaml), an axis file, or a bundled profile: article, demo.",
+        help="Folder with axis.yaml (and model.yaml), axis file, or bundled profile: article, demo.",
     ),
 ]
 MachineArgument = Annotated[
     str,
     typer.Argument(
         metavar="MACHINE",
-        help="A machine file, its folder, a profile (the machine of that one axis), or one that comes with "
-        "hdbridge: cell, article, demo.",
+        help="Machine file, its folder, profile (a machine of that one axis), or a bundled one: cell, "
+        "article, "
+        "demo.",
     ),
 ]
 ModelOption = Annotated[
@@ -70,7 +71,7 @@ TruthOption = Annotated[
     typer.Option(
         "--truth",
         metavar="TRUTH.yaml",
-        help="Description of the simulated axis; else the profile's twin, or its truth file.",
+        help="Truth file of the simulated axis; else the profile's twin, or its truth file.",
     ),
 ]
 SeedOption = Annotated[int, typer.Option("--seed", help="Seed of the simulated axis.")]
@@ -86,8 +87,8 @@ BorrowOption = Annotated[
     bool,
     typer.Option(
         "--borrow",
-        help="Borrow the bus from the daemon that holds it. Its axes are stopped and switched off, and it "
-        "takes the bus back when this command ends.",
+        help="Borrow the bus from the daemon that holds it: its axes are stopped and switched off until this "
+        "command ends.",
     ),
 ]
 ColumnsOption = Annotated[
@@ -104,7 +105,8 @@ UnitsOption = Annotated[
     typer.Option(
         "--units",
         metavar="CHANNEL=UNIT,...",
-        help="Their units, for example motor=counts:65536,load=rad,time=ms; -deg counts the other way.",
+        help="Units of the columns: motor=counts:65536,load=rad,time=ms; a minus sign reverses the "
+        "direction.",
     ),
 ]
 UnwrapOption = Annotated[
@@ -112,7 +114,7 @@ UnwrapOption = Annotated[
     typer.Option(
         "--unwrap",
         metavar="CHANNEL=PERIOD,...",
-        help="Counters that wrap, with their period in the column's unit: motor=65536.",
+        help="Periods of counters that wrap, in the column's unit: motor=65536.",
     ),
 ]
 JsonOption = Annotated[
@@ -122,7 +124,7 @@ JsonOption = Annotated[
 ]
 HtmlOption = Annotated[
     Path | None,
-    typer.Option("--html", metavar="FILE", help="Write a page that opens without a network."),
+    typer.Option("--html", metavar="FILE", help="Write a self-contained HTML page."),
     Kind.PAGE,
 ]
 
@@ -166,7 +168,7 @@ def need_extra(subject: str, packages: Sequence[str], extra: str) -> None:
 def _installed(package: str) -> bool:
     try:
         return find_spec(package) is not None
-    except ModuleNotFoundError:  # of a package above it
+    except ModuleNotFoundError:  # a parent package is missing
         return False
 
 

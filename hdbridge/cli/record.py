@@ -32,7 +32,7 @@ OutOption = Annotated[
     typer.Option(
         "--out",
         metavar="FOLDER|FILE.csv",
-        help="Folder of a recording, new or empty; or a CSV file, .csv or .csv.gz.",
+        help="New or empty folder of a recording, or a file .csv or .csv.gz.",
     ),
 ]
 AllStatesOption = Annotated[
@@ -56,7 +56,7 @@ def register(app: typer.Typer) -> None:
 
 
 def overviews(flights: FlightsArgument, json_file: JsonOption = None) -> None:
-    """List recordings: from when to when, how large, and what stopped an axis in them."""
+    """List recordings: period, size, and stops in them."""
     need_reader()
     from hdbridge.daemon.recorder.reading import each_flight, overview
 
@@ -77,7 +77,7 @@ def overviews(flights: FlightsArgument, json_file: JsonOption = None) -> None:
 
 
 def info(
-    flight: Annotated[Path, typer.Argument(metavar="FILE.mcap", help="A flight recording.")],
+    flight: Annotated[Path, typer.Argument(metavar="FILE.mcap", help="Flight recording.")],
     json_file: JsonOption = None,
 ) -> None:
     """Report the content of a recording: machine, axes, models, missing cycles, events."""
@@ -131,7 +131,7 @@ def info(
 def mend(flights: FlightsArgument) -> None:
     """Repair recordings that were cut off (kill, power): complete up to their last second.
 
-    The daemon does this itself when it starts. One that is being written is refused.
+    The daemon does this when it starts. A recording that is being written is refused.
     """
     need_reader()
     from hdbridge.daemon.recorder import mend as mending
@@ -157,15 +157,15 @@ def export(
     model: Annotated[
         Path | None,
         typer.Option(
-            "--model-out", metavar="MODEL.yaml", help="Write the model that the axis used at the end, too."
+            "--model-out", metavar="MODEL.yaml", help="Write the model that the axis used at the end."
         ),
         Kind.MODEL,
     ] = None,
 ) -> None:
     """Make a record of one axis, as `fit` and `diagnose` read it.
 
-    Nothing is rounded or interpolated. A new part begins if cycles are missing or the axis was not enabled:
-    a recording folder has a file for each part, and a CSV file can hold only one.
+    Nothing is rounded or interpolated. Missing cycles or a disabled axis begin a new part; a recording
+    folder has a file for each part, a CSV file only one.
     """
     out = _checked_out(out)
     recording, used = read_flights(flights, axis, begin, end, all_states=all_states)
@@ -180,9 +180,9 @@ def export(
 def import_(
     log: Annotated[
         Path,
-        typer.Argument(metavar="LOG", help="A bus log: candump (.log), .asc, .blf, .trc, .mf4; also .gz."),
+        typer.Argument(metavar="LOG", help="Bus log: candump (.log), .asc, .blf, .trc, .mf4; also .gz."),
     ],
-    profile: Annotated[str, typer.Argument(metavar="PROFILE", help="The axis that was on the bus.")],
+    profile: Annotated[str, typer.Argument(metavar="PROFILE", help="Axis that was on the bus.")],
     out: OutOption = None,
     channel: Annotated[
         str | None,
@@ -192,8 +192,8 @@ def import_(
 ) -> None:
     """Make a record of a bus log, as `fit` and `diagnose` read it. Any master may have driven the axis.
 
-    The PDO mapping comes from the SDO traffic in the log, else from the axis file. Log from the drive's
-    boot-up on, so that the mapping is in it. Nothing is sent, and nothing is interpolated.
+    The PDO mapping comes from the SDO traffic in the log (log from the drive's boot-up on), else from the
+    axis file. Nothing is sent or interpolated.
     """
     from hdbridge.axis import AxisConfig
     from hdbridge.control.buslog import import_log

@@ -22,7 +22,7 @@ def command(
     json_file: JsonOption = None,
     html_file: HtmlOption = None,
 ) -> None:
-    """Fit a recording again and report the result; needs no axis and moves nothing."""
+    """Fit a recording again and report the result; nothing moves."""
     from hdbridge.cli.calibration_output import print_calibration, print_page, write_calibration_page
     from hdbridge.commissioning.calibration import concluded
 

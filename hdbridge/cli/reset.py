@@ -23,9 +23,8 @@ def reset(
 ) -> None:
     """Reset a fault of the drive when its cause is gone; power stays off.
 
-    Boots the drive, prints the error code and the last emergency, and resets the fault. It moves nothing. A
-    fault that comes back at once is an error (exit status 4): its cause is still there. A drive that a daemon
-    holds is reset with `hdbridge ctl reset`.
+    Boots the drive, prints the error code and the last emergency, and resets the fault. Nothing moves. A
+    fault that returns at once is an error (exit status 4). With a daemon use `hdbridge ctl reset`.
     """
     from hdbridge.drive.states import State
 

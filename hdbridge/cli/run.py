@@ -38,36 +38,36 @@ def run(
         bool, typer.Option("--simulate", help="Hold simulated drives in place of the bus.")
     ] = False,
     speed: Annotated[
-        float, typer.Option("--speed", min=0.01, max=1000.0, help="With --simulate: this fast, at most.")
+        float,
+        typer.Option(
+            "--speed", min=0.01, max=1000.0, help="With --simulate: speed relative to real time, at most."
+        ),
     ] = 1.0,
     truth: Annotated[
         list[Path] | None,
         typer.Option(
             "--truth",
             metavar="TRUTH.yaml",
-            help="Description of each simulated axis, once for each in order.",
+            help="Truth file of a simulated axis; once for each axis, in order.",
         ),
     ] = None,
     seed: SeedOption = 0,
     interface: InterfaceOption = None,
     channel: ChannelOption = None,
     page: Annotated[
-        bool, typer.Option("--page", help="Show the live page to this machine; its address is printed.")
+        bool, typer.Option("--page", help="Serve the live page to this computer and print its address.")
     ] = False,
-    port: Annotated[
-        int, typer.Option("--port", min=0, max=65_535, help="With --page: at this port; 0: any.")
-    ] = 8402,
+    port: Annotated[int, typer.Option("--port", min=0, max=65_535, help="Port of --page; 0: any.")] = 8402,
     force: ForceOption = False,
 ) -> None:
     """Run the daemon: hold the drives of a machine and take load angles from clients.
 
-    It opens the bus and an API (`hdbridge ctl`, the page, `hdbridge.client`), and moves nothing on its own:
-    a client enables an axis. SIGTERM, Ctrl-C and SIGHUP stop the axes in order and end it (exit status 0);
-    a second one stops them at the quick-stop ramp.
+    Serves `hdbridge ctl`, the page and `hdbridge.client`. Nothing moves until a client enables an axis.
+    SIGTERM, Ctrl-C and SIGHUP stop the axes in order and end the daemon; a second one stops them at the
+    quick-stop ramp. A drive fault is reported to clients and latched.
 
-    Exit status: 0 ended in order, 1 a process of it died again and again, 2 bad input, 3 the bus cannot be
-    opened or has another master, 7 another daemon has the API's address. A fault of a drive does not end the
-    daemon: it is reported to clients, and latched.
+    Exit status: 0 ended in order, 1 a process died repeatedly, 2 bad input, 3 the bus cannot be opened or has
+    another master, 7 another daemon has the API's address.
     """
     check_bus_options(interface, channel, simulate=simulate)
     need_extra("the daemon needs", _EXTRA, "daemon")
@@ -101,7 +101,7 @@ def _simulation(machine: Machine, truths: list[Path], seed: int, speed: float) -
 
     if truths and len(truths) != len(machine.axes):
         names = ", ".join(axis.name for axis in machine.axes)
-        raise InputError(f"--truth stands {len(truths)} times; expected once for each of the axes {names}")
+        raise InputError(f"--truth: given {len(truths)} times; expected once for each of the axes {names}")
     paths = tuple(path.absolute() for path in truths) or tuple(
         simulated_by(axis.profile, None) for axis in machine.axes
     )

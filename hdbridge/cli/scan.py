@@ -39,7 +39,8 @@ def scan(
         str | None,
         typer.Argument(
             metavar="PROFILE",
-            help="Axis with the bus to scan and the drive to expect. Without it: --interface and --channel.",
+            help="Axis whose bus is scanned and whose drive is expected. Without it: --interface and "
+            "--channel.",
         ),
     ] = None,
     interface: InterfaceOption = None,
@@ -48,7 +49,7 @@ def scan(
     borrow: BorrowOption = False,
     bitrate_bps: Annotated[
         int | None,
-        typer.Option("--bitrate", min=10_000, max=1_000_000, help="Bit rate, where the interface sets it."),
+        typer.Option("--bitrate", min=10_000, max=1_000_000, help="Bit rate, if the interface sets it."),
     ] = None,
     listen_s: Annotated[
         float,
@@ -62,13 +63,13 @@ def scan(
     seed: SeedOption = 0,
     json_file: JsonOption = None,
 ) -> None:
-    """List the nodes on a CAN bus: what they are, their identity, their state, and lines for an axis file.
+    """List the nodes on a CAN bus: type, identity, state, and lines for an axis file.
 
-    It listens first and sends nothing if another master is heard: a request may stop the axis that it moves.
-    Then it reads a few objects of every node id from 1 to 127. It writes no object, sends no NMT
-    command and enables nothing; a node that another SDO client is talking to is left alone.
+    Listens first, and sends nothing if another master is heard. Then reads a few objects of each node id from
+    1 to 127. Writes no object, sends no NMT command, enables nothing, and leaves a node alone that another
+    SDO client is talking to.
 
-    Exit status 4 when no node was found, or when PROFILE's drive is not among them.
+    Exit status 4 if no node was found, or PROFILE's drive is missing.
     """
     from hdbridge.axis import BusConfig
     from hdbridge.commissioning.bringup.match import compare
@@ -152,7 +153,7 @@ def _judge(name: str, found: Scan, axis: AxisConfig | None, matches: bool) -> No
             "CAN_H and CAN_L) and that every node has the same bit rate"
         )
     if axis is not None and not matches:
-        raise DriveError(f"{name}: the drive of {axis.path} is not among the nodes; the lines above say why")
+        raise DriveError(f"{name}: the drive of {axis.path} is not among the nodes; see the lines above")
 
 
 def _as_dict(name: str, found: Scan) -> dict[str, Any]:

@@ -63,11 +63,10 @@ def put(
     ],
     json_file: JsonOption = None,
 ) -> None:
-    """Write an object of the drive, and read it back. The drive is neither booted nor enabled by this.
+    """Write an object of the drive, and read it back. The drive is neither booted nor enabled.
 
-    A value that does not suit the object's type or range is refused before anything is sent. What the object
-    does is up to you: 6040h moves an axis. Until the drive stores it (1010h), it lasts until it is switched
-    off; `hdbridge` itself writes what the axis file says at every boot-up.
+    A value outside the object's type or range is refused. Careful: 6040h moves an axis. The value lasts
+    until the drive is switched off or booted by `hdbridge`.
     """
     from hdbridge.drive.dictionary import load_eds
     from hdbridge.drive.values import find_object

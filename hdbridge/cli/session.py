@@ -96,7 +96,7 @@ class Session:
                 yield bench[0], bench[1]
             return
         if self.truth is not None:
-            raise InputError("--truth says what a simulated axis is like: give --simulate with it")
+            raise InputError("--truth describes a simulated axis: give --simulate with it")
         if axis.bus.interface == "virtual":
             raise InputError(
                 f"{axis.where('bus.interface')}: found virtual, which reaches nothing outside this process; "
@@ -159,7 +159,7 @@ def _borrow(bus: BusConfig) -> None:
             if (machine.bus.interface, machine.bus.channel) == (bus.interface, str(bus.channel)):
                 break
     else:
-        return  # opening the bus names its holder
+        return  # opening the bus reports its holder
     names = ", ".join(each.name for each in machine.axes)
     with Client(address.socket, name="hdbridge --borrow") as client:
         client.lend_bus()

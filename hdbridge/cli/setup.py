@@ -47,7 +47,7 @@ def register(app: typer.Typer) -> None:
 
 def setup(
     folder: Annotated[
-        Path, typer.Argument(metavar="NAME", help="The folder of the axis, new or from a set-up before.")
+        Path, typer.Argument(metavar="NAME", help="Folder of the axis, new or from an earlier set-up.")
     ],
     interface: InterfaceOption = None,
     channel: ChannelOption = None,
@@ -67,13 +67,13 @@ def setup(
     ] = False,
     seed: SeedOption = 0,
     yes: Annotated[
-        bool, typer.Option("--yes", help="Answer every yes-or-no question with yes. The axis moves.")
+        bool, typer.Option("--yes", help="Answer every yes-or-no question with yes; the axis moves.")
     ] = False,
 ) -> None:
     """Set up an axis in one sitting: bus, axis file, checks, calibration, model, first move.
 
-    Each step is an ordinary command, which is printed before it runs. Only what nobody can measure is asked.
-    Nothing moves without a yes. The same command resumes a set-up that was interrupted.
+    Prints each command before it runs it, asks for what cannot be measured, and asks before each motion.
+    The same command resumes an interrupted set-up.
     """
     work = _Setup(folder, simulate=simulate, seed=seed, yes=yes)
     try:

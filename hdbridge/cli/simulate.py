@@ -33,7 +33,7 @@ def simulate(
     channel: ChannelOption = None,
     duration_s: Annotated[
         float | None,
-        typer.Option("--duration", min=0.0, help="Stop after this many seconds; else at Ctrl-C."),
+        typer.Option("--duration", min=0.0, help="Stop after this time, s; else at Ctrl-C."),
     ] = None,
 ) -> None:
     """Run the simulated drive of a profile on its bus, in real time, until Ctrl-C.

@@ -48,14 +48,12 @@ def step(
         list[Scheme] | None,
         typer.Option(
             "--scheme",
-            help="Only this scheme; may stand several times. Else all of the model. `none` needs none.",
+            help="Only this scheme; may be repeated. Else all of the model.",
         ),
     ] = None,
     count: Annotated[int, typer.Option("--count", min=2, max=100_000, help="Steps each way.")] = 240,
-    step_deg: Annotated[float, typer.Option("--step-deg", help="Step, in degrees of the motor.")] = 43.56,
-    start_deg: Annotated[
-        float, typer.Option("--start-deg", help="Load angle of the start, in degrees.")
-    ] = 0.0,
+    step_deg: Annotated[float, typer.Option("--step-deg", help="Step, motor degrees.")] = 43.56,
+    start_deg: Annotated[float, typer.Option("--start-deg", help="Load angle of the start, deg.")] = 0.0,
     json_file: JsonOption = None,
     html_file: HtmlOption = None,
     record: Annotated[
@@ -77,7 +75,7 @@ def step(
     stepping = Stepping(count=count, step_deg=step_deg, start_deg=start_deg)
     rehearse(stepping, axis_view(axis), start_deg)  # refused before anything is connected
     chosen: Path | None = None
-    if model is not None or not scheme or set(scheme) != {Scheme.NONE}:  # no compensation needs no model
+    if model is not None or not scheme or set(scheme) != {Scheme.NONE}:  # the scheme none needs no model
         chosen = compensating_model(files, session.profile, model, ", or step without one: --scheme none")
 
     def tell(comparison: Comparison) -> None:
@@ -156,8 +154,8 @@ def run_comparison(
         def show(scheme: Scheme, share: float) -> None:
             if scheme not in begun:
                 begun.add(scheme)
-                bar.reset(bars[scheme])  # its time begins now
-                for each in bars.values():  # none is shown for a refused test
+                bar.reset(bars[scheme])  # the progress time starts here
+                for each in bars.values():  # no progress bar for a refused test
                     bar.update(each, visible=True)
             bar.update(bars[scheme], completed=share)
 

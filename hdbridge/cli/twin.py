@@ -47,18 +47,18 @@ def command(
     profile: ProfileArgument,
     recordings: Annotated[
         list[Path],
-        typer.Argument(metavar="RECORDING...", help="Recording folders or CSV files, in their order."),
+        typer.Argument(metavar="RECORDING...", help="Recording folders or CSV files, in order of time."),
     ],
     check: Annotated[
-        bool, typer.Option("--check", help="Only report what has changed since the profile's twin was made.")
+        bool, typer.Option("--check", help="Only report changes since the profile's twin was made.")
     ] = False,
     compare: Annotated[
-        bool, typer.Option("--compare", help="Only compare the simulation as it is with the recordings.")
+        bool, typer.Option("--compare", help="Only compare the present simulation with the recordings.")
     ] = False,
     truth: TruthOption = None,
     afresh: Annotated[
         bool,
-        typer.Option("--afresh", help="Start from typical values, regardless of the profile's plant."),
+        typer.Option("--afresh", help="Start from typical values."),
     ] = False,
     columns: ColumnsOption = None,
     units: UnitsOption = None,
@@ -68,10 +68,10 @@ def command(
 ) -> None:
     """Fit the simulated drive to recordings of an axis; report its errors, and keep the twin as pending.
 
-    The recordings' commands are replayed on the simulated drive. It starts from the profile's twin or truth
-    file, else from typical values, with the transmission error of the active model. Friction, inertia,
-    spring, loops and delays are fitted until it behaves as the axis did. The first line reports if the values
-    are the axis's. `--simulate` uses the twin after `hdbridge model commit PROFILE --twin`.
+    Replays the recorded commands on the simulated drive and fits friction, inertia, spring, loops and delays,
+    starting from the profile's twin or truth file, else from typical values, with the transmission error of
+    the active model. The first line reports if the values are the axis's. `--simulate` uses the twin after
+    `hdbridge model commit PROFILE --twin`.
     """
     from hdbridge.axis import AxisConfig
     from hdbridge.twin.replay import doubts
@@ -208,7 +208,7 @@ def _left(twin: Twin) -> list[Named]:
 def _check(
     files: Profile, axis: AxisConfig, recording: Recording, json_file: Path | None, html_file: Path | None
 ) -> None:
-    """Reports in one sentence what has changed since the profile's twin was made."""
+    """Reports the changes since the profile's twin was made in one sentence."""
     from hdbridge.twin.check import check
     from hdbridge.twin.twin import KeptTwin
 

@@ -100,7 +100,7 @@ def _sockets(environment: Mapping[str, str]) -> list[Path]:
     found: list[Path] = []
     for folder in (session_folder(environment), SYSTEM_FOLDER):
         if _is_trusted(folder):
-            for place, inside, names in os.walk(folder, followlinks=True):  # ignores what vanishes
+            for place, inside, names in os.walk(folder, followlinks=True):  # files may vanish meanwhile
                 if Path(place) != folder:
                     inside.clear()  # one level of folders
                 found += [Path(place, name) for name in names if name.endswith(".sock")]

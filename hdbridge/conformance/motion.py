@@ -38,7 +38,7 @@ _BIT_13: Final = 1 << 13
 _MASTER: Final = 126
 _CYCLE_S: Final = 0.01
 _STOP_S: Final = 0.5
-"""Time after which an axis that was told to stop must stand."""
+"""Longest time from a stop command to standstill."""
 
 
 def check(
@@ -421,7 +421,7 @@ def _set_point(t: NodeTester, target: int, extra: int = 0) -> None:
 
 
 def _begin_move(t: NodeTester, distances: int) -> int:
-    """Begins a move of so many test distances and returns its target, once the axis moves."""
+    """Begins a move of ``distances`` test distances; returns its target once the axis moves."""
     start = _position(t)
     target = start + _direction(t, distances) * distances * t.travel
     _set_point(t, target)
@@ -668,7 +668,7 @@ class _Stream:
         t.nmt(NMT_START)
 
     def cycle(self, count: int = 1, step: float = 0.0) -> None:
-        """So many cycles, the target advancing by ``step`` in each."""
+        """Runs cycles in which the target advances by ``step``."""
         t, start = self.t, self.target
         for place in range(1, count + 1):
             since = t.mark()

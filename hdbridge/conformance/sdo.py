@@ -1,4 +1,4 @@
-"""Checks of SDO: expedited, segmented and block transfers, and what a server refuses."""
+"""Checks of SDO: expedited, segmented and block transfers, and requests that a server must refuse."""
 
 from __future__ import annotations
 

@@ -27,7 +27,7 @@ _POWERED = (OPERATION_ENABLED, QUICK_STOP_ACTIVE, FAULT_REACTION_ACTIVE)
 def checks(*, moves: bool = False, stores: bool = False) -> list[Check]:
     """Returns the checks in the order of the run.
 
-    Those that switch power on, and those that write to non-volatile memory, only on request.
+    Checks that switch power on or write to non-volatile memory are included only on request.
     """
     subjects = (network, sdo, pdo, emergency, description, drive, motion)
     every = [check for subject in subjects for check in subject.CHECKS]
@@ -58,7 +58,7 @@ def run(
 
 
 def run_one(tester: NodeTester, check: Check) -> Result:
-    """Runs one check and undoes what it has changed."""
+    """Runs one check and undoes its changes."""
     verdict, found, expected = Verdict.PASS, "", ""
     begun_s = tester.now
     tester.prepare(moves=check.moves)

@@ -350,7 +350,7 @@ class NodeTester:
         return None if frame is None else frame.data
 
     def answer(self, request: bytes) -> bytes:
-        """As `ask`; no answer, or one that has not eight bytes, fails the check."""
+        """Sends an SDO request as `ask`; fails the check without an answer of eight bytes."""
         answer = self.ask(request)
         if answer is None:
             self.fail(
@@ -604,7 +604,7 @@ class NodeTester:
         )
 
     def abandon(self) -> None:
-        """Ends a check that was broken off: quick stop, power off, and what it has changed is undone."""
+        """Ends an interrupted check: quick stop, power off, and its changes undone."""
         self._stopped = lambda: False
         if self.powered:
             self.send(0x600 + self.node_id, abort())

@@ -112,7 +112,7 @@ class AxisCycle:
         self._stop_cycles = max(int(stop_timeout_s / axis.drive.cycle_s), STILL_CYCLES + 1)
 
     def begin(self) -> None:
-        """Starts to speak with the next turn; earlier frames and encoder motion are not judged.
+        """Sends RPDOs from the next turn on; earlier frames and encoder motion are not supervised.
 
         After a `Reaction.LATCH` it stays silent unless the latch has been released.
         """

@@ -100,7 +100,7 @@ def record_of(samples: Sequence[Sample], axis: AxisConfig) -> Record:
     if np.isnan(columns["motor_torque_nm"]).any():
         del columns["motor_torque_nm"]  # the drive does not send it
     for place, key in enumerate(axis.channels):
-        reading = np.array([row.readings[place] for row in samples], dtype=np.float64)  # None: NaN
+        reading = np.array([row.readings[place] for row in samples], dtype=np.float64)  # None becomes NaN
         if not np.isnan(reading).any():
             columns[BY_KEY[key].value] = reading
     return Record(columns)

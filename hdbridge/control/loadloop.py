@@ -127,7 +127,7 @@ class LoadLoop:
         """Amount by which the load may lag the motor beyond the model's hysteresis."""
         self._value = 0.0
         self._standing = self._outliers = 0
-        """Periods at rest; consecutive readings outside of what is explained."""
+        """Number of periods at rest, and of consecutive readings outside the explained range."""
         self._difference = self._motor = self._error = 0.0
         """Averages at rest: load encoder minus load angle by motor encoder, the latter, and the error."""
         self._noise = 0.0
@@ -142,7 +142,7 @@ class LoadLoop:
         """During a doubt about the encoder: sum of its moves at rest, the greatest such sum, and the
         greatest disagreement."""
         self._agreeing = 0
-        """Number of readings since that sum became small."""
+        """Number of readings since the sum of moves at rest became small."""
         self._agreed = frozenset[int]()
         """Directions of motion after which the encoders have agreed again."""
 
@@ -189,7 +189,7 @@ class LoadLoop:
             self._standing = 0
         else:
             self._standing += 1
-            # The error without this loop.
+            # Error without this loop.
             error = target + self._value - load
             if self._standing <= self._settled:
                 self._settle(error, load - motor, motor)

@@ -208,6 +208,12 @@ def _axis(file: MachineFile, number: int, places: Places) -> Axis:
         raise places.error(("axes", number, "profile"), str(problem)) from None
     config = AxisConfig.load(profile.axis)
     plan(config)
+    if entry.load_loop is not None and config.load_encoder.is_motor_encoder:
+        raise places.error(
+            ("axes", number, "load_loop"),
+            f"{config.where('load_encoder.source')}: found the motor encoder (6064h); expected an encoder at "
+            "the load, which the load loop controls; leave 'load_loop' out",
+        )
     adaptation = file.adaptation
     if entry.adapt is not None:
         adaptation = adaptation.model_copy(update={"mode": entry.adapt})

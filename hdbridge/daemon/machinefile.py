@@ -31,7 +31,7 @@ class _Part(Strict):
 class LoadLoopSettings(_Part):
     """Load loop: a slow integral of the error at the load encoder, in addition to the model."""
 
-    gain_1_s: float = Field(0.5, gt=0, le=5, description="share of the error that is removed per second")
+    gain_1_s: float = Field(0.5, gt=0, le=5, description="share of the error removed per second")
     maximum_arcsec: float = Field(30.0, gt=0, le=3600, description="largest correction, at the load")
     slew_arcsec_s: float = Field(
         20.0, gt=0, le=10_000, description="fastest change of the correction, at the load"
@@ -43,30 +43,28 @@ class AxisEntry(_Part):
 
     profile: str = Field(
         min_length=1,
-        description="folder with axis.yaml, or an axis file, relative to this file; else a bundled profile",
+        description="folder with axis.yaml or axis file, relative to this file, or a bundled profile",
     )
     compensation: Scheme = Field(
         Scheme.EXTENDED,
-        description="part of the active model that compensates from the start; extended is the whole model",
+        description="part of the active model that compensates; extended is the whole model",
     )
-    adapt: Mode | None = Field(
-        None, description="adaptation mode of this axis, if it differs from adaptation.mode"
-    )
+    adapt: Mode | None = Field(None, description="adaptation mode of this axis; by default adaptation.mode")
     load_loop: LoadLoopSettings | None = Field(
-        None, description="slow control loop on the load encoder; none without this key"
+        None, description="slow control loop on the load encoder; by default none"
     )
 
 
 class TcpSettings(_Part):
     """The API over TCP, for this machine: for the page, local tools and a reverse proxy."""
 
-    port: int = Field(8402, ge=1, le=65_535, description="port of 127.0.0.1 to listen at")
+    port: int = Field(8402, ge=1, le=65_535, description="port of 127.0.0.1")
     names: tuple[Annotated[str, Field(pattern=r"^[A-Za-z0-9.-]+$")], ...] = Field(
         (), description="host names of a reverse proxy on this machine"
     )
     token_file: str = Field(
         min_length=1,
-        description="file with the clients' token, of mode 600, relative to this file",
+        description="file with the clients' token, mode 600",
     )
 
 
@@ -76,14 +74,12 @@ class ApiSettings(_Part):
     socket: str | None = Field(
         None,
         min_length=1,
-        description="Unix socket, relative to this file; by default NAME.sock in the runtime folder",
+        description="Unix socket; by default NAME.sock in the runtime folder",
     )
     group: str | None = Field(
         None, min_length=1, description="group whose members may use the socket; by default the daemon's"
     )
-    tcp: TcpSettings | None = Field(
-        None, description="an additional TCP port for this machine; none without this key"
-    )
+    tcp: TcpSettings | None = Field(None, description="additional TCP port; by default none")
 
 
 class GatewaySettings(_Part):
@@ -97,13 +93,13 @@ class GatewaySettings(_Part):
         12_960_000,
         ge=3600,
         le=1 << 28,
-        description="increments per turn of the load; by default 0.1 arcsec each",
+        description="increments per load turn (default 0.1 arcsec each)",
     )
     timeout_ms: float = Field(
         100.0,
         ge=10,
         le=10_000,
-        description="an axis at rest that gets no set-point for so long loses its power",
+        description="time without set-points after which an axis at rest loses power",
     )
 
 
@@ -130,22 +126,22 @@ class MachineFile(_Part):
     )
     api: ApiSettings = Field(default_factory=ApiSettings, description="access of clients to the daemon")
     lease_s: Annotated[float, Field(ge=0.5, le=3600)] = Field(
-        10.0, description="time after which the lease expires unless its holder renews it"
+        10.0, description="time after which an unrenewed lease expires"
     )
     limits: LimitSettings = Field(default_factory=LimitSettings, description="limits of the daemon")
     recorder: RecorderSettings = Field(
         default_factory=RecorderSettings,
-        description="the flight recorder: folder, size and age of recordings",
+        description="flight recorder",
     )
     gateway: GatewaySettings | None = Field(
-        None, description="axes as drives of another master; without this key there is no gateway"
+        None, description="axes as drives of another master; by default none"
     )
     adaptation: AdaptationSettings = Field(
         default_factory=AdaptationSettings, description="adaptation of model parameters to the load encoder"
     )
     realtime: RealtimeConfig | None = Field(
         None,
-        description="scheduling of the control process; by default that of the axis files, which must agree",
+        description="scheduling; by default that of the axis files, which must agree",
     )
 
 

@@ -45,15 +45,12 @@ class Behaviour(Strict):
         HeartbeatConsumer.RESTARTS,
         description="after a lost heartbeat, 1016h `restarts` with the next one, or `stops`",
     )
-    measures_period: bool = Field(
-        False, description="the period is that of SYNC, whatever 60C2h holds, as with 0 in it"
-    )
+    measures_period: bool = Field(False, description="the period is that of SYNC, whatever 60C2h holds")
     sync_timeout_periods: float = Field(
         0.0,
         ge=0,
         le=1000,
-        description="in a cyclic mode, SYNC overdue by this many periods counts as a lost master (6007h); "
-        "0: never",
+        description="in cyclic modes, a SYNC overdue by this many periods is a lost master (6007h); 0: never",
     )
     status_delay_ms: float = Field(
         0.0, ge=0, le=1_000, description="after a command, 6041h and 6061h keep their old values this long"

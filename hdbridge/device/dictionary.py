@@ -138,7 +138,7 @@ class Entry:
             self.default = self.default.encode()
         elif self._bits and isinstance(self.default, int):
             self.default = self._wrapped(self.default)
-        self.value: Any = self.default  # of the codec's type
+        self.value: Any = self.default  # value of the codec's type
         self.bound: Callable[[], int] | None = None
         self.guard: Callable[[int], None] | None = None
         self.follower: Callable[[int], None] | None = None
@@ -251,7 +251,7 @@ class Dictionary:
         ):
             named = variables.get((0x1018, sub))
             if named is not None and named.default is None and number is not None:
-                self._entries[0x1018, sub].default = number  # only [DeviceInfo] gives it
+                self._entries[0x1018, sub].default = number  # stated only in [DeviceInfo]
         for key, variable in own.items():
             if key not in self._entries and not _PDOS[0] <= variable.index <= _PDOS[1]:
                 self._add(variable, variable).hidden = True

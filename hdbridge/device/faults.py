@@ -46,7 +46,7 @@ class Faults:
     only_report_lost_heartbeat: bool = False
     """The drive sends the EMCY of a lost heartbeat and continues."""
     stay_operational: bool = False
-    """A lost heartbeat does not take it out of OPERATIONAL, whatever 1029h says."""
+    """A lost heartbeat does not take the node out of OPERATIONAL, regardless of 1029h."""
     ignore_missing_set_points: bool = False
     """The drive does not notice that RPDOs are missing."""
     deceleration_counts_s2: float | None = None

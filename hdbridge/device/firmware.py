@@ -315,7 +315,7 @@ class Firmware:
     def _brake(self, option: int, then: State | None) -> None:
         """Stops on the ramp that an option code of 605Ah to 605Eh selects, then enters ``then``."""
         value = self._dictionary.value
-        deceleration: float = value(0x60C6)  # 'current limit' and 'voltage limit': as hard as it goes
+        deceleration: float = value(0x60C6)  # 'current limit' and 'voltage limit' brake with maximum torque
         if option in SLOW_DOWN_RAMP:
             deceleration = min(value(0x6084), deceleration)
         elif option in QUICK_STOP_RAMP:
@@ -396,7 +396,7 @@ class Firmware:
             return
         self._resetting = False
         if self._stage.error_code:
-            return  # its cause is still there
+            return  # the cause persists
         self._error_code = 0
         self._following_error = False
         self._emergency.clear_all()

@@ -234,7 +234,7 @@ class Homing(Mode):
         if not rising & _NEW:
             return
         motion, value = self.motion, self.motion.dictionary.value
-        moved = abs(motion.machine.velocity_counts_s) * 1e-3 * max(value(0x6068), 1)  # in the window time
+        moved = abs(motion.machine.velocity_counts_s) * 1e-3 * max(value(0x6068), 1)  # within the window time
         self._failed = moved > value(0x6067) or motion.velocity_counts_s != 0.0
         self._attained = False
         if self._failed:

@@ -327,7 +327,7 @@ class DriveNode:
             if len(self._rpdo_by_id) > 1:
                 due_s = min([each.deadline_s for each in self._rpdo_by_id.values()])
             self._rpdo_due_s = due_s
-            if before_s <= self._due_s or due_s < self._due_s:  # else something else comes first
+            if before_s <= self._due_s or due_s < self._due_s:  # an earlier event remains
                 self._due_s = self._next_due_s()
         if len(data) > pdo.length:
             self.emergency.occur(ErrorCode.PDO_TOO_LONG)
@@ -471,8 +471,8 @@ class DriveNode:
     def _lose_sync(self) -> None:
         """Discards pending set-points when SYNC is overdue, and stops an axis that follows the bus.
 
-        The period is that of 60C2h again, because an axis that runs on its own clock needs one shorter than
-        sparse SYNCs may have measured.
+        The period is reset to 60C2h, because the measured period of sparse SYNCs is too long for an axis on
+        its own clock.
         """
         self._sync_due_s = _NEVER
         self._period_s = self._own_period_s()
@@ -501,7 +501,7 @@ class DriveNode:
 
 
 def _check_sync_id(value: int) -> None:
-    if value & ~0x7FF or not value & 0x7FF:  # bit 30 would make it a producer, which it is not
+    if value & ~0x7FF or not value & 0x7FF:  # bit 30 would make the node a SYNC producer
         raise SdoAbortError(Abort.RANGE)
 
 

@@ -243,7 +243,7 @@ class ReceivePdo(Pdo):
     def _link(self, entries: list[Entry]) -> None:
         self._writers = tuple(entry.writer() for entry in entries)
         self.length, self._unpack_from = self._codec.size, self._codec.unpack_from
-        self.pending = None  # of another mapping
+        self.pending = None  # data of another mapping are discarded
         self.restart()
 
     def restart(self) -> None:

@@ -55,7 +55,7 @@ class Status(IntEnum):
     INTERNAL_LIMIT = 1 << 11
     MODE_12 = 1 << 12  # PP: set-point acknowledged; CSP: follows; IP: interpolates; HM: attained
     MODE_13 = 1 << 13  # PP, CSP: following error; HM: homing error
-    REFERENCED = 1 << 14  # ours: homing has been done
+    REFERENCED = 1 << 14  # own bit: homing has been done
 
 
 class PowerStage:
@@ -87,7 +87,7 @@ _C = Command
 TRANSITIONS: Final[dict[tuple[State, Command], State]] = {
     (_S.SWITCH_ON_DISABLED, _C.SHUTDOWN): _S.READY_TO_SWITCH_ON,  # 2
     (_S.READY_TO_SWITCH_ON, _C.SWITCH_ON): _S.SWITCHED_ON,  # 3
-    (_S.READY_TO_SWITCH_ON, _C.ENABLE): _S.OPERATION_ENABLED,  # 3, then 4 by itself
+    (_S.READY_TO_SWITCH_ON, _C.ENABLE): _S.OPERATION_ENABLED,  # 3, then 4 automatically
     (_S.SWITCHED_ON, _C.ENABLE): _S.OPERATION_ENABLED,  # 4
     (_S.OPERATION_ENABLED, _C.SWITCH_ON): _S.SWITCHED_ON,  # 5, by option 605Ch
     (_S.SWITCHED_ON, _C.SHUTDOWN): _S.READY_TO_SWITCH_ON,  # 6

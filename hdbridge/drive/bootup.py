@@ -325,7 +325,7 @@ class BootUp:
             return False
         cause = error.__cause__
         if isinstance(cause, SdoError) and not isinstance(cause, SdoAbortError):
-            return False  # no answer at all
+            return False  # no answer
         read_only = isinstance(cause, SdoAbortError) and cause.code == _READ_ONLY
         return read_only or not self._axis.states(row.field)
 

@@ -96,7 +96,7 @@ def check_bus_load(axes: Sequence[AxisConfig], bitrate_bps: int | None = None) -
     raise InputError(
         f"the cycle of {' and '.join(axis.name for axis in axes)} takes {100 * load:.0f} % of the bus "
         f"({cycle_bits(axes):.0f} bits at most in {1e3 * cycle_s:g} ms at {rate} bit/s), "
-        f"allowed are {100 * MAXIMUM_LOAD:.0f} %; what fits is {longer}{fewer}"
+        f"at most {100 * MAXIMUM_LOAD:.0f} % is allowed; choose {longer}{fewer}"
     )
 
 

@@ -326,7 +326,7 @@ def _check_needed(axis: AxisConfig, od: ObjectDictionary) -> None:
     if lacking:
         named = ", ".join(lacking[:4]) + (f" and {len(lacking) - 4} more" if len(lacking) > 4 else "")
         raise InputError(
-            f"{where}: {eds} lacks {named}, which hdbridge cannot do without; expected the EDS file of this "
+            f"{where}: {eds} lacks {named}, which hdbridge requires; expected the EDS file of this "
             "drive, with all of its objects"
         )
     senders = list(_offers(od, objects.TPDO_COMMUNICATION, objects.TPDO_MAPPING))

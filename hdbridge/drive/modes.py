@@ -127,7 +127,7 @@ class Homing:
         """Builds a homing run; raises `InputError` if a value is not finite or beyond the axis's limits."""
         limits = axis.limits
         highest_deg = abs(axis.motor_encoder.degrees(_OFFSET_COUNTS) / axis.gear.ratio)
-        if not abs(offset_deg) < highest_deg:  # false for NaN, too
+        if not abs(offset_deg) < highest_deg:  # also false for NaN
             raise InputError(
                 f"offset_deg: found {offset_deg!r}; expected an angle within {highest_deg:.4g} deg, which "
                 "607Ch can hold; nothing was sent"

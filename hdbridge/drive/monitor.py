@@ -59,7 +59,7 @@ class NodeStatus:
         return self.boot_ups, self.heartbeats, self.emergency_count
 
     def heard_since(self, counts: tuple[int, int, int]) -> str:
-        """Describes what was heard of the node since it had these counts; empty if nothing was."""
+        """Describes the messages of the node since these counts; empty if there were none."""
         boot_ups, heartbeats, emergencies = counts
         said = []
         if self.boot_ups > boot_ups:

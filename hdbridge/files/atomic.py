@@ -69,7 +69,7 @@ def check_writable(path: Path | str) -> None:
                 if number is None
                 else fcntl.fcntl(number, fcntl.F_GETFL) & os.O_ACCMODE == os.O_RDONLY
             ):
-                raise InputError(f"{path}: cannot be written: it does not permit it")
+                raise InputError(f"{path}: cannot be written: no permission")
             return
         target = Path(path).resolve()
         if target.is_dir():
@@ -86,7 +86,7 @@ def check_writable(path: Path | str) -> None:
     except OSError as problem:
         raise InputError(f"{path}: cannot be written: {problem.strerror}") from None
     except RuntimeError:  # Python 3.11 and 3.12 report it this way
-        raise InputError(f"{path}: cannot be written: its links go round in a circle") from None
+        raise InputError(f"{path}: cannot be written: its symbolic links form a loop") from None
 
 
 def _try_out(target: Path) -> None:

@@ -79,8 +79,8 @@ def check_outputs(outputs: Sequence[Output], inputs: Iterable[Path] = ()) -> Non
         for other in outputs[:number]:
             if not _endless(output.path) and _same(output.path, other.path):
                 raise InputError(
-                    f"{output.path}: {other.option} and {output.option} both go there; expected a place for "
-                    "each"
+                    f"{output.path}: {other.option} and {output.option} both write there; expected different "
+                    f"places"
                 )
 
 
@@ -223,7 +223,7 @@ def _resolved(path: Path) -> Path:
     try:
         return path if is_stream(path) else path.resolve()
     except (OSError, RuntimeError):  # a loop of links
-        raise InputError(f"{path}: cannot be written: its links go round in a circle") from None
+        raise InputError(f"{path}: cannot be written: its symbolic links form a loop") from None
 
 
 def _head(path: Path) -> str:

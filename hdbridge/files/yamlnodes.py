@@ -151,7 +151,7 @@ class _Composer:
                 raise self._error(event, f"key {key.found} is not text; expected a name")
             if key.value in children:
                 first = children[key.value][0].line
-                raise self._error(event, f"key '{key.value}' stands twice; it stands first in line {first}")
+                raise self._error(event, f"key '{key.value}' appears twice, first in line {first}")
             children[key.value] = (key, self._node(next(self._events), depth + 1))
         data = {name: child.value for name, (_, child) in children.items()}
         return Node(line, column, data, "a mapping", children)

@@ -39,20 +39,20 @@ COLUMNS: Final[Mapping[str, Mapping[str, tuple[str, str]]]] = {
     RECORDINGS: {
         "key": (
             "text",
-            "SHA-256 of what the row was made from: see below",
+            "SHA-256 as above",
         ),
         "path": ("text", "recording: absolute path or URL"),
-        "joint": ("text", "name of the joint; empty if nothing says it"),
+        "joint": ("text", "name of the joint; empty if unknown"),
         "axis": ("text", "axis of a flight recording, or axis file of a bus log"),
-        "gear": ("text", "type of the gear: the manifest's, else the ratio"),
+        "gear": ("text", "gear type of the manifest, else the ratio"),
         "batch": ("text", "from the manifest"),
         "cell": ("text", "from the manifest"),
         "lubricant": ("text", "from the manifest"),
         "hours": ("number", "operating hours, from the manifest"),
-        "date": ("text", "when it was recorded, ISO 8601"),
+        "date": ("text", "date, ISO 8601"),
         "samples_sha256": (
             "text",
-            "of time, motor angle and load angle, little-endian float64, one after the other",
+            "of time, motor angle and load angle as little-endian float64",
         ),
         "model_sha256": ("text", "of the model without its provenance"),
         "version": ("text", "version of hdbridge"),
@@ -62,22 +62,22 @@ COLUMNS: Final[Mapping[str, Mapping[str, tuple[str, str]]]] = {
         "duration_s": ("number", "time in its parts"),
         "travel_deg": ("number", "range of the load angle"),
         "temperature_c": ("number", "mean, if the recording has the channel"),
-        "rms_arcsec": ("number", "model as given against measurement"),
-        "refitted_rms_arcsec": ("number", "the same with its parameters refitted"),
-        "extended_rms_arcsec": ("number", "the same with the causes that were found"),
+        "rms_arcsec": ("number", "measurement minus the given model"),
+        "refitted_rms_arcsec": ("number", "the same, parameters refitted"),
+        "extended_rms_arcsec": ("number", "the same, with the causes found"),
         "floor_arcsec": ("number", "noise of a reading"),
         "figures": ("figures", "parameters of the extended model, with 95 % half widths"),
         "limits": (
             "limits",
-            "smallest peak from which each cause would be named; no entry if it cannot be seen",
+            "smallest peak from which a cause would be named; no entry if not detectable",
         ),
         "orders": (
             "orders",
-            "orders of the motor angle in the samples, without any model; empty below two turns",
+            "motor orders in the samples, without a model; empty below two turns",
         ),
         "remarks": ("texts", "restrictions of the data"),
-        "reason": ("text", "why there is no diagnosis; null if there is one"),
-        "duplicate_of": ("text", "path of the first recording with the same samples; null for that one"),
+        "reason": ("text", "reason for a missing diagnosis"),
+        "duplicate_of": ("text", "path of the first recording with the same samples"),
         "stamp": (
             "text",
             "SHA-256 of size and times (or etag) of its files and of its row in the manifest; "
@@ -92,15 +92,15 @@ COLUMNS: Final[Mapping[str, Mapping[str, tuple[str, str]]]] = {
         "key": ("text", "of the recording"),
         "path": ("text", "of the recording"),
         "joint": ("text", "of the recording"),
-        "rank": ("integer", "1 is what the diagnosis names first"),
+        "rank": ("integer", "1 is named first"),
         "cause": ("text", "name in the catalogue, or `unexplained`"),
-        "probability": ("number", "that this cause, or one of its aliases, is there"),
-        "aliases": ("texts", "causes that the recording cannot distinguish from it"),
-        "peak_arcsec": ("number", "half the span of what it does in the recording"),
-        "held_out_before_arcsec": ("number", "rms on held-out data without it; null if nothing was held out"),
+        "probability": ("number", "of this cause or one of its aliases"),
+        "aliases": ("texts", "causes that cannot be separated from it"),
+        "peak_arcsec": ("number", "half the span of its effect"),
+        "held_out_before_arcsec": ("number", "held-out rms without it; null if nothing was held out"),
         "held_out_after_arcsec": ("number", "the same with it"),
         "parameters": ("parameters", "its parameters, with 95 % intervals"),
-        "lives_in": ("text", "of `unexplained`: the coordinate that it depends on"),
+        "lives_in": ("text", "coordinate on which `unexplained` depends"),
         "note": ("text", "restriction"),
     },
 }
@@ -177,7 +177,7 @@ class Dataset:
             os.close(folder)
 
     def stored(self) -> Stored:
-        """Returns what a run needs to know of the rows: no figures, no findings."""
+        """Returns the columns that a run needs, without figures and findings."""
         return Stored(self._rows(RECORDINGS, STORED))
 
     def renew(self, changes: Mapping[tuple[str, str], Mapping[str, Any]]) -> None:

@@ -227,7 +227,7 @@ class _Run:
                     again.append(tasks[place])
                 else:
                     self._take(row)
-            for task in again:  # alone, so that no recording is blamed for another
+            for task in again:  # one at a time, so that the failing recording is known
                 for _, row in self._results([task]):
                     self._take(row if row is not None else lost(task[1][0], KILLED))
         finally:

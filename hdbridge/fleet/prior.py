@@ -68,7 +68,7 @@ def _ranges(cause: str, joints: Mapping[str, Sequence[Row]]) -> list[dict[str, A
     for own in joints.values():
         last = next(found for row in reversed(own) if (found := named_by(row, cause)))
         for each in last["parameters"] or ():
-            if not each["name"].endswith("phase_deg"):  # without a middle
+            if not each["name"].endswith("phase_deg"):  # angles have no median
                 values[each["name"]].append(each["value"])
     result = []
     for name, each in values.items():

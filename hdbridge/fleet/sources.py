@@ -30,17 +30,17 @@ FLIGHT: Final = (".mcap",)
 BUS_LOG: Final = (".log", ".asc", ".blf", ".trc", ".mf4")
 BUS_LOGS: Final = (*BUS_LOG, *(f"{each}.gz" for each in BUS_LOG))
 MANIFEST: Final[Mapping[str, str]] = {
-    "path": "recording, relative to the manifest's folder; or a URL",
-    "joint": "name of the joint; the same in each of its recordings",
-    "model": "model file of the joint, relative to the manifest's folder",
+    "path": "recording, relative to the manifest's folder, or a URL",
+    "joint": "name of the joint",
+    "model": "model file of the joint, relative to the same",
     "ratio": "motor turns per load turn",
     "axis": "axis file, for a bus log; name of the axis, for a flight recording",
-    "gear": "type of the gear; joints of one type are compared. Without it: the ratio",
+    "gear": "gear type; joints of one type are compared; by default the ratio",
     "batch": "production batch",
-    "cell": "place of work",
+    "cell": "cell",
     "lubricant": "lubricant",
-    "hours": "operating hours of the joint at the recording",
-    "date": "when it was recorded, ISO 8601",
+    "hours": "operating hours at the recording",
+    "date": "date, ISO 8601",
     "columns": "`--columns` of a CSV file",
     "units": "`--units` of a CSV file",
     "unwrap": "`--unwrap` of a CSV file",
@@ -111,7 +111,7 @@ NOTHING_STORED: Final = Stored()
 
 
 class NotFetchedError(InputError):
-    """A remote recording cannot be fetched; that says nothing about its content."""
+    """A remote recording cannot be fetched; its content is unknown."""
 
 
 def find_sources(
@@ -211,7 +211,7 @@ def _stamp(source: Source, mark: str | None) -> str | None:
 
 
 def _with_about(source: Source, stored: Stored) -> Source:
-    """Fills in what only ``recording.yaml`` says: joint, ratio and date."""
+    """Fills in joint, ratio and date from ``recording.yaml``."""
     if source.joint is not None or source.path.endswith(CSV_NAMES + FLIGHT + BUS_LOGS):
         return source
     about: Mapping[str, Any] = {}

@@ -378,7 +378,9 @@ def identities(orders: Complexes, joint: Sequence[int], time: Sequence[Any]) -> 
     if not later:
         return result
     apart = np.abs(orders[later] - orders[[first[int(numbers[place])] for place in later]])
-    absolute = np.maximum(np.median(apart, axis=0) / 1.1774, 0.02)  # of a Rayleigh distribution
+    absolute = np.maximum(
+        np.median(apart, axis=0) / 1.1774, 0.02
+    )  # 1.1774: median of a Rayleigh distribution of scale 1
     joints = list(first)
     references = orders[[first[each] for each in joints]]
     scale = np.hypot(absolute, EVERYDAY_SHARE * np.median(np.abs(references), axis=0))

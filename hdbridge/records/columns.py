@@ -25,7 +25,7 @@ from hdbridge.units import DEG_PER_TURN, without_unit
 
 REQUIRED: Final[Mapping[str, str]] = MappingProxyType(
     {
-        "time_s": "time; it never runs backwards, its zero and its steps are free",
+        "time_s": "time; never decreasing",
         "motor_position_deg": "measured motor angle, multi-turn",
         "load_position_deg": "measured load angle, multi-turn",
     }

@@ -10,7 +10,7 @@ from hdbridge.records.record import Record
 from hdbridge.records.recording import Recording
 
 Given = Record | Recording | Sequence[Record | Recording] | Mapping[Path, Recording]
-"""In chronological order; the keys of a mapping name them in messages."""
+"""Recordings in chronological order; the keys of a mapping name them in messages."""
 
 
 def by_name(given: Given) -> dict[Path, Recording]:

@@ -57,8 +57,8 @@ class Segment(Strict):
 class RecordedFile(Strict):
     """A file of the recording."""
 
-    name: str = Field(pattern=r"^[^/\\]+$", description="its name in this folder")
-    sha256: str = Field(pattern=r"^[0-9a-f]{64}$", description="checksum of its bytes")
+    name: str = Field(pattern=r"^[^/\\]+$", description="name in this folder")
+    sha256: str = Field(pattern=r"^[0-9a-f]{64}$", description="checksum")
     samples: int = Field(ge=0, description="rows")
 
 
@@ -70,14 +70,12 @@ class RecordingFile(Strict):
     )
     axis: str | None = Field(None, description="name of the axis")
     ratio: float | None = Field(None, gt=0, le=1000, description="N: motor turns per load turn")
-    drive: Identity | None = Field(None, description="identity that the drive answered")
-    date: str | None = Field(None, description="when it was made, ISO 8601")
-    versions: dict[str, str] = Field(default_factory=dict, description="software that made it")
-    notes: dict[str, Any] = Field(default_factory=dict, description="more about it: seed, scheme, model, ...")
-    files: tuple[RecordedFile, ...] = Field(
-        min_length=1, description="the CSV files, in the order of their time"
-    )
-    segments: tuple[Segment, ...] = Field((), description="legs of the motion, in the order of time")
+    drive: Identity | None = Field(None, description="identity of the drive")
+    date: str | None = Field(None, description="date, ISO 8601")
+    versions: dict[str, str] = Field(default_factory=dict, description="versions of the software")
+    notes: dict[str, Any] = Field(default_factory=dict, description="seed, scheme, model, ...")
+    files: tuple[RecordedFile, ...] = Field(min_length=1, description="CSV files, in order of time")
+    segments: tuple[Segment, ...] = Field((), description="legs of the motion, in order of time")
 
 
 @dataclass(frozen=True)

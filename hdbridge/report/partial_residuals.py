@@ -34,7 +34,7 @@ class Strength:
     spread_percent: FloatArray
     """Standard deviation of the measured value, for white noise."""
     finding_percent: FloatArray
-    """The same according to the finding."""
+    """Change of the scale factor according to the finding."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -44,14 +44,14 @@ class Learned:
     name: str
     unit: str
     before: float | None
-    """None if it was only assumed."""
+    """Value before; None if it was only assumed."""
     after: float
     interval: tuple[float, float] | None
     """95 %; None if the value is not the axis's."""
 
     @property
     def text(self) -> str:
-        """In words, as an estimate."""
+        """Description as an estimate."""
         between = f" ({_figure(self.interval[0])} to {_figure(self.interval[1])})" if self.interval else ""
         return f"estimate: {self.name} {_figure(self.after)}{f' {self.unit}' if self.unit else ''}{between}"
 

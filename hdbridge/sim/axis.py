@@ -32,7 +32,7 @@ class Axis:
     _hold_counts: float
     _hold_deg: float
     _holds: bool
-    """True while the demand stays where the loops were switched on."""
+    """True while the demand is still that at which the loops were switched on."""
     _load_counts_per_deg: float
     _load_errors: FixedErrors
     _load_losses: Losses

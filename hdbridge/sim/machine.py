@@ -165,7 +165,7 @@ class Machine:
     def _responded(
         self, counts: Sequence[float], substeps: Sequence[int], first: int
     ) -> tuple[Sequence[float], list[float]]:
-        """Returns the demand with the measured response, and what it adds to the torque of each cycle."""
+        """Returns the demand with the measured response, and its contribution to the torque of each cycle."""
         if self._response is None:
             return counts, []
         demand, torque_nm = list(counts), []

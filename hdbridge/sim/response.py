@@ -21,7 +21,7 @@ class Response:
     demand_counts: float
     """Change of the demand at the end of the latest cycle; motor counts."""
     torque_nm: float
-    """Change of the reported torque there, positive forward."""
+    """Change of the reported torque, Nm, positive forward."""
 
     def __init__(self, truth: TrueResponse, counts_per_rad: float) -> None:
         self._truth, self._counts_per_rad = truth, counts_per_rad

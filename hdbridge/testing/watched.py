@@ -163,7 +163,7 @@ class WatchedDrive(DriveNode):
 
         def bind(read: Callable[[], int] | None) -> None:
             entry.bound = read
-            for pdo in self._tpdos:  # they have compiled their sources
+            for pdo in self._tpdos:  # compiled mappings hold the old source
                 pdo.compile()
 
         bind(lambda: value)

@@ -723,10 +723,8 @@ SHORT_MS: Final = 0.1
 """Negligible command filter: a fifth of a substep."""
 VELOCITY_FEEDFORWARD: Final = 0.9
 """Start value between none (rare) and the full speed."""
-BEST: Final = 3
-"""Number of starts that are followed up."""
-FEW_STEPS, BLOCK_STEPS, WHOLE_STEPS = 5, 10, 25
-"""Maximum steps of a fit: from each start, of each structure, and over the whole recording."""
+FEW_STEPS, WHOLE_STEPS = 3, 25
+"""Maximum steps of a fit: from each start between two halvings, and over the whole recording."""
 GAIN: Final = 0.97
 """Maximum ratio of the misfits with and without a block for keeping it; mere extra parameters gain less."""
 MECHANICS: Final = (
@@ -769,11 +767,7 @@ def in_best_structure(
     """
     few = replays.rough
     cycle_ms = 1e3 * replays.data.pieces[0].commands.cycle_s
-    tried = [_in_units(few, each, FEW_STEPS) for each in starts(begun, cycle_ms)]
-    progress(0.4)
-    tried.sort(key=lambda each: misfit(few.data, each.residuals))
-    again = [_in_units(few, begun_at(each.truth, each.parameters), BLOCK_STEPS) for each in tried[:BEST]]
-    best = min(again, key=lambda each: misfit(few.data, each.residuals))
+    best = by_halving(few, starts(begun, cycle_ms), keep)
     keep(best)
     progress(0.6)
     best = with_blocks(few, best)
@@ -782,20 +776,32 @@ def in_best_structure(
     return _in_units(replays, begun_at(best.truth, best.parameters), WHOLE_STEPS)
 
 
-def with_blocks(few: Replays, best: Fitted) -> Fitted:
-    """Adds blocks to a servo one at a time, as long as one reduces what held-out legs leave."""
-    added: set[str] = set()
+def by_halving(
+    few: Replays, begun: Iterable[Fitting], keep: Callable[[Fitted], None] = lambda _: None
+) -> Fitted:
+    """Fits from each start for a few steps, from the better half for as many more, until one is left.
+
+    A structure that takes more steps to a better place is not lost to one that is near its minimum
+    (successive halving; Jamieson and Talwalkar, AISTATS 2016). All legs count, because a few held-out ones
+    do not decide between servos with equally many parameters.
+    """
+    tried = [_in_units(few, each, FEW_STEPS) for each in begun]
     while True:
-        found = {
-            name: _in_units(few, each, BLOCK_STEPS)
-            for name, each in more_blocks(best)
-            if name.split()[0] not in added
-        }
-        left = {name: misfit(few.data, each.residuals) for name, each in found.items()}
-        name = min(left, key=lambda each: left[each], default=None)
-        if name is None or left[name] > GAIN * misfit(few.data, best.residuals):
-            return best
-        best, added = found[name], added | {name.split()[0]}
+        tried = sorted(tried, key=lambda each: each.cost)[: (len(tried) + 1) // 2]
+        keep(tried[0])
+        tried = [_in_units(few, begun_at(each.truth, each.parameters), FEW_STEPS) for each in tried]
+        if len(tried) == 1:
+            return tried[0]
+
+
+def with_blocks(few: Replays, best: Fitted) -> Fitted:
+    """Adds blocks to a servo one at a time, as long as the best one reduces what held-out legs leave."""
+    while more := list(more_blocks(best)):
+        found = by_halving(few, more)
+        if misfit(few.data, found.residuals) > GAIN * misfit(few.data, best.residuals):
+            break
+        best = found
+    return best
 
 
 def _in_units(replays: Replays, start: Fitting, steps: int) -> Fitted:
@@ -842,8 +848,8 @@ def starts(truth: Truth, cycle_ms: float) -> Iterator[Fitting]:
             yield begun_at(with_sections(truth.model_copy(update={"servo": servo}), parameters), parameters)
 
 
-def more_blocks(best: Fitted) -> Iterator[tuple[str, Fitting]]:
-    """Yields the servo with one more or a replaced block; the names begin with the block's."""
+def more_blocks(best: Fitted) -> Iterator[Fitting]:
+    """Yields the servo with one more or a replaced block."""
     truth, servo = best.truth, best.truth.servo
     if servo.notch is None:
         load = truth.load_.whole_inertia_kg_m2
@@ -853,18 +859,18 @@ def more_blocks(best: Fitted) -> Iterator[tuple[str, Fitting]]:
             notch = TrueNotch(frequency_hz=min(place * free_hz, 600.0), depth=0.5, width=0.7)
             notched = servo.model_copy(update={"notch": notch})
             parameters = (*best.parameters, *(BY_NAME[each] for each in NOTCH))
-            yield f"notch {place}", begun_at(truth.model_copy(update={"servo": notched}), parameters)
-    if servo.moving_average_ms == 0.0:
+            yield begun_at(truth.model_copy(update={"servo": notched}), parameters)
+    if BY_NAME["moving average"] not in best.parameters:
         lag_ms = min(max(2.0 * servo.command_filter_ms, 0.5), 3.0)
         averaged = servo.model_copy(update={"moving_average_ms": 2.0 * lag_ms, "command_filter_ms": SHORT_MS})
         parameters = (*best.parameters, BY_NAME["moving average"])
-        yield "average", begun_at(truth.model_copy(update={"servo": averaged}), parameters)
+        yield begun_at(truth.model_copy(update={"servo": averaged}), parameters)
     filters = tuple(BY_NAME[each] for each in ("speed filter", "torque filter"))
     if not {*filters} & {*best.parameters}:
-        yield "filters", begun_at(with_sections(truth, filters), (*best.parameters, *filters))
-    if servo.friction_feedforward_nm == 0.0:
+        yield begun_at(with_sections(truth, filters), (*best.parameters, *filters))
+    if BY_NAME["friction feed-forward"] not in best.parameters:
         with_friction = with_values(truth, {"friction feed-forward": 0.3 * truth.motor.coulomb_nm})
-        yield "friction", begun_at(with_friction, (*best.parameters, BY_NAME["friction feed-forward"]))
+        yield begun_at(with_friction, (*best.parameters, BY_NAME["friction feed-forward"]))
 
 
 # ----------------------------------------------------------------

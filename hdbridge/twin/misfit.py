@@ -61,8 +61,9 @@ UNKNOWN_DEG = 60.0
 recording, if they are not known (from a gear without such a state, or from the holding torque)."""
 LONGEST_LEG_S = 2.0
 """Maximum length of a leg; a longer one is split, because residuals further apart are uncorrelated."""
-COARSE_S = 15.0
-"""Duration of the pieces on which the first steps of a fit are made."""
+COARSE_S = 20.0
+"""Duration of the pieces on which the first steps of a fit are made: a sweep, steps and a sine of the plan
+`dynamics`, each after its run-in."""
 WITHOUT_MOTION = frozenset({"standstill", "reference", "settle"})
 """Kinds of leg that alone do not qualify a piece for a coarse fit."""
 HELD_OUT = 4
@@ -115,7 +116,7 @@ class Data:
     @property
     def duration_s(self) -> float:
         """Duration of the replayed motion."""
-        return sum(len(each.commands.counts) * each.commands.cycle_s for each in self.pieces)
+        return sum(map(_replayed_s, self.pieces))
 
 
 def held_out_legs(recording: Recording) -> tuple[Segment, ...]:
@@ -163,20 +164,26 @@ def coarse(data: Data, wanted_s: float = COARSE_S) -> Data:
     """Selects pieces of about ``wanted_s`` in total with as many kinds of motion as possible, and then with
     different temperatures.
     """
-    left = sorted(data.pieces, key=lambda each: len(each.commands.counts))
     taken: list[Piece] = []
-    duration_s, kinds = 0.0, set[str]()
-    for again in range(2):
-        for piece in _by_warmth(left, taken) if again else left:
-            length_s = len(piece.commands.counts) * piece.commands.cycle_s
-            new = not kinds.union(WITHOUT_MOTION).issuperset(piece.kind)
-            if any(piece is each for each in taken) or (taken and duration_s + length_s > wanted_s):
-                continue
-            if new or again:
-                taken.append(piece)
-                duration_s += length_s
-                kinds.update(piece.kind)
+    left = sorted(data.pieces, key=_replayed_s)
+    while left:
+        seen = WITHOUT_MOTION.union(*(each.kind for each in taken))
+        piece = max(left, key=lambda each: len({*each.kind} - seen) / _replayed_s(each))
+        if taken and seen.issuperset(piece.kind):
+            break
+        left = [each for each in left if each is not piece]
+        if not taken or sum(map(_replayed_s, taken)) + _replayed_s(piece) <= wanted_s:
+            taken.append(piece)
+    left = [piece for piece in data.pieces if not any(piece is each for each in taken)]
+    for piece in _by_warmth(sorted(left, key=_replayed_s), taken):
+        if sum(map(_replayed_s, taken)) + _replayed_s(piece) <= wanted_s:
+            taken.append(piece)
     return replace(data, pieces=tuple(piece for piece in data.pieces if any(piece is each for each in taken)))
+
+
+def _replayed_s(piece: Piece) -> float:
+    """Returns the duration of a piece with its run-in."""
+    return len(piece.commands.counts) * piece.commands.cycle_s
 
 
 def _by_warmth(pieces: list[Piece], taken: Sequence[Piece]) -> list[Piece]:

@@ -4,33 +4,21 @@ import json
 from pathlib import Path
 
 import pytest
-from support.raised import raised_profile
+from support.raised import raised_profile, without_load_encoder
 
 from hdbridge import AxisConfig, Bench, TransmissionModel
 from hdbridge.analysis.response import harmonics
 from hdbridge.motion.procedures.even_speed import EvenSpeed
 from hdbridge.simulated import simulated
 
-REMOVED = {
-    "counts_per_turn: 2880000": "counts_per_turn: 400000",
-    "{index: 0x60E4, subindex: 1": "{index: 0x6064, subindex: 0",
-}
-"""The load encoder's reading is that of the motor, 50 turns to one."""
-
 
 @pytest.fixture
 def blind(tmp_path: Path) -> Path:
-    folder = raised_profile(tmp_path / "blind")
-    text = (folder / "axis.yaml").read_text()
-    for old, new in REMOVED.items():
-        assert old in text
-        text = text.replace(old, new)
-    (folder / "axis.yaml").write_text(text)
-    return folder
+    return without_load_encoder(raised_profile(tmp_path / "blind"))
 
 
 def ripples(profile: Path, *models: TransmissionModel) -> list[float]:
-    """Ripple of the load at 76 deg/s, arcsec rms; the encoder at the load sees it."""
+    """Ripple of the load at 76 deg/s, arcsec rms; load encoder sees it."""
     with simulated(AxisConfig.load(profile)) as drive:
         drive.boot()
         runs = [Bench(drive, each).run(EvenSpeed((76.0,))).outcome for each in models]

@@ -93,7 +93,7 @@ def test_more_axes_than_the_bus_carries_are_refused_with_what_would_fit() -> Non
         check_bus_load(fast, 1_000_000)
     text = str(refused.value)
     assert "axis 1 and axis 2" in text
-    assert "allowed are 80 %" in text
+    assert "at most 80 % is allowed" in text
     assert "or 3 of the 6 axes" in text
     longer_ms = float(text.split("a cycle_ms of ")[1].split(maxsplit=1)[0])
     assert check_bus_load(axes(6, cycle_ms=longer_ms), 1_000_000) <= MAXIMUM_LOAD

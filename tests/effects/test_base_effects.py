@@ -18,6 +18,7 @@ from hdbridge.axis.effects import (
     Start,
     Synchronous,
 )
+from hdbridge.axis.effects.orders import waves
 
 ARTICLE_ORDERS = [
     (1, 4.9, -126.8),
@@ -47,6 +48,14 @@ def test_article_synchronous_part_has_the_peak_to_peak_of_its_table():
         orders=tuple(MotorOrder(order=k, amplitude_arcsec=a, phase_deg=p) for k, a, p in ARTICLE_ORDERS)
     )
     assert np.ptp(effect.predict(Motion(np.linspace(0, 360, 200_001)))) == pytest.approx(42.93, abs=0.01)
+
+
+@given(st.lists(st.one_of(st.integers(0, 200), st.floats(0.01, 10.0)), max_size=8), st.floats(-1e4, 1e4))
+def test_waves_of_any_order_are_its_cosine_and_sine(numbers, first_rad):
+    angle_rad = first_rad + np.linspace(0.0, 10.0, 50)
+    for number, wave in zip(numbers, waves(angle_rad, numbers), strict=True):
+        # An angle of 2e6 rad has 2e6 * 1e-16 rad of rounding.
+        assert wave == pytest.approx(np.exp(1j * number * angle_rad), abs=1e-8)
 
 
 def test_an_order_may_stand_only_once():

@@ -88,7 +88,7 @@ HEAD = "schema: test.thing/1\nnode_id: 1\n"
         ("- 1\n", "1:1: found a list; expected a mapping"),
         ("", "1:1: the file is empty"),
         ("# only a comment\n", "1:1: the file is empty"),
-        (HEAD + "node_id: 2\n", "3:1: key 'node_id' stands twice; it stands first in line 2"),
+        (HEAD + "node_id: 2\n", "3:1: key 'node_id' appears twice, first in line 2"),
         (HEAD + "big: &a {width_mm: 1}\n", "3:6: anchor &a; expected plain values, without anchors"),
         (HEAD + "big: *a\n", "3:6: alias *a; expected values written out, without aliases"),
         (HEAD + "name: !!python/object:os.system x\n", "3:7: tag tag:yaml.org,2002:python/object:os.system; expected plain values, without tags"),

@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import math
+import shutil
 import struct
 
 import numpy as np
 import pytest
+from support.daemon import PROFILE
 from support.gateway import COUNTS_PER_DEG, NODE, GatewayBench, gateway_bench
+from support.raised import without_load_encoder
 from support.service import play
 
+from hdbridge.daemon.loop.states import AxisState
 from hdbridge.daemon.memory import CommandKind
 from hdbridge.motion import MotionMode
 
@@ -440,8 +444,30 @@ def client_by_force(bench):
     bench.bridge.lease.take("a person", force=True)
 
 
-@pytest.mark.parametrize("withdraw", [nmt_stop, disable_voltage, lost_sync, client_by_force])
-def test_a_request_for_power_that_is_withdrawn_meanwhile_is_not_followed(tmp_path, withdraw):
+def client_for_a_moment(bench):
+    """A client takes the lease by force and releases it before the service has looked."""
+    lease = bench.bridge.lease
+    lease.release(lease.take("a person", force=True))
+
+
+def test_a_client_that_takes_the_axis_for_a_moment_ends_the_motion_of_the_gateway(tmp_path):
+    async def scenario(bench):
+        await bench.enable()
+        await swing(bench)
+        await bench.wait(0.6)
+        client_for_a_moment(bench)
+        await faulted(bench, 0xFF01)
+        await stands(bench)
+        await reset(bench)
+
+    scene(tmp_path, scenario)
+
+
+@pytest.mark.parametrize("seen", ["ENABLING", "ENABLED"])
+@pytest.mark.parametrize(
+    "withdraw", [nmt_stop, disable_voltage, lost_sync, client_by_force, client_for_a_moment]
+)
+def test_a_request_for_power_that_is_withdrawn_meanwhile_is_not_followed(tmp_path, withdraw, seen):
     async def scenario(bench):
         plc = bench.plc
         plc.begin()
@@ -450,11 +476,15 @@ def test_a_request_for_power_that_is_withdrawn_meanwhile_is_not_followed(tmp_pat
             await bench.until(lambda bits=bits: plc.statusword & STATE == bits)
         reader = bench.daemon.memory.reader()
         plc.controlword = 0x0F
-        await bench.until(lambda: bench.daemon.states[0].name == "ENABLING")
+        plc.target += round(COUNTS_PER_DEG)
+        await bench.until(lambda: bench.daemon.states[0].name == seen)
         withdraw(bench)
         await bench.wait(1.0)
-        samples, _ = reader.read()
-        assert not any(samples["axes"][:, 0]["mode"] == MotionMode.FOLLOW)
+        axis = reader.read()[0]["axes"][:, 0]
+        if seen == "ENABLING":
+            assert not any(axis["mode"] == MotionMode.FOLLOW)
+        driven = axis["load_target_deg"][axis["state"] == AxisState.ENABLED]
+        assert np.ptp(driven) < 0.01  # the target begins at the load encoder; 1 degree was asked for
         await stands(bench)
         if withdraw is not client_by_force:  # who has it now, and at rest
             assert bench.daemon.states[0].name == "DISABLED"
@@ -515,3 +545,18 @@ def test_a_fault_of_one_axis_leaves_the_other_in_motion(tmp_path):
         assert first.statusword & STATE == ENABLED
 
     scene(tmp_path, scenario, axes=2)
+
+
+def test_without_a_load_encoder_it_reports_the_predicted_load_angle(tmp_path):
+    async def scenario(bench):
+        await bench.enable()
+        await swing(bench, amplitude_deg=10.0)
+        await bench.wait(3.0)
+        bench.plc.plan = lambda cycle: None
+        await bench.wait(0.5)
+        await stands(bench)
+        off_deg = bench.plc.position / COUNTS_PER_DEG - bench.load_deg
+        assert abs(off_deg * 3600.0) < 5.0  # the motor's angle alone would be off by 40 arcsec
+
+    profile = without_load_encoder(shutil.copytree(PROFILE, tmp_path / "profile"))
+    scene(tmp_path, scenario, profile=profile)

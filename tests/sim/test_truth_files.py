@@ -73,7 +73,7 @@ def test_the_inertias_are_1_to_3_and_the_load_s_resonance_is_realistic() -> None
         ),
         ("law: rolling_friction", "law: rolling", r"gear\.hysteresis"),
         ("exponent: 1.6", "exponent: 1.6\n    start_arcsec: 41", r"41 arcsec lies outside"),
-        ("order: 8", "order: 6", r"order 6 stands twice"),
+        ("order: 8", "order: 6", r"order 6 appears twice"),
         ("substep_ms: 0.5", "substep_ms: 5", r"substep_ms: found 5"),
         ("stiffness_nm_per_rad: 16000", "stiffness_nm_per_rad: 4.0e6", r"too long for a resonance"),
         ("hdbridge.truth/1", "hdbridge.truth/2", r"schema: found 'hdbridge.truth/2'"),

@@ -59,7 +59,9 @@ class Laws:
         """Last event that may stop the axis; last time that the master sent another controlword."""
         self.word = 0
         self.following = False
-        self.lowest = self.highest = 0.0
+        self.unasked = ""
+        """Reason why the present following, once it moves, is motion that nobody asked for."""
+        self.lowest = self.highest = self.began_deg = 0.0
         self.enabled = 0
         self.before: tuple[int, float] | None = None
 
@@ -88,10 +90,15 @@ class Laws:
         following = axis["mode"] == MotionMode.FOLLOW
         if following and not self.following:
             self.enabled += 1
-            assert self.word & 0x8F == 0x0F, "followed without 'enable operation'"
-            assert self.asked_s > self.disturbed_s, "followed without a new controlword"
-            self.lowest = self.highest = place
+            self.unasked = ""
+            if self.word & 0x8F != 0x0F:
+                self.unasked = "followed without 'enable operation'"
+            elif self.asked_s <= self.disturbed_s:
+                self.unasked = "followed without a new controlword"
+            self.lowest = self.highest = self.began_deg = place
         self.following = following
+        # A disturbance while the command to follow is on its way must not move the axis.
+        assert not (following and self.unasked and place != self.began_deg), self.unasked
         # A stop from full speed overshoots by what it needs to brake.
         slack = limits.velocity_deg_s**2 / (2.0 * limits.acceleration_deg_s2) + limits.velocity_deg_s * 0.15
         assert self.lowest - slack <= place <= self.highest + slack

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import re
 import shutil
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
 import numpy as np
 
 from hdbridge import Bench, Drive
-from hdbridge.analysis.response import Trial, harmonics, motor_orders, response_of
+from hdbridge.analysis.response import Harmonics, Trial, harmonics, motor_orders, response_of
 from hdbridge.axis import AxisConfig
 from hdbridge.axis.model import TransmissionModel
 from hdbridge.axis.model.response import Response
@@ -28,8 +29,13 @@ RAISED = {
     "maximum_arcsec": "600",
     "slew_arcsec_s": "100000",
 }
+REMOVED = {
+    "counts_per_turn: 2880000": "counts_per_turn: 400000",
+    "{index: 0x60E4, subindex: 1": "{index: 0x6064, subindex: 0",
+}
+"""The load encoder's reading is that of the motor, 50 turns to one."""
 
-RUNS = EvenSpeed((123.5, 104.0, 83.2, 65.0, 49.4, 36.4, 23.4), window_s=0.6)
+RUNS = EvenSpeed((123.5, 104.0, 83.2, 65.0, 49.4, 36.4, 23.4), window_s=1.2)
 
 
 def raised_axis() -> str:
@@ -48,24 +54,39 @@ def raised_profile(folder: Path) -> Path:
     return folder
 
 
+def without_load_encoder(folder: Path) -> Path:
+    """Removes the load encoder from a profile."""
+    text = (folder / "axis.yaml").read_text(encoding="utf-8")
+    for old, new in REMOVED.items():
+        assert old in text
+        text = text.replace(old, new)
+    (folder / "axis.yaml").write_text(text, encoding="utf-8")
+    return folder
+
+
 @cache
 def measured_response(profile: Path) -> Response:
-    """Measures the response of a raised profile's axis on a bench, without the trials of a motion test."""
+    """Measures the response of a raised profile's axis on a bench, with a single trial of its filter."""
     axis = AxisConfig.load(profile)
     model = TransmissionModel.load(profile / "model.yaml")
     orders = tuple(each.order for each in motor_orders(model))
+    limits, cycle_s = limits_of(axis, model), axis.drive.cycle_s
     with (
         simulated_bench(profile / "truth.yaml", axis.eds_path) as (bus, clock, _),
         Drive(bus, axis, clock) as drive,
     ):
         drive.boot()
-        none, static = (
-            tuple(harmonics(each, orders, model.ratio) for each in Bench(drive, used).run(RUNS).outcome)
-            for used in (None, model)
-        )
-    limits = limits_of(axis, model)
-    response = response_of(none, [Trial(static)], orders, model.ratio, axis.drive.cycle_s, limits)
-    assert response is not None
+
+        def runs(used: TransmissionModel | None) -> tuple[Harmonics, ...]:
+            outcome = Bench(drive, used).run(RUNS).outcome
+            return tuple(harmonics(each, orders, model.ratio) for each in outcome)
+
+        none, static = runs(None), Trial(runs(model))
+        first = response_of(none, [static], orders, model.ratio, cycle_s, limits)
+        assert first is not None
+        trials = [static, Trial(runs(replace(model, response=first)), first.filter)]
+        response = response_of(none, trials, orders, model.ratio, cycle_s, limits)
+        assert response is not None
     return response
 
 

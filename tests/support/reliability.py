@@ -27,7 +27,7 @@ from tests.support.characters import FRIENDLY, Character
 RECORD: Final = "HDBRIDGE_RELIABILITY"
 """Environment variable: file to which a line of JSON is added for each row that was tried."""
 WORDS: Final = {
-    Reaction.GO: "go on, count",
+    Reaction.GO: "continue, count",
     Reaction.FREEZE: "freeze",
     Reaction.QUICK_STOP: "quick stop",
     Reaction.LATCH: "latch",
@@ -231,18 +231,18 @@ FURTHER: Final = (
     Further("the motor does not follow", "quick stop, once the error is beyond the limit", 2),
     Further("a model asks for a step beyond the limits of speed and slew",
         "quick stop; the target is not sent", 1),
-    Further("a client's target is not a number, infinite or out of limits",
-        "refused; the motion goes on", 1),
+    Further("a client's target is not a number, infinite or outside the limits",
+        "refused; the motion continues", 1),
     Further("a client streams a set-point that is not a number", "the stream ends, braking", 1),
-    Further("a mailbox full of commands that make no sense", "each refused; the motion goes on", 32),
+    Further("a mailbox full of invalid commands", "each refused; the motion continues", 32),
     Further("an SDO write, an NMT reset, a set-point from the service in motion", "not sent", 0),
-    Further("the place told with the enable command is stale", "enabled where it is; no motion", 0),
-    Further("the drive's identity, encoder or gear is another", "no set-point; not enabled", 0),
+    Further("the position in the enable command is stale", "enabled in place; no motion", 0),
+    Further("another drive identity, encoder or gear", "no set-point; not enabled", 0),
     Further("the control process is killed in motion", "the drives stop by themselves", 25),
-    Further("the control process begins again", "every axis disabled and unverified", 1),
+    Further("the control process restarts", "every axis disabled and unverified", 1),
     Further("the service dies during a jog", "the jog runs out and brakes", 150),
     Further("the interface comes back", "opened; verified again; disabled", 126),
-    Further("the disk is full", "the recorder drops and says so; no cycle is missed", 0),
+    Further("the disk is full", "the recorder drops and reports it; no cycle is missed", 0),
 )  # fmt: skip
 """Further faults, in the order of the page."""
 

@@ -6,7 +6,6 @@ import struct
 from pathlib import Path
 
 import can
-import fault_names
 import pytest
 
 from hdbridge.drive.supervision import Fault
@@ -341,10 +340,6 @@ def test_what_is_checked_above_was_asked_for(drive, program):
 def test_every_fault_of_the_supervision_can_be_made():
     answered = {each.answers for each in FAULTS.values() if each.answers} | {*OF_THE_PROGRAM}
     assert answered == {fault.value for fault in Fault}
-
-
-def test_the_page_has_the_table():
-    assert fault_names.PAGE.read_text(encoding="utf-8") == fault_names.page(), "run tools/fault_names.py"
 
 
 def test_the_drive_lists_its_faults(drive):

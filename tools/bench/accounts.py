@@ -1,4 +1,4 @@
-"""An account of the cycles: each number is that of a sample, was told as skipped, or was lost by a reader."""
+"""Account of the cycles: each number has a sample, was reported as skipped, or was lost by a reader."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ class Accounts:
     def __init__(self) -> None:
         self.samples = 0
         self.lost = 0
-        """Samples that this reader was too slow for."""
+        """Samples lost because this reader was too slow."""
         self.missing = 0
-        """Numbers between two samples that have none."""
+        """Cycle numbers without a sample."""
         self.skipped = 0
         """Cycles that the samples report as skipped."""
         self._cycle: int | None = None

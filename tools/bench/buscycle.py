@@ -1,17 +1,11 @@
-"""CPU time of the control cycle of n axes, and of one axis before and after a change.
+"""CPU time of the control cycle of n axes.
 
-    python tools/bench/buscycle.py [--before FOLDER] [--interface virtual|loopback]... [--json FILE]
+    python tools/bench/buscycle.py [--interface virtual|loopback]... [--json FILE]
 
-One run measures, in interleaved blocks, the CPU time of the thread (`time.thread_time`) per cycle of
-
-  before       one axis through `Cycle` as another checkout (FOLDER, made with ``git worktree add``) has it
-  now          one axis through `Cycle` as it is here
-  n axes       `BusCycle` with 1, 2, 4 and 6 axes
-
-each with the target held, and compensated. Each of the three has a process of its own, kept alive for the
-whole run; only one of them works at a time. The buses are those of `cycle.py`, and what the answering nodes
-cost is subtracted. Of n axes the cost for each axis and for one axis more is printed: what is linear in n has
-both constant or falling.
+One run measures, in interleaved blocks, the CPU time of the thread (`time.thread_time`) per cycle of one axis
+through `Cycle`, and of `BusCycle` with 1, 2, 4 and 6 axes, each with the target held, and compensated. The
+buses are those of `cycle.py`, and the cost of the answering nodes is subtracted. Of n axes the cost for each
+axis and for one axis more is printed: what is linear in n has both constant or falling.
 """
 
 from __future__ import annotations
@@ -19,10 +13,7 @@ from __future__ import annotations
 import argparse
 import json
 import math
-import os
 import statistics
-import subprocess
-import sys
 import time
 import warnings
 from collections.abc import Callable
@@ -35,6 +26,8 @@ from cycle import PROFILE, AnsweringBus, LoopbackSocket, NeverSleeping, Variants
 from hdbridge.axis import AxisConfig
 from hdbridge.axis.model import TransmissionModel
 from hdbridge.clock import Clock
+from hdbridge.control.axiscycle import AxisCycle
+from hdbridge.control.buscycle import BusCycle
 from hdbridge.control.compensation import Compensation, CompensationLimits
 from hdbridge.drive.feedback import Feedback
 from hdbridge.drive.image import ProcessImage
@@ -45,21 +38,16 @@ from hdbridge.errors import SafetyStop
 
 AXES = (1, 2, 4, 6)
 HELD, COMPENSATED = "held", "compensated"
-HERE = Path(__file__).resolve().parents[2]
 
 
 class Busy(Exception):  # noqa: N818 - what happened
-    """The machine stalled within a block, and the cycle made a fault of it."""
+    """Raised if the machine stalled within a block, which the cycle reported as a fault."""
 
 
 class Axes:
-    """Some axes on one bus, enabled, each on its own slow sine."""
+    """Enabled axes on one bus, each on its own slow sine."""
 
     def __init__(self, bus: Any, count: int, model: TransmissionModel, clock: Clock | None = None) -> None:
-        # Only here: the checkout before the change may not have them.
-        from hdbridge.control.axiscycle import AxisCycle  # noqa: PLC0415
-        from hdbridge.control.buscycle import BusCycle  # noqa: PLC0415
-
         self.bus = bus
         self.clock = clock if clock is not None else NeverSleeping()
         axis = AxisConfig.load(PROFILE)
@@ -83,7 +71,7 @@ class Axes:
         return lambda feedback: counts_for(command(2.0 * sin(feedback.time_s + phase)))
 
     def start(self, kind: str) -> None:
-        """Before a block: everything released, power on."""
+        """Prepares a block: latches released, power on."""
         while self.bus.recv(0.0) is not None:
             pass
         for axis, answer in zip(self.cycle.axes, self.answers, strict=True):
@@ -99,13 +87,13 @@ class Axes:
             axis.image.power.go(State.OPERATION_ENABLED)
 
     def check(self) -> None:
-        """Raise `Busy` where an axis was stopped within the block."""
+        """Raises `Busy` if an axis was stopped within the block."""
         if any(axis.supervision.stop is not None for axis in self.cycle.axes):
             raise Busy
 
 
 def _bus(interface: str, count: int) -> tuple[Any, Callable[[], object]]:
-    """A bus on which so many drives answer, and what answering costs by itself."""
+    """Returns a bus on which ``count`` drives answer, and the cost of answering."""
     node_ids = range(1, count + 1)
     if interface == "virtual":
         bus = AnsweringBus(*node_ids)
@@ -115,7 +103,7 @@ def _bus(interface: str, count: int) -> tuple[Any, Callable[[], object]]:
 
 
 class Worker:
-    """The cycles of one checkout, measured block by block."""
+    """Cycles, measured block by block."""
 
     def __init__(self) -> None:
         self.model = TransmissionModel.load(PROFILE / "model.yaml")
@@ -124,7 +112,7 @@ class Worker:
         self.several: dict[tuple[str, int], tuple[Axes, Callable[[], object]]] = {}
 
     def block(self, interface: str, count: int, kind: str, cycles: int) -> float:
-        """Own cost of one cycle, us; ``count`` 0 is one axis through `Cycle`."""
+        """Returns the net cost of one cycle, us; ``count`` 0 is one axis through `Cycle`."""
         for _ in range(20):
             with suppress(SafetyStop, Busy):
                 return (
@@ -163,61 +151,21 @@ class Worker:
             pass
         return cost_us
 
-    def serve(self) -> None:
-        """A line of JSON in, a line out, to the end of the input."""
-        for line in sys.stdin:
-            print(json.dumps(self.block(*json.loads(line))), flush=True)
 
-
-class Checkout:
-    """A worker in a process of its own, with the hdbridge of ``folder``."""
-
-    def __init__(self, folder: Path) -> None:
-        environment = {**os.environ, "PYTHONPATH": str(folder)}
-        command = [sys.executable, str(Path(__file__).resolve()), "--worker"]
-        self.process = subprocess.Popen(
-            command, env=environment, cwd=folder, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
-        )
-
-    def block(self, *what: object) -> float:
-        assert self.process.stdin is not None
-        assert self.process.stdout is not None
-        self.process.stdin.write(json.dumps(what) + "\n")
-        self.process.stdin.flush()
-        return float(json.loads(self.process.stdout.readline()))
-
-    def close(self) -> None:
-        assert self.process.stdin is not None
-        self.process.stdin.close()
-        self.process.wait()
-
-
-def measure(interface: str, options: argparse.Namespace) -> dict[str, dict[str, float]]:
-    """Medians by kind and variant, and of the ratios of neighbouring blocks; us."""
-    # A worker of its own for the single axis of each side: they shall share the processor's caches alike.
-    now, several = Checkout(HERE), Checkout(HERE)
-    before = Checkout(options.before) if options.before is not None else None
+def measure(interface: str, blocks: int, cycles: int) -> dict[str, dict[str, float]]:
+    """Returns medians by kind and variant, us, and the median ratio of neighbouring blocks."""
+    worker = Worker()
     times: dict[tuple[str, str], list[float]] = {}
-    for _ in range(options.blocks):
+    for _ in range(blocks):
         for kind in (HELD, COMPENSATED):
-            if before is not None:
-                times.setdefault((kind, "before"), []).append(
-                    before.block(interface, 0, kind, options.cycles)
-                )
-            times.setdefault((kind, "now"), []).append(now.block(interface, 0, kind, options.cycles))
+            times.setdefault((kind, "now"), []).append(worker.block(interface, 0, kind, cycles))
             for count in AXES:
-                own_us = several.block(interface, count, kind, max(options.cycles // count, 50))
+                own_us = worker.block(interface, count, kind, max(cycles // count, 50))
                 times.setdefault((kind, str(count)), []).append(own_us)
-    for each in (now, several, before):
-        if each is not None:
-            each.close()
     result: dict[str, dict[str, float]] = {HELD: {}, COMPENSATED: {}}
     for (kind, name), values in times.items():
         result[kind][name] = statistics.median(values)
     for kind, figures in result.items():
-        if before is not None:
-            pairs = zip(times[kind, "now"], times[kind, "before"], strict=True)
-            figures["now / before"] = statistics.median(a / b for a, b in pairs)
         pairs = zip(times[kind, "1"], times[kind, "now"], strict=True)
         figures["bus of one / now"] = statistics.median(a / b for a, b in pairs)
     return result
@@ -230,13 +178,10 @@ def report(result: dict[str, dict[str, float]], where: str) -> str:
         lines.append(f"  {label:<26} {values[0]:>10.2f} {values[1]:>12.2f}")
 
     for name, label in (
-        ("before", "one axis, before"),
-        ("now", "one axis, now"),
-        ("now / before", "  now / before"),
+        ("now", "one axis, Cycle"),
         ("bus of one / now", "  BusCycle / Cycle"),
     ):
-        if name in result[HELD]:
-            row(label, *(figures[name] for figures in result.values()))
+        row(label, *(figures[name] for figures in result.values()))
     for place, count in enumerate(AXES):
         row(f"{count} axes", *(figures[str(count)] for figures in result.values()))
         row("  for each axis", *(figures[str(count)] / count for figures in result.values()))
@@ -252,20 +197,15 @@ def main() -> int:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--interface", choices=("virtual", "loopback"), action="append")
-    parser.add_argument("--before", type=Path, help="another checkout of hdbridge")
     parser.add_argument("--blocks", type=int, default=41, help="blocks per variant")
     parser.add_argument("--cycles", type=int, default=400, help="cycles per block, for one axis")
     parser.add_argument("--json", type=Path)
-    parser.add_argument("--worker", action="store_true", help=argparse.SUPPRESS)
     options = parser.parse_args()
     warnings.simplefilter("ignore")
-    if options.worker:
-        Worker().serve()
-        return 0
     began_s = time.monotonic()
     results = {}
     for interface in options.interface or ["virtual", "loopback"]:
-        results[interface] = measure(interface, options)
+        results[interface] = measure(interface, options.blocks, options.cycles)
         print(report(results[interface], interface), end="\n\n")
     print(f"{time.monotonic() - began_s:.0f} s")
     if options.json is not None:

@@ -37,9 +37,9 @@ POLL_S: Final = 0.2
 PAGE_HZ: Final = 50.0
 KNOTS_HZ: Final = 100.0
 AT_A_TIME: Final = 20
-"""Set-points that are sent."""
+"""Number of set-points per message."""
 AHEAD_S: Final = 1.0
-"""Path that is sent before it is due."""
+"""Time by which the path is sent ahead."""
 QUICK_STOP_EVERY: Final = 20
 """Rounds of the story."""
 
@@ -66,7 +66,7 @@ class Seen:
 
 
 async def poll(client: AsyncClient, seen: Seen) -> None:
-    """The machine's state, again and again."""
+    """Polls the machine's state."""
     while True:
         async with seen.request():
             await client.state()
@@ -74,14 +74,14 @@ async def poll(client: AsyncClient, seen: Seen) -> None:
 
 
 async def watch(client: AsyncClient, seen: Seen, every: int = 1) -> None:
-    """The live samples."""
+    """Reads the live samples."""
     async for samples in client.live(every=every):
         seen.samples += len(samples.cycle)
         seen.lost += samples.lost
 
 
 async def page(client: AsyncClient, seen: Seen) -> None:
-    """Requests of the page."""
+    """Sends the requests of the page."""
     state = await client.state()
     every = max(1, round(1.0 / (PAGE_HZ * state.cycle.period_s)))
 
@@ -101,7 +101,7 @@ async def page(client: AsyncClient, seen: Seen) -> None:
 
 
 async def ready(axis: AsyncAxis) -> None:
-    """Under power, whatever it was before."""
+    """Enables the axis from any state."""
     state = await axis.state()
     if state.state in ("quick-stopped", "latched"):
         await axis.reset()
@@ -110,7 +110,7 @@ async def ready(axis: AsyncAxis) -> None:
 
 
 async def sine(axis: AsyncAxis, seen: Seen, knots: int | None) -> None:
-    """So many set-points on a sine of 1 deg from where it stands; None: without an end."""
+    """Streams ``knots`` set-points on a sine of 1 deg from the present position; without end if None."""
     middle_deg = (await axis.state()).load_target_deg
     assert middle_deg is not None
     async with axis.stream() as stream:
@@ -127,7 +127,7 @@ async def sine(axis: AsyncAxis, seen: Seen, knots: int | None) -> None:
 
 
 async def stream_on(client: AsyncClient, seen: Seen) -> None:
-    """Set-points to the first axis."""
+    """Streams set-points to the first axis."""
     async with client.lease(force=True):
         axis = next(iter((await client.axes()).values()))
         await ready(axis)
@@ -179,7 +179,7 @@ async def persistent(
 
 
 async def serve(options: argparse.Namespace) -> None:
-    """Begin and end as standard input says."""
+    """Starts and stops clients on command from standard input."""
     seen = Seen()
     moving = {"stream": [stream_on], "story": [story], "none": []}[options.moving]
     wanted = [poll] * options.polling + [watch] * options.watching + [page] * options.pages + moving
@@ -205,7 +205,7 @@ async def lines() -> AsyncIterator[str]:
 
 
 async def end(tasks: list[asyncio.Task[None]]) -> None:
-    """And wait until they have ended."""
+    """Stops the clients and waits for their end."""
     for task in tasks:
         task.cancel()
     for task in tasks:

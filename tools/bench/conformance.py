@@ -60,7 +60,7 @@ class SteppedBus(VirtualBus):
         return message
 
     def run(self, wanted: list[Check], path: Path) -> list[Result]:
-        """The tester's thread."""
+        """Runs the tester's thread."""
         self._turn.acquire()
         try:
             od = read_eds(path, NODE).dictionary
@@ -93,7 +93,7 @@ def whole_gateway(wanted: list[Check], folder: Path) -> list[Result]:
 
 @contextmanager
 def foreign(name: str, folder: Path) -> Iterator[NodeTester]:
-    """A node of another stack."""
+    """Yields a node of another stack."""
     with local_node(EDS) if name == "canopen" else durand_drive() as opened:
         bus: Any = opened if name == "canopen" else opened[0]
         path = EDS if name == "canopen" else folder / "durand.eds"

@@ -68,16 +68,16 @@ Result = tuple[str, dict[str, float]]
 
 
 class NeverSleeping:
-    """The real clock without the waiting: every deadline is taken for reached."""
+    """Real clock without waiting: every deadline counts as reached."""
 
     now = staticmethod(time.monotonic)
 
     def sleep_until(self, deadline_s: float) -> None:
-        """Return at once."""
+        """Returns at once."""
 
 
 def answers(*node_ids: int) -> tuple[can.Message, ...]:
-    """The two TPDOs of each of some enabled drives that stand at zero."""
+    """Returns the two TPDOs of each enabled drive at position zero."""
     data = {0x180: TPDO1.pack(STATUS_ENABLED, 0, 0), 0x280: TPDO2.pack(0, 0)}
     return tuple(
         can.Message(arbitration_id=base + node_id, is_extended_id=False, data=data[base])
@@ -87,7 +87,7 @@ def answers(*node_ids: int) -> tuple[can.Message, ...]:
 
 
 def heartbeats(*node_ids: int) -> tuple[can.Message, ...]:
-    """The heartbeats of these drives."""
+    """Returns the heartbeats of these drives."""
     return tuple(
         can.Message(arbitration_id=0x700 + node_id, is_extended_id=False, data=b"\x05")
         for node_id in node_ids
@@ -95,7 +95,7 @@ def heartbeats(*node_ids: int) -> tuple[can.Message, ...]:
 
 
 class AnsweringBus(VirtualBus):
-    """The master's end of a virtual bus with other nodes on it that answer SYNC at once."""
+    """Master's end of a virtual bus on which other nodes answer SYNC at once."""
 
     def __init__(self, *node_ids: int) -> None:
         super().__init__(channel=self)
@@ -124,7 +124,7 @@ class AnsweringBus(VirtualBus):
 
 
 class LoopbackSocket:
-    """Looks like the CAN socket of a master; a second UDP socket answers its SYNC at once."""
+    """Stand-in for the CAN socket of a master; a second UDP socket answers its SYNC at once."""
 
     def __init__(self, *node_ids: int) -> None:
         self.master = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -169,7 +169,7 @@ class LoopbackSocket:
 
 
 def loopback_bus(sock: LoopbackSocket) -> SocketcanBus:
-    """python-can's SocketCAN bus, without opening an interface."""
+    """Returns python-can's SocketCAN bus, without opening an interface."""
     bus = SocketcanBus.__new__(SocketcanBus)
     bus.socket, bus.channel, bus.channel_info = sock, "loopback", "SocketCAN code on UDP sockets"
     bus._is_filtered, bus._filters, bus._tasks, bus._task_id = True, None, {}, 0
@@ -179,7 +179,7 @@ def loopback_bus(sock: LoopbackSocket) -> SocketcanBus:
 
 @contextmanager
 def answering_kernel(channel: str, *node_ids: int) -> Iterator[None]:
-    """The kernel's CAN gateway answers SYNC with the TPDOs, and the master's heartbeat with the drives'."""
+    """Makes the kernel's CAN gateway answer SYNC with TPDOs, and the master's heartbeat with the drives'."""
     rules = [("080", f"{reply.arbitration_id:X}.8.{reply.data.hex()}") for reply in answers(*node_ids)]
     rules += [("77F", f"{0x700 + node_id:X}.1.0500000000000000") for node_id in node_ids]
     commands = [
@@ -198,7 +198,7 @@ def answering_kernel(channel: str, *node_ids: int) -> Iterator[None]:
 
 
 def response_of_usual_length(cycle_ms: float) -> Response:
-    """A response whose filter has as many weights as that of the article's axis."""
+    """Returns a response whose filter has as many weights as that of the article's axis."""
     return Response(
         cycle_ms=cycle_ms,
         following_lag_ms=10.0,
@@ -240,7 +240,7 @@ class Variants:
         self.network, self.node = self._canopen(axis.drive.node_id)
 
     def start(self) -> None:
-        """Before a block: the deadlines begin anew."""
+        """Restarts the deadlines before a block."""
         while self.bus.recv(0.0) is not None:
             pass
         self.deadline_s = self.clock.now()
@@ -254,7 +254,7 @@ class Variants:
         self.image.power.go(State.OPERATION_ENABLED)
 
     def _wait(self) -> bool:
-        """Sleep to the next deadline; whether the master's heartbeat is due."""
+        """Sleeps until the next deadline; returns True if the master's heartbeat is due."""
         self.deadline_s += self.period_s
         self.clock.sleep_until(self.deadline_s)
         now = self.clock.now()
@@ -372,7 +372,7 @@ class Variants:
 
 
 def block_us(work: Callable[[], object], cycles: int, timer: Callable[[], float] = time.thread_time) -> float:
-    """Time per call, us."""
+    """Returns the time per call, us."""
     begin = timer()
     for _ in range(cycles):
         work()
@@ -382,7 +382,7 @@ def block_us(work: Callable[[], object], cycles: int, timer: Callable[[], float]
 def block_of(
     variants: Variants, loop: Callable[[], object], cycles: int, timer: Callable[[], float]
 ) -> float:
-    """One block's time per cycle, us; begun anew when a busy machine has made the cycle stop in it."""
+    """Returns a block's time per cycle, us; repeats the block if a busy machine stopped the cycle in it."""
     for _ in range(20):
         with suppress(SafetyStop):
             variants.start()
@@ -398,7 +398,7 @@ def run(
     responder: Callable[[], object] | None,
     timer: Callable[[], float],
 ) -> dict[str, float]:
-    """Median time per cycle of each variant, us, without what the answering node costs."""
+    """Returns the median time per cycle of each variant, us, without the cost of the answering node."""
     loops: dict[str, Callable[[], object]] = {
         "bare": variants.bare,
         "cycle": variants.plain,

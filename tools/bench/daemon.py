@@ -53,7 +53,7 @@ from hdbridge.sim.lockstep import SimulatedAxis, simulated_benches
 
 HERE: Final = Path(__file__).resolve().parent
 PATIENCE: Final = 5
-"""Attempts at a phase in which the axis is not stopped."""
+"""Maximum number of attempts at a phase without a stop of the axis."""
 KINDS: Final = ("bench", "idle", "busy")
 
 
@@ -71,7 +71,7 @@ class Phase:
     late_most_us: float
     skipped: int
     service_share: float = 0.0
-    """CPU time of the service, share of a processor."""
+    """Returns the CPU time of the service as a share of a processor."""
 
     @classmethod
     def of(cls, late_us: Any, busy_us: Any, cpu_us: float, skipped: int, service_share: float = 0.0) -> Phase:
@@ -84,7 +84,7 @@ class Phase:
 
 
 def bench_phase(seconds: float) -> Phase:
-    """One phase of the bench's cycle, in this process. HdbridgeError where a stall stopped it."""
+    """Runs one phase of the bench's cycle in this process; raises HdbridgeError if a stall stopped it."""
     profile = Profile.find("article")
     config = AxisConfig.load(profile.axis)
     clock = RealClock()
@@ -108,7 +108,7 @@ def bench_phase(seconds: float) -> Phase:
 
 
 def serve_bench() -> int:
-    """A phase for each line of input."""
+    """Runs a phase for each line of input."""
     warnings.simplefilter("ignore")
     for line in sys.stdin:
         for _ in range(PATIENCE):
@@ -121,7 +121,7 @@ def serve_bench() -> int:
 
 
 class Bench:
-    """The bench in a process of its own."""
+    """Bench in a process of its own."""
 
     def __init__(self) -> None:
         self.process = subprocess.Popen(
@@ -129,7 +129,7 @@ class Bench:
         )
 
     def phase(self, seconds: float) -> Phase | None:
-        """None where the machine stalled too often."""
+        """Returns the figures of a phase; None if the machine stalled too often."""
         assert self.process.stdin is not None
         assert self.process.stdout is not None
         self.process.stdin.write(f"{seconds}\n")
@@ -138,7 +138,7 @@ class Bench:
         return None if found is None else Phase(**found)
 
     def close(self) -> None:
-        """End it."""
+        """Ends the process."""
         self.process.kill()
         self.process.wait()
 
@@ -147,7 +147,7 @@ class Bench:
 
 
 def moving(daemon: RunningDaemon) -> None:
-    """Enabled, and on a long way; the client has gone when this returns."""
+    """Enables the axis and starts a long move; the client has disconnected on return."""
     with Client(str(daemon.socket), name="bench", timeout_s=60.0) as client, client.lease(force=True):
         (axis,) = client.axes.values()
         state = axis.state()
@@ -190,7 +190,7 @@ ENABLED: Final = 3
 def daemon_phase(
     daemon: RunningDaemon, memory: Memory, seconds: float, clients: Clients | None
 ) -> Phase | None:
-    """One phase of the daemon, with clients or without."""
+    """Runs one phase of the daemon, with clients or without."""
     for _ in range(PATIENCE):
         try:
             moving(daemon)
@@ -210,7 +210,7 @@ def daemon_phase(
 
 
 def table(phases: dict[str, list[Phase]]) -> str:
-    """Medians, and their ratios."""
+    """Returns medians and their ratios."""
     names = [name for name in Phase.__dataclass_fields__ if name != "turns"]
     medians = {
         kind: {name: statistics.median(getattr(each, name) for each in found) for name in names}

@@ -10,27 +10,20 @@ One run measures, in interleaved blocks, the CPU time of the thread (`time.threa
 
 all on the same path, and prints medians, the ratio to the bench, and the cost per axis. The answering nodes
 run in the same thread; what they cost is measured in the same blocks and subtracted. Nobody sleeps.
-``--growth HOURS`` moves one simulated axis for so much axis time instead, and prints by how much the process
-and its Python objects have grown.
 """
 
 from __future__ import annotations
 
 import argparse
-import gc
 import json
-import resource
 import statistics
-import sys
-import tracemalloc
 import warnings
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 
 import can
-from can.interfaces.virtual import VirtualBus
-from cycle import PROFILE, NeverSleeping, answers, block_us
+from cycle import PROFILE, AnsweringBus, NeverSleeping, block_us
 
 from hdbridge.axis import AxisConfig
 from hdbridge.axis.effects import Moment, Observer
@@ -54,49 +47,14 @@ from hdbridge.motion import SetPoint
 
 GOAL = 1.3
 STATUS_OFF, STATUS_READY, STATUS_ON = 0x0250, 0x0231, 0x0233
-NODES_HEARTBEAT_TURNS = 12
 
 
-class AnsweringNodes(VirtualBus):
-    """The master's end of a virtual bus, with nodes on it that answer SYNC at once and stand at zero."""
-
-    def __init__(self, nodes: int) -> None:
-        super().__init__(channel=self)
-        self.listener = VirtualBus(channel=self)
-        self.replies = [reply for node in range(1, nodes + 1) for reply in answers(node)]
-        self.heartbeats = [
-            can.Message(arbitration_id=0x700 + node, is_extended_id=False, data=b"\x05")
-            for node in range(1, nodes + 1)
-        ]
-        self.count = 0
-
-    def answer(self) -> None:
-        self.count += 1
-        if self.count % NODES_HEARTBEAT_TURNS == 0:
-            for heartbeat in self.heartbeats:
-                self.queue.put(heartbeat)
-        for reply in self.replies:
-            self.queue.put(reply)
-        self.listener.queue.queue.clear()
-
-    def send(self, msg: can.Message, timeout: float | None = None) -> None:
-        super().send(msg, timeout)
-        if msg.arbitration_id == 0x80:
-            self.answer()
-
-    def shutdown(self) -> None:
-        self.listener.shutdown()
-        super().shutdown()
-
-
-def configs_of(count: int) -> list[AxisConfig]:
+def configs_of(count: int, cycle_ms: float | None = None) -> list[AxisConfig]:
+    """Returns several of the article's axis on one bus, by default with its cycle."""
     first = AxisConfig.load(PROFILE)
-    return [
-        first.model_copy(
-            update={"name": f"axis{node}", "drive": first.drive.model_copy(update={"node_id": node})}
-        )
-        for node in range(1, count + 1)
-    ]
+    cycle = {} if cycle_ms is None else {"cycle_ms": cycle_ms}
+    drives = [first.drive.model_copy(update={"node_id": node, **cycle}) for node in range(1, count + 1)]
+    return [first.model_copy(update={"name": f"axis{drive.node_id}", "drive": drive}) for drive in drives]
 
 
 def bench_cycle(
@@ -106,7 +64,7 @@ def bench_cycle(
     clock: Clock | None = None,
     image: ProcessImage | None = None,
 ) -> tuple[Callable[[], None], Cycle]:
-    """The bench's own cycle: `Bench._leg` without what keeps the samples; by default it never sleeps.
+    """Returns the bench's cycle: `Bench._leg` without the storage of samples; by default it never sleeps.
 
     ``image`` is that of a drive that was made ready for power.
     """
@@ -142,7 +100,7 @@ def bench_cycle(
             goal = -goal
         target_deg = set_point.step()
         feedback = cycle.tick(answer)
-        # What the bench keeps of each cycle, as numbers.
+        # Numbers that the bench stores per cycle.
         image.motor_deg(feedback.demand_counts)
         image.motor_deg(feedback.motor_counts)
         image.load_deg(feedback.load_counts)
@@ -153,7 +111,9 @@ def bench_cycle(
 def controller_of(
     bus: can.BusABC, memory: Memory, model: TransmissionModel, *, followed: int = 0
 ) -> Controller:
-    """A loop whose axes are enabled and on their way; ``followed``: set-points of a gateway for the first."""
+    """Returns a loop whose axes are enabled and in motion; ``followed``: the first follows a gateway's
+    set-points.
+    """
     configs = configs_of(memory.axes)
     cycle = BusCycle(Link(bus, NeverSleeping()), NeverSleeping(), memory.period_s, bitrate_bps=1_000_000)
     setups = [AxisSetup(each, compensation_for(each, model.bound_to(each))) for each in configs]
@@ -173,7 +133,7 @@ def controller_of(
 
 
 def follow(controller: Controller, memory: Memory, turns: int) -> None:
-    """Have the axis follow a ramp of so many turns from the gateway's ring; another process would fill it."""
+    """Makes the axis follow a ramp from the gateway's ring, which another process normally fills."""
     memory.commands.post(CommandKind.FOLLOW, 0, a=1.0, j=1)
     begin_s, begin_deg = controller.cycle.due_s, controller.axes[0].set_point.position_deg
     for turn in range(turns):
@@ -183,9 +143,9 @@ def follow(controller: Controller, memory: Memory, turns: int) -> None:
 
 
 def loop_block(count: int, model: TransmissionModel, cycles: int, *, followed: bool = False) -> float:
-    """CPU time of a turn for so many axes, us; begun anew when a busy machine has stopped an axis in it."""
+    """Returns the CPU time of a turn, us; repeats the block if a busy machine stopped an axis in it."""
     for _ in range(20):
-        with AnsweringNodes(count) as bus, Memory.create(count, 0.004) as memory:
+        with AnsweringBus(*range(1, count + 1)) as bus, Memory.create(count, 0.004) as memory:
             controller = controller_of(bus, memory, model, followed=cycles + 100 if followed else 0)
             block_us(controller.turn, 50)
             own = block_us(controller.turn, cycles)
@@ -195,9 +155,9 @@ def loop_block(count: int, model: TransmissionModel, cycles: int, *, followed: b
 
 
 def bench_block(model: TransmissionModel, cycles: int) -> float:
-    """The same of the bench's cycle."""
+    """Returns the CPU time of the bench's cycle, us."""
     for _ in range(20):
-        with suppress(SafetyStop), AnsweringNodes(1) as bus:
+        with suppress(SafetyStop), AnsweringBus(1) as bus:
             turn, _ = bench_cycle(bus, model)
             block_us(turn, 50)
             own = block_us(turn, cycles)
@@ -206,7 +166,7 @@ def bench_block(model: TransmissionModel, cycles: int) -> float:
 
 
 def measure(counts: list[int], blocks: int, cycles: int) -> dict[str, float]:
-    """Median CPU time of one cycle of each, us, without the answering nodes."""
+    """Returns the median CPU time of one cycle of each, us, without the answering nodes."""
     model = TransmissionModel.load(PROFILE / "model.yaml")
     times: dict[str, list[float]] = {}
     for _ in range(blocks):
@@ -231,45 +191,6 @@ def report(result: dict[str, float]) -> str:
     return "\n".join(lines)
 
 
-def growth(hours: float) -> None:
-    """Axis time on a simulated drive, moving, with a service that reads; what has grown."""
-    sys.path.append(str(Path(__file__).resolve().parents[2] / "tests"))
-    from support.daemon import stepped_daemon  # noqa: PLC0415
-
-    with stepped_daemon() as daemon:
-        daemon.verify()
-        daemon.enable()
-        goal = 5.0
-
-        def run(turns: int) -> None:
-            nonlocal goal
-            for turn in range(turns):
-                if turn % 500 == 0:
-                    daemon.post(CommandKind.MOVE, 0, a=goal, b=float("nan"), c=float("nan"))
-                    goal = -goal
-                daemon.turn()
-                if turn % 100 == 0:
-                    daemon.samples.read()
-
-        run(20_000)
-        gc.collect()
-        rss = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-        turns = round(3600.0 * hours / daemon.period_s)
-        run(turns - 5000)
-        tracemalloc.start()
-        run(2000)
-        before, _ = tracemalloc.get_traced_memory()
-        run(3000)
-        after, _ = tracemalloc.get_traced_memory()
-        tracemalloc.stop()
-        grown = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - rss
-        print(f"{hours:g} h of axis time, {turns} turns, states {daemon.states}")
-        print(
-            f"  resident set {grown:+d} KiB; Python objects in the last 3000 turns {after - before:+d} bytes"
-        )
-        print(f"  skipped periods: {daemon.controller.cycle.skipped}")
-
-
 def main() -> int:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -277,13 +198,9 @@ def main() -> int:
     parser.add_argument("--axes", default="1,2,6", help="numbers of axes, comma-separated")
     parser.add_argument("--blocks", type=int, default=21, help="blocks per variant")
     parser.add_argument("--cycles", type=int, default=500, help="cycles per block")
-    parser.add_argument("--growth", type=float, metavar="HOURS", help="look for growth of memory instead")
     parser.add_argument("--json", type=Path)
     options = parser.parse_args()
     warnings.simplefilter("ignore")
-    if options.growth is not None:
-        growth(options.growth)
-        return 0
     result = measure([int(each) for each in options.axes.split(",")], options.blocks, options.cycles)
     print(report(result))
     if options.json is not None:

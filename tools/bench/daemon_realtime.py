@@ -20,12 +20,12 @@ CONTROL = "--control"
 
 
 class RealClock(VirtualClock):
-    """The machine's clock, which lets the drives do what was due whenever somebody waits or sends."""
+    """Machine's clock, which advances the drives at each wait and each frame sent."""
 
     def __init__(self, start_s: float = 0.0, speed: float = 1.0) -> None:
         super().__init__(time.monotonic())
         self.woke_s = self.late_s = 0.0
-        """When the last wait was over, and how late that was."""
+        """End of the last wait, and its lateness; s."""
 
     def now(self) -> float:
         return time.monotonic()
@@ -40,7 +40,7 @@ class RealClock(VirtualClock):
 
 
 def control(arguments: list[str]) -> int:
-    """The control process."""
+    """Runs the control process."""
     import hdbridge.sim.paced  # noqa: PLC0415 - the keeper needs no simulation
     from hdbridge.daemon.loop.process import main  # noqa: PLC0415
 
@@ -50,7 +50,7 @@ def control(arguments: list[str]) -> int:
 
 
 def keeper() -> None:
-    """``hdbridge run`` with that control process."""
+    """Runs ``hdbridge run`` with that control process."""
     from hdbridge.cli import main  # noqa: PLC0415
     from hdbridge.daemon import hold  # noqa: PLC0415
     from hdbridge.daemon.keeper import Keeper, Programs  # noqa: PLC0415

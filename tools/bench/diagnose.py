@@ -26,7 +26,7 @@ HIDDEN = {"backlash": {"gap": 6.0}, "load_order": {"orders": [(1, 5.0, 30.0)]}}
 
 
 def record(samples: int) -> Record:
-    """The same plan again and again, with a time and a noise of its own each time."""
+    """Returns repetitions of one plan, each with its own time and noise."""
     once = plant.record(plant.Truth(effects=HIDDEN), plant.Plan(), 1)
     count = len(once["time_s"])
     period = float(np.median(np.diff(once["time_s"])))
@@ -39,7 +39,7 @@ def record(samples: int) -> Record:
 
 
 def main() -> None:
-    """Print a line for each size."""
+    """Prints a line for each size."""
     sizes = [int(float(each)) for each in sys.argv[1:]] or [32_000, 100_000, 300_000, 1_000_000]
     model = TransmissionModel.from_text(plant.model_text(1))
     before: tuple[int, float] | None = None

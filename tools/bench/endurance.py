@@ -31,7 +31,7 @@ from accounts import Accounts
 from rundaemon import CONTROL, KEEPER, SERVICE, Cost, running
 
 RECORDER = "size_mb: 8, file_mb: 2, file_s: 60, kept_mb: 4, before_s: 10, after_s: 5"
-"""A small ring, so that it is full within minutes."""
+"""Recorder settings with a small ring, which is full within minutes."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ class Growth:
 
     @classmethod
     def of(cls, name: str, values: Sequence[float], allowed: float) -> Growth:
-        """``values`` at equal distances in time, four at least."""
+        """Computes the growth of at least four equidistant ``values``."""
         quarter = max(len(values) // 4, 1)
         second = statistics.median(values[quarter : 2 * quarter])
         return cls(name, values[0], second, statistics.median(values[-quarter:]), allowed)
@@ -70,7 +70,7 @@ HEAD = f"  {'':<34} {'first':>10} {'2nd quarter':>10} {'last quarter':>10}"
 
 
 def real(minutes: float, every_s: float) -> tuple[list[Growth], dict[str, Any]]:
-    """The processes for so long; what grew, and what else was seen."""
+    """Runs the processes; returns their growth and the account of cycles."""
     rows: list[dict[str, Cost]] = []
     accounts = Accounts()
     with tempfile.TemporaryDirectory(prefix="endurance-") as text:
@@ -143,12 +143,12 @@ def _state(socket: Path) -> str:
 
 
 def memory_period(state: dict[str, Any]) -> float:
-    """Seconds of a turn."""
+    """Turn time, s."""
     return float(state["cycle"]["period_s"])
 
 
 def stepped(options: argparse.Namespace) -> tuple[list[Growth], dict[str, Any]]:
-    """Hours of axis time; what grew, and what else was seen."""
+    """Runs hours of axis time; returns growth and the account of cycles."""
     from stepped_day import run  # noqa: PLC0415 - needs the tests' support
 
     def say(row: dict[str, float]) -> None:

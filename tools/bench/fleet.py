@@ -1,4 +1,4 @@
-"""Figures of a fleet: how right it is, what its prior brings, what the engine costs.
+"""Figures of a fleet: accuracy, gain by the prior, cost of the engine.
 
 .venv/bin/python tools/bench/fleet.py score FLEET OUT [--limit ARCSEC]
 .venv/bin/python tools/bench/fleet.py prior FLEET OUT
@@ -46,7 +46,7 @@ DETECTABLE = 2
 
 
 def score(fleet: Path, out: Path, limit_arcsec: float) -> None:
-    """Compares the summary of a run with what the simulation hid; joints without a row are left out."""
+    """Compares the summary of a run with the hidden causes; joints without a row are left out."""
 
     rows = [row for row in Dataset(out).recordings() if row["joint"]]
     answers = json.loads((fleet / "answers.json").read_text())

@@ -57,7 +57,7 @@ class Errors:
 
 
 def targets(steps: int) -> list[tuple[int, float]]:
-    """Direction and target of each step; the first of each direction is not judged."""
+    """Returns direction and target of each step; the first of each direction is not evaluated."""
     up = [(1, STEP_DEG * step) for step in range(steps + 2)]
     return up + [(-1, STEP_DEG * step) for step in range(steps, -1, -1)]
 
@@ -97,7 +97,7 @@ async def through(bench: GatewayBench, steps: int) -> tuple[Errors, float, float
 
 
 def lag(bench: GatewayBench, reader: Any, begun: int) -> float:
-    """Delay that fits the set-point of the loop best to that of an ideal drive in the same mode."""
+    """Returns the delay that best fits the loop's set-point to that of an ideal drive in the same mode."""
     samples, _ = reader.read()
     plc = bench.plc
     times = np.array([time_s for time_s, *_ in plc.seen]) + plc.period_s

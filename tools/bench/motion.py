@@ -34,7 +34,7 @@ PERIOD_S = 0.004
 def median_us(
     action: Callable[[], object], prepare: Callable[[], object] = lambda: None, count: int = 3000
 ) -> float:
-    """Median of one call, microseconds; ``prepare`` is not counted."""
+    """Returns the median time of one call, microseconds, without ``prepare``."""
     taken = []
     for _ in range(count):
         prepare()
@@ -45,7 +45,7 @@ def median_us(
 
 
 def unit() -> float:
-    """The yardstick."""
+    """Runs the reference loop."""
     value = 1.0
     for _ in range(100):
         value *= 1.000001
@@ -53,7 +53,7 @@ def unit() -> float:
 
 
 def moving() -> SetPoint:
-    """In motion, with a long way to go."""
+    """Returns a set-point in a long motion."""
     set_point = SetPoint(LIMITS, PERIOD_S)
     set_point.goto(3600.0)
     for _ in range(30):
@@ -94,7 +94,7 @@ def corrections() -> dict[str, float]:
     """Measures a cycle of the compensation, alone and behind a `Correction`, and the load loop's."""
     model = TransmissionModel.load(PROFILES / "article" / "model.yaml")
     moment = Moment()
-    # So slow a ramp that the change lasts as long as it is measured.
+    # A slow ramp, so that the change lasts for the whole measurement.
     slow = CompensationLimits(ramp_s=1e6)
 
     def made() -> Compensation:
@@ -115,7 +115,7 @@ def corrections() -> dict[str, float]:
         return run
 
     loop = LoadLoop(1.0, 40.0, 100.0, PERIOD_S, counts_arcsec=3.6)
-    # In turns, so that a machine that slows down does so for both.
+    # Alternating, so that a slower machine affects both.
     alone_us, behind_us = [], []
     for _ in range(9):
         alone_us.append(median_us(cycle(0, alone), count=1000))
@@ -140,7 +140,7 @@ def pickles() -> dict[str, float]:
 
 
 def main() -> None:
-    """Measure and print."""
+    """Measures and prints."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--json", type=Path)
     given = parser.parse_args()

@@ -22,7 +22,7 @@ PER_STORY = {"slave": 200, "gateway": 100}
 
 
 def story(stack: str, seed: int) -> None:
-    """Plays one story; AssertionError if it breaks a law."""
+    """Plays one sequence of events; raises AssertionError if a law is broken."""
     if stack == "slave":
         seen = play_events(seed, PER_STORY[stack])
         for name in TOTAL:

@@ -40,7 +40,7 @@ KINDS = ("bare", "cycle", "compensated", "canopen", "axes")
 
 
 class Waking:
-    """The machine's clock; it keeps when it woke up last and how late that was."""
+    """Machine's clock, which records time and lateness of its last waking."""
 
     now = staticmethod(time.monotonic)
 
@@ -49,7 +49,7 @@ class Waking:
         self.late_s = 0.0
 
     def sleep_until(self, deadline_s: float) -> None:
-        """Sleep to the absolute deadline."""
+        """Sleeps until the absolute deadline."""
         delay_s = deadline_s - time.monotonic()
         if delay_s > 0.0:
             time.sleep(delay_s)
@@ -82,7 +82,7 @@ class Figures:
 
 
 def timed(name: str, cycle: Callable[[], object], clock: Waking, cycles: int, period_s: float) -> Figures:
-    """So many cycles, each on its deadline."""
+    """Times ``cycles`` cycles, each on its deadline."""
     late_s, busy_s = np.zeros(cycles), np.zeros(cycles)
     for _ in range(WARM_UP):
         cycle()
@@ -94,7 +94,7 @@ def timed(name: str, cycle: Callable[[], object], clock: Waking, cycles: int, pe
 
 
 def in_c(master: Path, channel: str, cycles: int, period_s: float) -> Figures:
-    """The same exchange in C."""
+    """Runs the same exchange in C."""
     command = [str(master), channel, f"{1e6 * period_s:.0f}", str(cycles)]
     done = subprocess.run(command, check=True, capture_output=True, text=True)
     late_ns, busy_ns = np.array([line.split() for line in done.stdout.splitlines()], dtype=float).T
@@ -102,7 +102,7 @@ def in_c(master: Path, channel: str, cycles: int, period_s: float) -> Figures:
 
 
 def of_axes(channel: str, model: TransmissionModel, clock: Waking, cycles: int) -> tuple[Figures, float]:
-    """Several axes at the cycle of the profile, and that cycle in seconds."""
+    """Returns several axes at the cycle of the profile, and that cycle in seconds."""
     with (
         answering_kernel(channel, *range(1, AXES + 1)),
         can.Bus(interface="socketcan", channel=channel, ignore_config=True) as bus,
@@ -118,7 +118,7 @@ def of_axes(channel: str, model: TransmissionModel, clock: Waking, cycles: int) 
 
 
 def table(figures: list[Figures], period_s: float) -> str:
-    """One line for each, the ratios to the bare exchange where that was measured."""
+    """Returns one line for each, with ratios to the bare exchange if that was measured."""
     bare = next((each for each in figures if each.name.startswith("bare")), None)
     head = (
         f"{'':<28} {'busy us':>8} {'99.9 %':>8} {'most':>8} {'late 99.9 %':>12} {'missed':>14} {'x bare':>7}"

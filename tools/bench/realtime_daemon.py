@@ -37,10 +37,9 @@ from typing import Any
 import can
 import numpy as np
 from cycle import PROFILE, answering_kernel
-from daemon_loop import bench_cycle
+from daemon_loop import bench_cycle, configs_of
 from realtime_cycle import WARM_UP, Figures, Waking, table
 
-from hdbridge.axis import AxisConfig
 from hdbridge.axis.model import TransmissionModel
 from hdbridge.commissioning.evaluation.stepping import Scheme
 from hdbridge.control.bench import compensation_for
@@ -54,7 +53,7 @@ from hdbridge.daemon.setting import CompensationSetting
 from hdbridge.drive.link import Link
 
 VARIANTS = {"bench": (1, 1.0), "one": (1, 1.0), "six": (6, 4.0)}
-"""Axes, and the cycle in milliseconds."""
+"""Numbers of axes with their cycle, ms."""
 STATUS_OFF = 0x0250
 POLL_S = 0.02
 JOG_EVERY_S = 0.05
@@ -74,7 +73,7 @@ class TurnClock(Waking):
         self.keeping = False
 
     def sleep_until(self, deadline_s: float) -> None:
-        """Sleep to the absolute deadline."""
+        """Sleeps until the absolute deadline."""
         if self.keeping and self.turns < len(self.busy_s):
             self.busy_s[self.turns] = time.monotonic() - self.woke_s
             self.lateness_s[self.turns] = self.late_s
@@ -83,7 +82,7 @@ class TurnClock(Waking):
 
     @property
     def full(self) -> bool:
-        """All turns are kept that there is room for."""
+        """True if the buffer of turns is full."""
         return self.turns == len(self.busy_s)
 
 
@@ -91,10 +90,10 @@ class TurnClock(Waking):
 
 
 class Clients:
-    """Requests of the clients of one axis over time; about six seconds, then again."""
+    """Requests of the clients of one axis, a repeated sequence of about six seconds."""
 
     def __init__(self, memory: Memory, axis: int, setting: CompensationSetting) -> None:
-        """``setting`` compensates the axis; it is changed to in motion."""
+        """Takes the ``setting`` of the compensation that is activated in motion."""
         self._memory, self._axis, self._setting = memory, axis, setting
         self._stream = 0
         self.steps = self._steps()
@@ -107,7 +106,7 @@ class Clients:
         self._post(CommandKind.CHANGE, i=slot.put(setting.to_json()))
 
     def _steps(self) -> Iterator[float]:
-        """Each `next` is one thing that is asked; what it gives is how long to wait for the next, s."""
+        """Makes one request per `next`; yields the time to wait for the next one, s."""
         while True:
             for target in (2.0, -2.0, 3.0, 0.5):
                 self._post(CommandKind.MOVE, a=target, b=SPEED, c=math.nan)
@@ -127,7 +126,7 @@ class Clients:
             yield from self._streamed()
 
     def _streamed(self) -> Iterator[float]:
-        """A slow sine about the place where it stands, 100 knots a second."""
+        """Streams a slow sine about the present position, 100 knots a second."""
         self._stream += 1
         knots = self._memory.knots[self._axis]
 
@@ -147,7 +146,7 @@ class Clients:
 
 
 def serve(fd: int, axes: int) -> int:
-    """The service's side until its standard input is closed; what it saw, as JSON."""
+    """Runs the service's side until standard input is closed; prints its observations as JSON."""
     with Memory.attach(fd) as memory:
         samples, events = memory.reader(), memory.event_reader()
         seen: dict[str, Any] = {"samples": 0, "lost": 0, "told": {}, "refused": []}
@@ -186,7 +185,7 @@ def serve(fd: int, axes: int) -> int:
 
 @contextmanager
 def service(memory: Memory) -> Iterator[subprocess.Popen[str]]:
-    """Its process, which posts nothing before this says so."""
+    """Yields the service's process, which waits for a start command."""
     process = subprocess.Popen(
         [sys.executable, __file__, "--serve", str(memory.fd), "--axes", str(memory.axes)],
         stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, pass_fds=(memory.fd,),
@@ -201,17 +200,8 @@ def service(memory: Memory) -> Iterator[subprocess.Popen[str]]:
 # -------------------------------------------------------------------- the loop
 
 
-def configs_of(axes: int, cycle_ms: float) -> list[AxisConfig]:
-    """So many of the article's axis on one bus."""
-    first = AxisConfig.load(PROFILE)
-    drives = [
-        first.drive.model_copy(update={"node_id": node, "cycle_ms": cycle_ms}) for node in range(1, axes + 1)
-    ]
-    return [first.model_copy(update={"name": f"axis{drive.node_id}", "drive": drive}) for drive in drives]
-
-
 def enabled(controller: Controller, memory: Memory) -> None:
-    """All axes under power."""
+    """Enables all axes."""
     for axis in range(memory.axes):
         memory.commands.post(CommandKind.VERIFIED, axis, k=STATUS_OFF)
         memory.commands.post(CommandKind.ENABLE, axis, k=STATUS_OFF)
@@ -221,7 +211,7 @@ def enabled(controller: Controller, memory: Memory) -> None:
 
 
 def check(controller: Controller) -> None:
-    """Every axis goes on, and no period was left out."""
+    """Checks that every axis still moves and no period was skipped."""
     for axis in controller.axes:
         if axis.state is not AxisState.ENABLED:
             raise SystemExit(f"{axis.config.name} is {axis.state.name}: {axis.supervision.stop}")
@@ -230,7 +220,7 @@ def check(controller: Controller) -> None:
 
 
 def measured(axes: int, cycle_ms: float, turns: int, channel: str) -> tuple[Figures, dict[str, Any]]:
-    """The turns of so many axes, and what the service saw of them."""
+    """Measures the loop with ``axes`` axes; returns figures and the service's observations."""
     configs = configs_of(axes, cycle_ms)
     model = TransmissionModel.load(PROFILE / "model.yaml")
     clock = TurnClock(turns)
@@ -265,7 +255,7 @@ def measured(axes: int, cycle_ms: float, turns: int, channel: str) -> tuple[Figu
 
 
 def of_bench(cycle_ms: float, turns: int, channel: str) -> Figures:
-    """The bench's cycle on the path of a move, with nobody else on the processor."""
+    """Measures the bench's cycle on the path of a move, alone on the processor."""
     (axis,) = configs_of(1, cycle_ms)
     clock = TurnClock(turns)
     with (

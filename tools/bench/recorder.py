@@ -32,7 +32,7 @@ MOTOR_COUNTS, LOAD_COUNTS = 8_000, 2_880_000
 
 
 def at_work(seconds: int, rate: int, axes: int) -> Any:
-    """Samples of axes that move for 2 s and rest for 1 s, in turn."""
+    """Yields samples of axes that alternately move for 2 s and rest for 1 s."""
     random = np.random.default_rng(1)
     count = seconds * rate
     samples = np.zeros(count, sample_dtype(axes))
@@ -69,7 +69,7 @@ def _counted(angle_deg: Any, counts: int) -> Any:
 
 
 def as_recorded(samples: Any, rate: int, folder: Path) -> tuple[float, int]:
-    """Processor time and bytes of the recorder."""
+    """Returns processor time and bytes of the recorder."""
     axes = samples["axes"].shape[1]
     about = About.of("bench", tuple(AxisAbout(f"axis{each}", RATIO) for each in range(axes)), 1.0 / rate)
     settings = RecorderSettings(free_mb=0.0, file_s=86_400.0, file_mb=4000.0)
@@ -86,7 +86,7 @@ def as_recorded(samples: Any, rate: int, folder: Path) -> tuple[float, int]:
 
 
 def as_json(samples: Any, rate: int, path: Path) -> tuple[float, int]:
-    """The same with JSON messages."""
+    """Returns processor time and bytes of a recorder with JSON messages."""
     axes = samples["axes"].shape[1]
     names = AXIS_SAMPLE.names or ()
     begun = time.thread_time()
@@ -115,7 +115,7 @@ def as_json(samples: Any, rate: int, path: Path) -> tuple[float, int]:
 
 
 def measured(axes: int, seconds: int, rate: int) -> dict[str, Any]:
-    """All figures for so many axes."""
+    """Returns all figures for ``axes`` axes."""
     samples = at_work(seconds, rate, axes)
     messages = len(samples) * (1 + axes)
     result: dict[str, Any] = {"axes": axes, "rate_hz": rate}
@@ -138,7 +138,7 @@ def measured(axes: int, seconds: int, rate: int) -> dict[str, Any]:
 
 
 def main() -> None:
-    """Measure and print."""
+    """Measures and prints."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--axes", type=int, nargs="+", default=[1, 6])
     parser.add_argument("--seconds", type=int, default=120)

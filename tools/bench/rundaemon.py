@@ -1,4 +1,4 @@
-"""``hdbridge run --simulate`` as processes, and what they cost: for `daemon.py` and `endurance.py`."""
+"""``hdbridge run --simulate`` as processes, with their cost: for `daemon.py` and `endurance.py`."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class Cost:
 
     cpu_s: float
     rss_kb: int
-    """Memory of its own: resident, without files and without what it shares."""
+    """Private resident memory, without files and shared pages."""
     descriptors: int
     threads: int
 
@@ -41,7 +41,7 @@ class Cost:
 
     @classmethod
     def of(cls, pid: int) -> Cost:
-        """OSError where it is gone."""
+        """Reads the figures of a process; raises OSError if it has ended."""
         proc = Path(f"/proc/{pid}")
         fields = dict(
             line.split(":", 1) for line in (proc / "status").read_text(encoding="ascii").splitlines()
@@ -55,10 +55,10 @@ class Cost:
 
 
 class RunningDaemon:
-    """A daemon in processes of its own; its log is the file ``log``."""
+    """Daemon in its own processes; its log is the file ``log``."""
 
     def __init__(self, folder: Path, machine: Path, program: Sequence[str] = (), speed: float = 1.0) -> None:
-        """``program`` is what runs the daemon, by default ``hdbridge run``."""
+        """Starts ``program``, by default ``hdbridge run``."""
         self.log = folder / "daemon.log"
         self.machine = machine
         environment = {**os.environ, "XDG_RUNTIME_DIR": str(folder), "XDG_STATE_HOME": str(folder)}
@@ -72,7 +72,7 @@ class RunningDaemon:
         self.socket = folder / "hdbridge" / f"{name}.sock"
 
     def until(self, met: Callable[[], Any], what: str) -> Any:
-        """Wait for something; what it gave."""
+        """Polls a condition until it is true; returns its value."""
         end_s = time.monotonic() + PATIENCE_S
         while not (found := met()):
             if self.process.poll() is not None or time.monotonic() > end_s:
@@ -81,7 +81,7 @@ class RunningDaemon:
         return found
 
     def until_disabled(self) -> None:
-        """Every drive is verified."""
+        """Waits until every drive is verified."""
 
         def verified() -> bool:
             with suppress(DaemonError), Client(str(self.socket)) as client:
@@ -91,18 +91,18 @@ class RunningDaemon:
         self.until(verified, "the drives are verified")
 
     def told(self) -> Iterator[dict[str, Any]]:
-        """The events of the log."""
+        """Returns the events of the log."""
         for line in self.log.read_text(encoding="utf-8").splitlines():
             with suppress(ValueError):
                 yield json.loads(line)
 
     def last_words(self) -> list[str]:
-        """The end of the log, without the requests."""
+        """Returns the end of the log, without the requests."""
         lines = self.log.read_text(encoding="utf-8").splitlines()
         return [line for line in lines if '"request"' not in line][-30:]
 
     def pids(self) -> dict[str, int]:
-        """The processes of it that run now."""
+        """Returns the running processes of the daemon."""
         found = {KEEPER: self.process.pid}
         for event in self.told():
             for name in (CONTROL, SERVICE):
@@ -112,14 +112,14 @@ class RunningDaemon:
 
     @contextmanager
     def memory(self) -> Iterator[Memory]:
-        """The shared memory, which the keeper holds: to read, as the service does."""
+        """Opens the keeper's shared memory for reading, as the service does."""
         fds = Path(f"/proc/{self.process.pid}/fd")
         found = next(each for each in fds.iterdir() if str(each.readlink()).startswith("/memfd:hdbridge "))
         with Memory.attach(os.open(found, os.O_RDWR)) as memory:  # which closes it
             yield memory
 
     def close(self) -> None:
-        """End it in order."""
+        """Ends the daemon in order."""
         if self.process.poll() is None:
             self.process.send_signal(signal.SIGTERM)
         try:
@@ -130,7 +130,7 @@ class RunningDaemon:
 
 
 class Clients:
-    """The process of `clients.py`."""
+    """Process of `clients.py`."""
 
     def __init__(self, socket: Path, *options: str) -> None:
         self.process = subprocess.Popen(
@@ -142,21 +142,21 @@ class Clients:
         self._to, self._from = self.process.stdin, self.process.stdout
 
     def say(self, word: str) -> None:
-        """``on`` or ``off``; returns when that is so."""
+        """Switches the clients ``on`` or ``off`` and waits until it is done."""
         self._to.write(word + "\n")
         self._to.flush()
         if self._from.readline().strip() != word:
             raise SystemExit("the clients have ended")
 
     def seen(self) -> dict[str, Any]:
-        """End them; what they saw."""
+        """Ends the clients; returns their figures."""
         self._to.close()
         found: dict[str, Any] = json.loads(self._from.readline())
         self.process.wait()
         return found
 
     def close(self) -> None:
-        """End it where it still runs."""
+        """Ends the process if it still runs."""
         self.process.kill()
         self.process.wait()
 
@@ -165,7 +165,7 @@ class Clients:
 def running(
     folder: Path, *options: str, program: Sequence[str] = (), recorder: str = ""
 ) -> Iterator[tuple[RunningDaemon, Clients]]:
-    """A daemon of the article's axis with its drive verified, and its clients, who wait.
+    """Yields a daemon of the article's axis, its drive verified, and its waiting clients.
 
     ``options`` are those of `clients.py`, ``recorder`` the lines of a machine file under that key.
     """

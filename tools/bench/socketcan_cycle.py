@@ -42,7 +42,7 @@ BOOT_ATTEMPTS = 20
 
 @contextmanager
 def simulated_drive(profile: Path, channel: str) -> Iterator[None]:
-    """`hdbridge simulate` in a process of its own, ended on the way out."""
+    """Runs `hdbridge simulate` in a process of its own for the duration of the block."""
     command = [sys.executable, "-m", "hdbridge", "simulate", str(profile)]
     process = subprocess.Popen([*command, "--interface", "socketcan", "--channel", channel])
     try:
@@ -53,7 +53,7 @@ def simulated_drive(profile: Path, channel: str) -> Iterator[None]:
 
 
 def boot(drive: Drive) -> None:
-    """Boot the drive, waiting for its process to come up."""
+    """Boots the drive after waiting for its process."""
     for attempt in range(BOOT_ATTEMPTS):
         try:
             drive.boot()
@@ -66,7 +66,7 @@ def boot(drive: Drive) -> None:
 
 
 def measure(drive: Drive, model: TransmissionModel, cycles: int) -> dict[str, object]:
-    """Run so many cycles; what was missed, and how late they began."""
+    """Runs cycles; returns the missed periods and the lateness."""
     axis, image = drive.axis, drive.image
     clock, supervision = drive.link.clock, Supervision()
     cycle = Cycle(drive.link, clock, image, supervision, axis.drive.cycle_s, monitor=drive.monitor)

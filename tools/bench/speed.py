@@ -30,12 +30,12 @@ from hdbridge.sim.truth import Truth
 
 
 def clocks() -> tuple[float, float]:
-    """Wall time and CPU time of this process, s."""
+    """Returns wall time and CPU time of this process, s."""
     return time.perf_counter(), time.process_time()
 
 
 def main() -> None:
-    """Measure and print."""
+    """Measures and prints."""
     parser = argparse.ArgumentParser(description="How much faster than the axis itself the bench is.")
     parser.add_argument("--count", type=int, default=40, help="steps each way")
     parser.add_argument("--blocks", type=int, default=3, help="repetitions; the median is printed")

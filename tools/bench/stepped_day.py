@@ -52,19 +52,19 @@ from hdbridge.daemon.service.streams import StreamPoint
 from hdbridge.errors import HdbridgeError
 
 RECORDER: Final = RecorderSettings(size_mb=8, file_mb=2, file_s=60, kept_mb=4, before_s=10, after_s=5)
-"""A small ring, so that it is full within minutes."""
+"""Recorder settings with a small ring, which is full within minutes."""
 SETTLE_S: Final = 20.0
-"""In which an axis is enabled again after whatever has stopped it."""
+"""Time in which a stopped axis is enabled again, s."""
 SPAN_DEG: Final = 20.0
 FAULT_SHARE: Final = 0.12
-"""Counts of the events of a day."""
+"""Share of faults among the events of a day."""
 
 
 Say = Callable[[dict[str, float]], None]
 
 
 class Recorder:
-    """The flight log as a sink, written in this thread, by the loop's time."""
+    """Flight log as a sink, written in this thread by the loop's time."""
 
     def __init__(self, service: Service) -> None:
         axes = tuple(AxisAbout.of(axis.config) for axis in service.machine.axes)
@@ -78,28 +78,28 @@ class Recorder:
         self._clock = clock
 
     def take(self, samples: SampleArray, events: Sequence[Event], lost: int) -> None:
-        """From the observer."""
+        """Takes samples and events from the observer."""
         self._flight.put(Batch(samples if len(samples) else None, tuple(events), lost))
         if self._clock.now() >= self._due_s:
             self._due_s = self._clock.now() + 1.0
             self._flight.flush()
 
     def close(self) -> dict[str, int]:
-        """Finish; what became of the cycles."""
+        """Closes the log; returns the account of the cycles."""
         self._flight.close()
         counts = self._flight.counts
         return {"recorded": counts.recorded, "dropped": counts.dropped, "refused": counts.refused}
 
 
 class Told:
-    """A sink that counts the events, and what the loop says of skipped periods."""
+    """Sink that counts events and reported skipped periods."""
 
     def __init__(self) -> None:
         self.kinds: Counter[str] = Counter()
         self.skipped = 0
 
     def take(self, samples: SampleArray, events: Sequence[Event], lost: int) -> None:
-        """From the observer."""
+        """Takes samples and events from the observer."""
         for event in events:
             self.kinds[event.kind.name] += 1
             if event.kind is EventKind.FAULT and "periods skipped: " in event.text:
@@ -138,7 +138,7 @@ class Story:
             await self.axis.stop()
 
     async def step(self) -> None:
-        """One thing, and what it takes to go on after it."""
+        """Makes one event and recovers from it."""
         await self.ready()
         table = self.faults if self.chance.random() < FAULT_SHARE else self.wishes
         wish = self.chance.choice(table)
@@ -153,7 +153,7 @@ class Story:
         self.service.daemon.intruder.queue.queue.clear()  # the test bench's third node, who reads nothing
 
     async def ready(self) -> None:
-        """Enabled, with the lease."""
+        """Enables the axis with the lease."""
         lease = self.bridge.lease
         if not self.token or not lease.holds(self.token):
             self.token = lease.take("endurance", force=True)
@@ -202,7 +202,7 @@ class Story:
         await self.sleep(0.5)
         middle_deg = self.axis.state().load_target_deg
         assert middle_deg is not None
-        ends = self.chance.random() < 0.8  # else its set-points run out
+        ends = self.chance.random() < 0.8  # otherwise its set-points run out
         async with await self.axis.stream(self.token) as stream:
             for begin in range(0, 201, 50):
                 phases = [(0.01 * knot, math.pi * 0.01 * knot) for knot in range(begin, min(begin + 50, 201))]
@@ -261,7 +261,7 @@ class Story:
         await self.sleep(0.2)
 
     async def stall(self) -> None:
-        """The loop does not run for some periods, as on a busy machine."""
+        """Skips some periods of the loop, as on a busy machine."""
         await self.axis.move(self.token, self.target(), wait=False)
         clock, period_s = self.service.daemon.clock, self.service.daemon.period_s
         clock.sleep_until(clock.now() + self.chance.choice((1.7, 2.5, 5.0, 12.0, 40.0)) * period_s)
@@ -308,9 +308,9 @@ async def _read(subscription: Any) -> None:
 async def day(
     service: Service, hours: float, every_s: float, seed: int, say: Say, at_most_s: float
 ) -> dict[str, Any]:
-    """So many hours of axis time; what was seen. ``say`` is told at each look.
+    """Runs hours of axis time and returns the figures. ``say`` gets interim figures.
 
-    It ends before that after ``at_most_s`` by the clock.
+    It ends early after ``at_most_s`` of real time.
     """
     daemon = service.daemon
     accounts, told = Accounts(), Told()
@@ -369,7 +369,7 @@ async def day(
 
 
 def run(hours: float, every_s: float, seed: int, say: Say, at_most_s: float = math.inf) -> dict[str, Any]:
-    """In a folder of its own."""
+    """Runs the day in a temporary folder."""
     warnings.simplefilter("ignore")
     log = logging.getLogger("hdbridge")
     log.addHandler(logging.NullHandler())

@@ -38,12 +38,12 @@ COARSE_COUNTS = (8_000, 8_192, 10_000, 16_384, 20_000)
 FINE_COUNTS = (2**16, 2**17, 2**18, 2**20)
 SUBSTEPS_MS = (1.0, 0.5, 0.25, 0.2, 0.1, 0.05)
 MOST_SAMPLES = 600_000
-"""Samples of a calibration; the travel is drawn smaller if it takes more."""
+"""Maximum number of samples of a calibration; a smaller travel is drawn if it takes more."""
 
 
 @dataclass(frozen=True)
 class BlindAxis:
-    """An axis and what its owner believes of it."""
+    """Axis with the model that the diagnosis is given."""
 
     truth: Truth
     model_yaml: str
@@ -53,7 +53,7 @@ class BlindAxis:
 
 
 def drawn_axis(rng: random.Random, name: str, law: str = "rolling_friction") -> BlindAxis:
-    """An axis of ordinary size; ``law`` is the plant's hysteresis law, the model's is the article's."""
+    """Draws an axis of ordinary size; ``law`` is the plant's hysteresis law, the model's is the article's."""
     ratio = rng.choice((50, 50, 80, 100, 120, 160))
     motor = _motor(rng)
     share = rng.uniform(1.2, 2.8)
@@ -175,7 +175,7 @@ def _loop(rng: random.Random, law: str) -> dict[str, Any]:
 
 
 def nearest_loop(truth: Truth) -> tuple[float, float, float]:
-    """Offset, width and exponent of the article's law that come nearest to the plant's, in one reversal."""
+    """Returns offset, width and exponent of the article's law that best fit the plant's in one reversal."""
     law = truth.gear.hysteresis
     if isinstance(law, RollingFriction):
         return law.offset_arcsec, law.width_deg, law.exponent
@@ -200,7 +200,7 @@ def nearest_loop(truth: Truth) -> tuple[float, float, float]:
 
 
 def _model_yaml(rng: random.Random, truth: Truth, name: str) -> str:
-    """The baseline: right in kind, a few per cent wrong in its numbers."""
+    """Returns a model file of the right form with parameters a few per cent wrong."""
     offset, width, exponent = nearest_loop(truth)
     rows = "\n".join(
         f"        - {{order: {each.order}, "
@@ -229,7 +229,7 @@ provenance:
 
 @dataclass(frozen=True)
 class EverydayAxis:
-    """An axis as it is built, and what its owner has written down of it."""
+    """Axis with its axis file, plan and calibrated model."""
 
     config: AxisConfig
     truth: Truth
@@ -250,7 +250,7 @@ class EverydayAxis:
 
     @property
     def count_arcsec(self) -> float:
-        """One count of the motor encoder, at the load."""
+        """Returns one count of the motor encoder, arcsec at the load."""
         return ARCSEC_PER_TURN / self.truth.motor.encoder.counts_per_turn / self.truth.gear.ratio
 
 
@@ -260,10 +260,9 @@ def everyday_axes(
     law: str = "rolling_friction",
     encoders: Sequence[tuple[int, float] | None] = (None,),
 ) -> list[EverydayAxis]:
-    """An axis drawn over what is built, with each of the motor encoders: counts per turn and flicker.
+    """Draws an axis with each motor encoder: counts per turn and flicker, or drawn if None.
 
-    None draws the encoder. An axis that does not come to rest after a move, or lacks the torque for it, is
-    drawn again.
+    An axis that does not come to rest after a move, or lacks the torque for it, is drawn again.
     """
     base = yaml.safe_load((bundled_profile("demo") / "axis.yaml").read_text(encoding="utf-8"))
     while True:
@@ -404,7 +403,7 @@ def _everyday_orders(rng: random.Random) -> list[dict[str, Any]]:
 
 
 def _give_law(rng: random.Random, law: str, gear: dict[str, Any], load: dict[str, Any]) -> None:
-    """The loop of the gear, and of the load's friction if that is the law."""
+    """Sets the loop of the gear, and of the load's friction if that is the law."""
     rolling = RollingFriction(
         law="rolling_friction",
         offset_arcsec=_stretched(rng, 8.0, 60.0),
@@ -427,7 +426,7 @@ def _give_law(rng: random.Random, law: str, gear: dict[str, Any], load: dict[str
 
 
 def _works(axis: EverydayAxis) -> bool:
-    """The axis follows a fast move each way, stands still afterwards, and has torque to spare."""
+    """True if the axis follows a fast move each way, stands still afterwards, and has torque to spare."""
     limits, period_s = axis_view(axis.config).limits, axis.config.drive.cycle_s
     machine = Machine(axis.truth, 1, may_compile=True)
     substeps = round(period_s / axis.truth.substep_s)

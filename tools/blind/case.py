@@ -1,4 +1,4 @@
-"""One blind case: what is hidden in it, drawn by its name and the suite's seed, and its folder."""
+"""Blind case: its hidden cause, drawn by its name and the suite's seed, and its folder."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ NEED_ROLLING = ("hysteresis_memory", "hysteresis_parameters")
 RECORDS_PER_AXIS = 4
 LARGEST_ARCSEC = 40.0
 BETWEEN_TASKS_S = 1.0
-"""Between two tasks of a plan, in the recording's time."""
+"""Pause between two tasks of a plan, in the recording's time."""
 MOST_BENCH_SAMPLES = 1_000_000
 
 # Structural look-alikes, by physics: whatever is measured at one axis without touching it, they read alike.
@@ -79,14 +79,14 @@ class Case:
     kind: str
     causes: tuple[str, ...] = ()
     over_noise: float | None = None
-    """Size over the noise of a reading; None: drawn."""
+    """Size over the noise of a reading; drawn if None."""
     axis: str = ""
     """Axis of an everyday case, with its calibration."""
     law: str = "rolling_friction"
     bench: bool = False
-    """An everyday case on a plan of the bench, not on everyday work."""
+    """True if an everyday case uses a plan of the bench, not everyday work."""
     pair: str = ""
-    """Draws as the case with the same pair does."""
+    """Cases with the same pair share their random draws."""
 
     def folder(self, suite: Path, seed: int) -> Path:
         """Folder of the case; the name of a folder of a held-out suite reveals nothing."""
@@ -95,7 +95,7 @@ class Case:
 
 
 def cases(wanted: Mapping[str, int], seed: int) -> Iterator[Case]:
-    """The cases of a suite; ``wanted`` is a number by kind. Single and power count for each cause."""
+    """Returns the cases of a suite; ``wanted`` is a number by kind, for single and power per cause."""
     for kind, number in wanted.items():
         if kind not in KINDS:
             raise ValueError(f"--suite: found '{kind}'; expected kinds of {', '.join(KINDS)}")
@@ -145,7 +145,7 @@ def _everyday_cases(kind: str, number: int, seed: int) -> Iterator[Case]:
 
 
 def _together(rng: random.Random, number: int) -> tuple[str, ...]:
-    """Causes that can be distinguished at all when they come together."""
+    """Draws causes that can be distinguished when they occur together."""
     while True:
         causes = tuple(rng.sample(sorted(CAUSES), number))
         apart = all(not set(twins) <= set(causes) for twins in TWINS)
@@ -154,7 +154,7 @@ def _together(rng: random.Random, number: int) -> tuple[str, ...]:
 
 
 def make(case: Case, seed: int, suite: Path, means: bool = False) -> Path:
-    """Draw, run and write a case, whole or not at all; its folder.
+    """Draws, runs and writes a case atomically; returns its folder.
 
     The folder holds the record (CSV files, or a recording in ``record``), ``model.yaml``, ``sealed.json``
     and, if there is a cause, ``fresh``: the same course again on the same plant, with other noise.
@@ -175,20 +175,22 @@ def make(case: Case, seed: int, suite: Path, means: bool = False) -> Path:
 
 
 def seal(folder: Path, seed: int, secret: Mapping[str, Any]) -> None:
-    """Write the secret of a case so that nobody reads it by accident."""
+    """Writes the secret of a case in packed form, to prevent reading it by accident."""
     packed = base64.b64encode(zlib.compress(json.dumps(secret).encode())).decode()
     text = json.dumps({"schema": SCHEMA, "seed": seed, "sealed": packed})
     (folder / "sealed.json").write_text(text + "\n", encoding="utf-8")
 
 
 def unsealed(folder: Path) -> dict[str, Any]:
-    """The secret of a case."""
+    """Reads the secret of a case."""
     packed = json.loads((folder / "sealed.json").read_text(encoding="utf-8"))["sealed"]
     return dict(json.loads(zlib.decompress(base64.b64decode(packed))))
 
 
 def _full_bench(case: Case, seed: int, folder: Path, means: bool) -> dict[str, Any]:
-    """A case of the bench suite: one long record that shows everything, a model a few per cent off."""
+    """Makes a case of the bench suite: one long record that shows everything, and a model a few per cent
+    wrong.
+    """
     rng = random.Random(f"blind {seed} {case.name}")
     law = rng.choice(OTHER_LAWS) if case.kind == "other_law" else "rolling_friction"
     axis = drawn_axis(rng, f"blind-{case.name}", law)
@@ -242,13 +244,13 @@ def _brought(hidden: Sequence[Hidden]) -> list[str]:
 
 
 def _wind_up_arcsec(truth: Truth, acceleration_deg_s2: float) -> float:
-    """Wind-up of the load on its spring while it accelerates: what every axis has."""
+    """Returns the wind-up of the load in acceleration, which every axis has."""
     spring = truth.gear.stiffness_nm_per_rad / truth.load_.whole_inertia_kg_m2
     return acceleration_deg_s2 * 3600.0 / spring
 
 
 def _always(truth: Truth, run: Run, axis: BlindAxis, hidden: Sequence[Hidden]) -> list[str]:
-    """Causes that the axis has of itself, large enough to be seen."""
+    """Returns the causes that every axis has, if they are large enough to be seen."""
     wind_up = _wind_up_arcsec(truth, run.load_acceleration_deg_s2)
     causes = {"inertial_windup"} if wind_up > 0.2 * max(axis.noise_arcsec, 0.5) else set()
     if truth.load_.coulomb_nm:
@@ -259,7 +261,7 @@ def _always(truth: Truth, run: Run, axis: BlindAxis, hidden: Sequence[Hidden]) -
 
 
 def _columns(readings: Readings, rng: random.Random, with_torque: bool) -> dict[str, tuple[Any, str]]:
-    """Columns of the record with their formats; the slow channels have their own noise and steps."""
+    """Returns the columns of the record with their formats; slow channels have their own noise and steps."""
     torque, warmth = _slow_channels(readings.load_torque_nm, readings.temperature_c, rng.randrange(2**31))
     columns: dict[str, tuple[Any, str]] = {
         "time_s": (readings.time_s, "%.3f"),
@@ -283,14 +285,14 @@ def _slow_channels(torque_nm: Any, temperature_c: Any, seed: int) -> tuple[Any, 
 
 
 def write_csv(path: Path, columns: dict[str, tuple[Any, str]]) -> None:
-    """A record as bare CSV."""
+    """Writes a record as bare CSV."""
     table = np.column_stack([values for values, _ in columns.values()])
     formats = [each for _, each in columns.values()]
     np.savetxt(path, table, fmt=formats, delimiter=",", header=",".join(columns), comments="")
 
 
 def axis_of(case: Case, seed: int) -> EverydayAxis:
-    """The axis of an everyday case. Both axes of a flickering pair are one but for the motor encoder."""
+    """Returns the axis of an everyday case; those of a flickering pair differ only in the motor encoder."""
     if not case.pair:
         return everyday_axes(random.Random(f"axis {seed} {case.axis}"), case.axis, case.law)[0]
     name, _, encoder = case.axis.rpartition("-")
@@ -309,7 +311,7 @@ class Course:
     """First cycle, and the one after the last, of each part of the record."""
     segments: list[Segment]
     pause_s: float = 0.0
-    """Put between two parts."""
+    """Pause between two parts of the record, s."""
 
     def run(self, ratio: float) -> Run:
         """Returns the scale of a cause's size for the course."""
@@ -327,7 +329,7 @@ class Course:
 
 
 def _everyday(case: Case, seed: int, folder: Path, axes: Path) -> dict[str, Any]:
-    """A case on an axis of its own, with the model that its calibration gave."""
+    """Makes a case on its own axis, with the model of its calibration."""
     axis = axis_of(case, seed)
     model = calibrated(
         axis, axes / case.axis, random.Random(f"calibration {seed} {case.axis}").randrange(2**31)
@@ -345,7 +347,7 @@ def _everyday(case: Case, seed: int, folder: Path, axes: Path) -> dict[str, Any]
         course = _work_course(rig, bench, kind, rng, SLOW_S if slow else 10.0)
     run = course.run(axis.config.gear.ratio)
     truth, hidden, seen, healthy = _with_cause(case, axis, course, run, rng)
-    # Only now: a case without the cause draws the same.
+    # Drawn last, so that a case without the cause has the same draws.
     period_s = axis.config.drive.cycle_s
     as_recorded = (case.bench and rng.random() < 0.6) or (course.motion == "daemon" and rng.random() < 0.6)
     rate_hz = math.exp(rng.uniform(math.log(10.0), math.log(1000.0)))
@@ -416,9 +418,9 @@ def _work_course(rig: PlantRig, bench: Any, kind: str, rng: random.Random, short
 def _with_cause(
     case: Case, axis: EverydayAxis, course: Course, run: Run, rng: random.Random
 ) -> tuple[Truth, list[Hidden], dict[str, Any], dict[str, Any]]:
-    """The truth with the cause in it, and what the axis reads with it and without it.
+    """Returns the truth with the cause, and the readings with and without it.
 
-    The size is drawn from what is barely visible to large; it is halved if the motor cannot carry it.
+    The size is drawn from barely visible to large, and halved if the motor cannot carry it.
     """
     seed, hiding = rng.randrange(2**31), rng.randrange(2**31)
     healthy = Plant(axis, axis.truth, seed).run(course.rig.counts)
@@ -455,7 +457,7 @@ def _with_cause(
 
 
 def _later(truth: Truth, seconds: float) -> Truth:
-    """Lose the counts after the axis has come to where the record begins."""
+    """Moves the loss of counts behind the start of the record."""
     data = truth.model_dump(by_alias=True)
     for encoder in (data["motor"]["encoder"], data["load"]["encoder"]):
         for loss in encoder["losses"]:
@@ -464,7 +466,7 @@ def _later(truth: Truth, seconds: float) -> Truth:
 
 
 def _channels(case: Case, rng: random.Random) -> list[str]:
-    """The columns beyond the three that a record must have."""
+    """Returns the optional columns of the record."""
     shares = {
         "motor_target_deg": 0.55,
         "motor_torque_nm": 0.4,
@@ -483,17 +485,17 @@ class _Layout:
     begin_s: float
     names: list[str]
     as_recorded: bool
-    """As hdbridge keeps it: a recording folder with the command and the torque; else CSV files."""
+    """True for a recording folder with command and torque; else CSV files."""
 
     def _places(self) -> list[Any]:
         return [np.arange(first, end, self.every) for first, end in self.course.parts]
 
     def taken(self, column: Any) -> Any:
-        """The samples of a column."""
+        """Returns the samples of a column."""
         return column[np.concatenate(self._places())]
 
     def _times(self) -> list[Any]:
-        """Scale of each part."""
+        """Returns the times of each part."""
         first = self.course.parts[0][0]
         period_s = self.course.rig.axis.drive.cycle_s
         return [
@@ -502,12 +504,12 @@ class _Layout:
         ]
 
     def time_of(self, switched_on_s: float) -> float:
-        """The record's time at so many seconds since the axis was switched on."""
+        """Converts a time since the axis was switched on to the record's time."""
         cycles = np.concatenate(self._places()) * self.course.rig.axis.drive.cycle_s
         return float(np.interp(switched_on_s, cycles, np.concatenate(self._times())))
 
     def write(self, folder: Path, name: str, seen: Mapping[str, Any], seed: int) -> int:
-        """Write the record; the number of its samples."""
+        """Writes the record; returns its number of samples."""
         torque, warmth = _slow_channels(seen["load_torque_nm"], seen["temperature_c"], seed)
         seen = {**seen, "load_torque_nm": torque, "temperature_c": warmth}
         names = ["motor_position_deg", "load_position_deg", *self.names]
@@ -533,12 +535,12 @@ class _Layout:
         return sum(map(len, records))
 
     def _segment_shift_s(self) -> float:
-        """From the time since the axis was switched on, read at the ends of cycles, to the record's."""
+        """Offset from the time since the axis was switched on to the record's time, s."""
         return self.begin_s - (self.course.parts[0][0] + 1) * self.course.rig.axis.drive.cycle_s
 
 
 def record_of(folder: Path, name: str = "record") -> list[Path]:
-    """The files or the recording folder of a case's record; empty if it has none of that name."""
+    """Returns the files or the recording folder of a case's record; empty if there is none of that name."""
     if (folder / name).is_dir():
         return [folder / name]
     return sorted([*folder.glob(f"{name}.csv"), *folder.glob(f"{name}-*.csv.gz")])

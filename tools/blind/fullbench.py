@@ -42,7 +42,7 @@ class Plan:
 
 
 def drawn_plan(rng: random.Random, ratio: float) -> Plan:
-    """A plan of 10 to 25 minutes. No speed is a whole number of counts per sample."""
+    """Draws a plan of 10 to 25 minutes. No speed is a whole number of counts per sample."""
     load_turns = 2.05 if ratio <= 60 else 1.1
     return Plan(
         fast_deg_s=360.0 * rng.uniform(0.9, 1.15),
@@ -76,7 +76,7 @@ class Bench:
         )
 
     def record(self) -> Readings:
-        """The whole record."""
+        """Returns the whole record."""
         plan, exercise = self._plan, self._exercise
         self._to(-80.0)
         self._to(0.0)
@@ -111,7 +111,7 @@ class Bench:
         )
 
     def _pose(self) -> None:
-        """The recurring pose, from below and from above."""
+        """Moves to the recurring pose, from below and from above."""
         for side in (-70.0, 70.0):
             self._to(self._plan.pose_deg + side)
             self._to(self._plan.pose_deg)
@@ -125,7 +125,7 @@ class Bench:
         self._exercise.hold(0.5)
 
     def _nested(self) -> None:
-        """Reversals of each depth, and one staircase within another."""
+        """Runs reversals of each depth, and nested staircases."""
         base = self._exercise.target_deg + 150.0
         slow = 6.0
         for depth in self._plan.depths_deg:
@@ -162,6 +162,6 @@ def run_of(plan: Plan, truth: Truth) -> Run:
 
 
 def _decimated(readings: Readings) -> Readings:
-    """Means over `CYCLES_PER_SAMPLE` readings."""
+    """Returns means over `CYCLES_PER_SAMPLE` readings."""
     whole = len(readings.time_s) // CYCLES_PER_SAMPLE * CYCLES_PER_SAMPLE
     return Readings(*(np.mean(each[:whole].reshape(-1, CYCLES_PER_SAMPLE), axis=1) for each in readings))

@@ -1,4 +1,4 @@
-"""Make a blind suite: records of simulated axes with something hidden in them, or nothing.
+"""Makes a blind suite: records of simulated axes with hidden causes, or none.
 
     python tools/blind/generate.py build/blind                      # everyday records, to develop on: seed 1
     python tools/blind/generate.py build/held --seed 4711 --suite everyday
@@ -39,13 +39,13 @@ SUITES = {
 
 
 def wanted(text: str) -> dict[str, int]:
-    """A suite's name, or ``kind=number,...``, as a mapping."""
+    """Parses a suite's name, or ``kind=number,...``."""
     pairs = (each.partition("=") for each in SUITES.get(text, text).split(",") if each)
     return {kind.strip(): int(number or 1) for kind, _, number in pairs}
 
 
 def made(group: Sequence[Case], seed: int, out: Path, means: bool) -> list[tuple[str, float]]:
-    """Make the cases of one axis that are not there; their names and seconds, NaN if it failed."""
+    """Makes the missing cases of one axis; returns their names and durations, NaN after a failure."""
     done = []
     for case in group:
         began_s, folder = time.perf_counter(), case.folder(out, seed)
@@ -59,7 +59,7 @@ def made(group: Sequence[Case], seed: int, out: Path, means: bool) -> list[tuple
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Parse the command line and make the suite."""
+    """Parses the command line and makes the suite."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -98,7 +98,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def claim(folder: Path, seed: int) -> None:
-    """Write down whose seed the folder is; ValueError if it belongs to another."""
+    """Records the seed of the folder; raises ValueError if it belongs to another seed."""
     about = folder / "suite.json"
     if about.exists():
         found = json.loads(about.read_text(encoding="utf-8"))["seed"]

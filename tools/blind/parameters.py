@@ -1,4 +1,4 @@
-"""The parameters of a finding if it were right: what was hidden, in the finding's units and conventions.
+"""True parameters of a finding: the hidden cause in the finding's units and conventions.
 
 The secret says what was hidden and what the plant is, model.yaml what the diagnosis compared it with. A
 parameter is missing if the two do not mean the same, for the reasons given next to each cause.
@@ -18,11 +18,11 @@ Data = Mapping[str, Any]
 Values = dict[str, float]
 ARCSEC_PER_RAD = 180.0 * 3600.0 / math.pi
 FINE = 1024
-"""Angles of a turn, or of a line, at which orders are taken apart."""
+"""Number of angles per turn, or per line, for the separation of orders."""
 TWINS = {"motor_order": "motor_encoder_eccentricity", "motor_encoder_eccentricity": "motor_order"}
-"""Orders of the motor have the same amplitudes and phases under either name."""
+"""Pairs of causes whose orders have the same amplitudes and phases under either name."""
 ALWAYS_THERE = ("inertial_windup", "compliance")
-"""Causes that need not have been hidden: the plant says how large they are."""
+"""Causes that exist without being hidden; the plant gives their size."""
 
 
 @dataclass(frozen=True)
@@ -76,7 +76,7 @@ def _sum_of(rows: Any) -> dict[float, complex]:
 
 
 def _disc(disc: Data, arcsec_per_rad: float) -> dict[float, complex]:
-    """Orders 1 and 2 of what a disc adds to a reading: (e / R) sin(a - at), (d / R) sin 2 (a - at)."""
+    """Returns orders 1 and 2 of a disc's reading error: (e / R) sin(a - at), (d / R) sin 2 (a - at)."""
     scale = arcsec_per_rad / float(disc["radius_mm"]) * 1e-3
     first = _phasor(scale * disc.get("eccentricity_um", 0.0), -disc.get("eccentric_at_deg", 0.0) - 90.0)
     second = _phasor(scale * disc.get("ovality_um", 0.0), -2.0 * disc.get("oval_at_deg", 0.0) - 90.0)
@@ -105,7 +105,7 @@ def _read_by(disc: Data, teeth: dict[float, complex], ratio: float) -> dict[floa
 
 
 def _motor_orders(secret: Secret) -> Values:
-    """The change against model.yaml: what was hidden, and what its calibration had wrong of that order."""
+    """Returns the change against model.yaml: the hidden cause plus the calibration's error of that order."""
     if not secret.truth:
         order = secret.parameters.get("order", 1.0)
         return {f"order_{order:.0f}_amplitude_arcsec": float(secret.parameters["amplitude_arcsec"])}
@@ -114,7 +114,7 @@ def _motor_orders(secret: Secret) -> Values:
     if disc:
         total = _read_by(disc, total, float(secret.gear["ratio"]))
     shift_deg = float(secret.gear.get("flank", {}).get("shift_deg", 0.0))
-    # What a finding tells is the mean over both flanks.
+    # A finding reports the mean over both flanks.
     total = {order: each * math.cos(math.radians(order * shift_deg)) for order, each in total.items()}
     given = _sum_of(
         row
@@ -171,7 +171,7 @@ def _compliance(secret: Secret) -> Values:
 
 
 def _inertial(secret: Secret) -> Values:
-    """J / K of the load on the gear, and of the encoder on its coupling: it lags behind the load too."""
+    """Returns J / K of the load on the gear plus that of the encoder on its coupling."""
     if secret.stiffness is None:
         value = secret.parameters.get("seconds_squared")
         return {} if value is None else {"inertia_over_stiffness_s2": float(value)}
@@ -183,9 +183,7 @@ def _inertial(secret: Secret) -> Values:
 
 
 def _velocity(secret: Secret) -> Values:
-    """The dry part. The viscous slope at rest is an extrapolation by a law of thinning that is not the
-    finding's.
-    """
+    """Returns the dry part. The viscous slope at rest would extrapolate another law of thinning."""
     stiffness, dry = secret.stiffness, secret.parameters.get("coulomb_nm")
     if stiffness is None or not dry:
         return {}
@@ -193,9 +191,9 @@ def _velocity(secret: Secret) -> Values:
 
 
 def _loop_height(secret: Secret) -> Values:
-    """Half the height of both laws together. Width and exponent are those of a law that the plant, with
-    memory in a share of its loop, does not have.
-    """
+    """Returns half the height of both laws together.
+
+    Width and exponent have no true values, because the plant obeys another law."""
     height = 0.0
     for name in ("hysteresis", "second_hysteresis"):
         law = secret.gear.get(name) or {}
@@ -224,14 +222,14 @@ def _interpolation(secret: Secret) -> Values:
 
 
 def _zero_drift(secret: Secret) -> Values:
-    """Per kelvin of the temperature channel; the time constant where the plant has one."""
+    """Returns the drift per kelvin of the temperature channel, and the time constant if the plant has one."""
     result = {"drift_arcsec_per_k": float(secret.parameters["arcsec_per_k"])}
     tau_s = secret.truth.get("temperature", {}).get("zero_time_constant_s")
     return result | ({"tau_s": float(tau_s)} if tau_s else {})
 
 
 def _amplitude_drift(secret: Secret) -> Values:
-    """Per cent of the part as it is at the plant's reference, where the given model was measured."""
+    """Returns the growth in per cent of the part at the plant's reference temperature."""
     warmth = secret.truth.get("temperature", {})
     growths = {
         "ripple_percent_per_k": warmth.get("tooth_growth_per_k", secret.parameters.get("growth_per_k")),
@@ -258,7 +256,7 @@ def _wear(secret: Secret) -> Values:
 
 
 def _count_loss(secret: Secret) -> Values:
-    """The step that is nearest in time, of those that the finding has."""
+    """Returns the step of the finding that is nearest in time."""
     known = secret.parameters
     times = {name: value for name, value in secret.found.items() if name.endswith("_time_s")}
     nearest = min(times, key=lambda name: abs(times[name] - known["time_s"]), default="step_1_time_s")
@@ -276,7 +274,7 @@ def _local_defect(secret: Secret) -> Values:
 
 
 def _named(**names: str) -> Callable[[Secret], Values]:
-    """Parameters that differ by their name alone: finding's name = secret's."""
+    """Converts parameters that differ only in name; keywords are finding's name = secret's name."""
     return lambda secret: {
         mine: float(secret.parameters[theirs])
         for mine, theirs in names.items()

@@ -40,7 +40,7 @@ Floats = NDArray[np.float64]
 
 
 class Plant:
-    """A powered axis that follows a command, and what its encoders read."""
+    """Powered axis that follows a command, with its encoder readings."""
 
     def __init__(self, axis: EverydayAxis, truth: Truth, seed: int) -> None:
         self._machine = Machine(truth, seed, may_compile=True)
@@ -51,7 +51,7 @@ class Plant:
         self._last = 0.0
 
     def run(self, counts: Sequence[float]) -> dict[str, Floats]:
-        """Follow a target in motor counts for each SYNC; returns columns of a record, and the exact error."""
+        """Follows a target in motor counts for each SYNC; returns columns of a record and the exact error."""
         seen = self._machine.follow_all([self._last, *counts], [self._substeps] * len(counts))
         self._last = float(counts[-1])
         size, noise = self._flicker
@@ -70,7 +70,7 @@ class Plant:
 
 
 class PlantRig:
-    """A plant as a place where procedures run (`hdbridge.control.rig.Rig`)."""
+    """Rig for procedures on a plant (`hdbridge.control.rig.Rig`)."""
 
     def __init__(self, axis: EverydayAxis, seed: int) -> None:
         self.axis: AxisConfig = axis.config
@@ -79,16 +79,16 @@ class PlantRig:
         self.target_deg: list[float] = []
         """Load target of every SYNC since the axis was switched on."""
         self.counts: list[float] = []
-        """The command, motor counts."""
+        """Commands, motor counts."""
 
     def bench(
         self, compensation: Compensation | None = None, *, interrupted: Callable[[], bool] = lambda: False
     ) -> PlantBench:
-        """Without compensation the motor is sent to the ratio times the load target."""
+        """Returns a bench without compensation: the motor target is the ratio times the load target."""
         return PlantBench(self, compensation)
 
     def compensated(self, model: TransmissionModel) -> PlantBench:
-        """A bench whose command is compensated; without compensation if the model has no inverse."""
+        """Returns a bench with compensation, or without it if the model has no inverse."""
         compensation = None
         with suppress(InputError):
             compensation = compensation_for(self.axis, model)
@@ -111,11 +111,11 @@ class PlantBench:
 
     @property
     def legs(self) -> tuple[Segment, ...]:
-        """The moves of the last procedure."""
+        """Returns the moves of the last procedure."""
         return tuple(self._legs)
 
     def run(self, procedure: Procedure[Any], progress: Callable[[float], None] = lambda _: None) -> Run[Any]:
-        """Run one procedure to its end."""
+        """Runs a procedure to its end."""
         self._samples, self._legs = [], []
         view = axis_view(self._rig.axis)
         rehearsal = rehearse(procedure, view, self._place)
@@ -123,14 +123,14 @@ class PlantBench:
         return Run(self.record(), self.legs, outcome=outcome)
 
     def record(self) -> Record:
-        """The samples of the last procedure."""
+        """Returns the samples of the last procedure."""
         names = ("time_s", "motor_position_deg", "load_position_deg", "motor_target_deg", "motor_torque_nm")
         if not self._samples:
             return record_of((), self._rig.axis)
         return Record({name: np.concatenate([each[name] for each in self._samples]) for name in names})
 
     def _leg(self, move: Move, way: Way) -> Sequence[Sample]:
-        """One move; only a `Settle` reads what was measured."""
+        """Runs one move; only a `Settle` reads measured values."""
         period_s = self._rig.axis.drive.cycle_s
         cycles = math.ceil(way.duration_s / period_s - 1e-9) + 1
         samples = self._follow([way.at(cycle * period_s) for cycle in range(cycles)])
@@ -159,7 +159,7 @@ class PlantBench:
         self._place = targets[-1]
         self._samples.append(seen)
         if len(targets) > 1_000:
-            return []  # no settling takes as long
+            return []  # longer than any settling
         rows = zip(
             seen["time_s"].tolist(), targets, seen["motor_target_deg"].tolist(),
             seen["motor_position_deg"].tolist(), seen["load_position_deg"].tolist(),
@@ -169,7 +169,7 @@ class PlantBench:
 
 
 def calibrated(axis: EverydayAxis, folder: Path, seed: int) -> TransmissionModel:
-    """The model that a calibration of the axis gives; ``folder`` keeps it for the next record of the axis."""
+    """Calibrates the axis; ``folder`` keeps the model for its next record."""
     kept = folder / "model.yaml"
     if not kept.exists():
         shutil.rmtree(folder, ignore_errors=True)

@@ -37,7 +37,7 @@ BAD_INPUT = 2
 
 
 def diagnosed(case: Path, answers: Path, command: Sequence[str], timeout_s: float) -> None:
-    """Run the command on a case; keep its answer, whole or not at all."""
+    """Runs the command on a case; stores its answer atomically."""
     target = answers / case.name
     draft = answers / f".{case.name}.part"
     shutil.rmtree(draft, ignore_errors=True)
@@ -67,7 +67,7 @@ def diagnosed(case: Path, answers: Path, command: Sequence[str], timeout_s: floa
 
 
 def verdict_of(case: Path, answers: Path) -> Verdict:
-    """Judge the answer that is kept."""
+    """Evaluates the stored answer."""
     kept = answers / case.name
     report = _json(kept / "answer.json") or {}
     status = report["exit_status"]
@@ -96,7 +96,7 @@ def _yaml(path: Path) -> dict[str, Any] | None:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Parse the command line, diagnose, judge, print."""
+    """Parses the command line, diagnoses, evaluates and prints."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

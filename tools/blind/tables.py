@@ -1,4 +1,4 @@
-"""The tables of a blind suite, from the verdicts on its cases: rates, and no case."""
+"""Tables of a blind suite: rates from the verdicts on its cases."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ from blind.verdict import Verdict
 
 BINS = (0.0, 0.5, 0.8, 0.9, 0.95, 0.99, 1.0001)
 NEAR = 0.05
-"""A gain holds that comes as near to what was claimed."""
+"""Relative tolerance within which a claimed gain holds."""
 Z95 = 1.959964
 EFFECTS = ((0.0, 0.3), (0.3, 1.0), (1.0, 3.0), (3.0, math.inf))
-"""Rms of a cause over the noise of a reading."""
+"""Bin edges: rms of a cause over the noise of a reading."""
 LONG = 30_000
-"""Samples of a record whose run time does not depend on how long a program takes to start."""
+"""Number of samples from which the program start is a negligible part of the run time."""
 Test = Callable[[Verdict], bool]
 
 
 def wilson(hits: int, number: int) -> tuple[float, float]:
-    """Wilson's 95 % interval of a share."""
+    """Returns Wilson's 95 % interval of a share."""
     share, square = hits / number, Z95**2 / number
     middle = (share + 0.5 * square) / (1.0 + square)
     half = Z95 * math.sqrt(share * (1.0 - share) / number + 0.25 * square / number) / (1.0 + square)
@@ -39,27 +39,27 @@ def rate(hits: Iterable[bool]) -> str:
 
 
 def wrong_first(verdict: Verdict) -> bool:
-    """A wrong name leads."""
+    """True if a wrong name leads."""
     return verdict.first == "wrong"
 
 
 def right_first(verdict: Verdict) -> bool:
-    """The right name, or an alias of it, leads."""
+    """True if the right name or an alias leads."""
     return verdict.first == "right"
 
 
 def unexplained_first(verdict: Verdict) -> bool:
-    """Something unexplained leads."""
+    """True if ``unexplained`` leads."""
     return verdict.first == "unexplained"
 
 
 def false_name(verdict: Verdict) -> bool:
-    """Something is named that is not there."""
+    """True if an absent cause is named."""
     return bool(verdict.wrong)
 
 
 def everyday(verdicts: Sequence[Verdict]) -> list[tuple[str, str, str]]:
-    """The figures of everyday records: (what, figure, goal)."""
+    """Returns the figures of everyday records: (what, figure, goal)."""
     healthy = [each for each in verdicts if each.kind in {"healthy_bench", "healthy_work"}]
     faults = [each for each in verdicts if each.kind == "fault"]
     law = [each for each in verdicts if each.kind == "law"]
@@ -95,7 +95,7 @@ def everyday(verdicts: Sequence[Verdict]) -> list[tuple[str, str, str]]:
 
 
 def _pairs(verdicts: Sequence[Verdict]) -> list[tuple[str, str, str]]:
-    """Fine flickering encoders against the same axis at 16 bits."""
+    """Compares fine flickering encoders with the same axis at 16 bits."""
     by_pair: dict[str, dict[bool, Verdict]] = {}
     for each in verdicts:
         by_pair.setdefault(each.pair, {})[each.flicker_counts > 0.0] = each
@@ -108,7 +108,7 @@ def _pairs(verdicts: Sequence[Verdict]) -> list[tuple[str, str, str]]:
 
 
 def bench(verdicts: Sequence[Verdict]) -> list[tuple[str, str, str]]:
-    """The figures of the bench suite: (what, figure, goal)."""
+    """Returns the figures of the bench suite: (what, figure, goal)."""
     by_kind: dict[str, list[Verdict]] = {}
     for each in verdicts:
         by_kind.setdefault(each.kind, []).append(each)
@@ -146,7 +146,7 @@ def _several(kind: str, verdicts: Sequence[Verdict], goal: str) -> list[tuple[st
 
 
 def common(verdicts: Sequence[Verdict]) -> list[tuple[str, str, str]]:
-    """Figures that every suite has: (what, figure, goal)."""
+    """Returns the figures of every suite: (what, figure, goal)."""
     compared = [each for verdict in verdicts for each in verdict.compared]
     pairs = [pair for each in verdicts for pair in each.probabilities]
     sure = [right for chance, right in pairs if chance >= 0.95]
@@ -186,7 +186,7 @@ def _median(values: Iterable[float | None]) -> str:
 
 
 def calibration(verdicts: Sequence[Verdict]) -> list[tuple[str, str, str]]:
-    """Probabilities by bin: (bin, mean probability, share that was right)."""
+    """Returns probabilities by bin: (bin, mean probability, share that was right)."""
     pairs = [pair for each in verdicts for pair in each.probabilities]
     rows = []
     for low, high in itertools.pairwise(BINS):
@@ -215,7 +215,7 @@ CATEGORIES: tuple[tuple[str, Callable[[Verdict], str]], ...] = (
 
 
 def by_category(verdicts: Sequence[Verdict]) -> list[list[str]]:
-    """Everyday records by rough category: healthy ones, and those with one fault."""
+    """Tabulates everyday records by category: healthy, and with one fault."""
     rows = []
     for category, of in CATEGORIES:
         for value in sorted({of(each) for each in verdicts}):
@@ -235,7 +235,7 @@ def by_category(verdicts: Sequence[Verdict]) -> list[list[str]]:
 
 
 def by_effect(verdicts: Sequence[Verdict]) -> list[list[str]]:
-    """Everyday faults by the rms that they have in the record, over the noise of a reading."""
+    """Tabulates everyday faults by their rms in the record over the noise of a reading."""
     rows = []
     for low, high in EFFECTS:
         mine = [each for each in verdicts if each.effect_over_noise is not None]
@@ -248,20 +248,20 @@ def by_effect(verdicts: Sequence[Verdict]) -> list[list[str]]:
 
 
 def power(verdicts: Sequence[Verdict]) -> list[list[str]]:
-    """Right names of the bench suite by size over the noise."""
+    """Tabulates right names of the bench suite by size over the noise."""
     mine = [each for each in verdicts if each.kind == "power"]
     ratios = sorted({each.over_noise for each in mine if each.over_noise is not None})
     return [[f"{ratio:g}", rate(right_first(v) for v in mine if v.over_noise == ratio)] for ratio in ratios]
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """A Markdown table."""
+    """Returns a Markdown table."""
     lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
     return "\n".join([*lines, *("| " + " | ".join(row) + " |" for row in rows)])
 
 
 def page(verdicts: Sequence[Verdict], seed: int, cases: bool = False) -> str:
-    """All tables; with ``cases`` also what went wrong in each."""
+    """Returns all tables; with ``cases`` also the errors of each case."""
     held = "development" if cases or seed < 1000 else "held out"
     parts = [
         f"{len(verdicts)} cases of seed {seed} ({held}); in brackets per cent and Wilson's 95 % interval"

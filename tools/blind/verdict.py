@@ -1,4 +1,4 @@
-"""Compares what a diagnosis says with what was hidden: one verdict for each case.
+"""Compares a diagnosis with the hidden causes: one verdict for each case.
 
 Only the published JSON of ``hdbridge diagnose`` and the model that it writes are read. A cause is *named* if
 its probability is above 0.5. A finding *meets* a hidden cause if it names it, or gives it as an alias. What
@@ -20,13 +20,13 @@ UNEXPLAINED = "unexplained"
 MEMORY = "hysteresis_memory"
 NAMED_ABOVE = 0.5
 ANGLES = ("phase_deg", "centre_deg")
-"""Parameters that are angles, full turns apart the same."""
+"""Parameters that are angles, compared modulo a turn."""
 SORTS = {
     "single": "fault", "power": "fault", "no_torque": "fault", "fault": "fault", "pair": "several",
     "triple": "several", "none": "healthy", "healthy_bench": "healthy", "healthy_work": "healthy",
     "other_law": "law", "law": "law", "unknown": "unknown", "outside": "unknown",
 }  # fmt: skip
-"""Question of each kind of case; that of a flickering pair depends on the case."""
+"""Category of each kind of case; that of a flickering pair depends on the case."""
 PARTS = {
     "hysteresis_parameters": "hysteresis", MEMORY: "hysteresis", "motor_order": "synchronous",
     "motor_encoder_eccentricity": "synchronous",
@@ -36,7 +36,7 @@ PARTS = {
 
 @dataclass(frozen=True)
 class Compared:
-    """A parameter that is in both: the finding's and the truth's."""
+    """Parameter of a finding with its true value."""
 
     cause: str
     name: str
@@ -64,9 +64,9 @@ class Answer:
 
     diagnosis: Data | None = None
     extended: Data | None = None
-    """The model that was written."""
+    """Extended model, as written."""
     fresh_given: Data | None = None
-    """Diagnosis of the fresh record with the given model, and with the written one."""
+    """Diagnoses of the fresh record with the given and the written model."""
     fresh_extended: Data | None = None
     refused: bool = False
     failed: str = ""
@@ -75,7 +75,7 @@ class Answer:
 
 @dataclass(frozen=True)
 class Verdict:
-    """One case judged."""
+    """Evaluation of one case."""
 
     case: str
     kind: str
@@ -89,36 +89,36 @@ class Verdict:
     samples: int
     over_noise: float | None
     effect_over_noise: float | None
-    """Rms of what the cause does in the record, over the noise of a reading."""
+    """Rms of the cause's effect in the record over the noise of a reading."""
     hidden: tuple[str, ...]
     first: str
     """Returns the kind of the leading finding: ``right``, ``wrong``, ``unexplained`` or ``nothing``."""
     first_names_it: bool
-    """Right without the help of an alias."""
+    """True if the leading name is right without an alias."""
     named: tuple[str, ...]
     met: tuple[str, ...]
     """Hidden causes that were named or given as an alias."""
     wrong: tuple[str, ...]
-    """Named, but not there."""
+    """Causes named but absent."""
     ordinary: bool
-    """Something is named that the axis has of itself, as the wind-up of its load."""
+    """True if a cause is named that every axis has, such as wind-up."""
     detectable: bool | None
     """The diagnosis reports that it would name a cause of this size in this record."""
     probabilities: tuple[tuple[float, bool], ...]
     compared: tuple[Compared, ...]
     fresh_gain: float | None
-    """Rms that the written model explains in a fresh record, over what the only finding claims."""
+    """Rms explained by the written model in a fresh record, relative to the claim of the only finding."""
     fresh_left: float | None
-    """Rms that it leaves there, over what was stated."""
+    """Residual rms of the written model in a fresh record, relative to the stated one."""
     unwritten: tuple[str, ...]
-    """Named, but not in the written model."""
+    """Causes named but missing in the written model."""
     refused: bool
     failed: str
     seconds: float
 
 
 def judged(secret: Data, answer: Answer, model: Data | None = None) -> Verdict:
-    """The verdict on a case; ``model`` is what the diagnosis was given."""
+    """Evaluates a case; ``model`` is the model given to the diagnosis."""
     causes = tuple(each["cause"] for each in secret["hidden"])
     known = tuple(each for each in causes if each != UNEXPLAINED)
     kind = secret["kind"]
@@ -193,7 +193,9 @@ def _first(first: Data | None, expected: tuple[str, ...]) -> str:
 
 
 def _detectable(diagnosis: Data | None, known: tuple[str, ...], secret: Data) -> bool | None:
-    """The identifiability report of the cause, or of its structural twin, covers what the cause does here."""
+    """True if the identifiability report of the cause, or of its structural twin, covers its size in this
+    record.
+    """
     if diagnosis is None or len(known) != 1 or not secret.get("effect"):
         return None
     # What the cause does here is not more of it than there is: a mass also winds up the spring, for example.
@@ -224,7 +226,7 @@ def _fresh(answer: Answer, named: list[Data]) -> tuple[float | None, float | Non
 
 
 def _explained(before: float, after: float) -> float:
-    """Rms of what was taken away; what is noise in both cancels."""
+    """Returns the rms of the explained part; noise common to both cancels."""
     return math.copysign(math.sqrt(abs(before**2 - after**2)), before - after)
 
 
@@ -243,7 +245,7 @@ def _unwritten(named: Iterable[str], extended: Data | None, model: Data) -> tupl
 
 
 def _compared(secret: Data, findings: list[Data], model: Data) -> Iterable[Compared]:
-    """Every parameter of which the truth is known, in the first finding of each cause; angles to a turn."""
+    """Returns the parameters with known truth in the first finding of each cause; angles modulo a turn."""
     first = {each["cause"]: each.get("parameters") or {} for each in reversed(findings)}
     for cause, parameters in first.items():
         values = {name: float(there["value"]) for name, there in parameters.items()}

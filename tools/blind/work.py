@@ -27,19 +27,19 @@ class Burst:
     """Duration of the rest afterwards, unrecorded."""
 
     def moves(self, axis: AxisView) -> Steps[None]:
-        """The legs, one after the other."""
+        """Yields the legs."""
         for each in self.legs:  # noqa: UP028 - what a generator is sent is of no use to a tuple
             yield each
 
     @property
     def standing(self) -> Burst:
-        """The pause as a procedure."""
+        """Returns the pause as a procedure."""
         return Burst((Dwell(self.pause_s),))
 
 
 @dataclass(frozen=True)
 class Smooth:
-    """A sum of sines that begins and ends at rest where the axis stands."""
+    """Sum of sines that begins and ends at rest at the position of the axis."""
 
     duration_s: float
     sines: tuple[tuple[float, float, float], ...]
@@ -47,7 +47,7 @@ class Smooth:
     kind: str = "stream"
 
     def path(self, start_deg: float, limits: MotionLimits) -> Path:
-        """The path; its limits were kept when it was drawn."""
+        """Returns the path, which was drawn within the limits."""
         ramp_s, turns = 0.2 * self.duration_s, [(a, math.tau * f, p) for a, f, p in self.sines]
 
         def at(time_s: float) -> float:
@@ -59,12 +59,12 @@ class Smooth:
         return Path(self.duration_s, at, start_deg - reach, start_deg + reach)
 
     def ended(self, samples: Sequence[Sample]) -> bool:
-        """The path's end is the leg's end."""
+        """True at the end of the path."""
         return True
 
 
 class Draft:
-    """Motion that is being drawn, within a part of the axis's travel."""
+    """Motion under construction, within a part of the axis's travel."""
 
     def __init__(self, rng: random.Random, view: AxisView) -> None:
         self.rng, self.view = rng, view
@@ -77,36 +77,36 @@ class Draft:
         self.legs: list[Move] = []
 
     def stretched(self, low: float, high: float) -> float:
-        """A number between two, evenly by its logarithm."""
+        """Draws a number between two, log-uniformly."""
         return math.exp(self.rng.uniform(math.log(low), math.log(high)))
 
     def add(self, move: Move) -> None:
-        """One more leg."""
+        """Adds a leg."""
         path = move.path(self.place_deg, self.view.limits)
         self.place_deg = path.at(path.duration_s)
         self.elapsed_s += path.duration_s
         self.legs.append(move)
 
     def go(self, goal_deg: float, speed: float = 1.0, acceleration: float = 1.0, kind: str = "move") -> None:
-        """A move with shares of the axis's speed and acceleration."""
+        """Adds a move with shares of the axis's speed and acceleration."""
         limits = self.view.limits
         self.add(
             MoveTo(goal_deg, speed * limits.velocity_deg_s, kind, acceleration * limits.acceleration_deg_s2)
         )
 
     def rest(self, duration_s: float) -> None:
-        """Stand."""
+        """Adds a rest."""
         if duration_s > 0.0:
             self.add(Dwell(duration_s))
 
     def burst(self, pause_s: float = 0.0) -> Burst:
-        """Commands drawn since the last burst."""
+        """Returns the commands drawn since the last burst."""
         legs, self.legs = tuple(self.legs), []
         return Burst(legs, pause_s)
 
 
 def drawn_work(rng: random.Random, view: AxisView, kind: str, shortest_s: float = 10.0) -> list[Burst]:
-    """The bursts of a work record; the first is the way to where it begins, and is not recorded."""
+    """Draws the bursts of a work record; the first moves to the start and is not recorded."""
     draft = Draft(rng, view)
     draft.go(rng.uniform(draft.low_deg, draft.high_deg))
     for _ in range(rng.randint(0, 3)):  # the elastic state at the start is anywhere in the loop
@@ -133,7 +133,7 @@ def _draw(draft: Draft, kind: str, duration_s: float) -> None:
 
 
 def _goal(draft: Draft) -> float:
-    """A target at a distance that is anything from a motor degree to the whole travel."""
+    """Draws a target at a distance between a motor degree and the whole travel."""
     rng, room = draft.rng, draft.high_deg - draft.low_deg
     distance = draft.stretched(1.0 / draft.view.ratio, room) * rng.choice((-1.0, 1.0))
     if not draft.low_deg <= draft.place_deg + distance <= draft.high_deg:
@@ -142,7 +142,7 @@ def _goal(draft: Draft) -> float:
 
 
 def _moves(draft: Draft, duration_s: float) -> None:
-    """Point to point, at random."""
+    """Adds random point-to-point moves."""
     end_s = draft.elapsed_s + duration_s
     speed, acceleration = draft.stretched(0.2, 1.0), draft.stretched(0.1, 1.0)
     dwell_s = draft.rng.choice((0.0, draft.stretched(0.1, 3.0)))
@@ -152,7 +152,7 @@ def _moves(draft: Draft, duration_s: float) -> None:
 
 
 def _steps(draft: Draft, _: float) -> None:
-    """Equal fast steps, one way or there and back."""
+    """Adds equal fast steps, one way or there and back."""
     rng = draft.rng
     both = rng.random() < 0.5
     count = rng.randint(12, 60)
@@ -172,7 +172,7 @@ def _steps(draft: Draft, _: float) -> None:
 
 
 def _pick(draft: Draft, duration_s: float) -> None:
-    """The same few poses over and over, some of them approached slowly."""
+    """Adds repeated moves between a few poses, some approached slowly."""
     rng, end_s = draft.rng, draft.elapsed_s + duration_s
     speed, acceleration = draft.stretched(0.3, 1.0), draft.stretched(0.2, 1.0)
     poses = [
@@ -188,7 +188,7 @@ def _pick(draft: Draft, duration_s: float) -> None:
 
 
 def _stream(draft: Draft, duration_s: float) -> None:
-    """A smooth path about the middle of the room."""
+    """Adds a smooth path about the middle of the available travel."""
     rng, limits = draft.rng, draft.view.limits
     middle_deg = 0.5 * (draft.low_deg + draft.high_deg)
     draft.go(middle_deg)

@@ -44,16 +44,16 @@ class AmplitudeDrift(Linear, Warmed):
         equation="w (ripple S + friction H), S the model's orders (times 1 + growth tau where they grow with "
         "torque), H its loop, w the gear's warmth as in zero_drift",
         signature="the ripple within a motor turn, or the height of the loop, follows the temperature",
-        consequence="a compensation measured warm is wrong in the cold morning",
+        consequence="a compensation calibrated warm is wrong in the cold",
         remedy="warm up before work; calibrate at working temperature; compensate it with a temperature "
         "sensor",
-        experiment="the same sweeps both ways cold, while it soaks, and warm, at one load",
+        experiment="the same sweeps both ways cold, warming up and warm, at one load",
         aliases=("torque_modulation", "wear", "hysteresis_parameters"),
         source="first-order dependence on temperature with a first-order lag",
         size="10-30 % over the warm-up",
     )
     compensable: ClassVar[Compensable] = Compensable(
-        True, "where the temperature is recorded on line; driven by time alone only after a start from cold"
+        True, "if the temperature is measured on line; driven by time only after a cold start"
     )
     carries: ClassVar[Mapping[Part, str]] = {
         Part.ORDERS: "orders",
@@ -91,7 +91,7 @@ class AmplitudeDrift(Linear, Warmed):
                 )  # fmt: skip
 
     def scales(self) -> tuple[Part, Effect]:
-        """Returns loop or ripple, whichever changes more."""
+        """Returns the part that changes more: loop or ripple."""
         ripple = math.sqrt(0.5 * sum(each.amplitude_arcsec**2 for each in self.orders))
         friction = abs(self.friction_percent_per_k * self.loop.offset_arcsec)
         if abs(self.ripple_percent_per_k) * ripple <= friction:

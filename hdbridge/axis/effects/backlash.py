@@ -41,12 +41,11 @@ class Backlash(Linear):
     about: ClassVar[Cause] = Cause(
         title="backlash behind the gear",
         equation="-(gap / 2) s, s = clip(s_before + 2 d theta_M / crossing, -1, 1)",
-        signature="after each reversal the load rests while the motor moves on, then it follows: a loop "
-        "opposite in sense "
-        "to the elastic one, crossed within a fraction of a motor degree",
+        signature="after each reversal the load rests for a fraction of a motor degree, then follows: a loop "
+        "opposite in sense to the elastic one",
         consequence="the load lags by half the gap on either side, and is free within the gap",
-        remedy="tighten the coupling or key; preload the axis by torque; compensate what is left",
-        experiment="reversals with a load torque to one side: it holds the play closed, hysteresis stays",
+        remedy="tighten the coupling or key; preload the axis; compensate the rest",
+        experiment="reversals under a torque to one side: the torque closes the play, hysteresis stays",
         aliases=("hysteresis_parameters", "wear", "hysteresis_memory"),
         source="play operator (dead zone with a resting load)",
         size="2-36 arcsec",
@@ -61,9 +60,8 @@ class Backlash(Linear):
     )
     compensable: ClassVar[Compensable] = Compensable(
         True,
-        "as long as friction holds the load against one side; the motor has to jump the gap at each "
-        "reversal, so with "
-        "a load that swings freely leave it out",
+        "while friction holds the load against one side; leave it out if the load swings freely, because the "
+        "motor has to cross the gap at each reversal",
     )
     shape: ClassVar[tuple[Shape, ...]] = (Shape("crossing_deg", 0.02, 20.0, logarithmic=True),)
     ordinary_arcsec: ClassVar[float] = 1.0
@@ -77,9 +75,7 @@ class Backlash(Linear):
 
     @classmethod
     def of_gap(cls, gap_arcsec: float, ratio: float, softness: float = _SOFTNESS) -> Self:
-        """Returns a gap that takes ``softness`` times its ideal motor angle; from 1.25 on it is
-        invertible.
-        """
+        """Returns a gap with a crossing of ``softness`` times the ideal angle; invertible from 1.25 on."""
         return cls(gap_arcsec=gap_arcsec, crossing_deg=_crossing_deg(gap_arcsec, ratio, softness))
 
     @classmethod

@@ -123,8 +123,7 @@ class Effect(Strict, ABC):
     locations.
     """
     ordinary_arcsec: ClassVar[float] = 0.0
-    """Peak amplitude that any healthy axis has, of this cause or of one that cannot be
-    distinguished from it.
+    """Peak amplitude on a healthy axis, of this cause or an indistinguishable one.
     """
     incidental: ClassVar[frozenset[str]] = frozenset()
     """Names of coefficients that are no evidence for the cause, because they are also non-zero without it."""

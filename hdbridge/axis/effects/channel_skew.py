@@ -43,8 +43,8 @@ class ChannelSkew(Linear):
         subject="delays",
         equation="delay omega_L + second alpha_L / 2; omega_L, alpha_L = commanded motor speed and "
         "acceleration / N, limited",
-        signature="an error in proportion to the speed, a straight line through zero, none at rest",
-        consequence="none for the axis: the measurement alone is wrong while it moves",
+        signature="an error proportional to the speed, none at rest",
+        consequence="the axis is right; the measurement is wrong in motion",
         remedy="latch both encoders by one signal, or correct the time stamps in the recording",
         experiment="sweeps at several speeds both ways: skew is linear in speed, drag falls off",
         aliases=("velocity_windup", "inertial_windup", "rate_dependence"),
@@ -59,11 +59,9 @@ class ChannelSkew(Linear):
             ),
         },
     )
-    compensable: ClassVar[Compensable] = Compensable(
-        False, "it is an error of the measurement; to compensate it would make the load lag or lead"
-    )
+    compensable: ClassVar[Compensable] = Compensable(False, "it is an error of the measurement")
     ordinary_arcsec: ClassVar[float] = 1.0
-    """No two encoders are sampled at exactly the same instant."""
+    """Usual skew, because no two encoders are sampled at exactly the same instant."""
     incidental: ClassVar[frozenset[str]] = frozenset({"second_order_ms2"})
     """Includes the load's own wind-up."""
     linear: ClassVar[tuple[str, ...]] = ("delay_ms", "second_order_ms2")

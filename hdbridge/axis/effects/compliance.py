@@ -52,10 +52,10 @@ class Compliance(Linear):
         subject="effects of torque",
         equation="sense sgn(T) (c1 min(|T|, T1) + c2 (|T| between T1 and T2) + c3 (|T| beyond T2)), c = "
         "206265 arcsec / K",
-        signature="the error follows the torque; with a mass off centre it looks like once per load turn",
+        signature="the error follows the torque; a mass off centre looks like a load order 1",
         consequence="the load sags under its weight and yields to process forces",
-        remedy="compensate it where the torque is known; balance the load; a larger or stiffer gear",
-        experiment="move or take off the mass: the wind-up goes with it, a load order stays",
+        remedy="measure the torque and compensate it; balance the load; a larger or stiffer gear",
+        experiment="move or remove the mass: the wind-up changes, a load order stays",
         aliases=("load_order", "inertial_windup", "velocity_windup"),
         source="catalogue stiffness K1, K2, K3 of strain wave gears with torques T1, T2",
         size="about 16 arcsec/Nm in a size 20; 10-100 arcsec",

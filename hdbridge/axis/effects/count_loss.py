@@ -46,15 +46,13 @@ class CountLoss(Effect):
     name: ClassVar[str] = "count_loss"
     channels: ClassVar[frozenset[Channel]] = frozenset({Channel.TIME})
     about: ClassVar[Cause] = Cause(
-        title="a step that stays",
+        title="lasting step",
         subject="lost counts",
         equation="sum of size_j over the steps with t >= t_j",
-        signature="at one instant everything shifts, by whole counts of an encoder or by a tooth, and "
-        "stays so",
-        consequence="every position after it is off by the step, until the axis is homed",
-        remedy="home again; check cable, shield and supply of the encoder. A step of a whole tooth (360/z "
-        "deg) is "
-        "ratcheting: stop and look at the gear",
+        signature="a sudden lasting shift by whole encoder counts or by a tooth",
+        consequence="every later position is off by the step until the axis is homed",
+        remedy="home again; check cable, shield and supply of the encoder; a step of a whole tooth (360/z "
+        "deg) is ratcheting: stop and inspect the gear",
         experiment="pass an index pulse or a reference mark before and after",
         aliases=("zero_drift", "wear"),
         source="kinematics",
@@ -62,7 +60,8 @@ class CountLoss(Effect):
     )
     compensable: ClassVar[Compensable] = Compensable(
         False,
-        "it cannot be foreseen, and after homing it is gone; a loss in the load encoder is no motion at all",
+        "it cannot be predicted and ends with homing; a loss in the load encoder is an error of the "
+        "measurement",
     )
     shape: ClassVar[tuple[Shape, ...]] = (Shape("time_s", -1e10, 1e10, moves=Moves.NEVER),)
     usual: ClassVar[int] = 2

@@ -60,9 +60,9 @@ class Creep(Effect):
         equation="sum of A_j y_j; tau_j dy_j/dt = -y_j at rest, build_up tau_j dy_j/dt = sgn(v) - y_j in "
         "motion",
         signature="after a stop the load moves on for seconds to minutes while the motor stands still",
-        consequence="the position at the end of a move is not the one a minute later",
-        remedy="compensate it, or wait; less preload or friction torque; it is the flexspline and the grease",
-        experiment="long rests after moves in either direction; servo settling would show at the motor too",
+        consequence="the position after a move differs from that a minute later",
+        remedy="compensate it, or wait; less preload or friction torque",
+        experiment="long rests after moves in either direction; servo settling shows at the motor, too",
         aliases=("zero_drift",),
         source="generalised Kelvin-Voigt element: a sum of exponentials",
         size="1-10 arcsec",
@@ -74,7 +74,7 @@ class Creep(Effect):
         Shape("tau_s", 0.05, 3600.0, logarithmic=True),
         Shape("build_up", 0.01, 1.0, logarithmic=True),
     )
-    """``tau_s`` is that of the first exponential; the others keep their ratio to it."""
+    """Time constant of the first exponential; the others keep their ratio to it."""
 
     usual: ClassVar[int] = 8
     """A real relaxation is a sum of exponentials."""

@@ -39,9 +39,9 @@ class Moves(Enum):
 
     ANYWHERE = "anywhere"
     NEARBY = "nearby"
-    """Only from near its optimum, which must be found by a search."""
+    """A local step helps only near the optimum, which must be found by a search."""
     NEVER = "never"
-    """The error does not depend smoothly on it."""
+    """A local step never helps, because the error does not depend smoothly on the parameter."""
 
 
 class Experiment(NamedTuple):

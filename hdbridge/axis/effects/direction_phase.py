@@ -50,12 +50,10 @@ class DirectionPhase(Effect):
         title="synchronous part shifted with the direction",
         equation="d times the sum over k of -A_k tan(k shift) sin(k theta_M + phi_k), A_k and phi_k the "
         "synchronous part's, d the direction held at rest",
-        signature="the ripple within a motor turn is displaced between the two directions, by one angle "
-        "for all orders",
-        consequence="a compensation without it leaves the ripple's difference, with opposite signs in the "
-        "two directions",
-        remedy="compensate it; it is the change of tooth flanks, and grows with preload and with load",
-        experiment="slow sweeps over the same motor turns both ways; even and odd part in the direction",
+        signature="the ripple is displaced between the two directions by one motor angle for all orders",
+        consequence="the compensation leaves a ripple with opposite signs in the two directions",
+        remedy="compensate it; it comes from the change of tooth flanks and grows with preload and load",
+        experiment="slow sweeps over the same motor turns both ways",
         aliases=("hysteresis_parameters",),
         source="phase of the kinematic error differs between the tooth flanks that carry",
         size="1-5 arcsec",

@@ -77,7 +77,7 @@ class ElasticLoop(Effect):
     """A published gear of ratio 50."""
     part: ClassVar[Part | None] = Part.LOOP
     drifting: ClassVar[tuple[str, ...]] = ("offset_arcsec",)
-    """Preload settles, grease and friction change; width and exponent stay."""
+    """The offset, because preload settles and friction changes; width and exponent stay."""
 
     offset_arcsec: Annotated[
         float,

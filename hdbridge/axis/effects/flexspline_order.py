@@ -21,13 +21,11 @@ class FlexsplineOrders(OrderSeries):
         title="order of the wave generator relative to the flexspline",
         subject="orders",
         equation="sum over k of A_k cos(k (1 + 1/N) theta_M + phi_k)",
-        signature="nearly an order of the motor, but its phase runs through once per load turn (k times "
-        "for order k)",
-        consequence="a ripple that a model of motor orders compensates at one load angle and doubles at "
+        signature="nearly a motor order, but its phase advances by k turns per load turn",
+        consequence="a model of motor orders compensates the ripple at one load angle and doubles it at "
         "another",
-        remedy="add it to the model; it is a flexspline that is not of even stiffness or pitch around",
-        experiment="a slow sweep over at least one, better two turns of the load: shorter, it looks like a "
-        "motor order",
+        remedy="add it to the model; the flexspline's stiffness or pitch is uneven around its circumference",
+        experiment="a slow sweep over one load turn, better two: over less it looks like a motor order",
         aliases=("motor_order", "synchronous"),
         source="kinematics of a strain wave gear: the flexspline turns by -theta_M / N under the wave "
         "generator",

@@ -46,9 +46,9 @@ class Hysteresis(ElasticLoop):
         "xi = |theta_M - theta_M,rev| / width; offset > 0: the load leads, offset < 0: it lags",
         signature="a loop of constant height between the two directions; after a reversal it takes a fixed "
         "motor angle to cross",
-        consequence="the load comes to rest ahead of its target in the direction of motion (offset > 0) or "
-        "short of it (offset < 0), from either side",
-        remedy="compensate it; a leading loop grows with preload and friction in the mesh, a lagging one "
+        consequence="the load overshoots its target (offset > 0) or stops short of it (offset < 0), from "
+        "either side",
+        remedy="compensate it; a leading loop grows with preload and friction of the mesh, a lagging one "
         "with friction at the load",
         experiment="slow sines of several amplitudes, some smaller than the width",
         aliases=("backlash",),

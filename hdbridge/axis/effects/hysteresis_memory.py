@@ -50,10 +50,9 @@ class HysteresisMemory(ElasticLoop):
         "back at the angle "
         "of the reversal before, both are forgotten and the outer branch goes on",
         signature="nested loops close; the plain law misses by 10 to 30 arcsec after small back-steps",
-        consequence="after a small move back and forth within the width, the load is not where the plain "
-        "law says",
-        remedy="use this law in place of the plain one; it costs nothing more",
-        experiment="first-order reversal curves: back-steps of growing size within the width, each undone",
+        consequence="after a small move back and forth the plain law predicts another position",
+        remedy="use this law in place of the plain one",
+        experiment="first-order reversal curves: back-steps of growing size, each undone",
         aliases=("hysteresis_parameters", "backlash"),
         source="G. Masing 1926; return-point memory of Prandtl-Ishlinskii and Preisach operators",
         size="10-27 arcsec from the plain law, for a loop of 80",
@@ -87,14 +86,17 @@ class HysteresisMemory(ElasticLoop):
         samples at once.
         """
         # A saturated start is a direction, but only true reversals of the motion count here.
-        path = path_of(motor_deg, start)
-        turning, signs = path.turning, path.signs
+        way = path_of(motor_deg, start)
+        turning, signs = way.turning, way.signs
         memory = _Memory(self.width_deg, self.exponent, float(motor_deg[0]), start.value)
         lengths: list[int] = [turning[0] + 1]
         segments: list[_Segment] = [_Segment(0.0, float(start.value), 0, False)]
-        for first, last, sign in zip(turning[:-1], turning[1:], signs, strict=True):
-            begin = first + 1
-            for closing, segment in memory.walk(float(motor_deg[first]), float(motor_deg[last]), sign):
+        value_there = float(start.value)
+        angles = motor_deg[list(turning)].tolist()
+        for at, sign in enumerate(signs):
+            begin, last = turning[at] + 1, turning[at + 1]
+            path, value_there = memory.walk(angles[at], value_there, angles[at + 1], sign)
+            for closing, segment in path:
                 end = last + 1
                 if closing is not None:
                     end = _reached(motor_deg, closing, begin, last + 1, sign)
@@ -158,7 +160,7 @@ class _Memory:
         nothing.
         """
         depth = len(self._points)
-        if sign == -self._sign:  # a reversal: first its own branch, which closes where the last one began
+        if sign == -self._sign:  # a reversal starts a branch that closes at the start of the last one
             if depth > _DEPTH:
                 depth -= 2
             closing = self._points[depth - 1][0] if depth else 2.0 * self._origin - last
@@ -175,30 +177,13 @@ class _Memory:
             depth -= 2
 
     def move(self, last: float, value: float, angle: float, sign: int) -> float:
-        """Moves straight from ``last`` to ``angle``, updates the memory and returns the value there."""
-        *_, (_, segment) = self._go(last, value, angle, sign)
-        reached = self._on(segment, angle)
-        self._settle(angle, reached, sign)
-        return reached
+        """Moves straight from ``last`` (with ``value``) to ``angle``; returns the value there."""
+        return self.walk(last, value, angle, sign)[1]
 
-    def walk(self, last: float, angle: float, sign: int) -> Iterator[tuple[float | None, _Segment]]:
-        """Does the same as `move` for a record; yields the segments of the path, each with the angle at which
-        it closes.
-        """
-        value = self._value_here(last)
-        segment = _Segment(0.0, 0.0, 0, False)
-        for closing, segment in self._go(last, value, angle, sign):
-            yield closing, segment
-        self._settle(angle, self._on(segment, angle), sign)
-
-    def _value_here(self, angle: float) -> float:
-        if not self._sign:
-            return 0.0
-        return self._on(self.branch(len(self._points), self._sign)[0], angle)
-
-    def _go(
+    def walk(
         self, last: float, value: float, angle: float, sign: int
-    ) -> Iterator[tuple[float | None, _Segment]]:
+    ) -> tuple[list[tuple[float | None, _Segment]], float]:
+        """Moves as `move` does; returns the segments, each with its closing angle, and the value."""
         points = self._points
         if sign == -self._sign:
             if not points:
@@ -207,21 +192,20 @@ class _Memory:
                 del points[-2:]
             points.append((last, value))
         self._sign = sign
-        while True:
-            segment, closing = self.branch(len(points), sign)
-            if closing is None or sign * angle < sign * closing:
-                yield None, segment
-                return
-            yield closing, segment
+        segment, closing = self.branch(len(points), sign)
+        path = [(closing, segment)]
+        while closing is not None and sign * angle >= sign * closing:
             del points[-2:]
             if len(points) < 2:  # back on the virgin curve: its mirror point is no longer needed
                 points.clear()
-
-    def _settle(self, angle: float, value: float, sign: int) -> None:
-        """Clears the memory at saturation."""
-        if value == float(sign):
-            self._points.clear()
+            segment, closing = self.branch(len(points), sign)
+            path.append((closing, segment))
+        path[-1] = (None, segment)
+        reached = self._on(segment, angle)
+        if reached == float(sign):  # saturation clears the memory
+            points.clear()
             self._origin = angle - 0.5 * sign * self._width
+        return path, reached
 
     def _on(self, segment: _Segment, angle: float) -> float:
         xi = abs(angle - segment.angle) / self._width

@@ -37,21 +37,20 @@ class HysteresisParameters(Effect):
 
     name: ClassVar[str] = "hysteresis_parameters"
     about: ClassVar[Cause] = Cause(
-        title="the elastic loop has changed",
+        title="changed hysteresis loop",
         subject="hysteresis",
         equation="H(offset, width, exponent) - H(the model's offset, width, exponent)",
-        signature="a rest of the loop after each reversal, or a constant distance between the two directions",
-        consequence="the compensation makes up for a loop that is not the axis's any more",
-        remedy="calibrate again; a smaller offset hints at lost preload, a larger one at friction (cold, "
+        signature="part of a loop remains after each reversal, or a constant distance between the two "
+        "directions",
+        consequence="the compensation still uses the old loop",
+        remedy="calibrate again; a smaller offset suggests lost preload, a larger one more friction (cold, "
         "dry, misaligned)",
         experiment="slow sines of several amplitudes, some smaller than the width",
         aliases=("backlash", "hysteresis_memory", "direction_phase"),
         source="the difference of two loops of one law",
         size="5-30 % of the offset",
     )
-    compensable: ClassVar[Compensable] = Compensable(
-        True, "through the model's loop, which takes over the new parameters"
-    )
+    compensable: ClassVar[Compensable] = Compensable(True, "by new parameters of the model's loop")
     changes: ClassVar[Part | None] = Part.LOOP
     shape: ClassVar[tuple[Shape, ...]] = Hysteresis.shape
 

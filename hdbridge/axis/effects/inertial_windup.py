@@ -38,8 +38,9 @@ class InertialWindup(Linear):
         equation="-(J / K) alpha_L, alpha_L = commanded motor acceleration / N, limited to the limit / N",
         signature="the error follows the acceleration; nothing at rest or at constant speed",
         consequence="the load lags in each acceleration and leads in each deceleration",
-        remedy="compensate it, or accept it where only positions at rest count; less inertia, a stiffer gear",
-        experiment="the same move at another acceleration: it scales; a resonance rings at its own frequency",
+        remedy="compensate it, or accept it if only positions at rest matter; less inertia, a stiffer gear",
+        experiment="the same move at another acceleration: wind-up scales; a resonance rings at its own "
+        "frequency",
         aliases=("channel_skew", "compliance"),
         source="spring and inertia far below the resonance: J / K = 1 / (2 pi f)^2",
         size="7 arcsec at 200 deg/s^2 of the load with a resonance at 50 Hz",
@@ -48,7 +49,7 @@ class InertialWindup(Linear):
         True, "the load really moves so and the acceleration is commanded; at rest it is nothing"
     )
     ordinary_arcsec: ClassVar[float] = 1.5
-    """Every axis winds up a little in its fastest moves."""
+    """Wind-up of any axis in its fastest moves."""
     linear: ClassVar[tuple[str, ...]] = ("inertia_over_stiffness_s2",)
     typical: ClassVar[Mapping[str, Any]] = {"inertia_over_stiffness_s2": 1e-5}
     """A resonance at 50 Hz."""

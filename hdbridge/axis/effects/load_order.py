@@ -34,14 +34,11 @@ class LoadOrders(OrderSeries):
         subject="load orders",
         equation="sum over k of A_k cos(k theta_M / N + phi_k)",
         signature="k periods per turn of the load, the same in both directions and on every turn",
-        consequence="if it is the spline's pitch, the load is off by this much across its turn; if it is "
-        "the load "
-        "encoder, only the measurement is",
-        remedy="centre the load encoder; then compensate what is left (set origin: gear). Until then it is "
-        "left alone",
-        experiment="two load turns both ways, then again with the load encoder re-clocked by 90 deg: what "
-        "turns "
-        "with it is the encoder's. With a mass off centre: again without it",
+        consequence="from the pitch of the spline, the load is wrong; from the load encoder, only the "
+        "measurement is",
+        remedy="centre the load encoder; then compensate the rest (set origin: gear)",
+        experiment="two load turns both ways, again with the load encoder re-clocked by 90 deg: the "
+        "encoder's error turns with it; with a mass off centre, again without the mass",
         aliases=("compliance", "ratio_error", "zero_drift"),
         source="geometry of an eccentric disc; pitch error of the splines",
         size="5-60 arcsec",
@@ -58,9 +55,8 @@ class LoadOrders(OrderSeries):
     )
     compensable: ClassVar[Compensable] = Compensable(
         False,
-        "no, unless its origin is known to be the gear: a load encoder's run-out is an error of the "
-        "measurement, and "
-        "to compensate it would move the load away from where it should be",
+        "no, unless its origin is known to be the gear, because the run-out of a load encoder is an error of "
+        "the measurement",
     )
     typical: ClassVar[Mapping[str, Any]] = {"orders": orders_from((1, 2), 10.0)}
     """Orders 1 and 2."""

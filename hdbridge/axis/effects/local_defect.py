@@ -50,11 +50,10 @@ class LocalDefect(Linear):
         subject="local defects",
         equation="height (1 + cos(pi u)) / 2 where |u| < 1, u = ((theta_M / N - centre) mod 360 deg) / "
         "half_width",
-        signature="the same bump on every pass over one load angle, in both directions, and nothing "
-        "elsewhere",
-        consequence="the load is off at this one place, and the tooth wears on",
-        remedy="look at the tooth; compensate it meanwhile; a mark on the load encoder's disc looks the "
-        "same: clean it",
+        signature="the same bump on every pass over one load angle, in both directions",
+        consequence="the load is off at one place, and the tooth wears further",
+        remedy="inspect the tooth; compensate it meanwhile; clean the load encoder's disc, because a mark on "
+        "it looks the same",
         experiment="several slow passes over the place, both ways, and again with the load encoder "
         "re-clocked",
         aliases=("load_order",),
@@ -62,7 +61,7 @@ class LocalDefect(Linear):
         size="1-20 arcsec",
     )
     compensable: ClassVar[Compensable] = Compensable(
-        True, "the load really moves so, if it is a tooth and no mark on the encoder's disc"
+        True, "the load really moves so, if it is a tooth and not a mark on the encoder's disc"
     )
     shape: ClassVar[tuple[Shape, ...]] = (
         Shape("centre_deg", 0.0, 360.0),

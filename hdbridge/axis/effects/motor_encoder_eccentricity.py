@@ -22,13 +22,11 @@ class MotorEncoderEccentricity(OrderSeries):
         "radius r "
         "that is out of centre by e",
         signature="order 1 (eccentric) and 2 (tilted or oval) of the motor angle, divided by N at the load",
-        consequence="the drive holds the encoder, so the motor and with it the load really run ahead and "
-        "behind "
-        "once per motor turn",
-        remedy="compensate it with the synchronous part; centre the disc; calibrate again whenever the "
-        "encoder has "
-        "been off",
-        experiment="re-clock the encoder on the motor shaft by 90 deg: its part turns with it, the gear's "
+        consequence="the drive follows the encoder, so motor and load really run ahead and behind once per "
+        "motor turn",
+        remedy="compensate it with the synchronous part; centre the disc; calibrate again after removing the "
+        "encoder",
+        experiment="re-clock the encoder on the motor shaft by 90 deg: its error turns with it, the gear's "
         "does not",
         aliases=("motor_order", "synchronous"),
         source="geometry of an eccentric disc: reading error (e / r) sin(theta), first order in e / r",

@@ -14,14 +14,14 @@ class MotorOrders(OrderSeries):
 
     name: ClassVar[str] = "motor_order"
     about: ClassVar[Cause] = Cause(
-        title="an order of the motor that the model does not have",
+        title="motor order missing in the model",
         subject="orders",
         equation="sum over k of A_k cos(k theta_M + phi_k), k not among the synchronous part's orders",
         signature="repeats with every motor turn; the same in both directions, at every load angle and speed",
-        consequence="a ripple of the load within each motor turn that the compensation leaves",
-        remedy="add the order to the model; new orders after months hint at wear of the wave generator's "
+        consequence="the compensation leaves a ripple within each motor turn",
+        remedy="add the order to the model; a new order after months suggests wear of the wave generator's "
         "bearing",
-        experiment="steps of another size, or a slow sweep: an order that was an alias of the step moves",
+        experiment="steps of another size, or a slow sweep: an order aliased by the step moves",
         aliases=("motor_encoder_eccentricity", "synchronous"),
         source="Fourier series over the wave generator's angle",
         size="0.3-3 arcsec; often k = 3, 5, 7, 10, 12",
@@ -38,7 +38,7 @@ class MotorOrders(OrderSeries):
     usual: ClassVar[int] = 4
     """A worn wave generator bearing has several."""
     drifting: ClassVar[tuple[str, ...]] = ("orders",)
-    """The same as for the synchronous part."""
+    """Orders, which change with the wear of teeth and bearing."""
 
     def turns_per_motor_turn(self) -> float:
         """One, because the orders refer to the motor angle itself."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import cmath
 import math
 from abc import abstractmethod
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Annotated, ClassVar, Final, Self, TypeVar, cast
 
 import numpy as np
@@ -61,7 +61,7 @@ class OrderSeries(Effect):
     def _distinct(cls, orders: tuple[MotorOrder, ...]) -> tuple[MotorOrder, ...]:
         numbers = [each.order for each in orders]
         if len(set(numbers)) != len(numbers):
-            raise ValueError("each order may stand only once")
+            raise ValueError("each order may appear only once")
         if cls.few and not cls.few.issuperset(numbers):
             raise ValueError(f"only orders {', '.join(map(str, sorted(cls.few)))} are of this cause")
         return orders
@@ -179,11 +179,26 @@ def orders_from(numbers: Iterable[int], amplitude_arcsec: float = 1.0) -> tuple[
 def cosines_and_sines(angle_rad: FloatArray, numbers: Sequence[int]) -> FloatArray:
     """Returns columns cos(k angle), sin(k angle) for each k, shape (n, 2 * len(numbers))."""
     result = np.empty((2 * len(numbers), len(angle_rad))).T
-    for at, number in enumerate(numbers):
-        angle = number * angle_rad
-        np.cos(angle, out=result[:, 2 * at])
-        np.sin(angle, out=result[:, 2 * at + 1])
+    for at, wave in enumerate(waves(angle_rad, numbers)):
+        result[:, 2 * at], result[:, 2 * at + 1] = wave.real, wave.imag
     return result
+
+
+def waves(angle_rad: FloatArray, numbers: Iterable[float]) -> Iterator[_ComplexArray]:
+    """Yields exp(j k angle), shape (n,), for each k.
+
+    Whole numbers are powers of exp(j angle): a multiplication is several times faster than a cosine and a
+    sine.
+    """
+    turn = turn_of(angle_rad)
+    power, before = np.ones_like(turn), 0
+    for number in numbers:
+        if number == int(number):
+            step, before = int(number) - before, int(number)
+            power = power * (turn if step == 1 else turn**step)
+            yield power
+        else:
+            yield turn_of(number * angle_rad)
 
 
 def coefficients_of(orders: Iterable[MotorOrder]) -> FloatArray:

@@ -42,7 +42,7 @@ class RateDependence(Linear):
         "limited to v_limit",
         signature="the same sine at a higher frequency has a higher loop; at rest the difference is gone",
         consequence="a loop measured slowly is too small for fast moves",
-        remedy="compensate it; calibrate at the speeds of the work; a thinner grease",
+        remedy="compensate it; calibrate at working speed; thinner grease",
         experiment="sines of one amplitude at 0.01 to 1 Hz",
         aliases=("velocity_windup", "channel_skew", "hysteresis_parameters"),
         source="rate-dependent friction, logarithmic in the rate (rate-and-state laws)",

@@ -43,10 +43,9 @@ class RatioError(Linear):
         subject="ratio errors",
         equation="ramp theta_M, ramp = 3600 (1 / N_true - 1 / N), theta_M limited to +- limit",
         signature="a ramp over the motor angle, the same in both directions, undone on the return",
-        consequence="the load is off in proportion to its distance from zero",
-        remedy="correct ratio, teeth or counts per turn in the axis file: a ratio is a fraction of tooth "
-        "numbers, not a fit",
-        experiment="a long sweep both ways, then rest: it grows with the angle, a drift with time",
+        consequence="the error is proportional to the distance from zero",
+        remedy="correct ratio, teeth or counts per turn in the axis file",
+        experiment="a long sweep both ways, then rest: a ratio error grows with the angle, a drift with time",
         aliases=("load_order", "zero_drift", "wear"),
         source="kinematics",
         size="784 arcsec per step of 43.56 motor degrees between ratios 40 and 50",

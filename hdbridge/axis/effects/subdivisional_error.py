@@ -66,20 +66,18 @@ class SubdivisionalError(Effect):
         subject="interpolation errors",
         equation="sum over k of A_k cos(k lines theta_L + phi_k), k = 1 (offset), 2 (gain, phase), 4 "
         "(distortion)",
-        signature="very many periods per load turn: as many as the encoder has lines, or twice, or four "
-        "times",
-        consequence="none for the axis: the measurement alone is wrong within each line",
+        signature="one, two or four periods per encoder line",
+        consequence="the axis is right; the measurement is wrong within each line",
         remedy="align and clean the reading head; correct offset, gain and phase of its signals",
-        experiment="a very slow sweep over some lines, then with the reading head moved along by a "
-        "fraction of a line",
+        experiment="a very slow sweep over some lines, again with the reading head moved by a fraction of a "
+        "line",
         aliases=("motor_order", "vibration"),
         source="Lissajous errors of sine encoders (Heydemann)",
         size="0.1-2 arcsec",
     )
     compensable: ClassVar[Compensable] = Compensable(
         False,
-        "it is an error of the measurement; to compensate it would move the load away from where it should "
-        "be",
+        "it is an error of the measurement",
     )
     usual: ClassVar[int] = 2
     sought: ClassVar[Sought | None] = Sought.LINE

@@ -43,8 +43,8 @@ class TorqueModulation(TorqueGrowth, Linear):
         equation="growth tau S(theta_M), S the carried orders, tau = |T| (or T where signed), limited to "
         "T_limit",
         signature="the amplitude of the ripple within a motor turn follows the load torque",
-        consequence="the compensation of the synchronous part is too small under load",
-        remedy="compensate it where the torque is known; calibrate with the load of the work; a larger gear",
+        consequence="the synchronous compensation is too small under load",
+        remedy="measure the torque and compensate it; calibrate under the working load; a larger gear",
         experiment="the same motor turns under two torques at one temperature",
         aliases=("amplitude_drift", "motor_order"),
         source="kinematic error of strain wave gears under load: amplitude roughly linear in the torque",

@@ -53,10 +53,10 @@ class VelocityWindup(Linear):
         subject="drag",
         equation="-(coulomb sgn(v) + viscous v / (1 + |v| / v_shear)), v the commanded motor speed, "
         "limited to v_limit",
-        signature="the error follows the speed, less than linearly, and goes back at rest",
+        signature="the error grows less than linearly with speed and vanishes at rest",
         consequence="the load lags while it moves",
         remedy="compensate it; thinner grease, seals with less drag; warm the axis up first",
-        experiment="sweeps at several speeds both ways: drag bends with speed, a skew is a straight line",
+        experiment="sweeps at several speeds both ways: drag is curved over speed, a skew is a straight line",
         aliases=("channel_skew", "rate_dependence"),
         source="Coulomb and viscous friction with shear thinning, over the gear's stiffness",
         size="5-50 arcsec",

@@ -39,11 +39,10 @@ class Vibration(Effect):
         title="vibration at a fixed frequency",
         equation="A cos(2 pi f t + phase)",
         signature="the same frequency in hertz at every speed, and at rest",
-        consequence="the load (or only the reading head) trembles",
-        remedy="find the source by its frequency; decouple it; lower the loop's gain where it is a "
-        "resonance of the axis",
-        experiment="a standstill, and sweeps at two speeds: an order moves in hertz with the speed, a "
-        "vibration stays",
+        consequence="the load, or only the reading head, vibrates",
+        remedy="find the source by its frequency; decouple it; lower the loop gain if the axis resonates",
+        experiment="a standstill and sweeps at two speeds: the frequency of an order changes with speed, "
+        "that of a vibration does not",
         aliases=("motor_order", "load_order", "flexspline_order", "subdivisional_error"),
         source="a sinusoid in time",
         size="0.1-5 arcsec",
@@ -54,7 +53,7 @@ class Vibration(Effect):
         },
     )
     compensable: ClassVar[Compensable] = Compensable(
-        False, "its phase drifts and cannot be foreseen, and it is mostly faster than the axis can follow"
+        False, "its phase drifts unpredictably, and it is mostly faster than the axis"
     )
     shape: ClassVar[tuple[Shape, ...]] = (
         Shape("frequency_hz", 0.05, 5000.0, logarithmic=True, is_frequency=True),

@@ -38,20 +38,20 @@ class Wear(Linear):
 
     name: ClassVar[str] = "wear"
     about: ClassVar[Cause] = Cause(
-        title="lost motion that grows",
+        title="growing lost motion",
         equation="(growth / 2) (run / 1000)^exponent s, run = turns_before + sum |d theta_M| / 360, "
         "s = clip(s_before + 2 d theta_M / width, -1, 1)",
         signature="the distance between the two directions grows steadily with the turns run, at one "
         "temperature",
         consequence="repeatability from either side gets worse with time",
-        remedy="calibrate again at intervals; watch the rate; grease; replace the gear when it speeds up",
-        experiment="the same stepping test again, cold, some hours of running apart",
+        remedy="calibrate at intervals; watch the rate; grease; replace the gear when the rate rises",
+        experiment="the same stepping test, cold, some hours of running apart",
         aliases=("amplitude_drift", "zero_drift", "ratio_error", "backlash"),
         source="lost motion proportional to sliding distance (Archard's law), slowing down while it runs in",
         size="grows by 0.1-10 arcsec per thousand motor turns in a fast test",
     )
     compensable: ClassVar[Compensable] = Compensable(
-        True, "the turns run are known; they have to be carried over from run to run in turns_before"
+        True, "the turns run must be carried over in turns_before"
     )
     shape: ClassVar[tuple[Shape, ...]] = (
         Shape("width_deg", 0.05, 60.0, logarithmic=True),

@@ -35,13 +35,12 @@ class ZeroDrift(Linear, Warmed):
         subject="drift",
         equation="drift w, w = u - reference, tau du/dt = temperature - u "
         "(or w = warm_up (1 - exp(-t / tau)))",
-        signature="everything shifts slowly and alike in both directions, with a time constant of minutes "
-        "to an hour",
-        consequence="all positions are off by the same amount, until the axis has the temperature of its "
+        signature="a slow shift, the same in both directions, with a time constant of minutes to an hour",
+        consequence="all positions are off by the same amount until the axis is as warm as in its "
         "calibration",
         remedy="warm up before work; home warm; a temperature sensor at the gear makes it predictable",
-        experiment="return to one reference pose again and again while it warms and cools, with the "
-        "temperature recorded",
+        experiment="return to a reference pose repeatedly while the axis warms and cools; record the "
+        "temperature",
         aliases=("creep", "wear", "count_loss", "load_order", "ratio_error"),
         source="thermal expansion with a first-order lag",
         size="5-60 arcsec, tau 10-60 min",
@@ -62,7 +61,7 @@ class ZeroDrift(Linear, Warmed):
         },
     )
     compensable: ClassVar[Compensable] = Compensable(
-        True, "where the temperature is recorded on line; driven by time alone only after a start from cold"
+        True, "if the temperature is measured on line; driven by time only after a cold start"
     )
     linear: ClassVar[tuple[str, ...]] = ("drift_arcsec_per_k",)
     typical: ClassVar[Mapping[str, Any]] = {"drift_arcsec_per_k": 1.0, "tau_s": 1800.0}

@@ -30,11 +30,11 @@ class Provenance(Strict):
 
     model_config = ConfigDict(defer_build=True, frozen=True, extra="allow")
 
-    axis: str | None = Field(None, description="name of the axis that it was measured on")
-    drive: Identity | None = Field(None, description="identity of the drive that it was measured with")
-    gear: GearOfModel | None = Field(None, description="the gear that it was measured on")
-    date: str | None = Field(None, description="when it was made, ISO 8601")
-    reason: str | None = Field(None, description="why it was made, in words")
+    axis: str | None = Field(None, description="name of the axis")
+    drive: Identity | None = Field(None, description="identity of the drive")
+    gear: GearOfModel | None = Field(None, description="gear")
+    date: str | None = Field(None, description="date, ISO 8601")
+    reason: str | None = Field(None, description="reason")
 
 
 class EffectEntry(BaseModel):
@@ -42,11 +42,9 @@ class EffectEntry(BaseModel):
 
     model_config = ConfigDict(defer_build=True, frozen=True, extra="forbid")
 
-    effect: str = Field(description="name of the effect in the catalogue")
+    effect: str = Field(description="name in the catalogue")
     parameters: dict[str, Any] = Field(description="its parameters, with the unit in the name")
-    uncertainty: dict[str, Any] = Field(
-        default_factory=dict, description="half width of the 95 % interval of parameters, in their units"
-    )
+    uncertainty: dict[str, Any] = Field(default_factory=dict, description="half widths of the 95 % intervals")
 
 
 class ModelFile(BaseModel):
@@ -54,7 +52,7 @@ class ModelFile(BaseModel):
 
     schema_: Literal["hdbridge.model/1"] = Field(alias="schema", description="kind and version of this file")
     ratio: float = Field(gt=0, le=1000, description="N: motor turns per load turn")
-    effects: tuple[EffectEntry, ...] = Field(description="the effects whose sum is the transmission error")
+    effects: tuple[EffectEntry, ...] = Field(description="effects, whose sum is the transmission error")
     provenance: Provenance | None = Field(None, description="origin of the numbers")
     response: Response | None = Field(None, description="response of the axis to the correction in motion")
 
@@ -142,7 +140,7 @@ def _effect(document: Document, number: int, entry: EffectEntry, before: list[st
             f"no effect is called '{entry.effect}'; expected one of {', '.join(CATALOGUE)}{hint}",
         )
     if entry.effect in before:
-        raise document.error((*at, "effect"), f"'{entry.effect}' stands twice; expected each effect once")
+        raise document.error((*at, "effect"), f"'{entry.effect}' appears twice; expected each effect once")
     for name, value in entry.uncertainty.items():
         where = (*at, "uncertainty", name)
         if name not in kind.model_fields:

@@ -23,16 +23,14 @@ class LeadFilter(Strict):
     so that nothing changes at rest.
     """
 
-    lead_cycles: int = Field(ge=0, le=50, description="how far ahead the first weight lies, in cycles")
+    lead_cycles: int = Field(ge=0, le=50, description="lead of the first weight, cycles")
     per_cycle: int = Field(ge=1, le=8, description="weights per cycle")
-    full_speed_deg_s: float = Field(
-        gt=0, description="load speed from which the filter works in full; it fades out with its square"
-    )
+    full_speed_deg_s: float = Field(gt=0, description="load speed from which the filter acts in full")
     weights: tuple[float, ...] = Field(
-        min_length=1, max_length=1000, description="the weights; their sum is 1 plus the sum of feedback"
+        min_length=1, max_length=1000, description="weights; their sum is 1 plus the sum of feedback"
     )
     feedback: tuple[float, ...] = Field(
-        default=(), max_length=2, description="weights of the outputs of the last cycles, subtracted"
+        default=(), max_length=2, description="weights of the last outputs, subtracted"
     )
 
     @model_validator(mode="after")
@@ -58,17 +56,17 @@ class Response(Strict):
     following_lag_ms: float = Field(description="lag of the motor behind its target at constant speed")
     known_to_hz: float = Field(gt=0, description="frequency up to which the correction is applied in full")
     frequency_hz: tuple[float, ...] = Field(description="measured frequencies, rising")
-    gain: tuple[float, ...] = Field(description="amplitude that the load makes of a correction of 1, at each")
+    gain: tuple[float, ...] = Field(description="amplitude of the load per unit of correction, at each")
     phase_deg: tuple[float, ...] = Field(
-        description="phase of the load against the correction at each, following lag included"
+        description="phase of the load against the correction, following lag included"
     )
     uncertainty: tuple[float, ...] = Field(
-        description="half width of the 95 % interval at each, as a share of the gain"
+        description="half width of the 95 % interval, as a share of the gain"
     )
     filter: LeadFilter = Field(description="filter of the correction, computed from the points")
     gain_objects: dict[str, int] = Field(
         default={},
-        description="objects of the drive that hold servo gains, and their values at the measurement",
+        description="drive objects with servo gains, and their values",
     )
 
     @model_validator(mode="after")

@@ -46,8 +46,8 @@ class Activation(BaseModel):
 
     model_config = ConfigDict(defer_build=True, frozen=True, extra="forbid")
 
-    date: str = Field(description="when, ISO 8601")
-    action: Action = Field(description="how it became active")
+    date: str = Field(description="date, ISO 8601")
+    action: Action = Field(description="action")
     version: int = Field(ge=1, description="number of the version")
     reason: str = Field("", description="why, in words")
 
@@ -60,7 +60,7 @@ class LogFile(BaseModel):
     schema_: Literal["hdbridge.history/1"] = Field(
         alias="schema", description="kind and version of this file"
     )
-    activations: tuple[Activation, ...] = Field(description="what was activated, oldest first")
+    activations: tuple[Activation, ...] = Field(description="activations, oldest first")
 
 
 class Kept(Protocol):

@@ -37,15 +37,13 @@ AtOption = Annotated[
 ]
 OneAxisArgument = Annotated[
     str | None,
-    typer.Argument(metavar="AXIS", help="Name of the axis; may be left out where there is one only."),
+    typer.Argument(metavar="AXIS", help="Name of the axis; needed if there are several."),
 ]
 AxisArgument = Annotated[str, typer.Argument(metavar="AXIS", help="Name of the axis.")]
-AxesArgument = Annotated[
-    list[str] | None, typer.Argument(metavar="AXIS...", help="Names of axes; else every one.")
-]
+AxesArgument = Annotated[list[str] | None, typer.Argument(metavar="AXIS...", help="Names of axes; else all.")]
 TakeOption = Annotated[
     bool,
-    typer.Option("--force", help="Take the right to move from whoever has it, whose motion is stopped."),
+    typer.Option("--force", help="Take the lease from its holder, whose motion is stopped."),
 ]
 
 
@@ -83,7 +81,7 @@ def stopping(at: str | None) -> Iterator[Client]:
             yield client
     except DaemonError as problem:
         if type(problem) is not DaemonError:
-            raise  # it answers
+            raise  # the daemon answers
         raise DaemonError(f"{problem}; {_who_holds(at)}") from None
 
 

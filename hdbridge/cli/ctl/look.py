@@ -35,13 +35,13 @@ def status(at: AtOption = None, json_file: JsonOption = None) -> None:
 def watch(
     at: AtOption = None,
     every_s: Annotated[
-        float, typer.Option("--every", min=0.05, max=3600.0, help="Seconds between two updates.")
+        float, typer.Option("--every", min=0.05, max=3600.0, help="Time between updates, s.")
     ] = 0.25,
     count: Annotated[
         int | None, typer.Option("--count", min=1, help="Number of updates; else until Ctrl-C.")
     ] = None,
     lines: Annotated[
-        bool, typer.Option("--lines", help="A JSON object per line on standard output, in place of a table.")
+        bool, typer.Option("--lines", help="Print a JSON object per line in place of a table.")
     ] = False,
 ) -> None:
     """Show the state of a machine until Ctrl-C; it moves nothing."""
@@ -59,13 +59,11 @@ def watch(
 
 def events(
     at: AtOption = None,
-    since: Annotated[
-        int, typer.Option("--since", min=0, help="Only those after the event of this number.")
-    ] = 0,
-    follow: Annotated[bool, typer.Option("--follow", "-f", help="Go on until Ctrl-C.")] = False,
+    since: Annotated[int, typer.Option("--since", min=0, help="Only events after this number.")] = 0,
+    follow: Annotated[bool, typer.Option("--follow", "-f", help="Continue until Ctrl-C.")] = False,
     json_file: JsonOption = None,
 ) -> None:
-    """List what happened: faults, states, refused commands, remarks; oldest first."""
+    """List faults, states, refused commands and remarks; oldest first."""
     with connected(at) as client:
         found = client.events(since)
         write_json(json_file, document("ctl-events", found))

@@ -54,16 +54,14 @@ def adapt(
         AdaptationMode | None,
         typer.Argument(metavar="MODE", help="`off`, `observe` (report what would change) or `on`."),
     ] = None,
-    back: Annotated[
-        bool, typer.Option("--back", help="Take back what was changed since the model was activated.")
-    ] = False,
+    back: Annotated[bool, typer.Option("--back", help="Return to the committed model.")] = False,
     at: AtOption = None,
     force: TakeOption = False,
     json_file: JsonOption = None,
 ) -> None:
-    """Let parameters follow the load encoder, only observe what would change, or neither."""
+    """Set the adaptation of model parameters to the load encoder."""
     if back == (mode is not None):
-        raise InputError("expected a mode, or --back: one of the two")
+        raise InputError("expected either a mode or --back")
     with moving(at, axis, force=force) as moved:
         tell(moved.adaptation_back() if mode is None else moved.adapt(mode.value), json_file)
 

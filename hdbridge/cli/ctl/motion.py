@@ -23,10 +23,11 @@ from hdbridge.errors import InputError
 
 VelocityOption = Annotated[
     float | None,
-    typer.Option("--velocity", min=1e-6, help="Degrees of the load per second; else the axis's limit."),
+    typer.Option("--velocity", min=1e-6, help="Speed of the load, deg/s; else the axis's limit."),
 ]
 AccelerationOption = Annotated[
-    float | None, typer.Option("--acceleration", min=1e-6, help="Of the load, deg/s2; else the axis's limit.")
+    float | None,
+    typer.Option("--acceleration", min=1e-6, help="Acceleration of the load, deg/s2; else the axis's limit."),
 ]
 
 
@@ -62,23 +63,24 @@ def home(
     axis: OneAxisArgument = None,
     switch_velocity_deg_s: Annotated[
         float | None,
-        typer.Option("--switch-velocity", min=1e-6, help="Towards the switch, deg/s at the load."),
+        typer.Option("--switch-velocity", min=1e-6, help="Speed towards the switch, deg/s of the load."),
     ] = None,
     zero_velocity_deg_s: Annotated[
-        float | None, typer.Option("--zero-velocity", min=1e-6, help="Towards the zero, deg/s at the load.")
+        float | None,
+        typer.Option("--zero-velocity", min=1e-6, help="Speed towards the zero, deg/s of the load."),
     ] = None,
     acceleration_deg_s2: AccelerationOption = None,
     offset_deg: Annotated[
-        float, typer.Option("--offset", help="Load angle that the home position gets (607Ch).")
+        float, typer.Option("--offset", help="Load angle of the home position (607Ch).")
     ] = 0.0,
     timeout_s: Annotated[
-        float, typer.Option("--timeout", min=0.1, max=3600.0, help="Seconds that it may take.")
+        float, typer.Option("--timeout", min=0.1, max=3600.0, help="Longest time, s.")
     ] = 60.0,
     at: AtOption = None,
     force: TakeOption = False,
     json_file: JsonOption = None,
 ) -> None:
-    """Home by a method of the drive's own, from disabled; it is disabled again afterwards."""
+    """Home by one of the drive's own methods; the axis is disabled before and after."""
     with moving(at, axis, force=force) as moved:
         done = moved.home(
             method,
@@ -118,7 +120,7 @@ def move(
     velocity_deg_s: VelocityOption = None,
     acceleration_deg_s2: AccelerationOption = None,
     wait: Annotated[
-        bool, typer.Option("--wait/--no-wait", help="Wait until the axis rests there; else answer at once.")
+        bool, typer.Option("--wait/--no-wait", help="Wait until the axis rests there; else return at once.")
     ] = True,
     at: AtOption = None,
     force: TakeOption = False,
@@ -148,16 +150,16 @@ def move(
 def jog(
     axis: AxisArgument,
     velocity_deg_s: Annotated[
-        float, typer.Argument(metavar="SPEED", help="Degrees of the load per second, with a sign.")
+        float, typer.Argument(metavar="SPEED", help="Speed of the load, deg/s, with sign.")
     ],
     duration_s: Annotated[
-        float, typer.Option("--for", min=0.05, max=86_400.0, help="Seconds; Ctrl-C ends it before.")
+        float, typer.Option("--for", min=0.05, max=86_400.0, help="Time, s; Ctrl-C ends it earlier.")
     ] = 1.0,
     at: AtOption = None,
     force: TakeOption = False,
     json_file: JsonOption = None,
 ) -> None:
-    """Turn an axis at a speed for a time, then brake to rest. It also stops if this command is killed."""
+    """Turn an axis at a speed for a time, then brake to rest; also if this command is killed."""
     with moving(at, axis, force=force) as moved:
         note_clamped(moved.state().limits, velocity_deg_s=velocity_deg_s)
         moved.jog(velocity_deg_s, duration_s)
@@ -171,12 +173,10 @@ def queue(
     ] = None,
     velocity_deg_s: VelocityOption = None,
     acceleration_deg_s2: AccelerationOption = None,
-    dwell_s: Annotated[
-        float, typer.Option("--dwell", min=0.0, max=86_400.0, help="Seconds to rest at each of them.")
-    ] = 0.0,
+    dwell_s: Annotated[float, typer.Option("--dwell", min=0.0, max=86_400.0, help="Rest at each, s.")] = 0.0,
     clear: Annotated[
         bool,
-        typer.Option("--clear", help="Forget the way points that have not begun, in place of adding any."),
+        typer.Option("--clear", help="Remove the way points not yet begun; add none."),
     ] = False,
     at: AtOption = None,
     force: TakeOption = False,
@@ -187,7 +187,7 @@ def queue(
     from hdbridge.client.messages import QueueItem
 
     if clear == bool(angles_deg):
-        raise InputError("expected angles, or --clear: one of the two")
+        raise InputError("expected either angles or --clear")
     if clear:
         with connected(at) as client, client.lease(force=force):
             tell(client.axis(axis).clear_queue(), json_file)

@@ -1,6 +1,4 @@
-"""Selection of the findings that enter the proposed model, and of the causes that they must be separated
-from.
-"""
+"""Selection of the findings for the proposed model, and of the causes to separate them from."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Further experiments of the axis that separate what a diagnosis leaves open."""
+"""Further experiments that separate the causes which a diagnosis cannot separate."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from hdbridge.motion.procedures.rehearsal import rehearse
 
 @dataclass(frozen=True, slots=True)
 class Choice:
-    """An experiment that is worth its time."""
+    """Chosen experiment, with the pairs of causes that it separates."""
 
     plan: Plan
     duration_s: float

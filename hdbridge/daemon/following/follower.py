@@ -27,6 +27,7 @@ from hdbridge.daemon.following.settings import AdaptationSettings, Mode
 from hdbridge.daemon.following.statefile import AdaptationFiles
 from hdbridge.daemon.loop.states import AxisState
 from hdbridge.daemon.memory import NO_FAULT, SampleArray, SampleFlag, joined_samples
+from hdbridge.errors import InputError
 
 SAMPLES_TOGETHER: Final = 25
 """Minimum number of samples evaluated together: ten evaluations per second at 250 Hz."""
@@ -46,6 +47,9 @@ class Outcome(NamedTuple):
     proposal: Proposal | None = None
 
 
+NO_LOAD_ENCODER: Final = (
+    "the axis has no encoder at its load: neither gear nor encoder are watched, and the model is not adapted"
+)
 NOTHING: Final = Outcome([])
 """Outcome of samples that are not evaluated yet."""
 
@@ -67,6 +71,8 @@ class Follower:
         self.adaptation: Adaptation | None = None
         self.updated: datetime | None = None
         """Time at which the model in use was last changed."""
+        self.unwatched = NO_LOAD_ENCODER if axis.load_encoder.is_motor_encoder else ""
+        """Reason why gear and load encoder are not watched; empty if they are."""
         self._axis, self._index = axis.name, index
         self._settings = settings or AdaptationSettings()
         self._drift = DriftModel(model)
@@ -90,9 +96,11 @@ class Follower:
     def adapt(self, mode: Mode, files: AdaptationFiles | None = None) -> None:
         """Changes the mode of the adaptation, or starts it, from the state in ``files`` if there is one.
 
-        Raises InputError if the settings name a parameter that the model does not have, OutputError if the
-        files cannot be written.
+        Raises InputError if the settings name a parameter that the model does not have or the axis has no
+        encoder at its load, OutputError if the files cannot be written.
         """
+        if self.unwatched:
+            raise InputError(self.unwatched)
         if self.adaptation is None:
             settings = self._settings.model_copy(update={"mode": mode})
             learned = files.load() if files is not None else None
@@ -119,7 +127,8 @@ class Follower:
         if sum(map(len, self._waiting)) < SAMPLES_TOGETHER:
             return NOTHING
         together, self._waiting = joined_samples(self._waiting), []
-        return self.advance(together, self.health.take(together))
+        status = EncoderStatus() if self.unwatched else self.health.take(together)
+        return self.advance(together, status)
 
     def advance(self, samples: SampleArray, status: EncoderStatus) -> Outcome:
         """Measures, judges and adapts with consecutive samples; ``status`` is that of the load encoder."""
@@ -129,14 +138,17 @@ class Follower:
         joined = self._next_cycle in {None, int(cycle[0])} and int(cycle[-1] - cycle[0]) == len(cycle) - 1
         servo = self._servo.take(axis, joined=joined)
         first = self._begin_of_path(axis, cycle)
+        raised: list[Raised] = []
+        if servo is not None:
+            verdict = Verdict.RETUNED if self._servo.retuned else self.watch.verdict
+            raised.append(Raised(self._now_s, self._axis, verdict, servo))
+        if self.unwatched:
+            return Outcome(raised)
         axis, times_s = axis[first:], times_s[first:]
         stopped = axis["fault"] != NO_FAULT
         usable = ((axis["flags"] & NEEDED) == NEEDED) & (axis["state"] == AxisState.ENABLED) & ~stopped
         observations = self._measuring.take(times_s, axis, usable & (status.fault is None))
-        raised = self.watch.take(observations, status, self._now_s)
-        if servo is not None:
-            verdict = Verdict.RETUNED if self._servo.retuned else self.watch.verdict
-            raised.append(Raised(self._now_s, self._axis, verdict, servo))
+        raised = [*self.watch.take(observations, status, self._now_s), *raised]
         proposal = None
         if self.adaptation is not None:
             fault = "the supervision has stopped the axis" if np.any(stopped) else status.reason

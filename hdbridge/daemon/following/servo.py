@@ -1,7 +1,7 @@
 """Servo watch: does the servo still answer as the model's response in motion says?
 
-Judges runs at constant speed with the filtered correction in force, from the motor encoder and the model, so
-that neither a change of the gear nor a fault of the load encoder counts. Uses no clock.
+Judges runs at constant speed, in which the correction moves the set-points, by the motor encoder's answer to
+them. So neither a change of the gear nor a fault of the load encoder counts. Uses no clock.
 """
 
 from __future__ import annotations
@@ -14,18 +14,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hdbridge.analysis.response import (
-    Left,
-    harmonics_of,
+    DIFFERENT,
+    Found,
+    answers,
+    difference_seen,
     lags_agree,
-    left_by_filter,
     motor_orders,
     samples_needed,
 )
 from hdbridge.axis import AxisConfig
 from hdbridge.axis.model import TransmissionModel
+from hdbridge.daemon.following.judging import CLEARLY
 from hdbridge.daemon.loop.states import AxisState
 from hdbridge.daemon.memory import SampleFlag
-from hdbridge.units import ARCSEC_PER_DEG, DEG_PER_TURN
+from hdbridge.units import DEG_PER_TURN
 
 EVEN: Final = 1e-3
 """Largest relative deviation of a constant speed."""
@@ -36,7 +38,7 @@ RUN_TURNS: Final = 2.0
 """Minimum duration and motor turns of a run."""
 MIN_RUNS: Final = 4
 MAX_RUNS: Final = 12
-"""Number of runs that are judged together: one alone shows a few frequencies."""
+"""Number of runs that are judged together, for each frequency: one alone shows a few frequencies."""
 NEEDED: Final = SampleFlag.FRESH | SampleFlag.COMPENSATING
 SPOILT: Final = SampleFlag.CHANGING | SampleFlag.LIMITED
 
@@ -56,7 +58,9 @@ class ServoWatch:
         self._speed_deg_s = 0.0
         self._even = 0
         """Samples at this speed so far."""
-        self._runs: deque[tuple[Left, float]] = deque(maxlen=MAX_RUNS)
+        self._lags_ms: deque[float] = deque(maxlen=MAX_RUNS)
+        self._seen: dict[tuple[int, int], deque[Found]] = {}
+        """Responses relative to the stored one, by order and the nearest stored frequency."""
 
     def take(self, axis: NDArray[Any], *, joined: bool) -> str | None:
         """Takes the next samples of the axis; returns the evidence if the judgement changes.
@@ -91,26 +95,27 @@ class ServoWatch:
         """Adds a run; returns the evidence if the judgement changes."""
         stored = self._response
         assert stored is not None
-        target, motor = run["load_target_deg"], run["motor_position_deg"]
-        behind_s = float(np.mean(run["issued_deg"] - motor)) / (self._ratio * speed_deg_s)
-        # The prediction belongs to the issued angle, which the motor reaches by its lag later.
-        places = np.arange(len(run))
-        predicted = np.interp(places - behind_s / self._period_s, places, run["predicted_arcsec"])
-        error = ARCSEC_PER_DEG * (motor / self._ratio - target) + predicted
-        late = slice(int(np.ceil(max(behind_s, 0.0) / self._period_s)), None)
-        found = harmonics_of(speed_deg_s, target[late], error[late], self._orders, self._ratio)
-        left = left_by_filter(stored, found, self._orders, self._amplitudes, self._ratio)
-        self._runs.append((left, -1000.0 * found.mean_arcsec / ARCSEC_PER_DEG / speed_deg_s))
-        if len(self._runs) < MIN_RUNS:
+        issued, motor = run["issued_deg"], run["motor_position_deg"]
+        if not np.all(np.isfinite(issued)):
             return None
-        lag_ms = median(lag for _, lag in self._runs)
-        share = sum(each.square for each, _ in self._runs) / sum(each.allowed for each, _ in self._runs)
-        retuned = share > 1.0 or not lags_agree(stored.following_lag_ms, lag_ms)
+        lag_s = float(np.mean(issued - motor)) / (self._ratio * speed_deg_s)
+        self._lags_ms.append(1000.0 * lag_s)
+        for order, each in answers(
+            stored, speed_deg_s, lag_s, run["load_target_deg"], issued, motor, self._orders, self._ratio
+        ):
+            nearest = int(np.argmin(np.abs(np.array(stored.frequency_hz) - each.frequency_hz)))
+            self._seen.setdefault((order, nearest), deque(maxlen=MAX_RUNS)).append(each)
+        if len(self._lags_ms) < MIN_RUNS:
+            return None
+        amplitudes = (self._amplitudes[order] for order, _ in self._seen)
+        apart = difference_seen(stored, self._seen.values(), amplitudes)
+        lag_ms = median(self._lags_ms)
+        limit = CLEARLY * DIFFERENT if self.retuned else DIFFERENT
+        retuned = apart > limit or not lags_agree(stored.following_lag_ms, lag_ms)
         if retuned == self.retuned:
             return None
         self.retuned = retuned
-        times = max(share, 0.0) ** 0.5
         return (
             f"following lag {lag_ms:.1f} ms, {stored.following_lag_ms:.1f} when the response was measured; "
-            f"the correction leaves {times:.1f} times what its response allows"
+            f"the response differs by {100.0 * apart:.0f} %"
         )

@@ -19,20 +19,16 @@ class Excitation(Strict):
         2.0,
         ge=0.5,
         le=1000,
-        description="motor turns, in both directions together, required for the motor orders",
+        description="motor turns, both directions together, for the motor orders",
     )
-    reversals: int = Field(
-        2, ge=1, le=1000, description="reversals required to separate the hysteresis loop from the zero"
-    )
-    samples: int = Field(10, ge=2, le=10_000, description="standstills and stretches of slow motion required")
+    reversals: int = Field(2, ge=1, le=1000, description="reversals, to separate the loop from the zero")
+    samples: int = Field(10, ge=2, le=10_000, description="standstills and stretches of slow motion")
 
 
 class AdaptationSettings(Strict):
     """Settings of the adaptation. Rates are per hour of axis time, bounds relative to the committed model."""
 
-    mode: Mode = Field(
-        "off", description="off, observe (only report what would change), or on (change the model in use)"
-    )
+    mode: Mode = Field("off", description="observe only reports what would change")
     parameters: tuple[Parameter, ...] | None = Field(
         None,
         description="adapted parameters, as EFFECT.PARAMETER; by default all that wear or temperature move",
@@ -44,13 +40,13 @@ class AdaptationSettings(Strict):
         60.0,
         gt=0,
         le=36_000,
-        description="fastest change of the zero (reported, never applied); a faster one is a fault",
+        description="fastest plausible change of the zero (reported, never applied)",
     )
     bound_share: float = Field(
         0.5,
         gt=0,
         le=1,
-        description="largest deviation of a coefficient from the committed one, as a share of it",
+        description="largest deviation of a coefficient, as a share of the committed one",
     )
     least_bound_arcsec: float = Field(
         5.0, ge=0, le=3600, description="largest deviation, if that share is smaller"
@@ -59,23 +55,23 @@ class AdaptationSettings(Strict):
         60.0,
         gt=0,
         le=3600,
-        description="largest change of the zero since it was taken; a larger one is a fault",
+        description="largest plausible change of the zero",
     )
     half_life_turns: float = Field(
         40.0,
         ge=1,
         le=1e6,
-        description="motor turns after which older observations count half, in the observed directions",
+        description="motor turns after which older observations count half",
     )
     excitation: Excitation = Field(default_factory=Excitation, description="motion required for an update")
     slow_deg_s: float = Field(
         0.5,
         gt=0,
         le=100,
-        description="highest load speed at which motion is used; of faster motion only standstills count",
+        description="highest load speed at which motion is used",
     )
     interval_s: float = Field(
-        60.0, ge=1, le=86_400, description="minimum time between two changes of the model in use"
+        60.0, ge=1, le=86_400, description="minimum time between changes of the model in use"
     )
     smallest_arcsec: float = Field(
         0.1, ge=0, le=100, description="smallest change of a coefficient that is applied"
@@ -83,6 +79,5 @@ class AdaptationSettings(Strict):
     folder: str | None = Field(
         None,
         min_length=1,
-        description="folder of state and history (AXIS.json, AXIS.log.jsonl), relative to the machine "
-        "file; by default 'adaptation' next to the axis file",
+        description="folder of AXIS.json and AXIS.log.jsonl; by default 'adaptation' next to the axis file",
     )

@@ -130,7 +130,7 @@ class LoadAxis(PowerStage):
     def _take(self, newest: SampleArray) -> None:
         self.sample = sample = newest[0]["axes"][self._index]
         motor_deg, time_s = float(sample["motor_position_deg"]), 1e-9 * int(newest[0]["time_ns"])
-        self.motor_counts = round(float(sample["load_position_deg"]) * self._counts_per_deg)
+        self.motor_counts = round(self._load_deg(sample) * self._counts_per_deg)
         self.load_counts = round(motor_deg / self._motor_deg)
         self.torque_permille = round(1000.0 * float(sample["motor_torque_nm"]) / self._rated_nm)
         since_s, before_deg = self._measured
@@ -219,11 +219,19 @@ class LoadAxis(PowerStage):
             lambda: 0 if self.sample is None else int(self.sample["state"]),
         )
 
+    def _load_deg(self, sample: SampleArray) -> float:
+        """Returns the load angle; without an encoder at the load, the one by motor encoder and model."""
+        load_deg = float(sample["load_position_deg"])
+        if math.isnan(load_deg):
+            predicted_deg = float(sample["predicted_arcsec"]) / ARCSEC_PER_DEG
+            return float(sample["motor_position_deg"]) / self._ratio + predicted_deg
+        return load_deg
+
     def _error(self) -> int:
         sample = self.sample
         if sample is None:
             return 0
-        error_deg = float(sample["load_position_deg"]) - float(sample["load_target_deg"])
+        error_deg = self._load_deg(sample) - float(sample["load_target_deg"])
         return round(100.0 * ARCSEC_PER_DEG * error_deg)
 
     def _compensation(self) -> int:

@@ -39,7 +39,8 @@ class AxisSampler:
         axis = cycle.image.axis
         self._ratio = axis.gear.ratio
         self._motor_deg = axis.motor_encoder.degrees(1)
-        self._load_deg = axis.load_encoder.degrees(1)
+        encoder = axis.load_encoder
+        self._load_deg = math.nan if encoder.is_motor_encoder else encoder.degrees(1)
         self._limited = 0
 
     def take(self, state: AxisState, *, changing: bool, underrun: bool) -> tuple[float, ...]:

@@ -219,6 +219,7 @@ class Axis(NamedTuple):
     """The drive's demand, 6062h, as in a record."""
     motor_position_deg: float
     load_position_deg: float
+    """NaN if the axis has no encoder at its load."""
     motor_torque_nm: float
     velocity_deg_s: float
     """Velocity of the load target."""

@@ -139,6 +139,11 @@ def _split(rows: Columns, cuts: NDArray[np.intp]) -> list[Columns]:
 
 def _record(rows: Columns, axis: AxisAbout, period_s: float) -> Record:
     columns = {"time_s": rows["cycle"] * period_s, **{name: rows[name] for name in MEASURED}}
+    if np.isnan(columns["load_position_deg"]).all():
+        raise InputError(
+            f"axis '{axis.name}' has no encoder at its load (load_encoder.source is the motor encoder); "
+            "expected a recording of an axis with one, because a record shows the load's error"
+        )
     if np.isnan(columns["motor_torque_nm"]).any():
         del columns["motor_torque_nm"]  # the drive does not report it
     for place, channel in enumerate(axis.channels):

@@ -13,12 +13,10 @@ class RecorderSettings(Strict):
     folder: str | None = Field(
         None,
         min_length=1,
-        description="folder of the recordings, relative to this file; by default recordings/daemon "
-        "next to it, or in the state folder of the service",
+        description="folder of the recordings; by default recordings/daemon next to this file, or in the "
+        "state folder of the service",
     )
-    size_mb: float = Field(
-        2000.0, ge=1, le=1e7, description="size of the ring; the oldest file is removed first"
-    )
+    size_mb: float = Field(2000.0, ge=1, le=1e7, description="size of the ring")
     age_days: float = Field(30.0, gt=0, le=36_500, description="age at which a file of the ring is removed")
     file_mb: float = Field(64.0, ge=0.1, le=4000, description="size at which the next file begins")
     file_s: float = Field(300.0, ge=5, le=86_400, description="time after which the next file begins")
@@ -28,8 +26,6 @@ class RecorderSettings(Strict):
         1000.0,
         ge=1,
         le=1e7,
-        description="size of the recordings kept for faults; the oldest is removed first",
+        description="size of the recordings kept for faults",
     )
-    free_mb: float = Field(
-        100.0, ge=0, le=1e7, description="minimum free disk space; with less, nothing is recorded"
-    )
+    free_mb: float = Field(100.0, ge=0, le=1e7, description="free disk space below which nothing is recorded")

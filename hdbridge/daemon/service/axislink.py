@@ -56,10 +56,14 @@ class AxisLink:
 
     def seeds(self) -> Arguments:
         """Counts of both encoders and statusword, as ENABLE has them."""
-        motor, load = self.config.motor_encoder, self.config.load_encoder
+        encoder = self.config.load_encoder
+        motor = round(self.value("motor_position_deg") / self.config.motor_encoder.degrees(1))
+        load = (
+            motor if encoder.is_motor_encoder else round(self.value("load_position_deg") / encoder.degrees(1))
+        )
         return Arguments(
-            i=round(self.value("motor_position_deg") / motor.degrees(1)),
-            j=round(self.value("load_position_deg") / load.degrees(1)),
+            i=motor,
+            j=load,
             k=int(self.value("statusword")),
         )
 

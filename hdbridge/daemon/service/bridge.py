@@ -119,6 +119,7 @@ class ServiceBridge:
             self._start(self._take_over(axis))
         if (gateway := self.machine.gateway) is not None:
             master = OuterMaster(self.core, gateway)
+            self._start(master.keep())
             for name in gateway.nodes:
                 self._start(master.serve(self.axes[name]))
         # Let each take-over start, so that no other request precedes it.

@@ -54,7 +54,7 @@ class Following:
         self.state = messages.AdaptationState(mode=messages.AdaptationMode(settings.mode))
         """State of the adaptation."""
         self.advice: list[str] = []
-        """Present verdict of the watch; empty while the model holds."""
+        """Present verdict of the watch unless the model holds, and what is not watched."""
         self._index, self._axis = index, axis
         self._settings, self._folder = settings, folder
         self._worker, self._recorder, self._diagnosis = worker, recorder, diagnosis
@@ -122,7 +122,7 @@ class Following:
         """Follows another committed model."""
         self._save()
         self._follower = Follower(self._axis.axis.config, model, self._index, self._settings)
-        self.advice = []
+        self.advice = self._unwatched()
         self._adapt()
 
     def _adapt(self) -> None:
@@ -181,10 +181,15 @@ class Following:
             event = "adaptation" if proposal.apply else "adaptation would change"
             _log.info(event, {"axis": name, **changes})
         for raised in outcome.raised:
-            self.advice = [] if raised.verdict is Verdict.HOLDS else [raised.text]
+            verdict = [] if raised.verdict is Verdict.HOLDS else [raised.text]
+            self.advice = verdict + self._unwatched()
             self._note("WATCH", raised.text)
             if self._diagnosis is not None and raised.verdict in DIAGNOSED:
                 self._diagnose(self._diagnosis, raised, model)
+
+    def _unwatched(self) -> list[str]:
+        follower = self._follower
+        return [follower.unwatched] if follower is not None and follower.unwatched else []
 
     def _diagnose(self, diagnosis: AutoDiagnosis, raised: Raised, model: TransmissionModel) -> None:
         minutes = WINDOW_S / 60.0

@@ -7,6 +7,7 @@ follows its set-points, and the next service takes it as it is.
 
 from __future__ import annotations
 
+from contextlib import suppress
 from typing import TYPE_CHECKING, Final
 
 from hdbridge.daemon.loop.states import AxisState
@@ -38,25 +39,30 @@ class OuterMaster:
         self._name = f"the master on {settings.bus.interface}:{settings.bus.channel}"
         self._token = ""
 
-    def holds(self) -> bool:
-        """Returns True if the lease is the outer master's; takes the lease if it is free, and renews it."""
+    def _holds(self) -> bool:
+        """Returns True if the lease is the outer master's."""
+        return self._core.lease.holds(self._token)
+
+    async def keep(self) -> None:
+        """Takes the lease whenever it is free, and renews it, until cancelled."""
         lease = self._core.lease
-        if lease.holder is None:
-            self._token = lease.take(self._name)
-        try:
-            lease.renew(self._token)
-        except LeaseError:
-            return False
-        return True
+        while True:
+            if lease.holder is None:
+                self._token = lease.take(self._name)
+            with suppress(LeaseError):
+                lease.renew(self._token)
+            await self._core.timing.sleep(POLL_S)
 
     async def serve(self, axis: ServiceAxis) -> None:
         """Do what the gateway asks for one axis, until cancelled."""
         cells = self._core.memory.outer[axis.link.index]
         timing = self._core.timing
         prepare_s = timing.clock.now()
+        granted_by = ""
         while True:
             await timing.sleep(POLL_S)
-            holds = self.holds()
+            holds = self._holds()
+            granted_by = granted_by or self._token  # an earlier service may have granted it
             cells[OuterCell.HELD] = int(holds)
             try:
                 if cells[OuterCell.RESETS] != cells[OuterCell.RESETS_DONE]:
@@ -64,11 +70,12 @@ class OuterMaster:
                 elif (series := cells[OuterCell.WANTED]) > max(
                     cells[OuterCell.GRANTED], cells[OuterCell.REFUSED]
                 ):
+                    granted_by = self._token
                     await self._enable(axis, cells, series)
+                elif axis.link.value("mode") == MotionMode.FOLLOW and not self._core.lease.holds(granted_by):
+                    await axis.link.do(CommandKind.STOP)
                 elif holds and self._is_left(axis, cells):
                     await axis.disable(self._token)
-                elif not holds and axis.link.value("mode") == MotionMode.FOLLOW:
-                    await axis.link.do(CommandKind.STOP)
                 elif (
                     holds
                     and timing.clock.now() >= prepare_s
@@ -87,7 +94,12 @@ class OuterMaster:
         return axis.link.state in _OWN and granted != 0 and cells[OuterCell.WANTED] != granted
 
     async def _enable(self, axis: ServiceAxis, cells: OuterCells, series: int) -> None:
-        link = axis.link
+        link, token = axis.link, self._token
+
+        def is_withdrawn() -> bool:
+            """The lease may have been taken meanwhile, even if it is free again."""
+            return not self._core.lease.holds(token) or cells[OuterCell.WANTED] != series
+
         try:
             # A master may enable again while the axis still brakes from the last time.
             await link.until(
@@ -96,12 +108,13 @@ class OuterMaster:
                 ),
                 SETTLES_S,
             )
-            await axis.enable(self._token)
-            if not self.holds() or cells[OuterCell.WANTED] != series:  # withdrawn while power was switched on
+            await axis.enable(token)
+            if not is_withdrawn():
+                await link.do(CommandKind.FOLLOW, a=self._patience_s, j=series)
+            if is_withdrawn():
                 cells[OuterCell.REFUSED] = series
                 await axis.disable(self._token)
                 return
-            await axis.link.do(CommandKind.FOLLOW, a=self._patience_s, j=series)
         except HdbridgeError:
             cells[OuterCell.REFUSED] = series
             raise

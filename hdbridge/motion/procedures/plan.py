@@ -42,7 +42,7 @@ class StandstillEntry(Strict):
     """Standstill at the reference pose: noise of the encoders."""
 
     procedure: Literal["standstill"] = Field(description="stand at the reference pose")
-    duration_s: float = Field(5.0, ge=0.5, le=36_000, description="for so long")
+    duration_s: float = Field(5.0, ge=0.5, le=36_000, description="duration")
 
     def fitted(self, room: Room, name: str) -> Iterator[Procedure[object]]:
         """Yields the procedure unchanged."""
@@ -54,11 +54,11 @@ class SweepEntry(Strict):
 
     procedure: Literal["sweep"] = Field(description="both ways at constant speed, about the middle")
     load_turns: float | None = Field(
-        None, gt=0, le=100, description="turns of the load, or the whole permitted travel if that is less"
+        None, gt=0, le=100, description="load turns, or the permitted travel if less"
     )
-    motor_turns: float | None = Field(None, gt=0, le=100_000, description="instead: turns of the motor")
+    motor_turns: float | None = Field(None, gt=0, le=100_000, description="motor turns instead")
     motor_turns_per_s: float = Field(1.0, gt=0, le=100, description="speed of the motor")
-    laps: int = Field(1, ge=1, le=1000, description="how often there and back")
+    laps: int = Field(1, ge=1, le=1000, description="repetitions, there and back")
 
     @model_validator(mode="after")
     def _one_length(self) -> Self:
@@ -82,7 +82,7 @@ class SinesEntry(Strict):
         (180.0, 45.0, 5.0), min_length=1, max_length=100, description="amplitudes at the motor"
     )
     frequency_hz: float = Field(0.05, gt=0, le=10, description="frequency")
-    periods: float = Field(2.0, ge=0.5, le=1000, description="periods of each")
+    periods: float = Field(2.0, ge=0.5, le=1000, description="periods per amplitude")
 
     def fitted(self, room: Room, name: str) -> Iterator[Procedure[object]]:
         """Yields the sines, with amplitudes shortened to the travel and the frequency lowered to the
@@ -106,12 +106,10 @@ class ReversalsEntry(Strict):
     depths_deg: tuple[Annotated[float, Field(gt=0, le=3600)], ...] = Field(
         (2.0, 4.0, 8.0, 12.0, 16.0, 24.0), min_length=1, max_length=100, description="depths at the motor"
     )
-    reach_deg: float = Field(
-        60.0, gt=0, le=3600, description="travel of the motor before each, more than the hysteresis is wide"
-    )
+    reach_deg: float = Field(60.0, gt=0, le=3600, description="motor travel before each, wider than the loop")
     motor_deg_per_s: float = Field(10.0, gt=0, le=3600, description="speed of the motor")
     beyond: bool = Field(
-        False, description="all depths in one curve, each beyond the last turning point: shows memory"
+        False, description="all depths in one curve, each beyond the last turning point; shows memory"
     )
 
     def fitted(self, room: Room, name: str) -> Iterator[Procedure[object]]:
@@ -172,18 +170,16 @@ class ValidationEntry(Strict):
         5,
         ge=0,
         le=100,
-        description="approaches of the positioning test (ISO 230-2) from each side; 0: no test",
+        description="approaches from each side in the positioning test (ISO 230-2); 0: no test",
     )
     travel_deg: float = Field(
         360.0,
         gt=0,
         le=36_000,
-        description="travel of the positioning test at the load, if the limits allow it",
+        description="travel of the positioning test at the load",
     )
 
-    motion: bool = Field(
-        False, description="measure the response of the axis in motion, and test the compensation with it"
-    )
+    motion: bool = Field(False, description="measure the response in motion and test it")
 
     @model_validator(mode="after")
     def _enough(self) -> Self:
@@ -206,19 +202,19 @@ class Plan(Strict):
         100.0,
         gt=0,
         le=3600,
-        description="pre-conditioning move at the motor, more than any hysteresis is wide",
+        description="pre-conditioning move at the motor, wider than any hysteresis loop",
     )
-    reference_s: float = Field(1.5, ge=0.2, le=600, description="how long it stands at the reference pose")
+    reference_s: float = Field(1.5, ge=0.2, le=600, description="time at the reference pose")
     acceleration_deg_s2: float = Field(
         5.0,
         gt=0,
         le=1e7,
-        description="acceleration of its moves at the load, if the axis file allows it: gentle, so that the "
-        "load does not wind the gear's spring up",
+        description="acceleration of the moves at the load, if the axis file allows it; gentle, against "
+        "wind-up of the gear",
     )
     procedures: tuple[Entry, ...] = Field(min_length=1, max_length=1000, description="procedures, in order")
     validation: ValidationEntry = Field(
-        default_factory=ValidationEntry, description="the stepping test of the new model"
+        default_factory=ValidationEntry, description="stepping test of the new model"
     )
 
     @classmethod

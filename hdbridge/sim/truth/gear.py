@@ -187,5 +187,5 @@ def _refuse_twice(orders: tuple[TrueOrder, ...], *where: str) -> None:
     seen: set[int] = set()
     for position, each in enumerate(orders):
         if each.order in seen:
-            raise wrong(f"order {each.order} stands twice", *where, position, "order")
+            raise wrong(f"order {each.order} appears twice", *where, position, "order")
         seen.add(each.order)

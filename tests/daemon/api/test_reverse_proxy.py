@@ -136,7 +136,7 @@ def tls_only(daemon_port: int, certificate: Path, folder: Path) -> Iterator[int]
         for task in left:
             task.cancel()
         if left:
-            await asyncio.wait(left, timeout=10)
+            await asyncio.wait(left)
 
     thread = threading.Thread(target=lambda: loop.run_until_complete(serve()), daemon=True)
     thread.start()

@@ -48,7 +48,9 @@ def test_the_same_servo_is_not_reported(profile: Path) -> None:
     assert raised(profile) == []
 
 
-@pytest.mark.parametrize("servo", [{"position_gain_per_s": 110.0}, {"command_filter_ms": 2.6}])
+@pytest.mark.parametrize(
+    "servo", [{"position_gain_per_s": 130.0}, {"position_gain_per_s": 270.0}, {"command_filter_ms": 2.6}]
+)
 def test_a_retuned_servo_is_reported(profile: Path, servo: dict[str, float]) -> None:
     verdicts = [each.verdict for each in raised(profile, **servo)]
     assert Verdict.RETUNED in verdicts, verdicts

@@ -117,7 +117,7 @@ def test_a_drive_that_is_another_is_never_spoken_to(bench: DaemonBench) -> None:
     daemon.run(0.2)
     assert daemon.states == [S.UNVERIFIED] * 2
     assert sent == []
-    further("the drive's identity, encoder or gear is another").show(0)
+    further("another drive identity, encoder or gear").show(0)
 
 
 def test_the_service_verifies_a_bus_that_comes_back(bench: DaemonBench) -> None:
@@ -169,7 +169,7 @@ def test_a_target_that_makes_no_sense_is_refused(moving: DaemonBench) -> None:
             assert answer.kind is E.REFUSED, (kind, bad)
             assert daemon.axes[0].set_point.velocity_deg_s == before
     assert moving.moves_on(0)
-    further("a client's target is not a number, infinite or out of limits").show(1)
+    further("a client's target is not a number, infinite or outside the limits").show(1)
 
 
 def test_a_stream_with_a_number_that_is_none_brakes(bench: DaemonBench) -> None:
@@ -205,7 +205,7 @@ def test_a_mailbox_of_nonsense_is_refused_and_nothing_else(moving: DaemonBench) 
     assert not daemon.told(E.DONE)
     assert moving.moves_on(0)
     assert moving.moves_on(1)
-    further("a mailbox full of commands that make no sense").show(turns)
+    further("a mailbox full of invalid commands").show(turns)
 
 
 def test_the_service_cannot_write_restart_or_command_a_moving_drive(moving: DaemonBench) -> None:
@@ -240,7 +240,7 @@ def test_a_stale_place_at_enable_moves_nothing(bench: DaemonBench) -> None:
     assert abs(enabled[0] - before) <= 1
     # All that it moves from there on is the compensation's, as it is faded in.
     assert abs(bench.motor_counts() - before) < 20
-    further("the place told with the enable command is stale").show(0)
+    further("the position in the enable command is stale").show(0)
 
 
 # ---------------------------------------------------------------- processes
@@ -261,7 +261,7 @@ def test_a_killed_control_process(bench: DaemonBench) -> None:
     daemon.begin_again()
     daemon.turn()
     assert daemon.states == [S.UNVERIFIED] * 2
-    further("the control process begins again").show(1)
+    further("the control process restarts").show(1)
     daemon.run(0.5)
     assert sent == []
     for axis in range(2):

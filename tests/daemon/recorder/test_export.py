@@ -272,3 +272,10 @@ def test_mending_by_hand(tmp_path):
     (path,) = tmp_path.iterdir()
     assert read(path).finished
     assert read(path).about.axes == about().axes
+
+
+def test_an_axis_without_an_encoder_at_its_load_is_refused(tmp_path):
+    made = samples(250)
+    made["axes"]["load_position_deg"] = np.nan
+    with pytest.raises(InputError, match="no encoder at its load"):
+        exported(flown(tmp_path, made))

@@ -2,7 +2,6 @@
 
 import asyncio
 from collections.abc import AsyncIterator
-from concurrent.futures import Executor, Future
 from contextlib import asynccontextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
@@ -11,7 +10,7 @@ import numpy as np
 import pytest
 import yaml
 from support.adapting import truth_of
-from support.service import Service, play, stepped_service, until
+from support.service import AtOnce, Service, play, stepped_service, until
 
 from hdbridge.axis.effects import Hysteresis
 from hdbridge.client import messages
@@ -63,15 +62,6 @@ async def follow(bridge: ServiceBridge, made: Following) -> None:
     while True:
         await made.apply()
         await bridge.core.timing.sleep(1.0)
-
-
-class AtOnce(Executor):
-    """Does what it is given where it is given it."""
-
-    def submit(self, fn, /, *args, **kwargs):
-        done: Future = Future()
-        done.set_result(fn(*args, **kwargs))
-        return done
 
 
 async def work(bridge: ServiceBridge, token: str, stands: int, seed: int = 0) -> None:

@@ -1,0 +1,78 @@
+"""An axis without an encoder at its load: the servo is watched, the rest is reported as not available."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import yaml
+from support.raised import measured_response, raised_profile, without_load_encoder
+from support.service import AtOnce, Service, play, stepped_service
+
+from hdbridge import TransmissionModel
+from hdbridge.client import messages
+from hdbridge.daemon.following.follower import NO_LOAD_ENCODER
+from hdbridge.daemon.following.settings import AdaptationSettings
+from hdbridge.daemon.machine import Machine
+from hdbridge.daemon.service.following import Following
+from hdbridge.errors import InputError
+from hdbridge.sim.truth import Truth
+
+FAR_DEG = 90.0
+SPEED_DEG_S = 60.0
+
+
+@pytest.fixture(scope="module")
+def blind(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Raised limits, a model with the measured response, and then no load encoder."""
+    folder = raised_profile(tmp_path_factory.mktemp("blind") / "axis")
+    model = TransmissionModel.load(folder / "model.yaml")
+    replace(model, response=measured_response(folder)).save(folder / "model.yaml")
+    return without_load_encoder(folder)
+
+
+def at_work(blind: Path, folder: Path, **servo: float) -> tuple[messages.AxisState, list[str]]:
+    """Moves there and back, with these parameters of the servo; returns the state and all notes."""
+
+    async def story(service: Service) -> tuple[messages.AxisState, list[str]]:
+        async with service.enabled() as (bridge, token):
+            axis = bridge.axes["axis1"]
+            axis.following = Following(0, axis, AdaptationSettings(mode="on"), folder / "state", AtOnce())
+            bridge.core.observer.add(axis.following)
+            for target in (FAR_DEG, -FAR_DEG, FAR_DEG):
+                bridge.lease.renew(token)
+                await axis.move(token, target, SPEED_DEG_S)
+            await axis.disable(token)
+            return axis.state(), [each.text for each in bridge.events().events]
+
+    truth = Truth.load(blind / "truth.yaml")
+    truth = truth.model_copy(update={"servo": truth.servo.model_copy(update=servo)})
+    path = folder / "truth.yaml"
+    path.write_text(yaml.safe_dump(truth.model_dump(mode="json", by_alias=True, exclude_none=True)))
+    with stepped_service(folder, profile=blind, truth=path) as service:
+        return play(story(service))
+
+
+def test_what_needs_a_load_encoder_is_reported_as_not_available(blind: Path, tmp_path: Path) -> None:
+    state, noted = at_work(blind, tmp_path)
+    assert state.load_position_deg is None
+    assert state.error_arcsec is None
+    assert state.load_target_deg == pytest.approx(FAR_DEG, abs=0.1)
+    assert state.advice == [NO_LOAD_ENCODER]
+    assert state.adaptation.frozen == NO_LOAD_ENCODER
+    assert not [each for each in noted if "load encoder" in each or "recalibrate" in each], noted
+
+
+def test_a_retuned_servo_is_reported(blind: Path, tmp_path: Path) -> None:
+    state, _ = at_work(blind, tmp_path, position_gain_per_s=110.0)
+    verdict, unwatched = state.advice
+    assert verdict.startswith("measure the response in motion again")
+    assert unwatched == NO_LOAD_ENCODER
+
+
+def test_a_load_loop_is_refused(blind: Path, tmp_path: Path) -> None:
+    machine = tmp_path / "machine.yaml"
+    machine.write_text(
+        f"schema: hdbridge.machine/1\nname: m\naxes:\n  - profile: {blind}\n    load_loop: {{}}\n"
+    )
+    with pytest.raises(InputError, match=r"machine.yaml:5:.*axis.yaml:.*expected an encoder at the load"):
+        Machine.load(machine)
