@@ -133,4 +133,4 @@ def test_diagnose_shows_the_prior_and_refuses_a_wrong_one(prior, tmp_path):
         assert done.returncode == 2
         assert complaint in done.stderr
     done = run_here(tmp_path, *command[:-2], "--group", "batch=B")
-    assert "name that with --prior" in done.stderr
+    assert "--group needs --prior" in done.stderr
