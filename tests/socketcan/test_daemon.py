@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import os
 import subprocess
+import sys
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
@@ -94,3 +96,21 @@ def test_the_daemon_survives(benches: Benches, row: DaemonRow) -> None:
     finally:
         if ended:
             benches.end()
+
+
+def test_a_borrowed_step_runs_to_its_end_and_the_axis_moves_again_when_enabled(benches: Benches) -> None:
+    daemon = benches.bench().daemon
+    command = ("step", unhurried_profile(), "--interface", "socketcan", "--channel", OURS, "--count", 3)
+    done = subprocess.run(
+        [sys.executable, "-m", "hdbridge", *map(str, command), "--scheme", "both", "--borrow", "--json", "-"],
+        env={**os.environ, "XDG_RUNTIME_DIR": str(daemon.folder), "XDG_STATE_HOME": str(daemon.folder)},
+        cwd=daemon.folder, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert len(json.loads(done.stdout)["both"]["steps"]["cw"]["error_arcsec"]) == 3
+    daemon.until(
+        lambda: (state := daemon.state())
+        and state["bus"]["lent_to"] is None and daemon.axis()["state"] == "disabled",
+        "the axis is back, disabled",
+    )  # fmt: skip
+    benches.bench().under_way()
