@@ -417,11 +417,15 @@ def _describe_limits(state: State, lines: Sequence[Line], warnings: list[str]) -
             f"the record spans {load_turns:.2f} load turns: errors that repeat with the "
             "load turn cannot be seen and may bend the rest; sweep over two"
         )
-    if outliers.samples:
-        share = outliers.samples / len(samples)
+    if outliers.swinging:
         warnings.append(
-            f"{outliers.samples} samples ({share:.2%}, at most {outliers.longest_run} in a row) stand out "
-            "from their neighbours and were given no weight: look for lost counts, plugs, shields"
+            f"{outliers.swinging} samples ({outliers.swinging / len(samples):.2%}) in or just after fast "
+            "accelerations stand out and were given no weight: the load swings on its spring there"
+        )
+    if others := outliers.samples - outliers.swinging:
+        warnings.append(
+            f"{others} samples ({others / len(samples):.2%}, at most {outliers.longest_run} in a row) stand "
+            "out from their neighbours and were given no weight: look for lost counts, plugs, shields"
         )
     for order in _not_the_motors(state):
         warnings.append(

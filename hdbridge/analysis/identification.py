@@ -69,7 +69,10 @@ class Outliers:
     """Isolated outliers, which have zero weight."""
 
     samples: int
+    swinging: int
+    """Number of them in or just after a high acceleration, where the load swings on its spring."""
     longest_run: int
+    """Longest run of the others, samples."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -245,25 +248,36 @@ def laps_arcsec(samples: Samples) -> float | None:
     return float(np.sqrt(np.mean(np.square(differences)) / 2.0)) if len(differences) >= 8 else None
 
 
-def outlying(residual: FloatArray, count_arcsec: float = 0.0) -> tuple[FloatArray, Outliers]:
+def outlying(
+    residual: FloatArray, swings: BoolArray, count_arcsec: float = 0.0
+) -> tuple[FloatArray, Outliers]:
     """Returns weights (n,): 0 for samples far from the median of their neighbours, else 1 (also for NaN).
 
     Comparison with neighbours, not with the model, keeps effects that the model lacks and lasting steps
-    (lost counts). ``count_arcsec`` is the motor encoder's count at the load: a motor between two counts
-    alternates between them, and only the mean is right.
+    (lost counts). ``swings`` is the mask of `swinging`, shape (n,). ``count_arcsec`` is the motor encoder's
+    count at the load: a motor between two counts alternates between them, and only the mean is right.
     """
     weight = np.ones(len(residual))
     index = np.flatnonzero(np.isfinite(residual))
     if len(index) < WINDOW:
-        return weight, Outliers(0, 0)
+        return weight, Outliers(0, 0, 0)
     values = residual[index]
     off = np.abs(values - median_filter(values, WINDOW, mode="nearest"))
     scale = max(median_deviation(off), 0.1)
     out = off > OUTLYING * scale + count_arcsec
     weight[index[out]] = 0.0
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], out, [False]]).astype(np.int8)))
+    others = out & ~swings[index]
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], others, [False]]).astype(np.int8)))
     runs = edges[1::2] - edges[::2]
-    return weight, Outliers(int(np.count_nonzero(out)), int(np.max(runs, initial=0)))
+    samples = int(np.count_nonzero(out))
+    return weight, Outliers(samples, samples - int(np.count_nonzero(others)), int(np.max(runs, initial=0)))
+
+
+def swinging(samples: Samples) -> BoolArray:
+    """Selects samples in an acceleration of the load above `GENTLE_DEG_S2`, or within `SETTLE_S` after it."""
+    acceleration = samples.motion.motor_acceleration_deg_s2
+    assert acceleration is not None
+    return settling(np.abs(acceleration / samples.ratio) > GENTLE_DEG_S2, samples.time_s)
 
 
 # Selection of the quasi-static samples of a calibration.
@@ -413,7 +427,7 @@ class State(NamedTuple):
     selection: Selection = Selection((), ())
     ripple: Effect | None = None
     """Ripple of the last fit."""
-    outliers: Outliers = Outliers(0, 0)
+    outliers: Outliers = Outliers(0, 0, 0)
     delay_ms: float = 0.0
     """Delay by which the samples have already been corrected."""
 

@@ -16,6 +16,7 @@ from hdbridge.analysis.identification import (
     candidate_orders,
     outlying,
     searched,
+    swinging,
     turns_covered,
     usable_samples,
 )
@@ -172,6 +173,7 @@ def _settle(state: State) -> tuple[State, Solution, System]:
     samples = state.design.samples
     weight, outliers = outlying(
         state.design.residual(solution.effects, state.columns().columns @ solution.nuisances),
+        swinging(samples),
         samples.count_deg / samples.ratio * ARCSEC_PER_DEG,
     )
     state = state._replace(outliers=outliers)

@@ -63,7 +63,7 @@ PANELS: Final = {
     },
     "Day and night": {
         "run": "Run the daemon: hold the drives of a machine and take load angles from clients.",
-        "ctl": "Control a running daemon: look, move, stop, compensate, run procedures.",
+        "ctl": "Control a running daemon: look, move, stop, compensate.",
         "gateway": "The axes of a machine as drives of another master.",
         "record": "Flight recordings and bus logs: list, mend, and make records for fit and diagnose.",
         "install-service": "Show, write or remove the systemd files that run a machine's daemon from the "

@@ -74,9 +74,12 @@ def test_a_spike_is_an_outlier_and_a_step_that_stays_is_not():
     residual = rng.normal(size=5000)
     residual[2500:] += 40.0
     residual[[100, 900, 901]] += 30.0
-    weight, outliers = outlying(residual)
+    calm = np.zeros(5000, dtype=bool)
+    weight, outliers = outlying(residual, calm)
     assert set(np.flatnonzero(weight == 0.0)) == {100, 900, 901}
-    assert (outliers.samples, outliers.longest_run) == (3, 2)
+    assert (outliers.samples, outliers.swinging, outliers.longest_run) == (3, 0, 2)
+    calm[895:905] = True  # an acceleration
+    assert (outlying(residual, calm)[1].swinging, outlying(residual, calm)[1].longest_run) == (2, 1)
 
 
 def test_blocks_average_a_column_exactly():
@@ -123,8 +126,9 @@ def test_a_motor_between_two_counts_is_neither_noise_at_rest_nor_an_outlier():
     assert samples.count_deg == pytest.approx(count)
     assert standing_arcsec(samples) == pytest.approx(noise, rel=0.05)
     error = samples.error_arcsec
-    assert outlying(error)[1].samples > 100  # as it would be for an encoder without counts
-    assert outlying(error, count / 50.0 * 3600.0)[1].samples == 0
+    calm = np.zeros(len(error), dtype=bool)
+    assert outlying(error, calm)[1].samples > 100  # as it would be for an encoder without counts
+    assert outlying(error, calm, count / 50.0 * 3600.0)[1].samples == 0
 
 
 def test_what_moved_unseen_or_slowly_is_not_at_rest():
