@@ -94,7 +94,7 @@ export function barChart(id, xLabel, yLabel, bars, ticks) {
   return new Chart(id, () => {
     const share = 0.8 / bars.length;
     return {
-      scales: { x: { time: false, range: (_, low, high) => [low - 0.6, high + 0.6] }, y: { range: (_, low, high) => [0, Math.max(high * 1.1, 1e-9)] } },
+      scales: { x: { time: false, range: (_, low, high) => [low - 0.6, high + 0.6] }, y: { range: (_, low, high) => [0, high > 0 ? high * 1.1 : 1] } },
       axes: axes(xLabel, yLabel).map((each, n) => (n === 0 ? { ...each, splits: (plot) => plot.data[0], values: (plot, splits) => splits.map(ticks) } : each)),
       series: [
         { label: xLabel, value: (_, value) => (value === null ? "-" : ticks(value)) },
