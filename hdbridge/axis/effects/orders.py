@@ -31,6 +31,8 @@ HIGHEST_MOTOR_ORDER: Final = 24
 and harmonics of each from encoders or bearings).
 """
 _ComplexArray = np.ndarray[tuple[int], np.dtype[np.complex128]]
+_AT_ONCE: Final = 1 << 14
+"""Number of samples whose powers fit in the processor's cache."""
 _Phasor = TypeVar("_Phasor", complex, _ComplexArray)
 
 
@@ -179,8 +181,10 @@ def orders_from(numbers: Iterable[int], amplitude_arcsec: float = 1.0) -> tuple[
 def cosines_and_sines(angle_rad: FloatArray, numbers: Sequence[int]) -> FloatArray:
     """Returns columns cos(k angle), sin(k angle) for each k, shape (n, 2 * len(numbers))."""
     result = np.empty((2 * len(numbers), len(angle_rad))).T
-    for at, wave in enumerate(waves(angle_rad, numbers)):
-        result[:, 2 * at], result[:, 2 * at + 1] = wave.real, wave.imag
+    for first in range(0, len(angle_rad), _AT_ONCE):
+        rows = slice(first, first + _AT_ONCE)
+        for at, wave in enumerate(waves(angle_rad[rows], numbers)):
+            result[rows, 2 * at], result[rows, 2 * at + 1] = wave.real, wave.imag
     return result
 
 
@@ -191,11 +195,12 @@ def waves(angle_rad: FloatArray, numbers: Iterable[float]) -> Iterator[_ComplexA
     sine.
     """
     turn = turn_of(angle_rad)
-    power, before = np.ones_like(turn), 0
+    power, before = None, 0
     for number in numbers:
         if number == int(number):
             step, before = int(number) - before, int(number)
-            power = power * (turn if step == 1 else turn**step)
+            factor = turn if step == 1 else turn**step
+            power = factor if power is None else power * factor
             yield power
         else:
             yield turn_of(number * angle_rad)
