@@ -79,7 +79,7 @@ def fitted():
         zeros_arcsec=(0.0,),
         nuisances=(Nuisance("delay_ms", "the load encoder is read later by", 0.25, 0.02, "ms"),),
         noise=NoiseFigures(None, 0.4, NoiseModel(0.3, 0.4), 1.0, 1.0, 8400, 800.0),
-        outliers=Outliers(3, 1),
+        outliers=Outliers(3, 0, 1),
         orders=(Line(second, 5.0, 170.0, 0.01, 0.05),),
         spectrum=(Line(Order.motor(3), 0.02, 0.0, 0.01, 0.05), Line(second, 5.0, 170.0, 0.01, 0.05)),
         residual_tests=(ResidualTest("motor_angle", True, 0.0, "no order is left"),),

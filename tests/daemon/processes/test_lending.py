@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any
 
 import httpx
 import pytest
@@ -80,6 +81,11 @@ def until_taken_back(daemon: Daemon, loops: int) -> None:
     until_off(daemon)
 
 
+def model_in_use(daemon: Daemon) -> dict[str, Any]:
+    """Returns the model in use; a control process that has just begun has none yet."""
+    return dict(daemon.until(lambda: (daemon.state() or {"axes": [{}]})["axes"][0].get("model"), "a model"))
+
+
 def until_borrowed(daemon: Daemon, pid: int) -> None:
     bus = (daemon.state() or {})["bus"]
     until(lambda: InterfaceLock(bus["interface"], bus["channel"]).holder == pid, lambda: str(daemon.state()))
@@ -121,7 +127,7 @@ def test_others_see_who_has_the_bus_and_can_stop_it(daemon: Daemon) -> None:
 
 def test_the_daemon_commits_the_model_that_a_borrower_proposed(daemon: Daemon) -> None:
     folder, loops = daemon.folder, len(daemon.pids("control"))
-    before = (daemon.state() or {})["axes"][0]["model"]
+    before = model_in_use(daemon)
 
     def committed() -> httpx.Response:
         lease = daemon.client.post("/lease", json={"client": "test", "force": True}).json()["token"]
@@ -139,10 +145,10 @@ def test_the_daemon_commits_the_model_that_a_borrower_proposed(daemon: Daemon) -
         borrower.terminate()
         borrower.wait()
     until_taken_back(daemon, loops)
-    assert (daemon.state() or {})["axes"][0]["model"]["reason"] == before["reason"] != "calibration"
+    assert model_in_use(daemon)["reason"] == before["reason"] != "calibration"
     # A request that meets the control process as it begins is refused, and nothing of it is done.
     until(lambda: committed().status_code == 200, lambda: str(daemon.state()))
-    in_use = (daemon.state() or {})["axes"][0]["model"]
+    in_use = model_in_use(daemon)
     assert (in_use["reason"], in_use["version"]) == ("calibration", store.find(folder, store.ACTIVE).number)
     assert not pending.exists()
 
