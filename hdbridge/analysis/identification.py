@@ -275,9 +275,14 @@ def outlying(
 
 def swinging(samples: Samples) -> BoolArray:
     """Selects samples in an acceleration of the load above `GENTLE_DEG_S2`, or within `SETTLE_S` after it."""
+    return settling(_accelerating(samples), samples.time_s)
+
+
+def _accelerating(samples: Samples) -> BoolArray:
+    """Selects samples in an acceleration of the load above `GENTLE_DEG_S2`."""
     acceleration = samples.motion.motor_acceleration_deg_s2
     assert acceleration is not None
-    return settling(np.abs(acceleration / samples.ratio) > GENTLE_DEG_S2, samples.time_s)
+    return np.asarray(np.abs(acceleration / samples.ratio) > GENTLE_DEG_S2)
 
 
 # Selection of the quasi-static samples of a calibration.
@@ -323,15 +328,14 @@ def _slow(samples: Samples, slow_deg_s: float | None) -> BoolArray:
     not slow. Of moves and steps only the rests are used. In motions of unknown kind, samples with high
     acceleration are dropped.
     """
-    speed, acceleration = samples.speed_deg_s / samples.ratio, samples.motion.motor_acceleration_deg_s2
-    assert acceleration is not None
+    speed = samples.speed_deg_s / samples.ratio
     moving = np.abs(speed)
     own = moving[samples.of_kind(*SLOW) & (moving > 0)]
     if slow_deg_s is None:
         slow_deg_s = 1.2 * float(np.quantile(own, 0.995)) if len(own) else np.inf
     under_way = moving > STANDING_DEG_S
     fast = under_way & samples.of_kind(*ON_THE_WAY)
-    fast |= ~samples.of_kind(*KNOWN) & (np.abs(acceleration / samples.ratio) > GENTLE_DEG_S2)
+    fast |= ~samples.of_kind(*KNOWN) & _accelerating(samples)
     # Consecutive motions without a rest between them differ in kind or direction.
     changes = [np.diff(each) != 0 for each in (under_way, samples.kind, np.sign(speed))]
     first = np.append(0, np.flatnonzero(np.any(changes, axis=0)) + 1)

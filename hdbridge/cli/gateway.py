@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from itertools import chain
+from itertools import chain, islice
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated, Any
@@ -173,7 +173,7 @@ def _heard(settings: GatewaySettings, duration_s: float) -> Iterator[Frame]:
 
 def _begun(frames: Iterator[Frame]) -> Iterator[Frame]:
     """Returns the same frames, the first of them read already, so that a wrong file is refused first."""
-    return chain([first for first in (next(frames, None),) if first is not None], frames)
+    return chain(list(islice(frames, 1)), frames)
 
 
 def _logged(path: Path) -> Iterator[Frame]:

@@ -128,6 +128,16 @@ HtmlOption = Annotated[
     Kind.PAGE,
 ]
 
+ObjectArgument = Annotated[
+    str,
+    typer.Argument(
+        metavar="OBJECT", help="Its number (6064h, 0x1018:4, 60C2h:01; hexadecimal) or its name in the EDS."
+    ),
+]
+ValueArgument = Annotated[
+    str, typer.Argument(metavar="VALUE", help="Decimal or 0x...; text, or bytes in hexadecimal.")
+]
+
 
 def taking(group: type[Any]) -> Callable[[Callable[..., None]], Callable[..., None]]:
     """Gives a command the fields of a dataclass as options; it receives them as its first argument.
@@ -313,6 +323,13 @@ def _part(table: Table, columns: list[Column]) -> Table:
     for row, values in zip(table.rows, cells, strict=True):
         part.add_row(*values, end_section=row.end_section)
     return part
+
+
+def print_object(name: str, value: object, type_name: str) -> None:
+    """Prints an object of a drive: a natural number also in hexadecimal."""
+    whole = isinstance(value, int) and not isinstance(value, bool) and value >= 0
+    also = f" ({value:#x})" if whole else ""
+    console.print(f"{name}: {value}{also}  {type_name}", markup=False, soft_wrap=True)
 
 
 def write_json(path: Path | None, result: dict[str, Any]) -> None:

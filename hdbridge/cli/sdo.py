@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
 import typer
 
 from hdbridge.cli.options import (
     JsonOption,
-    console,
+    ObjectArgument,
+    ValueArgument,
+    print_object,
     write_json,
 )
 from hdbridge.cli.session import Session, on_axis
@@ -16,13 +18,6 @@ from hdbridge.errors import InputError
 
 if TYPE_CHECKING:
     from hdbridge.drive.values import Object, Value
-
-ObjectArgument = Annotated[
-    str,
-    typer.Argument(
-        metavar="OBJECT", help="Its number (6064h, 0x1018:4, 60C2h:01; hexadecimal) or its name in the EDS."
-    ),
-]
 
 
 def register(app: typer.Typer) -> None:
@@ -52,15 +47,13 @@ def get(
             raise InputError(f"{wanted}: can only be written, by the EDS")
         value = wanted.decode(drive.sdo.read_bytes(wanted.index, wanted.sub))
     write_json(json_file, _document(wanted, value))
-    _print(wanted, value)
+    print_object(str(wanted), value, wanted.type_name)
 
 
 def put(
     session: Session,
     object_: ObjectArgument,
-    value: Annotated[
-        str, typer.Argument(metavar="VALUE", help="Decimal or 0x...; text, or bytes in hexadecimal.")
-    ],
+    value: ValueArgument,
     json_file: JsonOption = None,
 ) -> None:
     """Write an object of the drive, and read it back. The drive is neither booted nor enabled.
@@ -81,7 +74,7 @@ def put(
         drive.sdo.write_bytes(wanted.index, wanted.sub, data)
         now = wanted.decode(drive.sdo.read_bytes(wanted.index, wanted.sub) if wanted.readable else data)
     write_json(json_file, _document(wanted, now))
-    _print(wanted, now)
+    print_object(str(wanted), now, wanted.type_name)
 
 
 def _document(wanted: Object, value: Value) -> dict[str, object]:
@@ -93,8 +86,3 @@ def _document(wanted: Object, value: Value) -> dict[str, object]:
         "type": wanted.type_name,
         "value": value,
     }
-
-
-def _print(wanted: Object, value: Value) -> None:
-    also = f" ({value:#x})" if isinstance(value, int) and not isinstance(value, bool) and value >= 0 else ""
-    console.print(f"{wanted}: {value}{also}  {wanted.type_name}", markup=False, soft_wrap=True)

@@ -839,10 +839,13 @@ def starts(truth: Truth, cycle_ms: float) -> Iterator[Fitting]:
     averaged = {"moving_average_ms": averaged_ms, **split(max(late_ms - 2.0 * SHORT_MS, 0.0), SHORT_MS)}
     whole = truth.motor.inertia_kg_m2 + truth.load_.whole_inertia_kg_m2 / truth.gear.ratio**2
     fastest = VELOCITY_BANDWIDTH_RAD_S.value * truth.motor.inertia_kg_m2
+    commands = (
+        (plain, 0.0, ()),
+        (plain, whole, ("inertia feed-forward",)),
+        (averaged, whole, ("inertia feed-forward", "moving average")),
+    )
     for gain, rate in BANDWIDTHS:
-        for (forward, command), integral in product(
-            ((0.0, plain), (whole, plain), (whole, averaged)), INTEGRALS
-        ):
+        for (command, forward, more), integral in product(commands, INTEGRALS):
             servo = truth.servo.model_copy(
                 update={
                     "position_gain_per_s": gain,
@@ -858,9 +861,6 @@ def starts(truth: Truth, cycle_ms: float) -> Iterator[Fitting]:
                     "friction_feedforward_nm": 0.0,
                     **command,
                 }
-            )
-            more = (("inertia feed-forward",) if forward else ()) + (
-                ("moving average",) if command is averaged else ()
             )
             parameters = (*known.values(), *(BY_NAME[each] for each in more))
             yield begun_at(with_sections(truth.model_copy(update={"servo": servo}), parameters), parameters)

@@ -90,6 +90,14 @@ def measured_response(profile: Path) -> Response:
     return response
 
 
+def measured_profile(folder: Path) -> Path:
+    """Makes a raised profile whose model has the measured response."""
+    profile = raised_profile(folder)
+    model = TransmissionModel.load(profile / "model.yaml")
+    replace(model, response=measured_response(profile)).save(profile / "model.yaml")
+    return profile
+
+
 def ripple_arcsec(samples: np.ndarray, speed_deg_s: float) -> float:
     """Returns the rms of the load error about a straight line while the target runs at a speed.
 

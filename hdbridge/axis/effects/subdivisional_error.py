@@ -37,6 +37,7 @@ from hdbridge.axis.effects.orders import (
     orders_fitted,
     orders_from,
     phasors,
+    turn_of,
 )
 from hdbridge.axis.effects.path import away_from_reversals
 from hdbridge.units import ARCSEC_PER_DEG, DEG_PER_TURN
@@ -150,7 +151,7 @@ class SubdivisionalError(Effect):
 
     def predict(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
         """Returns the error in arcsec, shape (n,)."""
-        error: FloatArray = horner(phasors(self.orders), np.exp(1j * self._angle(motion))).real
+        error: FloatArray = horner(phasors(self.orders), turn_of(self._angle(motion))).real
         return error
 
     def tracker(self, start: Start = Start.VIRGIN) -> Tracker:

@@ -15,18 +15,11 @@ from hdbridge.cli.ctl.common import (
     document,
     moving,
 )
-from hdbridge.cli.options import JsonOption, console, write_json
+from hdbridge.cli.options import JsonOption, ObjectArgument, ValueArgument, print_object, write_json
 from hdbridge.errors import InputError, RefusedError
 
 if TYPE_CHECKING:
     from hdbridge.client.messages import SdoValue
-
-ObjectArgument = Annotated[
-    str,
-    typer.Argument(
-        metavar="OBJECT", help="Its number (6064h, 0x1018:4, 60C2h:01; hexadecimal) or its name in the EDS."
-    ),
-]
 
 
 def job(
@@ -53,9 +46,7 @@ def get(
 def put(
     axis: AxisArgument,
     object_: ObjectArgument,
-    value: Annotated[
-        str, typer.Argument(metavar="VALUE", help="Decimal or 0x...; text, or bytes in hexadecimal.")
-    ],
+    value: ValueArgument,
     at: AtOption = None,
     force: TakeOption = False,
     json_file: JsonOption = None,
@@ -67,7 +58,4 @@ def put(
 
 def _print_object(found: SdoValue, json_file: Path | None) -> None:
     write_json(json_file, document("ctl-object", found))
-    number = f"{found.index:04X}h:{found.subindex:02X}"
-    whole = isinstance(found.value, int) and not isinstance(found.value, bool) and found.value >= 0
-    also = f" ({found.value:#x})" if whole else ""
-    console.print(f"{number} '{found.name}': {found.value}{also}  {found.type}", markup=False, soft_wrap=True)
+    print_object(f"{found.index:04X}h:{found.subindex:02X} '{found.name}'", found.value, found.type)

@@ -39,10 +39,6 @@ class OuterMaster:
         self._name = f"the master on {settings.bus.interface}:{settings.bus.channel}"
         self._token = ""
 
-    def _holds(self) -> bool:
-        """Returns True if the lease is the outer master's."""
-        return self._core.lease.holds(self._token)
-
     async def keep(self) -> None:
         """Takes the lease whenever it is free, and renews it, until cancelled."""
         lease = self._core.lease
@@ -61,7 +57,7 @@ class OuterMaster:
         granted_by = ""
         while True:
             await timing.sleep(POLL_S)
-            holds = self._holds()
+            holds = self._core.lease.holds(self._token)
             granted_by = granted_by or self._token  # an earlier service may have granted it
             cells[OuterCell.HELD] = int(holds)
             try:

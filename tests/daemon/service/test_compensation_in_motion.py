@@ -1,14 +1,12 @@
 """Every kind of motion through the daemon leaves the ripple of the filtered correction."""
 
 from collections.abc import Awaitable, Callable
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from support.raised import measured_response, raised_profile, ripple_arcsec
+from support.raised import measured_profile, ripple_arcsec
 from support.service import Service, play, stepped_service, until
 
-from hdbridge import TransmissionModel
 from hdbridge.commissioning.evaluation.stepping import Scheme
 from hdbridge.control.bench import axis_view
 from hdbridge.daemon.service.bridge import ServiceBridge
@@ -23,10 +21,7 @@ FAR_DEG = 140.0
 @pytest.fixture(scope="module")
 def profile(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Raised limits, and a model with the measured response."""
-    folder = raised_profile(tmp_path_factory.mktemp("raised") / "fast")
-    model = TransmissionModel.load(folder / "model.yaml")
-    replace(model, response=measured_response(folder)).save(folder / "model.yaml")
-    return folder
+    return measured_profile(tmp_path_factory.mktemp("raised") / "fast")
 
 
 async def goto(bridge: ServiceBridge, token: str) -> None:

@@ -1,14 +1,12 @@
 """An axis without an encoder at its load: the servo is watched, the rest is reported as not available."""
 
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import yaml
-from support.raised import measured_response, raised_profile, without_load_encoder
+from support.raised import measured_profile, without_load_encoder
 from support.service import AtOnce, Service, play, stepped_service
 
-from hdbridge import TransmissionModel
 from hdbridge.client import messages
 from hdbridge.daemon.following.follower import NO_LOAD_ENCODER
 from hdbridge.daemon.following.settings import AdaptationSettings
@@ -24,10 +22,7 @@ SPEED_DEG_S = 60.0
 @pytest.fixture(scope="module")
 def blind(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Raised limits, a model with the measured response, and then no load encoder."""
-    folder = raised_profile(tmp_path_factory.mktemp("blind") / "axis")
-    model = TransmissionModel.load(folder / "model.yaml")
-    replace(model, response=measured_response(folder)).save(folder / "model.yaml")
-    return without_load_encoder(folder)
+    return without_load_encoder(measured_profile(tmp_path_factory.mktemp("blind") / "axis"))
 
 
 def at_work(blind: Path, folder: Path, **servo: float) -> tuple[messages.AxisState, list[str]]:
