@@ -287,7 +287,7 @@ def one(job: tuple[int, int, float]) -> dict[str, object]:
 
 def main() -> None:
     given = parser(__doc__, axes=100, first=1000, workers=2)
-    given.add_argument("--every", type=int, default=5, help="keep every so many samples of 250 Hz")
+    given.add_argument("--every", type=int, default=5, help="keep one sample in this many, of 250 Hz")
     given.add_argument("--speed", type=float, default=4.0, help="of the sweeps, load degrees per second")
     given.add_argument("--json", type=Path)
     options = given.parse_args()

@@ -390,7 +390,7 @@ def test_filters_on_speed_and_torque_make_no_following_error_at_a_constant_speed
 
 @pytest.mark.parametrize("share", [0.0, 0.5, 1.0])
 def test_a_disturbance_observer_supplies_its_share_of_the_friction(share: float) -> None:
-    """What it does not supply is left to the position error, if the integral is slow."""
+    """If the integral is slow, the position error supplies the rest of the torque."""
     slow = {"servo__integral_time_ms": 1e4}
     rubs, slides = (
         following_error_ms(

@@ -540,7 +540,7 @@ class _Layout:
 
 
 def record_of(folder: Path, name: str = "record") -> list[Path]:
-    """Returns the files or the recording folder of a case's record; empty if there is none of that name."""
+    """Returns the files or the recording folder of a case's record; empty if the case lacks that record."""
     if (folder / name).is_dir():
         return [folder / name]
     return sorted([*folder.glob(f"{name}.csv"), *folder.glob(f"{name}-*.csv.gz")])
