@@ -23,6 +23,7 @@ axes:
 gateway:
   bus: {{interface: udp_multicast, channel: 239.74.163.9, options: {{port: {port}}}}}
   nodes: {{article: 5}}
+  timeout_ms: 2000
 """
 COUNTS_PER_DEG = 36_000
 
