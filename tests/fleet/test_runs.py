@@ -105,7 +105,7 @@ def test_a_joint_without_a_model_gets_one_from_its_earliest_recording(fleet, sch
 
 def test_a_folder_of_something_else_is_refused(fleet, scheduler, tmp_path):
     (tmp_path / "mine.txt").write_text("mine")
-    with pytest.raises(InputError, match="not empty"):
+    with pytest.raises(InputError, match="not written by hdbridge fleet"):
         go(fleet, tmp_path, scheduler)
 
 
