@@ -338,7 +338,7 @@ def _summarise(
     if summary.first:
         print_table(table)
     else:
-        _say("No joint stands out.")
+        _say("No joint stands out." if rows else "No recording is diagnosed yet.")
     for line in summary.lines():
         _say(line)
     target = page or dataset.folder / PAGE_NAME
