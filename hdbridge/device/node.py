@@ -153,6 +153,11 @@ class DriveNode:
         return (value(0x60C2, 1) or 1) / 10.0 ** -value(0x60C2, 2)
 
     @property
+    def now_s(self) -> float:
+        """Reception of the frame, or time of the event, that is being processed; on the node's clock."""
+        return self._now_s
+
+    @property
     def has_sync(self) -> bool:
         """True while SYNC drives the node."""
         return self._sync_due_s < _NEVER

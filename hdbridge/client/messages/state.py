@@ -99,6 +99,13 @@ class OuterState(Report):
     jitter_s: float | None = Field(
         None, description="mean deviation of that SYNC from its regular time", examples=[2e-5]
     )
+    latency_s: float | None = Field(
+        None,
+        description="median time from a SYNC to the drive's first frame with its target; None at rest or "
+        "without targets",
+        examples=[0.0061],
+    )
+    latency_99_s: float | None = Field(None, description="99 % of them are not longer", examples=[0.008])
 
 
 class AxisState(Report):

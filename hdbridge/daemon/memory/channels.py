@@ -31,6 +31,7 @@ from hdbridge.daemon.memory.layout import (
     Event,
     EventKind,
     Knot,
+    OuterKnot,
     Place,
     RelayedFrame,
 )
@@ -78,6 +79,7 @@ COMMANDS: Final[Format[Command]] = Format(
     COMMAND, lambda command: command[1:], lambda sequence, values: Command(sequence, *values)
 )
 KNOTS: Final[Format[Knot]] = Format(KNOT, lambda knot: knot, lambda _, values: Knot(*values))
+FOLLOWED: Final[Format[OuterKnot]] = Format(KNOT, lambda knot: knot, lambda _, values: OuterKnot(*values))
 
 
 class _Slots(Generic[T]):
