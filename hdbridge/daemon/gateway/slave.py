@@ -31,9 +31,17 @@ if TYPE_CHECKING:
     from hdbridge.daemon.machinefile import GatewaySettings
 
 BEHAVIOUR: Final = Behaviour.model_validate(
-    {"controlword": Controlword.LEVEL, "measures_period": True, "sync_timeout_periods": 3.0}
+    {
+        "controlword": Controlword.LEVEL,
+        "measures_period": True,
+        "sync_timeout_periods": 3.0,
+        "fixed_node_id": True,
+    }
 )
-"""Reads controlwords as levels, runs with any period of SYNC, and stops if SYNC is lost."""
+"""Reads controlwords as levels, runs with any period of SYNC, and stops if SYNC is lost.
+
+Its node id is that of the machine file.
+"""
 DEAD_S: Final = 0.3
 """A loop that has not turned for so long hangs or is gone."""
 POWER_S: Final = 5.0
@@ -179,6 +187,7 @@ class LoadAxis(PowerStage):
     def publish(self, node: DriveNode) -> None:
         """Shows the other processes the node as the outer master sees it, and what that asks for."""
         cells, value, motion = self._cells, node.dictionary.value, node.firmware.motion
+        cells[OuterCell.NODE_ID] = node.node_id
         mode = value(0x6061)
         target = value(0x60C1, 1) if mode == InterpolatedPosition.number else value(0x607A)
         target_deg = motion.unlimited(target) / self._counts_per_deg
@@ -292,6 +301,7 @@ class Gateway:
                 BEHAVIOUR,
                 load,
                 store_of(axis),
+                settings.bus.bitrate_bps,
             )
             load.use_times_of(node)
             for sub, read in enumerate(load.values(), start=1):

@@ -231,7 +231,9 @@ class OuterCell(IntEnum):
     """Service: 1 while the outer master holds the lease."""
     JITTER_NS = 7
     """Gateway: mean deviation of the outer SYNC from its regular time."""
-    VIEW = 8
+    NODE_ID = 8
+    """Gateway: node id in use; 255 if LSS took it away."""
+    VIEW = 9
     """Gateway: `OuterView`, packed; the control process puts it in its samples."""
 
 

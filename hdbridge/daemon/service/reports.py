@@ -146,7 +146,7 @@ def outer_state(
     view, (median_s, most_s) = cells.view, latency_s or (None, None)
     period_s = 1e-9 * cells[OuterCell.PERIOD_NS]
     return messages.OuterState(
-        node_id=node_id,
+        node_id=cells[OuterCell.NODE_ID] or node_id,
         alive=time.monotonic_ns() - alive_ns < GATEWAY_GONE_NS,
         nmt=view.nmt,
         statusword=view.statusword,
