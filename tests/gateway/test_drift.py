@@ -18,10 +18,8 @@ DAY_S = 86_400.0
 class Knots(deque):
     """Queue of set-points between two processes."""
 
-    def peek(self):
-        return self[0] if self else None
-
-    drop = deque.popleft
+    def take(self):
+        return self.popleft() if self else None
 
 
 @pytest.mark.parametrize(

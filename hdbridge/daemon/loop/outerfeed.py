@@ -48,21 +48,18 @@ class OuterFeed:
         for _ in range(KNOTS_A_TURN):
             if before is not last and last[0] >= time_s:
                 break
-            knot = self._knots.peek()
+            knot = self._knots.take()
             if knot is None:
                 break
-            self._knots.drop()
-            if knot.series != self._series:
+            series, due_s, position_deg, received_s = knot
+            if series != self._series:
                 continue
-            if math.isnan(knot.position_deg):
+            if math.isnan(position_deg):
                 return None
-            if before is last or knot.time_s > last[0]:
-                self.received_s = knot.received_s
-                begun = (time_s, last[1]) if before is last else last
-                before, last = (
-                    begun,
-                    (max(knot.time_s, math.nextafter(begun[0], math.inf)), knot.position_deg),
-                )
+            if before is last or due_s > last[0]:
+                before = (time_s, last[1]) if before is last else last
+                last = (due_s if due_s > before[0] else math.nextafter(before[0], math.inf), position_deg)
+                self.received_s = received_s
         self._before, self._last = before, last
         if before is last:
             return last[1] if time_s <= last[0] else None
