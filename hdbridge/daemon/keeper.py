@@ -437,6 +437,8 @@ class Keeper:
             self._stop(now_s, known, f"the {name} cannot begin ({how})")
         else:
             helper.due_s = now_s + helper.back_off.delay_s(lived_s)
+        if helper.alive is Cell.GATEWAY_TIME_NS:
+            self._memory.forget_gateway()
 
     def _lend(self, loan: Loan, now_s: float) -> None:
         """Ends the control process if the bus is wanted; starts another one when the bus is free again."""

@@ -63,6 +63,7 @@ class Controller:
                 memory.settings[index],
                 self._tell,
                 memory.followed[index],
+                memory.outer[index],
                 lambda: cycle.due_s,
             )
             for index, setup in enumerate(setups)
@@ -92,8 +93,10 @@ class Controller:
         # Waiting commands, frames and knots were meant for an earlier loop with the axes in other states.
         memory.commands.clear()
         memory.outgoing.clear()
-        for knots in (*memory.knots, *memory.followed):
+        for knots in memory.knots:
             knots.clear()
+        for followed in memory.followed:
+            followed.clear()
         memory.status.set(Cell.LOOP_PID, os.getpid())
 
     # ---------------------------------------------------------------- a turn
