@@ -121,7 +121,7 @@ class Estimator:
         self.observed: FloatArray = points.error_arcsec[self.index]
         self.time_s: FloatArray = points.time_s[self.index]
         self.zero: IntArray = points.zero[self.index]
-        self._regressors = Regressors([data.full.motion], self.at_points, len(self.index))
+        self._regressors = Regressors([data.full.motion], data.at_points, len(self.index))
         self._noise: dict[object, FloatArray] = {}
         self._free_loops: dict[Start, Nuisances] = {}
         # The common level is subtracted: an encoder's zero is arbitrary.
@@ -150,11 +150,6 @@ class Estimator:
         """Returns regressors of an effect at the usable points (means over samples), arcsec, shape (m, p)."""
         return self._regressors.columns(effect, (start,))
 
-    def at_points(self, values: FloatArray) -> FloatArray:
-        """Averages a quantity of every sample to the usable points, as for the observations."""
-        means = self.data.mean(values)
-        return means if len(means) == len(self.index) else np.asarray(means[self.index])
-
     def does(self, effect: Effect, start: Start) -> FloatArray:
         """Returns an effect's contribution at every usable sample, arcsec.
 
@@ -171,7 +166,7 @@ class Estimator:
 
     def law_discrepancy(self, effect: Effect, start: Start) -> FloatArray:
         """Returns the uncertainty of an effect's law, one weighted column per standard deviation, (m, k)."""
-        return self.weighted(self.at_points(effect.law_discrepancy(self.data.full.motion, start)))
+        return self.weighted(self.data.at_points(effect.law_discrepancy(self.data.full.motion, start)))
 
     def angle_discrepancy(self, effects: Sequence[Effect], start: Start) -> FloatArray:
         """Returns the influence of the driving angle's uncertainty within its counts, weighted, shape (m, 1).
@@ -184,7 +179,7 @@ class Estimator:
         for each in effects:
             if each.tracker().memory_deg > 0.0:
                 change = change + each.predict(other, start) - each.predict(full.motion, start)
-        return self.weighted(self.at_points(change)[:, np.newaxis])
+        return self.weighted(self.data.at_points(change)[:, np.newaxis])
 
     def turn_discrepancy(self, effects: Sequence[Effect], start: Start) -> FloatArray:
         """Returns errors of turning points within counts, a weighted column per standard deviation, (m, k).
@@ -202,7 +197,7 @@ class Estimator:
         moved[turns] += (COUNTS * count + missed_deg(full.motor_deg, turns)) * np.array(signs[:-1])
         other = replace(full.motion, motor_deg=moved)
         change = sum(each.predict(other, start) - each.predict(full.motion, start) for each in loops)
-        columns = [self.at_points(np.asarray(change))]
+        columns = [self.data.at_points(np.asarray(change))]
         if len(turns) <= MOST_TURNS:
             leg = np.searchsorted(turns, self.data.runs[self.index], "right")
             columns += [np.where(leg == each, columns[0], 0.0) for each in range(1, len(turns) + 1)]
@@ -212,7 +207,9 @@ class Estimator:
         """Returns a free-form hysteresis: stop operators of `STOPS_DEG`, which form any loop shape."""
         if start not in self._free_loops:
             angle = self.data.full.motion.motor_deg
-            stops = {f"stop of {each:g} deg": self.at_points(stop(angle, each, start)) for each in STOPS_DEG}
+            stops = {
+                f"stop of {each:g} deg": self.data.at_points(stop(angle, each, start)) for each in STOPS_DEG
+            }
             self._free_loops[start] = unknown(np.stack([*stops.values()], axis=1), [*stops])
         return self._free_loops[start]
 
@@ -262,7 +259,7 @@ class Estimator:
         if key not in self._noise:
             noisy = {each: _smooth(motion.measured[each]) for each in channels}
             other = effect.columns(replace(motion, measured={**motion.measured, **noisy}), start)
-            apart = self.weighted(self.at_points(other) - self.columns(effect, start))
+            apart = self.weighted(self.data.at_points(other) - self.columns(effect, start))
             self._noise[key] = np.asarray(WHITE * np.sum(apart**2, axis=0))
         return self._noise[key]
 

@@ -129,7 +129,7 @@ def _shaken(estimator: Estimator, fitted: Fitted) -> Nuisances | None:
         return None
     angles = ((turns, size, RAD_PER_DEG * (turns * motion.motor_deg + phase)) for turns, size, phase in waves)
     both = ((turns, size * np.cos(angle), size * np.sin(angle)) for turns, size, angle in angles)
-    return swing(RAD_PER_DEG * speed, both, estimator.at_points)
+    return swing(RAD_PER_DEG * speed, both, estimator.data.at_points)
 
 
 # Parameters of a fitted effect with 95 % intervals, valid for coloured noise.

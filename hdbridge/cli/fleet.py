@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
@@ -114,6 +115,7 @@ class Fleet:
         from hdbridge.axis.model import TransmissionModel
 
         need_extra("a fleet needs", _EXTRA, "fleet")
+        logging.getLogger("paramiko").addHandler(logging.NullHandler())  # else its thread prints a traceback
         if self.out is None:
             raise InputError("--out is missing; name a new folder, or one of an earlier run")
         if not self.sources and self.manifest is None:
@@ -198,6 +200,9 @@ def run(fleet: Fleet) -> None:
     A joint without a model gets one fitted to its earliest recording. An unusable recording is a row with the
     reason. Ctrl-C keeps finished results; the same command continues.
     """
+    for each in fleet.sources or ():
+        if "://" in each:  # a server that does not answer takes minutes
+            _note(f"listing {each}")
     found = fleet.find(fleet.dataset.stored())
     fleet.dataset.create()
     with deferred_interrupt() as interrupted:
@@ -333,7 +338,7 @@ def _summarise(
     if summary.first:
         print_table(table)
     else:
-        _say("No joint stands out.")
+        _say("No joint stands out." if rows else "No recording is diagnosed yet.")
     for line in summary.lines():
         _say(line)
     target = page or dataset.folder / PAGE_NAME

@@ -22,7 +22,7 @@ from typing import Any, Final
 
 from hdbridge import __version__
 from hdbridge.errors import InputError
-from hdbridge.files.expectation import nearest
+from hdbridge.files.expectation import nearest, one_line
 from hdbridge.files.profile import Profile
 from hdbridge.records.recording import ABOUT_NAME, CSV_NAMES, recordings_among
 
@@ -186,8 +186,8 @@ def _listing(place: str) -> dict[str, str]:
             for each in matched
             for file, about in system.find(each, detail=True).items()
         }
-    except (OSError, ValueError, ImportError) as problem:
-        raise InputError(f"{place}: cannot be listed: {problem}") from None
+    except Exception as problem:  # each file system raises its own
+        raise InputError(one_line(f"{place}: cannot be listed: {problem}")) from None
 
 
 def _local(path: Path) -> Iterator[tuple[str, str]]:

@@ -202,16 +202,30 @@ class Trend:
     """Probability that the joint is one of those that change."""
 
     @cached_property
+    def _slopes(self) -> list[tuple[float, float, float]]:
+        """Weight, mean and standard deviation of the slope if the joint stays, and if it changes."""
+        slope, own = float(self.line[1]), float(self.covariance[1, 1])
+        result = []
+        for weight, centre, deviation in (
+            (1.0 - self.changing, 0.0, self.stay),
+            (self.changing, *self.change),
+        ):
+            variance = 1.0 / (1.0 / deviation**2 + 1.0 / own)
+            result.append((weight, variance * (centre / deviation**2 + slope / own), math.sqrt(variance)))
+        return result
+
+    @cached_property
     def _draws(self) -> tuple[FloatArray, FloatArray]:
         """Posterior levels and slopes, drawn by quantiles so that equal data give equal intervals."""
-        slope, cov = float(self.line[1]), self.covariance
-        count = round(self.changing * DRAWS)
-        slopes = []
-        for centre, deviation, number in ((0.0, self.stay, DRAWS - count), (*self.change, count)):
-            variance = 1.0 / (1.0 / deviation**2 + 1.0 / float(cov[1, 1]))
-            middle = variance * (centre / deviation**2 + slope / float(cov[1, 1]))
-            slopes.append(middle + math.sqrt(variance) * ndtri((np.arange(number) + 0.5) / max(number, 1)))
-        drawn = np.concatenate(slopes)
+        slope, cov, changing = float(self.line[1]), self.covariance, round(self.changing * DRAWS)
+        drawn = np.concatenate(
+            [
+                middle + deviation * ndtri((np.arange(number) + 0.5) / max(number, 1))
+                for number, (_, middle, deviation) in zip(
+                    (DRAWS - changing, changing), self._slopes, strict=True
+                )
+            ]
+        )
         # Level given the slope; its own variance takes the quantiles in another order than the slope's.
         level = self.line[0] + cov[0, 1] / cov[1, 1] * (drawn - slope)
         rest = math.sqrt(max(float(cov[0, 0] - cov[0, 1] ** 2 / cov[1, 1]), 0.0))
@@ -220,13 +234,12 @@ class Trend:
     @property
     def per_1000_hours(self) -> Interval:
         """Slope with its interval."""
-        return Interval(
-            *(float(each) for each in np.quantile(self._draws[1], (INTERVAL[0], 0.5, INTERVAL[1])))
-        )
+        low, middle, high = np.quantile(self._draws[1], (INTERVAL[0], 0.5, INTERVAL[1])).tolist()
+        return Interval(low, middle, high)
 
     def growing(self) -> float:
         """Returns the probability that the slope is positive."""
-        return float(np.mean(self._draws[1] > 0.0))
+        return sum(weight * float(ndtr(middle / deviation)) for weight, middle, deviation in self._slopes)
 
     def hours_to(self, limit: float) -> Interval | None:
         """Returns the hours from the last recording until the line reaches a limit, or None if unknown.

@@ -2,6 +2,7 @@
 
 import asyncio
 import gc
+import socket
 import threading
 from contextlib import suppress
 from dataclasses import replace
@@ -13,6 +14,7 @@ from support.fleet import MODEL, record
 from support.flight import flight_log, samples
 
 from hdbridge.daemon.recorder.flightlog import Batch
+from hdbridge.errors import InputError
 from hdbridge.fleet.diagnosing import axes_of, diagnosed, model_in
 from hdbridge.fleet.sources import Source, find_sources, with_axes
 from hdbridge.records.recording import Recording
@@ -99,6 +101,28 @@ def test_recordings_behind_sftp(files, monkeypatch, tmp_path):
         fsspec.get_filesystem_class("sftp").clear_instance_cache()
         where["loop"].call_soon_threadsafe(where["end"].set)
         thread.join(60)
+
+
+@pytest.mark.parametrize("protocol", ["s3", "sftp"])
+def test_a_server_of_something_else_is_an_error_of_one_line(protocol, monkeypatch):
+    pytest.importorskip("s3fs")
+    pytest.importorskip("paramiko")
+    with socket.create_server(("127.0.0.1", 0)) as server:
+
+        def answer():
+            with suppress(OSError):
+                while True:
+                    with server.accept()[0] as line:
+                        line.sendall(b"220 mail\r\n")
+
+        threading.Thread(target=answer, daemon=True).start()
+        port = server.getsockname()[1]
+        once = {"config_kwargs": {"retries": {"max_attempts": 0}}, "key": "k", "secret": "s"}
+        monkeypatch.setitem(fsspec.config.conf, "s3", {"endpoint_url": f"http://127.0.0.1:{port}", **once})
+        place = f"sftp://u:p@127.0.0.1:{port}/x" if protocol == "sftp" else "s3://bucket/x"
+        with pytest.raises(InputError, match=f"^{place}: cannot be listed: .+$"):
+            find_sources([place])
+        server.shutdown(socket.SHUT_RDWR)
 
 
 def test_each_axis_of_a_flight_recording_is_a_joint(tmp_path):

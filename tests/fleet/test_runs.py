@@ -1,5 +1,6 @@
 """Runs over small fleets on a real Dask cluster: the same Parquet however they went."""
 
+import gc
 import os
 import signal
 from pathlib import Path
@@ -10,7 +11,7 @@ from distributed import Client
 
 from hdbridge.errors import InputError
 from hdbridge.fleet.dataset import COLUMNS, Dataset
-from hdbridge.fleet.diagnosing import diagnosed, local_model
+from hdbridge.fleet.diagnosing import diagnosed, fitted, local_model
 from hdbridge.fleet.engine import Cluster, run
 from hdbridge.fleet.sources import Source, find_sources
 from hdbridge.fleet.summary import summarise
@@ -79,6 +80,7 @@ def test_a_worker_that_is_killed_loses_nothing(fleet, scheduler, whole, tmp_path
             victims.clear()
 
     assert go(fleet, tmp_path, scheduler, progress=kill).done == 12
+    assert not victims
     assert files(tmp_path) == files(whole[0])
 
 
@@ -105,7 +107,7 @@ def test_a_joint_without_a_model_gets_one_from_its_earliest_recording(fleet, sch
 
 def test_a_folder_of_something_else_is_refused(fleet, scheduler, tmp_path):
     (tmp_path / "mine.txt").write_text("mine")
-    with pytest.raises(InputError, match="not empty"):
+    with pytest.raises(InputError, match="not written by hdbridge fleet"):
         go(fleet, tmp_path, scheduler)
 
 
@@ -122,6 +124,23 @@ def test_nothing_that_is_wrong_with_a_recording_is_raised(fleet, tmp_path):
         "cannot be read"
         in diagnosed(Source(str(fleet / "J1-0.csv.gz"), joint="J"), local_model("x.yaml"))["reason"]
     )
+
+
+def test_a_task_leaves_nothing_to_the_collector_of_cycles(fleet):
+    """A worker collects rarely, so its memory would grow by what each diagnosis caches."""
+    model = local_model(str(fleet / "model.yaml"))
+    source = Source(str(fleet / "J1-0.csv.gz"), joint="J", ratio=50.0)
+    gc.collect()
+    gc.set_debug(gc.DEBUG_SAVEALL)
+    try:
+        diagnosed(source, model)
+        fitted([source], "model.yaml")
+        gc.collect()
+        left = {type(each) for each in gc.garbage}
+    finally:
+        gc.set_debug(0)
+        gc.garbage.clear()
+    assert not [each for each in left if each.__module__.startswith("hdbridge")]
 
 
 def test_the_summary_of_a_run_is_plain_data(whole):
