@@ -269,7 +269,7 @@ class Firmware:
 
     def _operate(self) -> None:
         self._set_state(State.OPERATION_ENABLED)
-        self._halted = False
+        self._halted = bool(self._word & _HALT)
         self._following_error = False
         self._beyond_window_s = 0.0
         self._enter_mode()

@@ -6,6 +6,11 @@ import struct
 
 import pytest
 
+from hdbridge.device.behaviour import Behaviour, Controlword
+from hdbridge.sim.lockstep import lockstep_bench
+
+from .conftest import EDS, RawMaster
+
 REACHED, LIMIT, BIT_12, BIT_13, REFERENCED = 0x0400, 0x0800, 0x1000, 0x2000, 0x4000
 
 
@@ -297,6 +302,24 @@ def test_pp_needs_an_edge(master, motor):
     master.control(0x3F)
     master.wait(1.0)
     assert motor.position == 1000
+
+
+@pytest.mark.parametrize("behaviour", [Behaviour(), Behaviour(controlword=Controlword.LEVEL)])
+def test_a_halt_in_the_word_that_enables_holds_the_axis(motor, behaviour):
+    """As ros2_canopen enables."""
+    with lockstep_bench(motor, EDS, behaviour=behaviour) as (bus, clock, node):
+        master = RawMaster(bus, clock, node, motor)
+        master.put(0x6060, 0, 8, 1)
+        master.nmt(1)
+        for word in (0x0106, 0x0107, 0x010F):
+            master.cycle(word)
+        for _ in range(5):
+            status, position, *_ = master.cycle(0x010F, 2000)
+            assert position == 0
+        assert status & 0x046F == 0x0427
+        for _ in range(5):
+            master.cycle(0x000F, 2000)
+        assert master.read(0x6064) == 2000
 
 
 def test_pp_halts_and_goes_on(master, motor):

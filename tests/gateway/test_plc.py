@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import math
 import shutil
 import struct
 
 import numpy as np
 import pytest
 from support.daemon import PROFILE
-from support.gateway import COUNTS_PER_DEG, NODE, GatewayBench, gateway_bench
+from support.gateway import COUNTS_PER_DEG, NODE, GatewayBench, gateway_bench, swing
 from support.raised import without_load_encoder
 from support.service import play
 
@@ -32,17 +31,6 @@ def scene(tmp_path, scenario, **options):
 
     with gateway_bench(tmp_path, **options) as bench:
         play(main(bench))
-
-
-async def swing(bench, amplitude_deg=2.0, period_s=2.0):
-    """Have the PLC swing the axis from where it stands."""
-    plc, begun, centre = bench.plc, bench.plc.cycle, bench.plc.target
-
-    def plan(cycle):
-        share = (cycle - begun) * plc.period_s / period_s
-        return centre + round(COUNTS_PER_DEG * amplitude_deg * 0.5 * (1.0 - math.cos(2.0 * math.pi * share)))
-
-    plc.plan = plan
 
 
 async def stands(bench, duration_s=0.3, within_deg=0.003):

@@ -62,7 +62,8 @@ class Laws:
         self.unasked = ""
         """Reason why the present following, once it moves, is motion that nobody asked for."""
         self.lowest = self.highest = self.began_deg = 0.0
-        self.enabled = 0
+        self.periods = self.moved = self.enabled = 0
+        """Cycles judged, cycles with a moving set-point, and enablings by the master."""
         self.before: tuple[int, float] | None = None
 
     def look(self) -> None:
@@ -76,6 +77,7 @@ class Laws:
             self._judge(sample["axes"][0], int(sample["cycle"]))
 
     def _judge(self, axis: np.void, cycle: int) -> None:
+        self.periods += 1
         driven = axis["state"] in (AxisState.ENABLED, AxisState.STOPPING)
         place = float(axis["load_target_deg"])
         if not driven:
@@ -86,6 +88,7 @@ class Laws:
         assert limits.position_min_deg <= place <= limits.position_max_deg
         if self.before is not None and self.before[0] == cycle - 1:
             assert abs(place - self.before[1]) <= 1.0001 * limits.velocity_deg_s * self.period_s
+            self.moved += place != self.before[1]
         self.before = cycle, place
         following = axis["mode"] == MotionMode.FOLLOW
         if following and not self.following:
@@ -169,10 +172,10 @@ async def rest(bench: GatewayBench, laws: Laws, duration_s: float) -> None:
         laws.look()
 
 
-def play_story(folder: Path, story: Sequence[tuple[str, Any]]) -> None:
+def play_story(folder: Path, story: Sequence[tuple[str, Any]]) -> Laws:
     """Plays events on a gateway with an enabled axis; AssertionError if a law is broken."""
 
-    async def scenario(bench: GatewayBench) -> None:
+    async def scenario(bench: GatewayBench) -> Laws:
         async with bench.service.ready() as bridge:
             bench.bridge = bridge
             await bench.configure()
@@ -183,6 +186,7 @@ def play_story(folder: Path, story: Sequence[tuple[str, Any]]) -> None:
             assert laws.enabled == 1
             for kind, value in story:
                 await happen(bench, laws, kind, value)
+            return laws
 
     with gateway_bench(folder) as bench:
-        play(scenario(bench))
+        return play(scenario(bench))

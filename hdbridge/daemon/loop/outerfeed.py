@@ -6,7 +6,7 @@ import math
 from typing import Final
 
 from hdbridge.daemon.memory.channels import Queue
-from hdbridge.daemon.memory.layout import Knot
+from hdbridge.daemon.memory.layout import OuterKnot
 
 KNOTS_A_TURN: Final = 64
 LONGEST_SPACING_S: Final = 0.05
@@ -21,12 +21,14 @@ class OuterFeed:
     longer. Set-points of another series are dropped, so none from before an interruption takes effect.
     """
 
-    __slots__ = ("_before", "_knots", "_last", "_patience_s", "_series")
+    __slots__ = ("_before", "_knots", "_last", "_patience_s", "_series", "received_s")
 
-    def __init__(self, knots: Queue[Knot]) -> None:
+    def __init__(self, knots: Queue[OuterKnot]) -> None:
         self._knots = knots
         self._series = 0
         self._patience_s = 0.0
+        self.received_s = math.nan
+        """When the newest set-point was received; NaN before the first."""
         self._before = self._last = (0.0, 0.0)
         """Time and position of the last two set-points."""
 
@@ -37,7 +39,7 @@ class OuterFeed:
 
     def begin(self, series: int, patience_s: float, time_s: float, position_deg: float) -> None:
         """Begin at rest; ``patience_s``: longest time without a set-point at rest."""
-        self._series, self._patience_s = series, patience_s
+        self._series, self._patience_s, self.received_s = series, patience_s, math.nan
         self._before = self._last = (time_s + FIRST_KNOT_S, position_deg)
 
     def at(self, time_s: float) -> float | None:
@@ -46,20 +48,18 @@ class OuterFeed:
         for _ in range(KNOTS_A_TURN):
             if before is not last and last[0] >= time_s:
                 break
-            knot = self._knots.peek()
+            knot = self._knots.take()
             if knot is None:
                 break
-            self._knots.drop()
-            if knot.stream != self._series:
+            series, due_s, position_deg, received_s = knot
+            if series != self._series:
                 continue
-            if math.isnan(knot.position_deg):
+            if math.isnan(position_deg):
                 return None
-            if before is last or knot.time_s > last[0]:
-                begun = (time_s, last[1]) if before is last else last
-                before, last = (
-                    begun,
-                    (max(knot.time_s, math.nextafter(begun[0], math.inf)), knot.position_deg),
-                )
+            if before is last or due_s > last[0]:
+                before = (time_s, last[1]) if before is last else last
+                last = (due_s if due_s > before[0] else math.nextafter(before[0], math.inf), position_deg)
+                self.received_s = received_s
         self._before, self._last = before, last
         if before is last:
             return last[1] if time_s <= last[0] else None

@@ -37,12 +37,12 @@ def check(bench: DaemonBench, row: Row, character: Character) -> None:
     try_out(row, bench, DAEMON, bench.daemon.axes[0].image.heartbeat_timeout_s, character)
     stops = row.reaction >= Reaction.QUICK_STOP
     concerned = ((0, 1) if row.everybody else (0,)) if stops else ()
-    for axis in range(2):
-        if axis not in concerned:
-            assert bench.moves_on(axis)
-            continue
-        assert bench.states[axis] is STATES[bench.daemon.axes[axis].supervision.reaction]
-        bench.stays_stopped(axis)
+    assert all(bench.moves_on(axis) for axis in range(2) if axis not in concerned)
+    if concerned:
+        for axis in concerned:
+            assert bench.states[axis] is STATES[bench.daemon.axes[axis].supervision.reaction]
+        bench.stay_stopped(*concerned)
+    for axis in concerned:
         (stopped,) = bench.daemon.told(EventKind.STOPPED, axis)
         assert stopped.code == FAULT_INDEX[row.fault]
         assert row.fault.value in stopped.text

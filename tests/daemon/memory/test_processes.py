@@ -23,7 +23,7 @@ cycle = 0
 while True:
     cycle += 1
     # Every number of a sample is the same: a torn one shows.
-    memory.samples.write(cycle, cycle, 0.0, 0.0, 0.0, 0, (0, 0, 0, 0, 0, 0, *(float(cycle),) * 13))
+    memory.samples.write(cycle, cycle, 0.0, 0.0, 0.0, 0, (0,) * 6 + (float(cycle),) * 15 + (0,) * 5)
     if cycle % 16 == 0:
         memory.events.append(Event(0, cycle, cycle, 0, EventKind.DONE, cycle, 0, str(cycle)))
 """
@@ -106,7 +106,7 @@ def test_a_loop_that_takes_the_place_of_a_killed_one_goes_on_with_the_numbers() 
         samples, lost = reader.read()
         events.read()
         with Memory.attach(os.dup(memory.fd)) as successor:
-            successor.samples.write(-1, 0, 0.0, 0.0, 0.0, 0, (0,) * 6 + (0.0,) * 13)
+            successor.samples.write(-1, 0, 0.0, 0.0, 0.0, 0, (0,) * 6 + (0.0,) * 15 + (0,) * 5)
             successor.events.append(Event(0, 0, 0, -1, EventKind.BUS_UP))
         after, lost = reader.read()
         assert lost == 0
