@@ -39,6 +39,8 @@ grows.
 SURE: Final = 0.95
 REPEATED: Final = 2
 """Minimum number of recordings that name a cause."""
+PEAK_ERROR: Final = 0.25
+"""Standard deviation of a small peak, in detection limits."""
 SILENT: Final = 3.0
 """Time without a recording after which a joint is silent; multiples of its median interval."""
 ATTRIBUTES: Final = ("batch", "cell", "lubricant")
@@ -238,15 +240,19 @@ def _peak(row: Row, cause: str) -> float | None:
     return found["peak_arcsec"] if found else None
 
 
+def _floor(row: Row, cause: str) -> float:
+    """Returns the smallest peak from which a recording would name a cause, arcsec."""
+    limit = next((each["arcsec"] for each in row["limits"] or () if each["cause"] == cause), None)
+    return limit if limit is not None else max(row["rms_arcsec"] or 0.0, 1.0)
+
+
 def _size(rows: Sequence[Row], cause: str) -> Series:
     """Returns the peak of a cause over the hours; if not named, it lies between 0 and the detection limit."""
     points = []
     for row in rows:
-        limit = next((each["arcsec"] for each in row["limits"] or () if each["cause"] == cause), None)
-        peak = _peak(row, cause)
-        floor = limit if limit is not None else max(row["rms_arcsec"] or 0.0, 1.0)
+        peak, floor = _peak(row, cause), _floor(row, cause)
         if peak is not None:
-            points.append((row, peak, max(0.25 * floor, 0.02 * peak)))
+            points.append((row, peak, max(PEAK_ERROR * floor, 0.02 * peak)))
         else:  # 0.29: standard deviation of a uniform distribution
             points.append((row, 0.5 * floor, 0.29 * floor))
     return _series(points)
@@ -302,9 +308,12 @@ def _first(
                 continue
             trend = sizes[cause][name]
             growing = trend is not None and trend.growing() >= SURE and trend.changing >= SURE
-            if not growing and (_peak(rows[0], cause) is not None or common[rows[-1]["gear"]]):
-                continue
             last = next(each for each in named[-1]["findings"] if each["cause"] == cause)
+            # The first recording would have shown it.
+            seen = last["peak_arcsec"] > (1.0 + 2.0 * PEAK_ERROR) * _floor(rows[0], cause)
+            appeared = _peak(rows[0], cause) is None and seen and not common[rows[-1]["gear"]]
+            if not growing and not appeared:
+                continue
             claims.append(
                 Candidate(
                     joint=name,
