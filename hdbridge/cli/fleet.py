@@ -162,7 +162,7 @@ class Fleet:
         from hdbridge.fleet.engine import RETRIED, Cluster, Progress
         from hdbridge.fleet.engine import run as run_fleet
 
-        _note(f"{len(found)} sources, {len({each.joint for each in found})} joints")
+        _note(f"{len(found)} sources, {len({each.joint for each in found} - {None})} joints")
         with progress_bar() as bar:
             task = bar.add_task("diagnosing", total=len(found))
 
@@ -338,7 +338,7 @@ def _summarise(
     if summary.first:
         print_table(table)
     else:
-        _say("No joint stands out." if rows else "No recording is diagnosed yet.")
+        _say("No joint stands out." if latest else "No recording has a diagnosis.")
     for line in summary.lines():
         _say(line)
     target = page or dataset.folder / PAGE_NAME

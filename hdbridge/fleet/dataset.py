@@ -272,4 +272,5 @@ def _write(path: Path, rows: Sequence[Mapping[str, Any]], name: str) -> None:
         aside.replace(path)
     except OSError as problem:
         aside.unlink(missing_ok=True)
-        raise OutputError(f"{path}: cannot be written: {problem.strerror}") from None
+        why = os.strerror(problem.errno) if problem.errno else str(problem)  # Arrow's own text is longer
+        raise OutputError(f"{path}: cannot be written: {why}") from None

@@ -70,8 +70,10 @@ def _verdict(summary: Summary) -> str:
         if soonest.remaining is not None and soonest.remaining.high > 0.0:
             text += f", {summary.limit_arcsec:g} arcsec in {hours_words(soonest.remaining)} h"
         text += "."
-    else:
+    elif summary.recordings > len(summary.failed):
         text = f"No joint of {summary.joints:,} stands out by a cause that repeats and is not common to all."
+    else:
+        text = "No joint can be judged."
     if wrong := len(summary.failed):
         have = "have" if wrong > 1 else "has"
         text += f" {wrong:,} of {summary.recordings:,} recordings {have} no diagnosis."
