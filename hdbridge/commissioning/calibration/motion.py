@@ -8,6 +8,7 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
+from pydantic import TypeAdapter
 
 from hdbridge.analysis.response import (
     DIFFERENT,
@@ -93,7 +94,7 @@ class Ripple:
     none_arcsec: float
     static_arcsec: float | None = None
     filtered_arcsec: float | None = None
-    faded: tuple[int, ...] = ()
+    faded_orders: tuple[int, ...] = ()
     """Motor orders that the filter does not correct at this speed, because they are too fast."""
     orders: tuple[OrderRipple, ...] = ()
 
@@ -194,14 +195,9 @@ class MotionTest:
             "helps_to_deg_s": self.helps_to_deg_s,
             "speeds": [
                 {
-                    "speed_deg_s": each.speed_deg_s,
-                    "none_arcsec": each.none_arcsec,
-                    "static_arcsec": each.static_arcsec,
-                    "filtered_arcsec": each.filtered_arcsec,
+                    **asdict(each),
                     "removed_static_percent": each.removed_static_percent,
                     "removed_percent": each.removed_percent,
-                    "faded_orders": list(each.faded),
-                    "orders": [asdict(order) for order in each.orders],
                 }
                 for each in self.ripples
             ],
@@ -214,29 +210,8 @@ class MotionTest:
     @classmethod
     def from_dict(cls, data: dict[str, Any]) -> MotionTest:
         """Restores a test from `as_dict`."""
-        ripples = tuple(
-            Ripple(
-                each["speed_deg_s"],
-                each["none_arcsec"],
-                each["static_arcsec"],
-                each["filtered_arcsec"],
-                tuple(each["faded_orders"]),
-                tuple(OrderRipple(**order) for order in each.get("orders", ())),
-            )
-            for each in data["speeds"]
-        )
-        paths = tuple(
-            PathResult(
-                each["name"],
-                PathError(**each["none"]),
-                PathError(**each["static"]),
-                *(PathError(**each[name]) if each.get(name) else None for name in ("filtered", "wind_up")),
-            )
-            for each in data.get("paths", ())
-        )
-        response = Response.model_validate(data["response"]) if data["response"] else None
-        wind_up = InertialWindup.model_validate(data["wind_up"]) if data.get("wind_up") else None
-        return cls(ripples, response, tuple(map(str, data["remarks"])), paths, wind_up)
+        restored: MotionTest = TypeAdapter(cls).validate_python({**data, "ripples": data["speeds"]})
+        return restored
 
 
 def motion_test_s(axis: AxisConfig, runs: int = 2 + TRIALS) -> float:
