@@ -16,7 +16,7 @@ from support.flight import flight_log, samples
 from hdbridge.daemon.recorder.flightlog import Batch
 from hdbridge.errors import InputError
 from hdbridge.fleet.diagnosing import axes_of, diagnosed, model_in
-from hdbridge.fleet.sources import Source, find_sources, with_axes
+from hdbridge.fleet.sources import Source, fetched, find_sources, with_axes
 from hdbridge.records.recording import Recording
 
 KNOWN = model_in(MODEL, "model.yaml")
@@ -27,6 +27,10 @@ def check_fleet_at(url):
     """One folder with a recording, and one CSV file."""
     found = find_sources([url])
     assert [each.path.removeprefix(f"{url}/") for each in found] == ["a.csv.gz", "rec"]
+    assert [each.joint for each in found] == [None, "J7"]
+    with fetched(found[0].path) as path:
+        assert path.is_file()
+    assert not path.exists()
     rows = [diagnosed(replace(each, joint="J7", ratio=50.0), KNOWN) for each in found]
     assert [row.get("reason") for row in rows] == [None, None]
     assert rows[0]["samples_sha256"] == rows[1]["samples_sha256"]
