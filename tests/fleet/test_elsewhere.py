@@ -107,8 +107,8 @@ def test_recordings_behind_sftp(files, monkeypatch, tmp_path):
         thread.join(60)
 
 
-@pytest.mark.parametrize("protocol", ["s3", "sftp"])
-def test_a_server_of_something_else_is_an_error_of_one_line(protocol, monkeypatch):
+@pytest.mark.parametrize("place", ["s3://bucket/x", "sftp://u:p@127.0.0.1:{}/x", "http://127.0.0.1:{}/x/"])
+def test_a_server_of_something_else_is_an_error_of_one_line(place, monkeypatch):
     pytest.importorskip("s3fs")
     pytest.importorskip("paramiko")
     with socket.create_server(("127.0.0.1", 0)) as server:
@@ -123,7 +123,7 @@ def test_a_server_of_something_else_is_an_error_of_one_line(protocol, monkeypatc
         port = server.getsockname()[1]
         once = {"config_kwargs": {"retries": {"max_attempts": 0}}, "key": "k", "secret": "s"}
         monkeypatch.setitem(fsspec.config.conf, "s3", {"endpoint_url": f"http://127.0.0.1:{port}", **once})
-        place = f"sftp://u:p@127.0.0.1:{port}/x" if protocol == "sftp" else "s3://bucket/x"
+        place = place.format(port)
         with pytest.raises(InputError, match=f"^{place}: cannot be listed: .+$"):
             find_sources([place])
         server.shutdown(socket.SHUT_RDWR)

@@ -96,7 +96,4 @@ def test_rows_of_a_manifest_name_axes_of_a_flight():
     split = with_axes("a.mcap", ["arm", "base"], [arm])
     assert [(each.axis, each.joint) for each in split] == [("arm", "K"), ("base", "base")]
     split = with_axes("a.mcap", ["arm", "base"], [Source("a.mcap", cell="2")])
-    assert [(each.axis, each.joint, each.cell) for each in split] == [
-        ("arm", "arm", "2"),
-        ("base", "base", "2"),
-    ]
+    assert [(each.joint, each.cell) for each in split] == [("arm", "2"), ("base", "2")]
