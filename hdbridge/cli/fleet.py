@@ -180,10 +180,9 @@ class Fleet:
                 interrupted=interrupted,
                 retried=RETRIED if retried is None else retried,
             )
-        _say(
-            f"{self.dataset.folder}: {end.done} recordings, {end.known} of them known already, "
-            f"{end.failed} newly failed; largest memory of a worker {end.memory_mb:.0f} MB"
-        )
+        memory = f"; largest memory of a worker {end.memory_mb:.0f} MB" if end.memory_mb else ""
+        counts = f"{end.done} recordings, {end.known} of them known already, {end.failed} newly failed"
+        _say(f"{self.dataset.folder}: {counts}{memory}")
 
     def summarise(self) -> None:
         """Prints and writes the summary of the data set."""

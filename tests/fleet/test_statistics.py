@@ -138,11 +138,6 @@ def test_a_step_in_one_joint_hides_no_other_and_has_no_trend_of_its_own(height):
         assert found[-1].hours_to(1e6) is None
 
 
-def test_of_joints_that_stay_the_hours_are_not_known():
-    series, _ = aged(np.random.default_rng(2), 40, 0)
-    assert sum(each.hours_to(20.0) is not None for each in trends(series)) <= 1
-
-
 def test_a_limit_that_is_passed_is_reached_now():
     hours = np.arange(5.0) * 1000.0
     (trend,) = trends([Series(hours, 10.0 + hours / 500.0, np.full(5, 0.01))])
