@@ -7,13 +7,6 @@ import pytest
 PRE_OPERATIONAL, OPERATIONAL, STOPPED = 0x7F, 0x05, 0x04
 
 
-def nmt_state(master) -> int:
-    """As the next heartbeat tells it."""
-    master.node.dictionary[0x1017, 0].put(5)
-    (beat, *_) = [data for can_id, data in master.wait(0.0051) if can_id == 0x701]
-    return beat[0]
-
-
 def heartbeat(master, data: bytes = b"\x05") -> None:
     master.send(0x77F, data)
 
@@ -40,49 +33,9 @@ def test_the_sync_identifier_can_be_moved_but_it_produces_none(master):
     assert [can_id for can_id, _ in master.take()] == [0x181, 0x281]
 
 
-@pytest.mark.parametrize(("behaviour", "state"), [(0, PRE_OPERATIONAL), (1, OPERATIONAL), (2, STOPPED)])
-def test_a_lost_heartbeat_changes_the_nmt_state_by_1029(master, behaviour, state):
-    master.put(0x1016, 1, 0x7F0032, 4)
-    master.put(0x1029, 1, behaviour, 1)
-    master.nmt(1)
-    heartbeat(master)
-    master.wait(0.06)
-    assert master.emergencies() == [0x8130]
-    assert nmt_state(master) == state
-
-
-@pytest.mark.parametrize(
-    ("option", "state"), [(0, "enabled"), (1, "fault"), (2, "disabled"), (3, "quick stop")]
-)
-def test_a_dead_master_stops_the_axis_by_6007(master, motor, option, state):
-    """No SYNC, no heartbeat, nothing: the drive runs on its own clock and reacts."""
-    master.put(0x6007, 0, option, 2)
-    master.put(0x605A, 0, 6, 2)
-    master.put(0x1016, 1, 0x7F0032, 4)
-    master.enable_csp()
-    heartbeat(master)
-    master.cruise(40, 10)
-    master.wait(1.0)
-    assert 0x8130 in master.emergencies()
-    assert master.state == state
-    assert motor.velocity_counts_s == 0.0
-    assert motor.powered is (state in ("enabled", "quick stop"))
-
-
 @pytest.mark.parametrize("value", [0x80_7F0032, 0xFFFFFFFF])
 def test_a_consumer_entry_with_reserved_bits_is_refused(master, value):
     assert master.write(0x1016, 1, value, 4) == 0x06090030
-
-
-@pytest.mark.parametrize("command", [2, 128, 130])
-def test_losing_nmt_operational_stops_an_axis_that_lives_on_pdos(master, command):
-    master.enable_csp()
-    master.cruise(40, 5)
-    master.nmt(command)
-    master.wait(0.5)
-    master.nmt(128)
-    assert master.state == "fault"
-    assert master.read(0x603F) & 0xFFFF == 0x8100
 
 
 def test_pre_operational_leaves_a_profile_move_alone(master):
