@@ -71,6 +71,13 @@ LAG_NOISE_MS = 0.5
 REFINED = 0.05
 """Smallest share of the ripple, as the root of the difference of squares, that a refinement removes: half of
 `DIFFERENT`."""
+SHARE_NOISE = 0.02
+ERROR_CHANGE = 0.5
+"""Standard deviations of what is left and of the error without correction by another servo, as shares of the
+latter.
+"""
+FIRST_STEP = 0.5
+"""Share of the change of a filter that is made first."""
 MAX_RUNS = 12
 """Number of runs that are judged together, for each frequency: one alone shows a few frequencies."""
 REGULARISATION = 1e-3
@@ -365,12 +372,20 @@ class Answers:
     few fast ones show.
     """
 
-    def __init__(self, response: Response, orders: Sequence[MotorOrder], ratio: float) -> None:
+    def __init__(
+        self,
+        response: Response,
+        orders: Sequence[MotorOrder],
+        ratio: float,
+        earlier: Answers | None = None,
+    ) -> None:
+        """``earlier`` are those with another filter on the same servo."""
         self.lags_ms: deque[float] = deque(maxlen=MAX_RUNS)
         """Lag of the motor behind its set-points in the last runs."""
         self._response, self._orders, self._ratio = response, orders, ratio
         self._motor: dict[tuple[int, int], deque[Found]] = {}
         self._left: dict[tuple[int, int], deque[Left]] = {}
+        self._earlier = {} if earlier is None else earlier.by_frequency()
 
     def take(
         self,
@@ -427,23 +442,40 @@ class Answers:
             for place, group in self._left.items()
         }
 
+    def by_frequency(self) -> dict[int, _Seen]:
+        """Returns what is left, the orders of one frequency together."""
+        groups: dict[int, list[Left]] = {}
+        for (_, place), group in self._left.items():
+            groups.setdefault(place, []).extend(group)
+        found = {}
+        for place, lefts in groups.items():
+            hertz, shares, sizes = (np.array(each) for each in zip(*lefts, strict=True))
+            weight = sizes**2 / np.sum(sizes**2)
+            at_hz = float(weight @ hertz)
+            at = gain(self._response.filter, np.array([at_hz]), self._response.cycle_ms / 1000.0)[0]
+            found[place] = _Seen(at_hz, complex(weight @ shares), math.sqrt(np.mean(sizes**2)), complex(at))
+        return found
+
     def refined(
         self, committed: Response, limits: Limits, bound: float, *, retuned: bool = False
     ) -> Response | None:
         """Returns the response whose filter removes what is left of the load error; None if it would not.
 
-        The filter must change by the factor E / (E - rest), interpolated between the frequencies. Unless
-        the servo is known to have changed (``retuned``), the others must predict the factor at each frequency
-        in turn: what is left on an unchanged servo differs from one frequency to the next. ``bound`` limits
-        the deviation from the committed response, as a share.
+        The rest E - G F c is a straight line over the filter's gain F, which must change by E / (E - rest), a
+        factor that is interpolated between the frequencies. E is that of the calibration, and the step is
+        shorter, until runs with another filter show E with the present servo. Unless the servo is known to
+        have changed (``retuned``), the others must predict the factor at each frequency in turn: what is left
+        on an unchanged servo differs from one frequency to the next. ``bound`` limits the deviation from the
+        committed response, as a share.
         """
-        by_place: dict[int, list[Left]] = {}
-        for (_, place), group in self._left.items():
-            by_place.setdefault(place, []).extend(group)
-        if len(by_place) < 2:
+        seen = self.by_frequency()
+        if len(seen) < 2:
             return None
-        hertz, shares, sizes = _columns_of([_mean_left(by_place[at]) for at in sorted(by_place)])
-        factors = 1.0 + _bounded(1.0 / (1.0 - shares) - 1.0, bound)
+        places = sorted(seen)
+        hertz, shares, sizes, _ = (np.array(each) for each in zip(*(seen[at] for at in places), strict=True))
+        error = np.array([_error(seen[at], self._earlier.get(at)) for at in places])
+        certain = np.array([1.0 if at in self._earlier else FIRST_STEP for at in places])
+        factors = 1.0 + certain * _bounded(error / (error - shares) - 1.0, bound)
         stored = self._response
         points_hz, lag_s = np.array(stored.frequency_hz), median(self.lags_ms) / 1000.0
         first, now = (_points(each) for each in (committed, stored))
@@ -451,7 +483,7 @@ class Answers:
         others = [np.delete(np.arange(len(hertz)), at) for at in range(len(hertz))]
         predicted = [_between(at, hertz[each], factors[each]) for at, each in zip(hertz, others, strict=True)]
         for applied in (_between(hertz, points_hz, now / new), *([] if retuned else [np.array(predicted)])):
-            less = abs(shares) ** 2 - abs(1.0 - (1.0 - shares) * applied) ** 2
+            less = abs(shares) ** 2 - abs(error - (error - shares) * applied) ** 2
             if sizes**2 @ less < REFINED**2 * np.sum(sizes**2):
                 return None
         values = new * np.exp(-2j * math.pi * points_hz * lag_s)
@@ -464,15 +496,26 @@ class Answers:
         return stored.model_copy(update={"following_lag_ms": lag_ms, "filter": lead, **_columns("", values)})
 
 
-def _columns_of(group: Sequence[Left]) -> tuple[FloatArray, ComplexArray, FloatArray]:
-    hertz, shares, sizes = zip(*group, strict=True)
-    return np.array(hertz), np.array(shares, dtype=complex), np.array(sizes)
+class _Seen(NamedTuple):
+    """Mean of what is left at one frequency, with the gain of the filter there."""
+
+    frequency_hz: float
+    share: complex
+    size_arcsec: float
+    gain: complex
 
 
-def _mean_left(group: Sequence[Left]) -> Left:
-    hertz, shares, sizes = _columns_of(group)
-    weight = sizes**2 / np.sum(sizes**2)
-    return Left(float(weight @ hertz), complex(weight @ shares), float(np.sqrt(np.mean(sizes**2))))
+def _error(now: _Seen, earlier: _Seen | None) -> complex:
+    """Returns the error without correction, relative to that of the calibration, at one frequency.
+
+    The rest is a straight line over the gain of the filter. Two points of it are weighed against the
+    calibration, by the noise of a share and the change of the error by another servo.
+    """
+    if earlier is None:
+        return 1.0
+    rows = np.array([[1.0, now.gain], [1.0, earlier.gain], [SHARE_NOISE / ERROR_CHANGE, 0.0]])
+    wanted = np.array([now.share, earlier.share, SHARE_NOISE / ERROR_CHANGE])
+    return complex(np.linalg.lstsq(rows, wanted, rcond=None)[0][0])
 
 
 def _bounded(change: ComplexArray, bound: float) -> ComplexArray:

@@ -65,7 +65,7 @@ def without_load_encoder(folder: Path) -> Path:
 
 @cache
 def measured_response(profile: Path) -> Response:
-    """Measures the response of a raised profile's axis on a bench, with a single trial of its filter."""
+    """Measures the response of a raised profile's axis on a bench, as the motion test does."""
     axis = AxisConfig.load(profile)
     model = TransmissionModel.load(profile / "model.yaml")
     orders = motor_orders(model)
@@ -81,12 +81,11 @@ def measured_response(profile: Path) -> Response:
             outcome = Bench(drive, used).run(RUNS).outcome
             return tuple(harmonics(each, numbers, model.ratio) for each in outcome)
 
-        none, static = runs(None), Trial(runs(model))
-        first = response_of(none, [static], orders, model.ratio, cycle_s, limits)
-        assert first is not None
-        trials = [static, Trial(runs(replace(model, response=first)), first.filter)]
-        response = response_of(none, trials, orders, model.ratio, cycle_s, limits)
-        assert response is not None
+        none, trials = runs(None), [Trial(runs(model))]
+        for explore in (True, False, False):
+            response = response_of(none, trials, orders, model.ratio, cycle_s, limits, explore=explore)
+            assert response is not None
+            trials.append(Trial(runs(replace(model, response=response)), response.filter))
     return response
 
 

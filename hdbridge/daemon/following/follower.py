@@ -173,9 +173,10 @@ class Follower:
             self._servo.forget_load()
         if not adaptation.may_refine:
             return None
-        if self._servo.worse:
-            return adaptation.withdraw()
         refined = self._servo.refined(self._settings.bound_share)
+        # The first step assumes the load of the calibration, the second knows what the first has done.
+        if self._servo.worse and (refined is None or self._servo.refinements > 1):
+            return adaptation.withdraw()
         return None if refined is None else adaptation.refine(refined)
 
     def state(self) -> messages.AdaptationState:

@@ -47,15 +47,17 @@ class ServoWatch:
     def __init__(self, axis: AxisConfig, model: TransmissionModel) -> None:
         self.retuned = False
         """True while the servo does not answer as when the response was measured."""
+        self.refinements = 0
+        """Number of responses that have replaced the committed one, one after the other."""
         self._ratio, self._period_s = model.ratio, axis.drive.cycle_s
         self._orders = motor_orders(model)
         self._limits = Limits.of(axis, model)
         self._committed = model.response
         self._use(model.response)
 
-    def _use(self, response: Response | None) -> None:
+    def _use(self, response: Response | None, earlier: Answers | None = None) -> None:
         self._response = response
-        self._answers = None if response is None else Answers(response, self._orders, self._ratio)
+        self._answers = None if response is None else Answers(response, self._orders, self._ratio, earlier)
         self._before_arcsec2: dict[tuple[int, int], float] = {}
         """What the committed response left of each order at each frequency."""
         self._run: list[NDArray[Any]] = []
@@ -68,8 +70,9 @@ class ServoWatch:
         if response != self._response:
             before = self._before_arcsec2
             if self._answers is not None and self._response == self._committed:
-                before = self._answers.left_arcsec2()
-            self._use(response)
+                before, self.refinements = self._answers.left_arcsec2(), 0
+            self.refinements += 1
+            self._use(response, self._answers)
             self._before_arcsec2 = before
 
     def forget_load(self) -> None:
@@ -95,7 +98,8 @@ class ServoWatch:
         """
         if self._answers is None or self._committed is None or len(self._answers.lags_ms) < MIN_RUNS:
             return None
-        return self._answers.refined(self._committed, self._limits, bound, retuned=self.retuned)
+        changed = self.retuned or self._response != self._committed
+        return self._answers.refined(self._committed, self._limits, bound, retuned=changed)
 
     def take(self, axis: NDArray[Any], *, joined: bool) -> str | None:
         """Takes the next samples of the axis; returns the evidence if the judgement changes.

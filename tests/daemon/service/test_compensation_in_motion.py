@@ -96,7 +96,7 @@ def test_the_ripple_of_a_retuned_servo_comes_back(profile: Path, tmp_path: Path)
             bridge.core.observer.add(following)
             await axis.move(token, -FAR_DEG)
             before = await ripple(service, bridge, token, goto)
-            for speed in (60.0, 45.0, 60.0):
+            for speed in (60.0, 45.0) * 2:
                 for target in (0.0, FAR_DEG):
                     bridge.lease.renew(token)
                     await axis.move(token, target, speed)
@@ -114,4 +114,4 @@ def test_the_ripple_of_a_retuned_servo_comes_back(profile: Path, tmp_path: Path)
     with stepped_service(tmp_path, profile=profile, truth=path) as service:
         before, after = play(story(service))
     assert before > 2.0
-    assert after < 1.4  # 1.3 with the servo of the calibration
+    assert after < 1.6  # 1.3 with the servo of the calibration, 19 without correction
