@@ -92,7 +92,7 @@ def info(
     missing = int(np.sum(steps[steps > 1] - 1))
 
     def outer_of(axis: str) -> dict[str, Any] | None:
-        """What the other master of a gateway asked for and saw."""
+        """Returns the connection of another master to an axis of a gateway; None without one."""
         rows = found.axes[axis]
         asked = ~np.isnan(rows["outer_target_deg"])
         if not asked.any():

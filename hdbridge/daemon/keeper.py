@@ -403,6 +403,7 @@ class Keeper:
         assert status is not None
         self._forget(child)
         self._control = None
+        self._memory.status.set(Cell.LOOP_PID, 0)
         if self._stopping_since_s is not None:
             self._status = self._status or max(status, 0)
             return

@@ -97,11 +97,12 @@ def layouts(axis: AxisConfig, od: ObjectDictionary | None = None) -> Layouts:
     Raises `InputError` with the line of the axis file if the drive cannot send or receive a needed object.
     """
     od = dictionary_of(axis) if od is None else od
+    offers = list(_offers(od, objects.TPDO_COMMUNICATION, objects.TPDO_MAPPING))
+    receivers = list(_offers(od, objects.RPDO_COMMUNICATION, objects.RPDO_MAPPING))
     if od is not None:
-        _check_needed(axis, od)
+        _check_needed(axis, od, offers, receivers)
     node_id, source = axis.drive.node_id, axis.load_encoder.source
     load = PdoEntry(source.index, source.subindex, IntegerType.named(source.type))
-    offers = list(_offers(od, objects.TPDO_COMMUNICATION, objects.TPDO_MAPPING))
     senders = [each for each in offers if each.every is None or 1 <= each.every <= _LAST_SYNCHRONOUS]
     needed = [_entry(od, objects.STATUSWORD), _entry(od, objects.POSITION_ACTUAL)]
     needed += [load] if source.node is None else []
@@ -126,7 +127,7 @@ def layouts(axis: AxisConfig, od: ObjectDictionary | None = None) -> Layouts:
     if source.node is not None:
         cyclic.append(Layout(source.node, 1, objects.COB_TPDO1 + source.node, PdoCodec([load])))
     absent = tuple(each for each in OPTIONAL if (each.index, each.sub) not in carried)
-    return Layouts(tuple(cyclic), tuple(channels), _receiving(axis, od), absent)
+    return Layouts(tuple(cyclic), tuple(channels), _receiving(axis, od, receivers), absent)
 
 
 def _channel_layouts(
@@ -154,9 +155,8 @@ def _channel_layouts(
     return found
 
 
-def _receiving(axis: AxisConfig, od: ObjectDictionary | None) -> tuple[Layout, ...]:
+def _receiving(axis: AxisConfig, od: ObjectDictionary | None, offers: Sequence[_Offer]) -> tuple[Layout, ...]:
     needs = [_entry(od, objects.CONTROLWORD), _entry(od, cyclic_mode(axis).target)]
-    offers = list(_offers(od, objects.RPDO_COMMUNICATION, objects.RPDO_MAPPING))
     chosen = _assign(needs, offers, None)
     if chosen is None:
         raise InputError(
@@ -176,7 +176,9 @@ def _offers(od: ObjectDictionary | None, communication: int, mapping: int) -> It
         for number in range(1, _PREDEFINED + 1):
             yield _Offer(number, _STANDARD_ENTRIES, None, None, None)
         return
-    for place in range(PDOS_PER_KIND):
+    for place in (index - communication for index in od):
+        if not 0 <= place < PDOS_PER_KIND:
+            continue
         cob_id, count = find(od, communication + place, 1), find(od, mapping + place, 0)
         if cob_id is None or count is None:
             continue
@@ -317,7 +319,9 @@ def _laid_out(node_id: int, first: int, chosen: _Choice, taken: set[int], every:
 # -- checks against the EDS -------------------------------------------------------------------------------
 
 
-def _check_needed(axis: AxisConfig, od: ObjectDictionary) -> None:
+def _check_needed(
+    axis: AxisConfig, od: ObjectDictionary, senders: Sequence[_Offer], receivers: Sequence[_Offer]
+) -> None:
     """Raises `InputError` if the EDS lacks a needed object or contradicts a source in the axis file."""
     target = cyclic_mode(axis).target
     needed = (*objects.REQUIRED, target)
@@ -329,8 +333,6 @@ def _check_needed(axis: AxisConfig, od: ObjectDictionary) -> None:
             f"{where}: {eds} lacks {named}, which hdbridge requires; expected the EDS file of this "
             "drive, with all of its objects"
         )
-    senders = list(_offers(od, objects.TPDO_COMMUNICATION, objects.TPDO_MAPPING))
-    receivers = list(_offers(od, objects.RPDO_COMMUNICATION, objects.RPDO_MAPPING))
     for address, offers in (
         (objects.STATUSWORD, senders),
         (objects.POSITION_ACTUAL, senders),

@@ -186,7 +186,7 @@ class CycleState(Report):
     period_s: float = Field(gt=0, examples=[0.004])
     cycle: int = Field(description="number of the newest cycle")
     alive: bool = Field(description="whether the loop turned lately")
-    pid: int = Field(0, ge=0, description="process id of the control loop")
+    pid: int = Field(0, ge=0, description="process id of the control process; 0 if there is none")
     skipped: int = Field(0, ge=0, description="periods left out because the loop was late")
     late_us: float | None = Field(None, description="how late the newest cycle began")
     busy_us: float | None = Field(None, description="how long the newest cycle took")

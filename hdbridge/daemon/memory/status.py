@@ -53,7 +53,7 @@ class Status:
 
     @property
     def loop_pid(self) -> int:
-        """Process id of the control process; it changes when the process is restarted."""
+        """Process id of the control process; 0 if there is none."""
         return int(self._cells[Cell.LOOP_PID * _STRIDE])
 
     @property

@@ -180,7 +180,7 @@ class ServiceBridge:
             elif event.kind is EventKind.BUS_UP:
                 self._bus_up = True
         pid = self.core.memory.status.loop_pid
-        if pid != self._loop_pid:
+        if pid and pid != self._loop_pid:
             if self._loop_pid:
                 self.core.log.note("the control process was started again: every axis is disabled")
                 self._bus_up = True

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import asyncio
 import copy
-from collections.abc import Iterator
-from contextlib import AsyncExitStack
+from collections.abc import Iterable, Iterator
+from contextlib import AsyncExitStack, suppress
+from itertools import combinations
+from math import comb
 from pathlib import Path
 from typing import Any
 
@@ -93,7 +95,7 @@ def test_these_are_all_calls_that_there_are() -> None:
         assert set(calls) == {name for name in vars(kind) if not name.startswith("_")}
 
 
-def files(folder: Path) -> tuple[dict[str, Any], dict[str, Any]]:
+def files(folder: Path) -> tuple[Any, Any]:
     """An axis file and a machine file with every optional key."""
     profile = article_profiles(folder, 2)[0]
     path = profile.axis
@@ -112,12 +114,14 @@ def keys(data: Any, at: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
         yield from keys(value, (*at, key))
 
 
-def without(data: Any, place: tuple[Any, ...]) -> Any:
-    """The same file with this key left out."""
-    left = at = copy.deepcopy(data)
-    for each in place[:-1]:
-        at = at[each]
-    del at[place[-1]]
+def without(data: Any, places: Iterable[tuple[Any, ...]]) -> Any:
+    """The same file with these keys left out, a section before its keys."""
+    left = copy.deepcopy(data)
+    for place in places:
+        at: Any = left
+        for each in place[:-1]:
+            at = at.get(each, {}) if isinstance(at, dict) else at[each]
+        at.pop(place[-1], None)
     return left
 
 
@@ -179,24 +183,31 @@ def call_everything(machine: Machine, folder: Path) -> list[str]:
 
 
 def test_every_optional_key_may_be_left_out(tmp_path: Path) -> None:
-    axis, machine = files(tmp_path)
-    complete = machine_of(tmp_path, axis, machine)
-    tried = {content(complete)}
-    complaints = {"nothing": call_everything(complete, tmp_path)}
-    for number, file in enumerate((axis, machine)):
+    """Together with others: of each two keys, each is left out once where the other is there."""
+    whole = files(tmp_path)
+    tried = {content(machine_of(tmp_path, *whole))}
+    optional = []
+    for number, file in enumerate(whole):
         for place in keys(file):
-            left = [axis, machine]
-            left[number] = without(file, place)
-            try:
-                one = machine_of(tmp_path, *left)
-            except InputError:
-                continue  # a required key
-            if content(one) in tried:
-                continue  # the same machine: the key was at its default
-            tried.add(content(one))
-            complaints[".".join(map(str, place))] = call_everything(one, tmp_path)
-    assert {name: said for name, said in complaints.items() if said} == {}
-    assert len(complaints) > 12
+            left = [*whole]
+            left[number] = without(file, [place])
+            with suppress(InputError):  # a required key
+                one = content(machine_of(tmp_path, *left))
+                if one not in tried:  # else the key was at its default
+                    tried.add(one)
+                    optional.append((number, place))
+    assert len(optional) > 12
+    runs = next(count for count in range(99) if comb(count, count // 2) >= len(optional))
+    missing: list[list[tuple[int, tuple[Any, ...]]]] = [[] for _ in range(runs)]
+    for key, chosen in zip(optional, combinations(missing, runs // 2), strict=False):
+        for each in chosen:
+            each.append(key)
+    complaints = {}
+    for each in ([], *missing):
+        left = [without(file, [p for n, p in each if n == number]) for number, file in enumerate(whole)]
+        complaints[str(each)] = call_everything(machine_of(tmp_path, *left), tmp_path)
+    assert {without: said for without, said in complaints.items() if said} == {}
+    assert len(complaints) == 1 + runs
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf")])

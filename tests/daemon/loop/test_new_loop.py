@@ -35,9 +35,9 @@ def places(daemon: SteppedDaemon) -> list[int]:
 
 
 def stays_without_power(daemon: SteppedDaemon, counts: list[PowerCount]) -> None:
-    daemon.run(1.5)
+    daemon.run(0.8)
     before = places(daemon)
-    daemon.run(1.0)
+    daemon.run(0.4)
     assert [each.times for each in counts] == [0, 0], "power without a request"
     assert all(abs(now - then) <= 2 for now, then in zip(places(daemon), before, strict=True))
 

@@ -95,7 +95,7 @@ def test_a_motor_that_does_not_follow(bench: DaemonBench) -> None:
     assert stop is not None
     assert stop.fault is Fault.FOLLOWING_ERROR
     assert axis.state is S.QUICK_STOPPED
-    bench.stays_stopped(0)
+    bench.stay_stopped(0)
     assert bench.moves_on(1)
     further("the motor does not follow").show(beyond)
 
@@ -131,7 +131,7 @@ def test_the_service_verifies_a_bus_that_comes_back(bench: DaemonBench) -> None:
     while not daemon.told(E.BUS_UP):
         daemon.turn()
         turns += 1
-    bench.stays_stopped(0)
+    bench.stay_stopped(0)
     bench.leads_back()  # the service verifies, and it stays disabled until it is enabled
     further("the interface comes back").show(turns)
 
@@ -150,7 +150,7 @@ def test_a_step_beyond_the_limits_is_not_sent(moving: DaemonBench) -> None:
     turns = turns_until(moving, S.QUICK_STOPPED)
     assert axis.supervision.stop is not None
     assert axis.supervision.stop.fault is Fault.BAD_TARGET
-    moving.stays_stopped(0)
+    moving.stay_stopped(0)
     assert all(abs(each - wrong) > 5_000 for each in sent)
     assert moving.moves_on(1)
     further("a model asks for a step beyond the limits of speed and slew").show(turns)
