@@ -66,8 +66,7 @@ def simulate(
     from hdbridge.cli.interrupt import deferred_interrupt
     from hdbridge.clock import MonotonicClock
     from hdbridge.daemon.gateway.ideal import IdealAxis
-    from hdbridge.daemon.gateway.objects import eds as text_of
-    from hdbridge.daemon.gateway.objects import nameplate
+    from hdbridge.daemon.gateway.objects import nameplate, write_eds
     from hdbridge.daemon.gateway.slave import BEHAVIOUR
     from hdbridge.device.node import DriveNode
     from hdbridge.device.run import run
@@ -81,8 +80,7 @@ def simulate(
         open_bus(settings.bus, shared=True) as bus,
         TemporaryDirectory(prefix="hdbridge-gateway-") as folder,
     ):
-        path = Path(folder) / "gateway.eds"
-        path.write_text(text_of(config, settings), encoding="utf-8")
+        path = write_eds(Path(folder), config, settings)
         rate_bps = settings.bus.bitrate_bps
         node = DriveNode(bus, IdealAxis(scale), path, node_id, clock, plate, BEHAVIOUR, bit_rate_bps=rate_bps)
         notes.print(f"ideal drive: node {node_id} on {bus.channel_info}; Ctrl-C ends it")
@@ -148,13 +146,11 @@ def doctor(
 
 def eds_of(axis: AxisConfig, settings: GatewaySettings) -> ObjectDictionary:
     """The object dictionary of a gateway axis, read from its EDS as another master does."""
-    from hdbridge.daemon.gateway.objects import eds as text_of
+    from hdbridge.daemon.gateway.objects import write_eds
     from hdbridge.files.edsfile import read_eds
 
     with TemporaryDirectory(prefix="hdbridge-gateway-") as folder:
-        path = Path(folder) / "gateway.eds"
-        path.write_text(text_of(axis, settings), encoding="utf-8")
-        return read_eds(path, settings.nodes[axis.name]).dictionary
+        return read_eds(write_eds(Path(folder), axis, settings), settings.nodes[axis.name]).dictionary
 
 
 def _heard(settings: GatewaySettings, duration_s: float) -> Iterator[Frame]:

@@ -155,7 +155,7 @@ class ProfilePosition(Mode):
         target = motion.dictionary.value(0x607A)
         if relative:  # CiA 402: to the preceding set-point, not to the actual position
             before = self._goal if self._waiting is None else self._waiting
-            target = wrap_int32(motion.user(before) + target)
+            target += wrap_int32(motion.user(before))
         motion.limited = False
         return motion.goal(target)
 

@@ -90,28 +90,30 @@ class Motion:
         return self.sign * round(counts) + self.home_counts
 
     def goal(self, target: int) -> float:
-        """Converts a user's int32 target to the plant position nearest to the demand, within the limits.
+        """Converts a user's int32 target to a plant position within the limits.
 
+        Without limits positions wrap around, and the one nearest to the demand is meant.
         An axis that already is beyond a software limit may stay where it is and come back; it is not
         dragged inside.
         """
         sign = self.sign
         here = sign * round(self.demand_counts) + self.home_counts
-        distance = ((target - here + _HALF) & _MASK) - _HALF
-        if self._has_limits:
-            low, high = self._low, self._high
+        if self._has_limits:  # then positions do not wrap around
             here32 = ((here + _HALF) & _MASK) - _HALF
-            reach = here32 + distance
-            if not low <= reach <= high:
-                allowed = min(max(reach, min(low, here32)), max(high, here32))
-                if allowed != reach:
-                    self.limited = True
-                    distance = allowed - here32
+            low, high = self._low, self._high
+            if not low <= target <= high:
+                allowed = min(max(target, min(low, here32)), max(high, here32))
+                self.limited |= allowed != target
+                target = allowed
+            distance = target - here32
+        else:
+            distance = ((target - here + _HALF) & _MASK) - _HALF
         return sign * (here + distance - self.home_counts)
 
     def unlimited(self, target: int) -> float:
         """Converts a user's int32 target to the plant position nearest to the demand, whatever the limits."""
-        return self.demand_counts + self.sign * wrap_int32(target - self.demand_position())
+        distance = target - self.demand_position()
+        return self.demand_counts + self.sign * (distance if self._has_limits else wrap_int32(distance))
 
     def actual_position(self) -> int:
         """Returns object 6064h."""

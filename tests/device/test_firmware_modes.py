@@ -108,14 +108,17 @@ def test_csp_adds_the_position_offset(master):
     assert row[1] == 107
 
 
-@pytest.mark.parametrize("target", [150, -150])
-def test_targets_stay_within_the_software_limits(master, target):
+@pytest.mark.parametrize("target", [150, -150, 2**31 - 1, -(2**31)])
+@pytest.mark.parametrize("start", [90, -90])
+def test_targets_stay_within_the_software_limits(master, start, target):
     master.put(0x607D, 1, -100, 4)
     master.put(0x607D, 2, 100, 4)
     master.enable_csp()
     for _ in range(4):
+        master.cycle(0x0F, start)
+    for _ in range(4):
         row = master.cycle(0x0F, target)
-    assert abs(row[1]) == 100
+    assert row[1] == (100 if target > 0 else -100)  # however far away, it is on that side
     assert row[0] & LIMIT
     for _ in range(3):
         row = master.cycle(0x0F, 0)
@@ -318,3 +321,16 @@ def test_the_units_are_counts(master):
     assert (resolution, gear, feed) == (8000, 50, 400_000)
     assert master.read(0x60E6, 1) == 2_880_000
     assert struct.pack("<i", master.read(0x6502)) == b"\xe1\0\0\0"
+
+
+@pytest.mark.parametrize("way", [2**31 - 1, -(2**31)])
+@pytest.mark.parametrize("start", [90, -90])
+def test_a_relative_move_ends_at_the_limit_on_its_side(master, start, way):
+    master.put(0x607D, 1, -100, 4)
+    master.put(0x607D, 2, 100, 4)
+    master.enable(1)
+    set_point(master, start)
+    master.wait(2.0)
+    set_point(master, way, 0x40)
+    master.wait(2.0)
+    assert master.read(0x6064) == (100 if way > 0 else -100)

@@ -12,7 +12,7 @@ from canopen.profiles.p402 import BaseNode402
 from support import patience
 from support.running import running
 
-from hdbridge.daemon.gateway.objects import eds
+from hdbridge.daemon.gateway.objects import write_eds
 from hdbridge.daemon.machine import Machine
 
 MACHINE = """
@@ -44,7 +44,7 @@ def test_a_foreign_master_moves_the_axis_and_a_dead_gateway_does_not(tmp_path: P
     machine = Machine.load(path)
     gateway = machine.gateway
     assert gateway is not None
-    (tmp_path / "bridge.eds").write_text(eds(machine.axes[0].config, gateway), encoding="utf-8")
+    path_of_eds = write_eds(tmp_path, machine.axes[0].config, gateway)
     with running(tmp_path, path, "--simulate", name="between") as daemon:
         daemon.until_told("READY=1")
         daemon.until_axis("disabled")
@@ -52,7 +52,7 @@ def test_a_foreign_master_moves_the_axis_and_a_dead_gateway_does_not(tmp_path: P
         options = {"port": gateway.bus.options["port"]}
         network.connect(interface="udp_multicast", channel=gateway.bus.channel, **options)
         try:
-            node = Patient(5, str(tmp_path / "bridge.eds"))
+            node = Patient(5, str(path_of_eds))
             node.sdo.RESPONSE_TIMEOUT = 30.0
             network.add_node(node)
             node.nmt.state = "PRE-OPERATIONAL"

@@ -19,7 +19,7 @@ import canopen
 import pytest
 
 from hdbridge.axis import AxisConfig
-from hdbridge.daemon.gateway.objects import eds
+from hdbridge.daemon.gateway.objects import write_eds
 from hdbridge.daemon.machine import Machine
 from hdbridge.drive.states import State, decode
 from tests.socketcan.conftest import CHANNEL, unhurried_profile
@@ -76,8 +76,7 @@ class Plc(threading.Thread):
 def master(folder: Path, machine: Machine) -> Iterator[Plc]:
     """Maps its PDOs by python-canopen, then cycles."""
     assert machine.gateway is not None
-    path = folder / "bridge.eds"
-    path.write_text(eds(machine.axes[0].config, machine.gateway), encoding="utf-8")
+    path = write_eds(folder, machine.axes[0].config, machine.gateway)
     network = canopen.Network()
     network.connect(interface="socketcan", channel=CHANNEL)
     node = network.add_node(5, str(path))

@@ -10,7 +10,7 @@ from typing import Any
 from hdbridge.axis import AxisConfig, BusConfig
 from hdbridge.conformance import NodeTester
 from hdbridge.daemon.gateway.ideal import IdealAxis
-from hdbridge.daemon.gateway.objects import eds, nameplate
+from hdbridge.daemon.gateway.objects import nameplate, write_eds
 from hdbridge.daemon.gateway.slave import BEHAVIOUR
 from hdbridge.daemon.machinefile import GatewaySettings
 from hdbridge.device.node import DriveNode
@@ -38,8 +38,7 @@ def gateway_bus(folder: Path) -> Iterator[tuple[LockstepBus, VirtualClock, Drive
     """The slave of a gateway in front of an ideal axis, with the master's end of its bus."""
     axis = AxisConfig.load(ROOT / "profiles" / "article" / "axis.yaml")
     settings = GatewaySettings(bus=BusConfig(interface="virtual", channel="outer"), nodes={axis.name: 5})
-    path = folder / "gateway.eds"
-    path.write_text(eds(axis, settings), encoding="utf-8")
+    path = write_eds(folder, axis, settings)
     plate, plant = nameplate(axis, settings), IdealAxis(axis.gear.ratio)
     plant.motor_counts = 1_000_000
     with lockstep_bench(plant, path, 5, nameplate=plate, behaviour=BEHAVIOUR) as bench:
@@ -50,4 +49,4 @@ def gateway_bus(folder: Path) -> Iterator[tuple[LockstepBus, VirtualClock, Drive
 def gateway_slave(folder: Path) -> Iterator[tuple[NodeTester, DriveNode]]:
     """The same, with a tester on its bus."""
     with gateway_bus(folder) as (bus, clock, node):
-        yield NodeTester(Link(bus, clock), 5, od=shared_eds(folder / "gateway.eds", 5).dictionary), node
+        yield NodeTester(Link(bus, clock), 5, od=shared_eds(folder / "article.eds", 5).dictionary), node

@@ -117,6 +117,10 @@ async def happen(bench: GatewayBench, laws: Laws, kind: str, value) -> None:
     if kind == "word":
         plc.controlword = value
     elif kind == "walk":
+        plc.controlword = 0
+        plc.send(0, bytes((128, NODE)))
+        laws.disturbed_s = bench.now_s
+        await bench.configure()  # a reset has removed it
         for word, wait_s in ((0x00, 0.1), (0x80, 1.5), (0x06, 0.05), (0x07, 0.05), (0x0F, 0.2)):
             plc.controlword = word
             plc.target = plc.position

@@ -16,7 +16,6 @@ import can
 from can.interfaces.virtual import VirtualBus
 
 from hdbridge.axis import BusConfig
-from hdbridge.daemon.gateway.objects import eds
 from hdbridge.daemon.gateway.slave import Gateway
 from hdbridge.daemon.machinefile import GatewaySettings
 from hdbridge.device.run import LONGEST_WAIT_S, Server
@@ -272,15 +271,10 @@ def gateway_bench(
         service.machine = replace(service.machine, gateway=settings)
         configs = [axis.config for axis in service.machine.axes]
 
-        def eds_of(axis: Any) -> Path:
-            path = folder / f"{axis.name}.eds"
-            path.write_text(eds(axis, settings))
-            return path
-
         outer = stack.enter_context(OuterBus(channel))
 
         def gateway() -> Gateway:
-            return Gateway(outer, configs, settings, service.daemon.memory, clock, eds_of)
+            return Gateway(outer, configs, settings, service.daemon.memory, clock, folder)
 
         plcs = [Plc(channel, clock, period_s, drift_ppm, node, syncs=node == NODE) for node in nodes.values()]
         for plc in plcs:

@@ -6,6 +6,7 @@ import io
 import math
 from collections.abc import Mapping
 from configparser import RawConfigParser
+from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from hdbridge.device.dictionary import BUNDLED
@@ -144,6 +145,13 @@ def eds(axis: AxisConfig, settings: GatewaySettings) -> str:
     text = io.StringIO()
     made.write(text, space_around_delimiters=False)
     return text.getvalue().rstrip() + "\n"
+
+
+def write_eds(folder: Path, axis: AxisConfig, settings: GatewaySettings) -> Path:
+    """Writes the EDS of a gateway axis into a folder; returns its path."""
+    path = folder / f"{axis.name}.eds"
+    path.write_text(eds(axis, settings), encoding="utf-8")
+    return path
 
 
 def _add_bridge(made: RawConfigParser) -> None:

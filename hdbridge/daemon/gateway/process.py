@@ -16,7 +16,6 @@ from types import FrameType
 from typing import TYPE_CHECKING, Final
 
 from hdbridge.clock import Clock, MonotonicClock
-from hdbridge.daemon.gateway.objects import eds
 from hdbridge.daemon.gateway.slave import Gateway
 from hdbridge.daemon.logs import begin_log
 from hdbridge.daemon.memory import Cell, Memory
@@ -87,11 +86,6 @@ def serve(start: Start) -> None:
         TemporaryDirectory(prefix="hdbridge-gateway-") as folder,
     ):
 
-        def eds_of(axis: AxisConfig) -> Path:
-            path = Path(folder) / f"{axis.name}.eds"
-            path.write_text(eds(axis, settings), encoding="utf-8")
-            return path
-
         def store_of(axis: AxisConfig) -> Path | None:
             try:
                 return (
@@ -103,7 +97,7 @@ def serve(start: Start) -> None:
         simulation = start.simulation
         clock: Clock = MonotonicClock() if simulation is None else SimulatedClock(memory, simulation.speed)
         gateway = Gateway(
-            bus, [axis.config for axis in machine.axes], settings, memory, clock, eds_of, store_of
+            bus, [axis.config for axis in machine.axes], settings, memory, clock, Path(folder), store_of
         )
         status = memory.status
         status.set(Cell.GATEWAY_PID, os.getpid())

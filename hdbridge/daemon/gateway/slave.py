@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Final
 import can
 
 from hdbridge.clock import Clock
-from hdbridge.daemon.gateway.objects import BRIDGE, nameplate
+from hdbridge.daemon.gateway.objects import BRIDGE, nameplate, write_eds
 from hdbridge.daemon.loop.faultlog import FAULT_INDEX
 from hdbridge.daemon.loop.states import AxisState
 from hdbridge.daemon.memory import NO_FAULT, Memory, OuterCell, OuterKnot, OuterView, SampleArray, SampleFlag
@@ -273,10 +273,10 @@ class Gateway:
         settings: GatewaySettings,
         memory: Memory,
         clock: Clock,
-        eds_of: Callable[[AxisConfig], Path],
+        folder: Path,
         store_of: Callable[[AxisConfig], Path | None] = lambda _: None,
     ) -> None:
-        """``eds_of`` returns the file with the EDS of an axis, ``store_of`` that of its stored parameters.
+        """``folder`` takes the EDS of each axis, ``store_of`` returns the file of its stored parameters.
 
         ``clock`` is the loop's.
         """
@@ -294,7 +294,7 @@ class Gateway:
             node = DriveNode(
                 bus,
                 load,
-                eds_of(axis),
+                write_eds(folder, axis, settings),
                 node_id,
                 clock,
                 nameplate(axis, settings),
