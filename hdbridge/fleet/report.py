@@ -91,8 +91,8 @@ def _sections(summary: Summary, joint: Joint) -> Iterator[Section]:
         "Look at first",
         text,
         ["joint", "cause", Heading("to the limit", "h"), Heading("peak"),
-         Heading("growth", "arcsec per 1000 h"), Heading("probability", ""), "named in", "what else changed",
-         "data"],
+         Heading("growth", "arcsec per 1000 h"), Heading("probability", ""), "named in", "data",
+         "also changed"],
         [_candidate(each, joint) for each in summary.first],
     ) if summary.first else [Section("Look at first", f"{text}\n\nThere is none.")]  # fmt: skip
     for attribute, causes in summary.prevalence.items():
@@ -182,8 +182,8 @@ def _candidate(each: Candidate, joint: Joint) -> list[Cell]:
         growth,
         f"{each.probability:.2f}" if each.probability < 0.995 else "above 0.99",
         f"{each.named} of {each.recordings}",
-        "; ".join(map(_words, each.what_changed)),
         f"{remarks} remark{'s' * (remarks != 1)}" if remarks else "good",
+        "; ".join(map(_words, each.what_changed)),
     ]
 
 

@@ -56,6 +56,9 @@ class Joint:
     arcsec_per_1000_hours: float = 0.0
     """Growth rate of the cause's peak, which is zero at 0 hours."""
     odd: bool = False
+    swapped_with: str | None = None
+    """Joint under whose name its recordings are filed from number ``swapped_at`` on."""
+    swapped_at: int | None = None
     turned_at: int | None = None
     """Number of the first recording after an exchange of the motor encoder."""
     turned_deg: float = 0.0
@@ -119,9 +122,9 @@ def simulate(
 ) -> None:
     """Writes recordings, `manifest.csv` and `answers.json` to a new folder.
 
-    One file in a hundred is damaged, and one in fifty is duplicated; there is at least one of each. Two
-    joints are exchanged for each other, and one has its motor encoder replaced. InputError for fewer than 4
-    joints or 3 recordings, and for a folder that is not empty.
+    One file in a hundred is damaged, and one in fifty is duplicated. In a hundred joints, two are exchanged
+    for each other, and one has its motor encoder replaced. There is at least one of each. InputError for
+    fewer than 4 joints or 3 recordings, and for a folder that is not empty.
     """
     if joints < 4 or recordings < 3:
         raise InputError(
@@ -136,31 +139,29 @@ def simulate(
     healthy = [each for each in fleet if each.cause is None]
     for each in fleet if len(healthy) < 3 else ():
         each.cause, each.arcsec_per_1000_hours = None, 0.0
-    healthy = rng.sample([each for each in fleet if each.cause is None], 3)
-    swapped, turned = healthy[:2], healthy[2]
-    swapped_at = rng.randrange(1, recordings)
-    turned.turned_at, turned.turned_deg = rng.randrange(1, recordings), rng.uniform(30.0, 330.0)
-    for number in range(recordings):  # exchanged: each joint's recordings are filed under the other's name
-        for one, other in (swapped, swapped[::-1]):
-            one.hours[number] = max(one.hours[number], other.hours[number])
+    healthy = [each for each in fleet if each.cause is None]
+    chosen = rng.sample(healthy, 3 * min(max(1, joints // 100), len(healthy) // 3))
+    for one, other, turned in zip(chosen[::3], chosen[1::3], chosen[2::3], strict=True):
+        one.swapped_with, other.swapped_with = other.name, one.name
+        one.swapped_at = other.swapped_at = rng.randrange(1, recordings)
+        turned.turned_at, turned.turned_deg = rng.randrange(1, recordings), rng.uniform(30.0, 330.0)
+        one.hours = other.hours = [max(each) for each in zip(one.hours, other.hours, strict=True)]
+    named = {each.name: each for each in fleet}
     rows, paths = [], []
     for done, each in enumerate(fleet):
         for number in range(recordings):
-            filed = each
-            if number >= swapped_at and each in swapped:
-                filed = swapped[1 - swapped.index(each)]
+            swapped = each.swapped_at is not None and number >= each.swapped_at
+            filed = named[each.swapped_with] if swapped and each.swapped_with else each
             path = folder / filed.name / f"{round(each.hours[number]):06d}.csv.gz"
             make_folder(path.parent)
             _recorded(each, number, base, rng).write_csv(path)
             paths.append(path)
             rows.append(_row(path.relative_to(folder), filed, each.hours[number]))
         progress((done + 1) / joints)
-    answers = {"swapped": [each.name for each in swapped], "swapped_from": swapped_at}
-    answers |= _spoiled(folder, paths, rows, rng)
     content = {
         "schema": "hdbridge.fleet-answers/1",
         "seed": seed,
-        **answers,
+        **_spoiled(folder, paths, rows, rng),
         "joints": [asdict(each) for each in fleet],
     }
     write_atomically(folder / "answers.json", json.dumps(content, indent=2) + "\n")

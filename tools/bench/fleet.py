@@ -73,12 +73,12 @@ def score(fleet: Path, out: Path, limit_arcsec: float) -> None:
         true = max(1000.0 * (limit_arcsec - begin) / rate - last, 0.0)
         known += 1
         held += each.remaining.low <= true <= each.remaining.high
-    swapped = {each for each in answers["swapped"] if each in seen}
     wanted = {
         row["path"]
         for row in rows
-        if row["joint"] in swapped and row["reason"] is None and row["duplicate_of"] is None
-        if _number(row, joints) >= answers["swapped_from"]
+        if joints[row["joint"]]["swapped_at"] is not None
+        if row["reason"] is None and row["duplicate_of"] is None
+        if _number(row, joints) >= joints[row["joint"]]["swapped_at"]
     }
     claimed = {each.path for each in found.mistaken if each.kind == "swapped"}
     damaged = {str((fleet / each).absolute()) for each in answers["damaged"]}
