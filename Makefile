@@ -4,7 +4,7 @@ VENV   := .venv
 BIN    := $(VENV)/bin
 READY  := $(VENV)/.ready
 PROCESSORS := $(shell nproc 2>/dev/null || echo 2)
-# The tests begin hundreds of processes: without bytecode on disk, each compiles the package anew.
+# The tests start hundreds of processes. Without bytecode on disk, each of them would compile the package.
 export PYTHONDONTWRITEBYTECODE :=
 
 .PHONY: help demo test unit check format unit-as-it-goes compiled test-socketcan test-slow coverage mutants blind bench-realtime docs dist clean
@@ -12,8 +12,8 @@ export PYTHONDONTWRITEBYTECODE :=
 help:            ## this list
 	@grep -E '^[a-z-]+: .*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/' | expand -t 18
 
-# uv takes a third of pip's time; where it cannot be had, or does not get at the packages, pip does it. uv reads no
-# settings of pip: it is told the index. The bytecode that is left out belongs to modules that nothing here imports.
+# uv takes a third of pip's time. pip installs if uv is not available or fails. uv ignores pip's settings, so the index
+# is passed. UNUSED are modules that nothing here imports: they are not compiled to bytecode.
 PIP    := $(BIN)/python -m pip install --quiet --disable-pip-version-check
 INDEX  := $${UV_DEFAULT_INDEX:-$${PIP_INDEX_URL:-https://pypi.org/simple}}
 UNUSED := /(tests|mypyc?|lexers|pip|setuptools)/
@@ -28,8 +28,7 @@ $(READY): pyproject.toml
 demo: $(READY)   ## the main job: step a simulated axis under four compensation schemes
 	$(BIN)/hdbridge demo
 
-# In user-mode-linux, which the check installs, nothing that else runs matters to the tests: it has a processor to
-# itself for two minutes, and the workers have the others.
+# The SocketCAN tests run in user-mode-linux, whose clock is slowed, so they can share the computer with the others.
 test: $(READY)   ## everything that CI runs
 	@if [ $(PROCESSORS) -gt 1 ] && tools/socketcan.sh --slowed 50 --check 2>&1 | grep -q 'vcan0: user-mode-linux'; \
 	then $(MAKE) --no-print-directory --jobs=3 --output-sync=target check test-socketcan unit-as-it-goes; \
@@ -38,19 +37,19 @@ test: $(READY)   ## everything that CI runs
 unit-as-it-goes:
 	@$(MAKE) --no-print-directory --output-sync=none unit
 
-# Each worker begins with a run of neighbouring tests, which share what was measured, and helps the others in the
-# end. One more than there are processors: a sixth of the time, a worker waits for a process or a clock.
+# Each worker starts with neighbouring tests, because they share fixtures, and takes tests from the others at the end.
+# There is one more worker than processors, because a worker waits for processes and clocks a sixth of the time.
 WORKERS ?= $(shell echo $$(( $(PROCESSORS) + 1 )))
-# Only the plugins that the tests use: pytest rewrites the assertions in all modules of a package that brings a
-# plugin by itself (hypothesis, schemathesis, hdbridge), in each worker anew where there is no bytecode yet.
+# Plugins are listed, not loaded automatically: pytest would rewrite the assertions in all modules of each package
+# that has a plugin (hypothesis, schemathesis, hdbridge), in each worker.
 PLUGINS := --disable-plugin-autoload -p xdist -p pytest_timeout -p _hypothesis_pytestplugin -p hdbridge.pytest_plugin \
 	-p schemathesis.pytest.plugin
 UNIT    := $(BIN)/python -m pytest -q $(PLUGINS) -n $(WORKERS) --dist worksteal --ignore=tests/socketcan
 unit: compiled   ## the tests on the virtual bus
 	$(UNIT) -m "not slow"
 
-# Compiling takes some 20 s of a processor, rewriting the tests' assertions 5 s: in each of the workers, unless it is
-# done before they begin.
+# Compiling the simulation takes about 20 s of processor time and rewriting the tests' assertions 5 s. Done once here,
+# it is not repeated by each worker.
 compiled: $(READY)
 	@$(BIN)/python tools/compile_simulation.py
 	@$(BIN)/python tools/compile_tests.py
@@ -69,7 +68,7 @@ check: $(READY)  ## format, lint, types, import contracts
 	$(BIN)/mypy hdbridge
 	$(BIN)/lint-imports
 
-format: $(READY) ## format and mend what can be mended
+format: $(READY) ## format, and apply the linter's fixes
 	$(BIN)/ruff format hdbridge tests tools
 	$(BIN)/ruff check --fix hdbridge tests tools
 
@@ -77,11 +76,11 @@ BLIND_SEED  ?= 1
 BLIND_SUITE ?= development
 BLIND_JOBS  ?= 2
 BLIND       := build/blind-$(BLIND_SEED)
-blind: $(READY)  ## a blind suite of diagnoses; continues where it stopped (BLIND_SEED, BLIND_SUITE=development|everyday|bench)
+blind: $(READY)  ## a blind suite of diagnoses; resumes after an interruption (BLIND_SEED, BLIND_SUITE=development|everyday|bench)
 	nice $(BIN)/python tools/blind/generate.py $(BLIND) --seed $(BLIND_SEED) --suite $(BLIND_SUITE) --jobs $(BLIND_JOBS)
 	nice $(BIN)/python tools/blind/score.py $(BLIND) --jobs $(BLIND_JOBS) | tee $(BLIND)/figures.md
 
-bench-realtime: $(READY)  ## what a cycle and the daemon's loop cost on PREEMPT_RT, in instructions (some twenty minutes; root, QEMU)
+bench-realtime: $(READY)  ## instructions of a cycle and of the daemon's loop on PREEMPT_RT (about twenty minutes; root, QEMU)
 	@mkdir -p build/realtime
 	$(CC) -O2 -o build/realtime/master tools/bench/master.c
 	tools/realtime/run.sh $(BIN)/python tools/bench/realtime_cycle.py --master build/realtime/master --json build/realtime/figures.json
@@ -107,8 +106,8 @@ MUTANTS ?= --sample 100 --minutes 15
 mutants: $(VENV)/.release compiled  ## the share of small changes to the pure modules that the tests notice (MUTANTS="--seed 2 --only motion")
 	nice $(BIN)/python tools/mutants.py $(MUTANTS)
 
-# The wheel is tried in an environment that has nothing else; what is installed there is its bill of materials.
-dist: $(VENV)/.release  ## wheel, sdist and bill of materials (CycloneDX) into dist, the wheel tried in an empty environment
+# The wheel is tested in an empty environment; the packages installed there are its bill of materials.
+dist: $(VENV)/.release  ## wheel, sdist and bill of materials (CycloneDX) into dist, the wheel tested in an empty environment
 	rm -rf dist build/dist
 	$(BIN)/python -m build --quiet --outdir dist .
 	$(PYTHON) -m venv build/dist

@@ -121,6 +121,7 @@ class Estimator:
         self.observed: FloatArray = points.error_arcsec[self.index]
         self.time_s: FloatArray = points.time_s[self.index]
         self.zero: IntArray = points.zero[self.index]
+        self.at_points = data.at_points  # not a method of its own: the cache below would be in a cycle
         self._regressors = Regressors([data.full.motion], self.at_points, len(self.index))
         self._noise: dict[object, FloatArray] = {}
         self._free_loops: dict[Start, Nuisances] = {}
@@ -149,11 +150,6 @@ class Estimator:
     def columns(self, effect: Effect, start: Start) -> FloatArray:
         """Returns regressors of an effect at the usable points (means over samples), arcsec, shape (m, p)."""
         return self._regressors.columns(effect, (start,))
-
-    def at_points(self, values: FloatArray) -> FloatArray:
-        """Averages a quantity of every sample to the usable points, as for the observations."""
-        means = self.data.mean(values)
-        return means if len(means) == len(self.index) else np.asarray(means[self.index])
 
     def does(self, effect: Effect, start: Start) -> FloatArray:
         """Returns an effect's contribution at every usable sample, arcsec.

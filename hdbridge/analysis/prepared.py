@@ -332,6 +332,11 @@ class Observed:
         """Averages a quantity of every sample, (n,) or (n, p), over the points: (points,) or (points, p)."""
         return means(values, self.runs)
 
+    def at_points(self, values: FloatArray) -> FloatArray:
+        """Averages a quantity of every sample to the usable points, as for the observations."""
+        found, usable = self.mean(values), self.points.usable
+        return found if usable.all() else np.asarray(found[usable])
+
 
 def gather(
     record: Record,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
@@ -114,6 +115,7 @@ class Fleet:
         from hdbridge.axis.model import TransmissionModel
 
         need_extra("a fleet needs", _EXTRA, "fleet")
+        logging.getLogger("paramiko").addHandler(logging.NullHandler())  # else its thread prints a traceback
         if self.out is None:
             raise InputError("--out is missing; name a new folder, or one of an earlier run")
         if not self.sources and self.manifest is None:
@@ -160,7 +162,7 @@ class Fleet:
         from hdbridge.fleet.engine import RETRIED, Cluster, Progress
         from hdbridge.fleet.engine import run as run_fleet
 
-        _note(f"{len(found)} sources, {len({each.joint for each in found})} joints")
+        _note(f"{len(found)} sources, {len({each.joint for each in found} - {None})} joints")
         with progress_bar() as bar:
             task = bar.add_task("diagnosing", total=len(found))
 
@@ -178,10 +180,9 @@ class Fleet:
                 interrupted=interrupted,
                 retried=RETRIED if retried is None else retried,
             )
-        _say(
-            f"{self.dataset.folder}: {end.done} recordings, {end.known} of them known already, "
-            f"{end.failed} newly failed; largest memory of a worker {end.memory_mb:.0f} MB"
-        )
+        memory = f"; largest memory of a worker {end.memory_mb:.0f} MB" if end.memory_mb else ""
+        counts = f"{end.done} recordings, {end.known} of them known already, {end.failed} newly failed"
+        _say(f"{self.dataset.folder}: {counts}{memory}")
 
     def summarise(self) -> None:
         """Prints and writes the summary of the data set."""
@@ -198,6 +199,9 @@ def run(fleet: Fleet) -> None:
     A joint without a model gets one fitted to its earliest recording. An unusable recording is a row with the
     reason. Ctrl-C keeps finished results; the same command continues.
     """
+    for each in fleet.sources or ():
+        if "://" in each:  # a server that does not answer takes minutes
+            _note(f"listing {each}")
     found = fleet.find(fleet.dataset.stored())
     fleet.dataset.create()
     with deferred_interrupt() as interrupted:
@@ -333,7 +337,7 @@ def _summarise(
     if summary.first:
         print_table(table)
     else:
-        _say("No joint stands out.")
+        _say("No joint stands out." if latest else "No recording has a diagnosis.")
     for line in summary.lines():
         _say(line)
     target = page or dataset.folder / PAGE_NAME

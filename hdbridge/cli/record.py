@@ -90,6 +90,21 @@ def info(
     about = found.about
     steps = np.diff(found.machine["cycle"])
     missing = int(np.sum(steps[steps > 1] - 1))
+
+    def outer_of(axis: str) -> dict[str, Any] | None:
+        """Returns the connection of another master to an axis of a gateway; None without one."""
+        rows = found.axes[axis]
+        asked = ~np.isnan(rows["outer_target_deg"])
+        if not asked.any():
+            return None
+        codes = rows["outer_error_code"]
+        begun = codes[1:][np.diff(codes) != 0]
+        return {
+            "connected_s": float(np.count_nonzero(asked)) * about.period_s,
+            "enabled_s": float(np.count_nonzero(rows["outer_statusword"] & 0x6F == 0x27)) * about.period_s,
+            "errors": [f"{each:04X}h" for each in begun[begun != 0].tolist()],
+        }
+
     document: dict[str, Any] = {
         "schema": "hdbridge.flight-info/1",
         "machine": about.machine,
@@ -109,6 +124,7 @@ def info(
                 "enabled_s": float(np.count_nonzero(np.isin(found.axes[each.name]["state"], (3, 4))))
                 * about.period_s,
                 "models": [used.version for used in found.models if used.axis == each.name],
+                "outer": outer_of(each.name),
             }
             for each in about.axes
         ],
@@ -124,6 +140,12 @@ def info(
     for each in document["axes"]:
         models = f"; models {', '.join(each['models'])}" if any(each["models"]) else ""
         _say(f"axis '{each['name']}', ratio {each['ratio']:g}, enabled for {each['enabled_s']:.1f} s{models}")
+        if (outer := each["outer"]) is not None:
+            errors = f"; errors {', '.join(outer['errors'])}" if outer["errors"] else ""
+            _say(
+                f"  another master: connected for {outer['connected_s']:.1f} s, 'operation enabled' for "
+                f"{outer['enabled_s']:.1f} s{errors}"
+            )
     for told in found.events:
         _say(f"{_date(told.time_ns):%H:%M:%S.%f}  {told.name}  {told.kind.lower()}  {told.text}")
 

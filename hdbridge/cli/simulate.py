@@ -71,6 +71,7 @@ def simulate(
             clock,
             nameplate,
             known.firmware,
+            bit_rate_bps=axis.bus.bitrate_bps,
         )
         notes.print(f"simulated drive: node {axis.drive.node_id} on {bus.channel_info}; Ctrl-C ends it")
         end = float("inf") if duration_s is None else clock.now() + duration_s

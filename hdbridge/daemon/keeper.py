@@ -403,6 +403,7 @@ class Keeper:
         assert status is not None
         self._forget(child)
         self._control = None
+        self._memory.status.set(Cell.LOOP_PID, 0)
         if self._stopping_since_s is not None:
             self._status = self._status or max(status, 0)
             return
@@ -436,6 +437,8 @@ class Keeper:
             self._stop(now_s, known, f"the {name} cannot begin ({how})")
         else:
             helper.due_s = now_s + helper.back_off.delay_s(lived_s)
+        if helper.alive is Cell.GATEWAY_TIME_NS:
+            self._memory.forget_gateway()
 
     def _lend(self, loan: Loan, now_s: float) -> None:
         """Ends the control process if the bus is wanted; starts another one when the bus is free again."""

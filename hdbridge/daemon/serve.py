@@ -168,11 +168,8 @@ async def _say_when_served(server: ApiServer, memory: Memory) -> None:
 async def _last_words(bridge: ServiceBridge, memory: Memory) -> None:
     """Continues while the axes are brought to rest, so that clients see it and it is recorded."""
     end_s = asyncio.get_running_loop().time() + LAST_WORDS_S
-    while bridge.core.observer.alive and asyncio.get_running_loop().time() < end_s:
-        try:
-            os.kill(memory.status.loop_pid, 0)
-        except OSError:
-            break
+    status = memory.status
+    while bridge.core.observer.alive and status.loop_pid and asyncio.get_running_loop().time() < end_s:
         await asyncio.sleep(0.05)
     bridge.core.observer.poll()
 

@@ -40,6 +40,9 @@ class Behaviour(Strict):
     rpdo_before_tpdo: bool = Field(
         False, description="at SYNC, RPDOs take effect before the values of the TPDOs are taken"
     )
+    fixed_node_id: bool = Field(
+        False, description="LSS changes the node id until the next reset, and does not store it"
+    )
     rpdo_timer: bool = Field(True, description="missing RPDOs stop the axis after the time in 1400h:05")
     heartbeat_consumer: HeartbeatConsumer = Field(
         HeartbeatConsumer.RESTARTS,

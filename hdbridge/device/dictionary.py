@@ -92,7 +92,7 @@ class Entry:
     ``value`` is what is stored; ``bind`` makes reads call a function instead; ``guard`` is asked with a new
     value before it is stored and refuses by raising ``SdoAbortError``; ``follower`` is called after it was
     stored. The firmware uses a ``hidden`` entry, but the bus does not see it. The firmware uses only entries
-    that are ``is_known``.
+    that are ``is_known``. The default of an ``is_relative`` one contains the node id.
     """
 
     __slots__ = (
@@ -106,6 +106,7 @@ class Entry:
         "high",
         "index",
         "is_known",
+        "is_relative",
         "low",
         "mappable",
         "name",
@@ -131,7 +132,9 @@ class Entry:
         self.high: Final[int | None] = variable.max
         other_type = own is None or own.data_type != variable.data_type
         self._bits = self.bits if other_type and code not in {*"fd"} else 0
-        default = variable.default if variable.default is not None or own is None else own.default
+        given = variable if variable.default is not None or own is None else own
+        default = given.default
+        self.is_relative: Final = bool(given.relative)
         empty: int | str = 0 if code else ""
         self.default: Any = empty if default is None else default
         if isinstance(self.default, str):
@@ -299,6 +302,12 @@ class Dictionary:
     def value(self, index: int, sub: int = 0) -> int:
         """Returns the present value of an integer entry."""
         return self._entries[index, sub].number()
+
+    def renumber(self, before: int, after: int) -> None:
+        """Adapts the defaults that contain the node id."""
+        for entry in self._entries.values():
+            if entry.is_relative:
+                entry.default += after - before
 
     def restore(self, first: int = 0x0000, last: int = 0xFFFF) -> None:
         """Restores the default of every entry in this range of indices, without asking the guards."""

@@ -109,6 +109,10 @@ class Motion:
                     distance = allowed - here32
         return sign * (here + distance - self.home_counts)
 
+    def unlimited(self, target: int) -> float:
+        """Converts a user's int32 target to the plant position nearest to the demand, whatever the limits."""
+        return self.demand_counts + self.sign * wrap_int32(target - self.demand_position())
+
     def actual_position(self) -> int:
         """Returns object 6064h."""
         return ((self.sign * self.motor_counts + self.home_counts + _HALF) & _MASK) - _HALF

@@ -23,6 +23,7 @@ from hdbridge.device.dictionary import Abort, Dictionary, SdoAbortError, only
 from hdbridge.device.emergency import Emergency, ErrorCode
 from hdbridge.device.faults import Faults, Outgoing
 from hdbridge.device.firmware import Firmware
+from hdbridge.device.lss import ANSWER, REQUEST, UNCONFIGURED, LssSlave
 from hdbridge.device.motion import Machine
 from hdbridge.device.nameplate import MOTOR_POSITION, Nameplate
 from hdbridge.device.nmt import Nmt, NmtCommand
@@ -54,7 +55,8 @@ class DriveNode:
 
     ``bus`` is any python-can bus, and is read only here; ``eds_path`` declares the objects; ``clock`` gives
     the time of start; ``nameplate`` distinguishes drives, ``behaviour`` their firmware. ``stage`` is a power
-    stage that takes time or fails, ``store`` the file of the stored parameters.
+    stage that takes time or fails, ``store`` the file of the stored parameters, ``bit_rate_bps`` the one that
+    LSS may configure, which is that of the interface.
     ``poll`` must be called when frames may have come and at ``next_event_s``.
     """
 
@@ -69,10 +71,16 @@ class DriveNode:
         behaviour: Behaviour | None = None,
         stage: PowerStage | None = None,
         store: Path | None = None,
+        bit_rate_bps: int | None = None,
     ) -> None:
         self.bus = bus
-        self.node_id = node_id
         self.behaviour = behaviour or Behaviour()
+        self._lss = LssSlave(
+            lambda sub: self.dictionary.value(0x1018, sub),
+            node_id,
+            stores=not self.behaviour.fixed_node_id,
+            bit_rate_bps=bit_rate_bps,
+        )
         self.faults = Faults()
         self.lost_frames = 0
         self.period_begins_s = clock.now()
@@ -133,7 +141,14 @@ class DriveNode:
         self._start_heartbeat()
         self._due_s = self._now_s
 
+    @property
+    def node_id(self) -> int:
+        """The node id in use; 255 if LSS took it away."""
+        return self._lss.node_id
+
     def _boot(self) -> None:
+        if self.node_id == UNCONFIGURED:
+            return
         self._send(_HEARTBEAT + self.node_id, bytes([Nmt.INITIALISING]))
         self._enter(Nmt.PRE_OPERATIONAL)
 
@@ -151,6 +166,11 @@ class DriveNode:
         """Returns the period in 60C2h; s."""
         value = self.dictionary.value
         return (value(0x60C2, 1) or 1) / 10.0 ** -value(0x60C2, 2)
+
+    @property
+    def now_s(self) -> float:
+        """Reception of the frame, or time of the event, that is being processed; on the node's clock."""
+        return self._now_s
 
     @property
     def has_sync(self) -> bool:
@@ -215,16 +235,16 @@ class DriveNode:
 
     def _listen(self) -> None:
         """Assigns a handler to each CAN identifier that the node receives in its present state."""
-        takers: dict[int | None, Callable[[bytearray, float], None]] = {
-            self._watched_id: self._on_watched_heartbeat,
-            0x000: self._on_nmt,
-        }
+        takers: dict[int | None, Callable[[bytearray, float], None]] = {REQUEST: self._on_lss}
+        self._takers = takers
+        if self.node_id == UNCONFIGURED:
+            return
+        takers |= {self._watched_id: self._on_watched_heartbeat, 0x000: self._on_nmt}
         for can_id, pdo in self._rpdo_by_id.items():
             takers[can_id] = partial(self._on_rpdo, pdo)
         if self.nmt is not Nmt.STOPPED:
             takers[0x600 + self.node_id] = self._on_sdo_request
             takers[self.dictionary.value(0x1005) & 0x7FF] = self._on_sync
-        self._takers = takers
 
     # ---------------------------------------------------------------- the outside
 
@@ -248,9 +268,10 @@ class DriveNode:
         self._now_s = now_s
         if self.nmt is _INITIALISING:
             self._boot()
-        if self.faults.concerns_poll:
-            self.faults.concerns_poll = False
-            self._make_faults()
+        if self.faults.pending:
+            pending, self.faults.pending = self.faults.pending, []
+            for happen in pending:
+                happen(self)
         if now_s >= self._due_s:
             self._do_what_is_due(now_s)
         if self._event_tpdos:
@@ -258,7 +279,7 @@ class DriveNode:
 
     def next_event_s(self) -> float:
         """Returns the time by which ``poll`` must be called, on the clock's scale."""
-        return self._now_s if self.faults.concerns_poll else self._due_s
+        return self._now_s if self.faults.pending else self._due_s
 
     def handle(self, message: can.Message, now_s: float) -> None:
         """Processes a frame received at ``now_s``; ignores all but data frames with 11-bit identifiers."""
@@ -361,12 +382,9 @@ class DriveNode:
         elif command == NmtCommand.ENTER_PRE_OPERATIONAL:
             self._leave_operational(Nmt.PRE_OPERATIONAL)
         elif command == NmtCommand.RESET_NODE:
-            self._reset_node()
+            self.reset()
         elif command == NmtCommand.RESET_COMMUNICATION:
-            self.firmware.connection_lost(ErrorCode.COMMUNICATION)
-            self._parameters.restore(0x1000, 0x1FFF)
-            self._begin()
-            self._boot()
+            self._reset_communication()
 
     def _enter(self, state: Nmt) -> None:
         if self.nmt is state:
@@ -383,7 +401,36 @@ class DriveNode:
             self.firmware.connection_lost(ErrorCode.COMMUNICATION)
         self._enter(state)
 
-    def _reset_node(self) -> None:
+    def drop_out(self) -> None:
+        """Enters PRE-OPERATIONAL without a command, and reports it."""
+        self._leave_operational(Nmt.PRE_OPERATIONAL)
+        self._send_heartbeat()
+
+    def _on_lss(self, data: bytearray, _: float) -> None:
+        answer = self._lss.respond(bytes(data))
+        if answer is not None:
+            self._send(ANSWER, answer)
+        if self.node_id == UNCONFIGURED != self._lss.pending and not self._lss.configuring:
+            self._reset_communication()  # CiA 305: a node without an id starts once it has one
+
+    def _take_node_id(self) -> None:
+        before, after = self.node_id, self._lss.pending
+        if after != before:
+            self.dictionary.renumber(before, after)
+            self._lss.node_id = after
+
+    def _reset_communication(self) -> None:
+        self.firmware.connection_lost(ErrorCode.COMMUNICATION)
+        self._take_node_id()
+        self._parameters.restore(0x1000, 0x1FFF)
+        self._begin()
+        self._boot()
+
+    def reset(self) -> None:
+        """Starts again as after power-on, with a boot-up message (NMT reset node)."""
+        self._lss.pending = self._lss.stored
+        self._lss.configuring = False
+        self._take_node_id()
         self._parameters.restore()
         self.emergency.reset()
         self.firmware.reset()
@@ -396,22 +443,6 @@ class DriveNode:
         self._watch_due_s = now_s + self._watched_s
         self.emergency.clear(ErrorCode.HEARTBEAT)
         self._due_s = self._next_due_s()
-
-    def _make_faults(self) -> None:
-        for code, additional in self.faults.take_errors():
-            self.firmware.fault(code, additional)
-        for code in self.faults.take_lost_masters():
-            self.firmware.connection_lost(code)
-        for code in self.faults.take_missed_masters():
-            self.emergency.occur(code)
-            self.firmware.connection_lost(code)
-        if self.faults.take_opening():
-            self.firmware.power_cut()
-        if self.faults.take_departure():
-            self._leave_operational(Nmt.PRE_OPERATIONAL)
-            self._send_heartbeat()
-        if self.faults.take_boot_up():
-            self._reset_node()
 
     # ---------------------------------------------------------------- time
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Final
 
 from canopen.objectdictionary import ODVariable
@@ -51,12 +52,12 @@ class Pdo:
         self.compile()
 
     def _install(self) -> None:
-        guards = {
+        guards: dict[int, Callable[[int], None] | None] = {
             1: self._check_can_id,
             2: _check_type,
-            3: self._check_inhibit,
+            3: partial(self._check_fixed, 3),
             5: None,
-            6: self._check_inhibit,
+            6: partial(self._check_fixed, 6),
         }
         for sub, guard in guards.items():
             if (self._communication, sub) in self._dictionary:
@@ -131,8 +132,9 @@ class Pdo:
     def _communication_id(self) -> int:
         return self._dictionary.value(self._communication, 1) & ~INVALID
 
-    def _check_inhibit(self, _: int) -> None:
-        if self.valid:
+    def _check_fixed(self, sub: int, value: int) -> None:
+        """Refuses another value while the PDO exists; some masters write the one that is there."""
+        if self.valid and value != self._parameter(sub):
             raise SdoAbortError(Abort.STATE)
 
     def _check_mapped(self, word: int) -> None:

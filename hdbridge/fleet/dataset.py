@@ -37,10 +37,7 @@ NESTED: Final = {
 """Fields of the list columns; numbers unless a type is given."""
 COLUMNS: Final[Mapping[str, Mapping[str, tuple[str, str]]]] = {
     RECORDINGS: {
-        "key": (
-            "text",
-            "SHA-256 as above",
-        ),
+        "key": ("text", "SHA-256 as above"),
         "path": ("text", "recording: absolute path or URL"),
         "joint": ("text", "name of the joint; empty if unknown"),
         "axis": ("text", "axis of a flight recording, or axis file of a bus log"),
@@ -50,10 +47,7 @@ COLUMNS: Final[Mapping[str, Mapping[str, tuple[str, str]]]] = {
         "lubricant": ("text", "from the manifest"),
         "hours": ("number", "operating hours, from the manifest"),
         "date": ("text", "date, ISO 8601"),
-        "samples_sha256": (
-            "text",
-            "of time, motor angle and load angle as little-endian float64",
-        ),
+        "samples_sha256": ("text", "of time, motor angle and load angle as little-endian float64"),
         "model_sha256": ("text", "of the model without its provenance"),
         "version": ("text", "version of hdbridge"),
         "model": ("text", "model file; `models/JOINT.yaml` is in OUT"),
@@ -67,14 +61,8 @@ COLUMNS: Final[Mapping[str, Mapping[str, tuple[str, str]]]] = {
         "extended_rms_arcsec": ("number", "the same, with the causes found"),
         "floor_arcsec": ("number", "noise of a reading"),
         "figures": ("figures", "parameters of the extended model, with 95 % half widths"),
-        "limits": (
-            "limits",
-            "smallest peak from which a cause would be named; no entry if not detectable",
-        ),
-        "orders": (
-            "orders",
-            "motor orders in the samples, without a model; empty below two turns",
-        ),
+        "limits": ("limits", "smallest peak from which a cause would be named; no entry if not detectable"),
+        "orders": ("orders", "motor orders in the samples, without a model; empty below two turns"),
         "remarks": ("texts", "restrictions of the data"),
         "reason": ("text", "reason for a missing diagnosis"),
         "duplicate_of": ("text", "path of the first recording with the same samples"),
@@ -143,8 +131,7 @@ class Dataset:
         """Creates the folder; InputError if that fails or the folder holds something else."""
         if self.folder.is_dir() and any(self.folder.iterdir()) and not self._is_one():
             raise InputError(
-                f"{self.folder}: is not empty and was not written by hdbridge fleet; expected a new "
-                "folder, or one "
+                f"{self.folder}: was not written by hdbridge fleet; expected a new folder, or one "
                 "of an earlier run"
             )
         make_folder(self.folder / INCREMENTS)
@@ -168,8 +155,7 @@ class Dataset:
             fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             raise InputError(
-                f"{self.folder}: another hdbridge fleet writes to this folder; wait until it has ended, or "
-                "stop it"
+                f"{self.folder}: another hdbridge fleet writes to this folder; wait until it ends, or stop it"
             ) from None
         else:
             yield
@@ -286,4 +272,5 @@ def _write(path: Path, rows: Sequence[Mapping[str, Any]], name: str) -> None:
         aside.replace(path)
     except OSError as problem:
         aside.unlink(missing_ok=True)
-        raise OutputError(f"{path}: cannot be written: {problem.strerror}") from None
+        why = os.strerror(problem.errno) if problem.errno else str(problem)  # Arrow's own text is longer
+        raise OutputError(f"{path}: cannot be written: {why}") from None

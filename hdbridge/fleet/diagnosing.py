@@ -63,17 +63,23 @@ def model_in(text: str, where: str) -> Model:
 
 
 def fitted(sources: Sequence[Source], where: str) -> Model:
-    """Fits the model of a joint to the first usable one of its recordings."""
+    """Fits the model of a joint to the first usable one of its recordings.
+
+    The reason for a failure is that of a recording which could be read, if there is one.
+    """
     from hdbridge.commissioning.calibration import fit
 
     reasons = []
     for source in sources:
+        unread = True
         try:
             recording = read(source)
+            unread = False
             return model_in(fit(recording, ratio=source.ratio or recording.ratio).model.dump(), where)
         except Exception as problem:
-            reasons.append(_reason(problem))
-    return Model(where=where, reason=f"no model could be fitted: {reasons[0] if reasons else 'no recording'}")
+            reasons.append((unread, _reason(problem)))
+    _, reason = min(reasons, key=lambda each: each[0], default=(True, "no recording"))
+    return Model(where=where, reason=f"no model could be fitted: {reason}")
 
 
 def axes_of(path: str) -> list[str] | str:
@@ -115,9 +121,9 @@ def diagnosed(source: Source, model: Model, known: str = "") -> Row:
     """Diagnoses a recording and returns its row; without ``findings`` if its key is the ``known`` one."""
     row = _described(source) | {"model": model.where or None, "model_sha256": model.sha256}
     try:
+        recording = read(source)
         if source.joint is None:
             raise InputError(f"{source.path}: the joint is not known; name it in the manifest: joint")
-        recording = read(source)
         row |= _of_samples(recording)
         row["date"] = row["date"] or recording.date
         if model.reason:

@@ -359,6 +359,7 @@ class _Run:
                 self._measure(client)
             if not batch:
                 time.sleep(POLL_S)
+        self._measure(client)
 
     def _measure(self, client: Client) -> None:
         """Updates the largest memory of a worker."""

@@ -22,7 +22,7 @@ from typing import Any, Final
 
 from hdbridge import __version__
 from hdbridge.errors import InputError
-from hdbridge.files.expectation import nearest
+from hdbridge.files.expectation import nearest, one_line
 from hdbridge.files.profile import Profile
 from hdbridge.records.recording import ABOUT_NAME, CSV_NAMES, recordings_among
 
@@ -180,14 +180,18 @@ def _listing(place: str) -> dict[str, str]:
         system, root = fsspec.core.url_to_fs(place)
         host = place.rstrip("/").removesuffix(root)  # protocol and host, which `system` paths lack
         system.invalidate_cache()
-        matched = system.glob(root) if glob.has_magic(root) else [root]
+        files: dict[str, Any] = {}
+        for each in system.glob(root) if glob.has_magic(root) else [root]:
+            found = system.find(each, detail=True)
+            if not found:  # `find` hides that a server is away; `ls` raises it
+                with suppress(FileNotFoundError):
+                    system.ls(each)
+            files |= found
         return {
-            host + file: " ".join(str(about.get(each)) for each in MARKS)
-            for each in matched
-            for file, about in system.find(each, detail=True).items()
+            host + file: " ".join(str(about.get(each)) for each in MARKS) for file, about in files.items()
         }
-    except (OSError, ValueError, ImportError) as problem:
-        raise InputError(f"{place}: cannot be listed: {problem}") from None
+    except Exception as problem:  # each file system raises its own
+        raise InputError(one_line(f"{place}: cannot be listed: {problem}")) from None
 
 
 def _local(path: Path) -> Iterator[tuple[str, str]]:

@@ -15,7 +15,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
-from scipy.special import betaln, chdtri, expit, logsumexp, ndtr, ndtri
+from scipy.special import betaln, chdtrc, chdtri, expit, logsumexp, ndtr, ndtri
 
 from hdbridge.analysis.intervals import NORMAL_95
 from hdbridge.analysis.readings import median_deviation
@@ -30,6 +30,8 @@ INTERVAL: Final = (0.05, 0.95)
 """Quantiles of the 90 % intervals of hours and prevalences."""
 SCATTER_SERIES: Final = 200
 """Number of series for estimating the common scatter; its error is then 5 % or less."""
+OWN_SCATTER: Final = 1e-3
+"""Share of joints whose figure does not follow a line, for example because of a repair."""
 PHASE_STEP_DEG: Final = 0.25
 EVERYDAY_SHARE: Final = 0.05
 """Relative difference of an order's amplitude that is normal between two recordings of one joint."""
@@ -202,16 +204,30 @@ class Trend:
     """Probability that the joint is one of those that change."""
 
     @cached_property
+    def _slopes(self) -> list[tuple[float, float, float]]:
+        """Weight, mean and standard deviation of the slope if the joint stays, and if it changes."""
+        slope, own = float(self.line[1]), float(self.covariance[1, 1])
+        result = []
+        for weight, centre, deviation in (
+            (1.0 - self.changing, 0.0, self.stay),
+            (self.changing, *self.change),
+        ):
+            variance = 1.0 / (1.0 / deviation**2 + 1.0 / own)
+            result.append((weight, variance * (centre / deviation**2 + slope / own), math.sqrt(variance)))
+        return result
+
+    @cached_property
     def _draws(self) -> tuple[FloatArray, FloatArray]:
         """Posterior levels and slopes, drawn by quantiles so that equal data give equal intervals."""
-        slope, cov = float(self.line[1]), self.covariance
-        count = round(self.changing * DRAWS)
-        slopes = []
-        for centre, deviation, number in ((0.0, self.stay, DRAWS - count), (*self.change, count)):
-            variance = 1.0 / (1.0 / deviation**2 + 1.0 / float(cov[1, 1]))
-            middle = variance * (centre / deviation**2 + slope / float(cov[1, 1]))
-            slopes.append(middle + math.sqrt(variance) * ndtri((np.arange(number) + 0.5) / max(number, 1)))
-        drawn = np.concatenate(slopes)
+        slope, cov, changing = float(self.line[1]), self.covariance, round(self.changing * DRAWS)
+        drawn = np.concatenate(
+            [
+                middle + deviation * ndtri((np.arange(number) + 0.5) / max(number, 1))
+                for number, (_, middle, deviation) in zip(
+                    (DRAWS - changing, changing), self._slopes, strict=True
+                )
+            ]
+        )
         # Level given the slope; its own variance takes the quantiles in another order than the slope's.
         level = self.line[0] + cov[0, 1] / cov[1, 1] * (drawn - slope)
         rest = math.sqrt(max(float(cov[0, 0] - cov[0, 1] ** 2 / cov[1, 1]), 0.0))
@@ -220,13 +236,12 @@ class Trend:
     @property
     def per_1000_hours(self) -> Interval:
         """Slope with its interval."""
-        return Interval(
-            *(float(each) for each in np.quantile(self._draws[1], (INTERVAL[0], 0.5, INTERVAL[1])))
-        )
+        low, middle, high = np.quantile(self._draws[1], (INTERVAL[0], 0.5, INTERVAL[1])).tolist()
+        return Interval(low, middle, high)
 
     def growing(self) -> float:
         """Returns the probability that the slope is positive."""
-        return float(np.mean(self._draws[1] > 0.0))
+        return sum(weight * float(ndtr(middle / deviation)) for weight, middle, deviation in self._slopes)
 
     def hours_to(self, limit: float) -> Interval | None:
         """Returns the hours from the last recording until the line reaches a limit, or None if unknown.
@@ -282,15 +297,22 @@ def _design(each: Series) -> FloatArray:
 
 
 def _line(each: Series, scatter: float) -> tuple[FloatArray, FloatArray]:
+    """Fits a line. If the values do not lie on one, as after a step, its covariance grows with the misfit."""
     design = _design(each)
     weight = 1.0 / (each.sd**2 + scatter**2)
     cov = np.linalg.pinv(design.T @ (weight[:, np.newaxis] * design))
     best: FloatArray = cov @ (design.T @ (weight * each.value))
+    misfit, free = float(weight @ (each.value - design @ best) ** 2), len(weight) - design.shape[1]
+    if free > 0 and chdtrc(free, misfit) < OWN_SCATTER:
+        cov = cov * (misfit / free)
     return best[:2], np.asarray(cov[:2, :2], dtype=np.float64)
 
 
 def _scatter(series: Sequence[Series]) -> float:
-    """Estimates the common scatter between recordings by restricted maximum likelihood (REML)."""
+    """Estimates the common scatter between recordings by restricted maximum likelihood (REML).
+
+    A share `OWN_SCATTER` of the series has a scatter of its own, so one step does not blur all the others.
+    """
     chosen = [each for each in series if len(each.hours) > _design(each).shape[1]]
     chosen = chosen[:: max(1, math.ceil(len(chosen) / SCATTER_SERIES))]
     if not chosen:
@@ -299,20 +321,18 @@ def _scatter(series: Sequence[Series]) -> float:
     spread = float(np.median([np.std(each.value) for each in chosen]))
     choices = np.concatenate([[0.0], np.geomspace(0.05, 10.0, 18) * max(typical, spread, 1e-12)])
 
-    def likelihood(scatter: float) -> float:
-        total = 0.0
-        for each in chosen:
-            design = _design(each)
-            variance = each.sd**2 + scatter**2
-            inner = design.T @ (design / variance[:, np.newaxis])
-            best = np.linalg.pinv(inner) @ (design.T @ (each.value / variance))
-            rest = each.value - design @ best
-            total -= 0.5 * float(
-                np.sum(np.log(variance)) + np.linalg.slogdet(inner)[1] + rest @ (rest / variance)
-            )
-        return total
+    def likelihood(each: Series, scatter: float) -> float:
+        design = _design(each)
+        variance = each.sd**2 + scatter**2
+        inner = design.T @ (design / variance[:, np.newaxis])
+        best = np.linalg.pinv(inner) @ (design.T @ (each.value / variance))
+        rest = each.value - design @ best
+        size = float(np.sum(np.log(variance))) + np.linalg.slogdet(inner)[1] + rest @ (rest / variance)
+        return -0.5 * float(size)
 
-    return float(choices[int(np.argmax([likelihood(float(each)) for each in choices]))])
+    common = np.array([[likelihood(each, scatter) for scatter in choices.tolist()] for each in chosen])
+    own = np.max(common, axis=1, keepdims=True) + math.log(OWN_SCATTER)
+    return float(choices[int(np.argmax(np.sum(np.logaddexp(common, own), axis=0)))])
 
 
 def _two_kinds(slopes: FloatArray, errors: FloatArray) -> tuple[float, tuple[float, float], float]:

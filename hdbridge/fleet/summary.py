@@ -39,6 +39,8 @@ grows.
 SURE: Final = 0.95
 REPEATED: Final = 2
 """Minimum number of recordings that name a cause."""
+PEAK_ERROR: Final = 0.25
+"""Standard deviation of a small peak, in detection limits."""
 SILENT: Final = 3.0
 """Time without a recording after which a joint is silent; multiples of its median interval."""
 ATTRIBUTES: Final = ("batch", "cell", "lubricant")
@@ -238,29 +240,30 @@ def _peak(row: Row, cause: str) -> float | None:
     return found["peak_arcsec"] if found else None
 
 
+def _floor(row: Row, cause: str) -> float:
+    """Returns the smallest peak from which a recording would name a cause, arcsec."""
+    limit = next((each["arcsec"] for each in row["limits"] or () if each["cause"] == cause), None)
+    return limit if limit is not None else max(row["rms_arcsec"] or 0.0, 1.0)
+
+
 def _size(rows: Sequence[Row], cause: str) -> Series:
     """Returns the peak of a cause over the hours; if not named, it lies between 0 and the detection limit."""
-    known = [row for row in rows if row["hours"] is not None]
-    values, errors = [], []
-    for row in known:
-        limit = next((each["arcsec"] for each in row["limits"] or () if each["cause"] == cause), None)
-        peak = _peak(row, cause)
-        floor = limit if limit is not None else max(row["rms_arcsec"] or 0.0, 1.0)
-        values.append(0.5 * floor if peak is None else peak)
-        errors.append(
-            0.29 * floor if peak is None else max(0.25 * floor, 0.02 * peak)
-        )  # 0.29: standard deviation of a uniform distribution
-    return Series(
-        np.array([row["hours"] for row in known], dtype=float),
-        np.array(values, dtype=float),
-        np.array(errors, dtype=float),
-        _temperatures(known),
-    )
+    points = []
+    for row in rows:
+        peak, floor = _peak(row, cause), _floor(row, cause)
+        if peak is not None:
+            points.append((row, peak, max(PEAK_ERROR * floor, 0.02 * peak)))
+        else:  # 0.29: standard deviation of a uniform distribution
+            points.append((row, 0.5 * floor, 0.29 * floor))
+    return _series(points)
 
 
-def _temperatures(rows: Sequence[Row]) -> Any:
-    values = [row["temperature_c"] for row in rows]
-    return None if any(each is None for each in values) or not values else np.array(values, dtype=float)
+def _series(points: Sequence[tuple[Row, float, float]]) -> Series:
+    """Returns values and standard deviations over the hours; recordings without hours are left out."""
+    known = [each for each in points if each[0]["hours"] is not None]
+    hours, value, sd = np.array([(row["hours"], *own) for row, *own in known]).reshape(-1, 3).T
+    warm = [row["temperature_c"] for row, _, _ in known]
+    return Series(hours, value, sd, np.array(warm) if warm and None not in warm else None)
 
 
 def _figures(joints: Mapping[str, Sequence[Row]]) -> dict[str, list[tuple[float, str]]]:
@@ -269,32 +272,18 @@ def _figures(joints: Mapping[str, Sequence[Row]]) -> dict[str, list[tuple[float,
     for name, rows in joints.items():
         for row in rows:
             for each in row["figures"] or ():
+                effect, _, parameter = each["name"].partition(".")
                 if (
-                    row["hours"] is not None
+                    effect in {"synchronous", "hysteresis"}
                     and each["half_width"] > 0.0
-                    and not each["name"].endswith("phase_deg")
+                    and not parameter.endswith("phase_deg")
                 ):
                     table[each["name"]][name].append((row, each["value"], each["half_width"] / NORMAL_95))
     result: dict[str, list[tuple[float, str]]] = defaultdict(list)
     for figure, of_joint in table.items():
-        if figure.split(".")[0] not in {"synchronous", "hysteresis"}:
-            continue
-        names = list(of_joint)
-        series = [
-            Series(
-                np.array([row["hours"] for row, _, _ in of_joint[name]]),
-                np.array([value for _, value, _ in of_joint[name]]),
-                np.array([sd for _, _, sd in of_joint[name]]),
-                _temperatures([row for row, _, _ in of_joint[name]]),
-            )
-            for name in names
-        ]
-        for name, trend in zip(names, trends(series), strict=True):
-            if (
-                trend is not None
-                and trend.changing > SURE
-                and max(trend.growing(), 1.0 - trend.growing()) > SURE
-            ):
+        found = trends([_series(points) for points in of_joint.values()])
+        for name, trend in zip(of_joint, found, strict=True):
+            if trend is not None and trend.changing > SURE and abs(trend.growing() - 0.5) > SURE - 0.5:
                 slope = trend.per_1000_hours
                 strength = abs(slope.value) / max(slope.high - slope.low, 1e-12)
                 result[name].append((strength, f"{figure} {slope.value:+.2g} per 1000 h"))
@@ -315,12 +304,16 @@ def _first(
             rows = joints[name]
             named = [row for row in rows if _peak(row, cause) is not None]
             recent = any(_peak(row, cause) is not None for row in rows[-2:])
+            if len(named) < REPEATED or not recent:
+                continue
             trend = sizes[cause][name]
             growing = trend is not None and trend.growing() >= SURE and trend.changing >= SURE
-            appeared = _peak(rows[0], cause) is None and not common[rows[-1]["gear"]]
-            if len(named) < REPEATED or not recent or not (growing or appeared):
-                continue
             last = next(each for each in named[-1]["findings"] if each["cause"] == cause)
+            # The first recording would have shown it.
+            seen = last["peak_arcsec"] > (1.0 + 2.0 * PEAK_ERROR) * _floor(rows[0], cause)
+            appeared = _peak(rows[0], cause) is None and seen and not common[rows[-1]["gear"]]
+            if not growing and not appeared:
+                continue
             claims.append(
                 Candidate(
                     joint=name,

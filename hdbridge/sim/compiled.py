@@ -231,29 +231,49 @@ def _version() -> int:
 # ---------------------------------------------------------------- records
 
 
-def _attributes(cls: type) -> dict[str, Any]:
+@cache
+def _attributes(cls: Any) -> dict[str, Any]:
     """Returns the declared attributes of a state class and its ancestors."""
-    if cls not in _ATTRIBUTES:
-        hints = get_type_hints(cls)
-        _ATTRIBUTES[cls] = {name: hint for name, hint in hints.items() if get_origin(hint) is not ClassVar}
-    return _ATTRIBUTES[cls]
+    hints = get_type_hints(cls)
+    return {name: hint for name, hint in hints.items() if get_origin(hint) is not ClassVar}
 
 
-_ATTRIBUTES: Final[dict[type, dict[str, Any]]] = {}
-"""Cache of `_attributes`, which are slow to determine."""
+class Members(NamedTuple):
+    """Attributes of a state class, by the form in which its record has them."""
+
+    numbers: tuple[str, ...]
+    lists: tuple[str, ...]
+    """Tuples and lists of numbers."""
+    objects: tuple[str, ...]
+    unions: tuple[tuple[str, Any], ...]
+    """Attributes that may belong to one of several classes, with their protocol."""
+    union_lists: tuple[tuple[str, Any], ...]
+
+
+@cache
+def _members(cls: Any) -> Members:
+    found: dict[str, Any] = Members((), (), (), (), ())._asdict()
+    for name, hint in _attributes(cls).items():
+        several = get_origin(hint) in {tuple, list}
+        entry = get_args(hint)[0] if several else hint
+        if entry in KINDS:
+            found["union_lists" if several else "unions"] += ((name, entry),)
+        elif several:
+            found["lists"] += (name,)
+        else:
+            found["numbers" if entry in _NUMBERS else "objects"] += (name,)
+    return Members(**found)
 
 
 def _room(value: Any) -> int:
     """Returns the smallest power of two that holds the longest list of numbers in an object."""
-    longest = LEAST_ROOM
-    for name in _attributes(type(value)):
-        each = getattr(value, name)
-        if isinstance(each, tuple | list) and all(isinstance(entry, complex | float) for entry in each):
-            longest = max(longest, len(each))
-        elif isinstance(each, tuple):
-            longest = max([longest, *map(_room, each)])
-        elif not isinstance(each, float | int):
-            longest = max(longest, _room(each))
+    members, longest = _members(value.__class__), LEAST_ROOM
+    for name in members.lists:
+        longest = max(longest, len(getattr(value, name)))
+    for name in (*members.objects, *(name for name, _ in members.unions)):
+        longest = max(longest, _room(getattr(value, name)))
+    for name, _ in members.union_lists:
+        longest = max([longest, *map(_room, getattr(value, name))])
     return 1 << (longest - 1).bit_length()
 
 
@@ -283,21 +303,22 @@ def _layout_of(plant: Any, room: int) -> Any:
 
 def _fill(record: Any, value: Any) -> None:
     """Writes an object's attributes to its record."""
-    for name, hint in _attributes(type(value)).items():
+    members = _members(value.__class__)
+    for name in members.numbers:
+        record[name] = getattr(value, name)
+    for name in members.lists:
         each = getattr(value, name)
-        if hint in KINDS:
-            _fill_union(record[name], hint, each)
-        elif get_origin(hint) in {tuple, list} and get_args(hint)[0] in KINDS:
-            if len(each) > len(record[name]):
-                raise Uncompilable(f"{len(each)} of {name}")
-            for place, entry in zip(record[name], each, strict=False):
-                _fill_union(place, get_args(hint)[0], entry)
-        elif get_origin(hint) in {tuple, list}:
-            record[name][: len(each)] = each
-        elif hint in _NUMBERS:
-            record[name] = each
-        else:
-            _fill(record[name], each)
+        record[name][: len(each)] = each
+    for name in members.objects:
+        _fill(record[name], getattr(value, name))
+    for name, protocol in members.unions:
+        _fill_union(record[name], protocol, getattr(value, name))
+    for name, protocol in members.union_lists:
+        each = getattr(value, name)
+        if len(each) > len(record[name]):
+            raise Uncompilable(f"{len(each)} of {name}")
+        for place, entry in zip(record[name], each, strict=False):
+            _fill_union(place, protocol, entry)
 
 
 def _fill_union(record: Any, protocol: Any, value: Any) -> None:

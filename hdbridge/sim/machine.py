@@ -125,7 +125,9 @@ class Machine:
         for cycle, count in enumerate(substeps):
             if isinstance(self._axis, fast.EvenAxis) and min(substeps[cycle:]) > 0:
                 counts, torque_nm = self._responded(counts, substeps, cycle)
-                noise_deg = np.array([self._chance_deg() for _ in substeps[cycle:]])
+                noise_deg = np.zeros(len(substeps) - cycle)
+                if self._noise_deg:
+                    noise_deg[:] = [self._chance_deg() for _ in noise_deg]
                 demand = np.array(counts[cycle:], dtype=np.float64)
                 steps = np.array(substeps[cycle:], dtype=np.int64)
                 on = slice(cycle, None)

@@ -57,6 +57,7 @@ def check_pages(folder):
         (["run", ".", "--out", "out", "--memory", "much"], "--memory: found 'much'"),
         (["run", ".", "--out", "out", "--memory", "1MB"], "at least 200MB"),
         (["run", ".", "--out", "out", "--scheduler", "tcp://a:1", "--workers", "2"], "--workers"),
+        (["run", ".", "--out", "."], "not written by hdbridge fleet"),
         (["report", "."], "no recordings in this folder"),
         (["simulate", "."], "is not empty"),
     ],

@@ -2,6 +2,7 @@
 
 import asyncio
 import gc
+import socket
 import threading
 from contextlib import suppress
 from dataclasses import replace
@@ -13,8 +14,9 @@ from support.fleet import MODEL, record
 from support.flight import flight_log, samples
 
 from hdbridge.daemon.recorder.flightlog import Batch
+from hdbridge.errors import InputError
 from hdbridge.fleet.diagnosing import axes_of, diagnosed, model_in
-from hdbridge.fleet.sources import Source, find_sources, with_axes
+from hdbridge.fleet.sources import Source, fetched, find_sources, with_axes
 from hdbridge.records.recording import Recording
 
 KNOWN = model_in(MODEL, "model.yaml")
@@ -25,6 +27,10 @@ def check_fleet_at(url):
     """One folder with a recording, and one CSV file."""
     found = find_sources([url])
     assert [each.path.removeprefix(f"{url}/") for each in found] == ["a.csv.gz", "rec"]
+    assert [each.joint for each in found] == [None, "J7"]
+    with fetched(found[0].path) as path:
+        assert path.is_file()
+    assert not path.exists()
     rows = [diagnosed(replace(each, joint="J7", ratio=50.0), KNOWN) for each in found]
     assert [row.get("reason") for row in rows] == [None, None]
     assert rows[0]["samples_sha256"] == rows[1]["samples_sha256"]
@@ -99,6 +105,28 @@ def test_recordings_behind_sftp(files, monkeypatch, tmp_path):
         fsspec.get_filesystem_class("sftp").clear_instance_cache()
         where["loop"].call_soon_threadsafe(where["end"].set)
         thread.join(60)
+
+
+@pytest.mark.parametrize("place", ["s3://bucket/x", "sftp://u:p@127.0.0.1:{}/x", "http://127.0.0.1:{}/x/"])
+def test_a_server_of_something_else_is_an_error_of_one_line(place, monkeypatch):
+    pytest.importorskip("s3fs")
+    pytest.importorskip("paramiko")
+    with socket.create_server(("127.0.0.1", 0)) as server:
+
+        def answer():
+            with suppress(OSError):
+                while True:
+                    with server.accept()[0] as line:
+                        line.sendall(b"220 mail\r\n")
+
+        threading.Thread(target=answer, daemon=True).start()
+        port = server.getsockname()[1]
+        once = {"config_kwargs": {"retries": {"max_attempts": 0}}, "key": "k", "secret": "s"}
+        monkeypatch.setitem(fsspec.config.conf, "s3", {"endpoint_url": f"http://127.0.0.1:{port}", **once})
+        place = place.format(port)
+        with pytest.raises(InputError, match=f"^{place}: cannot be listed: .+$"):
+            find_sources([place])
+        server.shutdown(socket.SHUT_RDWR)
 
 
 def test_each_axis_of_a_flight_recording_is_a_joint(tmp_path):

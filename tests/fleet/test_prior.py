@@ -15,6 +15,7 @@ from hdbridge.analysis.findings import UNWEIGHED, Finding, Parameter
 from hdbridge.analysis.probability import Context, Prior, weighed
 from hdbridge.analysis.scales import Scales
 from hdbridge.fleet.prior import read_prior, write_prior
+from hdbridge.fleet.summary import summarise
 
 SCALES = Scales()
 SHARES = st.floats(1e-6, 1.0 - 1e-6)
@@ -77,8 +78,10 @@ def test_intervals_with_the_fleets_range_hold_as_often_as_they_say():
 def row(joint, number, cause=None, batch="A", peak=5.0):
     """A row of a data set, as far as the prior reads it."""
     parameters = [{"name": "amplitude", "value": peak, "low": peak - 1, "high": peak + 1, "unit": "arcsec"}]
-    found = {"cause": cause, "rank": 1, "peak_arcsec": peak, "parameters": parameters}
-    same = {"reason": None, "duplicate_of": None, "orders": [], "date": None, "gear": "ratio 50"}
+    found = {"cause": cause, "rank": 1, "peak_arcsec": peak, "parameters": parameters, "aliases": []}
+    same = dict.fromkeys(("figures", "temperature_c", "remarks"))
+    same |= {"limits": [{"cause": "motor_order", "arcsec": 0.5}], "rms_arcsec": 0.6}
+    same |= {"reason": None, "duplicate_of": None, "orders": [], "date": None, "gear": "ratio 50"}
     same |= {"cell": None, "lubricant": None, "batch": batch, "hours": 100.0 * number}
     return {
         **same, "joint": joint, "key": f"{joint}{number}", "path": f"{joint}-{number}",
@@ -110,6 +113,15 @@ def test_the_prior_knows_what_is_common_where_and_which_names_mean_nothing(prior
     assert everyone.ranges.keys() == {("motor_order", "amplitude")}
     assert middle == pytest.approx(6.2, abs=0.3)
     assert 0.3 < deviation < 1.5
+
+
+def test_a_cause_that_the_first_recording_could_not_show_has_not_appeared_since():
+    rows = []
+    for joint, peak in enumerate((0.5, 6.0, *[0.0] * 30)):
+        for number in range(5):
+            rows.append(row(joint, number, "motor_order" if peak and number else None, peak=peak))
+    (listed,) = summarise([{**each, "joint": f"J{each['joint']}"} for each in rows], 10.0).first
+    assert (listed.joint, listed.cause) == ("J1", "motor_order")
 
 
 def test_diagnose_shows_the_prior_and_refuses_a_wrong_one(prior, tmp_path):

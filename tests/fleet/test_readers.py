@@ -23,24 +23,19 @@ def out(tmp_path_factory):
 
 def test_pandas_reads_a_folder_as_one_table(out):
     pandas = pytest.importorskip("pandas")
-    table = pandas.read_parquet(out / "recordings")
-    assert sorted(table["joint"]) == ["A", "B"]
-    found = pandas.read_parquet(out / "findings").merge(table, on=["key", "path"])
-    assert found["hours"].tolist() == [10.0]
+    findings, recordings = (pandas.read_parquet(out / each) for each in ("findings", "recordings"))
+    assert findings.merge(recordings, on=["key", "path"])["hours"].tolist() == [10.0]
 
 
 def test_polars_reads_a_folder_as_one_table(out):
     polars = pytest.importorskip("polars")
-    table = polars.read_parquet(out / "recordings" / "*.parquet")
-    assert sorted(table["joint"].to_list()) == ["A", "B"]
-    found = polars.read_parquet(out / "findings" / "*.parquet").join(table, on=["key", "path"])
-    assert found["hours"].to_list() == [10.0]
+    findings, recordings = (
+        polars.read_parquet(out / each / "*.parquet") for each in ("findings", "recordings")
+    )
+    assert findings.join(recordings, on=["key", "path"])["hours"].to_list() == [10.0]
 
 
 def test_duckdb_reads_a_folder_as_one_table(out):
     duckdb = pytest.importorskip("duckdb")
-    found = duckdb.sql(
-        f"select cause, hours from '{out}/findings/*.parquet' "
-        f"join '{out}/recordings/*.parquet' using (key, path)"
-    ).fetchall()
-    assert found == [("backlash", 10.0)]
+    both = f"'{out}/findings/*.parquet' join '{out}/recordings/*.parquet' using (key, path)"
+    assert duckdb.sql(f"select cause, hours from {both}").fetchall() == [("backlash", 10.0)]

@@ -2,7 +2,6 @@
 
 from contextlib import suppress
 
-import fsspec
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
@@ -11,7 +10,7 @@ from hypothesis import strategies as st
 from support.fleet import record
 
 from hdbridge.errors import InputError
-from hdbridge.fleet.sources import MANIFEST, Source, fetched, find_sources, read_manifest, with_axes
+from hdbridge.fleet.sources import Source, find_sources, read_manifest, with_axes
 from hdbridge.records.recording import Recording
 
 
@@ -92,31 +91,9 @@ def test_places_without_a_recording_are_refused(tmp_path):
         find_sources(["nosuch://place"])
 
 
-def test_urls_are_listed_and_fetched(tmp_path):
-    system = fsspec.filesystem("memory")
-    Recording(record(1), axis="J7", ratio=50.0).save(tmp_path / "rec")
-    system.put(str(tmp_path / "rec"), "/fleet/rec", recursive=True)
-    system.pipe("/fleet/b.csv", b"time_s\n")
-    found = find_sources(["memory://fleet"])
-    assert [each.path for each in found] == ["memory://fleet/b.csv", "memory://fleet/rec"]
-    assert found[1].joint == "J7"
-    with fetched(found[1].path) as path:
-        assert Recording.load(path).record == record(1)
-    assert not path.exists()
-    with pytest.raises(InputError, match="cannot be fetched"), fetched("memory://fleet/none.csv"):
-        pass
-
-
 def test_rows_of_a_manifest_name_axes_of_a_flight():
     arm = Source("a.mcap", joint="K", axis="arm", hours=3.0)
     split = with_axes("a.mcap", ["arm", "base"], [arm])
     assert [(each.axis, each.joint) for each in split] == [("arm", "K"), ("base", "base")]
     split = with_axes("a.mcap", ["arm", "base"], [Source("a.mcap", cell="2")])
-    assert [(each.axis, each.joint, each.cell) for each in split] == [
-        ("arm", "arm", "2"),
-        ("base", "base", "2"),
-    ]
-
-
-def test_every_column_of_a_manifest_is_described():
-    assert all(MANIFEST.values())
+    assert [(each.joint, each.cell) for each in split] == [("arm", "2"), ("base", "2")]

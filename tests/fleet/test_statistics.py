@@ -1,5 +1,7 @@
 """Promises of the statistics of a fleet, on fleets of known truth."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -126,9 +128,14 @@ def test_hours_to_a_limit_hold_as_often_as_they_say():
     assert stay <= 3
 
 
-def test_of_joints_that_stay_the_hours_are_not_known():
-    series, _ = aged(np.random.default_rng(2), 40, 0)
-    assert sum(each.hours_to(20.0) is not None for each in trends(series)) <= 1
+@pytest.mark.parametrize("height", [200.0, 2000.0])
+def test_a_step_in_one_joint_hides_no_other_and_has_no_trend_of_its_own(height):
+    for seed in range(3):
+        series, _ = aged(np.random.default_rng(seed), 25, 5)
+        step = replace(series[-1], value=series[-1].value + height * (np.arange(5) == 4))
+        found = trends([*series[:-1], step])
+        assert min(each.growing() for each in found[:5]) > 0.95
+        assert found[-1].hours_to(1e6) is None
 
 
 def test_a_limit_that_is_passed_is_reached_now():

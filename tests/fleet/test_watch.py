@@ -122,6 +122,8 @@ def test_a_changed_model_is_noticed_without_a_changed_recording(place, here):
     end = go(place, here)
     assert end.known == 1  # the damaged one
     assert len(here.read) == 4
+    hashes = [row["model_sha256"] for row in rows_by_name(place).values() if not row["reason"]]
+    assert (len(hashes), len(set(hashes))) == (3, 1)
 
 
 def test_a_recording_of_which_recording_yaml_is_missing_is_not_complete():

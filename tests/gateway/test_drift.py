@@ -9,7 +9,7 @@ from random import Random
 import pytest
 
 from hdbridge.daemon.loop.outerfeed import OuterFeed
-from hdbridge.daemon.memory.layout import Knot
+from hdbridge.daemon.memory.layout import OuterKnot
 from hdbridge.device.syncclock import SyncClock
 
 DAY_S = 86_400.0
@@ -18,10 +18,8 @@ DAY_S = 86_400.0
 class Knots(deque):
     """Queue of set-points between two processes."""
 
-    def peek(self):
-        return self[0] if self else None
-
-    drop = deque.popleft
+    def take(self):
+        return self.popleft() if self else None
 
 
 @pytest.mark.parametrize(
@@ -42,13 +40,13 @@ def test_drift_loses_no_set_point_and_delays_none(begin_s, duration_s, inner_s, 
     step_s = outer_s * (1.0 + 1e-6 * drift_ppm)
     sync_s, turn_s, target, worst = begin_s, begin_s, 0.0, 0.0
     times, targets = [begin_s], [0.0]
-    knots.append(Knot(1, begin_s, 0.0, 0.0))
+    knots.append(OuterKnot(1, begin_s, 0.0, 0.0))
     judged = 0
     while turn_s < begin_s + duration_s:
         while sync_s <= turn_s:  # SYNC comes with jitter, and with it a target
             sync.take(sync_s + rng.uniform(0.0, 0.02) * outer_s)
             target += rng.uniform(-1.0, 1.0)
-            knots.append(Knot(1, sync.time_s + sync.period_s, target, 0.0))
+            knots.append(OuterKnot(1, sync.time_s + sync.period_s, target, 0.0))
             times.append(sync_s + step_s)
             targets.append(target)
             sync_s += step_s

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import math
 import shutil
 import struct
 
 import numpy as np
 import pytest
 from support.daemon import PROFILE
-from support.gateway import COUNTS_PER_DEG, NODE, GatewayBench, gateway_bench
+from support.gateway import COUNTS_PER_DEG, NODE, GatewayBench, gateway_bench, swing
 from support.raised import without_load_encoder
 from support.service import play
 
@@ -32,17 +31,6 @@ def scene(tmp_path, scenario, **options):
 
     with gateway_bench(tmp_path, **options) as bench:
         play(main(bench))
-
-
-async def swing(bench, amplitude_deg=2.0, period_s=2.0):
-    """Have the PLC swing the axis from where it stands."""
-    plc, begun, centre = bench.plc, bench.plc.cycle, bench.plc.target
-
-    def plan(cycle):
-        share = (cycle - begun) * plc.period_s / period_s
-        return centre + round(COUNTS_PER_DEG * amplitude_deg * 0.5 * (1.0 - math.cos(2.0 * math.pi * share)))
-
-    plc.plan = plan
 
 
 async def stands(bench, duration_s=0.3, within_deg=0.003):
@@ -243,22 +231,6 @@ async def reset_and_go(bench):
     await bench.wait(0.5)
     assert bench.plc.statusword & STATE == ENABLED
     assert bench.plc.emergencies == []
-
-
-def test_a_dead_control_process_is_a_fault(tmp_path):
-    async def scenario(bench):
-        plc = bench.plc
-        await bench.enable()
-        await swing(bench)
-        await bench.wait(0.6)
-        bench.daemon.hang(0.2)
-        bench.daemon.begin_again()
-        await bench.until(lambda: plc.statusword & 0x4F == FAULT, 1.0)
-        await bench.until(lambda: bench.daemon.states[0].name == "DISABLED", 10.0)
-        await stands(bench)
-        await reset(bench)
-
-    scene(tmp_path, scenario)
 
 
 def test_a_client_takes_the_axis_by_force_and_gives_it_back(tmp_path):

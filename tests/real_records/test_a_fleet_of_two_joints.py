@@ -5,61 +5,50 @@ Four one-way moves of a second each, all within minutes: nothing can have change
 
 from __future__ import annotations
 
-import json
 import os
 from pathlib import Path
 
 import pytest
-from support.command import run_here
 
 from hdbridge.fleet.dataset import Dataset
+from hdbridge.fleet.diagnosing import diagnosed, fitted, model_in
+from hdbridge.fleet.sources import Source
+from hdbridge.fleet.summary import summarise
 
-FOLDER = Path(os.environ.get("HDBRIDGE_REAL_RECORDS", "/nowhere")) / "cobot"
+BESIDE = Path(__file__).parents[3] / "shared" / "data"
+FOLDER = Path(os.environ.get("HDBRIDGE_REAL_RECORDS", BESIDE)) / "cobot"
 pytestmark = pytest.mark.skipif(
-    not FOLDER.is_dir(), reason="HDBRIDGE_REAL_RECORDS names no folder of measured records"
+    not FOLDER.is_dir(),
+    reason=f"no folder {FOLDER}: set HDBRIDGE_REAL_RECORDS to that of the measured records",
 )
+SOURCES = [
+    Source(
+        str(FOLDER / f"joint{joint}-{number}.csv"), joint=f"joint{joint}", ratio=100.0, hours=float(number)
+    )
+    for joint in (4, 5)
+    for number in range(1, 5)
+]
 
 
-@pytest.fixture(scope="module")
-def out(tmp_path_factory, request):
-    """The result of a run without models, and of one with a model that has a ratio and nothing else."""
-    pytest.importorskip("distributed")
-    folder = tmp_path_factory.mktemp("cobot")
-    rows = [
-        f"{FOLDER / f'joint{joint}-{number}.csv'},joint{joint},100,{number}"
-        for joint in (4, 5)
-        for number in range(1, 5)
-    ]
-    (folder / "m.csv").write_text("\n".join(["path,joint,ratio,hours", *rows]) + "\n")
-    (folder / "model.yaml").write_text("schema: hdbridge.model/1\nratio: 100.0\neffects: []\n")
-    for name, options in (("unfitted", []), ("bare", ["--model", "model.yaml"])):
-        done = run_here(
-            folder, "fleet", "run", "--manifest", "m.csv", "--out", name, "--workers", "1", *options
-        )
-        assert done.returncode == 0, done.stderr
-        assert "No joint stands out." in done.stdout
-    return folder
+def test_without_a_model_it_says_that_the_moves_do_not_make_one():
+    for own in (SOURCES[:4], SOURCES[4:]):
+        reason = fitted(own, "model.yaml").reason
+        assert reason.startswith("no model could be fitted")
+        assert "slow sweeps" in reason
 
 
-def test_without_a_model_it_says_that_the_moves_do_not_make_one(out):
-    for row in Dataset(out / "unfitted").recordings():
-        assert row["reason"].startswith("no model could be fitted")
-        assert "slow sweeps" in row["reason"]
-
-
-def test_it_names_what_a_recording_shows_but_lists_nobody_and_gives_no_hours(out):
-    rows = Dataset(out / "bare").recordings()
+def test_it_names_what_a_recording_shows_but_lists_nobody_and_gives_no_hours(tmp_path):
+    bare = model_in("schema: hdbridge.model/1\nratio: 100.0\neffects: []\n", "model.yaml")
+    dataset = Dataset(tmp_path / "out")
+    dataset.create()
+    dataset.add([diagnosed(each, bare) for each in SOURCES])
+    dataset.compact()
+    rows = dataset.recordings()
     assert [row["reason"] for row in rows] == [None] * 8
     named = [each for row in rows for each in row["findings"] if each["cause"] != "unexplained"]
     assert named
     assert max(each["probability"] for each in named) <= 0.6
-    run_here(out, "fleet", "report", "bare", "--json", "fleet.json")
-    found = json.loads((out / "fleet.json").read_text())
-    assert found["first"] == []
-    assert found["mistaken"] == []
-    assert found["odd"] == []
-
-
-def test_an_identity_is_not_claimed_of_a_motor_turn(out):
-    """Below two turns the orders of the motor are not separable."""
-    assert all(row["orders"] == [] for row in Dataset(out / "bare").recordings())
+    # Below two motor turns the orders are not separable, so no identity is claimed.
+    assert [row["orders"] for row in rows] == [[]] * 8
+    found = summarise(rows, 10.0)
+    assert (found.first, found.mistaken, found.odd) == ((), (), ())

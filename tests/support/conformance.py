@@ -16,7 +16,7 @@ from hdbridge.daemon.machinefile import GatewaySettings
 from hdbridge.device.node import DriveNode
 from hdbridge.drive.link import Link
 from hdbridge.files.edsfile import shared_eds
-from hdbridge.sim.lockstep import lockstep_bench
+from hdbridge.sim.lockstep import LockstepBus, VirtualClock, lockstep_bench
 from support.ideal_motor import IdealMotor
 
 ROOT = Path(__file__).parents[2]
@@ -34,13 +34,20 @@ def simulated_drive(
 
 
 @contextmanager
-def gateway_slave(folder: Path) -> Iterator[tuple[NodeTester, DriveNode]]:
-    """The slave of a gateway in front of an ideal axis."""
+def gateway_bus(folder: Path) -> Iterator[tuple[LockstepBus, VirtualClock, DriveNode]]:
+    """The slave of a gateway in front of an ideal axis, with the master's end of its bus."""
     axis = AxisConfig.load(ROOT / "profiles" / "article" / "axis.yaml")
     settings = GatewaySettings(bus=BusConfig(interface="virtual", channel="outer"), nodes={axis.name: 5})
     path = folder / "gateway.eds"
     path.write_text(eds(axis, settings), encoding="utf-8")
     plate, plant = nameplate(axis, settings), IdealAxis(axis.gear.ratio)
     plant.motor_counts = 1_000_000
-    with lockstep_bench(plant, path, 5, nameplate=plate, behaviour=BEHAVIOUR) as (bus, clock, node):
-        yield NodeTester(Link(bus, clock), 5, od=shared_eds(path, 5).dictionary), node
+    with lockstep_bench(plant, path, 5, nameplate=plate, behaviour=BEHAVIOUR) as bench:
+        yield bench
+
+
+@contextmanager
+def gateway_slave(folder: Path) -> Iterator[tuple[NodeTester, DriveNode]]:
+    """The same, with a tester on its bus."""
+    with gateway_bus(folder) as (bus, clock, node):
+        yield NodeTester(Link(bus, clock), 5, od=shared_eds(folder / "gateway.eds", 5).dictionary), node

@@ -29,9 +29,8 @@ def draw(rng: Random) -> tuple[str, Any]:
     """A random event: kind and value."""
     kinds: tuple[tuple[str, Any], ...] = (
         ("word", rng.choice(WORDS)),
-        ("walk", 0),
-        ("walk", 0),
-        ("target", rng.uniform(-5.0, 5.0)),
+        *(("walk", 0),) * 4,
+        *(("target", rng.uniform(-5.0, 5.0)),) * 4,
         ("target", rng.choice([-1e5, 401.0, -401.0, 2000.0])),
         ("mode", rng.choice([0, 1, 6, 7, 8, 8, 3])),
         ("nmt", rng.choice([1, 1, 2, 128, 129, 130])),
@@ -62,7 +61,8 @@ class Laws:
         self.unasked = ""
         """Reason why the present following, once it moves, is motion that nobody asked for."""
         self.lowest = self.highest = self.began_deg = 0.0
-        self.enabled = 0
+        self.periods = self.moved = self.enabled = 0
+        """Cycles judged, cycles with a moving set-point, and enablings by the master."""
         self.before: tuple[int, float] | None = None
 
     def look(self) -> None:
@@ -76,6 +76,7 @@ class Laws:
             self._judge(sample["axes"][0], int(sample["cycle"]))
 
     def _judge(self, axis: np.void, cycle: int) -> None:
+        self.periods += 1
         driven = axis["state"] in (AxisState.ENABLED, AxisState.STOPPING)
         place = float(axis["load_target_deg"])
         if not driven:
@@ -86,6 +87,7 @@ class Laws:
         assert limits.position_min_deg <= place <= limits.position_max_deg
         if self.before is not None and self.before[0] == cycle - 1:
             assert abs(place - self.before[1]) <= 1.0001 * limits.velocity_deg_s * self.period_s
+            self.moved += place != self.before[1]
         self.before = cycle, place
         following = axis["mode"] == MotionMode.FOLLOW
         if following and not self.following:
@@ -115,12 +117,13 @@ async def happen(bench: GatewayBench, laws: Laws, kind: str, value) -> None:
     if kind == "word":
         plc.controlword = value
     elif kind == "walk":
-        for word in (0x00, 0x80, 0x06, 0x07, 0x0F):
+        for word, wait_s in ((0x00, 0.1), (0x80, 1.5), (0x06, 0.05), (0x07, 0.05), (0x0F, 0.2)):
             plc.controlword = word
             plc.target = plc.position
-            await rest(bench, laws, 0.15)
+            await rest(bench, laws, wait_s)  # a reset verifies and prepares the drive
     elif kind == "target":
         plc.target = max(min(plc.position + round(value * COUNTS_PER_DEG), 2**31 - 1), -(2**31))
+        await rest(bench, laws, 0.1)
     elif kind == "mode":
         plc.send(0x600 + NODE, struct.pack("<BHBb3x", 0x2F, 0x6060, 0, value))
     elif kind == "nmt":
@@ -169,10 +172,10 @@ async def rest(bench: GatewayBench, laws: Laws, duration_s: float) -> None:
         laws.look()
 
 
-def play_story(folder: Path, story: Sequence[tuple[str, Any]]) -> None:
+def play_story(folder: Path, story: Sequence[tuple[str, Any]]) -> Laws:
     """Plays events on a gateway with an enabled axis; AssertionError if a law is broken."""
 
-    async def scenario(bench: GatewayBench) -> None:
+    async def scenario(bench: GatewayBench) -> Laws:
         async with bench.service.ready() as bridge:
             bench.bridge = bridge
             await bench.configure()
@@ -183,6 +186,7 @@ def play_story(folder: Path, story: Sequence[tuple[str, Any]]) -> None:
             assert laws.enabled == 1
             for kind, value in story:
                 await happen(bench, laws, kind, value)
+            return laws
 
     with gateway_bench(folder) as bench:
-        play(scenario(bench))
+        return play(scenario(bench))

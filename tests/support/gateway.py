@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import struct
 from collections.abc import Callable, Iterator
@@ -243,6 +244,17 @@ class GatewayBench:
     def load_deg(self) -> float:
         """Returns the true angle of the load."""
         return float(self.daemon.nodes[0].firmware.motion.machine.load_reading) / 2_880_000 * 360.0
+
+
+async def swing(bench: GatewayBench, amplitude_deg: float = 2.0, period_s: float = 2.0) -> None:
+    """Have the PLC swing the axis from where it stands."""
+    plc, begun, centre = bench.plc, bench.plc.cycle, bench.plc.target
+
+    def plan(cycle: int) -> int:
+        share = (cycle - begun) * plc.period_s / period_s
+        return centre + round(COUNTS_PER_DEG * amplitude_deg * 0.5 * (1.0 - math.cos(2.0 * math.pi * share)))
+
+    plc.plan = plan
 
 
 @contextmanager

@@ -173,6 +173,17 @@ async def kill_daemon(bench: GatewayBench) -> None:
     bench.daemon.begin_again()
 
 
+def kill_keeper(bench: GatewayBench) -> None:
+    """Its processes get SIGTERM."""
+    bench.kill_gateway()
+    bench.daemon.controller.end()
+
+
+def start_daemon(bench: GatewayBench) -> None:
+    bench.daemon.begin_again()
+    start_gateway(bench)
+
+
 async def stall(bench: GatewayBench, duration_s: float) -> None:
     """Lets the drives and the gateway run while the control process does not, and observes the load."""
     for _ in range(round(duration_s / bench.daemon.period_s)):
@@ -213,6 +224,7 @@ ROWS = (
     OuterFault("both interfaces down", both_down, (), 0.06, ends=both_up),
     OuterFault("gateway process killed", kill_gateway, (), BRAKING_S, ends=start_gateway),
     OuterFault("control process killed", kill_control, (0x6010, 0x7500), 0.06),
+    OuterFault("keeper killed", kill_keeper, (), BRAKING_S, ends=start_daemon),
     OuterFault("all processes killed", kill_daemon, (), 0.06, ends=start_gateway),
 )
 

@@ -33,7 +33,7 @@ from hdbridge.control.sensed import Sensed
 from hdbridge.daemon.loop.controller import Controller
 from hdbridge.daemon.loop.follower import AxisSetup
 from hdbridge.daemon.loop.states import AxisState
-from hdbridge.daemon.memory import CommandKind, Knot, Memory
+from hdbridge.daemon.memory import CommandKind, Memory, OuterKnot
 from hdbridge.drive.feedback import Feedback
 from hdbridge.drive.image import ProcessImage
 from hdbridge.drive.link import Link
@@ -134,7 +134,8 @@ def follow(controller: Controller, memory: Memory, turns: int) -> None:
     begin_s, begin_deg = controller.cycle.due_s, controller.axes[0].set_point.position_deg
     for turn in range(turns):
         way_deg = 0.004 * min(turn * turn * 0.004, 2.0 * turn)  # 2 deg/s, within the limit of acceleration
-        memory.followed[0].put([Knot(1, begin_s + 0.004 * turn, begin_deg + way_deg, 0.0)])
+        due_s = begin_s + 0.004 * turn
+        memory.followed[0].add(OuterKnot(1, due_s, begin_deg + way_deg, due_s))
     controller.turn()
 
 

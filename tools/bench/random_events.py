@@ -13,6 +13,7 @@ import sys
 import tempfile
 from pathlib import Path
 from random import Random
+from typing import Any
 
 sys.path.append(str(Path(__file__).resolve().parents[2] / "tests"))
 from support.disorder import draw, play_story
@@ -23,14 +24,15 @@ PER_STORY = {"slave": 200, "gateway": 100}
 
 def story(stack: str, seed: int) -> None:
     """Plays one sequence of events; raises AssertionError if a law is broken."""
-    if stack == "slave":
-        seen = play_events(seed, PER_STORY[stack])
-        for name in TOTAL:
-            TOTAL[name] += getattr(seen, name)
-        return
-    rng = Random(seed)
+    count, rng = PER_STORY[stack], Random(seed)
+    seen: Any
     with tempfile.TemporaryDirectory(prefix="events-") as folder:
-        play_story(Path(folder), [draw(rng) for _ in range(PER_STORY[stack])])
+        if stack == "slave":
+            seen = play_events(seed, count)
+        else:
+            seen = play_story(Path(folder), [draw(rng) for _ in range(count)])
+    for name in TOTAL:
+        TOTAL[name] += getattr(seen, name)
 
 
 TOTAL = {"periods": 0, "moved": 0, "enabled": 0}

@@ -91,14 +91,22 @@ class AdaptationState(Report):
 class OuterState(Report):
     """The axis as a drive of another master, through the gateway."""
 
-    node_id: int = Field(ge=1, le=127, description="on the bus of that master")
+    node_id: int = Field(ge=1, le=255, description="on the bus of that master; 255: LSS took it away")
     alive: bool = Field(description="whether the gateway process runs")
     nmt: int = Field(description="NMT state of the node as in a heartbeat", examples=[5])
     statusword: int = Field(description="6041h as that master sees it", examples=[0x1237])
+    error_code: int = Field(0, description="603Fh as that master sees it; 0: no error", examples=[0x8700])
     period_s: float | None = Field(None, description="period of that master's SYNC", examples=[0.004])
     jitter_s: float | None = Field(
         None, description="mean deviation of that SYNC from its regular time", examples=[2e-5]
     )
+    latency_s: float | None = Field(
+        None,
+        description="median time from a SYNC to the drive's first frame with its target; None at rest or "
+        "without targets",
+        examples=[0.0061],
+    )
+    latency_99_s: float | None = Field(None, description="99 % of them are not longer", examples=[0.008])
 
 
 class AxisState(Report):
@@ -178,7 +186,7 @@ class CycleState(Report):
     period_s: float = Field(gt=0, examples=[0.004])
     cycle: int = Field(description="number of the newest cycle")
     alive: bool = Field(description="whether the loop turned lately")
-    pid: int = Field(0, ge=0, description="process id of the control loop")
+    pid: int = Field(0, ge=0, description="process id of the control process; 0 if there is none")
     skipped: int = Field(0, ge=0, description="periods left out because the loop was late")
     late_us: float | None = Field(None, description="how late the newest cycle began")
     busy_us: float | None = Field(None, description="how long the newest cycle took")

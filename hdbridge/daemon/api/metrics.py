@@ -124,6 +124,16 @@ _OUTER: Final[Sequence[tuple[str, str, Any]]] = (
         "Mean deviation of the other master's SYNC from its regular time.",
         lambda a: a.outer and a.outer.jitter_s,
     ),
+    (
+        "outer_latency_median_seconds",
+        "Time from the other master's SYNC to the drive's first frame with its target, median.",
+        lambda a: a.outer and a.outer.latency_s,
+    ),
+    (
+        "outer_latency_99_seconds",
+        "The same, 99 % of them are not longer.",
+        lambda a: a.outer and a.outer.latency_99_s,
+    ),
 )
 _AXIS: Final[Sequence[tuple[str, str, Any]]] = (
     ("load_target_degrees", "Load target.", lambda a: a.load_target_deg),

@@ -67,6 +67,7 @@ _FOLLOWING_TIME_S: Final = 0.2
 def nameplate(axis: AxisConfig, settings: GatewaySettings) -> Nameplate:
     """Scales: the load is the motor of this drive, without a gear; the real motor is the second encoder."""
     return Nameplate(
+        serial=settings.nodes[axis.name],  # LSS selects an axis by it
         motor_counts_per_turn=settings.counts_per_turn,
         load_counts_per_turn=round(axis.motor_encoder.counts_per_turn),
         gear_motor_turns=1,
@@ -86,6 +87,7 @@ def _defaults(axis: AxisConfig, settings: GatewaySettings) -> Mapping[str, int |
     return {
         **_PDOS,
         "1008": "hdbridge gateway",
+        "1018sub4": plate.serial,
         "2000": axis.name,
         "6065": unsigned(_FOLLOWING_TIME_S * limits.velocity_deg_s),
         "6066": round(1000.0 * _FOLLOWING_TIME_S),

@@ -17,8 +17,9 @@ from hdbridge.clock import Clock
 from hdbridge.daemon.gateway.objects import BRIDGE, nameplate
 from hdbridge.daemon.loop.faultlog import FAULT_INDEX
 from hdbridge.daemon.loop.states import AxisState
-from hdbridge.daemon.memory import NO_FAULT, Knot, Memory, OuterCell, SampleArray, SampleFlag
+from hdbridge.daemon.memory import NO_FAULT, Memory, OuterCell, OuterKnot, OuterView, SampleArray, SampleFlag
 from hdbridge.device.behaviour import Behaviour, Controlword
+from hdbridge.device.modes import InterpolatedPosition
 from hdbridge.device.node import FRAMES_PER_POLL, DriveNode
 from hdbridge.device.powerstate import PowerStage
 from hdbridge.drive.supervision import Fault
@@ -30,9 +31,17 @@ if TYPE_CHECKING:
     from hdbridge.daemon.machinefile import GatewaySettings
 
 BEHAVIOUR: Final = Behaviour.model_validate(
-    {"controlword": Controlword.LEVEL, "measures_period": True, "sync_timeout_periods": 3.0}
+    {
+        "controlword": Controlword.LEVEL,
+        "measures_period": True,
+        "sync_timeout_periods": 3.0,
+        "fixed_node_id": True,
+    }
 )
-"""Reads controlwords as levels, runs with any period of SYNC, and stops if SYNC is lost."""
+"""Reads controlwords as levels, runs with any period of SYNC, and stops if SYNC is lost.
+
+Its node id is that of the machine file.
+"""
 DEAD_S: Final = 0.3
 """A loop that has not turned for so long hangs or is gone."""
 POWER_S: Final = 5.0
@@ -162,7 +171,8 @@ class LoadAxis(PowerStage):
 
     def switch(self, on: bool) -> None:
         if not on and self._wanted:
-            self._knots.put([Knot(self._wanted, self._clock.now(), math.nan, 0.0)])
+            now_s = self._clock.now()
+            self._knots.add(OuterKnot(self._wanted, now_s, math.nan, now_s))
         self.is_on = self._begun = False
         self._wanted = self._series if on else 0
         self._series += on
@@ -175,10 +185,14 @@ class LoadAxis(PowerStage):
         self._cells[OuterCell.RESETS] = self._resets
 
     def publish(self, node: DriveNode) -> None:
-        """Shows the service the node as the outer master sees it."""
-        cells = self._cells
-        cells[OuterCell.STATUSWORD] = node.firmware.statusword()
-        cells[OuterCell.NMT] = int(node.nmt)
+        """Shows the other processes the node as the outer master sees it, and what that asks for."""
+        cells, value, motion = self._cells, node.dictionary.value, node.firmware.motion
+        cells[OuterCell.NODE_ID] = node.node_id
+        mode = value(0x6061)
+        target = value(0x60C1, 1) if mode == InterpolatedPosition.number else value(0x607A)
+        target_deg = motion.unlimited(target) / self._counts_per_deg
+        words = value(0x6040), node.firmware.statusword(), value(0x603F)
+        cells.show(OuterView(target_deg, *words, int(node.nmt), mode))
         cells[OuterCell.PERIOD_NS] = round(1e9 * node.period_s) if node.has_sync else 0
         cells[OuterCell.JITTER_NS] = round(1e9 * node.jitter_s)
 
@@ -198,7 +212,9 @@ class LoadAxis(PowerStage):
         self._put(begins_s + substeps * self.dt_s, end_counts)
 
     def _put(self, time_s: float, counts: float) -> None:
-        self._knots.put([Knot(self._wanted, time_s, counts / self._counts_per_deg, 0.0)])
+        assert self._node is not None
+        received_s = self._node.now_s
+        self._knots.add(OuterKnot(self._wanted, time_s, counts / self._counts_per_deg, received_s))
 
     def coast(self, substeps: int, braked: bool) -> None:
         """Without power there are no set-points."""
@@ -285,6 +301,7 @@ class Gateway:
                 BEHAVIOUR,
                 load,
                 store_of(axis),
+                settings.bus.bitrate_bps,
             )
             load.use_times_of(node)
             for sub, read in enumerate(load.values(), start=1):

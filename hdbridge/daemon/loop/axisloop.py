@@ -19,8 +19,9 @@ from hdbridge.daemon.loop.knotfeed import KnotFeed
 from hdbridge.daemon.loop.outerfeed import OuterFeed
 from hdbridge.daemon.loop.states import AxisState, Cause, Happening, refusal, target_of
 from hdbridge.daemon.memory.channels import Queue
-from hdbridge.daemon.memory.layout import NO_FAULT, Command, CommandKind, EventKind, Knot
+from hdbridge.daemon.memory.layout import NO_FAULT, Command, CommandKind, EventKind, Knot, OuterKnot
 from hdbridge.daemon.memory.setting import SettingSlot
+from hdbridge.daemon.memory.status import OuterCells
 from hdbridge.daemon.setting import CompensationSetting
 from hdbridge.drive.feedback import Feedback
 from hdbridge.drive.image import ProcessImage
@@ -44,10 +45,13 @@ class AxisLoop:
         knots: Queue[Knot],
         slot: SettingSlot,
         tell: Tell,
-        followed: Queue[Knot],
+        followed: Queue[OuterKnot],
+        outer: OuterCells,
         due_s: Callable[[], float],
     ) -> None:
-        """``followed`` has the gateway's set-points; ``due_s`` returns when the present turn was due."""
+        """``followed`` has the gateway's set-points, ``outer`` its states; ``due_s`` returns when the present
+        turn was due.
+        """
         config = setup.config
         self.index = index
         self.config = config
@@ -69,7 +73,7 @@ class AxisLoop:
         self._faults = FaultLog(index, self.supervision, tell, config.drive.cycle_s)
         self._period_s = config.drive.cycle_s
         self._follow = self.follower.follow
-        self._sampler = AxisSampler(self.cycle, self.follower)
+        self._sampler = AxisSampler(self.cycle, self.follower, self._outer, outer)
         self._changing = self._underrun = self._unfed = False
         self._doubt = ""
         """Last reported states of the compensation change, the stream underrun and the load loop."""
@@ -389,7 +393,8 @@ class AxisLoop:
         if self._unfed:
             self._unfed = False
             if not set_point.at_rest:
-                self._tell(self.index, EventKind.UNDERRUN, self._motion_id, 0)
+                words = "the set-points of the gateway ended in motion, or came too late; it loses its power"
+                self._tell(self.index, EventKind.UNDERRUN, self._motion_id, 0, words)
             self._happened(Happening.UNFED)
         if set_point.underrun is not self._underrun:
             self._underrun = set_point.underrun

@@ -8,10 +8,14 @@ from typing import Final
 from hdbridge.control.axiscycle import AxisCycle
 from hdbridge.daemon.loop.faultlog import FAULT_INDEX
 from hdbridge.daemon.loop.follower import Follower
+from hdbridge.daemon.loop.outerfeed import OuterFeed
 from hdbridge.daemon.loop.states import AxisState
 from hdbridge.daemon.memory.layout import NO_FAULT, SampleFlag
+from hdbridge.daemon.memory.status import OuterCells
 from hdbridge.drive.states import State
+from hdbridge.motion import MotionMode
 
+_FOLLOW: Final = MotionMode.FOLLOW
 _POWER_INDEX: Final = {state: place for place, state in enumerate(State)}
 # Plain integers: combining enum flags would cost more than the rest of the sample.
 _FRESH, _COMPENSATING, _LIMITED, _MEMORY_KNOWN, _CHANGING, _AT_REST, _UNDERRUN, _DOUBTED, _KNOWN0, _KNOWN1 = (
@@ -29,11 +33,16 @@ class AxisSampler:
         "_limited",
         "_load_deg",
         "_motor_deg",
+        "_outer",
+        "_outer_feed",
         "_ratio",
         "_supervision",
     )
 
-    def __init__(self, cycle: AxisCycle, follower: Follower) -> None:
+    def __init__(
+        self, cycle: AxisCycle, follower: Follower, outer_feed: OuterFeed, outer: OuterCells
+    ) -> None:
+        self._outer_feed, self._outer = outer_feed, outer
         self._cycle, self._follower = cycle, follower
         self._image, self._supervision = cycle.image, cycle.supervision
         axis = cycle.image.axis
@@ -50,7 +59,7 @@ class AxisSampler:
         position_deg = motor_deg * feedback.motor_counts
         stop = self._supervision.stop
         flags = _FRESH if feedback.fresh else 0
-        reading0 = reading1 = math.nan
+        reading0 = reading1 = received_s = math.nan
         if feedback.readings:
             flags, reading0, reading1 = _readings(flags, feedback.readings)
         if state is AxisState.ENABLED or state is AxisState.STOPPING:
@@ -73,6 +82,8 @@ class AxisSampler:
                 flags |= _UNDERRUN
             if follower.loop_doubt:
                 flags |= _DOUBTED
+            if set_point.mode is _FOLLOW:
+                received_s = self._outer_feed.received_s
         else:
             flags |= _AT_REST
             target_deg = position_deg / self._ratio
@@ -86,6 +97,7 @@ class AxisSampler:
             feedback.torque_permille * follower.sensed.torque_nm, set_point.velocity_deg_s,
             correction_arcsec, predicted_arcsec, loop_arcsec, weight, reading0, reading1,
             math.nan if self._cycle.silent else motor_deg * image.target_counts,
+            received_s, *self._outer.values(),
         )  # fmt: skip
 
 

@@ -8,6 +8,7 @@ compensation, runs after the RPDOs of one cycle and before the wait for the next
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Callable, Sequence
 from typing import Final
@@ -17,7 +18,7 @@ from hdbridge.daemon.loop.axisloop import AxisLoop
 from hdbridge.daemon.loop.follower import AxisSetup
 from hdbridge.daemon.loop.relay import incoming_ids, nodes_of, why_refused
 from hdbridge.daemon.loop.states import AxisState, label
-from hdbridge.daemon.memory import Command, CommandKind, Event, EventKind, Memory, RelayedFrame
+from hdbridge.daemon.memory import Cell, Command, CommandKind, Event, EventKind, Memory, RelayedFrame
 from hdbridge.drive.link import Frame, Link
 from hdbridge.drive.states import State
 from hdbridge.errors import BusError, HdbridgeError, InputError
@@ -62,6 +63,7 @@ class Controller:
                 memory.settings[index],
                 self._tell,
                 memory.followed[index],
+                memory.outer[index],
                 lambda: cycle.due_s,
             )
             for index, setup in enumerate(setups)
@@ -91,8 +93,11 @@ class Controller:
         # Waiting commands, frames and knots were meant for an earlier loop with the axes in other states.
         memory.commands.clear()
         memory.outgoing.clear()
-        for knots in (*memory.knots, *memory.followed):
+        for knots in memory.knots:
             knots.clear()
+        for followed in memory.followed:
+            followed.clear()
+        memory.status.set(Cell.LOOP_PID, os.getpid())
 
     # ---------------------------------------------------------------- a turn
 

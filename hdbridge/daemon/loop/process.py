@@ -6,7 +6,6 @@ loop runs, the process opens no files, writes no log and makes no SDO transfers 
 
 from __future__ import annotations
 
-import os
 import signal
 import sys
 import time
@@ -25,7 +24,7 @@ from hdbridge.daemon.loop.controller import Controller
 from hdbridge.daemon.loop.follower import AxisSetup
 from hdbridge.daemon.loop.interface import Interface, listen
 from hdbridge.daemon.machine import Axis, Machine
-from hdbridge.daemon.memory import Cell, Memory
+from hdbridge.daemon.memory import Memory
 from hdbridge.daemon.start import Simulation, Start, begin_child
 from hdbridge.drive.link import Link
 from hdbridge.errors import HdbridgeError
@@ -67,7 +66,6 @@ def run(start: Start) -> None:
         reopen = interface.reopen if interface is not None else lambda: None
         controller = Controller(cycle, setups, memory, reopen)
         status = memory.status
-        status.set(Cell.LOOP_PID, os.getpid())
         # No real-time priority for a simulation: a late one never sleeps and would starve its processor.
         real = interface is not None
         with prepare_realtime(realtime.priority, realtime.cpus) if real else nullcontext() as conditions:

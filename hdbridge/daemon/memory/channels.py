@@ -31,6 +31,7 @@ from hdbridge.daemon.memory.layout import (
     Event,
     EventKind,
     Knot,
+    OuterKnot,
     Place,
     RelayedFrame,
 )
@@ -78,6 +79,9 @@ COMMANDS: Final[Format[Command]] = Format(
     COMMAND, lambda command: command[1:], lambda sequence, values: Command(sequence, *values)
 )
 KNOTS: Final[Format[Knot]] = Format(KNOT, lambda knot: knot, lambda _, values: Knot(*values))
+FOLLOWED: Final[Format[OuterKnot]] = Format(
+    KNOT, lambda knot: knot, lambda _, values: OuterKnot._make(values)
+)
 
 
 class _Slots(Generic[T]):
@@ -119,11 +123,11 @@ class _Slots(Generic[T]):
         In a ring they may be torn, unless the slot is not overwritten afterwards either.
         """
         at = self._offset + sequence % self._slots * self._size
-        data = bytes(self._buffer[at : at + self._size])
-        values = self._struct.unpack(data)
+        data = bytes(self._buffer[at : at + self._size]) if self._checked else b""
+        values = self._struct.unpack(data) if data else self._struct.unpack_from(self._buffer, at)
         if values[0] != sequence or values[-1] != sequence:
             return None
-        if self._checked and values[-2] != zlib.crc32(data[:-TAIL_BYTES]):
+        if data and values[-2] != zlib.crc32(data[:-TAIL_BYTES]):
             return None
         return values[1:-2]
 
@@ -236,7 +240,8 @@ class Queue(_Slots[T]):
         """Removes and returns the next item; None if there is none."""
         item = self.peek()
         if item is not None:
-            self.drop()
+            self._misses = 0
+            self._tail[0] += 1
         return item
 
     def clear(self) -> None:

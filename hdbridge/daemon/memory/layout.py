@@ -9,7 +9,7 @@
     knots       one bounded queue per axis                          service -> control process
     settings    one compensation setting per axis                   service -> control process
     followed    one bounded queue per axis: set-points              gateway -> control process
-    outer       cells, one set per axis: power, resets, states      gateway <-> service
+    outer       cells, one set per axis: power, resets, view        gateway <-> service
 
 All numbers are in native byte order, because both ends run on one computer. A slot begins and ends with its
 sequence number, counted from 1. Any change here requires a new `VERSION`.
@@ -17,6 +17,7 @@ sequence number, counted from 1. Any change here requires a new `VERSION`.
 
 from __future__ import annotations
 
+import math
 import struct
 from enum import IntEnum, IntFlag
 from typing import Any, Final, NamedTuple
@@ -24,7 +25,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 MAGIC: Final = b"hdbridge"
-VERSION: Final = 4
+VERSION: Final = 5
 PAGE: Final = 4096
 LINE: Final = 64
 """Size of a cache line; data of different writers is in different lines."""
@@ -182,6 +183,35 @@ class Knot(NamedTuple):
     velocity_deg_s: float
 
 
+class OuterKnot(NamedTuple):
+    """Set-point of the gateway: the load's position at a time, reached linearly from the one before."""
+
+    series: int
+    """Number of its series; set-points of other series are discarded."""
+    time_s: float
+    """Time at which it is due, on the loop's clock."""
+    position_deg: float
+    """NaN ends the series."""
+    received_s: float
+    """Time of the outer SYNC (else of the slave's own period) that made it effective."""
+
+
+class OuterView(NamedTuple):
+    """The node of an axis as the outer master sees it, with what that master asks for."""
+
+    target_deg: float
+    controlword: int
+    statusword: int
+    error_code: int
+    nmt: int
+    mode: int
+
+
+OUTER_VIEW: Final = struct.Struct("@dHHHBB")
+NO_OUTER: Final = OuterView(math.nan, 0, 0, 0, 0, 0)
+"""No gateway process shows this axis to another master."""
+
+
 class OuterCell(IntEnum):
     """Cells that gateway process and service share about one axis, each with one writer."""
 
@@ -195,16 +225,16 @@ class OuterCell(IntEnum):
     """Gateway: number of fault resets that were asked for."""
     RESETS_DONE = 4
     """Service: number of fault resets that are over, with or without success."""
-    STATUSWORD = 5
-    """Gateway: statusword that the outer master sees."""
-    NMT = 6
-    """Gateway: NMT state of the outer node."""
-    PERIOD_NS = 7
+    PERIOD_NS = 5
     """Gateway: period of the outer SYNC; 0: none comes."""
-    HELD = 8
+    HELD = 6
     """Service: 1 while the outer master holds the lease."""
-    JITTER_NS = 9
+    JITTER_NS = 7
     """Gateway: mean deviation of the outer SYNC from its regular time."""
+    NODE_ID = 8
+    """Gateway: node id in use; 255 if LSS took it away."""
+    VIEW = 9
+    """Gateway: `OuterView`, packed; the control process puts it in its samples."""
 
 
 class Axis(NamedTuple):
@@ -234,12 +264,23 @@ class Axis(NamedTuple):
     reading1: float
     issued_deg: float
     """Target sent in this cycle (607Ah) in motor degrees; NaN if none was sent."""
+    outer_received_s: float
+    """When the newest set-point of the other master in this target was received; NaN without one."""
+    outer_target_deg: float
+    """Load angle that the other master asks for (607Ah; 60C1h in IP mode); NaN without a gateway."""
+    outer_controlword: int
+    outer_statusword: int
+    outer_error_code: int
+    """603Fh as the other master sees it."""
+    outer_nmt: int
+    outer_mode: int
+    """6061h as the other master sees it."""
 
 
-_AXIS_FORMATS: Final = ("u1", "u1", "u1", "u1", "u2", "u2", *("f8",) * 13)
+_AXIS_FORMATS: Final = ("u1", "u1", "u1", "u1", "u2", "u2", *("f8",) * 15, "u2", "u2", "u2", "u1", "u1")
 AXIS_SAMPLE: Final = np.dtype(list(zip(Axis._fields, _AXIS_FORMATS, strict=True)))
 """One axis of a sample."""
-_AXIS_CODE: Final = "BBBBHH13d"
+_AXIS_CODE: Final = "BBBBHH15dHHHBB"
 _HEAD: Final[tuple[tuple[str, str], ...]] = (
     ("sequence", "u8"),
     ("cycle", "i8"),

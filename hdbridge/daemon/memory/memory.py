@@ -7,6 +7,7 @@ from typing import Self
 from hdbridge.daemon.memory.channels import (
     COMMANDS,
     EVENTS,
+    FOLLOWED,
     FRAMES,
     KNOTS,
     Mailbox,
@@ -14,7 +15,7 @@ from hdbridge.daemon.memory.channels import (
     Ring,
     RingReader,
 )
-from hdbridge.daemon.memory.layout import AXES_AT_MOST, Event, Layout, RelayedFrame
+from hdbridge.daemon.memory.layout import AXES_AT_MOST, NO_OUTER, Event, Layout, RelayedFrame
 from hdbridge.daemon.memory.region import ORDERED, Region
 from hdbridge.daemon.memory.samples import SampleReader, SampleWriter
 from hdbridge.daemon.memory.setting import SettingSlot
@@ -44,7 +45,7 @@ class Memory:
         self.commands = Mailbox(region, layout.commands, COMMANDS)
         self.knots = tuple(Queue(region, place, KNOTS) for place in layout.knots)
         self.settings = tuple(SettingSlot(region, place) for place in layout.settings)
-        self.followed = tuple(Queue(region, place, KNOTS) for place in layout.followed)
+        self.followed = tuple(Queue(region, place, FOLLOWED) for place in layout.followed)
         self.outer = tuple(OuterCells(region, place) for place in layout.outer)
         self.status = Status(region)
 
@@ -57,7 +58,14 @@ class Memory:
                 f"{axes} axes at {period_s} s: expected 1 to {AXES_AT_MOST} axes, a period above 0"
             )
         layout = Layout.of(axes)
-        return cls(Region.create(layout, period_ns, checked=checked), layout, period_ns)
+        memory = cls(Region.create(layout, period_ns, checked=checked), layout, period_ns)
+        memory.forget_gateway()
+        return memory
+
+    def forget_gateway(self) -> None:
+        """No gateway process shows the axes to another master."""
+        for cells in self.outer:
+            cells.show(NO_OUTER)
 
     @classmethod
     def attach(cls, fd: int) -> Self:

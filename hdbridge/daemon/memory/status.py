@@ -5,7 +5,7 @@ from __future__ import annotations
 from enum import IntEnum
 from typing import Final
 
-from hdbridge.daemon.memory.layout import LINE, STATUS_OFFSET, OuterCell, Place
+from hdbridge.daemon.memory.layout import LINE, OUTER_VIEW, STATUS_OFFSET, OuterCell, OuterView, Place
 from hdbridge.daemon.memory.region import Region
 
 _STRIDE: Final = LINE // 8
@@ -53,7 +53,7 @@ class Status:
 
     @property
     def loop_pid(self) -> int:
-        """Process id of the control process; it changes when the process is restarted."""
+        """Process id of the control process; 0 if there is none."""
         return int(self._cells[Cell.LOOP_PID * _STRIDE])
 
     @property
@@ -79,13 +79,27 @@ class Status:
 class OuterCells:
     """The cells of one axis that gateway process and service share. To read or write one is whole."""
 
-    __slots__ = ("_cells",)
+    __slots__ = ("_at", "_buffer", "_cells")
 
     def __init__(self, region: Region, place: Place) -> None:
         self._cells = region.cells(place.offset, len(OuterCell) * _STRIDE)
+        self._buffer, self._at = region.view, place.offset + OuterCell.VIEW * LINE
 
     def __getitem__(self, cell: OuterCell) -> int:
         return int(self._cells[cell * _STRIDE])
 
     def __setitem__(self, cell: OuterCell, value: int) -> None:
         self._cells[cell * _STRIDE] = value
+
+    def show(self, view: OuterView) -> None:
+        """Writes the view of the outer master in one copy, unlike `pack_into`, which begins with zeros."""
+        self._buffer[self._at : self._at + OUTER_VIEW.size] = OUTER_VIEW.pack(*view)
+
+    def values(self) -> tuple[float, ...]:
+        """Returns the fields of `OuterView`; in the cycle of the control process, so as a plain tuple."""
+        return OUTER_VIEW.unpack_from(self._buffer, self._at)
+
+    @property
+    def view(self) -> OuterView:
+        """The view of the outer master."""
+        return OuterView(*OUTER_VIEW.unpack_from(self._buffer, self._at))

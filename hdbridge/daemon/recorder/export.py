@@ -30,6 +30,8 @@ from hdbridge.records.recording import GAP_CYCLES, PART_SAMPLES, Recording
 ENABLED: Final = (AxisState.ENABLED, AxisState.STOPPING)
 UNSEATED: Final = (AxisState.UNVERIFIED, AxisState.LENT)
 """States after which the encoders' zeros may have changed: the drive was booted or homed."""
+OUTER: Final = ("outer_target_deg", "outer_controlword", "outer_statusword", "outer_error_code")
+"""Columns of an axis with a gateway: what its other master asked for and saw."""
 MEASURED: Final = ("motor_target_deg", "motor_position_deg", "load_position_deg", "motor_torque_nm")
 SAME_RUN_S: Final = 0.5
 Columns = Mapping[str, NDArray[Any]]
@@ -146,6 +148,8 @@ def _record(rows: Columns, axis: AxisAbout, period_s: float) -> Record:
         )
     if np.isnan(columns["motor_torque_nm"]).any():
         del columns["motor_torque_nm"]  # the drive does not report it
+    if not np.isnan(rows[OUTER[0]]).all():
+        columns |= {name: rows[name] for name in OUTER}
     for place, channel in enumerate(axis.channels):
         if np.all(rows["flags"] & (SampleFlag.CHANNEL0_KNOWN << place)):
             columns[channel] = rows[f"reading{place}"]

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from hdbridge.daemon.loop.states import AxisState
 from hdbridge.daemon.memory import AXIS_SAMPLE, NO_FAULT, SampleArray
+from hdbridge.device.nmt import Nmt
 from hdbridge.drive.states import State
 from hdbridge.drive.supervision import Fault
 from hdbridge.errors import InputError
@@ -58,6 +59,8 @@ _ENUMS: Final[Mapping[str, Mapping[int, str]]] = {
     "mode": {int(each): each.name for each in MotionMode},
     "power": _names(State),
     "fault": _names(Fault) | {NO_FAULT: "NONE"},
+    "outer_nmt": {int(each): each.name for each in Nmt},
+    "outer_mode": {0: "NONE", 1: "PP", 6: "HM", 7: "IP", 8: "CSP"},
 }
 _WIDE: Final = {"u2": "u4"}
 """Wider types for those that protobuf lacks."""
@@ -136,19 +139,30 @@ class Message:
         return [data[at : at + size] for at in range(0, count * size, size)]
 
     def decode(self, messages: list[bytes]) -> dict[str, NDArray[Any]]:
-        """Returns a column per field. Raises InputError if a message does not have this layout."""
-        if any(len(each) != self.layout.itemsize for each in messages):
+        """Returns a column per field; those that are newer than the recording are NaN or 0.
+
+        Raises InputError if a message does not have this layout.
+        """
+        lengths = {len(each) for each in messages} or {self.layout.itemsize}
+        names = self.layout.names or ()
+        ends = np.cumsum([self.layout[name].itemsize for name in names])[1::2]
+        known = [name for name, end in zip(names[1::2], ends, strict=True) if end <= max(lengths)]
+        layout = np.dtype([(name, self.layout[name]) for name in names[: 2 * len(known)]])
+        if lengths != {layout.itemsize}:
             raise InputError(f"its {self._short} messages are of another release of hdbridge")
-        rows = np.frombuffer(b"".join(messages), self.layout)
-        for place in self.layout.names or ():
-            if place.startswith("tag ") and not np.all(rows[place] == self._template[place]):
+        rows = np.frombuffer(b"".join(messages), layout)
+        for place in names[: 2 * len(known) : 2]:
+            if not np.all(rows[place] == self._template[place]):
                 raise InputError(f"its {self._short} messages are of another release of hdbridge")
-        return {
-            each.name: (rows[each.name][:, 0] & 0x7F) | (rows[each.name][:, 1] << 7)
-            if each.kind == "enum"
-            else rows[each.name]
-            for each in self._fields
-        }
+        found = {}
+        for each in self._fields:
+            if each.name not in known:
+                found[each.name] = np.full(len(rows), np.nan if each.kind in ("f8", "f4") else 0)
+            elif each.kind == "enum":
+                found[each.name] = (rows[each.name][:, 0] & 0x7F) | (rows[each.name][:, 1] << 7)
+            else:
+                found[each.name] = rows[each.name]
+        return found
 
 
 def _varint(value: int) -> bytes:

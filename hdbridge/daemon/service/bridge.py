@@ -36,7 +36,7 @@ from hdbridge.daemon.service.core import ANSWER_S, Core
 from hdbridge.daemon.service.eventlog import Entry
 from hdbridge.daemon.service.lending import Lending
 from hdbridge.daemon.service.observer import PERIOD_S, Subscription
-from hdbridge.daemon.service.outermaster import OuterMaster
+from hdbridge.daemon.service.outermaster import Latency, OuterMaster
 from hdbridge.daemon.service.reports import LATCHED
 from hdbridge.daemon.service.timing import Timing
 from hdbridge.errors import HdbridgeError, InputError
@@ -89,6 +89,9 @@ class ServiceBridge:
         self._seen = 0
         self._bus_up = True
         self._loop_pid = 0
+        self._latency = Latency(memory.axes)
+        if machine.gateway is not None:
+            self.core.observer.add(self._latency)
         self._tasks: set[asyncio.Task[None]] = set()
         self._verifying: set[str] = set()
         self._settling: set[str] = set()
@@ -177,7 +180,7 @@ class ServiceBridge:
             elif event.kind is EventKind.BUS_UP:
                 self._bus_up = True
         pid = self.core.memory.status.loop_pid
-        if pid != self._loop_pid:
+        if pid and pid != self._loop_pid:
             if self._loop_pid:
                 self.core.log.note("the control process was started again: every axis is disabled")
                 self._bus_up = True
@@ -277,7 +280,8 @@ class ServiceBridge:
         if node_id is None:
             return None
         alive_ns = memory.status.get(Cell.GATEWAY_TIME_NS)
-        return reports.outer_state(memory.outer[self._axis(name).link.index], node_id, alive_ns)
+        place = self._axis(name).link.index
+        return reports.outer_state(memory.outer[place], node_id, alive_ns, self._latency.of(place))
 
     def _warnings(self) -> list[str]:
         core = self.core

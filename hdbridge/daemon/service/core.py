@@ -60,6 +60,11 @@ class Core:
         """
         self.refuse(kind)
         loop_pid = self.memory.status.loop_pid
+        if not loop_pid:
+            raise RefusedError(
+                f"{kind.name} was not sent, because there is no control process: the daemon is starting one, "
+                "with every axis disabled; wait for it and repeat the request"
+            )
         command_id = self.memory.commands.post(kind, axis, **arguments)
         deadline_s = self.timing.clock.now() + within_s
         while (answer := self._answer(command_id)) is None:

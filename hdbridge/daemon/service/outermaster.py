@@ -7,11 +7,16 @@ follows its set-points, and the next service takes it as it is.
 
 from __future__ import annotations
 
+import math
+from collections import deque
+from collections.abc import Sequence
 from contextlib import suppress
 from typing import TYPE_CHECKING, Final
 
+import numpy as np
+
 from hdbridge.daemon.loop.states import AxisState
-from hdbridge.daemon.memory import CommandKind, OuterCell, OuterCells
+from hdbridge.daemon.memory import CommandKind, Event, OuterCell, OuterCells, SampleArray
 from hdbridge.daemon.service.timing import POLL_S
 from hdbridge.drive.states import State
 from hdbridge.errors import HdbridgeError, LeaseError
@@ -28,6 +33,37 @@ SETTLES_S: Final = 2.0
 """Longest time for an axis to brake and lose its power before a reset or the next enable."""
 PREPARE_AGAIN_S: Final = 2.0
 """Pause after a drive could not be prepared."""
+
+LATENCIES_KEPT: Final = 1000
+
+
+class Latency:
+    """Time from the reception of an outer SYNC to the end of the first cycle whose frame has its target."""
+
+    def __init__(self, axes: int) -> None:
+        self._found: list[deque[float]] = [deque(maxlen=LATENCIES_KEPT) for _ in range(axes)]
+        self._newest_s = [math.nan] * axes
+
+    def take(self, samples: SampleArray, events: Sequence[Event], lost: int) -> None:
+        """Takes samples from the observer."""
+        if not len(samples):
+            return
+        sent_s = 1e-9 * samples["time_ns"] + 1e-6 * samples["busy_us"]
+        for place, found in enumerate(self._found):
+            received_s = samples["axes"][:, place]["outer_received_s"]
+            first = np.isfinite(received_s) & (np.diff(received_s, prepend=self._newest_s[place]) != 0.0)
+            found.extend((sent_s - received_s)[first])
+            self._newest_s[place] = received_s[-1]
+            if math.isnan(received_s[-1]):
+                found.clear()  # the axis no longer follows
+
+    def of(self, place: int) -> tuple[float, float] | None:
+        """Returns median and 99 % of an axis; None while it follows nothing."""
+        found = self._found[place]
+        if not found:
+            return None
+        median_s, most_s = np.quantile(found, (0.5, 0.99))
+        return float(median_s), float(most_s)
 
 
 class OuterMaster:

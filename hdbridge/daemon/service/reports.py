@@ -136,16 +136,25 @@ def limits(config: AxisConfig) -> messages.Limits:
     )
 
 
-def outer_state(cells: OuterCells, node_id: int, alive_ns: int) -> messages.OuterState:
-    """An axis as the other master sees it; ``alive_ns``: when the gateway process was last seen alive."""
+def outer_state(
+    cells: OuterCells, node_id: int, alive_ns: int, latency_s: tuple[float, float] | None
+) -> messages.OuterState:
+    """An axis as the other master sees it; ``alive_ns``: when the gateway process was last seen alive.
+
+    ``latency_s``: median and 99 % of the time from a set-point to the frame that carries it.
+    """
+    view, (median_s, most_s) = cells.view, latency_s or (None, None)
     period_s = 1e-9 * cells[OuterCell.PERIOD_NS]
     return messages.OuterState(
-        node_id=node_id,
+        node_id=cells[OuterCell.NODE_ID] or node_id,
         alive=time.monotonic_ns() - alive_ns < GATEWAY_GONE_NS,
-        nmt=cells[OuterCell.NMT],
-        statusword=cells[OuterCell.STATUSWORD],
+        nmt=view.nmt,
+        statusword=view.statusword,
+        error_code=view.error_code,
         period_s=period_s or None,
         jitter_s=1e-9 * cells[OuterCell.JITTER_NS] if period_s else None,
+        latency_s=median_s,
+        latency_99_s=most_s,
     )
 
 

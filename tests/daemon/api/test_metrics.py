@@ -5,7 +5,7 @@ import pytest
 from prometheus_client.parser import text_string_to_metric_families
 from support.fake_bridge import FakeBridge
 
-from hdbridge.client.messages import ControlState
+from hdbridge.client.messages import ControlState, OuterState
 from hdbridge.daemon.api.metrics import BOUNDS_US, Metrics, exposition
 from hdbridge.daemon.api.traffic import Traffic
 from hdbridge.daemon.memory import Event, EventKind
@@ -65,6 +65,8 @@ def test_an_axis_is_in_one_state_and_its_figures_are_there():
     bridge = FakeBridge()
     bridge.axes["joint-1"].at = ControlState.ENABLED
     bridge.axes["joint-1"].target_deg = 30.0
+    times = {"period_s": 0.004, "jitter_s": 2e-5, "latency_s": 0.006, "latency_99_s": 0.008}
+    bridge.axes["joint-1"].outer = OuterState(node_id=5, alive=True, nmt=5, statusword=0x1237, **times)
     found = scraped(bridge, Metrics())
     for name, state in (("joint-1", "enabled"), ("joint-2", "disabled")):
         states = {each: figure(found, "axis_state", axis=name, state=each.value) for each in ControlState}
@@ -72,6 +74,10 @@ def test_an_axis_is_in_one_state_and_its_figures_are_there():
     assert figure(found, "load_target_degrees", axis="joint-1") == 30.0
     assert figure(found, "load_error_arcsec", axis="joint-1") == 1.0
     assert figure(found, "bus_load_ratio") == 0.31
+    for name, value in zip(
+        ("sync_period", "sync_jitter", "latency_median", "latency_99"), times.values(), strict=True
+    ):
+        assert figure(found, f"outer_{name}_seconds", axis="joint-1") == value
     assert figure(found, "lease_held") == 0
     assert ("hdbridge_model_age_seconds", frozenset({("axis", "joint-1")})) not in found
 

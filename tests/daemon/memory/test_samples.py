@@ -15,7 +15,7 @@ from hdbridge.daemon.memory.layout import Axis
 
 def axis(value: float) -> Axis:
     flags = SampleFlag.FRESH | SampleFlag.AT_REST
-    return Axis(3, 1, 4, NO_FAULT, 0x1237, flags, *(value + place for place in range(13)))
+    return Axis(3, 1, 4, NO_FAULT, 0x1237, flags, *(value + place for place in range(15)), 1, 2, 3, 4, 5)
 
 
 def write(memory: Memory, cycle: int) -> None:

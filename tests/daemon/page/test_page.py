@@ -204,9 +204,12 @@ def test_without_its_token_the_page_asks_for_it(place, bridge, chromium):
 def test_it_shows_the_axis_as_the_other_master_sees_it(place, bridge, page):
     outer = {"node_id": 5, "nmt": 5, "statusword": 0x1237}
     axis = next(iter(bridge.axes.values()))
-    axis.outer = messages.OuterState(**outer, alive=True, period_s=0.004, jitter_s=2e-5)
+    axis.outer = messages.OuterState(
+        **outer, alive=True, period_s=0.004, jitter_s=2e-5, latency_s=0.006, latency_99_s=0.008
+    )
     page.until("document.querySelector('#model').innerText.includes('jitter 20 \u00b5s')")
     assert "node 5, operational, 6041h = 1237h, SYNC every 4.000 ms" in page.text("#model")
+    assert "target to frame 6.0 ms, 99 % within 8.0 ms" in page.text("#model")
     axis.outer = messages.OuterState(**outer, alive=True)
     page.until("document.querySelector('#model').innerText.includes('no SYNC')")
     axis.outer = messages.OuterState(**outer, alive=False)

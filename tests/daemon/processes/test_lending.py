@@ -112,6 +112,7 @@ def test_others_see_who_has_the_bus_and_can_stop_it(daemon: Daemon) -> None:
         until_borrowed(daemon, borrower.pid)
         state = daemon.state() or {}
         assert f"process {borrower.pid} of " in state["bus"]["lent_to"]
+        assert state["cycle"]["pid"] == 0, "there is no control process while the bus is lent"
         assert f"the bus is lent to process {borrower.pid}" in state["warnings"][0]
         assert 0.0 < state["bus"]["lent_s"] <= (daemon.state() or {})["bus"]["lent_s"]
         lease = daemon.client.post("/lease", json={"client": "test", "force": True}).json()["token"]

@@ -6,7 +6,7 @@ from support.service import Service, play, until
 from hdbridge.commissioning.evaluation.stepping import Scheme
 from hdbridge.daemon.loop.states import AxisState
 from hdbridge.daemon.memory import Cell, CommandKind
-from hdbridge.errors import LeaseError
+from hdbridge.errors import LeaseError, RefusedError
 
 
 def test_a_new_service_finds_the_axis_where_it_is(service: Service) -> None:
@@ -59,6 +59,24 @@ def test_nothing_is_asked_of_an_axis_before_its_state_is_known(service: Service)
             assert axis.commissioning.report is not None
             assert daemon.states == [AxisState.DISABLED]
             assert 0x000 not in sent  # no NMT command
+
+    play(story())
+
+
+def test_without_a_control_process_nothing_is_sent(service: Service) -> None:
+    """A request between two control processes is refused, and the next one does not find it."""
+
+    async def story() -> None:
+        async with service.ready() as bridge:
+            axis, token = bridge.axes["axis1"], bridge.lease.take("test")
+            status = service.daemon.memory.status
+            pid = status.loop_pid
+            status.set(Cell.LOOP_PID, 0)
+            with pytest.raises(RefusedError, match="there is no control process"):
+                await axis.enable(token)
+            status.set(Cell.LOOP_PID, pid)
+            assert axis.state().state == "disabled"
+            await axis.enable(token)
 
     play(story())
 
