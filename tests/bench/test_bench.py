@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from support.exercised import booted
 
 from hdbridge.axis import AxisConfig
 from hdbridge.axis.model import TransmissionModel
@@ -11,13 +12,11 @@ from hdbridge.commissioning.evaluation.comparison import compare_schemes
 from hdbridge.commissioning.evaluation.stepping import Scheme
 from hdbridge.control.bench import Bench, compensation_for
 from hdbridge.drive import State
-from hdbridge.drive.drive import Drive
 from hdbridge.drive.supervision import Fault
 from hdbridge.errors import InputError, SafetyStop
 from hdbridge.motion.procedures.moves import Dwell, MoveTo
 from hdbridge.motion.procedures.sine import Sines
 from hdbridge.motion.procedures.stepping import Stepping
-from hdbridge.sim.lockstep import simulated_bench
 
 PROFILE = Path(__file__).parents[2] / "profiles" / "article"
 
@@ -48,11 +47,7 @@ def model():
 @pytest.fixture
 def bench_on(axis):
     """The simulated article axis: its node, and a booted drive."""
-    with (
-        simulated_bench(PROFILE / "truth.yaml", axis.eds_path, axis.drive.node_id, 1) as (bus, clock, node),
-        Drive(bus, axis, clock) as drive,
-    ):
-        drive.boot()
+    with booted(axis, PROFILE / "truth.yaml", 1) as (drive, node):
         yield drive, node
 
 
@@ -170,11 +165,7 @@ def test_switching_the_compensation_on_does_not_jump(axis, model, bench_on):
 
 def test_sines_run_and_repeat_bit_for_bit(axis, model):
     def once():
-        with (
-            simulated_bench(PROFILE / "truth.yaml", axis.eds_path, axis.drive.node_id, 5) as (bus, clock, _),
-            Drive(bus, axis, clock) as drive,
-        ):
-            drive.boot()
+        with booted(axis, PROFILE / "truth.yaml", 5) as (drive, _):
             bench = Bench(drive, compensation_for(axis, model))
             return bench.run(Sines(amplitudes_deg=(5.0,), frequency_hz=1.0)).record
 

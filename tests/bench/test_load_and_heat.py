@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from support.exercised import booted
 from support.two_channels import CHANNELS, resumes, stops
 
 from hdbridge.axis import AxisConfig
@@ -49,11 +50,7 @@ def loaded(axis: AxisConfig, more: str = "", gear: str = ""):
     place, mass = MASS
     text = (PROFILE / "truth.yaml").read_text().replace(place, mass + place) + more
     text = text.replace("gear:\n", "gear:\n" + gear)
-    with (
-        simulated_bench(Truth.from_text(text), axis.eds_path, axis.drive.node_id, 1) as (bus, clock, node),
-        Drive(bus, axis, clock) as drive,
-    ):
-        drive.boot()
+    with booted(axis, Truth.from_text(text), 1) as (drive, node):
         yield drive, node
 
 

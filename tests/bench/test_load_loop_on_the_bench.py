@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from support.exercised import booted
 
 from hdbridge.axis import AxisConfig
 from hdbridge.axis.effects import Hysteresis
@@ -15,7 +16,6 @@ from hdbridge.control.compensation import Compensation, CompensationLimits
 from hdbridge.control.loadloop import LoadLoop
 from hdbridge.drive.drive import Drive
 from hdbridge.motion.procedures.moves import Dwell, MoveTo
-from hdbridge.sim.lockstep import simulated_bench
 
 PROFILE = Path(__file__).parents[2] / "profiles" / "article"
 TARGETS = (10.0, 17.3, 25.1, 20.2, 12.7, 12.6, 12.7)
@@ -82,11 +82,7 @@ def aged(model: TransmissionModel) -> TransmissionModel:
 
 def at_rest(axis: AxisConfig, loop: LoadLoop | None, seen: Seen = float) -> tuple[np.ndarray, Looped]:
     """The true error at the end of each rest, arcsec."""
-    with (
-        simulated_bench(PROFILE / "truth.yaml", axis.eds_path, axis.drive.node_id, 1) as (bus, clock, _),
-        Drive(bus, axis, clock) as drive,
-    ):
-        drive.boot()
+    with booted(axis, PROFILE / "truth.yaml", 1) as (drive, _):
         looped = Looped(drive, loop, seen)
         run = Bench(drive, looped).run(Places())
     time, load = run.record.columns["time_s"], run.record.columns["load_position_deg"]

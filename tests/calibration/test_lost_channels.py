@@ -3,13 +3,12 @@
 from datetime import UTC, datetime
 
 import yaml
+from support.exercised import booted
 from support.two_channels import CHANNELS, resumes, stops
 
 from hdbridge.axis import AxisConfig
 from hdbridge.commissioning.calibration import measure, start_journal
-from hdbridge.drive.drive import Drive
 from hdbridge.motion.procedures.plan import Plan
-from hdbridge.sim.lockstep import simulated_bench
 from hdbridge.sim.truth import Truth
 
 
@@ -19,11 +18,7 @@ def measured(cell, silent_cycles):
     path.write_text(path.read_text() + CHANNELS)
     axis, truth = AxisConfig.load(path), Truth.load(cell.axis / "truth.yaml")
     cycles = 0
-    with (
-        simulated_bench(truth, axis.eds_path, axis.drive.node_id, 1) as (bus, clock, node),
-        Drive(bus, axis, clock) as drive,
-    ):
-        drive.boot()
+    with booted(axis, truth, 1) as (drive, node):
         date = datetime(2026, 1, 2, tzinfo=UTC)
         plan = Plan.load(str(cell.folder / "short.yaml"))
         journal = start_journal(cell.folder / "rec", axis, plan, date, drive.identity)

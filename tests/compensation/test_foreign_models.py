@@ -4,6 +4,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from support.exercised import booted
 
 from hdbridge.axis import AxisConfig, Identity
 from hdbridge.axis.effects import Synchronous
@@ -11,10 +12,8 @@ from hdbridge.axis.model import TransmissionModel
 from hdbridge.control.bench import Bench, compensation_for
 from hdbridge.control.caps import cap_remark
 from hdbridge.control.compensation import Compensation, CompensationLimits
-from hdbridge.drive.drive import Drive
 from hdbridge.errors import InputError
 from hdbridge.motion.procedures.stepping import Stepping
-from hdbridge.sim.lockstep import simulated_bench
 from hdbridge.sim.truth import Truth
 
 PROFILE = Path(__file__).parents[2] / "profiles" / "article"
@@ -49,11 +48,7 @@ def test_a_foreign_model_compensates_nothing(what):
 
 def test_what_the_drive_answers_counts_and_a_compensation_of_ones_own_making_is_no_way_round():
     truth = Truth.load(PROFILE / "truth.yaml")
-    with (
-        simulated_bench(truth, AXIS.eds_path, AXIS.drive.node_id, 0) as (bus, clock, _),
-        Drive(bus, AXIS, clock) as drive,
-    ):
-        drive.boot()
+    with booted(AXIS, truth) as (drive, _):
         assert drive.identity.serial not in {None, 7}
         before = drive.read_positions().motor_counts
         own = Compensation(FOREIGN["axis"][0], CompensationLimits(), AXIS.drive.cycle_s)

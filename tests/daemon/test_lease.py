@@ -50,16 +50,6 @@ def test_a_second_client_is_told_who_holds_it_and_for_how_long(lease: Lease, tim
         lease.take("script")
 
 
-def test_even_its_own_holder_takes_it_twice_only_by_force(lease: Lease) -> None:
-    first = lease.take("page")
-    with pytest.raises(LeaseError):
-        lease.take("page")
-    second = lease.take("page", force=True)
-    with pytest.raises(LeaseError):
-        lease.check(first)
-    lease.check(second)
-
-
 def test_it_runs_out_and_says_so_once(lease: Lease, time: Time) -> None:
     token = lease.take("page")
     time.s = 9.99

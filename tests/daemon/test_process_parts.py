@@ -7,8 +7,6 @@ import logging
 import os
 import socket
 import stat
-import subprocess
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -58,17 +56,6 @@ def test_a_child_reads_what_it_was_told() -> None:
 def test_a_child_is_not_started_by_hand(arguments: list[str]) -> None:
     with pytest.raises(InputError, match="use 'hdbridge run'"):
         Start.inherited(arguments)
-
-
-def test_a_child_whose_keeper_is_gone_ends() -> None:
-    program = (
-        "from hdbridge.daemon.start import Start, begin_child\n"
-        "from hdbridge.daemon.machine import Machine\n"
-        "begin_child(Start(Machine.find('article'), 0, keeper=1), 'name')\n"
-        "print('went on')"
-    )
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, check=False)
-    assert (done.returncode, done.stdout) == (0, b"")
 
 
 @pytest.fixture

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support.exercised import booted
 
 from hdbridge.axis import AxisConfig
 from hdbridge.device.behaviour import Behaviour
@@ -26,11 +27,7 @@ DELAYS_MS = (0.0, 8.0, 50.0)
 @contextmanager
 def drive_that_shows_late(delay_ms: float) -> Iterator[tuple[Drive, DriveNode]]:
     truth = Truth.load(PROFILE).model_copy(update={"firmware": Behaviour(status_delay_ms=delay_ms)})
-    with (
-        simulated_bench(truth, AXIS.eds_path, AXIS.drive.node_id) as (bus, clock, node),
-        Drive(bus, AXIS, clock) as drive,
-    ):
-        drive.boot()
+    with booted(AXIS, truth) as (drive, node):
         yield drive, node
 
 

@@ -10,15 +10,14 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support.exercised import booted
 from support.keys import with_keys
 
 from hdbridge.axis import AxisConfig
 from hdbridge.control.bench import Bench
-from hdbridge.drive.drive import Drive
 from hdbridge.motion.procedures.stepping import Stepping
 from hdbridge.sim import fast
 from hdbridge.sim.axis import Axis
-from hdbridge.sim.lockstep import simulated_bench
 from hdbridge.sim.machine import Machine
 from hdbridge.sim.truth import Truth
 
@@ -228,11 +227,7 @@ def test_a_bench_gives_the_same_record_and_takes_over_on_the_way(monkeypatch: py
     axis, known = AxisConfig.load(ARTICLE / "axis.yaml"), Truth.load(ARTICLE)
 
     def record() -> dict[str, np.ndarray]:
-        with (
-            simulated_bench(known, axis.eds_path, axis.drive.node_id, 1) as (bus, clock, node),
-            Drive(bus, axis, clock) as drive,
-        ):
-            drive.boot()
+        with booted(axis, known, 1) as (drive, node):
             columns = Bench(drive).run(Stepping(count=3)).record.columns
             axes.append(node.firmware.motion.machine._axis)  # type: ignore[attr-defined]
             return dict(columns)

@@ -28,9 +28,9 @@ from hdbridge.device.node import DriveNode
 from hdbridge.drive import Drive
 from hdbridge.motion.procedures.stepping import Stepping
 from hdbridge.records.record import Record
-from hdbridge.sim.lockstep import simulated_bench
 from hdbridge.sim.truth import Truth
 from hdbridge.units import ARCSEC_PER_DEG
+from support.exercised import booted
 
 ARTICLE = Path(__file__).parents[2] / "profiles" / "article"
 AXIS = AxisConfig.load(ARTICLE / "axis.yaml")
@@ -298,9 +298,5 @@ FAULTS: dict[str, Callable[[Work], Misreading]] = {
 @contextmanager
 def at_work(truth: Truth, settings: AdaptationSettings | None) -> Iterator[Work]:
     """Provides a booted axis with the article's model; nothing is adapted without settings."""
-    with (
-        simulated_bench(truth, AXIS.eds_path, AXIS.drive.node_id, 1) as (bus, clock, node),
-        Drive(bus, AXIS, clock) as drive,
-    ):
-        drive.boot()
+    with booted(AXIS, truth, 1) as (drive, node):
         yield Work(drive, node, settings)

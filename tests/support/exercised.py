@@ -1,11 +1,17 @@
-"""Records of the simulated axis without a bus."""
+"""The simulated axis: without a bus, and booted on one."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
 
+from hdbridge.axis import AxisConfig
+from hdbridge.device.node import DriveNode
+from hdbridge.drive import Drive
 from hdbridge.records.record import Record
 from hdbridge.sim.exercise import Exercise
+from hdbridge.sim.lockstep import simulated_bench
 from hdbridge.sim.machine import Machine
 from hdbridge.sim.truth import Truth
 
@@ -26,3 +32,14 @@ def record_of(truth: Truth, lead: Callable[[Exercise], None], seed: int = 0) -> 
             "temperature_c": readings.temperature_c,
         }
     )
+
+
+@contextmanager
+def booted(axis: AxisConfig, truth: Truth | Path, seed: int = 0) -> Iterator[tuple[Drive, DriveNode]]:
+    """Provides a booted drive with a simulated axis, and its node."""
+    with (
+        simulated_bench(truth, axis.eds_path, axis.drive.node_id, seed) as (bus, clock, node),
+        Drive(bus, axis, clock) as drive,
+    ):
+        drive.boot()
+        yield drive, node

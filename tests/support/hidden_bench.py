@@ -29,8 +29,8 @@ from hdbridge.motion.procedures.moves import AxisView, Dwell, MoveTo, Procedure,
 from hdbridge.motion.procedures.rehearsal import rehearse
 from hdbridge.motion.procedures.stepping import Stepping
 from hdbridge.records.recording import Recording
-from hdbridge.sim.lockstep import simulated_bench
 from hdbridge.sim.truth import Truth
+from support.exercised import booted
 from support.hidden import Hidden, Run, hide_all
 
 DEMO = Path(__file__).parents[2] / "profiles" / "demo"
@@ -219,11 +219,7 @@ def hidden_bench(
     bare = truth or bare_truth()
     (folder / "model.yaml").write_text(model_text(bare_truth(), rng))
     known, hidden = hide_all(bare, causes, rng, run_of(parts, axis, highest_deg_s2))
-    with (
-        simulated_bench(known, axis.eds_path, axis.drive.node_id, seed) as (bus, clock, _),
-        Drive(bus, axis, clock) as drive,
-    ):
-        drive.boot()
+    with booted(axis, known, seed) as (drive, _):
         cell = Cell(drive, folder, bare, hidden)
         cell.measure(parts)
         yield cell

@@ -1,7 +1,8 @@
-"""Two records of the same commands, compared channel by channel."""
+"""Two records of the same commands, compared by channel, and the verdict on a twin by them."""
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,17 @@ from hdbridge.records.record import Record, concatenate
 from hdbridge.records.recording import Segment
 from hdbridge.sim.exercise import Exercise
 from hdbridge.sim.truth import Truth
-from hdbridge.twin.compare import ALL, Comparison, compare
+from hdbridge.twin.compare import (
+    ALL,
+    Comparison,
+    Row,
+    band_arcsec,
+    compare,
+    overshoot_arcsec,
+    scatter_s,
+    settling_s,
+)
+from hdbridge.twin.twin import HELD_OUT, better
 
 TRUTH = Truth.load(Path(__file__).parents[2] / "profiles" / "demo")
 N = 50.0
@@ -148,3 +159,92 @@ def test_records_of_other_rows_are_refused(measured: Record) -> None:
     bare = Record({name: column for name, column in measured.columns.items() if name != "motor_target_deg"})
     with pytest.raises(InputError, match="motor_target_deg"):
         compare(bare, bare, (), N)
+
+
+TIME_S = np.arange(250) * 0.004
+HZ, DECAY_S = 20.0, 0.15
+RINGING = 40.0 * np.exp(-TIME_S / DECAY_S) * np.cos(2.0 * np.pi * HZ * TIME_S)
+
+
+def test_a_load_that_rings_has_settled_where_it_swings_by_no_more_than_the_band() -> None:
+    found = settling_s(TIME_S, RINGING, 0.0, 10.0)
+    assert found == pytest.approx(DECAY_S * math.log(40.0 / 10.0), abs=0.025)
+    assert settling_s(TIME_S, 0.2 * RINGING, 0.0, 10.0) == 0.0
+
+
+def test_noise_moves_it_by_as_much_as_is_said_and_no_way_in_particular() -> None:
+    noise = 2.0
+    band = band_arcsec(noise)
+    true = settling_s(TIME_S, RINGING, 0.0, band)
+    rng = np.random.default_rng(5)
+    off = [
+        settling_s(TIME_S, RINGING + noise * rng.standard_normal(250), noise, band) - true for _ in range(60)
+    ]
+    said = scatter_s(TIME_S, RINGING, 0.0, band, (noise, 0.0))
+    assert np.sqrt(np.mean(np.square(off))) == pytest.approx(said, rel=0.4)
+    assert abs(np.mean(off)) < 0.6 * said
+    assert scatter_s(TIME_S, RINGING, 0.0, band, (0.0, 0.0)) == 0.0
+
+
+def test_overshoot_is_in_the_direction_of_the_motion() -> None:
+    assert overshoot_arcsec(RINGING, 1.0) == pytest.approx(40.0, abs=0.5)
+    assert overshoot_arcsec(RINGING, -1.0) == pytest.approx(40.0 * math.exp(-0.025 / DECAY_S), rel=0.05)
+
+
+UNITS = {"load_error": "arcsec", "following_error": "motor deg", "motor_torque": "Nm", "temperature": "K"}
+
+
+def comparison(kind: str = HELD_OUT, **differences: float) -> Comparison:
+    rows = [Row(name, kind, UNITS[name], 10.0, 10.0, value, 0.1, 100) for name, value in differences.items()]
+    return Comparison(tuple(rows), {}, {})
+
+
+def test_smaller_differences_on_held_out_legs_are_better() -> None:
+    gain = better(comparison(load_error=4.0, motor_torque=1.0), comparison(load_error=1.0, motor_torque=1.0))
+    assert gain.better
+    assert "50 % smaller" in gain.text
+    assert "has not seen" in gain.text
+
+
+@pytest.mark.parametrize(
+    ("now", "says"),
+    [
+        ({"load_error": 1.0, "motor_torque": 1.2}, "motor torque differs by 1.2 Nm, before by 1"),
+        ({"load_error": 4.0, "motor_torque": 1.0}, "no nearer"),
+    ],
+)
+def test_what_is_worse_or_no_nearer_is_not_kept(now: dict[str, float], says: str) -> None:
+    gain = better(comparison(load_error=4.0, motor_torque=1.0), comparison(**now))
+    assert not gain.better
+    assert says in gain.text
+
+
+def test_below_the_noise_nothing_is_lost() -> None:
+    before, after = (
+        comparison(load_error=4.0, motor_torque=0.02),
+        comparison(load_error=1.0, motor_torque=0.04),
+    )
+    assert better(before, after).better
+
+
+def test_below_what_counts_as_noise_there_may_be_much_to_gain() -> None:
+    """Rounding, and what a reversal leaves in third differences: a replay of the true axis has both."""
+    gain = better(comparison(motor_torque=0.08), comparison(motor_torque=0.02))
+    assert gain.better
+    assert "75 % smaller" in gain.text
+
+
+def test_a_temperature_counts_beyond_the_step_of_its_reading() -> None:
+    """Share for 0.1 K."""
+    cold, near = comparison(load_error=4.0, temperature=0.05), comparison(load_error=1.0, temperature=0.09)
+    assert "75 % smaller" in better(cold, near).text
+    far = comparison(load_error=1.0, temperature=0.4)
+    assert "temperature differs by 0.4 K, before by 0.05" in better(cold, far).text
+    # Each a quarter: of the temperature 0.4 to 0.1, for what is within a step is none.
+    assert "75 % smaller" in better(comparison(load_error=4.0, temperature=0.4), near).text
+
+
+def test_without_held_out_legs_all_of_them_count_and_it_is_said() -> None:
+    gain = better(comparison(ALL, load_error=4.0), comparison(ALL, load_error=1.0))
+    assert gain.better
+    assert "that it was fitted to" in gain.text

@@ -8,15 +8,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from support.exercised import booted
 
 from hdbridge.axis import AxisConfig
 from hdbridge.axis.effects import FloatArray
 from hdbridge.control.bench import Bench
-from hdbridge.drive.drive import Drive
 from hdbridge.motion.procedures.stepping import Stepping
 from hdbridge.records.record import Record
 from hdbridge.records.recording import Recording
-from hdbridge.sim.lockstep import simulated_bench
 from hdbridge.sim.truth import Truth
 from hdbridge.sim.truth.encoder import TrueCoupling
 from hdbridge.twin.fit import (
@@ -56,11 +55,7 @@ def recorded(truth: Truth = TRUTH) -> Recording:
 
 @cache
 def _recorded(truth: str) -> Recording:
-    with (
-        simulated_bench(Truth.from_text(truth), AXIS.eds_path, AXIS.drive.node_id, 0) as (bus, clock, _),
-        Drive(bus, AXIS, clock) as drive,
-    ):
-        drive.boot()
+    with booted(AXIS, Truth.from_text(truth)) as (drive, _):
         return Bench(drive).run(Stepping(1, step_deg=150.0))
 
 

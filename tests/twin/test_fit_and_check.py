@@ -1,4 +1,4 @@
-"""A twin is fitted to what an axis does, and says what has changed since."""
+"""A twin is fitted to what an axis does, states its certainty, and says what has changed since."""
 
 from __future__ import annotations
 
@@ -10,18 +10,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from support.exercised import booted
 
 from hdbridge.axis import AxisConfig
 from hdbridge.axis.channels import ChannelSource, Temperature
 from hdbridge.control.bench import Bench
-from hdbridge.drive.drive import Drive
 from hdbridge.errors import InputError
 from hdbridge.motion.procedures.stepping import Stepping
 from hdbridge.records.recording import Recording
-from hdbridge.sim.lockstep import simulated_bench
 from hdbridge.sim.truth import Truth
-from hdbridge.twin.check import Check, check, growth, scales_by_kind
-from hdbridge.twin.fit import read_off, solve
+from hdbridge.twin.check import Check, Known, check, growth, scales_by_kind
+from hdbridge.twin.fit import free_parameters, read_off, solve
 from hdbridge.twin.misfit import (
     CHANNELS,
     Replays,
@@ -53,11 +52,7 @@ def recorded(seed: int = 0, count: int = 3, **changes: float) -> Recording:
 
 
 def benched(axis: AxisConfig, truth: Truth, seed: int, count: int) -> Recording:
-    with (
-        simulated_bench(truth, axis.eds_path, axis.drive.node_id, seed) as (bus, clock, _),
-        Drive(bus, axis, clock) as drive,
-    ):
-        drive.boot()
+    with booted(axis, truth, seed) as (drive, _):
         return Bench(drive).run(Stepping(count, step_deg=150.0))
 
 
@@ -274,3 +269,32 @@ def test_what_no_cause_explains_is_no_nothing() -> None:
 def test_a_check_needs_a_twin_that_was_fitted() -> None:
     with pytest.raises(InputError, match=r"provenance\.fit"):
         check(recorded(), AXIS, TRUTH)
+
+
+PARAMETERS = free_parameters(TRUTH)
+PRIOR = np.array([each.spread for each in PARAMETERS])
+
+
+def known(covariance: np.ndarray) -> Known:
+    return Known(tuple(each.name for each in PARAMETERS), covariance, {})
+
+
+def test_what_a_fit_knows_better_than_the_prior_is_as_the_fit_says():
+    rng = np.random.default_rng(1)
+    some = rng.standard_normal((len(PRIOR), len(PRIOR)))
+    covariance = np.outer(PRIOR, PRIOR) * (some @ some.T / np.linalg.norm(some, 2) ** 2)
+    root = known(covariance).root(PARAMETERS)
+    assert root @ root.T == pytest.approx(covariance, abs=1e-9)
+
+
+def test_no_direction_is_known_worse_than_before_the_fit():
+    """Residuals of six legs and sixteen parameters gave 81 in the logarithm of an inertia."""
+    direction = np.ones(len(PRIOR)) / np.sqrt(len(PRIOR))
+    covariance = np.outer(PRIOR, PRIOR) * (
+        1e-4 * np.eye(len(PRIOR)) + 6000.0 * np.outer(direction, direction)
+    )
+    root = known(covariance).root(PARAMETERS) / PRIOR[:, None]
+    along = float(direction @ root @ root.T @ direction)
+    across = np.linalg.eigvalsh(root @ root.T)[:-1]
+    assert along == pytest.approx(1.0)
+    assert across == pytest.approx(1e-4)

@@ -1,4 +1,4 @@
-"""Residuals of a replay: each channel has the part that is its own."""
+"""Residuals of a replay: each channel has the part that is its own; the noise that they are held against."""
 
 from __future__ import annotations
 
@@ -18,7 +18,20 @@ from hdbridge.sim.exercise import Exercise
 from hdbridge.sim.truth import Truth
 from hdbridge.twin.compare import FOLLOWING_ERROR, LOAD_ERROR, compare
 from hdbridge.twin.fit import solve
-from hdbridge.twin.misfit import Replays, prepare, remembers, residuals, scales
+from hdbridge.twin.misfit import (
+    CHANNELS,
+    Data,
+    Replays,
+    demand_deg,
+    noise_floor,
+    noise_in_motion,
+    prepare,
+    remembers,
+    residuals,
+    scales,
+    traces_of,
+    what_is_left,
+)
 from hdbridge.twin.parameters import BY_NAME, FOLLOWING, LOAD, TORQUE, coordinates, with_values
 from hdbridge.twin.replay import replay
 
@@ -181,3 +194,85 @@ def test_the_load_counts_at_once_where_the_gear_does_not_remember() -> None:
         first = int(np.flatnonzero(piece.rest == 0.0)[0])
         assert bool(piece.counts[LOAD][first]) is at_once
         assert piece.counts[LOAD][-1]
+
+
+NOISE = {FOLLOWING: 0.5, TORQUE: 0.02, LOAD: 7.0}
+"""Some ten times the rounding."""
+
+
+def moves_and_rests(bench: Exercise) -> None:
+    bench.move(400.0, 600.0, 6000.0)
+    bench.hold(0.6)
+    bench.move(-400.0, 600.0, 6000.0)
+    bench.hold(0.6)
+
+
+@cache
+def as_measured() -> Data:
+    truth = Truth.load(DEMO)
+    return prepare(
+        Recording(record_of(truth, moves_and_rests), axis="demo", ratio=50.0), AxisConfig.load(DEMO), truth
+    )
+
+
+def noisy(where: str) -> Data:
+    """The recording with white noise on each channel, in motion or at rest only."""
+    rng = np.random.default_rng(1)
+    pieces = []
+    for piece in as_measured().pieces:
+        rows = piece.rest == (1.0 if where == "rest" else 0.0)
+        assert 0 < rows.sum() < len(rows)
+        measured = {
+            name: column + rows * NOISE[name] * rng.standard_normal(len(column))
+            for name, column in piece.measured.items()
+        }
+        pieces.append(replace(piece, measured=measured))
+    return replace(as_measured(), pieces=tuple(pieces))
+
+
+def test_a_smooth_replay_is_off_by_as_much_as_is_expected_of_a_drives_steps() -> None:
+    """The torque by more than the gain alone would have it, for the motor answers."""
+    data = as_measured()
+    (piece,), (even,), (steps,) = data.pieces, traces_of(data, data.base), traces_of(data, data.base, "loops")
+    moves_and_rests = np.abs(np.gradient(demand_deg(piece.commands, data.axis))) > 0.5
+    assert float(np.std((steps[TORQUE] - even[TORQUE])[moves_and_rests])) == pytest.approx(
+        noise_floor(data)[TORQUE], rel=0.1
+    )
+    # By a whole step, a motor within a step of a count's edge would count against the true values.
+    off_deg = float(np.std((steps[FOLLOWING] - even[FOLLOWING])[moves_and_rests]))
+    least = scales(data, {name: np.zeros(len(data.leg)) for name in CHANNELS})
+    assert off_deg < least.deviation[FOLLOWING] < 4.0 * off_deg
+
+
+def test_noise_in_motion_is_found_whatever_the_motion_is() -> None:
+    found = noise_in_motion(noisy("motion"))
+    for name in CHANNELS:
+        assert found[name] == pytest.approx(NOISE[name], rel=0.25), name
+
+
+def test_noise_at_rest_says_nothing_of_it() -> None:
+    assert noise_in_motion(noisy("rest")) == pytest.approx(noise_in_motion(as_measured()), rel=0.1)
+
+
+def test_no_noise_is_less_than_the_rounding() -> None:
+    still = [
+        replace(each, measured={name: 0.0 * column for name, column in each.measured.items()})
+        for each in as_measured().pieces
+    ]
+    assert noise_in_motion(replace(as_measured(), pieces=tuple(still))) == noise_floor(as_measured())
+
+
+def test_what_is_left_within_the_noise_of_the_motion_is_explained() -> None:
+    data = noisy("motion")
+    left = {
+        name: np.concatenate(
+            [
+                (one.measured[name] - other.measured[name]) * one.counts[name]
+                for one, other in zip(data.pieces, as_measured().pieces, strict=True)
+            ]
+        )
+        for name in CHANNELS
+    }
+    assert all(each.explained for each in what_is_left(data, left, noise_in_motion(data)))
+    some = what_is_left(data, left, noise_floor(data))
+    assert {each.channel for each in some if not each.explained} == set(CHANNELS)

@@ -1,28 +1,48 @@
-"""A recording's commands, replayed through the simulated drive."""
+"""A recording's commands, read and replayed through the simulated drive."""
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import yaml
+from hypothesis import given
+from hypothesis import strategies as st
+from support.exercised import booted, record_of
 
 from hdbridge.axis import AxisConfig
 from hdbridge.axis.channels import ChannelSource, Temperature
 from hdbridge.control.bench import Bench, axis_view
-from hdbridge.drive.drive import Drive
 from hdbridge.errors import InputError
 from hdbridge.motion.procedures.moves import MoveTo
 from hdbridge.motion.procedures.stepping import Stepping
-from hdbridge.records.record import Record
-from hdbridge.records.recording import Recording
-from hdbridge.sim.lockstep import simulated_bench
+from hdbridge.records.record import Record, concatenate
+from hdbridge.records.recording import Recording, Segment
+from hdbridge.sim.exercise import Exercise
 from hdbridge.sim.machine import Machine
 from hdbridge.sim.truth import Truth
-from hdbridge.twin.replay import replay
+from hdbridge.twin.misfit import Replays, coarse, prepare, residuals
+from hdbridge.twin.parameters import LOAD, with_values
+from hdbridge.twin.replay import (
+    HELD_S,
+    LARGEST_UNKNOWN,
+    commands_of,
+    continuous,
+    counted_cycles,
+    doubts,
+    held_rows,
+    legs_of,
+    replay,
+    stands,
+    stretches,
+    unknown_rows,
+)
 
 DEMO = Path(__file__).parents[2] / "profiles" / "demo"
 SENSOR = ChannelSource(index=0x2100, type="int16", via="tpdo")
@@ -42,11 +62,7 @@ def demo(noise_arcsec: float = 0.0, **servo: float) -> tuple[AxisConfig, Truth]:
 
 
 def benched(axis: AxisConfig, truth: Truth, procedure: Any) -> Recording:
-    with (
-        simulated_bench(truth, axis.eds_path, axis.drive.node_id) as (bus, clock, _),
-        Drive(bus, axis, clock) as drive,
-    ):
-        drive.boot()
+    with booted(axis, truth) as (drive, _):
         return Bench(drive).run(procedure)
 
 
@@ -175,3 +191,331 @@ def test_a_late_stamp_changes_no_simulated_signal() -> None:
     again, straight = (replay(each, axis, truth).columns for each in (late, recording))
     for name in CHANNELS[1:]:
         assert np.array_equal(again[name], straight[name]), name
+
+
+WORK = """
+import sys
+from hdbridge.axis import AxisConfig
+from hdbridge.records.recording import Recording
+from hdbridge.sim.truth import Truth
+from hdbridge.twin.misfit import prepare
+from hdbridge.twin.misfit import Replays
+truth = Truth.load(sys.argv[1])
+data = prepare(Recording.load(sys.argv[2]), AxisConfig.load(sys.argv[1]), truth)
+with Replays(data, 2) as replays:
+    while replays([truth, truth]):
+        print("replayed", flush=True)
+"""
+
+
+def moves(bench: Exercise) -> None:
+    bench.move(400.0, 600.0, 6000.0)
+    bench.hold(1.5)
+
+
+def recorded() -> Recording:
+    return Recording(record_of(Truth.load(DEMO), moves), axis="demo", ratio=50.0)
+
+
+def test_two_processes_give_what_one_gives() -> None:
+    truth = Truth.load(DEMO)
+    truths = [with_values(truth, {"Coulomb friction": each}) for each in (0.034, 0.05)]
+    data = prepare(recorded(), AxisConfig.load(DEMO), truth)
+    with Replays(data, 1) as alone, Replays(data, 2) as together:
+        for few in (False, True):
+            ones, others = (each.rough(truths) if few else each(truths) for each in (alone, together))
+            for one, other in zip(ones, others, strict=True):
+                assert all(np.array_equal(one[name], other[name]) for name in one)
+
+
+def test_workers_end_when_the_process_that_began_them_is_killed(tmp_path: Path) -> None:
+    recorded().save(tmp_path / "recording")
+    command = [sys.executable, "-c", WORK, str(DEMO), str(tmp_path / "recording")]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "replayed\n"
+        process.kill()
+        # The workers have its standard output too: it ends when the last of them has ended.
+        process.communicate()
+
+
+AXIS = AxisConfig.load(DEMO)
+
+
+def there_and_back(bench: Exercise) -> None:
+    for distance in (200.0, -150.0, 90.0, -140.0, 60.0):
+        bench.move(distance, 600.0, 6000.0)
+        bench.hold(0.4)
+
+
+@pytest.fixture(scope="module")
+def bare() -> Record:
+    """A record without any legs, as a CSV file is."""
+    return record_of(Truth.load(DEMO), there_and_back)
+
+
+def changed(record: Record, **columns: np.ndarray) -> Recording:
+    return Recording(Record({**record.columns, **columns}), axis="demo", ratio=50.0)
+
+
+@given(
+    late=st.dictionaries(st.integers(1, 498), st.floats(0.0, 0.9), max_size=20),
+    lost=st.sets(st.integers(1, 498), max_size=5),
+)
+def test_rows_are_counted_whatever_their_stamps_are_late_by(late: dict[int, float], lost: set[int]) -> None:
+    """No stamp is earlier than the one before it, and rows that were not recorded are cycles still."""
+    cycles = np.arange(500.0)
+    stamps = cycles.copy()
+    for row, share in late.items():
+        if row + 1 not in lost and row not in lost:
+            stamps[row] += min(share, 0.45)
+    kept = np.array([row not in lost for row in range(500)])
+    found = counted_cycles(0.004 * stamps[kept] + 7.0, 0.004)
+    assert found == pytest.approx(cycles[kept])
+
+
+def test_rows_that_follow_no_cycle_stay_where_they_are() -> None:
+    rng = np.random.default_rng(0)
+    time_s = np.cumsum(rng.uniform(0.002, 0.006, 400))
+    assert counted_cycles(time_s, 0.004) == pytest.approx((time_s - time_s[0]) / 0.004)
+
+
+def test_legs_of_a_bare_record_are_cut_where_its_command_sets_out(bare: Record) -> None:
+    legs = legs_of(Recording(bare, axis="demo", ratio=50.0))
+    assert len(legs) == 5
+    assert legs[0].start_s == bare.time_s[0]
+    assert legs[-1].end_s == bare.time_s[-1]
+    target = bare.motor_target_deg
+    assert target is not None
+    for leg in legs[1:]:
+        row = int(np.searchsorted(bare.time_s, leg.start_s))
+        assert target[row] == target[row - 1] != target[row + 1]
+
+
+def test_a_long_standstill_belongs_to_no_leg() -> None:
+    """Motion is held out, not the hour in which a gear cools down."""
+    time_s = np.arange(0.0, 20.0, 0.01)
+    angle = np.interp(time_s, [0.0, 1.0, 15.0, 16.0], [0.0, 90.0, 90.0, 0.0])
+    record = Record({"time_s": time_s, "motor_target_deg": angle, "motor_position_deg": angle,
+                     "load_position_deg": angle / 50.0})  # fmt: skip
+    spans = [(leg.start_s, leg.end_s) for leg in legs_of(Recording(record, ratio=50.0))]
+    assert spans == [pytest.approx((0.0, 2.0), abs=0.02), pytest.approx((15.0, 17.0), abs=0.02)]
+
+
+def test_an_oscillation_without_rest_is_cut_at_its_turns() -> None:
+    time_s = np.arange(0.0, 6.0, 0.004)
+    angle = 20.0 * np.sin(2.0 * np.pi * 0.5 * time_s)
+    record = Record({"time_s": time_s, "motor_target_deg": angle, "motor_position_deg": angle,
+                     "load_position_deg": angle / 50.0})  # fmt: skip
+    turns = [leg.start_s for leg in legs_of(Recording(record, ratio=50.0))[1:]]
+    assert turns == pytest.approx([0.5, 1.5, 2.5, 3.5, 4.5, 5.5], abs=0.01)
+
+
+def test_a_recording_in_order_raises_no_doubt(bare: Record) -> None:
+    assert doubts(changed(bare), AXIS) == ()
+
+
+def test_a_torque_with_the_wrong_sign_or_unit_is_noticed(bare: Record) -> None:
+    torque = bare.columns["motor_torque_nm"]
+    (sign,) = doubts(changed(bare, motor_torque_nm=-torque), AXIS)
+    assert "change its sign" in sign
+    percent = 100.0 * torque / AXIS.drive.rated_torque_nm
+    (unit,) = doubts(changed(bare, motor_torque_nm=percent), AXIS)
+    assert "per cent" in unit
+
+
+def test_a_command_that_was_logged_late_is_noticed(bare: Record) -> None:
+    target = bare.motor_target_deg
+    assert target is not None
+    late = np.concatenate([np.full(4, target[0]), target[:-4]])
+    (said,) = doubts(changed(bare, motor_target_deg=late), AXIS)
+    assert "move motor_target_deg earlier" in said
+
+
+CYCLE_S = 0.01
+COUNT_DEG = 0.045
+
+
+def moved_twice(creeps_deg: float) -> tuple[Record, np.ndarray]:
+    """Half a second of motion, as much of rest in which the motor creeps, and motion again."""
+    target = np.concatenate([np.linspace(0.0, 20.0, 50), np.full(50, 20.0), np.linspace(20.4, 40.0, 49)])
+    motor = target.copy()
+    motor[60:100] += creeps_deg * np.linspace(0.0, 1.0, 40)
+    time_s = CYCLE_S * np.arange(len(target))
+    columns = {"time_s": time_s, "motor_target_deg": target, "motor_position_deg": motor}
+    moved = np.diff(target, prepend=target[0]) != 0.0
+    return Record(columns | {"load_position_deg": motor / 50.0}), moved
+
+
+def test_a_standing_motor_tells_its_torque_again_and_again_and_at_last() -> None:
+    """The integral goes on meanwhile: what it comes to at the end may be after the motor broke away."""
+    record, moved = moved_twice(COUNT_DEG)
+    held = held_rows(record, moved, stands(moved, record.motor_position_deg, 1.5 * COUNT_DEG))
+    assert held[-1] == 99, "the last row of the rest"
+    assert np.all(np.abs(np.diff(record.time_s[held[:-1]]) - HELD_S) < 1.5 * CYCLE_S)
+    assert len(held) == 5
+    assert not moved[held].any()
+
+
+def test_a_motor_that_is_still_under_way_tells_none() -> None:
+    record, moved = moved_twice(100.0 * COUNT_DEG)
+    held = held_rows(record, moved, stands(moved, record.motor_position_deg, 1.5 * COUNT_DEG))
+    assert held.tolist() == [99]
+
+
+def ended_in_motion(first_s: float, then_s: float) -> Record:
+    """A procedure that ends far from where the next one begins."""
+    parts = []
+    for length_s, place in ((first_s, 0.0), (then_s, 7.0)):
+        time_s = CYCLE_S * np.arange(round(length_s / CYCLE_S))
+        target = place + 5.0 * np.maximum(time_s - 0.5, 0.0)
+        columns = {"time_s": time_s, "motor_target_deg": target, "motor_position_deg": target}
+        parts.append(Record(columns | {"load_position_deg": target / 50.0}))
+    return concatenate(parts)
+
+
+def test_a_load_rings_as_long_after_an_unknown_stop_however_short_the_procedure_after_it() -> None:
+    """A hardly damped one rings on in all of a procedure of a second."""
+    record = ended_in_motion(20.0, 1.2)
+    unknown = unknown_rows(record, COUNT_DEG)
+    assert not unknown[: record.starts[1]].any(), "it begins at rest"
+    assert unknown[record.starts[1] :].all()
+
+
+def test_no_more_of_a_recording_is_unknown_than_it_can_do_without() -> None:
+    unknown = unknown_rows(ended_in_motion(1.0, 1.2), COUNT_DEG)
+    assert np.mean(unknown) == pytest.approx(LARGEST_UNKNOWN, abs=0.02)
+
+
+LEGS = (
+    Segment(kind="standstill", start_s=0.0, end_s=4.0),
+    Segment(kind="sweep", start_s=4.0, end_s=100.0),
+    *(Segment(kind="step", start_s=100.0 + 2.0 * k, end_s=102.0 + 2.0 * k) for k in range(15)),
+)
+
+
+def swinging(duration_s: float = 130.0) -> Recording:
+    time_s = CYCLE_S * np.arange(round(duration_s / CYCLE_S))
+    motor_deg = 90.0 * np.sin(2.0 * np.pi * time_s / 40.0)
+    columns = {"time_s": time_s, "motor_target_deg": motor_deg, "motor_position_deg": motor_deg}
+    return Recording(Record({**columns, "load_position_deg": motor_deg / 50.0}), LEGS, ratio=50.0)
+
+
+def test_stretches_are_all_rows_in_order_and_begin_with_legs() -> None:
+    record = swinging().record
+    cut = stretches(record, LEGS)
+    assert np.array_equal(np.concatenate([each.time_s for each in cut]), record.time_s)
+    assert all(5.0 <= each.time_s[-1] - each.time_s[0] + CYCLE_S <= 16.0 for each in cut)
+    firsts = [float(each.time_s[0]) for each in cut]
+    assert [each for each in firsts if each >= 100.0] == pytest.approx([100.0, 106.0, 112.0, 118.0, 124.0])
+
+
+def test_a_short_part_stays_whole() -> None:
+    record = swinging(25.0).record
+    assert stretches(record, LEGS) == [record]
+
+
+def test_a_fit_takes_some_of_each_kind_of_motion() -> None:
+    data = prepare(swinging(), AxisConfig.load(DEMO), Truth.load(DEMO))
+    taken = coarse(data, 40.0)
+    assert taken.duration_s <= 40.0
+    assert {"sweep", "step"} <= set(taken.kinds)
+    assert data.duration_s > 130.0
+
+
+def test_a_fit_takes_pieces_of_a_warm_up_at_both_its_ends() -> None:
+    record = swinging().record
+    warm_c = 20.0 + 0.1 * np.floor(record.time_s)
+    warms = Recording(Record({**record.columns, "temperature_c": warm_c}), LEGS, ratio=50.0)
+    axis, truth = AxisConfig.load(DEMO), Truth.load(DEMO)
+    apart_k = {}
+    for name, each in {"untold": swinging(), "told": warms}.items():
+        whole, taken = prepare(each, axis, truth), coarse(prepare(each, axis, truth), 60.0)
+        begun_c = [20.0 + 0.1 * float(piece.commands.time_s[0]) for piece in taken.pieces]
+        apart_k[name] = max(begun_c) - min(begun_c)
+        assert whole.duration_s > 130.0
+    assert apart_k["untold"] < apart_k["told"]
+    assert apart_k["told"] > 11.0
+
+
+def test_a_stretch_that_begins_in_motion_does_not_rest_in_its_first_row() -> None:
+    """This axis never stands; the zero of a command is told by where it does."""
+    data = prepare(swinging(), AxisConfig.load(DEMO), Truth.load(DEMO))
+    assert len(data.pieces) > 5
+    assert not any(each.rest.any() for each in data.pieces)
+
+
+TRUTH = Truth.load(DEMO)
+
+
+@cache
+def two_tasks() -> Recording:
+    """Two tasks of one drive; the second begins where the first has ended."""
+    with booted(AXIS, TRUTH) as (drive, _):
+        bench = Bench(drive)
+        return Recording.joined([bench.run(Stepping(2, start_deg=0.0)) for _ in range(2)])
+
+
+def without_noise() -> Truth:
+    """The load encoder's noise is another draw."""
+    encoder = TRUTH.load_.encoder.model_copy(update={"noise_arcsec": 0.0})
+    return TRUTH.model_copy(update={"load_": TRUTH.load_.model_copy(update={"encoder": encoder})})
+
+
+def moved(recording: Recording, later_s: float) -> Recording:
+    """The second part later, as it would be in another recording."""
+    record = recording.record
+    time_s = record.time_s + later_s * (np.arange(len(record)) >= record.starts[1])
+    return Recording(
+        Record({**record.columns, "time_s": time_s}, record.source, record.starts), axis="demo", ratio=50.0
+    )
+
+
+def test_parts_soon_after_each_other_follow_and_later_ones_do_not() -> None:
+    assert len(two_tasks().record.starts) == 2
+    assert len(continuous(two_tasks().record)) == 1
+    assert len(continuous(moved(two_tasks(), 5.0).record)) == 2
+
+
+def test_a_replay_switches_the_drive_off_between_parts_as_the_bench_does() -> None:
+    """Otherwise a load that rings or a spring that is wound up would start again from rest."""
+    recording = two_tasks()
+    again = replay(recording, AXIS, without_noise())
+    for name in ("motor_target_deg", "motor_position_deg", "motor_torque_nm"):
+        assert np.array_equal(again.columns[name], recording.record.columns[name]), name
+
+
+def test_a_part_that_ends_in_motion_slows_down_as_before_and_is_switched_off() -> None:
+    record = two_tasks().record
+    target, second = record.motor_target_deg, record.starts[1]
+    assert target is not None
+    moves = np.flatnonzero(np.diff(target[:second]) != 0.0)
+    cut = int(moves[-1]) - 3  # the command of the first rows that are left out still moves
+    kept = np.r_[0:cut, second : len(record)]
+    columns = {name: column[kept] for name, column in record.columns.items()}
+    commands = commands_of(Record(columns, starts=(0, cut)), AXIS, TRUTH)
+    counts = np.array(commands.counts[commands.lead :])
+    assert AXIS.motor_encoder.counts(1.0) * target[cut : cut + 2] == pytest.approx(
+        counts[cut : cut + 2], abs=6
+    )
+    approach, off = commands.off
+    assert approach.stop < commands.lead
+    assert off.start == commands.lead + cut + 2
+    assert off.stop == commands.lead + len(counts) - (len(record) - second) - 1
+
+
+def test_the_second_part_counts_from_its_first_row_where_it_is_known_what_came_before() -> None:
+    first, second = prepare(two_tasks(), AXIS, TRUTH).pieces
+    judged = second.counts["following error"] > 0.0
+    assert judged.sum() == len(two_tasks().record) - two_tasks().record.starts[1]
+    assert not judged[: -int(judged.sum())].any(), "what leads up to it does not count"
+    alone = prepare(moved(two_tasks(), 5.0), AXIS, TRUTH).pieces[1]
+    assert second.counts[LOAD].sum() > alone.counts[LOAD].sum() + 50
+    assert first.counts[LOAD].any()
+
+
+def test_the_elastic_state_is_that_of_the_part_before() -> None:
+    """Alone, the second part would begin with the elastic state of a drive that has just been switched on."""
+    data = prepare(two_tasks(), AXIS, TRUTH)
+    left = residuals(data, TRUTH)[LOAD]
+    assert np.std(left[left != 0.0]) < 1.0, "arcsec: the noise and the rounding"

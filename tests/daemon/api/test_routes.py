@@ -83,15 +83,6 @@ def test_a_coordinated_move_takes_every_axis_or_none(api, leased):
     assert [each.target_deg for each in api.bridge.axes.values()] == [10.0, 20.0]
 
 
-def test_nothing_is_moved_by_looking(api, leased):
-    schema = leased.get("/openapi.json").json()
-    for path, methods in schema["paths"].items():
-        if "get" in methods:
-            leased.get(path.removeprefix("/api/v1").format(axis="joint-1", name="6041h"))
-    assert api.bridge.moved == []
-    assert api.bridge.stopped == []
-
-
 def test_the_lease_is_taken_renewed_and_given_back(api):
     bridge = api.bridge
     bridge.now_s = 0.0

@@ -106,15 +106,6 @@ def test_a_client_that_does_not_read_loses_samples_and_nobody_else_does(api):
     assert lost_by_reader < lost
 
 
-def test_watchers_go_and_come_and_leave_nothing_behind(api):
-    for _ in range(5):
-        with ExitStack() as open_now:
-            for _ in range(6):
-                batch(open_now.enter_context(live(api)))
-            assert api.server.traffic.open["websocket"] == 6
-        until(lambda: api.server.traffic.open["websocket"] == 0)
-
-
 def test_only_so_many_may_watch_and_the_next_is_told(api):
     with ExitStack() as open_now:
         for _ in range(32):

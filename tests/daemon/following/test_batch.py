@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from support.adapting import AXIS, MODEL, Sampler, truth_of
+from support.exercised import booted
 
 from hdbridge.analysis.identification import FitOptions
 from hdbridge.analysis.identify import fit
@@ -14,21 +15,15 @@ from hdbridge.control.bench import Bench
 from hdbridge.daemon.following.estimator import Estimator
 from hdbridge.daemon.following.follower import observation_sigma_arcsec
 from hdbridge.daemon.following.measuring import DriftModel, Measuring
-from hdbridge.drive import Drive
 from hdbridge.motion.procedures.moves import Settle
 from hdbridge.motion.procedures.stepping import Stepping
-from hdbridge.sim.lockstep import simulated_bench
 
 
 @pytest.fixture(scope="module")
 def run():
     """A stepping test of a gear whose loop is a tenth higher and whose second order is another."""
     truth = truth_of(1e-3, growth=0.1, second_order_arcsec=2.0)  # all of it at once
-    with (
-        simulated_bench(truth, AXIS.eds_path, AXIS.drive.node_id, 3) as (bus, clock, _),
-        Drive(bus, AXIS, clock) as drive,
-    ):
-        drive.boot()
+    with booted(AXIS, truth, 3) as (drive, _):
         return Bench(drive, MODEL).run(Stepping(count=40, settle=Settle(minimum_s=0.3)))
 
 

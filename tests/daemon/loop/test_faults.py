@@ -17,14 +17,6 @@ from hdbridge.drive.supervision import Fault, Reaction
 S, K, E = AxisState, CommandKind, EventKind
 
 
-def stands(daemon: SteppedDaemon) -> None:
-    """The axis comes to rest and stays there, whatever is sent."""
-    daemon.run(1.0)
-    place = daemon.nodes[0].firmware.motion.machine.motor_counts
-    daemon.run(0.5)
-    assert abs(daemon.nodes[0].firmware.motion.machine.motor_counts - place) <= 2
-
-
 def moving(daemon: SteppedDaemon) -> SteppedDaemon:
     daemon.move(200.0)
     daemon.run(1.0)
@@ -33,52 +25,6 @@ def moving(daemon: SteppedDaemon) -> SteppedDaemon:
 
 def drive_fault(daemon: SteppedDaemon) -> None:
     daemon.nodes[0].faults.raise_error(0x3210)
-
-
-def boot_up(daemon: SteppedDaemon) -> None:
-    daemon.nodes[0].faults.boot_up()
-
-
-def interface_down(daemon: SteppedDaemon) -> None:
-    daemon.bus.down = errno.ENETDOWN
-
-
-def test_a_drive_that_restarted_is_verified_again_and_comes_up_disabled(enabled: SteppedDaemon) -> None:
-    moving(enabled)
-    boot_up(enabled)
-    enabled.run(0.1)
-    assert enabled.states == [S.LATCHED]
-    assert "boot and verify" in enabled.order(K.RESET).text
-    enabled.drive(0).boot()
-    assert enabled.states == [S.LATCHED]
-    enabled.done(K.RESET, i=1)
-    assert enabled.states == [S.UNVERIFIED]
-    sent: list[bytes] = []
-    enabled.bus.spy = lambda can_id, data: sent.append(data) if can_id == 0x201 else None
-    enabled.done(K.VERIFIED, **enabled.seeds(0))
-    enabled.run(0.5)
-    assert enabled.states == [S.DISABLED]
-    assert {struct.unpack("<Hi", data)[0] for data in sent} == {0}
-    enabled.enable()
-    id_ = enabled.move(0.0)
-    enabled.until(lambda: enabled.ended(id_), 30.0)
-
-
-def test_an_interface_that_comes_back_is_used_again_with_everything_disabled(enabled: SteppedDaemon) -> None:
-    moving(enabled)
-    interface_down(enabled)
-    enabled.run(1.3)
-    (down,) = enabled.told(E.BUS_DOWN)
-    assert "Network is down" in down.text
-    assert enabled.told(E.BUS_UP) == []
-    enabled.bus.down = None
-    enabled.until(lambda: bool(enabled.told(E.BUS_UP)), 0.6)
-    assert enabled.states == [S.LATCHED]
-    enabled.drive(0).boot()
-    enabled.done(K.RESET, i=1)
-    enabled.done(K.VERIFIED, **enabled.seeds(0))
-    enabled.enable()
-    assert len(enabled.told(E.BUS_DOWN)) == 1
 
 
 @pytest.mark.parametrize("lent", [False, True])
@@ -97,16 +43,6 @@ def test_a_bus_that_goes_down_while_nothing_moves(daemon: SteppedDaemon, lent: b
         daemon.done(K.RESET, i=1)
     daemon.verify()
     daemon.enable()
-
-
-def test_a_process_that_hung_does_not_catch_up_and_the_axis_stops(enabled: SteppedDaemon) -> None:
-    moving(enabled)
-    before = enabled.axes[0].set_point.position_deg
-    enabled.hang(0.5)
-    enabled.turn(2)
-    assert enabled.states[0] in (S.QUICK_STOPPED, S.LATCHED)
-    assert abs(enabled.axes[0].set_point.position_deg - before) <= 2 * 20.0 * 0.004
-    stands(enabled)
 
 
 def test_one_late_cycle_costs_a_period_and_nothing_else(enabled: SteppedDaemon) -> None:
@@ -215,22 +151,3 @@ def test_the_axis_waits_at_the_end_of_its_move_when_the_service_is_gone(enabled:
     for _ in range(3000):
         enabled.controller.turn()
     assert enabled.states == [S.ENABLED]
-
-
-@pytest.mark.parametrize("how", ["jog", "stream"])
-def test_what_needs_the_service_runs_out_and_stops_when_it_is_gone(enabled: SteppedDaemon, how: str) -> None:
-    from hdbridge.daemon.memory import Knot
-
-    if how == "jog":
-        enabled.post(K.JOG, a=10.0, b=0.3)
-    else:
-        begin = enabled.axes[0].set_point.position_deg
-        path = [Knot(9, 0.1 * n, begin + 0.5 * 4.0 * (0.1 * n) ** 2, 0.4 * n) for n in range(10)]
-        enabled.memory.knots[0].put(path)
-        enabled.post(K.STREAM_BEGIN, a=0.3, i=1, j=9)
-    for _ in range(100):
-        enabled.controller.turn()
-    for _ in range(400):
-        enabled.controller.turn()
-    assert enabled.states == [S.ENABLED]
-    assert enabled.axes[0].set_point.at_rest

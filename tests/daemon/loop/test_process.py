@@ -70,7 +70,7 @@ def simulated() -> Iterator[Running]:
         yield made
 
 
-def test_it_turns_tells_who_it_is_and_answers(simulated: Running) -> None:
+def test_it_turns_tells_who_it_is_answers_and_ends_when_asked(simulated: Running) -> None:
     status = simulated.memory.status
     reader = simulated.memory.reader()
     simulated.until(lambda: status.loop_count > 50)
@@ -82,16 +82,14 @@ def test_it_turns_tells_who_it_is_and_answers(simulated: Running) -> None:
     simulated.until(lambda: any(each.id == id_ for each in simulated.events))
     (answer,) = [each for each in simulated.events if each.id == id_]
     assert answer.kind is EventKind.REFUSED
+    status.set(Cell.STOP_ASKED, 1)
+    assert simulated.ended() == 0
+    assert any(each.kind is EventKind.ENDING for each in simulated.events)
 
 
-@pytest.mark.parametrize("how", ["signal", "cell"])
-def test_it_ends_in_order_when_asked(simulated: Running, how: str) -> None:
-    memory = simulated.memory
-    simulated.until(lambda: memory.status.loop_count > 2)
-    if how == "signal":
-        simulated.process.send_signal(signal.SIGTERM)
-    else:
-        memory.status.set(Cell.STOP_ASKED, 1)
+def test_it_ends_in_order_when_signalled(simulated: Running) -> None:
+    simulated.until(lambda: simulated.memory.status.loop_count > 2)
+    simulated.process.send_signal(signal.SIGTERM)
     assert simulated.ended() == 0
     assert any(each.kind is EventKind.ENDING for each in simulated.events)
 

@@ -7,7 +7,7 @@ from support.daemon import SteppedDaemon
 
 from hdbridge.daemon.loop.relay import MAY_MOVE, incoming_ids, why_refused
 from hdbridge.daemon.loop.states import AxisState
-from hdbridge.daemon.memory import EventKind, RelayedFrame
+from hdbridge.daemon.memory import RelayedFrame
 
 UPLOAD, DOWNLOAD = bytes([0x40, 0x64, 0x60, 0, 0, 0, 0, 0]), bytes([0x2B, 0x40, 0x60, 0, 0x0F, 0, 0, 0])
 READS = [UPLOAD, bytes([0x60, *bytes(7)]), bytes([0x80, *bytes(7)]), bytes([0xA0, *bytes(7)])]
@@ -69,18 +69,6 @@ def test_objects_can_be_read_in_motion_and_cost_no_cycle(enabled: SteppedDaemon)
     assert len(samples) > 1
     assert (samples["axes"]["flags"] & 1).all()
     assert not enabled.ended(id_)
-
-
-def test_a_write_in_motion_is_dropped_and_told(enabled: SteppedDaemon) -> None:
-    enabled.move(20.0)
-    sent: list[int] = []
-    enabled.bus.spy = lambda can_id, _: sent.append(can_id)
-    enabled.memory.outgoing.add(RelayedFrame(0, 0x601, DOWNLOAD))
-    enabled.memory.outgoing.add(RelayedFrame(0, 0x000, b"\x81\x01"))
-    enabled.run(0.5)
-    assert not {0x601, 0x000} & set(sent)
-    assert "disable it first" in enabled.told(EventKind.REFUSED)[-1].text
-    assert enabled.states == [AxisState.ENABLED]
 
 
 def test_at_most_one_frame_a_turn(daemon: SteppedDaemon) -> None:

@@ -132,6 +132,8 @@ def test_the_service_verifies_a_bus_that_comes_back(bench: DaemonBench) -> None:
         daemon.turn()
         turns += 1
     bench.stay_stopped(0)
+    (down,) = daemon.told(E.BUS_DOWN)
+    assert "No such device" in down.text
     bench.leads_back()  # the service verifies, and it stays disabled until it is enabled
     further("the interface comes back").show(turns)
 

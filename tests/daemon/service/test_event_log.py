@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
-import pytest
-from support.service import Service, play, stepped_service
+from support.service import Service, play
 
 from hdbridge.daemon.memory import Event, EventKind
 from hdbridge.daemon.service.bridge import EVENTS_TOLD
@@ -42,12 +39,6 @@ def test_routine_does_not_push_out_what_stopped_an_axis() -> None:
     assert log.told(2) == log.told(99) == []
     assert log.newest == 2 * KEPT + 2  # the service itself sees all
     assert log.answer(7) is not None
-
-
-@pytest.fixture
-def service(tmp_path: Path):
-    with stepped_service(tmp_path) as made:
-        yield made
 
 
 def test_of_many_the_newest_are_told_and_the_others_counted(service: Service) -> None:

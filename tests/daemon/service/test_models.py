@@ -25,12 +25,6 @@ from hdbridge.errors import DaemonError, InputError, RefusedError
 NOW = datetime(2026, 3, 1, tzinfo=UTC)
 
 
-@pytest.fixture
-def service(tmp_path: Path):
-    with stepped_service(tmp_path) as made:
-        yield made
-
-
 def wider(model: TransmissionModel) -> TransmissionModel:
     """The model with half as much hysteresis again."""
     effects = tuple(

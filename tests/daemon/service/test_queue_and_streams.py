@@ -13,12 +13,6 @@ from hdbridge.daemon.service.streams import StreamPoint
 from hdbridge.errors import InputError, LeaseError, RefusedError
 
 
-@pytest.fixture
-def service(tmp_path: Path):
-    with stepped_service(tmp_path) as made:
-        yield made
-
-
 def test_way_points_are_stood_at_one_after_the_other(service: Service) -> None:
     async def story() -> None:
         async with service.enabled() as (bridge, token):

@@ -1,20 +1,12 @@
 """The service dies and another takes its place; the control process dies; the axes are found as they are."""
 
-from pathlib import Path
-
 import pytest
-from support.service import Service, play, stepped_service, until
+from support.service import Service, play, until
 
 from hdbridge.commissioning.evaluation.stepping import Scheme
 from hdbridge.daemon.loop.states import AxisState
 from hdbridge.daemon.memory import Cell, CommandKind
 from hdbridge.errors import LeaseError, RefusedError
-
-
-@pytest.fixture
-def service(tmp_path: Path):
-    with stepped_service(tmp_path) as made:
-        yield made
 
 
 def test_a_new_service_finds_the_axis_where_it_is(service: Service) -> None:

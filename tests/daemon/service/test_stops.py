@@ -2,11 +2,10 @@
 
 import errno
 from collections.abc import Callable
-from pathlib import Path
 
 import pytest
 from support.daemon import SteppedDaemon
-from support.service import Service, play, stepped_service, until
+from support.service import Service, play, until
 
 from hdbridge.cli.ctl.look import _event as printed
 from hdbridge.client import messages
@@ -14,12 +13,6 @@ from hdbridge.daemon.service.bridge import ServiceBridge
 from hdbridge.daemon.service.commissioning import HomingRun
 from hdbridge.drive.supervision import Fault
 from hdbridge.errors import HdbridgeError, RefusedError, SafetyStop
-
-
-@pytest.fixture
-def service(tmp_path: Path):
-    with stepped_service(tmp_path) as made:
-        yield made
 
 
 def lost_tpdos(daemon: SteppedDaemon) -> None:
@@ -164,29 +157,6 @@ def test_a_drive_that_is_not_there_yet_is_waited_for(service: Service) -> None:
             assert axis.state().state == "unverified"
             service.daemon.nodes[0].faults.silent = False
             await until(bridge, lambda: axis.state().state == "disabled", 60.0)
-
-    play(story())
-
-
-def test_everybody_may_stop(service: Service) -> None:
-    async def story() -> None:
-        async with service.enabled() as (bridge, token):
-            axis = bridge.axes["axis1"]
-            await axis.move(token, 100.0, wait=False)
-            await bridge.core.timing.sleep(0.5)
-            await axis.stop()
-            await until(bridge, lambda: axis.state().at_rest, 2.0)
-            assert axis.state().state == "enabled"
-            assert axis.state().load_target_deg < 50.0
-            await axis.move(token, 100.0, wait=False)
-            await bridge.core.timing.sleep(0.5)
-            await bridge.quick_stop()
-            await until(bridge, lambda: axis.state().state == "quick-stopped", 2.0)
-            assert axis.state().fault.name == "COMMAND"
-            await until(bridge, lambda: abs(axis.state().motor_torque_nm or 0.0) < 10.0, 2.0)
-            await bridge.core.timing.sleep(1.0)
-            await axis.reset(token)
-            assert axis.state().state == "disabled"
 
     play(story())
 

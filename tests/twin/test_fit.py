@@ -1,0 +1,353 @@
+"""Least squares of a fit: starts, slopes, minima, rounded readings, and the uncertainty of parameters."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.special import ndtr
+from support.exercised import record_of
+
+from hdbridge.axis import AxisConfig
+from hdbridge.records.recording import Recording, Segment
+from hdbridge.sim.exercise import Exercise
+from hdbridge.sim.truth import Truth
+from hdbridge.twin.fit import (
+    as_late,
+    better_places,
+    delays,
+    exchanged,
+    feedforwards,
+    fit,
+    inertias,
+    lags,
+    neighbours,
+    principal,
+    read_off,
+    sandwich,
+    slopes_at,
+    solve,
+    springs,
+)
+from hdbridge.twin.misfit import Data, Replays, deviation, expected, misfit, prepare, rooted
+from hdbridge.twin.parameters import BY_NAME, FOLLOWING, coordinates, free_value, with_values
+
+
+def test_what_slopes_would_still_take_is_no_scatter_of_the_legs() -> None:
+    rng = np.random.default_rng(1)
+    slopes = rng.standard_normal((600, 1)) + 0.01 * rng.standard_normal((600, 3))  # a valley
+    spread, legs = np.full(3, 0.7), np.repeat([0.0, 1.0], 300)
+    white = rng.standard_normal(600)
+    for left in (white, white + 5.0 * slopes[:, 0]):
+        covariance = sandwich(slopes, left, legs, spread)
+        least = np.linalg.inv(slopes.T @ slopes + np.diag(spread**-2.0))
+        times = np.linalg.eigvals(covariance @ np.linalg.inv(least)).real
+        assert np.all(times > 0.9), "never better than by independent residuals"
+        assert np.all(times < 8.0), "nor much worse where they are"
+        assert np.all(np.linalg.eigvalsh(covariance / 0.49) < 1.0 + 1e-9), "nor than before the fit"
+
+
+def test_intervals_hold_the_truth_where_one_leg_draws_the_fit_more_than_the_others() -> None:
+    """Each leg has a value of its own, and one of eight has as much information as four others."""
+    legs = np.repeat(np.arange(8.0), 50)
+    slopes = np.where(legs == 0.0, 2.0, 1.0)[:, None]
+    off = []
+    for seed in range(300):
+        rng = np.random.default_rng(seed)
+        own = rng.standard_normal(8)
+        seen = slopes[:, 0] * own[legs.astype(int)] + rng.standard_normal(400)
+        found = np.linalg.lstsq(slopes, seen, rcond=None)[0]
+        covariance = sandwich(slopes, seen - slopes @ found, legs, np.full(1, 10.0))
+        off.append(float(found[0]) / float(np.sqrt(covariance[0, 0])))
+    assert 0.88 <= np.mean(np.abs(off) < 1.96) <= 0.98
+
+
+def test_what_a_simulation_next_to_unstable_shows_of_one_direction_leaves_the_others_to_the_prior() -> None:
+    rng = np.random.default_rng(2)
+    slopes = 1e10 * np.outer(rng.standard_normal(200), [1.0, 2.0, -1.0])
+    along = principal(slopes, np.full(3, 0.7))
+    assert np.all(np.isfinite(along))
+    lengths = np.sort(np.linalg.norm(along, axis=0))
+    assert lengths[0] < 1e-9
+    np.testing.assert_allclose(lengths[1:], 0.7, rtol=1e-6)
+
+
+DEMO = Path(__file__).parents[2] / "profiles" / "demo"
+AXIS = AxisConfig.load(DEMO)
+VISCOUS = with_values(Truth.load(DEMO), {"viscous friction": 5e-4})
+
+
+def test_where_the_weight_is_told_one_way_is_enough_for_friction() -> None:
+    """Friction has one sense there; a weight of which nobody knows would be as good a reason for it."""
+
+    def one_way(bench: Exercise) -> None:
+        bench.hold(0.6)
+        bench.move(900.0, 1200.0, 6000.0)
+
+    found = read_off(prepare(Recording(record_of(VISCOUS, one_way), axis="demo", ratio=50.0), AXIS, VISCOUS))
+    assert found.coulomb_nm == pytest.approx(VISCOUS.motor.coulomb_nm, rel=0.1)
+    assert found.viscous_nm_s_per_rad == pytest.approx(VISCOUS.motor.viscous_nm_s_per_rad, rel=0.2)
+
+
+Rows = NDArray[np.float64]
+TRUE = np.random.default_rng(3).standard_normal((400, 2))
+BOUNDS = (np.full(2, -5.0), np.full(2, 5.0))
+
+
+def sight(shape: Callable[[Rows], Rows]) -> Callable[[Sequence[Rows]], list[Rows]]:
+    return lambda places: [shape(place) for place in places]
+
+
+def test_wide_differences_see_through_what_differs_from_replay_to_replay() -> None:
+    rng = np.random.default_rng(4)
+    where, rough = rng.uniform(size=400), 0.2
+
+    def shape(place: Rows) -> Rows:
+        """Rows that break away sooner or later, however little the place has changed."""
+        return TRUE @ place + rough * np.sin(2e3 * where * (1.0 + place.sum()))
+
+    moves = 0.05 * np.eye(2)
+    off = [
+        float(
+            np.linalg.norm(
+                slopes_at(sight(shape), shape(np.zeros(2)), np.zeros(2), moves, BOUNDS, wide=wide) - TRUE
+            )
+        )
+        for wide in (True, False)
+    ]
+    assert off[0] < 0.4 * off[1]
+
+
+@pytest.mark.parametrize("wide", [True, False])
+def test_a_bound_leaves_the_slopes_the_other_way(wide: bool) -> None:
+    place = np.array([5.0, 0.0])
+    now = TRUE @ place
+    found = slopes_at(sight(lambda at: TRUE @ at), now, place, 0.01 * np.eye(2), BOUNDS, wide=wide)
+    np.testing.assert_allclose(found, TRUE, atol=1e-9)
+
+
+def test_no_slope_is_taken_from_where_the_loops_are_unstable() -> None:
+    def shape(place: Rows) -> Rows:
+        return TRUE @ place + (1e9 * np.sin(np.arange(400.0)) if place[0] > 0.05 else 0.0)
+
+    found = slopes_at(sight(shape), shape(np.zeros(2)), np.zeros(2), 0.03 * np.eye(2), BOUNDS, wide=True)
+    np.testing.assert_allclose(found, TRUE, atol=1e-9)
+
+
+SPRUNG = with_values(Truth.load(DEMO), {"load feed-forward frequency": 75.0})
+
+
+@cache
+def data() -> Data:
+    """Two quick steps, the load left to ring after each."""
+
+    def lead(bench: Exercise) -> None:
+        for distance in (60.0, -60.0):
+            bench.move(distance, 1500.0, 60_000.0)
+            bench.hold(0.25)
+
+    record = record_of(SPRUNG, lead)
+    legs = (Segment(kind="step", start_s=0.0, end_s=float(record.time_s[-1])),)
+    return prepare(Recording(record, legs, axis="demo", ratio=50.0), AXIS, SPRUNG)
+
+
+def test_a_load_feed_forward_that_was_fitted_at_a_wrong_frequency_is_found_at_the_true_one() -> None:
+    names = ("inertia feed-forward", "load feed-forward", "load feed-forward frequency")
+    parameters = tuple(BY_NAME[name] for name in names)
+    begun = with_values(SPRUNG, {"load feed-forward frequency": 20.0})
+    prior = np.array(coordinates(begun, parameters))
+    with Replays(data(), 1) as replays:
+        there = solve(replays, begun, parameters, prior, 3)
+        assert free_value(there.truth, parameters[2]) < 40.0, "a minimum of its own"
+        place, *_ = better_places(replays, there, [feedforwards(there.truth, begun)], begun, prior)
+        found, true = (solve(replays, each, parameters, prior, 3) for each in (place, SPRUNG))
+    assert found.loss < there.loss
+    assert free_value(found.truth, parameters[2]) == pytest.approx(
+        free_value(true.truth, parameters[2]), rel=0.1
+    )
+
+
+def test_a_place_that_leads_back_to_the_same_minimum_is_no_other() -> None:
+    late = (BY_NAME["servo dead time"],)
+    prior = np.array(coordinates(SPRUNG, late))
+    begun = with_values(SPRUNG, {"servo dead time": 1.0})
+    with Replays(data(), 1) as replays:
+        best = solve(replays, SPRUNG, late, prior, 3)
+        assert better_places(replays, best, [[begun]], begun, prior) == []
+
+
+def test_springs_ring_elsewhere_and_as_long() -> None:
+    for truth in springs(SPRUNG):
+        gear, was = truth.gear, SPRUNG.gear
+        assert gear.damping_nm_s_per_rad / math.sqrt(gear.stiffness_nm_per_rad) == pytest.approx(
+            was.damping_nm_s_per_rad / math.sqrt(was.stiffness_nm_per_rad)
+        )
+        assert gear.stiffness_nm_per_rad < truth.highest_stiffness_nm_per_rad
+
+
+def test_a_lag_stays_as_long_whosever_it_is() -> None:
+    late = with_values(SPRUNG, {"servo dead time": 1.5})
+    wanted = 2.0 * late.servo.command_filter_ms + 1.5
+    for truth in lags(late):
+        assert 2.0 * truth.servo.command_filter_ms + truth.servo.dead_time_ms == pytest.approx(wanted)
+    assert len({each.servo.dead_time_ms for each in lags(late)}) > 1
+
+
+@pytest.mark.parametrize(("filter_ms", "dead_time_ms"), [(0.05, 0.0), (0.3, 1.4), (1.0, 0.0), (2.0, 19.9)])
+def test_a_dead_time_is_tried_in_each_other_substep_that_the_lag_has_room_for(
+    filter_ms: float, dead_time_ms: float
+) -> None:
+    late = with_values(SPRUNG, {"command filter": filter_ms, "servo dead time": dead_time_ms})
+    lag_ms, step_ms = 2.0 * filter_ms + dead_time_ms, late.substep_ms
+    found = {each.servo.dead_time_ms for each in delays(late)}
+    for truth in delays(late):
+        assert 2.0 * truth.servo.command_filter_ms + truth.servo.dead_time_ms == pytest.approx(lag_ms)
+        assert truth.servo.command_filter_ms >= BY_NAME["command filter"].least
+    middles = {(each + 0.5) * step_ms for each in range(39) if each != int(dead_time_ms / step_ms)}
+    assert found == {each for each in middles if each <= lag_ms - 0.1 + 1e-9}
+    own = (int(dead_time_ms / step_ms) + 0.5) * step_ms
+    near = {each.servo.dead_time_ms for each in neighbours(late)}
+    assert near == {each for each in found if abs(each - own) < 1.1 * step_ms}
+
+
+def test_a_lighter_motor_has_a_spring_that_its_time_step_resolves() -> None:
+    stiff = with_values(SPRUNG, {"gear stiffness": 0.99 * SPRUNG.highest_stiffness_nm_per_rad})
+    factors = [each.motor.inertia_kg_m2 / stiff.motor.inertia_kg_m2 for each in inertias(stiff)]
+    assert min(factors) < 0.5
+    assert max(factors) > 2.0
+    for truth in inertias(stiff):
+        assert truth.gear.stiffness_nm_per_rad <= stiff.gear.stiffness_nm_per_rad
+
+
+def test_as_much_is_fed_forward_whosever_inertia_it_is() -> None:
+    small = with_values(SPRUNG, {"load feed-forward": 1e-6})
+    both = small.servo.inertia_feedforward_kg_m2 + 1e-6
+    places = feedforwards(small, SPRUNG)
+    assert places
+    for truth in places:
+        load = truth.servo.load_feedforward
+        assert load is not None
+        assert truth.servo.inertia_feedforward_kg_m2 + load.inertia_kg_m2 == pytest.approx(both)
+    without = SPRUNG.model_copy(update={"servo": SPRUNG.servo.model_copy(update={"load_feedforward": None})})
+    assert feedforwards(without, SPRUNG) == []
+
+
+def test_position_gain_and_integral_rate_exchanged_are_the_same_loop_while_the_axis_moves() -> None:
+    other = exchanged(SPRUNG)
+    softer = with_values(SPRUNG, {"position gain": other.servo.position_gain_per_s})
+    with Replays(data(), 1) as replays:
+        own, same, wrong = (each[FOLLOWING] for each in replays([SPRUNG, other, softer]))
+    moving = np.concatenate([each.rest for each in data().pieces]) == 0.0
+    assert np.std((same - own)[moving]) < 0.1 * np.std((wrong - own)[moving])
+    assert other.servo.position_gain_per_s < 0.5 * SPRUNG.servo.position_gain_per_s
+    assert exchanged(other).servo.position_gain_per_s == pytest.approx(SPRUNG.servo.position_gain_per_s)
+
+
+def test_a_rival_is_as_late_by_filter_or_dead_time_whichever_is_free() -> None:
+    late = with_values(SPRUNG, {"command filter": 0.6, "servo dead time": 0.8})
+    dead_time, command_filter = BY_NAME["servo dead time"], BY_NAME["command filter"]
+    without_dead_time = as_late(with_values(late, {"servo dead time": 0.0}), late, [command_filter])
+    assert without_dead_time.servo.dead_time_ms == 0.0
+    assert without_dead_time.servo.command_filter_ms == pytest.approx(1.0)
+    quick = as_late(with_values(late, {"command filter": 0.2}), late, [dead_time])
+    assert quick.servo.command_filter_ms == pytest.approx(0.2)
+    assert quick.servo.dead_time_ms == pytest.approx(1.6)
+    slow = as_late(with_values(late, {"command filter": 1.5}), late, [dead_time])
+    assert slow.servo.dead_time_ms == 0.0
+    assert as_late(SPRUNG, late, []) == SPRUNG
+
+
+def interrupted_at(least: float) -> Callable[[float], None]:
+    def progress(share: float) -> None:
+        if share >= least:
+            raise KeyboardInterrupt
+
+    return progress
+
+
+def test_a_fit_that_is_interrupted_keeps_the_best_place_so_far() -> None:
+    wrong = with_values(SPRUNG, {"Coulomb friction": 2.0 * SPRUNG.motor.coulomb_nm})
+    with Replays(replace(data(), base=wrong), 1) as replays:
+        found = fit(replays, interrupted_at(0.2))
+        (before,) = replays([wrong])
+    assert found.interrupted
+    assert misfit(data(), found.residuals) < 0.5 * misfit(data(), before)
+
+
+def test_a_fit_that_is_interrupted_before_it_has_reached_anything_leaves_nothing() -> None:
+    with Replays(data(), 1) as replays, pytest.raises(KeyboardInterrupt):
+        fit(replays, interrupted_at(0.0))
+
+
+TRUTH = with_values(Truth.load(DEMO), {"command filter": 1.06})
+"""At 90 motor degrees per second the motor is 4.24 counts late: its encoder says 4."""
+PARAMETERS = (BY_NAME["command filter"],)
+
+
+def sweeps(bench: Exercise) -> None:
+    """So many whole counts per cycle that the motor's encoder errs alike in every row."""
+    bench.hold(0.4)
+    for speed_deg_s in (90.0, -90.0):
+        bench.lead(lambda seconds, speed=speed_deg_s: speed * seconds, 4.0)
+    bench.hold(0.2)
+
+
+def test_rounding_leads_a_fit_astray_that_takes_it_for_noise_and_no_other() -> None:
+    recording = Recording(record_of(TRUTH, sweeps), axis="demo", ratio=50.0)
+    true = np.array(coordinates(TRUTH, PARAMETERS))
+    data = prepare(recording, AXIS, TRUTH)
+    with Replays(data, 1) as replays:
+        plain = solve(replays, TRUTH, PARAMETERS, true, 2, known=expected(data))
+        fitted = solve(replays, plain.truth, PARAMETERS, true, 8)
+    (astray,), (off,) = plain.place - true, fitted.place - true
+    assert abs(astray) > 2.0 * float(np.sqrt(plain.covariance[0, 0]))
+    assert abs(off) < 0.2 * abs(astray)
+    assert abs(off) < 1.96 * float(np.sqrt(fitted.covariance[0, 0]))
+
+
+@pytest.mark.parametrize("half", [0.0, 0.01, 0.3, 4.0])
+@pytest.mark.parametrize("stray", [0.0, 1e-4])
+def test_half_the_squares_are_the_loss_of_log_likelihood(half: float, stray: float) -> None:
+    if half == 0.0:
+        stray = 0.0  # without steps: least squares
+    off = np.array([-7.0, -3.9, -0.2, 0.0, 0.05, 1.0, 4.1, 6.0])
+    halves, strays = np.full(8, half), np.full(8, stray)
+
+    def loss(off: np.ndarray) -> np.ndarray:
+        if half == 0.0:
+            return np.asarray(0.5 * off**2)
+        size = np.abs(off)
+        return -np.log(ndtr(half - size) - ndtr(-half - size) + stray)
+
+    root, slope = rooted(off, halves, strays)
+    assert 0.5 * root**2 == pytest.approx(loss(off) - loss(np.zeros(8)), rel=1e-6, abs=1e-9)
+    assert np.all(np.sign(root) == np.sign(off))
+    ahead, behind = (rooted(off + by, halves, strays)[0] for by in (1e-5, -1e-5))
+    assert slope == pytest.approx((ahead - behind) / 2e-5, rel=1e-4, abs=1e-5)
+
+
+@pytest.mark.parametrize("spread", [0.02, 0.1, 0.5, 2.0])
+def test_readings_in_steps_show_how_far_a_simulation_is_off(spread: float) -> None:
+    rng = np.random.default_rng(0)
+    angle = rng.uniform(-100.0, 100.0, 4000)
+    read = np.round(angle + spread * rng.standard_normal(4000))
+    read[:60] += 20.0 * rng.standard_normal(60)  # some are nowhere near
+    found, _ = deviation(read - angle, 1.0, 0.004)
+    assert found == pytest.approx(spread, rel=0.15)
+
+
+def test_what_a_reading_is_known_to_be_off_by_is_no_deviation_of_the_others() -> None:
+    """A third of the readings are of a motor that sticks: where it breaks away no replay can tell."""
+    rng = np.random.default_rng(3)
+    spread = np.where(np.arange(6000) % 3, 0.0, rng.uniform(0.0, 0.2, 6000))
+    off = rng.normal(0.0, np.hypot(0.01, spread)) + rng.uniform(-0.01, 0.01, 6000)
+    alone, _ = deviation(off, 0.02, 1e-4)
+    told, _ = deviation(off, 0.02, 1e-4, spread)
+    assert alone > 0.015
+    assert told == pytest.approx(0.01, rel=0.1)
