@@ -28,7 +28,7 @@ from hdbridge.analysis.hypothesis import Estimator, Fitted, Hypothesis
 from hdbridge.analysis.identifiability import identifiability
 from hdbridge.analysis.linear import about_zeros
 from hdbridge.analysis.parameters import confounded, covariance, parameters_of, precisely
-from hdbridge.analysis.prepared import gather
+from hdbridge.analysis.prepared import Observed, gather
 from hdbridge.analysis.probability import Context, Prior, weighed
 from hdbridge.analysis.scales import Scales
 from hdbridge.analysis.search import (
@@ -38,6 +38,7 @@ from hdbridge.analysis.search import (
     waves_alike,
     with_measured,
 )
+from hdbridge.analysis.swing import ORDINARY_HZ, seen_swing, settled, without
 from hdbridge.analysis.unexplained import (
     LESS,
     Rest,
@@ -94,23 +95,33 @@ def diagnose(
     data = gather(
         record, model.ratio, legs, independent_zeros, lambda motion: model.predict(motion, Start.VIRGIN)
     )
-    estimator = Estimator(data, scales or Scales())
-    estimator.calibrated = calibrated(
-        model.effects,
-        model.uncertainty,
-        lambda effect: estimator.columns(effect, Start.VIRGIN),
-        estimator.scales,
-    )
-    search = Search(estimator, model.effects)
+    scales = scales or Scales()
+    swing = seen_swing(data.full, model.effects, scales)
+    if swing is not None and swing.frequency_hz > ORDINARY_HZ:  # one that is softer is a cause to be found
+        data = without(data, swing)
+    search, soft = _search(data, model, scales), swing is not None and swing.frequency_hz <= ORDINARY_HZ
+    if not soft:
+        search = _search(settled(search.estimator, search.begun(), swing), model, scales)
+    estimator = search.estimator
     first = unfitted(estimator, model.effects)
     held = beyond_limit(model.effects, data.full.motion)
-    data = replace(data, remarks=(*((first,) if first else ()), *held, *data.remarks))
-    estimator.data = data
+    own = [swing.remark()] if swing is not None and swing.frequency_hz > ORDINARY_HZ else []
+    told = (*((first,) if first else ()), *held, *data.remarks, *own)
+    estimator.data = replace(estimator.data, remarks=told)
     progress("searching for causes")
     found = search.run()
     progress("judging what was found")
     diagnosis = _Judge(search, model, bool(first), prior).of(found)
     return replace(diagnosis, remarks=(*remarks, *diagnosis.remarks))
+
+
+def _search(data: Observed, model: TransmissionModel, scales: Scales) -> Search:
+    estimator = Estimator(data, scales)
+    estimator.calibrated = calibrated(
+        model.effects, model.uncertainty, lambda effect: estimator.columns(effect, Start.VIRGIN), scales
+    )
+    estimator.begins = estimator.begins_of(model.effects)
+    return Search(estimator, model.effects)
 
 
 def _of_zeros(parts: Sequence[Record], ratio: float) -> tuple[str, ...]:
@@ -149,7 +160,6 @@ class _Judge:
     def of(self, fitted: Fitted) -> Diagnosis:
         """Turns the result of the search into a diagnosis."""
         estimator, given = self.estimator, self.model.effects
-        base = len(given)
         fitted = self.search.eliminated(fitted, self._stopped, self.considered)
         fitted = self.search.eliminated(fitted, self._shadow, self.considered)
         fitted = with_measured(self.search, fitted)
@@ -161,31 +171,21 @@ class _Judge:
         self.considered.extend(each for each in refused if each.split(":")[0] not in known)
         findings = self._with_unexplained(findings, judged.left)
         refitted = estimator.fit(Hypothesis(given, fitted.hypothesis.start))
-        fitted = as_named(estimator, fitted, given, {each.cause for each in findings})
-        spread = covariance(estimator, fitted)
-        alone = {each.cause for each in findings if each.left_alone}
-        sound = supported(estimator, fitted, given, alone)
-        fitted = replace(fitted, hypothesis=replace(fitted.hypothesis, effects=sound))
-        named = {each.cause for each in findings if not each.within}
-        chosen = [place for place in range(base, len(sound)) if sound[place].name in named]
-        reason = "diagnosis: " + (", ".join(each.cause for each in findings) or "nothing found, refitted")
-        extended = extended_model(self.model, fitted, chosen, spread, reason, base)
-        # Residual of the given model from the best-fitting elastic start.
-        each_start = (self._left_by(given, start) for start in Start)
-        before = min(each_start, key=lambda error: float(error @ error))
-        after = self._left_by(extended.effects, fitted.hypothesis.start)
+        fitted, findings, extended = self._written(fitted, findings)
+        before, _ = self._left_by(given)
+        after, start = self._left_by(extended.effects)
         measured = estimator.observed - estimator.level - fitted.zeros[estimator.zero]
         visible = identifiability(estimator, refitted, given)
         return Diagnosis(
             baseline=_figures(before),
             refitted=_figures(refitted.residual / estimator.weight),
             extended=_figures(after),
-            noise_floor_arcsec=float(np.sqrt(np.mean(estimator.weight**-2.0))),
+            noise_floor_arcsec=estimator.data.noise_arcsec,
             findings=tuple(findings),
             identifiability=visible,
             capability=capability(estimator.data, given, visible, estimator.scales),
             by_kind=self._by_kind(before, after),
-            remarks=estimator.data.remarks,
+            remarks=(*estimator.data.remarks, *([judged.left.remark] if judged.left.remark else [])),
             model=extended,
             traces=Traces(
                 measured_arcsec=measured,
@@ -195,11 +195,37 @@ class _Judge:
                 rows=estimator.index,
                 samples=estimator.data.full.motion,
                 runs=estimator.data.runs,
-                start=fitted.hypothesis.start,
+                start=start,
             ),
             considered=tuple(dict.fromkeys(self.considered)),
             scales=estimator.scales,
         )
+
+    def _written(
+        self, fitted: Fitted, findings: list[Finding]
+    ) -> tuple[Fitted, list[Finding], TransmissionModel]:
+        """Returns the extended model, its fit, and the findings that it contains.
+
+        A finding that cannot be written is none: its parameters are out of bounds, the compensation could not
+        invert the model with it, or the record does not determine it.
+        """
+        estimator, given = self.estimator, self.model.effects
+        while True:
+            as_reported = as_named(estimator, fitted, given, {each.cause for each in findings})
+            alone = {each.cause for each in findings if each.left_alone}
+            spread = covariance(estimator, as_reported)
+            sound = supported(estimator, as_reported, given, alone)
+            as_reported = replace(as_reported, hypothesis=replace(as_reported.hypothesis, effects=sound))
+            named = {each.cause for each in findings if not each.within}
+            chosen = [place for place in range(len(given), len(sound)) if sound[place].name in named]
+            reason = "diagnosis: " + (", ".join(each.cause for each in findings) or "nothing found, refitted")
+            extended = extended_model(self.model, as_reported, chosen, spread, reason, len(given))
+            changed = [new for new in extended.effects if new not in given]
+            missing = [each for each in findings if not (each.left_alone or _is_in(each, changed))]
+            if not missing:
+                return as_reported, findings, extended
+            self.considered.extend(f"{each.cause}: it cannot be written into the model" for each in missing)
+            findings = [each for each in findings if each not in missing]
 
     def _stopped(self, fitted: Fitted) -> tuple[int, str] | None:
         """Returns the weakest cause that fails its gate, else an implausible or unidentifiable one."""
@@ -356,14 +382,25 @@ class _Judge:
             note = f"the loop has another shape than either law: {left.arcsec:.2g} arcsec rms are left"
             told = replace(loops[0], note=note, lives_in=lives)
             return [told if each is loops[0] else each for each in findings]
+        if size < self.estimator.floor_arcsec:
+            return findings
         largest = max((each.peak_arcsec for each in findings), default=0.0)
         return [*findings, unknown] if largest > size else [unknown, *findings]
 
-    def _left_by(self, effects: Sequence[Effect], start: Start) -> FloatArray:
-        """Returns observed minus predicted at the usable points, about the best-fitting zeros."""
+    def _left_by(self, effects: Sequence[Effect]) -> tuple[FloatArray, Start]:
+        """Returns observed minus predicted at the usable points from the best elastic start, which it names.
+
+        It is about the best-fitting zeros.
+        """
         estimator = self.estimator
-        left = estimator.observed - estimator.predict(effects, start)
-        return about_zeros(left, estimator.zero, estimator.weight**2)
+        left = {
+            start: about_zeros(
+                estimator.observed - estimator.predict(effects, start), estimator.zero, estimator.weight**2
+            )
+            for start in Start
+        }
+        best = min(left, key=lambda start: float(left[start] @ left[start]))
+        return left[best], best
 
     def _by_kind(self, given: FloatArray, after: FloatArray) -> dict[str, tuple[Figures, Figures]]:
         estimator = self.estimator
@@ -380,6 +417,15 @@ class _Judge:
             for name, rows in masks.items()
             if np.count_nonzero(rows) > 10
         }
+
+
+def _is_in(finding: Finding, changed: Sequence[Effect]) -> bool:
+    """Returns True if these effects, which differ from those of the given model, contain the finding."""
+    effect = finding.effect
+    if effect is None:  # something unexplained
+        return True
+    part = effect.changes or effect.part
+    return any(each.name == effect.name or (part is not None and each.part is part) for each in changed)
 
 
 def _ordinary(finding: Finding) -> bool:

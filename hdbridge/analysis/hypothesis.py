@@ -5,6 +5,7 @@ The baseline is refitted with every candidate, so nothing that the baseline can 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -39,6 +40,8 @@ MOST_TURNS = 100
 """Maximum number of turning points with an error of their own. With more, the mean is known well enough."""
 SHORT = 10_000
 """Record length, samples, below which the number of rare samples shrinks in proportion."""
+MOST_PARTS = 20
+"""Maximum number of parts of a record with an elastic state of their own."""
 STOPS_DEG = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0)
 """Widths of the stop operators of the free-form hysteresis."""
 
@@ -131,6 +134,8 @@ class Estimator:
         """Sign of the loop's offset; -1 if the load lags."""
         self.calibrated: tuple[CalibratedPart, ...] = ()
         """Priors from the calibration for the first effects of each hypothesis."""
+        self.begins: Nuisances | None = None
+        """Elastic states at the start of each part of the record."""
 
     @property
     def motion(self) -> Motion:
@@ -141,6 +146,17 @@ class Estimator:
     def rare(self) -> float:
         """Tail share of the record that is excluded at either end when a span is measured."""
         return self.scales.rare / max(len(self.data.full), SHORT)
+
+    @property
+    def count_arcsec(self) -> float:
+        """One count of the motor encoder at the load; 0 if none is visible."""
+        return self.data.full.count_deg / self.data.ratio * ARCSEC_PER_DEG
+
+    @property
+    def floor_arcsec(self) -> float:
+        """Smallest peak that matters: at rest, the rounding of both encoders is the same in all readings."""
+        rounded = math.hypot(self.count_arcsec, self.data.load_count_arcsec) / math.sqrt(12.0)
+        return max(self.scales.floor_arcsec, rounded, 0.5 * self.data.noise_arcsec)
 
     def half_span(self, values: FloatArray) -> float:
         """Returns half the span of values without the rare extremes."""
@@ -188,21 +204,48 @@ class Estimator:
         A motor with friction stops short of all turning points alike, and of each by its own amount. One
         column is common to all; up to `MOST_TURNS` of them also have one each.
         """
-        full, loops = self.data.full, [each for each in effects if each.tracker().memory_deg > 0.0]
-        turning, signs = branches(full.motor_deg, start)
-        turns = np.array(turning[1:-1], dtype=np.intp)
-        if not loops or not len(turns):
+        turns, change = self.turned(effects, start)
+        if not len(turns):
             return np.empty((len(self.index), 0))
-        count = full.reading.resolution_deg if full.commanded else CHATTER_COUNTS * full.reading.unaided_deg
-        moved = full.motor_deg.copy()
-        moved[turns] += (COUNTS * count + missed_deg(full.motor_deg, turns)) * np.array(signs[:-1])
-        other = replace(full.motion, motor_deg=moved)
-        change = sum(each.predict(other, start) - each.predict(full.motion, start) for each in loops)
-        columns = [self.at_points(np.asarray(change))]
+        columns = [self.at_points(change)]
         if len(turns) <= MOST_TURNS:
             leg = np.searchsorted(turns, self.data.runs[self.index], "right")
             columns += [np.where(leg == each, columns[0], 0.0) for each in range(1, len(turns) + 1)]
         return self.weighted(np.column_stack(columns))
+
+    def turned(self, effects: Sequence[Effect], start: Start) -> tuple[IntArray, FloatArray]:
+        """Returns the turning points and what their errors change in each sample, arcsec, shape (n,)."""
+        full, loops = self.data.full, [each for each in effects if each.tracker().memory_deg > 0.0]
+        turning, signs = branches(full.motor_deg, start)
+        turns = np.array(turning[1:-1] if loops else (), dtype=np.intp)
+        count = full.reading.resolution_deg if full.commanded else CHATTER_COUNTS * full.reading.unaided_deg
+        moved = full.motor_deg.copy()
+        moved[turns] += (COUNTS * count + missed_deg(full.motor_deg, turns)) * np.array(signs[:-1])[
+            : len(turns)
+        ]
+        other, change = replace(full.motion, motor_deg=moved), np.zeros(len(full))
+        for each in loops:
+            change += each.predict(other, start) - each.predict(full.motion, start)
+        return turns, change
+
+    def begins_of(self, effects: Sequence[Effect]) -> Nuisances | None:
+        """Returns a column for the elastic state at the start of each part: half of what it can change.
+
+        The state is anywhere between those of a saturated start either way. None without a loop.
+        """
+        full, loops = self.data.full, [each for each in effects if each.tracker().memory_deg > 0.0]
+        columns = []
+        for chain in full.chains[:MOST_PARTS]:
+            motion, change = full.along(chain), np.zeros(len(full))
+            for each in loops:
+                ends = [each.predict(motion, start) for start in (Start.FORWARD, Start.BACKWARD)]
+                change[chain.rows] += 0.5 * (ends[0] - ends[1])
+            if np.any(change):
+                columns.append(self.at_points(change))
+        names = tuple(f"state {each}" for each in range(len(columns)))
+        return (
+            Nuisances(np.stack(columns, axis=1), names, (Prior(0.0, 1.0),) * len(names)) if columns else None
+        )
 
     def free_loop(self, start: Start) -> Nuisances:
         """Returns a free-form hysteresis: stop operators of `STOPS_DEG`, which form any loop shape."""
@@ -297,6 +340,8 @@ class Estimator:
     def _nuisances(self, hypothesis: Hypothesis) -> Nuisances:
         """Returns the columns of the zeros and of the hypothesis's own nuisances."""
         own = zeros(self.zero, self.data.full.zeros)
+        if self.begins is not None:
+            own = own.and_also(self.begins)
         return own if hypothesis.nuisances is None else own.and_also(hypothesis.nuisances)
 
     def _sign(self, effect: Effect) -> float:

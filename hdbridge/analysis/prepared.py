@@ -311,6 +311,10 @@ class Observed:
     """First sample of each point's run, shape (points,)."""
     motor_count_arcsec: float
     """One count of the motor encoder at the load; if none is visible, the count with equal jitter."""
+    load_count_arcsec: float
+    """One count of the load encoder; 0 if none is visible."""
+    noise_arcsec: float
+    """White noise of a point."""
     period_s: float
     """Median time between samples."""
     standstill: bool
@@ -321,7 +325,7 @@ class Observed:
 
     def over(self, runs: IntArray) -> Observed:
         """Returns the same samples averaged over other runs, given by their first samples."""
-        return replace(self, points=_averaged(self.full, runs), runs=runs)
+        return replace(self, points=averaged(self.full, runs), runs=runs)
 
     @property
     def motion(self) -> Motion:
@@ -376,14 +380,18 @@ def gather(
     usable = ~settling(full.of_kind(*ON_THE_WAY) & ~still, time)
     full = replace(full, usable=usable if np.mean(usable) >= LEAST_SETTLED else np.ones_like(usable))
     steps = np.diff(time)
+    period_s = float(np.median(steps[steps > 0])) if np.any(steps > 0) else 1.0
     runs = _runs(len(time), record.starts)
+    noise_arcsec = float(np.sqrt(np.mean(averaged(full, runs).sigma_arcsec ** 2)))
     return Observed(
         ratio=ratio,
-        points=_averaged(full, runs),
+        points=averaged(full, runs),
         full=full,
         runs=runs,
         motor_count_arcsec=full.reading.resolution_deg / ratio * ARCSEC_PER_DEG,
-        period_s=float(np.median(steps[steps > 0])) if np.any(steps > 0) else 1.0,
+        load_count_arcsec=quantum_deg(full.load_deg) * ARCSEC_PER_DEG,
+        noise_arcsec=noise_arcsec,
+        period_s=period_s,
         standstill=standstill,
         reversals=turns,
         remarks=tuple(remarks),
@@ -424,7 +432,7 @@ def means(values: FloatArray, runs: IntArray) -> FloatArray:
     return np.asarray(total / (size if values.ndim == 1 else size[:, np.newaxis]))
 
 
-def _averaged(full: Samples, runs: IntArray) -> Samples:
+def averaged(full: Samples, runs: IntArray) -> Samples:
     """Averages samples over runs; a run with unusable samples becomes an unusable point of the path."""
     if len(runs) == len(full):
         return full

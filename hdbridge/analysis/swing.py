@@ -1,0 +1,206 @@
+"""Swing of the load on its spring, which every axis has: wind-up in acceleration and ringing after a stop.
+
+The load follows the motor and the gear's error as a mass on a spring with damping follows its base. A
+calibration moves too slowly to show it, and it is no fault. So its frequency and damping are fitted to the
+residual of the given model, before any part of the model is free to imitate it, and the swing is subtracted.
+Samples in which more of it remains unknown than matters are left out.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import product
+
+import numpy as np
+from scipy.linalg import solve_banded
+from scipy.ndimage import maximum_filter1d
+from scipy.optimize import minimize
+
+from hdbridge.analysis.driving import SETTLE_S
+from hdbridge.analysis.hypothesis import Estimator, Fitted
+from hdbridge.analysis.linear import about_zeros
+from hdbridge.analysis.prepared import Observed, Samples, averaged
+from hdbridge.analysis.scales import Scales
+from hdbridge.axis.effects import Effect, FloatArray, Part, Start
+from hdbridge.units import ARCSEC_PER_DEG, DEG_PER_TURN
+
+ORDINARY_HZ = 30.0
+"""Lowest natural frequency of a load that is ordinary. The demo axis has 42 Hz; of the axes that tools/blind
+draws, 20 to 640 Hz, one in thirty is softer."""
+HERTZ = np.geomspace(0.4 * ORDINARY_HZ, 16.0 * ORDINARY_HZ, 23)
+DAMPING = (0.05, 0.2, 0.5)
+"""Natural frequencies and damping ratios that are tried, before a refinement."""
+MOST_DAMPED = 0.9
+USUALLY_DAMPED = 0.2
+"""Damping ratio of a swing that is too fast for the sampling to show it."""
+LEAST_SEEN = 0.1
+"""Share of the squares of a residual that a swing explains: anything that moves explains a little."""
+CALMEST = 0.05
+"""Share of a record that is always used."""
+RESOLVED = 4.0
+"""Number of samples in a wave from which a spline follows it."""
+REFINED = 40
+"""Number of trials of the refinement."""
+LONGEST = 20_000
+"""Maximum number of samples that a swing is fitted to: those of the hardest accelerations."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Swing:
+    """Lag of the load behind its base."""
+
+    frequency_hz: float
+    damping: float
+    does_arcsec: FloatArray
+    """Its share of the error in each sample, shape (n,)."""
+
+    def remark(self) -> str:
+        """Describes it for the report."""
+        return (
+            f"the load swings on its spring at {self.frequency_hz:.0f} Hz (damping ratio "
+            f"{self.damping:.2f}) by up to {np.max(np.abs(self.does_arcsec)):.2g} arcsec: ordinary dynamics, "
+            "which are allowed for"
+        )
+
+
+def swing(
+    bend: FloatArray, step_s: FloatArray, first: Sequence[int], frequency_hz: float, damping: float
+) -> Swing:
+    """Computes the load's motion relative to its base, whose second derivative is ``bend``, (n,).
+
+    It is at rest at the ``first`` sample of each part; ``step_s`` (n - 1,) are the times between samples.
+    e'' + 2 z w e' + w^2 e = -bend, solved exactly for a bend that is linear between samples.
+    """
+    w, begins = math.tau * frequency_hz, np.asarray(first)
+    damped = w * math.sqrt(1.0 - damping**2)
+    fall = np.exp(-damping * w * step_s)
+    cosine, sine = fall * np.cos(damped * step_s), fall * np.sin(damped * step_s)
+    # Transition of deviation and speed over w, and the response to the second derivative.
+    own, cross = cosine + damping * w / damped * sine, w / damped * sine
+    other = cosine - damping * w / damped * sine
+    slope = np.diff(bend) / step_s / w**3
+    before = -bend[:-1] / w**2 + 2.0 * damping * slope
+    after = -bend[1:] / w**2 + 2.0 * damping * slope
+    right = np.zeros(2 * len(bend))
+    right[2::2] = after - own * before + cross * slope
+    right[3::2] = -slope + cross * before + other * slope
+    for each in (own, cross, other):
+        each[begins[1:] - 1] = 0.0
+    right.reshape(-1, 2)[begins[1:]] = 0.0
+    band = np.zeros((4, len(right)))
+    band[0] = 1.0
+    band[2, 0:-2:2], band[1, 1:-1:2] = -own, -cross
+    band[3, 0:-2:2], band[2, 1:-1:2] = cross, -other
+    state = solve_banded((3, 0), band, right, overwrite_ab=True, overwrite_b=True, check_finite=False)
+    return Swing(frequency_hz, damping, state[::2])
+
+
+def bend_of(base_arcsec: FloatArray, step_s: FloatArray, parts: Sequence[slice]) -> FloatArray:
+    """Returns the second derivative of the natural spline through each part of the base, shape (n,)."""
+    ends = [row for each in parts for row in (each.start, each.stop - 1)]
+    band, right = np.zeros((3, len(base_arcsec))), np.zeros(len(base_arcsec))
+    band[1, 1:-1] = (step_s[:-1] + step_s[1:]) / 3.0
+    band[0, 2:], band[2, :-2] = step_s[1:] / 6.0, step_s[:-1] / 6.0
+    right[1:-1] = np.diff(np.diff(base_arcsec) / step_s)
+    band[1, ends], right[ends] = 1.0, 0.0
+    for each in ends:  # their rows say that the derivative is zero
+        band[0, each + 1 : each + 2] = band[2, max(each - 1, 0) : each] = 0.0
+    return np.asarray(solve_banded((1, 1), band, right, check_finite=False))
+
+
+def seen_swing(full: Samples, effects: Sequence[Effect], scales: Scales) -> Swing | None:
+    """Fits the swing to the residual of the given model; None if nothing of it is seen."""
+    weight = full.usable / full.sigma_arcsec**2
+    step_s, parts = np.maximum(np.diff(full.time_s), 1e-9), [each.rows for each in full.chains]
+
+    def left(error: FloatArray, rows: slice) -> FloatArray:
+        return about_zeros(full.error_arcsec[rows] - error[rows], full.zero[rows], weight[rows])
+
+    def cost(residual: FloatArray, rows: slice) -> float:
+        return float(weight[rows] @ about_zeros(residual, full.zero[rows], weight[rows]) ** 2)
+
+    every = slice(0, len(full))
+    errors = [
+        sum((each.predict(full.motion, start) for each in effects), np.zeros(len(full))) for start in Start
+    ]
+    error = min(errors, key=lambda each: cost(left(each, every), every))
+    bend = bend_of(ARCSEC_PER_DEG / full.ratio * full.motor_deg + error, step_s, parts)
+    size = np.concatenate([[0.0], np.cumsum(bend**2)])
+    begin = int(np.argmax(size[LONGEST:] - size[:-LONGEST])) if len(full) > LONGEST else 0
+    rows = slice(begin, min(begin + LONGEST, len(full)))
+    first = [begin, *(each.start for each in parts if rows.start < each.start < rows.stop)]
+    residual = left(error, rows)
+
+    def tried(hertz: float, damping: float) -> float:
+        begins = [each - begin for each in first]
+        one = swing(bend[rows], step_s[rows.start : rows.stop - 1], begins, hertz, min(damping, MOST_DAMPED))
+        return cost(residual - one.does_arcsec, rows)
+
+    start = min(product(HERTZ.tolist(), DAMPING), key=lambda each: tried(*each))
+    found = minimize(
+        lambda x: tried(*np.exp(x).tolist()), np.log(start), method="Nelder-Mead", options={"maxfev": REFINED}
+    )
+    whole = cost(residual, rows)
+    if whole - found.fun < max(scales.enter + 2.0 * scales.penalty, LEAST_SEEN * whole):
+        return None
+    hertz, damping = np.exp(found.x).tolist()
+    return swing(bend, step_s, [each.start for each in parts], hertz, min(damping, MOST_DAMPED))
+
+
+def without(data: Observed, found: Swing) -> Observed:
+    """Returns the data less the swing."""
+    full = replace(data.full, error_arcsec=data.full.error_arcsec - found.does_arcsec)
+    return replace(data, full=full, points=averaged(full, data.runs))
+
+
+def settled(estimator: Estimator, fitted: Fitted, found: Swing | None) -> Observed:
+    """Returns the data without the samples in which more of the swing is unknown than matters.
+
+    The error of a ``found`` swing scales with the wind-up. Its share is regressed on the squares of the
+    residual in motion. Nothing is known of waves of the gear's error that are too fast for the sampling.
+    The calmest samples always stay. These errors, and those of the turning points, are in their noise.
+    """
+    data, weight, unknown = estimator.data, estimator.weight, np.zeros(len(estimator.data.full))
+    effects = fitted.hypothesis.effects
+    if found is not None:
+        wind_up = _accelerated(data.full, data.period_s) / (math.tau * found.frequency_hz) ** 2
+        moving = (data.points.speed_deg_s != 0.0)[estimator.index]
+        square, size = (fitted.residual / weight)[moving] ** 2, estimator.at_points(wind_up**2)[moving]
+        about = size - np.mean(size) if len(size) else size
+        share = min(max(float(about @ square) / max(float(about @ about), 1e-300), 0.0), 1.0)
+        unknown = np.hypot(math.sqrt(share) * wind_up, _aliased(data.full, effects, data.period_s, found))
+    most = max(estimator.scales.floor_arcsec, float(np.quantile(unknown[data.full.usable], CALMEST)))
+    usable = data.full.usable & (unknown <= most)
+    _, turned = estimator.turned(effects, fitted.hypothesis.start)
+    sigma = np.sqrt(data.full.sigma_arcsec**2 + unknown**2 + turned**2)
+    full = replace(data.full, usable=usable, sigma_arcsec=sigma)
+    return replace(data, full=full, points=averaged(full, data.runs))
+
+
+def _accelerated(full: Samples, period_s: float) -> FloatArray:
+    """Returns the largest acceleration of the base from one sample after to `SETTLE_S` before each, (n,)."""
+    size, rows = full.motion.motor_acceleration_deg_s2, max(1, round(SETTLE_S / period_s))
+    assert size is not None
+    result = np.empty(len(full))
+    for each in full.chains:
+        known = min(rows, each.rows.stop - each.rows.start)
+        part = np.abs(size[each.rows]) / full.ratio * ARCSEC_PER_DEG
+        result[each.rows] = maximum_filter1d(part, known + 2, origin=known // 2, mode="nearest")
+    return result
+
+
+def _aliased(full: Samples, effects: Sequence[Effect], period_s: float, found: Swing) -> FloatArray:
+    """Returns the standard deviation of the swing in waves with less than `RESOLVED` samples each, (n,)."""
+    turns_s, variance = np.abs(full.speed_deg_s) / DEG_PER_TURN, np.zeros(len(full))
+    seen = found.frequency_hz * period_s * RESOLVED < 1.0
+    damping = found.damping if seen else min(found.damping, USUALLY_DAMPED)
+    for turns, amplitude, _ in (
+        each for effect in effects if effect.part is Part.ORDERS for each in effect.waves()
+    ):
+        fast = turns * turns_s * period_s * RESOLVED > 1.0
+        ratio2 = (turns * turns_s[fast] / found.frequency_hz) ** 2
+        gain2 = ratio2**2 / ((1.0 - ratio2) ** 2 + 4.0 * damping**2 * ratio2)
+        variance[fast] += 0.5 * amplitude**2 * gain2
+    return np.sqrt(variance)
