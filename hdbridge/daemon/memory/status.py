@@ -47,11 +47,6 @@ class Status:
         return int(self._cells[Cell.LOOP_COUNT * _STRIDE])
 
     @property
-    def loop_time_ns(self) -> int:
-        """End of the loop's last turn, ``time.monotonic_ns``; 0 before the first."""
-        return int(self._cells[Cell.LOOP_TIME_NS * _STRIDE])
-
-    @property
     def loop_pid(self) -> int:
         """Process id of the control process; 0 if there is none."""
         return int(self._cells[Cell.LOOP_PID * _STRIDE])

@@ -75,7 +75,7 @@ def test_it_turns_tells_who_it_is_answers_and_ends_when_asked(simulated: Running
     reader = simulated.memory.reader()
     simulated.until(lambda: status.loop_count > 50)
     assert status.loop_pid == simulated.process.pid
-    assert 0 < status.loop_time_ns <= time.monotonic_ns()
+    assert 0 < status.get(Cell.LOOP_TIME_NS) <= time.monotonic_ns()
     samples, _ = reader.read()
     assert (samples["time_ns"][1:] > samples["time_ns"][:-1]).all()
     id_ = simulated.memory.commands.post(CommandKind.ENABLE, 0)

@@ -129,7 +129,7 @@ def test_status_cells_are_seen_by_the_other_side(memory: Memory) -> None:
         status = other.status
         assert [
             status.loop_count,
-            status.loop_time_ns,
+            status.get(Cell.LOOP_TIME_NS),
             status.get(Cell.SERVICE_TIME_NS),
             status.get(Cell.KEEPER_TIME_NS),
             status.loop_pid,
