@@ -9,14 +9,18 @@ has the right gain and phase at every speed.
 
 from __future__ import annotations
 
+import cmath
 import math
+from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from statistics import median
+from typing import NamedTuple, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from hdbridge.axis import AxisConfig
 from hdbridge.axis.effects.orders import MotorOrder, compensated_orders
 from hdbridge.axis.model import TransmissionModel
 from hdbridge.axis.model.response import LeadFilter, Response
@@ -64,6 +68,18 @@ much more error."""
 DIFFERENT_LAG = 0.15
 """Smallest share by which two following lags count as different."""
 LAG_NOISE_MS = 0.5
+REFINED = 0.05
+"""Smallest share of the ripple, as the root of the difference of squares, that a refinement removes: half of
+`DIFFERENT`."""
+SHARE_NOISE = 0.02
+ERROR_CHANGE = 0.5
+"""Standard deviations of what is left and of the error without correction by another servo, as shares of the
+latter.
+"""
+FIRST_STEP = 0.5
+"""Share of the change of a filter that is made first."""
+MAX_RUNS = 12
+"""Number of runs that are judged together, for each frequency: one alone shows a few frequencies."""
 REGULARISATION = 1e-3
 FADE_SHARE = 0.3
 SUM_WEIGHT = 1e3
@@ -78,6 +94,20 @@ class Limits(NamedTuple):
     maximum_arcsec: float
     slew_arcsec_s: float
     acceleration_deg_s2: float
+
+    @classmethod
+    def of(cls, axis: AxisConfig, model: TransmissionModel) -> Self:
+        """Returns the limits of the axis file on a correction of the model's motor orders."""
+        speed = axis.limits.velocity_deg_s
+        return cls(
+            tuple(
+                (float(order_hz(each.order, speed, model.ratio)), each.amplitude_arcsec)
+                for each in motor_orders(model)
+            ),
+            axis.compensation.maximum_arcsec,
+            axis.compensation.slew_arcsec_s,
+            axis.limits.acceleration_deg_s2,
+        )
 
     def amplitude_arcsec(self, frequency_hz: float) -> float:
         """Returns the amplitude of the largest order that reaches this frequency."""
@@ -111,6 +141,17 @@ class Harmonics(NamedTuple):
     ripple_arcsec: float
     """Rms about a straight line."""
 
+    @property
+    def over_time(self) -> ComplexArray:
+        """Amplitudes over exp(i w t): backwards the angle decreases with time."""
+        return self.amplitudes if self.speed_deg_s > 0.0 else self.amplitudes.conj()
+
+
+def _over_time(orders: Iterable[MotorOrder], speed_deg_s: float) -> ComplexArray:
+    """Returns the model's amplitudes like `Harmonics.over_time`."""
+    turned = math.copysign(math.pi / 180.0, speed_deg_s)
+    return np.array([cmath.rect(each.amplitude_arcsec, turned * each.phase_deg) for each in orders])
+
 
 def order_hz(order: ArrayLike, speed_deg_s: float, ratio: float) -> FloatArray:
     """Returns the frequency of a motor order at a load speed, Hz, shape of ``order``."""
@@ -122,7 +163,7 @@ def harmonics(run: EvenRun, orders: Sequence[int], ratio: float) -> Harmonics:
 
     InputError if the run is too short.
     """
-    if len(run.samples) < samples_needed(orders):
+    if len(run.samples) < samples_needed(len(orders)):
         raise InputError(
             f"a run at {run.speed_deg_s:g} deg/s has only {len(run.samples)} samples at constant speed: "
             "allow more travel in the axis file"
@@ -132,9 +173,9 @@ def harmonics(run: EvenRun, orders: Sequence[int], ratio: float) -> Harmonics:
     return harmonics_of(run.speed_deg_s, target, error, orders, ratio)
 
 
-def samples_needed(orders: Sequence[int]) -> int:
-    """Returns the minimum number of samples of a run for these orders."""
-    return 4 * (2 * len(orders) + 2)
+def samples_needed(orders: int) -> int:
+    """Returns the minimum number of samples of a run for so many orders."""
+    return 4 * (2 * orders + 2)
 
 
 def harmonics_of(
@@ -189,6 +230,8 @@ class Found(NamedTuple):
     """Load per correction and transmission error."""
     deviation: float
     """Standard deviation of the response."""
+    load: complex = 1.0
+    """Load per transmission error without correction, following lag excluded."""
 
     @property
     def uncertainty(self) -> float:
@@ -199,7 +242,7 @@ class Found(NamedTuple):
 def response_of(
     none: Sequence[Harmonics],
     trials: Sequence[Trial],
-    orders: Sequence[int],
+    orders: Sequence[MotorOrder],
     ratio: float,
     cycle_s: float,
     limits: Limits,
@@ -219,23 +262,34 @@ def response_of(
     if not kept:
         return None
     known_hz = min(kept[-1].frequency_hz, highest_hz)
-    fastest = float(order_hz(max(orders), max(abs(each.speed_deg_s) for each in none), ratio))
+    edge_hz = highest_hz if explore else known_hz
+    fastest = order_hz(max(each.order for each in orders), max(abs(each.speed_deg_s) for each in none), ratio)
+    per_cycle = min(max(2, math.ceil((float(fastest) + edge_hz) * cycle_s)), 4)
     return Response(
         cycle_ms=1000.0 * cycle_s,
         following_lag_ms=round(1000.0 * lag_s, 3),
         known_to_hz=round(known_hz, 2),
         frequency_hz=tuple(round(each.frequency_hz, 3) for each in points),
-        gain=tuple(float(f"{abs(each.response):.5g}") for each in points),
-        phase_deg=tuple(round(math.degrees(np.angle(each.response)), 2) for each in points),
         uncertainty=tuple(float(f"{each.uncertainty:.3g}") for each in points),
-        filter=_filter(kept, highest_hz if explore else known_hz, lag_s, cycle_s, fastest, limits),
+        filter=_filter(kept, edge_hz, lag_s, cycle_s, per_cycle, limits),
+        **_columns("", [each.response for each in points]),
+        **_columns("load_", [each.load for each in points]),
     )
+
+
+def _columns(name: str, values: Iterable[complex]) -> dict[str, tuple[float, ...]]:
+    """Returns two columns of a `Response`."""
+    values = list(values)
+    return {
+        f"{name}gain": tuple(float(f"{abs(each):.5g}") for each in values),
+        f"{name}phase_deg": tuple(round(math.degrees(cmath.phase(each)), 2) for each in values),
+    }
 
 
 def _found(
     none: Sequence[Harmonics],
     trials: Sequence[Trial],
-    orders: Sequence[int],
+    orders: Sequence[MotorOrder],
     ratio: float,
     cycle_s: float,
     lag_s: float,
@@ -244,19 +298,20 @@ def _found(
     found: list[Found] = []
     for trial in trials:
         for before, after in zip(none, trial.runs, strict=True):
-            hertz = order_hz(orders, before.speed_deg_s, ratio)
+            hertz = order_hz([each.order for each in orders], before.speed_deg_s, ratio)
+            lag = np.exp(-2j * math.pi * hertz * lag_s)
             applied = np.ones(len(orders)) if trial.filter is None else gain(trial.filter, hertz, cycle_s)
-            error, effect = before.amplitudes, before.amplitudes - after.amplitudes
-            if before.speed_deg_s < 0.0:  # the angle decreases with time
-                error, effect = error.conj(), effect.conj()
+            error, effect = before.over_time, before.over_time - after.over_time
             clear = abs(error) > MIN_Z_SCORE * before.deviations
             clear &= (hertz < STOP / cycle_s) & (abs(applied) > MIN_APPLIED)
             with np.errstate(divide="ignore", invalid="ignore"):
-                answer = effect / (applied * error) * np.exp(-2j * math.pi * hertz * lag_s)
+                answer = effect / (applied * error) * lag
                 share = np.hypot(before.deviations, after.deviations) / abs(applied * error)
                 deviation = np.hypot(share, abs(answer) * before.deviations / abs(error))
-            rows = zip(hertz[clear].tolist(), answer[clear].tolist(), deviation[clear].tolist(), strict=True)
-            found += [Found(at, value, max(each, MIN_DEVIATION * abs(value))) for at, value, each in rows]
+            deviation = np.maximum(deviation, MIN_DEVIATION * abs(answer))
+            load = error / (lag * _over_time(orders, before.speed_deg_s))
+            columns = (each[clear].tolist() for each in (hertz, answer, deviation, load))
+            found += [Found(*each) for each in zip(*columns, strict=True)]
     return sorted(found, key=lambda each: each.frequency_hz)
 
 
@@ -272,13 +327,13 @@ def _merged(found: Sequence[Found]) -> list[Found]:
 
 
 def _mean(group: Sequence[Found]) -> Found:
-    values = np.array([each.response for each in group])
-    hertz = np.array([each.frequency_hz for each in group])
-    weight = np.array([each.deviation for each in group]) ** -2.0
+    hertz, values, deviations, loads = (np.array([each[at] for each in group]) for at in range(4))
+    weight = deviations**-2.0
     total = float(weight.sum())
     mean = complex(weight @ values) / total
     scatter = float(weight @ abs(values - mean) ** 2) / total / max(len(group) - 1, 1)
-    return Found(float(weight @ hertz) / total, mean, math.sqrt(max(1.0 / total, scatter)))
+    spread = math.sqrt(max(1.0 / total, scatter))
+    return Found(float(weight @ hertz) / total, mean, spread, complex(weight @ loads) / total)
 
 
 def _known(points: Sequence[Found], highest_hz: float, max_gap_hz: float, limits: Limits) -> list[Found]:
@@ -300,38 +355,172 @@ def _known(points: Sequence[Found], highest_hz: float, max_gap_hz: float, limits
     return kept
 
 
-def difference(one: Response, other: Response) -> float:
-    """Returns the rms relative difference of two responses over their range, less their noise."""
-    hertz = np.array([each for each in other.frequency_hz if each <= min(one.known_to_hz, other.known_to_hz)])
-    (first, first_noise), (second, second_noise) = (_at(each, hertz) for each in (one, other))
-    return _rms_difference(first / second, 0.25 * (first_noise**2 + second_noise**2))
+class Left(NamedTuple):
+    """Remainder of an order of the load error in a run with the filtered correction."""
+
+    frequency_hz: float
+    share: complex
+    """Share of the error without correction."""
+    size_arcsec: float
+    """Amplitude of the error without correction."""
 
 
-def difference_seen(
-    stored: Response, seen: Iterable[Sequence[Found]], amplitudes_arcsec: Iterable[float]
-) -> float:
-    """Returns the same from relative responses of `answers`, as a share of the ripple.
+class Answers:
+    """Answers of motor and load to the filtered correction in runs at constant speed, against the response.
 
-    Each group of ``seen`` has one order and about one frequency, and ``amplitudes_arcsec`` has the amplitudes
-    of these orders. Each group counts once, so that many slow runs do not hide what a few fast ones show.
+    They are kept by order and nearest frequency of the response, so that many slow runs do not hide what a
+    few fast ones show.
     """
-    means = [_mean(each) for each in seen]
-    hertz, values, deviations = (np.array([each[at] for each in means]) for at in range(3))
-    variance = deviations**2 + 0.25 * _at(stored, hertz.real)[1] ** 2
-    return _rms_difference(values, variance, np.fromiter(amplitudes_arcsec, float))
+
+    def __init__(
+        self,
+        response: Response,
+        orders: Sequence[MotorOrder],
+        ratio: float,
+        earlier: Answers | None = None,
+    ) -> None:
+        """``earlier`` are those with another filter on the same servo."""
+        self.lags_ms: deque[float] = deque(maxlen=MAX_RUNS)
+        """Lag of the motor behind its set-points in the last runs."""
+        self._response, self._orders, self._ratio = response, orders, ratio
+        self._motor: dict[tuple[int, int], deque[Found]] = {}
+        self._left: dict[tuple[int, int], deque[Left]] = {}
+        self._earlier = {} if earlier is None else earlier.by_frequency()
+
+    def take(
+        self,
+        speed_deg_s: float,
+        target_deg: FloatArray,
+        issued_deg: FloatArray,
+        motor_deg: FloatArray,
+        load_deg: FloatArray,
+    ) -> None:
+        """Takes a run: load target, set-points of the motor, both encoders; shape (n,) each.
+
+        A load encoder that is not believed reads NaN.
+        """
+        ratio, stored, place_of = self._ratio, self._response, self._place
+        lag_s = float(np.mean(issued_deg - motor_deg)) / (ratio * speed_deg_s)
+        self.lags_ms.append(1000.0 * lag_s)
+        numbers = [each.order for each in self._orders]
+        run = (stored, speed_deg_s, lag_s, target_deg)
+        for order, found in answers(*run, issued_deg, motor_deg, numbers, ratio):
+            self._motor.setdefault(place_of(order, found), deque(maxlen=MAX_RUNS)).append(found)
+        if stored.load_gain and np.isfinite(load_deg).all():
+            for order, left in _left(*run, load_deg, self._orders, ratio):
+                self._left.setdefault(place_of(order, left), deque(maxlen=MAX_RUNS)).append(left)
+
+    def _place(self, order: int, found: Found | Left) -> tuple[int, int]:
+        known = np.array(self._response.frequency_hz)
+        return order, int(np.argmin(np.abs(known - found.frequency_hz)))
+
+    @property
+    def difference(self) -> float:
+        """Rms difference of the motor's response from the stored one, as a share of the ripple, less noise.
+
+        Neither the gear's error nor the load encoder matters.
+        """
+        if not self._motor:
+            return 0.0
+        means = [_mean(each) for each in self._motor.values()]
+        hertz, values, deviations = (np.array([each[at] for each in means]) for at in range(3))
+        spread = 0.5 * np.interp(hertz.real, self._response.frequency_hz, self._response.uncertainty)
+        variance = deviations**2 + spread**2
+        sizes = np.array([self._orders[order].amplitude_arcsec for order, _ in self._motor])
+        weight = sizes**2 / (DIFFERENT**2 + variance)
+        square = abs(values - 1.0) ** 2 - variance
+        return math.sqrt(max(0.0, float(np.sum(weight * square) / weight.sum())))
+
+    def forget_load(self) -> None:
+        """Discards the readings of the load encoder."""
+        self._left.clear()
+
+    def left_arcsec2(self) -> dict[tuple[int, int], float]:
+        """Returns the mean square that is left of each order at each frequency."""
+        return {
+            place: sum(abs(each.share * each.size_arcsec) ** 2 for each in group) / len(group)
+            for place, group in self._left.items()
+        }
+
+    def by_frequency(self) -> dict[int, _Seen]:
+        """Returns what is left, the orders of one frequency together."""
+        groups: dict[int, list[Left]] = {}
+        for (_, place), group in self._left.items():
+            groups.setdefault(place, []).extend(group)
+        found = {}
+        for place, lefts in groups.items():
+            hertz, shares, sizes = (np.array(each) for each in zip(*lefts, strict=True))
+            weight = sizes**2 / np.sum(sizes**2)
+            at_hz = float(weight @ hertz)
+            at = gain(self._response.filter, np.array([at_hz]), self._response.cycle_ms / 1000.0)[0]
+            found[place] = _Seen(at_hz, complex(weight @ shares), math.sqrt(np.mean(sizes**2)), complex(at))
+        return found
+
+    def refined(
+        self, committed: Response, limits: Limits, bound: float, *, retuned: bool = False
+    ) -> Response | None:
+        """Returns the response whose filter removes what is left of the load error; None if it would not.
+
+        The rest E - G F c is a straight line over the filter's gain F, which must change by E / (E - rest), a
+        factor that is interpolated between the frequencies. E is that of the calibration, and the step is
+        shorter, until runs with another filter show E with the present servo. Unless the servo is known to
+        have changed (``retuned``), the others must predict the factor at each frequency in turn: what is left
+        on an unchanged servo differs from one frequency to the next. ``bound`` limits the deviation from the
+        committed response, as a share.
+        """
+        seen = self.by_frequency()
+        if len(seen) < 2:
+            return None
+        places = sorted(seen)
+        hertz, shares, sizes, _ = (np.array(each) for each in zip(*(seen[at] for at in places), strict=True))
+        error = np.array([_error(seen[at], self._earlier.get(at)) for at in places])
+        certain = np.array([1.0 if at in self._earlier else FIRST_STEP for at in places])
+        factors = 1.0 + certain * _bounded(error / (error - shares) - 1.0, bound)
+        stored = self._response
+        points_hz, lag_s = np.array(stored.frequency_hz), median(self.lags_ms) / 1000.0
+        first, now = (_points(each) for each in (committed, stored))
+        new = first / (1.0 + _bounded(first / now * _between(points_hz, hertz, factors) - 1.0, bound))
+        others = [np.delete(np.arange(len(hertz)), at) for at in range(len(hertz))]
+        predicted = [_between(at, hertz[each], factors[each]) for at, each in zip(hertz, others, strict=True)]
+        for applied in (_between(hertz, points_hz, now / new), *([] if retuned else [np.array(predicted)])):
+            less = abs(shares) ** 2 - abs(error - (error - shares) * applied) ** 2
+            if sizes**2 @ less < REFINED**2 * np.sum(sizes**2):
+                return None
+        values = new * np.exp(-2j * math.pi * points_hz * lag_s)
+        deviations = 0.5 * np.array(stored.uncertainty) * abs(values)
+        points = [Found(*each) for each in zip(points_hz, values, deviations, strict=True)]
+        cycle_s, edge_hz = stored.cycle_ms / 1000.0, stored.known_to_hz
+        kept = _known(points, edge_hz, MAX_GAP / cycle_s, limits)
+        lead = _filter(kept, edge_hz, lag_s, cycle_s, stored.filter.per_cycle, limits)
+        lag_ms = round(1000.0 * lag_s, 3)
+        return stored.model_copy(update={"following_lag_ms": lag_ms, "filter": lead, **_columns("", values)})
 
 
-def _rms_difference(relative: ComplexArray, variance: FloatArray, sizes: ArrayLike = 1.0) -> float:
-    if not relative.size:
-        return 0.0
-    weight = np.square(sizes) / (DIFFERENT**2 + variance)
-    square = abs(relative - 1.0) ** 2 - variance
-    return math.sqrt(max(0.0, float(np.sum(weight * square) / weight.sum())))
+class _Seen(NamedTuple):
+    """Mean of what is left at one frequency, with the gain of the filter there."""
+
+    frequency_hz: float
+    share: complex
+    size_arcsec: float
+    gain: complex
 
 
-def agree(one: Response, other: Response) -> bool:
-    """Returns False if the following lag or the response differs beyond its noise."""
-    return lags_agree(one.following_lag_ms, other.following_lag_ms) and difference(one, other) < DIFFERENT
+def _error(now: _Seen, earlier: _Seen | None) -> complex:
+    """Returns the error without correction, relative to that of the calibration, at one frequency.
+
+    The rest is a straight line over the gain of the filter. Two points of it are weighed against the
+    calibration, by the noise of a share and the change of the error by another servo.
+    """
+    if earlier is None:
+        return 1.0
+    rows = np.array([[1.0, now.gain], [1.0, earlier.gain], [SHARE_NOISE / ERROR_CHANGE, 0.0]])
+    wanted = np.array([now.share, earlier.share, SHARE_NOISE / ERROR_CHANGE])
+    return complex(np.linalg.lstsq(rows, wanted, rcond=None)[0][0])
+
+
+def _bounded(change: ComplexArray, bound: float) -> ComplexArray:
+    """Returns changes of at most this size."""
+    return change * np.minimum(1.0, bound / np.maximum(abs(change), 1e-9))
 
 
 def lags_agree(one_ms: float, other_ms: float) -> bool:
@@ -361,12 +550,9 @@ def answers(
         for each in (issued_deg, motor_deg)
     )
     hertz = order_hz(orders, speed_deg_s, ratio)
-    late_s = lag_s - stored.following_lag_ms / 1000.0
     with np.errstate(divide="ignore", invalid="ignore"):
-        answer = motor.amplitudes / issued.amplitudes
-        if speed_deg_s < 0.0:  # the angle decreases with time
-            answer = answer.conj()
-        relative = answer * np.exp(2j * math.pi * hertz * late_s) / _at(stored, hertz)[0]
+        answer = motor.over_time / issued.over_time * np.exp(2j * math.pi * hertz * lag_s)
+        relative = answer / _between(hertz, stored.frequency_hz, _points(stored))
         noise = abs(relative) * math.sqrt(2.0) * motor.deviations / abs(motor.amplitudes)
     deviation = np.hypot(noise, MIN_DEVIATION * abs(relative))
     clear = (hertz <= stored.known_to_hz) & (2.0 * deviation < MAX_UNCERTAINTY * abs(relative))
@@ -374,12 +560,45 @@ def answers(
         yield place, Found(float(hertz[place]), complex(relative[place]), float(deviation[place]))
 
 
-def _at(response: Response, hertz: FloatArray) -> tuple[ComplexArray, FloatArray]:
-    """Interpolates response and uncertainty linearly at some frequencies."""
-    known = np.array(response.frequency_hz)
-    values = np.array(response.gain) * np.exp(1j * np.radians(response.phase_deg))
-    found: ComplexArray = np.interp(hertz, known, values.real) + 1j * np.interp(hertz, known, values.imag)
-    return found, np.interp(hertz, known, response.uncertainty)
+def _left(
+    stored: Response,
+    speed_deg_s: float,
+    lag_s: float,
+    target_deg: FloatArray,
+    load_deg: FloatArray,
+    orders: Sequence[MotorOrder],
+    ratio: float,
+) -> Iterator[tuple[int, Left]]:
+    """Yields what a run leaves of the load error, by index of order, up to the known frequency."""
+    numbers = [each.order for each in orders]
+    error = ARCSEC_PER_DEG * (load_deg - target_deg)
+    rest = harmonics_of(speed_deg_s, target_deg, error, numbers, ratio).over_time
+    hertz = order_hz(numbers, speed_deg_s, ratio)
+    load = np.array(stored.load_gain) * np.exp(1j * np.radians(stored.load_phase_deg))
+    load = _between(hertz, stored.frequency_hz, load) * np.exp(-2j * math.pi * hertz * lag_s)
+    expected = load * _over_time(orders, speed_deg_s)
+    for place in np.flatnonzero(hertz <= stored.known_to_hz).tolist():
+        share = complex(rest[place] / expected[place])
+        yield place, Left(float(hertz[place]), share, float(abs(expected[place])))
+
+
+def _points(response: Response) -> ComplexArray:
+    """Returns the response at its frequencies, following lag excluded."""
+    turned = np.radians(response.phase_deg) + 0.002 * math.pi * response.following_lag_ms * np.array(
+        response.frequency_hz
+    )
+    points: ComplexArray = np.array(response.gain) * np.exp(1j * turned)
+    return points
+
+
+def _between(
+    hertz: ArrayLike, points_hz: ArrayLike, values: ComplexArray, at_rest: float = 1.0
+) -> ComplexArray:
+    """Interpolates size (its logarithm) and phase of a function of frequency, real at 0 Hz."""
+    at, known = np.asarray(hertz, dtype=float), np.append(0.0, points_hz)
+    size = np.interp(at, known, np.log([at_rest, *abs(values)]))
+    between: ComplexArray = np.exp(size + 1j * np.interp(at, known, np.unwrap([0.0, *np.angle(values)])))
+    return between
 
 
 def gain(lead: LeadFilter, frequency_hz: FloatArray, cycle_s: float) -> ComplexArray:
@@ -401,23 +620,21 @@ def _denominator(hertz: FloatArray, feedback: FloatArray, cycle_s: float) -> Com
 
 
 def _filter(
-    kept: Sequence[Found], edge_hz: float, lag_s: float, cycle_s: float, fastest_hz: float, limits: Limits
+    kept: Sequence[Found], edge_hz: float, lag_s: float, cycle_s: float, per_cycle: int, limits: Limits
 ) -> LeadFilter:
     """Fits the filter by least squares on the relative error: the inverse response to ``edge_hz``, 0 beyond.
 
     Between the points the inverse response without its poles is interpolated, because it has no peak narrower
     than their distance.
     """
-    per_cycle = min(max(2, math.ceil((fastest_hz + edge_hz) * cycle_s)), 4)
     lag_cycles = math.ceil(max(0.0, lag_s) / cycle_s) + LAG_CYCLES
     count = (LEAD_CYCLES + lag_cycles) * per_cycle + 1
     ahead_s = (LEAD_CYCLES - np.arange(count) / per_cycle) * cycle_s
     points_hz = np.array([each.frequency_hz for each in kept])
-    inverse = 1.0 / np.array([each.response for each in kept])
+    inverse = _turned(points_hz, np.array(-lag_s)) / np.array([each.response for each in kept])
     trust = np.array([each.uncertainty / 2.0 for each in kept])
     hertz, beyond = np.linspace(0.0, edge_hz, 160), np.linspace(edge_hz, 0.5 * per_cycle / cycle_s, 200)[1:]
     weight = 1.0 / (1.0 + 3.0 * np.interp(hertz, points_hz, trust))
-    known = np.array([0.0, *points_hz])
     # Beyond the edge the response is unknown: the filter falls steeply to zero and stays there.
     fade = np.clip((beyond - edge_hz) / (FADE / cycle_s), 0.0, 1.0)
     inside, outside = _turned(hertz, ahead_s), _turned(beyond, ahead_s)
@@ -427,9 +644,7 @@ def _filter(
         # The poles are fitted to a plain interpolation, then removed before the final interpolation.
         smooth = feedback if refined == REFINEMENTS else np.zeros(POLES)
         flat, rest = inverse * _denominator(points_hz, smooth, cycle_s), 1.0 + float(smooth.sum())
-        size = np.interp(hertz, known, np.log([rest, *abs(flat)]))
-        phase = np.interp(hertz, known, np.unwrap([0.0, *np.angle(flat)])) - 2.0 * math.pi * lag_s * hertz
-        wanted = np.exp(size + 1j * phase) / _denominator(hertz, smooth, cycle_s)
+        wanted = _between(hertz, points_hz, flat, rest) / _denominator(hertz, smooth, cycle_s)
         below = _denominator(hertz, feedback, cycle_s)
         dread = (0.05 + 0.95 * fade**2) * np.maximum(1.0 / abs(wanted[-1]), np.minimum(fade, UNKNOWN))
         within = (weight / wanted / below)[:, None] * inside

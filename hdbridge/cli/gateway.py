@@ -83,7 +83,8 @@ def simulate(
     ):
         path = Path(folder) / "gateway.eds"
         path.write_text(text_of(config, settings), encoding="utf-8")
-        node = DriveNode(bus, IdealAxis(scale), path, node_id, clock, plate, BEHAVIOUR)
+        rate_bps = settings.bus.bitrate_bps
+        node = DriveNode(bus, IdealAxis(scale), path, node_id, clock, plate, BEHAVIOUR, bit_rate_bps=rate_bps)
         notes.print(f"ideal drive: node {node_id} on {bus.channel_info}; Ctrl-C ends it")
         end = float("inf") if duration_s is None else clock.now() + duration_s
         run(bus, node, clock, lambda: interrupted() or clock.now() >= end)

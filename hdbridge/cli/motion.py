@@ -103,7 +103,7 @@ def print_motion(result: MotionTest) -> None:
             _percent(each.removed_static_percent),
             _figure(each.filtered_arcsec),
             _percent(each.removed_percent),
-            " ".join(map(str, each.faded)),
+            " ".join(map(str, each.faded_orders)),
         )
     print_table(table)
     fastest = result.ripples[-1]

@@ -99,7 +99,8 @@ class GatewaySettings(_Part):
         100.0,
         ge=10,
         le=10_000,
-        description="time without set-points after which an axis at rest loses power",
+        description="time without set-points after which an axis at rest loses power; in motion it keeps its "
+        "speed for a fifth of it, then brakes",
     )
 
 

@@ -8,6 +8,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from hdbridge.device.node import DriveNode
 
 Outgoing = tuple[int, bytes]
 """CAN identifier and data of a TPDO that is about to be sent."""
@@ -51,87 +55,40 @@ class Faults:
     """The drive does not notice that RPDOs are missing."""
     deceleration_counts_s2: float | None = None
     """Deceleration of every ramp, in place of the one that the objects demand; counts/s2."""
-    concerns_poll: bool = False
-    """For the node: True if a fault is due at this poll."""
+    pending: list[Callable[[DriveNode], None]] = field(default_factory=list)
+    """For the node: what happens to it at the next poll."""
     _held: list[Outgoing] = field(default_factory=list)
-    _errors: list[tuple[int, bytes]] = field(default_factory=list)
-    _lost_masters: list[int] = field(default_factory=list)
-    _missed_masters: list[int] = field(default_factory=list)
-    _boot_ups: int = 0
-    _departures: int = 0
-    _openings: int = 0
 
     def raise_error(self, code: int, additional: bytes = b"") -> None:
         """At the next poll: malfunction ``code`` (EMCY, fault reaction), with up to five bytes of detail."""
-        self._errors.append((code, additional))
-        self.concerns_poll = True
+        self.pending.append(lambda node: node.firmware.fault(code, additional))
 
     def lose_master(self, code: int) -> None:
         """At the next poll: react as 6007h says to the loss of the master, without an EMCY."""
-        self._lost_masters.append(code)
-        self.concerns_poll = True
+        self.pending.append(lambda node: node.firmware.connection_lost(code))
 
     def miss_master(self, code: int) -> None:
         """At the next poll: as ``lose_master``, with the EMCY ``code`` (8130h or 8250h)."""
-        self._missed_masters.append(code)
-        self.concerns_poll = True
+        self.pending.append(lambda node: node.emergency.occur(code))
+        self.lose_master(code)
 
     def boot_up(self) -> None:
         """At the next poll: reset as after a brown-out, with a boot-up message, whatever the axis does."""
-        self._boot_ups += 1
-        self.concerns_poll = True
+        self.pending.append(lambda node: node.reset())
 
     def leave_operational(self) -> None:
         """At the next poll: enter PRE-OPERATIONAL, whatever the axis does, and report it by heartbeat."""
-        self._departures += 1
-        self.concerns_poll = True
+        self.pending.append(lambda node: node.drop_out())
 
     def open_enable_input(self) -> None:
         """At the next poll: switch the power stage off without an EMCY, as a hardware enable input does."""
-        self._openings += 1
-        self.concerns_poll = True
-
-    def take_errors(self) -> list[tuple[int, bytes]]:
-        """For the node: returns the pending errors and clears them."""
-        errors, self._errors = self._errors, []
-        return errors
-
-    def take_lost_masters(self) -> list[int]:
-        """For the node: returns the pending codes of ``lose_master`` and clears them."""
-        codes, self._lost_masters = self._lost_masters, []
-        return codes
-
-    def take_missed_masters(self) -> list[int]:
-        """For the node: returns the pending codes of ``miss_master`` and clears them."""
-        codes, self._missed_masters = self._missed_masters, []
-        return codes
-
-    def take_boot_up(self) -> bool:
-        """For the node: returns True if a reset is pending, and clears it."""
-        wanted, self._boot_ups = self._boot_ups > 0, 0
-        return wanted
-
-    def take_departure(self) -> bool:
-        """For the node: returns True if leaving OPERATIONAL is pending, and clears it."""
-        wanted, self._departures = self._departures > 0, 0
-        return wanted
-
-    def take_opening(self) -> bool:
-        """For the node: returns True if opening the enable input is pending, and clears it."""
-        wanted, self._openings = self._openings > 0, 0
-        return wanted
+        self.pending.append(lambda node: node.firmware.power_cut())
 
     @property
     def concerns_tpdos(self) -> bool:
         """For the node: True if TPDOs must pass through ``spoil``."""
-        return bool(
-            self._held
-            or self.drop_tpdos
-            or self.shorten_tpdos
-            or self.duplicate_tpdos
-            or self.hold_tpdos
-            or self.reverse_tpdos
-        )
+        counted = self.drop_tpdos + self.shorten_tpdos + self.duplicate_tpdos + self.hold_tpdos
+        return bool(counted or self.reverse_tpdos or self._held)
 
     def spoil(self, tpdos: list[Outgoing]) -> list[Outgoing]:
         """Applies the faults to ``tpdos``, the TPDOs of one SYNC, and returns the frames to send."""

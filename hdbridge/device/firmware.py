@@ -353,11 +353,7 @@ class Firmware:
         self._brake(option, State.FAULT)
 
     def power_cut(self) -> None:
-        """Switches the power stage off without an error, as a hardware enable input does when it opens."""
-        self._cut()
-
-    def _cut(self) -> None:
-        """Switches the power stage off; a fault remains one."""
+        """Switches the power stage off, as an opening enable input does; a fault remains one."""
         in_fault = self.state in (State.FAULT, State.FAULT_REACTION_ACTIVE)
         self._power_off(State.FAULT if in_fault else State.SWITCH_ON_DISABLED)
 
@@ -368,7 +364,7 @@ class Firmware:
         if option == 1 and is_powered:
             self.fault(code)
         elif (option == 2 and is_powered) or (option == 3 and self._awaits_power):
-            self._cut()
+            self.power_cut()
         elif option == 3 and self.state is State.OPERATION_ENABLED:
             self._stopped_itself = True
             self._quick_stop()

@@ -268,9 +268,10 @@ class DriveNode:
         self._now_s = now_s
         if self.nmt is _INITIALISING:
             self._boot()
-        if self.faults.concerns_poll:
-            self.faults.concerns_poll = False
-            self._make_faults()
+        if self.faults.pending:
+            pending, self.faults.pending = self.faults.pending, []
+            for happen in pending:
+                happen(self)
         if now_s >= self._due_s:
             self._do_what_is_due(now_s)
         if self._event_tpdos:
@@ -278,7 +279,7 @@ class DriveNode:
 
     def next_event_s(self) -> float:
         """Returns the time by which ``poll`` must be called, on the clock's scale."""
-        return self._now_s if self.faults.concerns_poll else self._due_s
+        return self._now_s if self.faults.pending else self._due_s
 
     def handle(self, message: can.Message, now_s: float) -> None:
         """Processes a frame received at ``now_s``; ignores all but data frames with 11-bit identifiers."""
@@ -381,7 +382,7 @@ class DriveNode:
         elif command == NmtCommand.ENTER_PRE_OPERATIONAL:
             self._leave_operational(Nmt.PRE_OPERATIONAL)
         elif command == NmtCommand.RESET_NODE:
-            self._reset_node()
+            self.reset()
         elif command == NmtCommand.RESET_COMMUNICATION:
             self._reset_communication()
 
@@ -399,6 +400,11 @@ class DriveNode:
         if lost:
             self.firmware.connection_lost(ErrorCode.COMMUNICATION)
         self._enter(state)
+
+    def drop_out(self) -> None:
+        """Enters PRE-OPERATIONAL without a command, and reports it."""
+        self._leave_operational(Nmt.PRE_OPERATIONAL)
+        self._send_heartbeat()
 
     def _on_lss(self, data: bytearray, _: float) -> None:
         answer = self._lss.respond(bytes(data))
@@ -420,7 +426,8 @@ class DriveNode:
         self._begin()
         self._boot()
 
-    def _reset_node(self) -> None:
+    def reset(self) -> None:
+        """Starts again as after power-on, with a boot-up message (NMT reset node)."""
         self._lss.pending = self._lss.stored
         self._lss.configuring = False
         self._take_node_id()
@@ -436,22 +443,6 @@ class DriveNode:
         self._watch_due_s = now_s + self._watched_s
         self.emergency.clear(ErrorCode.HEARTBEAT)
         self._due_s = self._next_due_s()
-
-    def _make_faults(self) -> None:
-        for code, additional in self.faults.take_errors():
-            self.firmware.fault(code, additional)
-        for code in self.faults.take_lost_masters():
-            self.firmware.connection_lost(code)
-        for code in self.faults.take_missed_masters():
-            self.emergency.occur(code)
-            self.firmware.connection_lost(code)
-        if self.faults.take_opening():
-            self.firmware.power_cut()
-        if self.faults.take_departure():
-            self._leave_operational(Nmt.PRE_OPERATIONAL)
-            self._send_heartbeat()
-        if self.faults.take_boot_up():
-            self._reset_node()
 
     # ---------------------------------------------------------------- time
 

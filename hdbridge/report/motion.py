@@ -82,7 +82,7 @@ def _table(result: MotionTest) -> Table:
             "" if each.static_arcsec is None else f"{each.static_arcsec:.2f}",
             "" if each.filtered_arcsec is None else f"{each.filtered_arcsec:.2f}",
             "" if each.removed_percent is None else f"{each.removed_percent:.0f} %",
-            " ".join(map(str, each.faded)),
+            " ".join(map(str, each.faded_orders)),
         ]
         for each in result.ripples
     ]

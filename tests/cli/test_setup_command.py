@@ -28,6 +28,7 @@ procedures:
   - {procedure: standstill, duration_s: 1}
   - {procedure: sweep, motor_turns: 12, motor_turns_per_s: 0.5}
   - {procedure: sines, amplitudes_deg: [60, 8], frequency_hz: 0.2, periods: 2}
+validation: {count: 8, cycles: 2, travel_deg: 10}
 """
 STEPS = ("new", "check", "doctor", "calibrate", "model diff", "model commit", "move")
 ARTICLE = (bundled_profile("article") / "axis.yaml").read_text(encoding="utf-8")

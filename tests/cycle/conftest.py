@@ -100,6 +100,12 @@ class Rig:
         assert self.drive.image.power.state is State.OPERATION_ENABLED
         self.target = feedback.motor_counts
 
+    def set_off(self) -> None:
+        """Enables the axis and moves it at constant speed."""
+        self.enable()
+        self.move(60)
+        self.bus.sent.clear()
+
     @property
     def period_s(self) -> float:
         return self.cycle.period_s
@@ -203,10 +209,8 @@ def idle() -> Iterator[Rig]:
 
 
 @pytest.fixture
-def moving(request: pytest.FixtureRequest) -> Iterator[Rig]:
-    """Enabled and moving at constant speed; a test may ask for the drive's character."""
-    with rig(character=getattr(request, "param", FRIENDLY)) as made:
-        made.enable()
-        made.move(60)
-        made.bus.sent.clear()
+def moving() -> Iterator[Rig]:
+    """Enabled and moving at constant speed."""
+    with rig() as made:
+        made.set_off()
         yield made

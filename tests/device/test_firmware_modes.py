@@ -22,14 +22,6 @@ def set_point(master, target: int, bits: int = 0) -> None:
     master.control(0x0F | bits)
 
 
-def test_mode_is_displayed_and_others_are_refused(master):
-    for mode in (1, 6, 7, 8, 0):
-        master.put(0x6060, 0, mode, 1)
-        assert master.read(0x6061) == mode
-    assert master.write(0x6060, 0, 3, 1) == 0x06090030
-    assert master.read(0x6061) == 0
-
-
 # interpolated position
 
 
@@ -188,21 +180,6 @@ def test_a_mode_change_in_motion_brakes_first(master, motor):
     assert master.state == "enabled"
 
 
-def test_halt_in_csp_stops_and_ignores_targets(master, motor):
-    master.put(0x6084, 0, 50_000, 4)
-    master.enable_csp()
-    target = master.cruise(40, 10)
-    for _ in range(60):
-        status = master.cycle(0x10F, target)[0]
-    assert motor.velocity_counts_s == 0.0
-    assert status & REACHED
-    assert not status & BIT_12
-    held = motor.position
-    master.cycle(0x10F, target + 5000)
-    master.cycle(0x10F, target + 5000)
-    assert motor.position == held
-
-
 def test_the_torque_limit_reaches_the_loops(master, motor):
     master.put(0x6072, 0, 500, 2)
     assert motor.torque_limit_permille == 500
@@ -253,57 +230,6 @@ def test_pp_target_reached_needs_the_window_for_its_time(master, motor):
     assert not master.statusword & REACHED
 
 
-def test_pp_keeps_one_set_point_waiting(master, motor):
-    master.enable(1)
-    set_point(master, 2000)
-    assert not master.statusword & BIT_12
-    set_point(master, -1000)
-    assert master.statusword & BIT_12  # no room for another
-    master.put(0x607A, 0, 7777, 4)
-    master.control(0x1F)
-    master.control(0x0F)
-    positions = []
-    for _ in range(400):
-        master.wait(0.004)
-        positions.append(motor.position)
-    assert max(positions) == 2000
-    assert positions[-1] == -1000
-    assert not master.statusword & BIT_12
-
-
-def test_pp_change_immediately(master, motor):
-    master.enable(1)
-    set_point(master, 20_000)
-    master.wait(0.2)
-    assert 0 < motor.position < 10_000
-    set_point(master, -1000, 0x20)
-    master.wait(3.0)
-    assert motor.position == -1000
-
-
-def test_pp_relative_to_the_preceding_set_point(master, motor):
-    master.enable(1)
-    set_point(master, 1000, 0x40)
-    master.wait(0.05)
-    set_point(master, 500, 0x40 | 0x20)
-    master.wait(1.0)
-    assert motor.position == 1500
-    set_point(master, -700, 0x40)
-    master.wait(1.0)
-    assert motor.position == 800
-
-
-def test_pp_needs_an_edge(master, motor):
-    master.enable(1)
-    set_point(master, 1000)
-    master.wait(1.0)
-    master.control(0x1F)
-    master.put(0x607A, 0, 3000, 4)
-    master.control(0x3F)
-    master.wait(1.0)
-    assert motor.position == 1000
-
-
 @pytest.mark.parametrize("behaviour", [Behaviour(), Behaviour(controlword=Controlword.LEVEL)])
 def test_a_halt_in_the_word_that_enables_holds_the_axis(motor, behaviour):
     """As ros2_canopen enables."""
@@ -320,31 +246,6 @@ def test_a_halt_in_the_word_that_enables_holds_the_axis(motor, behaviour):
         for _ in range(5):
             master.cycle(0x000F, 2000)
         assert master.read(0x6064) == 2000
-
-
-def test_pp_halts_and_goes_on(master, motor):
-    master.put(0x6084, 0, 50_000, 4)
-    master.enable(1)
-    set_point(master, 20_000)
-    master.wait(0.5)
-    start, speed = motor.position, motor.velocity_counts_s
-    master.control(0x10F)
-    master.wait(1.0)
-    assert motor.position - start == pytest.approx(speed**2 / 1e5, rel=1e-3)
-    assert master.statusword & REACHED
-    master.control(0x0F)
-    master.wait(2.0)
-    assert motor.position == 20_000
-
-
-def test_pp_respects_the_software_limits(master, motor):
-    master.put(0x607D, 1, -100, 4)
-    master.put(0x607D, 2, 100, 4)
-    master.enable(1)
-    set_point(master, 500)
-    master.wait(1.0)
-    assert motor.position == 100
-    assert master.statusword & LIMIT
 
 
 def test_pp_is_limited_in_speed(master, motor):

@@ -7,25 +7,6 @@ import struct
 import pytest
 
 
-def bring(master, state: str) -> None:
-    """Put the drive, at rest, into ``state`` (605Ah = 6, so that a quick stop stays)."""
-    master.put(0x605A, 0, 6, 2)
-    words = {
-        "disabled": (),
-        "ready": (0x06,),
-        "switched on": (0x06, 0x07),
-        "enabled": (0x06, 0x07, 0x0F),
-        "quick stop": (0x06, 0x07, 0x0F, 0x02),
-        "fault": (0x06, 0x07, 0x0F),
-    }[state]
-    for word in words:
-        master.control(word)
-    if state == "fault":
-        master.node.faults.raise_error(0x2310)
-        master.wait(0.01)
-    assert master.state == state
-
-
 @pytest.mark.parametrize(
     ("words", "status"),
     [
@@ -43,22 +24,6 @@ def test_the_statusword_of_each_state(master, words, status):
     assert master.statusword == status
 
 
-def test_only_a_fault_reset_leaves_fault_and_only_its_edge(master):
-    bring(master, "fault")
-    for word in (0x06, 0x07, 0x0F, 0x00, 0x02):
-        master.control(word)
-        assert master.state == "fault"
-    master.control(0x80)
-    assert master.state == "disabled"
-    master.node.faults.raise_error(0x2310)
-    master.wait(0.01)
-    master.control(0x80)
-    assert master.state == "fault"  # the bit is still set from before: no edge
-    master.control(0x00)
-    master.control(0x80)
-    assert master.state == "disabled"
-
-
 def test_a_repeated_controlword_does_not_enable_again(master):
     """A target stream that goes on, with a stale 'enable', must not undo a stop."""
     master.put(0x6007, 0, 3, 2)
@@ -73,18 +38,6 @@ def test_a_repeated_controlword_does_not_enable_again(master):
     for word in (0x00, 0x06, 0x07, 0x0F, 0x0F):
         status = master.cycle(word)[0]
     assert master.cycle()[0] & 0x6F == 0x27
-
-
-def test_nothing_moves_at_enable_whatever_the_target_was(master, motor):
-    motor.position = 123_456.0
-    master.put(0x607A, 0, -999_999, 4)
-    master.wait(0.01)
-    for mode in (0, 1, 6, 8):
-        master.enable(mode)
-        master.wait(0.1)
-        assert master.read(0x607A) == 123_456
-        master.control(0)
-    assert motor.position == 123_456.0
 
 
 @pytest.mark.parametrize(
@@ -202,15 +155,6 @@ def test_the_history_keeps_the_last_eight_newest_first(master):
     assert [master.read(0x1003, sub) for sub in range(1, 9)] == codes[:1:-1]
     master.put(0x1003, 0, 0, 1)
     assert [master.read(0x1003, sub) for sub in range(3)] == [0, 0, 0]
-
-
-def test_emergencies_can_be_silenced_and_moved(master):
-    master.put(0x1014, 0, 0x80000081, 4)
-    master.node.faults.raise_error(0x2310)
-    assert master.wait(0.01) == []
-    master.put(0x1014, 0, 0x0A1, 4)
-    master.control(0x80)
-    assert (0x0A1, bytes(8)) in master.take() + master.seen
 
 
 def test_the_brake_closes_at_rest_and_not_before(master, motor):

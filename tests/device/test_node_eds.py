@@ -93,17 +93,6 @@ def test_identifiers_follow_the_node_id(declared):
     assert declared[0x1014].default == 0x085
 
 
-def test_every_declared_object_answers_on_the_bus(master, declared):
-    """Each readable object can be uploaded; numbers that the EDS fixes are what it says."""
-    for variable in variables(declared):
-        head = variable.index.to_bytes(2, "little") + bytes([variable.subindex])
-        answer = master.request(b"\x40" + head + bytes(4))
-        assert answer[0] >> 5 == 2, variable.name
-        if variable.access_type == "const" and isinstance(variable.default, int) and answer[0] & 2:
-            size = 4 - (answer[0] >> 2 & 3)
-            assert answer[4 : 4 + size] == variable.encode_raw(variable.default), variable.name
-
-
 @pytest.mark.parametrize(
     "content", [None, b"", b"[1000]\n", b"\xff\xfe\x00", b"[1000]\nParameterName=x\nDataType=zz\n"]
 )

@@ -2,72 +2,13 @@
 
 from __future__ import annotations
 
-import struct
-
-import can
 import pytest
 
 PRE_OPERATIONAL, OPERATIONAL, STOPPED = 0x7F, 0x05, 0x04
 
 
-def nmt_state(master) -> int:
-    """As the next heartbeat tells it."""
-    master.node.dictionary[0x1017, 0].put(5)
-    (beat, *_) = [data for can_id, data in master.wait(0.0051) if can_id == 0x701]
-    return beat[0]
-
-
 def heartbeat(master, data: bytes = b"\x05") -> None:
     master.send(0x77F, data)
-
-
-def test_it_announces_itself_and_waits_in_pre_operational(master):
-    master.nmt(129)
-    assert master.take() == [(0x701, b"\0")]
-    assert nmt_state(master) == PRE_OPERATIONAL
-
-
-@pytest.mark.parametrize("node_id", [0, 1])
-def test_nmt_commands_to_all_and_to_this_node(master, node_id):
-    for command, state in ((1, OPERATIONAL), (2, STOPPED), (128, PRE_OPERATIONAL), (1, OPERATIONAL)):
-        master.nmt(command, node_id)
-        assert nmt_state(master) == state
-
-
-def test_nmt_commands_to_others_and_cut_ones_are_ignored(master):
-    master.nmt(1, 2)
-    master.send(0x000, b"\x01")
-    master.send(0x000, b"\x63\x01")
-    assert nmt_state(master) == PRE_OPERATIONAL
-
-
-def test_pdos_live_in_operational_only(master):
-    master.send(0x080)
-    assert master.take() == []
-    master.nmt(1)
-    master.send(0x080)
-    assert [can_id for can_id, _ in master.take()] == [0x181, 0x281]
-    master.nmt(128)
-    master.send(0x080)
-    assert master.take() == []
-
-
-def test_a_stopped_node_answers_nothing_but_nmt(master):
-    master.nmt(2)
-    master.send(0x601, struct.pack("<BHBI", 0x40, 0x6041, 0, 0))
-    master.send(0x080)
-    assert master.take() == []
-    master.nmt(128)
-    assert master.read(0x6502) == 0xE1
-
-
-def test_reset_communication_restores_the_communication_profile_alone(master):
-    master.put(0x1017, 0, 7, 2)
-    master.put(0x6085, 0, 12345, 4)
-    master.nmt(130)
-    assert master.take() == [(0x701, b"\0")]
-    assert master.read(0x1017) == 0
-    assert master.read(0x6085) == 12345
 
 
 def test_reset_node_restores_everything_and_switches_off(master):
@@ -82,23 +23,6 @@ def test_reset_node_restores_everything_and_switches_off(master):
     assert master.read(0x1800, 1) == 0x181
 
 
-def test_the_heartbeat_comes_with_its_period(master):
-    master.put(0x1017, 0, 50, 2)
-    frames = [frame for frame in master.wait(1.0005) if frame[0] == 0x701]
-    assert frames == [(0x701, b"\x7f")] * 20
-    master.put(0x1017, 0, 0, 2)
-    assert master.wait(1.0) == []
-
-
-def test_frames_that_are_not_plain_are_ignored(master):
-    for flags in ({"is_extended_id": True}, {"is_remote_frame": True}, {"is_error_frame": True}):
-        message = can.Message(arbitration_id=0x000, data=b"\x01\x00", is_extended_id=False)
-        for name, value in flags.items():
-            setattr(message, name, value)
-        master.bus.send(message)
-    assert nmt_state(master) == PRE_OPERATIONAL
-
-
 def test_the_sync_identifier_can_be_moved_but_it_produces_none(master):
     assert master.write(0x1005, 0, 0x40000080, 4) == 0x06090030
     master.put(0x1005, 0, 0x90, 4)
@@ -109,75 +33,9 @@ def test_the_sync_identifier_can_be_moved_but_it_produces_none(master):
     assert [can_id for can_id, _ in master.take()] == [0x181, 0x281]
 
 
-def test_heartbeat_supervision_begins_with_the_first_heartbeat(master):
-    master.put(0x1016, 1, 0x7F0064, 4)
-    master.enable_csp()
-    for _ in range(100):
-        master.cycle()
-    assert master.emergencies() == []
-    heartbeat(master)
-    for _ in range(24):
-        master.cycle()
-    assert master.emergencies() == []
-    for _ in range(2):
-        master.send(0x080)
-        master.wait(0.004)
-    assert master.emergencies() == [0x8130]
-
-
-@pytest.mark.parametrize(("behaviour", "state"), [(0, PRE_OPERATIONAL), (1, OPERATIONAL), (2, STOPPED)])
-def test_a_lost_heartbeat_changes_the_nmt_state_by_1029(master, behaviour, state):
-    master.put(0x1016, 1, 0x7F0032, 4)
-    master.put(0x1029, 1, behaviour, 1)
-    master.nmt(1)
-    heartbeat(master)
-    master.wait(0.06)
-    assert master.emergencies() == [0x8130]
-    assert nmt_state(master) == state
-
-
-@pytest.mark.parametrize(
-    ("option", "state"), [(0, "enabled"), (1, "fault"), (2, "disabled"), (3, "quick stop")]
-)
-def test_a_dead_master_stops_the_axis_by_6007(master, motor, option, state):
-    """No SYNC, no heartbeat, nothing: the drive runs on its own clock and reacts."""
-    master.put(0x6007, 0, option, 2)
-    master.put(0x605A, 0, 6, 2)
-    master.put(0x1016, 1, 0x7F0032, 4)
-    master.enable_csp()
-    heartbeat(master)
-    master.cruise(40, 10)
-    master.wait(1.0)
-    assert 0x8130 in master.emergencies()
-    assert master.state == state
-    assert motor.velocity_counts_s == 0.0
-    assert motor.powered is (state in ("enabled", "quick stop"))
-
-
-def test_a_heartbeat_that_returns_ends_the_error(master):
-    master.put(0x1016, 1, 0x7F0032, 4)
-    heartbeat(master)
-    master.wait(0.1)
-    assert master.read(0x1001) == 0x11
-    heartbeat(master)
-    assert master.emergencies() == [0x8130, 0x0000]
-    assert master.read(0x1001) == 0
-
-
 @pytest.mark.parametrize("value", [0x80_7F0032, 0xFFFFFFFF])
 def test_a_consumer_entry_with_reserved_bits_is_refused(master, value):
     assert master.write(0x1016, 1, value, 4) == 0x06090030
-
-
-@pytest.mark.parametrize("command", [2, 128, 130])
-def test_losing_nmt_operational_stops_an_axis_that_lives_on_pdos(master, command):
-    master.enable_csp()
-    master.cruise(40, 5)
-    master.nmt(command)
-    master.wait(0.5)
-    master.nmt(128)
-    assert master.state == "fault"
-    assert master.read(0x603F) & 0xFFFF == 0x8100
 
 
 def test_pre_operational_leaves_a_profile_move_alone(master):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import struct
-from binascii import crc_hqx
 
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -43,20 +42,6 @@ def download(master, index: int, sub: int, data: bytes, size: int | None = -1) -
         answer = master.request(bytes([toggle | (7 - len(segment)) << 1 | last]) + segment.ljust(7, b"\0"))
         toggle ^= 0x10
     return struct.unpack_from("<I", answer, 4)[0]
-
-
-def test_identity_and_names(master):
-    assert [master.read(0x1018, sub) for sub in range(5)] == [4, 0x4844, 0x402, 0x10000, 1]
-    assert master.read(0x1000) == 0x00020192
-    assert upload(master, 0x1008) == b"hdbridge simulated CiA-402 servo drive"
-
-
-@pytest.mark.parametrize(
-    ("index", "sub", "code"), [(0x5555, 0, 0x06020000), (0x607A, 1, 0x06090011), (0x1018, 9, 0x06090011)]
-)
-def test_what_is_not_there_is_refused(master, index, sub, code):
-    assert master.abort_of_read(index, sub) == code
-    assert master.write(index, sub, 0, 4) == code
 
 
 @pytest.mark.parametrize(
@@ -105,97 +90,11 @@ def test_what_is_written_in_segments_is_read_back(master, data, stated):
         assert master.request(struct.pack("<BHBI", 0x40, *LABEL, 0))[4 : 4 + len(data)] == data
 
 
-def test_numbers_can_be_written_in_segments(master):
-    assert download(master, 0x607A, 0, struct.pack("<i", -5)) == 0
-    assert master.read(0x607A) == -5
-
-
-@pytest.mark.parametrize(
-    ("data", "size", "code"),
-    [
-        (b"x" * 65, -1, 0x06070012),
-        (b"x" * 65, None, 0x06070012),
-        (b"x" * 14, 20, 0x06070010),
-        (b"x" * 21, 20, 0x06070012),
-    ],
-)
-def test_segments_of_the_wrong_length_are_refused(master, data, size, code):
-    assert download(master, *LABEL, data, size) == code
-    assert upload(master, *LABEL) == b"unnamed axis"
-
-
 def test_endless_segments_end(master):
     master.request(struct.pack("<BHBI", 0x20, *LABEL, 0))
     for k in range(10):
         answer = master.request(bytes([0x10 * (k % 2)]) + b"endless")
     assert answer[0] == 0x80
-
-
-def test_read_only_objects_refuse_at_the_start_of_a_segmented_download(master):
-    assert download(master, 0x1008, 0, b"x" * 20) == 0x06010002
-    assert download(master, 0x1008, 0, b"x" * 20, None) == 0x06010002
-
-
-def test_a_wrong_toggle_bit_aborts(master):
-    master.request(struct.pack("<BHBI", 0x40, 0x1008, 0, 0))
-    assert master.request(bytes([0x70]) + bytes(7))[4:] == struct.pack("<I", 0x05030000)
-    assert master.request(bytes([0x60]) + bytes(7))[4:] == struct.pack("<I", 0x05040001)
-
-
-@pytest.mark.parametrize("lost", [None, 2, 5])
-def test_a_block_download_is_taken_again_from_a_lost_segment(master, lost):
-    data = bytes(range(65, 65 + 40))
-    answer = master.request(struct.pack("<BHBI", 0xC6, *LABEL, len(data)))
-    assert answer[0] == 0xA4
-    assert answer[4] == 127
-    begin = 0
-    while begin < len(data):
-        rest = [data[at : at + 7] for at in range(begin, len(data), 7)]
-        for number, segment in enumerate(rest[:-1], start=1):
-            if number != lost:
-                master.send(0x601, bytes((number,)) + segment.ljust(7, b"\0"))
-        answer = master.request(bytes((0x80 | len(rest),)) + rest[-1].ljust(7, b"\0"))
-        assert answer[0] == 0xA2
-        begin += 7 * answer[1]
-        lost = None
-    answer = master.request(struct.pack("<BH5x", 0xC1 | 2 << 2, crc_hqx(data, 0)))
-    assert answer[0] == 0xA1
-    assert upload(master, *LABEL) == data
-
-
-def test_a_block_download_with_a_wrong_checksum_changes_nothing(master):
-    before = upload(master, *LABEL)
-    master.request(struct.pack("<BHBI", 0xC6, *LABEL, 4))
-    master.request(b"\x81abcd\0\0\0")
-    answer = master.request(struct.pack("<BH5x", 0xC1 | 3 << 2, crc_hqx(b"abcd", 0) ^ 1))
-    assert struct.unpack_from("<I", answer, 4)[0] == 0x05040004
-    assert upload(master, *LABEL) == before
-
-
-def test_a_block_upload_repeats_what_was_not_acknowledged(master):
-    name = b"hdbridge simulated CiA-402 servo drive"
-    answer = master.request(struct.pack("<BHBB3x", 0xA4, 0x1008, 0, 4))
-    assert answer == struct.pack("<BHBI", 0xC6, 0x1008, 0, len(name))
-    first = master.requests(bytes((0xA3,)) + bytes(7))
-    assert [frame[0] for frame in first] == [1, 2, 3, 4]
-    second = master.requests(bytes((0xA2, 2, 127)) + bytes(5))  # the third was lost
-    assert [frame[0] for frame in second] == [1, 2, 3, 0x84]
-    assert (b"".join(frame[1:] for frame in first[:2]) + b"".join(frame[1:] for frame in second))[:38] == name
-    (end,) = master.requests(bytes((0xA2, 4, 127)) + bytes(5))
-    assert end[:3] == struct.pack("<BH", 0xC1 | 4 << 2, crc_hqx(name, 0))
-    assert master.requests(bytes((0xA1,)) + bytes(7)) == []
-
-
-def test_block_transfers_out_of_order_are_refused(master):
-    for request in (b"\xa3", b"\xa2\1\x7f", b"\xa1", b"\xc1", struct.pack("<BHBB", 0xA0, *LABEL, 0)):
-        assert master.request(request.ljust(8, b"\0"))[0] == 0x80
-
-
-def test_a_client_may_give_up_and_begin_anew(master):
-    master.request(struct.pack("<BHBI", 0x40, 0x1008, 0, 0))
-    master.send(0x601, struct.pack("<BHBI", 0x80, 0x1008, 0, 0x05040000))
-    assert master.take() == []
-    assert upload(master, 0x1009) == b"simulated"
 
 
 @given(requests=st.lists(st.binary(min_size=0, max_size=8), max_size=20))

@@ -8,7 +8,8 @@ measured at ten speeds up to the limit, both ways, without, with static and with
 the foreign servo structures, and the simulated drive with a servo, load and spring drawn at random.
 FILE keeps a line of JSON per axis; axes that it has are not measured again. Printed, per speed: the
 share removed, per cent, median (worst), of the orders that are slower than a third of the SYNC rate, static
-and filtered; and on how many axes the whole ripple is larger than without correction.
+and filtered; and on how many axes the whole ripple is larger than without correction. Then, per path, the
+error and the time to settle without correction and with the one of the calibration; and the error at rest.
 """
 
 from __future__ import annotations
@@ -36,8 +37,8 @@ from hdbridge.analysis.response import Harmonics, harmonics, order_hz
 from hdbridge.axis import AxisConfig
 from hdbridge.axis.effects import MotorOrder, Synchronous
 from hdbridge.axis.model import TransmissionModel
-from hdbridge.commissioning.calibration import calibrate, start_journal
-from hdbridge.commissioning.calibration.motion import motion_test
+from hdbridge.commissioning.calibration import Calibration, calibrate, start_journal
+from hdbridge.commissioning.calibration.motion import MotionTest, motion_test
 from hdbridge.control.bench import compensation_for
 from hdbridge.errors import HdbridgeError
 from hdbridge.motion.procedures.even_speed import EvenSpeed
@@ -112,12 +113,12 @@ def foreign(seed: int, structure: str, folder: Path) -> Iterator[tuple[Drive, Tr
         yield drive, TransmissionModel(truth.mechanics.ratio, (Synchronous(orders=orders),))
 
 
-def calibrated(drive: Drive, folder: Path) -> TransmissionModel:
-    """The model of a calibration, with the response in motion."""
+def calibrated(drive: Drive, folder: Path) -> Calibration:
+    """A calibration with the response in motion."""
     path = folder / "plan.yaml"
     path.write_text(PLAN, encoding="utf-8")
     journal = start_journal(folder / "recording", drive.axis, Plan.load(str(path)), DATE, drive.identity)
-    return calibrate(drive, journal, folder, DATE).model
+    return calibrate(drive, journal, folder, DATE)
 
 
 def figures(drive: Drive, model: TransmissionModel) -> dict[str, Any]:
@@ -142,6 +143,15 @@ def figures(drive: Drive, model: TransmissionModel) -> dict[str, Any]:
     }
 
 
+def of_paths(tested: MotionTest) -> dict[str, Any]:
+    """Path error in arcsec and time to settle in ms, per path: without and with the correction in force."""
+    found = {}
+    for each in tested.paths:
+        kept = [each.none, each.filtered or each.static]
+        found[each.name] = [[one.path_arcsec for one in kept], [1000.0 * one.settle_s for one in kept]]
+    return {"paths": found}
+
+
 def _slow(run: Harmonics, third_hz: float, ratio: float) -> float:
     """Rms of the orders below a third of the SYNC rate, arcsec."""
     slow = order_hz(ORDERS, run.speed_deg_s, ratio) < third_hz
@@ -160,10 +170,13 @@ def measure(kind: str, seed: int, exact: bool) -> dict[str, Any]:
             with simulated(seed, folder) if kind == "simulated" else foreign(seed, kind, folder) as place:
                 drive, model = place
                 if exact:
-                    model = replace(model, response=motion_test(drive, model).response)
-                else:
-                    model = calibrated(drive, folder)
-                return figures(drive, model)
+                    tested = motion_test(drive, model)
+                    return figures(drive, replace(model, response=tested.response)) | of_paths(tested)
+                result = calibrated(drive, folder)
+                assert result.motion is not None
+                assert result.validation is not None
+                rest = {"of_floor": result.validation.as_dict()["of_floor"]}
+                return figures(drive, result.model) | of_paths(result.motion) | rest
         except HdbridgeError as problem:
             return {"error": str(problem)}
 
@@ -206,6 +219,19 @@ def report(kind: str, axes: list[dict[str, Any]]) -> None:
         f"  all speeds: median {np.median(filtered):.1f}, below 88 % {np.mean(filtered < 88.0):.0%} of "
         f"{filtered.size}, worst {filtered.min():.1f}"
     )
+    for name in axes[0]["paths"]:
+        error, settle = np.array([each["paths"][name] for each in axes]).transpose(1, 2, 0)
+        print(
+            f"  {name}: none {_spread(error[0])} arcsec, corrected {_spread(error[1])}, "
+            f"larger on {np.sum(error[1] > CHANCE * error[0])}; settled after {_spread(settle[0])} ms, "
+            f"{_spread(settle[1])}, later by {_spread(settle[1] - settle[0])}"
+        )
+    if "of_floor" in axes[0]:
+        print(f"  at rest: {_spread(np.array([each['of_floor'] for each in axes]))} times the floor")
+
+
+def _spread(values: np.ndarray) -> str:
+    return f"{np.median(values):.2f} ({values.max():.2f})"
 
 
 if __name__ == "__main__":

@@ -233,22 +233,6 @@ async def reset_and_go(bench):
     assert bench.plc.emergencies == []
 
 
-def test_a_dead_control_process_is_a_fault(tmp_path):
-    async def scenario(bench):
-        plc = bench.plc
-        await bench.enable()
-        await swing(bench)
-        await bench.wait(0.6)
-        bench.daemon.hang(0.2)
-        bench.daemon.begin_again()
-        await bench.until(lambda: plc.statusword & 0x4F == FAULT, 1.0)
-        await bench.until(lambda: bench.daemon.states[0].name == "DISABLED", 10.0)
-        await stands(bench)
-        await reset(bench)
-
-    scene(tmp_path, scenario)
-
-
 def test_a_client_takes_the_axis_by_force_and_gives_it_back(tmp_path):
     async def scenario(bench):
         plc, bridge = bench.plc, bench.bridge

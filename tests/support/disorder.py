@@ -29,9 +29,8 @@ def draw(rng: Random) -> tuple[str, Any]:
     """A random event: kind and value."""
     kinds: tuple[tuple[str, Any], ...] = (
         ("word", rng.choice(WORDS)),
-        ("walk", 0),
-        ("walk", 0),
-        ("target", rng.uniform(-5.0, 5.0)),
+        *(("walk", 0),) * 4,
+        *(("target", rng.uniform(-5.0, 5.0)),) * 4,
         ("target", rng.choice([-1e5, 401.0, -401.0, 2000.0])),
         ("mode", rng.choice([0, 1, 6, 7, 8, 8, 3])),
         ("nmt", rng.choice([1, 1, 2, 128, 129, 130])),
@@ -118,12 +117,13 @@ async def happen(bench: GatewayBench, laws: Laws, kind: str, value) -> None:
     if kind == "word":
         plc.controlword = value
     elif kind == "walk":
-        for word in (0x00, 0x80, 0x06, 0x07, 0x0F):
+        for word, wait_s in ((0x00, 0.1), (0x80, 1.5), (0x06, 0.05), (0x07, 0.05), (0x0F, 0.2)):
             plc.controlword = word
             plc.target = plc.position
-            await rest(bench, laws, 0.15)
+            await rest(bench, laws, wait_s)  # a reset verifies and prepares the drive
     elif kind == "target":
         plc.target = max(min(plc.position + round(value * COUNTS_PER_DEG), 2**31 - 1), -(2**31))
+        await rest(bench, laws, 0.1)
     elif kind == "mode":
         plc.send(0x600 + NODE, struct.pack("<BHBb3x", 0x2F, 0x6060, 0, value))
     elif kind == "nmt":

@@ -11,11 +11,10 @@ from pathlib import Path
 import numpy as np
 
 from hdbridge import Bench, Drive
-from hdbridge.analysis.response import Harmonics, Trial, harmonics, motor_orders, response_of
+from hdbridge.analysis.response import Harmonics, Limits, Trial, harmonics, motor_orders, response_of
 from hdbridge.axis import AxisConfig
 from hdbridge.axis.model import TransmissionModel
 from hdbridge.axis.model.response import Response
-from hdbridge.commissioning.calibration.motion import limits_of
 from hdbridge.motion.procedures.even_speed import EvenSpeed
 from hdbridge.sim.lockstep import simulated_bench
 
@@ -66,11 +65,12 @@ def without_load_encoder(folder: Path) -> Path:
 
 @cache
 def measured_response(profile: Path) -> Response:
-    """Measures the response of a raised profile's axis on a bench, with a single trial of its filter."""
+    """Measures the response of a raised profile's axis on a bench, as the motion test does."""
     axis = AxisConfig.load(profile)
     model = TransmissionModel.load(profile / "model.yaml")
-    orders = tuple(each.order for each in motor_orders(model))
-    limits, cycle_s = limits_of(axis, model), axis.drive.cycle_s
+    orders = motor_orders(model)
+    numbers = [each.order for each in orders]
+    limits, cycle_s = Limits.of(axis, model), axis.drive.cycle_s
     with (
         simulated_bench(profile / "truth.yaml", axis.eds_path) as (bus, clock, _),
         Drive(bus, axis, clock) as drive,
@@ -79,14 +79,13 @@ def measured_response(profile: Path) -> Response:
 
         def runs(used: TransmissionModel | None) -> tuple[Harmonics, ...]:
             outcome = Bench(drive, used).run(RUNS).outcome
-            return tuple(harmonics(each, orders, model.ratio) for each in outcome)
+            return tuple(harmonics(each, numbers, model.ratio) for each in outcome)
 
-        none, static = runs(None), Trial(runs(model))
-        first = response_of(none, [static], orders, model.ratio, cycle_s, limits)
-        assert first is not None
-        trials = [static, Trial(runs(replace(model, response=first)), first.filter)]
-        response = response_of(none, trials, orders, model.ratio, cycle_s, limits)
-        assert response is not None
+        none, trials = runs(None), [Trial(runs(model))]
+        for explore in (True, False, False):
+            response = response_of(none, trials, orders, model.ratio, cycle_s, limits, explore=explore)
+            assert response is not None
+            trials.append(Trial(runs(replace(model, response=response)), response.filter))
     return response
 
 

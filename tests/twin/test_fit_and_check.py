@@ -226,12 +226,11 @@ def test_such_a_twin_names_a_change_by_its_ratio() -> None:
 @pytest.mark.parametrize("twin_of", [twin, replay_only])
 def test_more_misfit_than_when_the_twin_was_made_is_never_nothing(twin_of: Callable[[], Truth]) -> None:
     """A torque that hunts, which no parameter of the simulated drive brings about."""
-    torque = recorded(seed=1).record.columns["motor_torque_nm"]
+    recording = recorded(seed=1, count=1)
+    torque = recording.record.columns["motor_torque_nm"]
     hunts = torque + 0.05 * np.sin(np.arange(len(torque)) / 2.0) * (torque != 0.0)
-    record = replace(
-        recorded(seed=1).record, columns={**recorded(seed=1).record.columns, "motor_torque_nm": hunts}
-    )
-    told = check(replace(recorded(seed=1), record=record), AXIS, twin_of(), workers=1)
+    record = replace(recording.record, columns={**recording.record.columns, "motor_torque_nm": hunts})
+    told = check(replace(recording, record=record), AXIS, twin_of(), workers=1)
     assert told.growth_before["motor torque"] > 1.5
     assert "Nothing has changed" not in told.sentence
     assert "motor torque" in told.sentence

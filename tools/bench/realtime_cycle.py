@@ -35,7 +35,7 @@ from hdbridge.control.realtime import prepare_realtime
 
 WARM_UP = 50
 AXES = 6
-KINDS = ("bare", "cycle", "compensated", "canopen", "axes")
+KINDS = ("bare", "cycle", "compensated", "filtered", "canopen", "axes")
 
 
 @dataclass(frozen=True)
@@ -138,6 +138,7 @@ def main() -> int:
             "bare": ("bare python-can exchange", variants.bare),
             "cycle": ("hdbridge cycle", variants.plain),
             "compensated": ("hdbridge cycle, compensated", variants.compensated),
+            "filtered": ("hdbridge cycle, filtered", variants.filtered),
             "canopen": ("canopen's PDO objects", variants.with_canopen),
         }
         for kind, (name, loop) in loops.items():

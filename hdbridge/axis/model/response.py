@@ -63,6 +63,10 @@ class Response(Strict):
     uncertainty: tuple[float, ...] = Field(
         description="half width of the 95 % interval, as a share of the gain"
     )
+    load_gain: tuple[float, ...] = Field(
+        default=(), description="amplitude of the load per unit of transmission error, without correction"
+    )
+    load_phase_deg: tuple[float, ...] = Field(default=(), description="its phase, following lag excluded")
     filter: LeadFilter = Field(description="filter of the correction, computed from the points")
     gain_objects: dict[str, int] = Field(
         default={},
@@ -74,6 +78,10 @@ class Response(Strict):
         columns = (self.frequency_hz, self.gain, self.phase_deg, self.uncertainty)
         if not self.frequency_hz or len({len(each) for each in columns}) != 1:
             raise ValueError("expected frequency_hz, gain, phase_deg and uncertainty of the same length")
+        if {len(self.load_gain), len(self.load_phase_deg)} not in ({0}, {len(self.frequency_hz)}):
+            raise ValueError(
+                "expected load_gain and load_phase_deg of the length of frequency_hz, or neither"
+            )
         return self
 
     def fits_cycle(self, cycle_s: float) -> bool:

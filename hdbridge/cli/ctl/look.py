@@ -17,7 +17,7 @@ from hdbridge.cli.ctl.common import AtOption, TakeOption, axes_table, concerns, 
 from hdbridge.cli.options import JsonOption, console, fitted, print_table, write_json
 
 if TYPE_CHECKING:
-    from hdbridge.client.messages import Event, LeaseState, MachineState
+    from hdbridge.client.messages import Event, LeaseState, MachineState, OuterState
 
 
 def status(at: AtOption = None, json_file: JsonOption = None) -> None:
@@ -120,17 +120,23 @@ def _machine(state: MachineState) -> list[str]:
 
 def _concerns(state: MachineState) -> list[str]:
     found = [line for each in state.axes for line in concerns(each)]
-    found += [
-        f"axis '{each.name}': node {outer.node_id} of another master, statusword {outer.statusword:04X}h, "
-        + ("no SYNC" if outer.period_s is None else f"SYNC every {1e3 * outer.period_s:.3f} ms")
-        if outer.alive
-        else f"axis '{each.name}': the gateway process does not run; it is started again by itself"
-        for each in state.axes
-        if (outer := each.outer) is not None
-    ]
+    found += [f"axis '{each.name}': {_outer(each.outer)}" for each in state.axes if each.outer is not None]
     if state.recorder.note is not None:
         found.append(f"recorder: {state.recorder.note}")
     return [*found, *state.warnings]
+
+
+def _outer(outer: OuterState) -> str:
+    from hdbridge.drive.states import decode
+
+    if not outer.alive:
+        return "the gateway process does not run; it is started again by itself"
+    sync = "no SYNC" if outer.period_s is None else f"SYNC every {1e3 * outer.period_s:.3f} ms"
+    error = f", error {outer.error_code:04X}h (docs/gateway.md)" if outer.error_code else ""
+    state = decode(outer.statusword).value
+    return (
+        f"node {outer.node_id} of another master, '{state}' (6041h = {outer.statusword:04X}h){error}, {sync}"
+    )
 
 
 def _lease(state: LeaseState) -> str:

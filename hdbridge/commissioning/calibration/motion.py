@@ -8,18 +8,20 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
+from pydantic import TypeAdapter
 
 from hdbridge.analysis.response import (
+    DIFFERENT,
     LEAST_ARCSEC,
     STOP,
+    Answers,
     Harmonics,
     Limits,
     Trial,
-    agree,
-    difference,
     following_lag_s,
     gain,
     harmonics,
+    lags_agree,
     motor_orders,
     order_hz,
     response_of,
@@ -92,7 +94,7 @@ class Ripple:
     none_arcsec: float
     static_arcsec: float | None = None
     filtered_arcsec: float | None = None
-    faded: tuple[int, ...] = ()
+    faded_orders: tuple[int, ...] = ()
     """Motor orders that the filter does not correct at this speed, because they are too fast."""
     orders: tuple[OrderRipple, ...] = ()
 
@@ -193,14 +195,9 @@ class MotionTest:
             "helps_to_deg_s": self.helps_to_deg_s,
             "speeds": [
                 {
-                    "speed_deg_s": each.speed_deg_s,
-                    "none_arcsec": each.none_arcsec,
-                    "static_arcsec": each.static_arcsec,
-                    "filtered_arcsec": each.filtered_arcsec,
+                    **asdict(each),
                     "removed_static_percent": each.removed_static_percent,
                     "removed_percent": each.removed_percent,
-                    "faded_orders": list(each.faded),
-                    "orders": [asdict(order) for order in each.orders],
                 }
                 for each in self.ripples
             ],
@@ -213,29 +210,8 @@ class MotionTest:
     @classmethod
     def from_dict(cls, data: dict[str, Any]) -> MotionTest:
         """Restores a test from `as_dict`."""
-        ripples = tuple(
-            Ripple(
-                each["speed_deg_s"],
-                each["none_arcsec"],
-                each["static_arcsec"],
-                each["filtered_arcsec"],
-                tuple(each["faded_orders"]),
-                tuple(OrderRipple(**order) for order in each.get("orders", ())),
-            )
-            for each in data["speeds"]
-        )
-        paths = tuple(
-            PathResult(
-                each["name"],
-                PathError(**each["none"]),
-                PathError(**each["static"]),
-                *(PathError(**each[name]) if each.get(name) else None for name in ("filtered", "wind_up")),
-            )
-            for each in data.get("paths", ())
-        )
-        response = Response.model_validate(data["response"]) if data["response"] else None
-        wind_up = InertialWindup.model_validate(data["wind_up"]) if data.get("wind_up") else None
-        return cls(ripples, response, tuple(map(str, data["remarks"])), paths, wind_up)
+        restored: MotionTest = TypeAdapter(cls).validate_python({**data, "ripples": data["speeds"]})
+        return restored
 
 
 def motion_test_s(axis: AxisConfig, runs: int = 2 + TRIALS) -> float:
@@ -296,16 +272,16 @@ def _ripple_test(runner: _Runner, model: TransmissionModel, measure: bool) -> Mo
     runner.lag_s = following_lag_s(none)
     static_model = replace(model, response=None)
     static = runner.run("correction of rest", static_model)
-    limits = limits_of(axis, model)
     if not measure:
-        return _tested(runner, model, none, static, limits)
+        return _tested(runner, model, none, static)
+    limits = Limits.of(axis, model)
     trials = [Trial(static)]
     highest, best = math.inf, MotionTest(_ripples(runner, none, static), None)
     for explore in (True, *[False] * (TRIALS - 1)):
         response = response_of(
             none,
             trials,
-            runner.orders,
+            runner.motor_orders,
             model.ratio,
             axis.drive.cycle_s,
             limits,
@@ -333,39 +309,29 @@ def _ripple_test(runner: _Runner, model: TransmissionModel, measure: bool) -> Mo
 
 
 def _tested(
-    runner: _Runner,
-    model: TransmissionModel,
-    none: tuple[Harmonics, ...],
-    static: tuple[Harmonics, ...],
-    limits: Limits,
+    runner: _Runner, model: TransmissionModel, none: tuple[Harmonics, ...], static: tuple[Harmonics, ...]
 ) -> MotionTest:
     """Tests the model's own response; remarks on it if the servo has changed since it was measured."""
-    stored = model.response
-    if stored is None:
+    if model.response is None:
         return MotionTest(_ripples(runner, none, static), None)
-    filtered = runner.run("filtered correction", model)
-    trials = [Trial(static), Trial(filtered, stored.filter)]
-    found = response_of(none, trials, runner.orders, model.ratio, runner.cycle_s, limits)
-    remark = None if found is None else ServoCheck.of(stored, found).remark
-    remarks = () if remark is None else (remark,)
-    return MotionTest(_ripples(runner, none, static, filtered, stored), stored, remarks)
+    filtered, check = runner.check(model)
+    remarks = () if check.remark is None else (check.remark,)
+    return MotionTest(_ripples(runner, none, static, filtered, model.response), model.response, remarks)
 
 
 @dataclass(frozen=True, slots=True)
 class ServoCheck:
-    """Comparison of the stored response with a new measurement."""
+    """Comparison of the motor's answers with the stored response."""
 
     stored_lag_ms: float
     lag_ms: float
     difference: float
-    """Rms relative difference of the responses over the frequencies that both have, less its noise."""
-    agrees: bool
+    """`Answers.difference`."""
 
-    @classmethod
-    def of(cls, stored: Response, found: Response) -> ServoCheck:
-        """Compares two responses."""
-        apart = difference(stored, found)
-        return cls(stored.following_lag_ms, found.following_lag_ms, apart, agree(stored, found))
+    @property
+    def agrees(self) -> bool:
+        """False if the following lag or the response differs beyond its noise."""
+        return lags_agree(self.stored_lag_ms, self.lag_ms) and self.difference < DIFFERENT
 
     @property
     def remark(self) -> str | None:
@@ -378,27 +344,13 @@ class ServoCheck:
 def servo_check(
     drive: Drive, model: TransmissionModel, interrupted: Callable[[], bool] = lambda: False
 ) -> ServoCheck:
-    """Measures a few frequencies of a booted drive's response, and compares them with the model's response.
+    """Runs a booted drive's axis at a few speeds, and compares the motor's answers with the model's response.
 
-    InputError if the model has no response or no motor order, or if the ripple is too small.
+    InputError if the model has no response or no motor order.
     """
-    stored = model.response
-    if stored is None:
+    if model.response is None:
         raise InputError(f"{model.path}: has no response in motion; measure it: hdbridge motion --propose")
-    runner = _Runner(drive, model, lambda *_: None, interrupted, CHECKED)
-    none = runner.run("without correction", replace(model.only(()), response=None))
-    filtered = runner.run("filtered correction", model)
-    found = response_of(
-        none,
-        [Trial(filtered, stored.filter)],
-        runner.orders,
-        model.ratio,
-        runner.cycle_s,
-        limits_of(drive.axis, model),
-    )
-    if found is None:
-        raise InputError("the response cannot be measured: the ripple is too small")
-    return ServoCheck.of(stored, found)
+    return _Runner(drive, model, lambda *_: None, interrupted, CHECKED).check(model)[1]
 
 
 class _Runner:
@@ -413,7 +365,8 @@ class _Runner:
         shares: Sequence[float] = SHARES,
     ) -> None:
         axis = self.axis = drive.axis
-        self.orders = tuple(each.order for each in motor_orders(model))
+        self.motor_orders = motor_orders(model)
+        self.orders = tuple(each.order for each in self.motor_orders)
         if not self.orders:
             raise InputError(
                 f"the model has no motor order of {LEAST_ARCSEC:g} arcsec or more: there is no ripple to "
@@ -423,16 +376,33 @@ class _Runner:
         """Following lag, from the runs without correction."""
         self._model = model
         self.procedure = EvenSpeed.spread(axis_view(axis), shares)
-        self._orders_only = TransmissionModel(model.ratio, (Synchronous(orders=tuple(motor_orders(model))),))
+        self._orders_only = TransmissionModel(model.ratio, (Synchronous(orders=tuple(self.motor_orders)),))
         self.ratio, self.cycle_s = model.ratio, axis.drive.cycle_s
         self._drive = drive
         self._pace = Pace(motion_test_s(axis), self.cycle_s, progress, interrupted)
 
     def run(self, name: str, model: TransmissionModel) -> tuple[Harmonics, ...]:
         """Runs all speeds with this model; returns the orders of each run."""
+        return self._harmonics(self._run(name, model))
+
+    def check(self, model: TransmissionModel) -> tuple[tuple[Harmonics, ...], ServoCheck]:
+        """Runs all speeds with a model that has a response; also compares the motor's answers with it."""
+        stored, runs = model.response, self._run("filtered correction", model)
+        assert stored is not None
+        answers = Answers(stored, self.motor_orders, self.ratio)
+        for run in runs:
+            columns = np.array([each[1:5] for each in run.samples]).T
+            answers.take(run.speed_deg_s, *columns)
+        found = self._harmonics(runs)
+        lag_ms = 1000.0 * following_lag_s(found)
+        return found, ServoCheck(stored.following_lag_ms, lag_ms, answers.difference)
+
+    def _run(self, name: str, model: TransmissionModel) -> tuple[EvenRun, ...]:
         self._pace.begin(name)
         bench = bench_on(self._drive, compensation_for(self.axis, model), interrupted=self._pace.interrupted)
-        runs = bench.run(self.procedure).outcome
+        return bench.run(self.procedure).outcome
+
+    def _harmonics(self, runs: tuple[EvenRun, ...]) -> tuple[Harmonics, ...]:
         if self.axis.load_encoder.is_motor_encoder:
             runs = tuple(predicted_run(each, self._orders_only) for each in runs)
         return tuple(harmonics(each, self.orders, self.ratio) for each in runs)
@@ -468,21 +438,6 @@ def predicted_run(run: EvenRun, model: TransmissionModel) -> EvenRun:
     load_deg = motor_deg / model.ratio + model.predict(Motion(motor_deg)) / ARCSEC_PER_DEG
     samples = zip(run.samples, load_deg.tolist(), strict=True)
     return replace(run, samples=tuple(each._replace(load_position_deg=load) for each, load in samples))
-
-
-def limits_of(axis: AxisConfig, model: TransmissionModel) -> Limits:
-    """Returns the limits of the axis file on a correction of the model's motor orders."""
-    speed = axis.limits.velocity_deg_s
-    tops = (
-        (float(order_hz(each.order, speed, model.ratio)), each.amplitude_arcsec)
-        for each in motor_orders(model)
-    )
-    return Limits(
-        tuple(tops),
-        axis.compensation.maximum_arcsec,
-        axis.compensation.slew_arcsec_s,
-        axis.limits.acceleration_deg_s2,
-    )
 
 
 def _ripples(

@@ -18,6 +18,7 @@ import numpy as np
 from hdbridge.analysis.intervals import difference
 from hdbridge.axis.effects import FloatArray
 from hdbridge.axis.model import TransmissionModel
+from hdbridge.axis.model.response import Response
 from hdbridge.control.compensation import Inverse
 from hdbridge.daemon.following.estimator import (
     ZERO_ARCSEC,
@@ -92,6 +93,8 @@ class Learned:
     covariance: tuple[tuple[float, ...], ...]
     applied: tuple[float, ...]
     windows: int
+    response: Response | None = None
+    """Refined response in motion; None if it is that of the committed model."""
 
 
 class Adaptation:
@@ -143,6 +146,8 @@ class Adaptation:
         """Changes of the coefficients in the last proposed model, applied or not, and in the model in use."""
         self._changed_s = -math.inf
         """Time at which a change was last made or considered."""
+        self._refined_s = -math.inf
+        """Time at which the response was last refined."""
         if learned is not None:
             self._restore(learned)
 
@@ -172,6 +177,7 @@ class Adaptation:
             self._unfreeze("by command")
         if mode != self.mode:
             # Changes that were only observed are not applied at once: start from the model in use.
+            self._refined_s = self._now_s
             self._proposed, self._changed_s = self._used, self._now_s
             if self.mode == "off":
                 self.forget_window()
@@ -189,6 +195,29 @@ class Adaptation:
         self.mode = "observe"
         self._log_event("back", changes=_changes_json(changes))
         return Proposal(self.committed, changes, True, self._now_s)
+
+    @property
+    def may_refine(self) -> bool:
+        """False if it is off, frozen, or the last refinement of the response is too recent."""
+        recent = self._now_s - self._refined_s < self.settings.interval_s
+        return not (self.mode == "off" or self.freeze_reason is not None or recent)
+
+    def refine(self, response: Response) -> Proposal:
+        """Takes a refined response in motion, which has no rate: a servo is retuned at once."""
+        model, apply = replace(self.model, response=response), self.mode == "on"
+        self._refined_s = self._now_s if apply else math.inf  # only observed: reported once
+        if apply:
+            self.model = model
+        self._log_event("refined" if apply else "would refine", following_lag_ms=response.following_lag_ms)
+        return Proposal(model, (), apply, self._now_s)
+
+    def withdraw(self) -> Proposal:
+        """Restores the committed response after a refinement that leaves more ripple, and freezes."""
+        self.model = replace(self.model, response=self.committed.response)
+        self.freeze(
+            Freeze("the refined response in motion leaves more ripple: it was withdrawn", lasting=True)
+        )
+        return Proposal(self.model, (), True, self._now_s)
 
     def forget_window(self) -> None:
         """Discards the incomplete window, for example after lost samples."""
@@ -260,6 +289,7 @@ class Adaptation:
             tuple(tuple(row) for row in estimator.covariance.tolist()),
             tuple(self._used.tolist()),
             self.windows,
+            None if self.model.response is self.committed.response else self.model.response,
         )
 
     def _restore(self, learned: Learned) -> None:
@@ -276,6 +306,7 @@ class Adaptation:
         self._free_zero()
         if self.mode == "on":
             self._proposed = self._used = np.clip(applied, -self._bounds, self._bounds)
+            self.model = replace(self.model, response=learned.response or self.model.response)
             self.model = self._changed(self._used)
 
     # ------------------------------------------------------------------ windows
@@ -417,8 +448,9 @@ class Adaptation:
 
     def _changed(self, change: FloatArray) -> TransmissionModel:
         """Returns the committed model with changed coefficients and their present intervals."""
+        response = self.model.response
         if not np.any(change):
-            return self.committed
+            return replace(self.committed, response=response)
         model = self._drift.changed(change)
         uncertainty = dict(model.uncertainty)
         for each in self._drift.terms:
@@ -426,7 +458,7 @@ class Adaptation:
             own = self._estimator.covariance[each.columns, each.columns]
             uncertainty[effect.name] = half_widths(effect, own, uncertainty.get(effect.name, {}))
         provenance = {**model.provenance, "reason": "the committed model, adapted by the load encoder"}
-        return replace(model, uncertainty=uncertainty, provenance=provenance)
+        return replace(model, uncertainty=uncertainty, provenance=provenance, response=response)
 
     def _log_event(self, event: str, **facts: Any) -> None:
         self._log({"event": event, "axis_time_s": self._now_s, **facts})

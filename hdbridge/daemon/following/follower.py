@@ -153,11 +153,31 @@ class Follower:
         if self.adaptation is not None:
             fault = "the supervision has stopped the axis" if np.any(stopped) else status.reason
             proposal = self.adaptation.take(observations, self._now_s, fault)
+            proposal = proposal or self._refinement()
             if proposal is not None and proposal.apply:
                 self._applied(proposal)
             elif self._entries or self._now_s - self._saved_s >= SAVE_S:
                 self.save()
         return Outcome(raised, proposal)
+
+    def in_force(self, model: TransmissionModel) -> None:
+        """Judges by another model, which the control process uses from now on."""
+        self.health.restart()
+        self._servo.use(model.response)
+
+    def _refinement(self) -> Proposal | None:
+        """Returns the proposal of a refined response, if one is due."""
+        adaptation = self.adaptation
+        assert adaptation is not None
+        if adaptation.freeze_reason is not None:
+            self._servo.forget_load()
+        if not adaptation.may_refine:
+            return None
+        refined = self._servo.refined(self._settings.bound_share)
+        # The first step assumes the load of the calibration, the second knows what the first has done.
+        if self._servo.worse and (refined is None or self._servo.refinements > 1):
+            return adaptation.withdraw()
+        return None if refined is None else adaptation.refine(refined)
 
     def state(self) -> messages.AdaptationState:
         """Returns the state of the adaptation for clients."""

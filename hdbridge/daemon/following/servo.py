@@ -1,12 +1,12 @@
 """Servo watch: does the servo still answer as the model's response in motion says?
 
 Judges runs at constant speed, in which the correction moves the set-points, by the motor encoder's answer to
-them. So neither a change of the gear nor a fault of the load encoder counts. Uses no clock.
+them. So neither a change of the gear nor a fault of the load encoder counts. What the load encoder shows in
+these runs refines the response. Uses no clock.
 """
 
 from __future__ import annotations
 
-from collections import deque
 from statistics import median
 from typing import Any, Final
 
@@ -15,15 +15,15 @@ from numpy.typing import NDArray
 
 from hdbridge.analysis.response import (
     DIFFERENT,
-    Found,
-    answers,
-    difference_seen,
+    Answers,
+    Limits,
     lags_agree,
     motor_orders,
     samples_needed,
 )
 from hdbridge.axis import AxisConfig
 from hdbridge.axis.model import TransmissionModel
+from hdbridge.axis.model.response import Response
 from hdbridge.daemon.following.judging import CLEARLY
 from hdbridge.daemon.loop.states import AxisState
 from hdbridge.daemon.memory import SampleFlag
@@ -37,8 +37,6 @@ RUN_S: Final = 1.0
 RUN_TURNS: Final = 2.0
 """Minimum duration and motor turns of a run."""
 MIN_RUNS: Final = 4
-MAX_RUNS: Final = 12
-"""Number of runs that are judged together, for each frequency: one alone shows a few frequencies."""
 NEEDED: Final = SampleFlag.FRESH | SampleFlag.COMPENSATING
 SPOILT: Final = SampleFlag.CHANGING | SampleFlag.LIMITED
 
@@ -49,25 +47,66 @@ class ServoWatch:
     def __init__(self, axis: AxisConfig, model: TransmissionModel) -> None:
         self.retuned = False
         """True while the servo does not answer as when the response was measured."""
-        self._response = model.response
+        self.refinements = 0
+        """Number of responses that have replaced the committed one, one after the other."""
         self._ratio, self._period_s = model.ratio, axis.drive.cycle_s
-        orders = motor_orders(model)
-        self._orders = tuple(each.order for each in orders)
-        self._amplitudes = tuple(each.amplitude_arcsec for each in orders)
+        self._orders = motor_orders(model)
+        self._limits = Limits.of(axis, model)
+        self._committed = model.response
+        self._use(model.response)
+
+    def _use(self, response: Response | None, earlier: Answers | None = None) -> None:
+        self._response = response
+        self._answers = None if response is None else Answers(response, self._orders, self._ratio, earlier)
+        self._before_arcsec2: dict[tuple[int, int], float] = {}
+        """What the committed response left of each order at each frequency."""
         self._run: list[NDArray[Any]] = []
         self._speed_deg_s = 0.0
         self._even = 0
         """Samples at this speed so far."""
-        self._lags_ms: deque[float] = deque(maxlen=MAX_RUNS)
-        self._seen: dict[tuple[int, int], deque[Found]] = {}
-        """Responses relative to the stored one, by order and the nearest stored frequency."""
+
+    def use(self, response: Response | None) -> None:
+        """Judges by another response from now on."""
+        if response != self._response:
+            before = self._before_arcsec2
+            if self._answers is not None and self._response == self._committed:
+                before, self.refinements = self._answers.left_arcsec2(), 0
+            self.refinements += 1
+            self._use(response, self._answers)
+            self._before_arcsec2 = before
+
+    def forget_load(self) -> None:
+        """Discards what the load encoder has shown."""
+        self._before_arcsec2 = {}
+        if self._answers is not None:
+            self._answers.forget_load()
+
+    @property
+    def worse(self) -> bool:
+        """True if the response leaves more of the load error than the committed one, at the same places."""
+        before = self._before_arcsec2
+        if self._answers is None or self._response == self._committed:
+            return False
+        now = self._answers.left_arcsec2()
+        both = before.keys() & now.keys()
+        return sum(now[each] for each in both) > sum(before[each] for each in both)
+
+    def refined(self, bound: float) -> Response | None:
+        """Returns a response that leaves less of the load error than the present one; None if uncertain.
+
+        ``bound`` limits the deviation from the committed response, as a share.
+        """
+        if self._answers is None or self._committed is None or len(self._answers.lags_ms) < MIN_RUNS:
+            return None
+        changed = self.retuned or self._response != self._committed
+        return self._answers.refined(self._committed, self._limits, bound, retuned=changed)
 
     def take(self, axis: NDArray[Any], *, joined: bool) -> str | None:
         """Takes the next samples of the axis; returns the evidence if the judgement changes.
 
         ``joined`` is False if cycles are missing before or between them.
         """
-        if self._response is None or not self._orders or not len(axis):
+        if self._answers is None or not self._orders or not len(axis):
             return None
         velocity, flags = axis["velocity_deg_s"], axis["flags"]
         speed = float(velocity[0])
@@ -80,36 +119,30 @@ class ServoWatch:
         if not even:
             return None
         self._even += len(axis)
+        assert self._response is not None
         if self._even * self._period_s < TRANSIENT_S or abs(speed) < self._response.filter.full_speed_deg_s:
             return None
         self._run.append(axis)
         count = sum(map(len, self._run))
         duration_s = count * self._period_s
         turns = duration_s * abs(speed) * self._ratio / DEG_PER_TURN
-        if duration_s < RUN_S or turns < RUN_TURNS or count < samples_needed(self._orders):
+        if duration_s < RUN_S or turns < RUN_TURNS or count < samples_needed(len(self._orders)):
             return None
         run, self._run = np.concatenate(self._run), []
         return self._judge(run, speed)
 
     def _judge(self, run: NDArray[Any], speed_deg_s: float) -> str | None:
         """Adds a run; returns the evidence if the judgement changes."""
-        stored = self._response
+        stored, answers = self._response, self._answers
         assert stored is not None
-        issued, motor = run["issued_deg"], run["motor_position_deg"]
-        if not np.all(np.isfinite(issued)):
+        assert answers is not None
+        if not np.all(np.isfinite(run["issued_deg"])):
             return None
-        lag_s = float(np.mean(issued - motor)) / (self._ratio * speed_deg_s)
-        self._lags_ms.append(1000.0 * lag_s)
-        for order, each in answers(
-            stored, speed_deg_s, lag_s, run["load_target_deg"], issued, motor, self._orders, self._ratio
-        ):
-            nearest = int(np.argmin(np.abs(np.array(stored.frequency_hz) - each.frequency_hz)))
-            self._seen.setdefault((order, nearest), deque(maxlen=MAX_RUNS)).append(each)
-        if len(self._lags_ms) < MIN_RUNS:
+        names = ("load_target_deg", "issued_deg", "motor_position_deg", "load_position_deg")
+        answers.take(speed_deg_s, *(run[each] for each in names))
+        if len(answers.lags_ms) < MIN_RUNS:
             return None
-        amplitudes = (self._amplitudes[order] for order, _ in self._seen)
-        apart = difference_seen(stored, self._seen.values(), amplitudes)
-        lag_ms = median(self._lags_ms)
+        apart, lag_ms = answers.difference, median(answers.lags_ms)
         limit = CLEARLY * DIFFERENT if self.retuned else DIFFERENT
         retuned = apart > limit or not lags_agree(stored.following_lag_ms, lag_ms)
         if retuned == self.retuned:

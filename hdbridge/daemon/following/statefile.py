@@ -19,6 +19,7 @@ from typing import Literal
 from pydantic import Field, ValidationError
 
 from hdbridge.axis.model import TransmissionModel
+from hdbridge.axis.model.response import Response
 from hdbridge.daemon.following.adaptation import Entry, Learned
 from hdbridge.errors import OutputError
 from hdbridge.files.atomic import make_folder, write_atomically
@@ -39,6 +40,7 @@ class _State(Strict):
     covariance: tuple[tuple[float, ...], ...]
     applied: tuple[float, ...]
     windows: int = Field(ge=0)
+    response: Response | None = None
 
 
 class AdaptationFiles:
@@ -81,7 +83,7 @@ class AdaptationFiles:
             self._append({"event": "began anew", "reason": "another model was committed"})
             return None
         self._append({"event": "restored", "windows": file.windows, "saved": file.saved.isoformat()})
-        return Learned(file.estimate, file.covariance, file.applied, file.windows)
+        return Learned(file.estimate, file.covariance, file.applied, file.windows, file.response)
 
     def write(self, entries: Sequence[Entry], learned: Learned) -> None:
         """Appends lines to the history and stores the state; an error is logged once."""

@@ -15,31 +15,18 @@ from typing import Final
 from canopen.objectdictionary import ObjectDictionary, ODVariable
 from canopen.sdo.exceptions import SdoAbortedError
 
+from hdbridge.device.nmt import Nmt, NmtCommand
 from hdbridge.drive.dictionary import find
 from hdbridge.drive.emergencies import error_name
 from hdbridge.drive.link import Frame
+from hdbridge.drive.states import State, decode
 from hdbridge.drive.unwrap import wrap_int32
 
 _MULTIPLEXER: Final = struct.Struct("<BHB")
-_STATES: Final = {
-    0x40: "switch on disabled",
-    0x21: "ready to switch on",
-    0x23: "switched on",
-    0x27: "operation enabled",
-    0x07: "quick stop active",
-    0x0F: "fault reaction active",
-    0x08: "fault",
-    0x00: "not ready to switch on",
-}
-_NMT: Final = {
-    1: "start",
-    2: "stop",
-    128: "enter pre-operational",
-    129: "reset node",
-    130: "reset communication",
-}
-_NMT_STATES: Final = {0x04: "STOPPED", 0x05: "OPERATIONAL", 0x7F: "PRE-OPERATIONAL"}
+_NMT: Final = {int(each): each.name.lower().replace("_", " ").replace("pre ", "pre-") for each in NmtCommand}
+_NMT_STATES: Final = {int(each): each.name.replace("_", "-") for each in Nmt}
 _CYCLIC: Final = (7, 8)
+_READY: Final = (State.READY_TO_SWITCH_ON, State.SWITCHED_ON)
 _INVALID: Final = 1 << 31
 _LATE: Final = 1.5
 """A SYNC interval of more than so many periods is a missing SYNC; the gateway stops the axis after four."""
@@ -86,7 +73,7 @@ class Trace:
         """Parameters that the master has written, in the order of the first write."""
         self._pending: tuple[int, int, bytes | None] | None = None
         self._nmt: int | None = None
-        self._state: int | None = None
+        self._state: State | None = None
         self._word: int | None = None
         self._reset_since_s: float | None = None
         self._targets: list[int] = []
@@ -285,11 +272,11 @@ class Trace:
 
     @property
     def _enabled_cyclic(self) -> bool:
-        return self._state == 0x27 and self._value(0x6060) in _CYCLIC
+        return self._state is State.OPERATION_ENABLED and self._value(0x6060) in _CYCLIC
 
     def _on_controlword(self, time_s: float, word: int) -> None:
         before, self._word = self._word, word
-        if word & 0x80 and self._state == 0x08:
+        if word & 0x80 and self._state is State.FAULT:
             self._reset_since_s = self._reset_since_s or time_s
             if before is not None and before & 0x80 and time_s - self._reset_since_s > 0.2:
                 self._say_once(
@@ -302,11 +289,11 @@ class Trace:
         if word == before:
             return
         advice = ""
-        if word & 0x8F == 0x0F and self._state == 0x40:
+        if word & 0x8F == 0x0F and self._state is State.SWITCH_ON_DISABLED:
             advice = "no transition from switch on disabled: send 0006h, wait, then 0007h, then 000Fh"
-        elif word & 0x8F in (0x06, 0x07, 0x0F) and self._state == 0x08:
+        elif word & 0x8F in (0x06, 0x07, 0x0F) and self._state is State.FAULT:
             advice = "the drive is in fault: an edge of bit 7 resets it"
-        elif word & 0x8F == 0x0F and self._state in (0x21, 0x23) and self._value(0x6060) in _CYCLIC:
+        elif word & 0x8F == 0x0F and self._state in _READY and self._value(0x6060) in _CYCLIC:
             advice = self._start_advice()
         self._say(time_s, f"controlword {word:04X}h: {_command(word)}", advice)
 
@@ -319,10 +306,9 @@ class Trace:
         return f"the target is {off} increments from 6064h: set it to the actual position before enabling"
 
     def _on_statusword(self, time_s: float, word: int) -> None:
-        masked = word & 0x4F
-        state = masked if masked in (0x00, 0x40, 0x0F, 0x08) else word & 0x6F
-        if state != self._state:
-            self._say(time_s, f"statusword {word:04X}h: {_STATES.get(state, 'no state of CiA 402')}")
+        state = decode(word & 0xFFFF)
+        if state is not self._state:
+            self._say(time_s, f"statusword {word:04X}h: {state.value}")
             self._state = state
             self._targets = self._targets[-1:]
 

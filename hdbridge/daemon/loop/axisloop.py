@@ -393,7 +393,8 @@ class AxisLoop:
         if self._unfed:
             self._unfed = False
             if not set_point.at_rest:
-                self._tell(self.index, EventKind.UNDERRUN, self._motion_id, 0)
+                words = "the set-points of the gateway ended in motion, or came too late; it loses its power"
+                self._tell(self.index, EventKind.UNDERRUN, self._motion_id, 0, words)
             self._happened(Happening.UNFED)
         if set_point.underrun is not self._underrun:
             self._underrun = set_point.underrun

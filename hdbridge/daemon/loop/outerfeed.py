@@ -10,15 +10,18 @@ from hdbridge.daemon.memory.layout import OuterKnot
 
 KNOTS_A_TURN: Final = 64
 LONGEST_SPACING_S: Final = 0.05
+BRIDGED: Final = 0.2
+"""Share of the patience at rest for which an axis in motion goes on without a set-point."""
 FIRST_KNOT_S: Final = 2.0
 """Longest time from the begin to the first set-point."""
 
 
 class OuterFeed:
-    """Set-points of the outer master for one axis. Between two of them the position is linear, as in CiA 402.
+    """Set-points of the outer master for one axis. Between two of them the position is linear (CiA 402).
 
-    A late set-point is bridged by going on for as long as the last two were apart. An axis at rest waits for
-    longer. Set-points of another series are dropped, so none from before an interruption takes effect.
+    A late set-point is bridged at the speed of the last two, because the gateway process has no real-time
+    priority. An axis at rest waits for longer. Set-points of another series are dropped, so none from before
+    an interruption takes effect.
     """
 
     __slots__ = ("_before", "_knots", "_last", "_patience_s", "_series", "received_s")
@@ -64,6 +67,7 @@ class OuterFeed:
         if before is last:
             return last[1] if time_s <= last[0] else None
         length_s, step_deg = last[0] - before[0], last[1] - before[1]
-        if time_s > last[0] + (length_s if step_deg else self._patience_s):
+        patience_s = max(length_s, BRIDGED * self._patience_s) if step_deg else self._patience_s
+        if time_s > last[0] + patience_s:
             return None
         return before[1] + step_deg * max(time_s - before[0], 0.0) / length_s if step_deg else last[1]

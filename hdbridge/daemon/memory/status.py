@@ -92,8 +92,8 @@ class OuterCells:
         self._cells[cell * _STRIDE] = value
 
     def show(self, view: OuterView) -> None:
-        """Writes the view of the outer master."""
-        OUTER_VIEW.pack_into(self._buffer, self._at, *view)
+        """Writes the view of the outer master in one copy, unlike `pack_into`, which begins with zeros."""
+        self._buffer[self._at : self._at + OUTER_VIEW.size] = OUTER_VIEW.pack(*view)
 
     def values(self) -> tuple[float, ...]:
         """Returns the fields of `OuterView`; in the cycle of the control process, so as a plain tuple."""

@@ -92,7 +92,8 @@ class Following:
         if follower is None or follower.adaptation is None or chosen.model is not follower.model:
             return
         model = follower.adaptation.model
-        if model.effects == (chosen.adapted or chosen.model).effects:
+        used = chosen.adapted or chosen.model
+        if (model.effects, model.response) == (used.effects, used.response):
             return
         try:
             await self._axis.follow(model)
@@ -102,7 +103,7 @@ class Following:
             self._not_applied = str(problem)
         else:
             self._not_applied = ""
-            self._do(follower.health.restart)
+            self._do(follower.in_force, model)
             _log.info("adaptation applied", {"axis": self._axis.name})
 
     def close(self) -> None:

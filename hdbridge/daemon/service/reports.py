@@ -150,6 +150,7 @@ def outer_state(
         alive=time.monotonic_ns() - alive_ns < GATEWAY_GONE_NS,
         nmt=view.nmt,
         statusword=view.statusword,
+        error_code=view.error_code,
         period_s=period_s or None,
         jitter_s=1e-9 * cells[OuterCell.JITTER_NS] if period_s else None,
         latency_s=median_s,

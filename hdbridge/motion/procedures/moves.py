@@ -97,8 +97,18 @@ class Procedure(Protocol[Outcome]):
         ...
 
 
+class _Timed:
+    """A leg that ends with its path."""
+
+    __slots__ = ()
+
+    def ended(self, samples: Sequence[Sample]) -> bool:
+        """Returns True."""
+        return True
+
+
 @dataclass(frozen=True, slots=True)
-class MoveTo:
+class MoveTo(_Timed):
     """Jerk-limited move to a load angle, at the axis's limits or slower."""
 
     load_deg: float
@@ -145,13 +155,9 @@ class MoveTo:
         except RuckigError:  # a value that is not finite, or a limit that is not positive
             return trajectory, Result.ErrorInvalidInput
 
-    def ended(self, samples: Sequence[Sample]) -> bool:
-        """Returns True, because the leg ends with its path."""
-        return True
-
 
 @dataclass(frozen=True, slots=True)
-class Dwell:
+class Dwell(_Timed):
     """Standstill for a given time."""
 
     duration_s: float
@@ -160,10 +166,6 @@ class Dwell:
     def path(self, start_deg: float, limits: MotionLimits) -> Path:
         """Returns a path without motion."""
         return Path(self.duration_s, lambda _: start_deg, start_deg, start_deg)
-
-    def ended(self, samples: Sequence[Sample]) -> bool:
-        """Returns True, because the leg ends with its path."""
-        return True
 
 
 @dataclass(frozen=True, slots=True)
@@ -205,7 +207,7 @@ class Settle:
 
 
 @dataclass(frozen=True, slots=True)
-class Sine:
+class Sine(_Timed):
     """``amplitude cos(2 pi f t)`` about a centre; starts and ends at the upper extreme, at rest.
 
     It starts at the extreme because the velocity is zero there.
@@ -237,7 +239,3 @@ class Sine:
 
         low, high = centre - abs(amplitude), centre + abs(amplitude)
         return Path(self.periods / self.frequency_hz, at, low, high)
-
-    def ended(self, samples: Sequence[Sample]) -> bool:
-        """Returns True, because the leg ends with its path."""
-        return True

@@ -1,8 +1,9 @@
-"""The watch reports a servo that was retuned since the response in motion was measured."""
+"""A servo that was retuned since the response in motion was measured: reported, and the response refined."""
 
 import math
 from dataclasses import replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -14,8 +15,11 @@ from support.raised import measured_response, raised_profile
 from hdbridge import AxisConfig, TransmissionModel
 from hdbridge.analysis.response import answers
 from hdbridge.axis.model.response import LeadFilter, Response
+from hdbridge.client import messages
+from hdbridge.daemon.following.adaptation import Proposal
 from hdbridge.daemon.following.follower import Follower
-from hdbridge.daemon.following.judging import Raised, Verdict
+from hdbridge.daemon.following.judging import Verdict
+from hdbridge.daemon.following.settings import AdaptationSettings, Mode
 from hdbridge.daemon.memory import CommandKind
 from hdbridge.sim.truth import Truth
 
@@ -27,38 +31,76 @@ def profile(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return raised_profile(tmp_path_factory.mktemp("raised") / "fast")
 
 
-def raised(profile: Path, **servo: float) -> list[Raised]:
-    """Verdicts over moves there and back, with these parameters of the servo."""
+class Seen(NamedTuple):
+    verdicts: list[Verdict]
+    proposals: list[Proposal]
+    state: messages.AdaptationState
+
+
+def seen(profile: Path, mode: Mode = "on", stuck: bool = False, **servo: float) -> Seen:
+    """Verdicts and proposals over moves there and back, with these parameters of the servo."""
     axis = AxisConfig.load(profile)
     model = replace(TransmissionModel.load(profile / "model.yaml"), response=measured_response(profile))
     truth = Truth.load(profile / "truth.yaml")
     truth = truth.model_copy(update={"servo": truth.servo.model_copy(update=servo)})
-    found: list[Raised] = []
+    verdicts: list[Verdict] = []
+    proposals: list[Proposal] = []
     with stepped_daemon([axis], model=model, truth=truth) as daemon:
         daemon.verify()
         daemon.enable()
         daemon.run(0.6)
-        samples, follower = daemon.memory.reader(), Follower(axis, model)
+        samples = daemon.memory.reader()
+        follower = Follower(axis, model, settings=AdaptationSettings(interval_s=1.0))
+        follower.adapt(mode)
+        if stuck:
+            daemon.nodes[0].faults.load_reading = lambda _: 0
         for speed in SPEEDS_DEG_S:
             for target in (90.0, -90.0):
                 daemon.post(CommandKind.MOVE, 0, a=target, b=speed, c=math.nan)
                 daemon.turn()
                 while not daemon.axes[0].set_point.at_rest:
                     daemon.turn(25)
-                    found += follower.take(samples.read()[0]).raised
-    return found
+                    outcome = follower.take(samples.read()[0])
+                    verdicts += [each.verdict for each in outcome.raised]
+                    proposals += [outcome.proposal] if outcome.proposal is not None else []
+        return Seen(verdicts, proposals, follower.state())
 
 
-def test_the_same_servo_is_not_reported(profile: Path) -> None:
-    assert raised(profile) == []
+def test_the_same_servo_is_neither_reported_nor_refined(profile: Path) -> None:
+    assert seen(profile)[:2] == ([], [])
 
 
 @pytest.mark.parametrize(
     "servo", [{"position_gain_per_s": 130.0}, {"position_gain_per_s": 270.0}, {"command_filter_ms": 2.6}]
 )
-def test_a_retuned_servo_is_reported(profile: Path, servo: dict[str, float]) -> None:
-    verdicts = [each.verdict for each in raised(profile, **servo)]
-    assert Verdict.RETUNED in verdicts, verdicts
+def test_a_retuned_servo_is_reported_and_the_response_refined(profile: Path, servo: dict[str, float]) -> None:
+    found = seen(profile, **servo)
+    assert Verdict.RETUNED in found.verdicts
+    committed = measured_response(profile)
+    assert found.proposals
+    for each in found.proposals:
+        assert each.apply
+        assert each.model.response is not None
+        change = abs(without_lag(committed) / without_lag(each.model.response) - 1.0)
+        assert 0.02 < change.max() < 1.01 * AdaptationSettings().bound_share
+
+
+def without_lag(response: Response) -> np.ndarray:
+    turned = np.radians(response.phase_deg) + math.tau * 0.001 * response.following_lag_ms * np.array(
+        response.frequency_hz
+    )
+    return np.array(response.gain) * np.exp(1j * turned)
+
+
+@pytest.mark.parametrize(("mode", "stuck"), [("off", False), ("on", True), ("observe", False)])
+def test_nothing_is_refined_without_a_believed_encoder_and_permission(
+    profile: Path, mode: Mode, stuck: bool
+) -> None:
+    found = seen(profile, mode, stuck, position_gain_per_s=130.0)
+    assert Verdict.RETUNED in found.verdicts
+    assert not any(each.apply for each in found.proposals)
+    assert len(found.proposals) == (mode == "observe")
+    assert ("load encoder" in (found.state.frozen or "")) == stuck
 
 
 @given(
@@ -88,14 +130,5 @@ def test_gain_and_phase_are_seen_in_both_directions_and_a_delay_alone_is_none(
     issued, motor = angle(at_s, 1.0, 0.0), angle(at_s - lag_s, gain, phase_deg)
     for place, found in answers(stored, speed, lag_s, speed * at_s, issued, motor, orders, ratio):
         hertz = orders[place] * abs(speed) * ratio / 360.0
-        expected = gain * np.exp(1j * math.radians(phase_deg))
-        kept = stored_at(stored, hertz) * np.exp(2j * math.pi * 0.01 * hertz)
-        assert found.response * kept == pytest.approx(expected, rel=1e-3)
-
-
-def stored_at(stored: Response, hertz: float) -> complex:
-    """The stored response, interpolated linearly as a complex number."""
-    values = np.array(stored.gain) * np.exp(1j * np.radians(stored.phase_deg))
-    return complex(
-        np.interp(hertz, stored.frequency_hz, values.real), np.interp(hertz, stored.frequency_hz, values.imag)
-    )
+        assert found.frequency_hz == pytest.approx(hertz)
+        assert found.response == pytest.approx(gain * np.exp(1j * math.radians(phase_deg)), rel=1e-3)

@@ -54,11 +54,8 @@ def benches(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Callable[[Char
 
 
 @pytest.fixture
-def moving(benches: Callable[[Character], DaemonBench], request: pytest.FixtureRequest) -> DaemonBench:
-    """Two axes of a daemon with a service, at constant speed; a test may ask for the drives' character.
-
-    To be left enabled.
-    """
-    made = benches(getattr(request, "param", FRIENDLY))
+def moving(benches: Callable[[Character], DaemonBench]) -> DaemonBench:
+    """Two axes of a daemon with a service, at constant speed; to be left enabled."""
+    made = benches(FRIENDLY)
     made.set_off()
     return made

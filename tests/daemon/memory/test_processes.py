@@ -17,13 +17,14 @@ from hdbridge.errors import InputError
 
 HAMMER = """
 import sys
-from hdbridge.daemon.memory import Event, EventKind, Memory
+from hdbridge.daemon.memory import Event, EventKind, Memory, OuterView
 memory = Memory.attach(int(sys.argv[1]))
 cycle = 0
 while True:
     cycle += 1
     # Every number of a sample is the same: a torn one shows.
     memory.samples.write(cycle, cycle, 0.0, 0.0, 0.0, 0, (0,) * 6 + (float(cycle),) * 15 + (0,) * 5)
+    memory.outer[0].show(OuterView(*(1 + cycle % 2,) * 6))
     if cycle % 16 == 0:
         memory.events.append(Event(0, cycle, cycle, 0, EventKind.DONE, cycle, 0, str(cycle)))
 """
@@ -64,6 +65,8 @@ def test_no_sample_is_torn_however_fast_the_writer_is(checked: bool) -> None:
                     assert (np.diff(cycles) == 1).all()
                     last = int(cycles[-1])
                 seen += len(samples)
+                if seen:
+                    assert {each for _ in range(200) for each in memory.outer[0].values()} <= {1, 2}
                 events, missed = events_of.read()
                 told += len(events)
                 for event in events:

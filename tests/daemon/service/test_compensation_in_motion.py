@@ -4,15 +4,19 @@ from collections.abc import Awaitable, Callable
 from pathlib import Path
 
 import pytest
+import yaml
 from support.raised import measured_profile, ripple_arcsec
-from support.service import Service, play, stepped_service, until
+from support.service import AtOnce, Service, play, stepped_service, until
 
 from hdbridge.commissioning.evaluation.stepping import Scheme
 from hdbridge.control.bench import axis_view
+from hdbridge.daemon.following.settings import AdaptationSettings
 from hdbridge.daemon.service.bridge import ServiceBridge
+from hdbridge.daemon.service.following import Following
 from hdbridge.daemon.service.moves import WayPoint
 from hdbridge.daemon.service.streams import StreamPoint
 from hdbridge.motion.procedures.moves import MoveTo
+from hdbridge.sim.truth import Truth
 
 SPEED_DEG_S = 76.0
 FAR_DEG = 140.0
@@ -81,3 +85,33 @@ def test_it_removes_the_ripple(motion, profile: Path, tmp_path: Path) -> None:
     with stepped_service(tmp_path, axes=1 + (motion is coordinated), profile=profile) as service:
         none, left = play(story(service))
     assert left < 0.1 * none, (none, left)
+
+
+def test_the_ripple_of_a_retuned_servo_comes_back(profile: Path, tmp_path: Path) -> None:
+    async def story(service: Service) -> tuple[float, float]:
+        async with service.enabled() as (bridge, token):
+            axis = bridge.axes["axis1"]
+            settings = AdaptationSettings(mode="on", interval_s=1.0)
+            following = axis.following = Following(0, axis, settings, tmp_path / "state", AtOnce())
+            bridge.core.observer.add(following)
+            await axis.move(token, -FAR_DEG)
+            before = await ripple(service, bridge, token, goto)
+            for speed in (60.0, 45.0) * 2:
+                for target in (0.0, FAR_DEG):
+                    bridge.lease.renew(token)
+                    await axis.move(token, target, speed)
+                    await following.apply()
+            await axis.move(token, -FAR_DEG)
+            return before, await ripple(service, bridge, token, goto)
+
+    truth = Truth.load(profile / "truth.yaml")
+    retuned = truth.servo.model_copy(update={"position_gain_per_s": 130.0})
+    path = tmp_path / "truth.yaml"
+    text = truth.model_copy(update={"servo": retuned}).model_dump(
+        mode="json", by_alias=True, exclude_none=True
+    )
+    path.write_text(yaml.safe_dump(text))
+    with stepped_service(tmp_path, profile=profile, truth=path) as service:
+        before, after = play(story(service))
+    assert before > 2.0
+    assert after < 1.6  # 1.3 with the servo of the calibration, 19 without correction
