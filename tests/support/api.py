@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import asyncio
 import threading
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import AsyncIterator, Iterator
+from contextlib import asynccontextmanager, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
 import httpx
 
+from hdbridge.daemon.api.metrics import Metrics
 from hdbridge.daemon.api.policy import Policy
 from hdbridge.daemon.api.server import ApiServer, Listener
 from hdbridge.daemon.api.sockets import tcp_socket, unix_socket
+from hdbridge.daemon.service.bridge import ServiceBridge
 from support.fake_bridge import FakeBridge
 from support.patience import until
 
@@ -55,6 +57,13 @@ def served(bridge: FakeBridge, folder: Path) -> Iterator[Served]:
     port = tcp.getsockname()[1]
     path = folder / "cell.sock"
     server = ApiServer(bridge, [Listener(unix_socket(path), Policy()), Listener(tcp, Policy(token=TOKEN))])
+    with running(server):
+        yield Served(bridge, path, port, server)
+
+
+@contextmanager
+def running(server: ApiServer) -> Iterator[None]:
+    """Runs a server in a thread until the end of the block."""
     thread = threading.Thread(target=lambda: asyncio.run(server.run()), daemon=True)
     thread.start()
     try:
@@ -64,8 +73,22 @@ def served(bridge: FakeBridge, folder: Path) -> Iterator[Served]:
             return server.started
 
         until(begun, lambda: "the server has not begun")
-        yield Served(bridge, path, port, server)
+        yield
     finally:
         server.stop()
         thread.join()
         assert not thread.is_alive(), "the server has not ended"
+
+
+@asynccontextmanager
+async def served_beside(bridge: ServiceBridge, path: Path) -> AsyncIterator[None]:
+    """Serves a real service at a Unix socket, in its own event loop, until the end of the block."""
+    metrics = Metrics()
+    bridge.core.observer.add(metrics)
+    server = ApiServer(bridge, [Listener(unix_socket(path), Policy())], metrics)
+    serving = asyncio.ensure_future(server.run())
+    try:
+        yield
+    finally:
+        server.stop()
+        await serving

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import json
 import os
 import re
@@ -126,11 +125,6 @@ class Page:
         self.call("Input.dispatchKeyEvent", type="keyDown", key=key)
         time.sleep(hold_s)
         self.call("Input.dispatchKeyEvent", type="keyUp", key=key)
-
-    def screenshot(self, path: Path) -> None:
-        """Saves the whole page as PNG."""
-        picture = self.call("Page.captureScreenshot", captureBeyondViewport=True)["data"]
-        path.write_bytes(base64.b64decode(picture))
 
 
 @contextmanager

@@ -9,14 +9,11 @@ from collections.abc import Callable
 from contextlib import asynccontextmanager
 
 import pytest
+from support.api import served_beside
 from support.service import Service, play, stepped_service
 
 from hdbridge import Client, InputError, LeaseError, RefusedError
 from hdbridge.client import messages
-from hdbridge.daemon.api.metrics import Metrics
-from hdbridge.daemon.api.policy import Policy
-from hdbridge.daemon.api.server import ApiServer, Listener
-from hdbridge.daemon.api.sockets import unix_socket
 
 
 @pytest.fixture(scope="module")
@@ -28,16 +25,8 @@ def service(tmp_path_factory):
 @asynccontextmanager
 async def served(service: Service):
     path = service.folder / "cell.sock"
-    metrics = Metrics()
-    async with service.ready(simulated=True) as bridge:
-        bridge.core.observer.add(metrics)
-        server = ApiServer(bridge, [Listener(unix_socket(path), Policy())], metrics)
-        serving = asyncio.ensure_future(server.run())
-        try:
-            yield path
-        finally:
-            server.stop()
-            await serving
+    async with service.ready(simulated=True) as bridge, served_beside(bridge, path):
+        yield path
 
 
 def with_client(service: Service, use: Callable[[Client], None]) -> None:

@@ -13,6 +13,7 @@ from typing import Any
 
 import pytest
 import yaml
+from support.api import served_beside
 from support.daemon import stepped_daemon
 from support.service import Service, article_profiles, play
 from support.two_channels import CHANNELS
@@ -20,10 +21,6 @@ from support.two_channels import CHANNELS
 from hdbridge import Client
 from hdbridge.axis import AxisConfig
 from hdbridge.client.axis import Axis
-from hdbridge.daemon.api.metrics import Metrics
-from hdbridge.daemon.api.policy import Policy
-from hdbridge.daemon.api.server import ApiServer, Listener
-from hdbridge.daemon.api.sockets import unix_socket
 from hdbridge.daemon.machine import Machine
 from hdbridge.daemon.serve import follow
 from hdbridge.errors import DaemonError, HdbridgeError, InputError
@@ -166,15 +163,8 @@ def call_everything(machine: Machine, folder: Path) -> list[str]:
             bridge = await stack.enter_async_context(service.ready(simulated=True))
             for each in follow(machine, bridge, None, stack):
                 bridge.core.observer.add(each)
-            metrics = Metrics()
-            bridge.core.observer.add(metrics)
-            server = ApiServer(bridge, [Listener(unix_socket(path), Policy())], metrics)
-            serving = asyncio.ensure_future(server.run())
-            try:
-                await asyncio.to_thread(program, path)
-            finally:
-                server.stop()
-                await serving
+            await stack.enter_async_context(served_beside(bridge, path))
+            await asyncio.to_thread(program, path)
 
     configs = [each.config for each in machine.axes]
     with stepped_daemon(configs, bitrate_bps=machine.bus.bitrate_bps) as daemon:

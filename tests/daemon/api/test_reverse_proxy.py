@@ -16,7 +16,7 @@ from pathlib import Path
 
 import httpx
 import pytest
-from support.api import TOKEN, Served
+from support.api import TOKEN, Served, running
 from support.fake_bridge import FakeBridge
 from support.patience import until
 
@@ -48,16 +48,8 @@ def behind() -> Iterator[Served]:
     """The API at a TCP port for a proxy that is called cell.example."""
     bridge, listener = FakeBridge(), tcp_socket(0)
     server = ApiServer(bridge, [Listener(listener, Policy(TOKEN, frozenset({"cell.example"})))])
-    thread = threading.Thread(target=lambda: asyncio.run(server.run()), daemon=True)
-    thread.start()
-    while not server.started:
-        assert thread.is_alive()
-        time.sleep(0.005)
-    try:
+    with running(server):
         yield Served(bridge, Path(), listener.getsockname()[1], server)
-    finally:
-        server.stop()
-        thread.join(30)
 
 
 def free_port() -> int:
