@@ -418,7 +418,8 @@ class Answers:
     def difference(self) -> float:
         """Rms difference of the motor's response from the stored one, as a share of the ripple, less noise.
 
-        Neither the gear's error nor the load encoder matters.
+        It is at most what the load encoder shows to be left, so neither a change of the gear nor a fault of
+        one encoder alone is a difference.
         """
         if not self._motor:
             return 0.0
@@ -429,7 +430,11 @@ class Answers:
         sizes = np.array([self._orders[order].amplitude_arcsec for order, _ in self._motor])
         weight = sizes**2 / (DIFFERENT**2 + variance)
         square = abs(values - 1.0) ** 2 - variance
-        return math.sqrt(max(0.0, float(np.sum(weight * square) / weight.sum())))
+        apart = math.sqrt(max(0.0, float(np.sum(weight * square) / weight.sum())))
+        seen = self.by_frequency().values()
+        whole = sum(each.size_arcsec**2 for each in seen)
+        left = sum(abs(each.size_arcsec * each.share) ** 2 for each in seen)
+        return min(apart, math.sqrt(left / whole)) if whole else apart
 
     def forget_load(self) -> None:
         """Discards the readings of the load encoder."""

@@ -1,6 +1,7 @@
 """Figures of the compensation in motion.
 
     PYTHONPATH=tests python -m foreign.motion FILE [--kinds KIND...] [--seeds 0-4] [--exact]
+    PYTHONPATH=tests python -m foreign.motion FILE --retuned [--seeds 0-4]
 
 Each axis is calibrated by `PLAN` with a motion test, and nothing is known beforehand. With ``--exact`` its
 model is the exact correction of rest, and only the response is measured. Then the error of the load is
@@ -10,6 +11,10 @@ FILE keeps a line of JSON per axis; axes that it has are not measured again. Pri
 share removed, per cent, median (worst), of the orders that are slower than a third of the SYNC rate, static
 and filtered; and on how many axes the whole ripple is larger than without correction. Then, per path, the
 error and the time to settle without correction and with the one of the calibration; and the error at rest.
+
+With ``--retuned`` the position gains of simulated drives are multiplied by `GAINS` after the measurement of
+the response. FILE gets what is removed of the slow orders over all speeds, per cent, before and after
+refinements by runs at the two speeds `WORK`, their number, and the difference by which the watch judges.
 """
 
 from __future__ import annotations
@@ -18,7 +23,7 @@ import argparse
 import json
 import math
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from datetime import UTC, datetime
@@ -33,15 +38,24 @@ from foreign.servos import STRUCTURES
 from support.raised import ARTICLE, raised_axis
 
 from hdbridge import Bench, Drive
-from hdbridge.analysis.response import Harmonics, harmonics, order_hz
+from hdbridge.analysis.response import (
+    DIFFERENT,
+    Answers,
+    Harmonics,
+    Limits,
+    harmonics,
+    motor_orders,
+    order_hz,
+)
 from hdbridge.axis import AxisConfig
 from hdbridge.axis.effects import MotorOrder, Synchronous
 from hdbridge.axis.model import TransmissionModel
 from hdbridge.commissioning.calibration import Calibration, calibrate, start_journal
 from hdbridge.commissioning.calibration.motion import MotionTest, motion_test
 from hdbridge.control.bench import compensation_for
+from hdbridge.daemon.following.settings import AdaptationSettings
 from hdbridge.errors import HdbridgeError
-from hdbridge.motion.procedures.even_speed import EvenSpeed
+from hdbridge.motion.procedures.even_speed import EvenRun, EvenSpeed
 from hdbridge.motion.procedures.plan import Plan
 from hdbridge.sim.lockstep import simulated_bench
 
@@ -49,6 +63,10 @@ SHARES = (0.04, 0.1, 0.2, 0.32, 0.45, 0.58, 0.71, 0.84, 1.0)
 """Speeds as shares of the limit, in addition to `SLOWEST_DEG_S`. The motion test measures at others."""
 SLOWEST_DEG_S = 1.0
 ORDERS = (1, 2, 3, 4, 6, 8)
+GAINS = (1.0, 0.65, 0.8, 1.25, 1.5)
+WORK = (0.46, 0.35)
+STEPS = 4
+BOUND = AdaptationSettings().bound_share
 CHANCE = 1.02
 """Factor by which a ripple must be larger to count as larger."""
 PLAN = """
@@ -92,12 +110,60 @@ def simulated(seed: int, folder: Path) -> Iterator[tuple[Drive, TransmissionMode
     (folder / "truth.yaml").write_text(yaml.safe_dump(truth), encoding="utf-8")
     config = AxisConfig.load(folder)
     model = TransmissionModel.load(ARTICLE / "model.yaml")
+    with booted(config, folder, seed) as drive:
+        yield drive, model
+
+
+@contextmanager
+def booted(axis: AxisConfig, folder: Path, seed: int) -> Iterator[Drive]:
+    """The drive of the truth in a folder."""
     with (
-        simulated_bench(folder / "truth.yaml", config.eds_path, seed=seed) as (bus, clock, _),
-        Drive(bus, config, clock) as drive,
+        simulated_bench(folder / "truth.yaml", axis.eds_path, seed=seed) as (bus, clock, _),
+        Drive(bus, axis, clock) as drive,
     ):
         drive.boot()
-        yield drive, model
+        yield drive
+
+
+def retuned(seed: int, folder: Path) -> Iterator[dict[str, Any]]:
+    """One document per gain."""
+    with simulated(seed, folder) as (drive, static):
+        axis, model = drive.axis, replace(static, response=motion_test(drive, static).response)
+    truth = yaml.safe_load((folder / "truth.yaml").read_text(encoding="utf-8"))
+    gain = truth["servo"]["position_gain_per_s"]
+    orders, limits, limit = motor_orders(model), Limits.of(axis, model), axis.limits.velocity_deg_s
+    third_hz = 1.0 / (3.0 * axis.drive.cycle_s)
+
+    def runs(used: TransmissionModel, shares: Sequence[float]) -> tuple[EvenRun, ...]:
+        return (
+            Bench(drive, compensation_for(axis, used))
+            .run(EvenSpeed(tuple(each * limit for each in shares)))
+            .outcome
+        )
+
+    def slow(used: TransmissionModel) -> float:
+        found = [harmonics(each, ORDERS, model.ratio) for each in runs(used, SHARES[1:])]
+        return math.hypot(*(_slow(each, third_hz, model.ratio) for each in found))
+
+    for factor in GAINS:
+        truth["servo"]["position_gain_per_s"] = factor * gain
+        (folder / "truth.yaml").write_text(yaml.safe_dump(truth), encoding="utf-8")
+        with booted(axis, folder, seed) as drive:
+            used, answers, differences = model, None, []
+            while len(differences) < STEPS:
+                answers = Answers(used.response, orders, model.ratio, answers)
+                for run in runs(used, WORK):
+                    answers.take(run.speed_deg_s, *np.array([each[1:5] for each in run.samples]).T)
+                differences.append(answers.difference)
+                changed = used is not model or answers.difference > DIFFERENT
+                response = answers.refined(model.response, limits, BOUND, retuned=changed)
+                if response is None:
+                    break
+                used = replace(model, response=response)
+            none = slow(model.only(()))
+            removed = [100.0 * (1.0 - slow(each) / none) for each in (model, used)]
+        steps = len(differences) - (response is None)
+        yield {"seed": seed, "gain": factor, "removed": removed, "steps": steps, "difference": differences[0]}
 
 
 @contextmanager
@@ -240,6 +306,13 @@ if __name__ == "__main__":
     parser.add_argument("--kinds", nargs="+", default=[*STRUCTURES, "simulated"])
     parser.add_argument("--seeds", default="0-4", help="first and last")
     parser.add_argument("--exact", action="store_true", help="take the exact correction of rest as the model")
+    parser.add_argument("--retuned", action="store_true", help="change the position gain afterwards")
     given = parser.parse_args()
     first, last = map(int, given.seeds.split("-"))
+    if given.retuned:
+        for number in range(first, last + 1):
+            with tempfile.TemporaryDirectory() as name, given.file.open("a") as out:
+                for found in retuned(number, Path(name)):
+                    print(json.dumps(found), file=out, flush=True)
+        raise SystemExit
     main(given.file, given.kinds, range(first, last + 1), given.exact)

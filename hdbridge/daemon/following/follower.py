@@ -137,6 +137,8 @@ class Follower:
         self._now_s = float(times_s[-1])
         joined = self._next_cycle in {None, int(cycle[0])} and int(cycle[-1] - cycle[0]) == len(cycle) - 1
         servo = self._servo.take(axis, joined=joined)
+        if status.fault is not None:
+            self._servo.forget_load()
         first = self._begin_of_path(axis, cycle)
         raised: list[Raised] = []
         if servo is not None:
