@@ -28,7 +28,7 @@ from hdbridge.analysis.hypothesis import Estimator, Fitted, Hypothesis
 from hdbridge.analysis.identifiability import identifiability
 from hdbridge.analysis.linear import about_zeros
 from hdbridge.analysis.parameters import confounded, covariance, parameters_of, precisely
-from hdbridge.analysis.prepared import gather
+from hdbridge.analysis.prepared import Observed, gather
 from hdbridge.analysis.probability import Context, Prior, weighed
 from hdbridge.analysis.scales import Scales
 from hdbridge.analysis.search import (
@@ -38,6 +38,7 @@ from hdbridge.analysis.search import (
     waves_alike,
     with_measured,
 )
+from hdbridge.analysis.swing import ORDINARY_HZ, allowed_for, seen_swing
 from hdbridge.analysis.unexplained import (
     LESS,
     Rest,
@@ -94,23 +95,32 @@ def diagnose(
     data = gather(
         record, model.ratio, legs, independent_zeros, lambda motion: model.predict(motion, Start.VIRGIN)
     )
-    estimator = Estimator(data, scales or Scales())
-    estimator.calibrated = calibrated(
-        model.effects,
-        model.uncertainty,
-        lambda effect: estimator.columns(effect, Start.VIRGIN),
-        estimator.scales,
-    )
-    search = Search(estimator, model.effects)
+    search = _search(data, model, scales or Scales())
+    begun = search.begun()
+    swing = seen_swing(search.estimator, begun)
+    if swing is not None and swing.frequency_hz <= ORDINARY_HZ:
+        swing = None  # softer than is ordinary: a cause to be found
+    elif (less := allowed_for(search.estimator, begun, swing)) is not data:
+        search = _search(less, model, search.scales)
+    estimator = search.estimator
     first = unfitted(estimator, model.effects)
     held = beyond_limit(model.effects, data.full.motion)
-    data = replace(data, remarks=(*((first,) if first else ()), *held, *data.remarks))
-    estimator.data = data
+    own = [swing.remark()] if swing is not None else []
+    told = (*((first,) if first else ()), *held, *data.remarks, *own)
+    estimator.data = replace(estimator.data, remarks=told)
     progress("searching for causes")
     found = search.run()
     progress("judging what was found")
     diagnosis = _Judge(search, model, bool(first), prior).of(found)
     return replace(diagnosis, remarks=(*remarks, *diagnosis.remarks))
+
+
+def _search(data: Observed, model: TransmissionModel, scales: Scales) -> Search:
+    estimator = Estimator(data, scales)
+    estimator.calibrated = calibrated(
+        model.effects, model.uncertainty, lambda effect: estimator.columns(effect, Start.VIRGIN), scales
+    )
+    return Search(estimator, model.effects)
 
 
 def _of_zeros(parts: Sequence[Record], ratio: float) -> tuple[str, ...]:

@@ -76,6 +76,8 @@ BoolArray = NDArray[np.bool_]
 CHATTER_COUNTS = 2.6
 """Minimum return for a reversal of a measured angle, counts: noise of a third of a count flickers over
 two."""
+LEAST_STILL = 20
+"""Minimum number of samples with the command at rest that show the noise of the motor reading."""
 WINDOW_S = 0.03
 """Averaging window of speed and acceleration."""
 LONGEST_S = 0.05
@@ -157,7 +159,7 @@ def _driving(
     solution = np.linalg.lstsq(columns / scale, lag, rcond=1e-9)[0] / scale
     line = columns @ solution
     rest = lag - line
-    noise = _noise(lag, count)
+    noise = _noise(lag, target, count)
     if noise >= 0.5 * count and float(np.std(rest)) > 0.45 * count + 1e-6:
         line = line + uniform_filter1d(rest, 2 * window + 1, mode="nearest")
     # A motor that sticks at a reversal or overshoots a stop is where its encoder says.
@@ -168,11 +170,22 @@ def _driving(
     return steadied(target + line, target + line, band)
 
 
-def _noise(lag: FloatArray, count: float) -> float:
-    """Returns the noise of the motor reading in addition to quantisation, degrees."""
-    if len(lag) < 4:
+def _noise(lag: FloatArray, target: FloatArray, count: float) -> float:
+    """Returns the noise of the motor reading in addition to quantisation, degrees.
+
+    In a fast move the lag itself bends within a few samples, which is no noise. So if counts are visible, it
+    is at most what the reading shows while the command rests, and nothing if the command never rests.
+    """
+    third = np.diff(lag, 3)
+    if not len(third):
         return 0.0
-    return math.sqrt(max(third_deviation(np.diff(lag, 3)) ** 2 - count**2 / 12.0, 0.0))
+    noise = third_deviation(third)
+    if count:
+        moved = np.abs(np.diff(target)) > 0.0
+        still = ~(moved[2:] | moved[1:-1] | moved[:-2])
+        enough = np.count_nonzero(still) >= LEAST_STILL
+        noise = min(noise, third_deviation(third[still]) if enough else 0.0)
+    return math.sqrt(max(noise**2 - count**2 / 12.0, 0.0))
 
 
 def _smooth(values: FloatArray, window: int) -> FloatArray:

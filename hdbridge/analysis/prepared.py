@@ -321,7 +321,7 @@ class Observed:
 
     def over(self, runs: IntArray) -> Observed:
         """Returns the same samples averaged over other runs, given by their first samples."""
-        return replace(self, points=_averaged(self.full, runs), runs=runs)
+        return replace(self, points=averaged(self.full, runs), runs=runs)
 
     @property
     def motion(self) -> Motion:
@@ -379,7 +379,7 @@ def gather(
     runs = _runs(len(time), record.starts)
     return Observed(
         ratio=ratio,
-        points=_averaged(full, runs),
+        points=averaged(full, runs),
         full=full,
         runs=runs,
         motor_count_arcsec=full.reading.resolution_deg / ratio * ARCSEC_PER_DEG,
@@ -424,7 +424,7 @@ def means(values: FloatArray, runs: IntArray) -> FloatArray:
     return np.asarray(total / (size if values.ndim == 1 else size[:, np.newaxis]))
 
 
-def _averaged(full: Samples, runs: IntArray) -> Samples:
+def averaged(full: Samples, runs: IntArray) -> Samples:
     """Averages samples over runs; a run with unusable samples becomes an unusable point of the path."""
     if len(runs) == len(full):
         return full

@@ -57,7 +57,7 @@ class Search:
 
     def run(self) -> Fitted:
         """Adds causes, best first, then removes those that no longer improve the fit enough."""
-        fitted = self._with_best_law(self._with_best_sign(self._begin()))
+        fitted = self._with_best_law(self._with_best_sign(self.begun()))
         for number in range(MOST):
             found = self._best_addition(fitted)
             if number < ANEW and fitted.hypothesis.nuisances is None:
@@ -78,7 +78,8 @@ class Search:
             fitted = self._swapped(fitted)
         return self._with_best_law(self.eliminated(fitted, self._least, []))
 
-    def _begin(self) -> Fitted:
+    def begun(self) -> Fitted:
+        """Fits the model alone, from the best elastic state at the start."""
         fits = [self.estimator.fit(Hypothesis(self._base, start)) for start in Start]
         return min(fits, key=lambda each: each.chi_square)
 
@@ -92,12 +93,12 @@ class Search:
         if self.estimator.data.reversals < 2 or not loops or any(each.coefficients()[0] for each in loops):
             return known  # a coefficient that is not held at zero confirms the model's sign
         self.estimator.loop_sign *= -1.0
-        other = self._begin()
+        other = self.begun()
         self.estimator.loop_sign *= -1.0
         rival = self._best_addition(known) or known
         if self.cost(other) + self.scales.enter < self.cost(rival):
             self.estimator.loop_sign *= -1.0
-        return self._begin()
+        return self.begun()
 
     def _with_best_law(self, fitted: Fitted) -> Fitted:
         """Exchanges the hysteresis law for an equivalent one if that fits better."""

@@ -39,7 +39,7 @@ def test_a_drag_that_does_not_bend_is_told_as_a_delay_and_stays_its_alias(
         ({"coulomb": 0.07, "viscous": 0.0145, "shear": 780.0}, 5e-6, {VelocityWindup.name}),  # too small
         (
             {"coulomb": 0.07, "viscous": 0.02, "shear": 1500.0},
-            2e-5,
+            6e-5,
             {VelocityWindup.name, InertialWindup.name},
         ),
     ],

@@ -1,0 +1,58 @@
+"""Swing of the load on its spring: the response, and how near the driving angle stays to its encoder."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from hdbridge.analysis.driving import kinematics
+from hdbridge.analysis.readings import Reading
+from hdbridge.analysis.swing import swing
+
+COUNT_DEG = 0.018
+
+
+@pytest.mark.parametrize(("frequency_hz", "damping"), [(25.0, 0.1), (60.0, 0.4)])
+def test_the_load_follows_its_base_as_the_equation_says(frequency_hz: float, damping: float) -> None:
+    """Over irregular samples, two of which belong to another record."""
+    rng = np.random.default_rng(1)
+    time_s = np.cumsum(rng.uniform(0.5e-3, 1.5e-3, 800))
+    natural = math.tau * frequency_hz
+
+    def base(t: np.ndarray | float) -> np.ndarray:
+        return np.asarray(100.0 * np.exp(-(((t - 0.4) / 0.05) ** 2)))
+
+    def bend(t: float) -> float:
+        return float((base(t + 1e-4) - 2.0 * base(t) + base(t - 1e-4)) / 1e-8)
+
+    def rate(t: float, state: np.ndarray) -> list[float]:
+        return [state[1], -2.0 * damping * natural * state[1] - natural**2 * state[0] - bend(t)]
+
+    span = (float(time_s[0]), float(time_s[-1]))
+    true = solve_ivp(rate, span, [0.0, 0.0], t_eval=time_s, rtol=1e-7, atol=1e-7, max_step=2e-3).y[0]
+    both = np.concatenate([base(time_s), [3.0, 4.0]])
+    times = np.concatenate([time_s, time_s[:2]])
+    found = swing(both, times, [slice(0, 800), slice(800, 802)], frequency_hz, damping)
+    assert found.does_arcsec[:800] == pytest.approx(true, abs=0.01 * np.ptp(true))
+    assert not np.any(found.does_arcsec[800:])
+
+
+def test_a_steady_acceleration_winds_the_load_up() -> None:
+    """Wind-up J / K per acceleration: 1 / (2 pi f)^2."""
+    time_s = np.arange(2000) * 1e-3
+    found = swing(0.5 * 3600.0 * 100.0 * time_s**2, time_s, [slice(0, 2000)], 40.0, 0.2)
+    assert found.does_arcsec[1500] == pytest.approx(-360_000.0 / (math.tau * 40.0) ** 2, rel=1e-3)
+
+
+def test_a_lag_that_changes_within_a_few_samples_is_no_noise_of_the_encoder() -> None:
+    """The motor rings about its command in every move and never rests."""
+    time_s = np.arange(600) * 0.006
+    target = 200.0 * np.sin(math.tau * 1.5 * time_s)
+    motor = target + 0.5 * np.sin(math.tau * 35.0 * time_s) * np.sign(np.cos(math.tau * 1.5 * time_s))
+    counted = np.round(motor / COUNT_DEG) * COUNT_DEG
+    driven = kinematics(counted, target, time_s, Reading(COUNT_DEG, COUNT_DEG / math.sqrt(12.0)))
+    moving = np.abs(np.gradient(motor, time_s)) > 300.0
+    assert np.max(np.abs(driven.motor_deg - counted)[moving]) <= 0.501 * COUNT_DEG
