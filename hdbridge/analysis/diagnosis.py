@@ -38,7 +38,7 @@ from hdbridge.analysis.search import (
     waves_alike,
     with_measured,
 )
-from hdbridge.analysis.swing import ORDINARY_HZ, allowed_for, seen_swing
+from hdbridge.analysis.swing import ORDINARY_HZ, seen_swing, settled, without
 from hdbridge.analysis.unexplained import (
     LESS,
     Rest,
@@ -95,17 +95,18 @@ def diagnose(
     data = gather(
         record, model.ratio, legs, independent_zeros, lambda motion: model.predict(motion, Start.VIRGIN)
     )
-    search = _search(data, model, scales or Scales())
-    begun = search.begun()
-    swing = seen_swing(search.estimator, begun)
-    if swing is not None and swing.frequency_hz <= ORDINARY_HZ:
-        swing = None  # softer than is ordinary: a cause to be found
-    elif (less := allowed_for(search.estimator, begun, swing)) is not data:
-        search = _search(less, model, search.scales)
+    scales = scales or Scales()
+    swing = seen_swing(data.full, model.effects, scales)
+    if swing is not None and swing.frequency_hz > ORDINARY_HZ:  # one that is softer is a cause to be found
+        data = without(data, swing)
+    hertz = ORDINARY_HZ if swing is None else swing.frequency_hz
+    search = _search(data, model, scales)
+    if hertz >= ORDINARY_HZ and (less := settled(search.estimator, search.begun(), hertz)) is not data:
+        search = _search(less, model, scales)
     estimator = search.estimator
     first = unfitted(estimator, model.effects)
     held = beyond_limit(model.effects, data.full.motion)
-    own = [swing.remark()] if swing is not None else []
+    own = [swing.remark()] if swing is not None and swing.frequency_hz > ORDINARY_HZ else []
     told = (*((first,) if first else ()), *held, *data.remarks, *own)
     estimator.data = replace(estimator.data, remarks=told)
     progress("searching for causes")

@@ -2,7 +2,8 @@
 
 The load follows the motor and the gear's error as a mass on a spring with damping follows its base. A
 calibration moves too slowly to show it, and it is no fault. So its frequency and damping are fitted to the
-residual of the given model, and what it does is part of the baseline.
+residual of the given model, before any part of the model is free to imitate it, and the swing is subtracted.
+Samples in which more of it remains unknown than matters are left out.
 """
 
 from __future__ import annotations
@@ -15,31 +16,37 @@ from itertools import product
 import numpy as np
 from scipy.linalg import solve_banded
 from scipy.ndimage import maximum_filter1d
+from scipy.optimize import minimize
 
 from hdbridge.analysis.driving import SETTLE_S
 from hdbridge.analysis.hypothesis import Estimator, Fitted
 from hdbridge.analysis.linear import about_zeros
-from hdbridge.analysis.prepared import LEAST_SETTLED, Observed, averaged
-from hdbridge.axis.effects import FloatArray
-from hdbridge.units import ARCSEC_PER_DEG
+from hdbridge.analysis.prepared import LEAST_SETTLED, Observed, Samples, averaged
+from hdbridge.analysis.scales import Scales
+from hdbridge.axis.effects import Effect, FloatArray, Part, Start
+from hdbridge.units import ARCSEC_PER_DEG, DEG_PER_TURN
 
 ORDINARY_HZ = 30.0
 """Lowest natural frequency of a load that is ordinary. The demo axis has 42 Hz; of the axes that tools/blind
 draws, 20 to 640 Hz, one in thirty is softer."""
-HERTZ = tuple(float(each) for each in np.geomspace(0.4 * ORDINARY_HZ, 16.0 * ORDINARY_HZ, 23))
-DAMPING = (0.05, 0.1, 0.2, 0.4)
+HERTZ = np.geomspace(0.4 * ORDINARY_HZ, 16.0 * ORDINARY_HZ, 23)
+DAMPING = (0.05, 0.2, 0.5)
 """Natural frequencies and damping ratios that are tried, before a refinement."""
+MOST_DAMPED = 0.9
+REFINED = 40
+"""Number of trials of the refinement."""
+LONGEST = 20_000
+"""Maximum number of samples that a swing is fitted to: those of the hardest accelerations."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Swing:
-    """Lag of the load behind its base in each sample, arcsec, shape (n,)."""
+    """Lag of the load behind its base."""
 
     frequency_hz: float
     damping: float
     does_arcsec: FloatArray
-    envelope_arcsec: FloatArray
-    """Amplitude of the swing, whatever its phase."""
+    """Its share of the error in each sample, shape (n,)."""
 
     def remark(self) -> str:
         """Describes it for the report."""
@@ -51,18 +58,14 @@ class Swing:
 
 
 def swing(
-    base_arcsec: FloatArray, time_s: FloatArray, parts: Sequence[slice], frequency_hz: float, damping: float
+    bend: FloatArray, step_s: FloatArray, first: Sequence[int], frequency_hz: float, damping: float
 ) -> Swing:
-    """Computes the load's motion relative to its base (n,); it is at rest at the start of each part.
+    """Computes the load's motion relative to its base, whose second derivative is ``bend``, (n,).
 
-    e'' + 2 z w e' + w^2 e = -base'', solved exactly for a second derivative that is linear between samples.
+    It is at rest at the ``first`` sample of each part; ``step_s`` (n - 1,) are the times between samples.
+    e'' + 2 z w e' + w^2 e = -bend, solved exactly for a bend that is linear between samples.
     """
-    w = math.tau * frequency_hz
-    step_s = np.maximum(np.diff(time_s), 1e-9)
-    bend = _bend(base_arcsec, time_s)
-    first = np.array([each.start for each in parts])
-    last = np.array([each.stop - 1 for each in parts])
-    bend[first] = bend[last] = 0.0
+    w, begins = math.tau * frequency_hz, np.asarray(first)
     damped = w * math.sqrt(1.0 - damping**2)
     fall = np.exp(-damping * w * step_s)
     cosine, sine = fall * np.cos(damped * step_s), fall * np.sin(damped * step_s)
@@ -72,101 +75,109 @@ def swing(
     slope = np.diff(bend) / step_s / w**3
     before = -bend[:-1] / w**2 + 2.0 * damping * slope
     after = -bend[1:] / w**2 + 2.0 * damping * slope
-    right = np.zeros(2 * len(base_arcsec))
+    right = np.zeros(2 * len(bend))
     right[2::2] = after - own * before + cross * slope
     right[3::2] = -slope + cross * before + other * slope
     for each in (own, cross, other):
-        each[first[1:] - 1] = 0.0
-    right.reshape(-1, 2)[first[1:]] = 0.0
+        each[begins[1:] - 1] = 0.0
+    right.reshape(-1, 2)[begins[1:]] = 0.0
     band = np.zeros((4, len(right)))
     band[0] = 1.0
     band[2, 0:-2:2], band[1, 1:-1:2] = -own, -cross
     band[3, 0:-2:2], band[2, 1:-1:2] = cross, -other
     state = solve_banded((3, 0), band, right, overwrite_ab=True, overwrite_b=True, check_finite=False)
-    return Swing(frequency_hz, damping, state[::2], np.hypot(state[::2], state[1::2]))
+    return Swing(frequency_hz, damping, state[::2])
 
 
-def seen_swing(estimator: Estimator, fitted: Fitted) -> Swing | None:
-    """Fits the swing to the residual of a fit; None if nothing of it is seen."""
-    full, start = estimator.data.full, fitted.hypothesis.start
-    error = sum(each.predict(full.motion, start) for each in fitted.hypothesis.effects)
-    base = ARCSEC_PER_DEG / full.ratio * full.motor_deg + error
-    parts = [each.rows for each in full.chains]
-    residual, weight = fitted.residual / estimator.weight, estimator.weight**2
-
-    def tried(frequency_hz: float, damping: float) -> tuple[float, Swing]:
-        one = swing(base, full.time_s, parts, frequency_hz, damping)
-        left = about_zeros(residual - estimator.at_points(one.does_arcsec), estimator.zero, weight)
-        return float(np.sum(weight * left**2)), one
-
-    best = min((tried(*each) for each in product(HERTZ, DAMPING)), key=lambda each: each[0])
-    for factor in (1.1, 1.05):
-        here = best[1]
-        near = product((1.0 / factor, 1.0, factor), (1.0 / factor**2, 1.0, factor**2))
-        trials = (tried(here.frequency_hz * f, min(here.damping * z, 0.7)) for f, z in near)
-        best = min((best, *trials), key=lambda each: each[0])
-    scales, whole = estimator.scales, float(np.sum(fitted.residual**2))
-    seen = whole - best[0] > scales.enter + 2.0 * scales.penalty
-    # Of what a model lacks otherwise, a swing may take a part.
-    clear = best[0] < scales.large * len(residual) or best[0] < 0.5 * whole
-    return best[1] if seen and clear else None
+def bend_of(base_arcsec: FloatArray, step_s: FloatArray, parts: Sequence[slice]) -> FloatArray:
+    """Returns the second derivative of the natural spline through each part of the base, shape (n,)."""
+    ends = [row for each in parts for row in (each.start, each.stop - 1)]
+    band, right = np.zeros((3, len(base_arcsec))), np.zeros(len(base_arcsec))
+    band[1, 1:-1] = (step_s[:-1] + step_s[1:]) / 3.0
+    band[0, 2:], band[2, :-2] = step_s[1:] / 6.0, step_s[:-1] / 6.0
+    right[1:-1] = np.diff(np.diff(base_arcsec) / step_s)
+    band[1, ends], right[ends] = 1.0, 0.0
+    for each in ends:  # their rows say that the derivative is zero
+        band[0, each + 1 : each + 2] = band[2, max(each - 1, 0) : each] = 0.0
+    return np.asarray(solve_banded((1, 1), band, right, check_finite=False))
 
 
-def allowed_for(estimator: Estimator, fitted: Fitted, found: Swing | None) -> Observed:
-    """Returns the data less the swing; samples in which more of it is unknown than matters are left out.
+def seen_swing(full: Samples, effects: Sequence[Effect], scales: Scales) -> Swing | None:
+    """Fits the swing to the residual of the given model; None if nothing of it is seen."""
+    weight = full.usable / full.sigma_arcsec**2
+    step_s, parts = np.maximum(np.diff(full.time_s), 1e-9), [each.rows for each in full.chains]
 
-    What the law leaves, and what the samples are too far apart to show, scales with the swing's amplitude and
-    with the wind-up at `ORDINARY_HZ`. Both shares are regressed on the squares of the residual in motion.
-    """
-    data, weight, full = estimator.data, estimator.weight, estimator.data.full
-    shaken = _accelerated(data) / (math.tau * ORDINARY_HZ) ** 2
-    sizes, left = [shaken], fitted.residual / weight
-    if found is not None:
-        sizes.insert(0, found.envelope_arcsec)
-        left = left - estimator.at_points(found.does_arcsec)
-        full = replace(full, error_arcsec=full.error_arcsec - found.does_arcsec)
-    moving = (data.points.speed_deg_s != 0.0)[estimator.index]
-    square, unknown = left[moving] ** 2, np.zeros(len(full))
-    size = estimator.at_points(sizes[-1])[moving]
-    quiet = size <= np.median(size) if len(size) else moving[moving]
-    if len(size) and float(np.mean((square * weight[moving] ** 2)[quiet])) > estimator.scales.large:
-        sizes = []  # the model lacks more than dynamics, and its residual says nothing about them
-    for each in sizes:
-        size = estimator.at_points(each**2)[moving]
-        about = (size - np.mean(size)) if len(size) else size
-        share = max(float(about @ square) / max(float(about @ about), 1e-300), 0.0)
-        if share > 1.0 and each is shaken:
-            continue  # more than any ordinary axis has
-        share = min(share, 1.0)
-        square = square - share * size
-        unknown += share * each**2
-    if found is None and not np.any(unknown):
-        return data
-    unknown = np.sqrt(unknown)
-    most = max(estimator.scales.floor_arcsec, 2.0 * float(np.min(full.sigma_arcsec)))
-    usable = full.usable & (unknown <= most)
-    if np.mean(usable) < LEAST_SETTLED:
-        usable = full.usable
-    full = replace(full, sigma_arcsec=np.hypot(full.sigma_arcsec, unknown), usable=usable)
+    def left(error: FloatArray, rows: slice) -> FloatArray:
+        return about_zeros(full.error_arcsec[rows] - error[rows], full.zero[rows], weight[rows])
+
+    def cost(residual: FloatArray, rows: slice) -> float:
+        return float(weight[rows] @ about_zeros(residual, full.zero[rows], weight[rows]) ** 2)
+
+    whole = slice(0, len(full))
+    errors = [sum((each.predict(full.motion, start) for each in effects), np.zeros(len(full))) for start in Start]
+    error = min(errors, key=lambda each: cost(left(each, whole), whole))
+    bend = bend_of(ARCSEC_PER_DEG / full.ratio * full.motor_deg + error, step_s, parts)
+    size = np.concatenate([[0.0], np.cumsum(bend**2)])
+    begin = int(np.argmax(size[LONGEST:] - size[:-LONGEST])) if len(full) > LONGEST else 0
+    rows = slice(begin, min(begin + LONGEST, len(full)))
+    first = [begin, *(each.start for each in parts if rows.start < each.start < rows.stop)]
+    residual = left(error, rows)
+
+    def tried(hertz: float, damping: float) -> float:
+        begins = [each - begin for each in first]
+        one = swing(bend[rows], step_s[rows.start : rows.stop - 1], begins, hertz, min(damping, MOST_DAMPED))
+        return cost(residual - one.does_arcsec, rows)
+
+    start = min(product(HERTZ.tolist(), DAMPING), key=lambda each: tried(*each))
+    found = minimize(
+        lambda x: tried(*np.exp(x).tolist()), np.log(start), method="Nelder-Mead", options={"maxfev": REFINED}
+    )
+    if cost(residual, rows) - found.fun < scales.enter + 2.0 * scales.penalty:
+        return None
+    hertz, damping = np.exp(found.x).tolist()
+    return swing(bend, step_s, [each.start for each in parts], hertz, min(damping, MOST_DAMPED))
+
+
+def without(data: Observed, found: Swing) -> Observed:
+    """Returns the data less the swing."""
+    full = replace(data.full, error_arcsec=data.full.error_arcsec - found.does_arcsec)
     return replace(data, full=full, points=averaged(full, data.runs))
 
 
-def _accelerated(data: Observed) -> FloatArray:
+def settled(estimator: Estimator, fitted: Fitted, hertz: float) -> Observed:
+    """Returns the data without the samples in which more of the swing is unknown than matters.
+
+    The error of a swing scales with the wind-up at its frequency, by the motor's acceleration and by that of
+    the gear's error. Its share is regressed on the squares of the residual in motion. If too few samples
+    are left, they all stay, with that error in their noise.
+    """
+    data, weight = estimator.data, estimator.weight
+    size_arcsec = _shaken(data.full, fitted.hypothesis.effects, data.period_s) / (math.tau * hertz) ** 2
+    moving = (data.points.speed_deg_s != 0.0)[estimator.index]
+    square, size = (fitted.residual / weight)[moving] ** 2, estimator.at_points(size_arcsec**2)[moving]
+    about = size - np.mean(size) if len(size) else size
+    share = min(max(float(about @ square) / max(float(about @ about), 1e-300), 0.0), 1.0)
+    unknown, full = math.sqrt(share) * size_arcsec, data.full
+    usable = full.usable & (unknown <= estimator.scales.floor_arcsec)
+    if np.all(usable == full.usable):
+        return data
+    if np.mean(usable) >= LEAST_SETTLED:
+        full = replace(full, usable=usable)
+    else:
+        full = replace(full, sigma_arcsec=np.hypot(full.sigma_arcsec, unknown))
+    return replace(data, full=full, points=averaged(full, data.runs))
+
+
+def _shaken(full: Samples, effects: Sequence[Effect], period_s: float) -> FloatArray:
     """Returns the largest acceleration of the base from one sample after to `SETTLE_S` before each, (n,)."""
-    full, rows = data.full, max(1, round(SETTLE_S / data.period_s))
-    result = np.zeros(len(full))
+    motion, rows = full.motion, max(1, round(SETTLE_S / period_s))
+    orders = [each for effect in effects if effect.part is Part.ORDERS for each in effect.waves()]
+    curved = math.sqrt(sum((amplitude * (turns * math.tau) ** 2) ** 2 for turns, amplitude, _ in orders))
+    assert motion.motor_acceleration_deg_s2 is not None
+    by_motor = ARCSEC_PER_DEG / full.ratio * np.abs(motion.motor_acceleration_deg_s2)
+    size = np.hypot(by_motor, curved * (full.speed_deg_s / DEG_PER_TURN) ** 2)
+    result = np.empty(len(full))
     for each in full.chains:
-        size = np.abs(_bend(ARCSEC_PER_DEG / full.ratio * full.motor_deg[each.rows], full.time_s[each.rows]))
-        known = min(rows, len(size))
-        result[each.rows] = maximum_filter1d(size, known + 2, origin=known // 2, mode="nearest")
+        known = min(rows, each.rows.stop - each.rows.start)
+        result[each.rows] = maximum_filter1d(size[each.rows], known + 2, origin=known // 2, mode="nearest")
     return result
-
-
-def _bend(base_arcsec: FloatArray, time_s: FloatArray) -> FloatArray:
-    """Returns the second derivative, zero at both ends, shape (n,)."""
-    step_s = np.maximum(np.diff(time_s), 1e-9)
-    bend = np.zeros(len(base_arcsec))
-    if len(bend) < 3:
-        return bend
-    bend[1:-1] = np.diff(np.diff(base_arcsec) / step_s) / (0.5 * (step_s[1:] + step_s[:-1]))
-    return bend
