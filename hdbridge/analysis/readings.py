@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
 from hdbridge.axis.effects import FloatArray
 
@@ -23,6 +24,10 @@ FINEST_COUNT_DEG = 360.0 / 2**20 - ROUNDED_DEG
 """Smallest plausible count. Smaller steps are a digit of the file, or a count hidden by noise."""
 COUNTS_PER_DIGIT = 6.0
 """Smallest count that can be recognised in a rounded file, in units of its last digit."""
+NEAR_COUNTS = 6
+"""Span of four readings that show jitter, counts: twice what flickers by a count."""
+LEAST_NEAR = 20
+"""Minimum number of such readings."""
 _THIRD = np.sqrt(20.0)
 """Amplification of white noise by third differences: the root of 1 + 9 + 9 + 1."""
 _MAD = 1.4826
@@ -61,8 +66,20 @@ class Reading:
 
 
 def reading_of(angle_deg: FloatArray) -> Reading:
-    """Returns the resolution of an angle, shape (n,)."""
-    return Reading(quantum_deg(angle_deg), jitter_deg(angle_deg))
+    """Returns the resolution of an angle, shape (n,).
+
+    The jitter is that of readings within a few counts of each other, if counts are visible and there are
+    enough of these: a motion that bends within a few samples is no noise.
+    """
+    count, jitter = quantum_deg(angle_deg), jitter_deg(angle_deg)
+    if count and len(angle_deg) > 3:
+        four = sliding_window_view(angle_deg, 4)
+        span = np.ptp(four, axis=1)
+        near = np.diff(four[(span > 0.5 * count) & (span < (NEAR_COUNTS + 0.5) * count)], 3, axis=1)
+        if len(near) >= LEAST_NEAR:
+            size = float(np.sqrt(np.mean(near**2)) / _THIRD)
+            jitter = min(jitter, max(size, float(count / _UNIFORM)))
+    return Reading(count, jitter)
 
 
 def jitter_deg(angle_deg: FloatArray) -> float:
