@@ -99,9 +99,8 @@ def diagnose(
     swing = seen_swing(data.full, model.effects, scales)
     if swing is not None and swing.frequency_hz > ORDINARY_HZ:  # one that is softer is a cause to be found
         data = without(data, swing)
-    hertz = ORDINARY_HZ if swing is None else swing.frequency_hz
-    search = _search(data, model, scales)
-    if hertz >= ORDINARY_HZ and (less := settled(search.estimator, search.begun(), hertz)) is not data:
+    search, soft = _search(data, model, scales), swing is not None and swing.frequency_hz <= ORDINARY_HZ
+    if not soft and (less := settled(search.estimator, search.begun(), swing)) is not data:
         search = _search(less, model, scales)
     estimator = search.estimator
     first = unfitted(estimator, model.effects)
@@ -121,6 +120,7 @@ def _search(data: Observed, model: TransmissionModel, scales: Scales) -> Search:
     estimator.calibrated = calibrated(
         model.effects, model.uncertainty, lambda effect: estimator.columns(effect, Start.VIRGIN), scales
     )
+    estimator.begins = estimator.begins_of(model.effects)
     return Search(estimator, model.effects)
 
 

@@ -39,6 +39,8 @@ MOST_TURNS = 100
 """Maximum number of turning points with an error of their own. With more, the mean is known well enough."""
 SHORT = 10_000
 """Record length, samples, below which the number of rare samples shrinks in proportion."""
+MOST_PARTS = 20
+"""Maximum number of parts of a record with an elastic state of their own."""
 STOPS_DEG = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0)
 """Widths of the stop operators of the free-form hysteresis."""
 
@@ -131,6 +133,8 @@ class Estimator:
         """Sign of the loop's offset; -1 if the load lags."""
         self.calibrated: tuple[CalibratedPart, ...] = ()
         """Priors from the calibration for the first effects of each hypothesis."""
+        self.begins: Nuisances | None = None
+        """Elastic states at the start of each part of the record."""
 
     @property
     def motion(self) -> Motion:
@@ -203,6 +207,23 @@ class Estimator:
             leg = np.searchsorted(turns, self.data.runs[self.index], "right")
             columns += [np.where(leg == each, columns[0], 0.0) for each in range(1, len(turns) + 1)]
         return self.weighted(np.column_stack(columns))
+
+    def begins_of(self, effects: Sequence[Effect]) -> Nuisances | None:
+        """Returns a column for the elastic state at the start of each part: half of what it can change.
+
+        The state is anywhere between those of a saturated start either way. None without a loop.
+        """
+        full, loops = self.data.full, [each for each in effects if each.tracker().memory_deg > 0.0]
+        columns = []
+        for chain in full.chains[:MOST_PARTS]:
+            motion, change = full.along(chain), np.zeros(len(full))
+            for each in loops:
+                ends = [each.predict(motion, start) for start in (Start.FORWARD, Start.BACKWARD)]
+                change[chain.rows] += 0.5 * (ends[0] - ends[1])
+            if np.any(change):
+                columns.append(self.at_points(change))
+        names = tuple(f"state {each}" for each in range(len(columns)))
+        return Nuisances(np.stack(columns, axis=1), names, (Prior(0.0, 1.0),) * len(names)) if columns else None
 
     def free_loop(self, start: Start) -> Nuisances:
         """Returns a free-form hysteresis: stop operators of `STOPS_DEG`, which form any loop shape."""
@@ -297,6 +318,8 @@ class Estimator:
     def _nuisances(self, hypothesis: Hypothesis) -> Nuisances:
         """Returns the columns of the zeros and of the hypothesis's own nuisances."""
         own = zeros(self.zero, self.data.full.zeros)
+        if self.begins is not None:
+            own = own.and_also(self.begins)
         return own if hypothesis.nuisances is None else own.and_also(hypothesis.nuisances)
 
     def _sign(self, effect: Effect) -> float:

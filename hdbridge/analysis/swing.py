@@ -33,6 +33,8 @@ HERTZ = np.geomspace(0.4 * ORDINARY_HZ, 16.0 * ORDINARY_HZ, 23)
 DAMPING = (0.05, 0.2, 0.5)
 """Natural frequencies and damping ratios that are tried, before a refinement."""
 MOST_DAMPED = 0.9
+RESOLVED = 4.0
+"""Number of samples in a wave from which a spline follows it."""
 REFINED = 40
 """Number of trials of the refinement."""
 LONGEST = 20_000
@@ -144,40 +146,49 @@ def without(data: Observed, found: Swing) -> Observed:
     return replace(data, full=full, points=averaged(full, data.runs))
 
 
-def settled(estimator: Estimator, fitted: Fitted, hertz: float) -> Observed:
+def settled(estimator: Estimator, fitted: Fitted, found: Swing | None) -> Observed:
     """Returns the data without the samples in which more of the swing is unknown than matters.
 
-    The error of a swing scales with the wind-up at its frequency, by the motor's acceleration and by that of
-    the gear's error. Its share is regressed on the squares of the residual in motion. If too few samples
-    are left, they all stay, with that error in their noise.
+    The error of a ``found`` swing scales with the wind-up. Its share is regressed on the squares of the
+    residual in motion. Nothing is known of waves of the gear's error that are too fast for the sampling.
+    The calmest samples always stay, with these errors in their noise.
     """
     data, weight = estimator.data, estimator.weight
-    size_arcsec = _shaken(data.full, fitted.hypothesis.effects, data.period_s) / (math.tau * hertz) ** 2
+    hertz = ORDINARY_HZ if found is None else found.frequency_hz
+    wind_up = _accelerated(data.full, data.period_s) / (math.tau * hertz) ** 2
     moving = (data.points.speed_deg_s != 0.0)[estimator.index]
-    square, size = (fitted.residual / weight)[moving] ** 2, estimator.at_points(size_arcsec**2)[moving]
+    square, size = (fitted.residual / weight)[moving] ** 2, estimator.at_points(wind_up**2)[moving]
     about = size - np.mean(size) if len(size) else size
     share = min(max(float(about @ square) / max(float(about @ about), 1e-300), 0.0), 1.0)
-    unknown, full = math.sqrt(share) * size_arcsec, data.full
-    usable = full.usable & (unknown <= estimator.scales.floor_arcsec)
-    if np.all(usable == full.usable):
+    unknown = math.sqrt(share) * wind_up
+    if found is not None:
+        unknown = np.hypot(unknown, _aliased(data.full, fitted.hypothesis.effects, data.period_s, found))
+    most = max(estimator.scales.floor_arcsec, float(np.quantile(unknown[data.full.usable], LEAST_SETTLED)))
+    usable = data.full.usable & (unknown <= most)
+    if np.all(usable == data.full.usable):
         return data
-    if np.mean(usable) >= LEAST_SETTLED:
-        full = replace(full, usable=usable)
-    else:
-        full = replace(full, sigma_arcsec=np.hypot(full.sigma_arcsec, unknown))
+    full = replace(data.full, usable=usable, sigma_arcsec=np.hypot(data.full.sigma_arcsec, unknown))
     return replace(data, full=full, points=averaged(full, data.runs))
 
 
-def _shaken(full: Samples, effects: Sequence[Effect], period_s: float) -> FloatArray:
+def _accelerated(full: Samples, period_s: float) -> FloatArray:
     """Returns the largest acceleration of the base from one sample after to `SETTLE_S` before each, (n,)."""
-    motion, rows = full.motion, max(1, round(SETTLE_S / period_s))
-    orders = [each for effect in effects if effect.part is Part.ORDERS for each in effect.waves()]
-    curved = math.sqrt(sum((amplitude * (turns * math.tau) ** 2) ** 2 for turns, amplitude, _ in orders))
-    assert motion.motor_acceleration_deg_s2 is not None
-    by_motor = ARCSEC_PER_DEG / full.ratio * np.abs(motion.motor_acceleration_deg_s2)
-    size = np.hypot(by_motor, curved * (full.speed_deg_s / DEG_PER_TURN) ** 2)
+    size, rows = full.motion.motor_acceleration_deg_s2, max(1, round(SETTLE_S / period_s))
+    assert size is not None
     result = np.empty(len(full))
     for each in full.chains:
         known = min(rows, each.rows.stop - each.rows.start)
-        result[each.rows] = maximum_filter1d(size[each.rows], known + 2, origin=known // 2, mode="nearest")
+        part = np.abs(size[each.rows]) / full.ratio * ARCSEC_PER_DEG
+        result[each.rows] = maximum_filter1d(part, known + 2, origin=known // 2, mode="nearest")
     return result
+
+
+def _aliased(full: Samples, effects: Sequence[Effect], period_s: float, found: Swing) -> FloatArray:
+    """Returns the standard deviation of the swing in waves with less than `RESOLVED` samples each, (n,)."""
+    turns_s, variance = np.abs(full.speed_deg_s) / DEG_PER_TURN, np.zeros(len(full))
+    for turns, amplitude, _ in (each for effect in effects if effect.part is Part.ORDERS for each in effect.waves()):
+        fast = turns * turns_s * period_s * RESOLVED > 1.0
+        ratio2 = (turns * turns_s[fast] / found.frequency_hz) ** 2
+        gain2 = ratio2**2 / ((1.0 - ratio2) ** 2 + 4.0 * found.damping**2 * ratio2)
+        variance[fast] += 0.5 * amplitude**2 * gain2
+    return np.sqrt(variance)
