@@ -88,7 +88,7 @@ def _loop(
     change = _change(estimator, precise, place, given)
     peak = 0.5 * float(np.ptp(change))
     lawless = _lawless_arcsec(estimator, fitted)
-    small = peak < scales.floor_arcsec or strain(precise, usual, spread) < scales.calibrations**2
+    small = peak < estimator.floor_arcsec or strain(precise, usual, spread) < scales.calibrations**2
     causes = causes_of(given, precise.hypothesis.effects[place])
     if (small and not lawless) or not causes:
         return None
@@ -139,7 +139,7 @@ def _orders(
         number = round(new.waves()[0][0]) if new.waves() else 0
         share = math.prod(each.left_in_mean(number) for each in fitted.hypothesis.effects)
         part = next(each for each in usual if str(named.columns[0]) in each.parameters).times(share)
-        large = float(np.linalg.norm(after - share * before)) >= scales.floor_arcsec
+        large = float(np.linalg.norm(after - share * before)) >= estimator.floor_arcsec
         if large and strain(fitted, part, spread) >= scales.calibrations**2:
             changed.append((old, new))
             own += [columns[each] for each in named.columns]
@@ -176,7 +176,7 @@ def _freed(
         return None
     change = _change(estimator, precise, place, given)
     peak = 0.5 * float(np.ptp(change))
-    if peak < estimator.scales.floor_arcsec:
+    if peak < estimator.floor_arcsec:
         return None
     aliases = tuple(search.instead_of_change(fitted, place, given))
     return _finding(

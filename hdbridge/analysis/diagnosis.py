@@ -196,7 +196,7 @@ class _Judge:
             identifiability=visible,
             capability=capability(estimator.data, given, visible, estimator.scales),
             by_kind=self._by_kind(before, after),
-            remarks=estimator.data.remarks,
+            remarks=(*estimator.data.remarks, *([judged.left.remark] if judged.left.remark else [])),
             model=extended,
             traces=Traces(
                 measured_arcsec=measured,
@@ -367,6 +367,8 @@ class _Judge:
             note = f"the loop has another shape than either law: {left.arcsec:.2g} arcsec rms are left"
             told = replace(loops[0], note=note, lives_in=lives)
             return [told if each is loops[0] else each for each in findings]
+        if size < self.estimator.floor_arcsec:
+            return findings
         largest = max((each.peak_arcsec for each in findings), default=0.0)
         return [*findings, unknown] if largest > size else [unknown, *findings]
 

@@ -5,6 +5,7 @@ The baseline is refitted with every candidate, so nothing that the baseline can 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -145,6 +146,11 @@ class Estimator:
     def rare(self) -> float:
         """Tail share of the record that is excluded at either end when a span is measured."""
         return self.scales.rare / max(len(self.data.full), SHORT)
+
+    @property
+    def floor_arcsec(self) -> float:
+        """Smallest peak that matters: a compensation acts in counts of the motor."""
+        return max(self.scales.floor_arcsec, self.data.motor_count_arcsec / math.sqrt(12.0))
 
     def half_span(self, values: FloatArray) -> float:
         """Returns half the span of values without the rare extremes."""

@@ -167,7 +167,7 @@ class Search:
         }
         toll = {each: self.scales.penalty * len(fitted.places(each)) + self.scales.enter for each in gains}
         place = min(gains, key=lambda each: gains[each] - toll[each])
-        small = self.peak(fitted, place) < self.scales.floor_arcsec
+        small = self.peak(fitted, place) < self.estimator.floor_arcsec
         # The error of a large effect's law resembles a small effect of the same kind.
         alike = [each for each in gains if each != place and effects[each].name == effects[place].name]
         share = effects[place].inexact * max((gains[each] for each in alike), default=0.0)
@@ -221,7 +221,7 @@ class Search:
 
     def _too_small(self, trial: Fitted, cause: str) -> bool:
         """Returns True if the last effect of this name is below the floor of practical relevance."""
-        return self.peak(trial, _last(trial, cause)) < self.scales.floor_arcsec
+        return self.peak(trial, _last(trial, cause)) < self.estimator.floor_arcsec
 
     def _refusal(self, trial: Fitted, cause: str, as_alias: bool = False) -> str:
         """Returns the reason to reject the last effect of this name, or an empty string.

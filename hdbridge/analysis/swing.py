@@ -21,7 +21,7 @@ from scipy.optimize import minimize
 from hdbridge.analysis.driving import SETTLE_S
 from hdbridge.analysis.hypothesis import Estimator, Fitted
 from hdbridge.analysis.linear import about_zeros
-from hdbridge.analysis.prepared import LEAST_SETTLED, Observed, Samples, averaged
+from hdbridge.analysis.prepared import Observed, Samples, averaged
 from hdbridge.analysis.scales import Scales
 from hdbridge.axis.effects import Effect, FloatArray, Part, Start
 from hdbridge.units import ARCSEC_PER_DEG, DEG_PER_TURN
@@ -33,6 +33,10 @@ HERTZ = np.geomspace(0.4 * ORDINARY_HZ, 16.0 * ORDINARY_HZ, 23)
 DAMPING = (0.05, 0.2, 0.5)
 """Natural frequencies and damping ratios that are tried, before a refinement."""
 MOST_DAMPED = 0.9
+USUALLY_DAMPED = 0.2
+"""Damping ratio of a swing that is too fast for the sampling to show it."""
+CALMEST = 0.05
+"""Share of a record that is always used."""
 RESOLVED = 4.0
 """Number of samples in a wave from which a spline follows it."""
 REFINED = 40
@@ -163,7 +167,7 @@ def settled(estimator: Estimator, fitted: Fitted, found: Swing | None) -> Observ
     unknown = math.sqrt(share) * wind_up
     if found is not None:
         unknown = np.hypot(unknown, _aliased(data.full, fitted.hypothesis.effects, data.period_s, found))
-    most = max(estimator.scales.floor_arcsec, float(np.quantile(unknown[data.full.usable], LEAST_SETTLED)))
+    most = max(estimator.scales.floor_arcsec, float(np.quantile(unknown[data.full.usable], CALMEST)))
     usable = data.full.usable & (unknown <= most)
     if np.all(usable == data.full.usable):
         return data
@@ -186,9 +190,11 @@ def _accelerated(full: Samples, period_s: float) -> FloatArray:
 def _aliased(full: Samples, effects: Sequence[Effect], period_s: float, found: Swing) -> FloatArray:
     """Returns the standard deviation of the swing in waves with less than `RESOLVED` samples each, (n,)."""
     turns_s, variance = np.abs(full.speed_deg_s) / DEG_PER_TURN, np.zeros(len(full))
+    seen = found.frequency_hz * period_s * RESOLVED < 1.0
+    damping = found.damping if seen else min(found.damping, USUALLY_DAMPED)
     for turns, amplitude, _ in (each for effect in effects if effect.part is Part.ORDERS for each in effect.waves()):
         fast = turns * turns_s * period_s * RESOLVED > 1.0
         ratio2 = (turns * turns_s[fast] / found.frequency_hz) ** 2
-        gain2 = ratio2**2 / ((1.0 - ratio2) ** 2 + 4.0 * found.damping**2 * ratio2)
+        gain2 = ratio2**2 / ((1.0 - ratio2) ** 2 + 4.0 * damping**2 * ratio2)
         variance[fast] += 0.5 * amplitude**2 * gain2
     return np.sqrt(variance)

@@ -59,6 +59,8 @@ class Rest:
     """Coordinate on which it depends most; time if none."""
     seen: bool
     """True if that dependence passes the criteria for a cause, apart from the reversals."""
+    remark: str
+    """Dependence that passes them, too, but is too small to act on; empty if there is none."""
 
 
 class _View(NamedTuple):
@@ -78,7 +80,7 @@ def rest(estimator: Estimator, fitted: Fitted) -> Rest:
     apart = ~near & (estimator.data.points.speed_deg_s != 0.0)[estimator.index]
     if np.count_nonzero(apart) < FEW:
         apart[:] = True
-    seen = _seen(estimator, fitted, apart, _views(estimator, residual, apart))
+    seen, small = _seen(estimator, fitted, apart, _views(estimator, residual, apart))
     views = seen or _views(estimator, residual, np.ones_like(apart))
     best = max((_View(0.0, "time", np.zeros(1)), *views), key=lambda each: each.gain)
     return Rest(
@@ -90,6 +92,7 @@ def rest(estimator: Estimator, fitted: Fitted) -> Rest:
         _standing(estimator, residual),
         best.name,
         bool(seen),
+        small,
     )
 
 
@@ -228,31 +231,42 @@ def _views(estimator: Estimator, residual: FloatArray, rows: BoolArray) -> Itera
                 yield _View(gain, f"{name} and direction" if both else name, told)
 
 
-def _seen(estimator: Estimator, fitted: Fitted, rows: BoolArray, views: Iterable[_View]) -> list[_View]:
-    """Returns the views that pass the criteria for a cause and are large enough to be reported."""
-    scales, start = estimator.scales, fitted.hypothesis.start
-    weight, step_arcsec = estimator.weight[rows], 0.5 * _angle_step_arcsec(estimator)
-    gain, peak = scales.enter + scales.penalty, float(np.hypot(scales.plain_arcsec, step_arcsec))
+def _seen(
+    estimator: Estimator, fitted: Fitted, rows: BoolArray, views: Iterable[_View]
+) -> tuple[list[_View], str]:
+    """Returns the views that pass the criteria for a cause and are large enough to be reported.
+
+    If there are none, a remark on the best one that is too small to act on: below a count of the motor.
+    """
+    scales, start, weight = estimator.scales, fitted.hypothesis.start, estimator.weight[rows]
+    count_arcsec = estimator.data.motor_count_arcsec
+    gain, peak = scales.enter + scales.penalty, max(scales.plain_arcsec, count_arcsec)
     laws = [each for each in fitted.hypothesis.effects if each.part is None]
     for law in laws:  # the larger its contribution, the larger the error of its formula
         does = estimator.columns(law, start)[rows] @ law.coefficients()
         gain = max(gain, scales.alias * len(does) * float(np.var(weight * does)))
         peak = max(peak, scales.plain_arcsec + math.sqrt(scales.alias) * estimator.half_span(does))
-    large = [
-        each for each in views if each.gain >= gain and estimator.half_span(each.predicted_arcsec) >= peak
-    ]
-    if not large:
-        return []
+    views = sorted((each for each in views if each.gain >= gain), key=lambda each: -each.gain)
+    if not views:
+        return [], ""
     tangent, residual = fitted.tangent[rows], fitted.residual[rows]
     known = np.vstack([fitted.linearised.known, np.zeros(2)])
     discrepancies = law_discrepancies(estimator, fitted.hypothesis)
 
-    def robust(view: _View) -> float:
+    def passes(view: _View) -> bool:
         columns = np.column_stack([tangent, weight * view.predicted_arcsec])
         fit = Linearised(columns, residual, known)
-        return block_robust(estimator, fit, [fitted.count()], np.zeros(1), rows, discrepancies)
+        own = [fitted.count()]
+        return block_robust(estimator, fit, own, np.zeros(1), rows, discrepancies) > scales.robust
 
-    return [each for each in large if robust(each) > scales.robust]
+    sizes = [estimator.half_span(each.predicted_arcsec) for each in views]
+    seen = [each for each, size in zip(views, sizes, strict=True) if size >= peak and passes(each)]
+    if seen or not passes(views[0]):
+        return seen, ""
+    return [], (
+        f"{sizes[0]:.2g} arcsec beyond the noise depend on {views[0].name}, less than matters on this axis: "
+        f"{peak:.2g} arcsec, for a motor count is {count_arcsec:.2g}"
+    )
 
 
 def _standing(estimator: Estimator, residual: FloatArray) -> float:
