@@ -191,7 +191,7 @@ class _Judge:
             baseline=_figures(before),
             refitted=_figures(refitted.residual / estimator.weight),
             extended=_figures(after),
-            noise_floor_arcsec=float(np.sqrt(np.mean(estimator.weight**-2.0))),
+            noise_floor_arcsec=estimator.data.noise_arcsec,
             findings=tuple(findings),
             identifiability=visible,
             capability=capability(estimator.data, given, visible, estimator.scales),

@@ -149,8 +149,12 @@ class Estimator:
 
     @property
     def floor_arcsec(self) -> float:
-        """Smallest peak that matters: a compensation acts in counts of the motor."""
-        return max(self.scales.floor_arcsec, self.data.motor_count_arcsec / math.sqrt(12.0))
+        """Smallest peak that matters: a compensation acts in counts of the motor, and a reading shows it."""
+        return max(
+            self.scales.floor_arcsec,
+            self.data.motor_count_arcsec / math.sqrt(12.0),
+            0.5 * self.data.noise_arcsec,
+        )
 
     def half_span(self, values: FloatArray) -> float:
         """Returns half the span of values without the rare extremes."""

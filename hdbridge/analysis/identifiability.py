@@ -75,7 +75,7 @@ def identifiability(
             continue
         limit = max(
             INFLATION * math.sqrt(estimator.scales.penalty * rest.shape[1] + estimator.scales.enter) / size,
-            estimator.scales.floor_arcsec,
+            estimator.floor_arcsec,
         )
         own = [*type(example).proposals(estimator.data, ())]  # any of them may be the one
         waves = set(waves_alike(estimator, own, fitted.hypothesis.start))

@@ -315,6 +315,8 @@ class Observed:
     """First sample of each point's run, shape (points,)."""
     motor_count_arcsec: float
     """One count of the motor encoder at the load; if none is visible, the count with equal jitter."""
+    noise_arcsec: float
+    """White noise of a point."""
     period_s: float
     """Median time between samples."""
     standstill: bool
@@ -381,14 +383,16 @@ def gather(
     full = replace(full, usable=usable if np.mean(usable) >= LEAST_SETTLED else np.ones_like(usable))
     steps = np.diff(time)
     period_s = float(np.median(steps[steps > 0])) if np.any(steps > 0) else 1.0
-    full = replace(full, sigma_arcsec=np.hypot(full.sigma_arcsec, rounded_at_rest(full, period_s)))
     runs = _runs(len(time), record.starts)
+    noise_arcsec = float(np.sqrt(np.mean(averaged(full, runs).sigma_arcsec ** 2)))
+    full = replace(full, sigma_arcsec=np.hypot(full.sigma_arcsec, rounded_at_rest(full, period_s)))
     return Observed(
         ratio=ratio,
         points=averaged(full, runs),
         full=full,
         runs=runs,
         motor_count_arcsec=full.reading.resolution_deg / ratio * ARCSEC_PER_DEG,
+        noise_arcsec=noise_arcsec,
         period_s=period_s,
         standstill=standstill,
         reversals=turns,

@@ -105,8 +105,7 @@ def is_unexplained(estimator: Estimator, left: Rest) -> bool:
     counts = data.motor_count_arcsec / np.sqrt(12.0)
     # If command and standstill separate noise and following error from the gear, fast residuals count.
     if data.full.commanded and data.standstill:
-        floor = float(np.sqrt(np.mean(1.0 / estimator.weight**2)))
-        if left.fast_arcsec > np.hypot(max(scales.plain_arcsec, floor), left.standing_arcsec):
+        if left.fast_arcsec > np.hypot(max(scales.plain_arcsec, data.noise_arcsec), left.standing_arcsec):
             return True
     return bool(left.arcsec > np.linalg.norm((scales.plain_arcsec, counts, left.standing_arcsec)))
 
