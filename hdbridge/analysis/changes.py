@@ -8,20 +8,20 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 
 from hdbridge.analysis.acceptance import gate_of_change
 from hdbridge.analysis.calibrated import CalibratedPart, calibrated, variances
 from hdbridge.analysis.findings import UNWEIGHED, Finding, Parameter, next_experiment
-from hdbridge.analysis.gain import held_out, held_out_change
+from hdbridge.analysis.gain import held_out
 from hdbridge.analysis.hypothesis import Estimator, Fitted
 from hdbridge.analysis.linear import Column
 from hdbridge.analysis.parameters import named_parameters, parameters_of
 from hdbridge.analysis.search import Search, together
 from hdbridge.analysis.unexplained import near_reversals
-from hdbridge.axis.effects import CATALOGUE, Effect, FloatArray, IntArray, Part, Start
+from hdbridge.axis.effects import CATALOGUE, Effect, FloatArray, Part, Start
 from hdbridge.axis.model import TransmissionModel
 
 
@@ -37,25 +37,72 @@ def findings(
     parts = calibrated(
         model.effects, {}, lambda effect: estimator.columns(effect, Start.VIRGIN), estimator.scales
     )
+    plain = estimator.fit(replace(fitted.hypothesis, nuisances=None))
     result: list[Finding | None] = []
     for place, given in enumerate(model.effects):
         usual = [each for each in parts if each.place == place]
+        change: _Change | None = None
         if given.part is Part.LOOP:
             if estimator.data.reversals >= 2:  # a loop shows only where the axis reverses
                 same = type(given) is type(precise.hypothesis.effects[place])
-                law = _loop(search, fitted, precise, usual[0], given, spread) if same else None
-                result.append(law if same else _another_law(search, fitted, precise, place, given, spread))
+                change = (
+                    _loop(search, fitted, precise, usual[0], given, spread)
+                    if same
+                    else _another_law(search, fitted, precise, place, given, spread)
+                )
         elif given.part is Part.ORDERS:
-            result.append(_orders(estimator, precise, usual, given, spread) if usual else None)
+            change = _orders(estimator, precise, usual, given, spread) if usual else None
         else:
-            result.append(_freed(search, fitted, precise, place, given, spread))
+            change = _freed(search, fitted, precise, place, given, spread)
+        if change is not None:
+            result.append(_finding(search, plain, fitted, place, given, change))
     return [each for each in result if each is not None]
+
+
+class _Change(NamedTuple):
+    effect: Effect
+    peak_arcsec: float
+    parameters: Mapping[str, Parameter]
+    note: str
+    aliases: tuple[str, ...] = ()
+    taken_arcsec: float = 0.0
+    left_alone: bool = False
+
+
+def _finding(
+    search: Search, fitted: Fitted, loose: Fitted, place: int, given: Effect, change: _Change
+) -> Finding | None:
+    """Judges a change as any other cause: by evidence that is robust and by its gain on held-out data.
+
+    Both compare a fit with one that has the part as ``given``. The evidence is that of the ``loose`` fit,
+    which may have a loop of free form, unlike a model. None if the evidence is not enough.
+    """
+    estimator, name = search.estimator, change.effect.name
+
+    def as_given(fit: Fitted) -> Fitted:
+        now = fit.hypothesis.effects[place]
+        if type(now) is type(given):
+            return search.with_given(fit, place, given)
+        return estimator.fit(fit.hypothesis.instead(place, type(given)(**change.effect.parameters())))
+
+    as_it_was = as_given(loose)
+    gate = gate_of_change(estimator, loose, as_it_was)
+    if gate.reason:
+        search.refusals[name] = gate.reason
+        return None
+    without = as_given(fitted)
+    return Finding(
+        name, UNWEIGHED, change.aliases, change.parameters, held_out(estimator, fitted, without),
+        next_experiment(name, change.aliases), change.peak_arcsec,
+        robust=as_it_was.chi_square - loose.chi_square, taken_arcsec=change.taken_arcsec,
+        left_alone=change.left_alone, within=True, note=change.note, effect=change.effect, gate=gate,
+    )  # fmt: skip
 
 
 def _another_law(
     search: Search, fitted: Fitted, precise: Fitted, place: int, given: Effect, spread: FloatArray
-) -> Finding | None:
-    """Returns a finding if another hysteresis law fits better than the ``given`` one."""
+) -> _Change | None:
+    """Returns a change if another hysteresis law fits better than the ``given`` one."""
     estimator, now = search.estimator, precise.hypothesis.effects[place]
     scales = estimator.scales
     causes = causes_of(given, now)
@@ -64,14 +111,7 @@ def _another_law(
     gain = old.chi_square - fitted.chi_square
     if gain < scales.enter + scales.penalty or peak < scales.plain_arcsec or not causes:
         return None
-    if reason := gate_of_change(estimator, fitted, old).reason:
-        search.refusals[causes[0].name] = reason
-        return None
-    name, parameters = causes[0].name, parameters_of(estimator, precise, place, spread)
-    return Finding(
-        name, UNWEIGHED, (), parameters, held_out(estimator, fitted, old), next_experiment(name, ()), peak,
-        robust=gain, effect=causes[0],
-    )  # fmt: skip
+    return _Change(causes[0], peak, parameters_of(estimator, precise, place, spread), "")
 
 
 def _loop(
@@ -81,8 +121,8 @@ def _loop(
     usual: CalibratedPart,
     given: Effect,
     spread: FloatArray,
-) -> Finding | None:
-    """Returns a finding if the loop's parameters have changed, or its shape matches neither law."""
+) -> _Change | None:
+    """Returns a change if the loop's parameters have changed, or its shape matches neither law."""
     estimator, place = search.estimator, usual.place
     scales = estimator.scales
     change = _change(estimator, precise, place, given)
@@ -92,18 +132,18 @@ def _loop(
     causes = causes_of(given, precise.hypothesis.effects[place])
     if (small and not lawless) or not causes:
         return None
-    if reason := gate_of_change(estimator, fitted, search.with_given(fitted, place, given)).reason:
-        search.refusals[causes[0].name] = reason
-        return None
     # A loop that follows neither law exactly may follow the other one in part.
     laws = [kind.name for kind in CATALOGUE.values() if kind.part is Part.LOOP and kind.changes is Part.LOOP]
     residual, near = fitted.residual / estimator.weight, near_reversals(estimator, fitted)
     taken = float(np.mean(((residual + change - np.mean(change)) ** 2 - residual**2)[near]))
-    return _finding(
-        estimator, precise, precise.places(place), change, causes[0],
-        parameters_of(estimator, precise, place, spread), max(peak, lawless), tuple(laws) if lawless else (),
-        taken_arcsec=math.sqrt(max(taken, 0.0)), note="the baseline's own loop takes over the new parameters",
-    )  # fmt: skip
+    return _Change(
+        causes[0],
+        max(peak, lawless),
+        parameters_of(estimator, precise, place, spread),
+        "the baseline's own loop takes over the new parameters",
+        tuple(laws) if lawless else (),
+        taken_arcsec=math.sqrt(max(taken, 0.0)),
+    )
 
 
 def _apart_arcsec(estimator: Estimator, one: Fitted, other: Fitted) -> float:
@@ -125,8 +165,8 @@ def _lawless_arcsec(estimator: Estimator, fitted: Fitted) -> float:
 
 def _orders(
     estimator: Estimator, fitted: Fitted, usual: Sequence[CalibratedPart], given: Effect, spread: FloatArray
-) -> Finding | None:
-    """Returns a finding of the motor orders that have changed."""
+) -> _Change | None:
+    """Returns a change of the motor orders."""
     place, scales = usual[0].place, estimator.scales
     now = fitted.hypothesis.effects[place]
     columns = fitted.places(place)
@@ -155,19 +195,19 @@ def _orders(
         return None  # on an arc of their turn, orders can take any amplitude
     # The old value has the uncertainty of its calibration.
     apart = spread[np.ix_(own, own)] + np.diag(np.concatenate(known))
-    parameters = named_parameters(difference, [Column(0, str(i)) for i in range(len(own))], apart)
-    return _finding(
-        estimator, fitted, np.array(own),
-        estimator.columns(difference, fitted.hypothesis.start) @ difference.coefficients(),
-        causes[0], parameters, difference.bound_arcsec(), tuple(each.name for each in causes[1:]),
-        note="a change of orders that the model has: its synchronous part takes it over",
-    )  # fmt: skip
+    return _Change(
+        causes[0],
+        difference.bound_arcsec(),
+        named_parameters(difference, [Column(0, str(i)) for i in range(len(own))], apart),
+        "a change of orders that the model has: its synchronous part takes it over",
+        tuple(each.name for each in causes[1:]),
+    )
 
 
 def _freed(
     search: Search, fitted: Fitted, precise: Fitted, place: int, given: Effect, spread: FloatArray
-) -> Finding | None:
-    """Returns a finding for another part that the data pull out of its calibration.
+) -> _Change | None:
+    """Returns a change of another part that the data pull out of its calibration.
 
     See `hdbridge.analysis.calibrated`.
     """
@@ -179,34 +219,19 @@ def _freed(
     if peak < estimator.floor_arcsec:
         return None
     aliases = tuple(search.instead_of_change(fitted, place, given))
-    return _finding(
-        estimator, precise, own, change, precise.hypothesis.effects[place],
-        parameters_of(estimator, precise, place, spread), peak, aliases,
-        left_alone=bool(aliases), note="a change of what the model has: " + (
+    return _Change(
+        precise.hypothesis.effects[place],
+        peak,
+        parameters_of(estimator, precise, place, spread),
+        "a change of what the model has: "
+        + (
             "it is left as it was, for the record does not distinguish it from another cause"
-            if aliases else "its own parameters take it over"
+            if aliases
+            else "its own parameters take it over"
         ),
-    )  # fmt: skip
-
-
-def _finding(
-    estimator: Estimator,
-    fitted: Fitted,
-    own: IntArray,
-    change_arcsec: FloatArray,
-    effect: Effect,
-    parameters: Mapping[str, Parameter],
-    peak_arcsec: float,
-    aliases: tuple[str, ...],
-    **more: Any,
-) -> Finding:
-    """Returns the finding that the columns ``own`` of a fit have changed by ``change_arcsec``, (m,)."""
-    weighted = estimator.weight * (change_arcsec - np.mean(change_arcsec))
-    return Finding(
-        effect.name, UNWEIGHED, aliases, parameters, held_out_change(estimator, fitted, own, change_arcsec),
-        next_experiment(effect.name, aliases), peak_arcsec, robust=float(weighted @ weighted), effect=effect,
-        **more,
-    )  # fmt: skip
+        aliases,
+        left_alone=bool(aliases),
+    )
 
 
 def _change(estimator: Estimator, fitted: Fitted, place: int, given: Effect) -> FloatArray:

@@ -160,7 +160,6 @@ class _Judge:
     def of(self, fitted: Fitted) -> Diagnosis:
         """Turns the result of the search into a diagnosis."""
         estimator, given = self.estimator, self.model.effects
-        base = len(given)
         fitted = self.search.eliminated(fitted, self._stopped, self.considered)
         fitted = self.search.eliminated(fitted, self._shadow, self.considered)
         fitted = with_measured(self.search, fitted)
@@ -172,15 +171,7 @@ class _Judge:
         self.considered.extend(each for each in refused if each.split(":")[0] not in known)
         findings = self._with_unexplained(findings, judged.left)
         refitted = estimator.fit(Hypothesis(given, fitted.hypothesis.start))
-        fitted = as_named(estimator, fitted, given, {each.cause for each in findings})
-        spread = covariance(estimator, fitted)
-        alone = {each.cause for each in findings if each.left_alone}
-        sound = supported(estimator, fitted, given, alone)
-        fitted = replace(fitted, hypothesis=replace(fitted.hypothesis, effects=sound))
-        named = {each.cause for each in findings if not each.within}
-        chosen = [place for place in range(base, len(sound)) if sound[place].name in named]
-        reason = "diagnosis: " + (", ".join(each.cause for each in findings) or "nothing found, refitted")
-        extended = extended_model(self.model, fitted, chosen, spread, reason, base)
+        fitted, findings, extended = self._written(fitted, findings)
         # Residual of the given model from the best-fitting elastic start.
         each_start = (self._left_by(given, start) for start in Start)
         before = min(each_start, key=lambda error: float(error @ error))
@@ -211,6 +202,32 @@ class _Judge:
             considered=tuple(dict.fromkeys(self.considered)),
             scales=estimator.scales,
         )
+
+    def _written(
+        self, fitted: Fitted, findings: list[Finding]
+    ) -> tuple[Fitted, list[Finding], TransmissionModel]:
+        """Returns the extended model, its fit, and the findings that it contains.
+
+        A finding that cannot be written is none: its parameters are out of bounds, the compensation could not
+        invert the model with it, or the record does not determine it.
+        """
+        estimator, given = self.estimator, self.model.effects
+        while True:
+            as_reported = as_named(estimator, fitted, given, {each.cause for each in findings})
+            alone = {each.cause for each in findings if each.left_alone}
+            spread = covariance(estimator, as_reported)
+            sound = supported(estimator, as_reported, given, alone)
+            as_reported = replace(as_reported, hypothesis=replace(as_reported.hypothesis, effects=sound))
+            named = {each.cause for each in findings if not each.within}
+            chosen = [place for place in range(len(given), len(sound)) if sound[place].name in named]
+            reason = "diagnosis: " + (", ".join(each.cause for each in findings) or "nothing found, refitted")
+            extended = extended_model(self.model, as_reported, chosen, spread, reason, len(given))
+            changed = [new for new in extended.effects if new not in given]
+            missing = [each for each in findings if not (each.left_alone or _is_in(each, changed))]
+            if not missing:
+                return as_reported, findings, extended
+            self.considered.extend(f"{each.cause}: it cannot be written into the model" for each in missing)
+            findings = [each for each in findings if each not in missing]
 
     def _stopped(self, fitted: Fitted) -> tuple[int, str] | None:
         """Returns the weakest cause that fails its gate, else an implausible or unidentifiable one."""
@@ -393,6 +410,15 @@ class _Judge:
             for name, rows in masks.items()
             if np.count_nonzero(rows) > 10
         }
+
+
+def _is_in(finding: Finding, changed: Sequence[Effect]) -> bool:
+    """Returns True if these effects, which differ from those of the given model, contain the finding."""
+    effect = finding.effect
+    if effect is None:  # something unexplained
+        return True
+    part = effect.changes or effect.part
+    return any(each.name == effect.name or (part is not None and each.part is part) for each in changed)
 
 
 def _ordinary(finding: Finding) -> bool:

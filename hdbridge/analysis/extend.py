@@ -62,11 +62,9 @@ def extended_model(
     chosen = [*range(base), *places]
     for place in places:
         effect = fitted.hypothesis.effects[place].tidied(ratio)
-        if effect.violations():
-            continue
-        effects = extended(effects, effect)
-    if conflicts(effects, model.ratio):
-        effects = tuple(each.tidied(ratio) for each in fitted.hypothesis.effects[:base])
+        more = extended(effects, effect)
+        if not (effect.violations() or conflicts(more, ratio)):
+            effects = more
     kept = {each.name for each in effects}
     for place in chosen:
         effect = fitted.hypothesis.effects[place]

@@ -139,6 +139,8 @@ class Finding:
     left_alone: bool = False
     """True if either a part of the model has changed or another cause is present: the model keeps its
     part."""
+    within: bool = False
+    """True for a change of a part of the model."""
     lives_in: str = ""
     """Coordinate on which an unexplained residual depends."""
     note: str = ""
@@ -147,7 +149,7 @@ class Finding:
     effect: Effect | None = field(default=None, repr=False)
     """Effect to add to the model."""
     gate: Gate | None = field(default=None, repr=False)
-    """Evidence for it; None for a change within the model."""
+    """Evidence for it; None for an unexplained residual."""
     terms: Mapping[str, float] = field(default_factory=dict, repr=False)
     """Terms of the probability formula."""
 
@@ -170,9 +172,9 @@ class Finding:
         } | {name: each for name, each in words.items() if each}
 
     @property
-    def within(self) -> bool:
-        """True for a change of a part of the model."""
-        return self.gate is None and self.cause != "unexplained"
+    def gains(self) -> bool:
+        """True if what is written of it predicts data that were held out better than the model does."""
+        return self.gain is not None and self.gain.recovered > 0.0 and not self.left_alone
 
     def refusal(self) -> str:
         """Returns the reason not to offer it as an improvement of the model; empty if there is none."""

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from hdbridge.analysis.hypothesis import Estimator, Fitted
-from hdbridge.analysis.linear import Linearised, counted, of_number, steps_without
+from hdbridge.analysis.linear import counted, of_number, steps_without
 from hdbridge.analysis.noise import White
-from hdbridge.axis.effects import FloatArray, IntArray
+from hdbridge.axis.effects import FloatArray
 
 SURE = 2.0
 """Minimum significance of a gain, standard errors."""
@@ -76,29 +76,11 @@ OVER = "stretches of time"
 
 
 def held_out(estimator: Estimator, fitted: Fitted, without: Fitted) -> Gain | None:
-    """Leaves out stretches in turn; ``without`` is the fit without the effect in question.
+    """Leaves out stretches in turn; ``without`` is the fit without the effect or the change in question.
 
     None if the record is too short.
     """
-    return _gain(estimator, without.linearised, fitted.linearised)
-
-
-def held_out_change(
-    estimator: Estimator, fitted: Fitted, columns: IntArray, change_arcsec: FloatArray
-) -> Gain | None:
-    """Tests a change within the model's own parts by leaving out stretches in turn.
-
-    In the comparison these ``columns`` of the tangent keep their given values, and everything else is
-    refitted; ``change_arcsec`` (m,) is the change.
-    """
-    after = fitted.linearised
-    kept = np.setdiff1d(np.arange(fitted.count()), columns)
-    given = after.residual + estimator.weight * change_arcsec
-    return _gain(estimator, replace(after.of(kept), residual=given), after)
-
-
-def _gain(estimator: Estimator, before: Linearised, after: Linearised) -> Gain | None:
-    """Computes the gain from two linearised fits."""
+    before, after = without.linearised, fitted.linearised
     stretch = counted(of_number(estimator.time_s, STRETCHES))
     fold = stretch % FOLDS
     samples = np.bincount(stretch).astype(np.float64)

@@ -233,7 +233,9 @@ class Estimator:
             if np.any(change):
                 columns.append(self.at_points(change))
         names = tuple(f"state {each}" for each in range(len(columns)))
-        return Nuisances(np.stack(columns, axis=1), names, (Prior(0.0, 1.0),) * len(names)) if columns else None
+        return (
+            Nuisances(np.stack(columns, axis=1), names, (Prior(0.0, 1.0),) * len(names)) if columns else None
+        )
 
     def free_loop(self, start: Start) -> Nuisances:
         """Returns a free-form hysteresis: stop operators of `STOPS_DEG`, which form any loop shape."""

@@ -416,8 +416,9 @@ def rounded_at_rest(full: Samples, period_s: float) -> FloatArray:
     common = math.hypot(
         mean_rounding(count, noise_deg) / full.ratio * ARCSEC_PER_DEG, mean_rounding(load_count, load_noise)
     )
-    rows, (_, place) = np.flatnonzero(still), np.unique(
-        np.round(full.motor_deg[still] / max(count, 1e-6)), return_inverse=True
+    rows, (_, place) = (
+        np.flatnonzero(still),
+        np.unique(np.round(full.motor_deg[still] / max(count, 1e-6)), return_inverse=True),
     )
     visit = counted(np.cumsum((np.diff(rows, prepend=-2) != 1) | (np.diff(place, prepend=-1) != 0)))
     length = np.minimum(np.bincount(visit), max(1.0, ONE_REST_S / period_s))
@@ -431,7 +432,9 @@ def mean_rounding(count: float, noise: float) -> float:
 
     It is the first harmonic of the rounding error, which the noise smooths; in the units of both.
     """
-    return count / (math.pi * math.sqrt(2.0)) * math.exp(-2.0 * (math.pi * noise / count) ** 2) if count else 0.0
+    return (
+        count / (math.pi * math.sqrt(2.0)) * math.exp(-2.0 * (math.pi * noise / count) ** 2) if count else 0.0
+    )
 
 
 def _kinds(time: FloatArray, legs: Sequence[Segment]) -> tuple[tuple[str, ...], IntArray]:

@@ -11,9 +11,11 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
-from hdbridge.analysis.acceptance import Gate
 from hdbridge.analysis.findings import Finding
 from hdbridge.analysis.scales import Scales
+
+UNPROVEN = 0.5
+"""Highest probability of a cause that does not predict data that were held out."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,7 +70,8 @@ def coefficients(scales: Scales) -> dict[str, float]:
 
 def features(finding: Finding, largest: float, context: Context, scales: Scales) -> dict[str, float]:
     """Returns the terms of the formula by name; ``largest`` is the chi square of the largest finding."""
-    gate = finding.gate or Gate(finding.robust, scales.robust)
+    gate = finding.gate
+    assert gate is not None, "only an unexplained residual has no gate"
     return {
         "constant": 1.0,
         "strength": math.log(min(max(gate.robust, 1e-9) / gate.needed, scales.strong)),
@@ -88,7 +91,8 @@ def weighed(
     for each in findings:
         terms = features(each, largest, context, scales)
         more = prior.log_odds(each.cause, scales) if prior else 0.0
-        found = replace(each, probability=probability(terms, scales, more), terms=terms)
+        likely = min(probability(terms, scales, more), 1.0 if each.gains else UNPROVEN)
+        found = replace(each, probability=likely, terms=terms)
         weighed.append(prior.narrowed(found) if prior else found)
     return weighed
 

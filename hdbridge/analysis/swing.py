@@ -120,7 +120,9 @@ def seen_swing(full: Samples, effects: Sequence[Effect], scales: Scales) -> Swin
         return float(weight[rows] @ about_zeros(residual, full.zero[rows], weight[rows]) ** 2)
 
     whole = slice(0, len(full))
-    errors = [sum((each.predict(full.motion, start) for each in effects), np.zeros(len(full))) for start in Start]
+    errors = [
+        sum((each.predict(full.motion, start) for each in effects), np.zeros(len(full))) for start in Start
+    ]
     error = min(errors, key=lambda each: cost(left(each, whole), whole))
     bend = bend_of(ARCSEC_PER_DEG / full.ratio * full.motor_deg + error, step_s, parts)
     size = np.concatenate([[0.0], np.cumsum(bend**2)])
@@ -192,7 +194,9 @@ def _aliased(full: Samples, effects: Sequence[Effect], period_s: float, found: S
     turns_s, variance = np.abs(full.speed_deg_s) / DEG_PER_TURN, np.zeros(len(full))
     seen = found.frequency_hz * period_s * RESOLVED < 1.0
     damping = found.damping if seen else min(found.damping, USUALLY_DAMPED)
-    for turns, amplitude, _ in (each for effect in effects if effect.part is Part.ORDERS for each in effect.waves()):
+    for turns, amplitude, _ in (
+        each for effect in effects if effect.part is Part.ORDERS for each in effect.waves()
+    ):
         fast = turns * turns_s * period_s * RESOLVED > 1.0
         ratio2 = (turns * turns_s[fast] / found.frequency_hz) ** 2
         gain2 = ratio2**2 / ((1.0 - ratio2) ** 2 + 4.0 * damping**2 * ratio2)

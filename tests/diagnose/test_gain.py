@@ -11,10 +11,11 @@ import pytest
 
 from hdbridge.analysis.diagnosis import diagnose
 from hdbridge.analysis.findings import Diagnosis
-from hdbridge.analysis.gain import Gain, held_out_change
+from hdbridge.analysis.gain import Gain, held_out
 from hdbridge.analysis.hypothesis import Estimator, Hypothesis
 from hdbridge.analysis.prepared import gather
-from hdbridge.axis.effects import Start, Synchronous
+from hdbridge.analysis.probability import Context, weighed
+from hdbridge.axis.effects import Start, Synchronous, VelocityWindup
 from hdbridge.axis.effects.orders import orders_from
 from hdbridge.axis.model import TransmissionModel
 from hdbridge.commissioning.improvement import extension_of
@@ -40,11 +41,10 @@ def test_a_change_that_is_not_there_loses_on_what_is_held_out(
     estimator = Estimator(gather(record, 50.0))
     nothing = Synchronous(orders=orders_from(range(3, 24), 0.0))
     fitted = estimator.fit(Hypothesis((nothing,), Start.VIRGIN))
-    moved = estimator.columns(nothing, Start.VIRGIN) @ fitted.hypothesis.effects[0].coefficients()
-    as_given = fitted.residual + estimator.weight * moved
-    gain = held_out_change(estimator, fitted, fitted.places(0), moved)
+    without = estimator.fit(Hypothesis((), Start.VIRGIN))
+    gain = held_out(estimator, fitted, without)
     assert gain is not None
-    assert float(as_given @ as_given) > fitted.chi_square
+    assert without.chi_square > fitted.chi_square
     assert gain.after_arcsec > gain.before_arcsec
 
 
@@ -67,6 +67,28 @@ def test_a_change_without_a_gain_is_refused(
     assert not extension.carried
     assert "held out" in extension.left[0] or "held-out" in extension.left[0]
     assert "not_offered" in finding.as_dict()
+
+
+@pytest.mark.parametrize("gain", [WORSE, None], ids=["worse", "none made"])
+def test_a_cause_without_a_gain_is_not_more_likely_than_not(wider: Diagnosis, gain: Gain | None) -> None:
+    (found,) = wider.findings
+    context = Context(left_arcsec=0.1, excess=1.0, unexplained=False)
+    (known,) = weighed([found], context, wider.scales)
+    (unproven,) = weighed([replace(found, gain=gain)], context, wider.scales)
+    assert unproven.probability <= 0.5 < known.probability
+
+
+def test_a_finding_that_cannot_be_written_is_none(
+    diagnosed: Diagnosed, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its parameters are out of bounds once everything is fitted together."""
+    monkeypatch.setattr(
+        VelocityWindup, "tidied", lambda self, _: self.model_copy(update={"shear_deg_s": -1.0})
+    )
+    result = diagnosed({"velocity_windup": {"coulomb": 1.5, "viscous": 0.03, "shear": 400.0}})
+    assert "velocity_windup" not in {each.cause for each in result.findings}
+    assert "velocity_windup: it cannot be written into the model" in result.considered
+    assert "velocity_windup" not in {each.name for each in result.model.effects}
 
 
 def test_what_may_be_nothing_is_not_offered(diagnosed: Diagnosed, model: TransmissionModel) -> None:

@@ -14,6 +14,7 @@ from support.filters import filtered
 from hdbridge.analysis.acceptance import Gate
 from hdbridge.analysis.diagnosis import diagnose
 from hdbridge.analysis.findings import Diagnosis, Finding
+from hdbridge.analysis.gain import Gain
 from hdbridge.analysis.probability import Context, weighed
 from hdbridge.analysis.scales import Scales
 from hdbridge.axis.effects import Hysteresis
@@ -189,7 +190,8 @@ def test_the_orders_of_one_interpolation_error_are_one_finding(diagnosed: Diagno
 
 def finding(cause: str, robust: float, peak_arcsec: float) -> Finding:
     gate = Gate(robust=robust / 10.0, needed=25.0)
-    return Finding(cause, 0.5, (), {}, None, "", peak_arcsec, robust=robust, gate=gate)
+    gain = Gain("stretches of time", 8, np.ones(8), np.full(8, 4.0), np.full(8, 1.0))
+    return Finding(cause, 0.5, (), {}, gain, "", peak_arcsec, robust=robust, gate=gate)
 
 
 ALONE = Context(left_arcsec=0.1, excess=1.0, unexplained=False)

@@ -11,7 +11,7 @@ from hdbridge.analysis.findings import Diagnosis
 LOOPS = {"hysteresis_parameters", "hysteresis_memory"}
 
 
-@pytest.mark.parametrize(("size", "width"), [(3.1, 12.0), (5.0, 8.0)])
+@pytest.mark.parametrize(("size", "width"), [(5.0, 12.0), (5.0, 8.0)])
 def test_what_acts_in_a_small_part_of_a_record_is_unexplained(
     diagnosed: Callable[..., Diagnosis], size: float, width: float
 ) -> None:
@@ -20,6 +20,14 @@ def test_what_acts_in_a_small_part_of_a_record_is_unexplained(
     assert found.cause == "unexplained"
     assert found.left_arcsec < 0.5 < found.peak_arcsec < 1.2 * size
     assert found.lives_in in {"load angle", "position"}
+
+
+def test_what_is_less_than_a_motor_count_is_a_remark(diagnosed: Callable[..., Diagnosis]) -> None:
+    """A count of the motor is 3.2 arcsec at the load: nobody can act on less."""
+    result = diagnosed({"unknown": {"kind": "packet", "size": 2.8, "width": 12.0}})
+    assert not result.findings
+    (remark,) = [each for each in result.remarks if "beyond the noise" in each]
+    assert "motor count" in remark
 
 
 @pytest.mark.parametrize("law", ["dahl", "bouc_wen"])
