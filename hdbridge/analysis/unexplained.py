@@ -104,9 +104,9 @@ def is_unexplained(estimator: Estimator, left: Rest) -> bool:
     # An axis rests anywhere within a count of its motor encoder, and noise wanders; neither has a cause.
     counts = data.motor_count_arcsec / np.sqrt(12.0)
     # If command and standstill separate noise and following error from the gear, fast residuals count.
-    if data.full.commanded and data.standstill:
-        if left.fast_arcsec > np.hypot(max(scales.plain_arcsec, data.noise_arcsec), left.standing_arcsec):
-            return True
+    fast = float(np.hypot(max(scales.plain_arcsec, data.noise_arcsec), left.standing_arcsec))
+    if data.full.commanded and data.standstill and left.fast_arcsec > fast:
+        return True
     return bool(left.arcsec > np.linalg.norm((scales.plain_arcsec, counts, left.standing_arcsec)))
 
 
