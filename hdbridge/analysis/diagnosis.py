@@ -100,8 +100,8 @@ def diagnose(
     if swing is not None and swing.frequency_hz > ORDINARY_HZ:  # one that is softer is a cause to be found
         data = without(data, swing)
     search, soft = _search(data, model, scales), swing is not None and swing.frequency_hz <= ORDINARY_HZ
-    if not soft and (less := settled(search.estimator, search.begun(), swing)) is not data:
-        search = _search(less, model, scales)
+    if not soft:
+        search = _search(settled(search.estimator, search.begun(), swing), model, scales)
     estimator = search.estimator
     first = unfitted(estimator, model.effects)
     held = beyond_limit(model.effects, data.full.motion)

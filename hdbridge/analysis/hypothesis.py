@@ -202,21 +202,29 @@ class Estimator:
         A motor with friction stops short of all turning points alike, and of each by its own amount. One
         column is common to all; up to `MOST_TURNS` of them also have one each.
         """
-        full, loops = self.data.full, [each for each in effects if each.tracker().memory_deg > 0.0]
-        turning, signs = branches(full.motor_deg, start)
-        turns = np.array(turning[1:-1], dtype=np.intp)
-        if not loops or not len(turns):
+        turns, change = self.turned(effects, start)
+        if not len(turns):
             return np.empty((len(self.index), 0))
-        count = full.reading.resolution_deg if full.commanded else CHATTER_COUNTS * full.reading.unaided_deg
-        moved = full.motor_deg.copy()
-        moved[turns] += (COUNTS * count + missed_deg(full.motor_deg, turns)) * np.array(signs[:-1])
-        other = replace(full.motion, motor_deg=moved)
-        change = sum(each.predict(other, start) - each.predict(full.motion, start) for each in loops)
-        columns = [self.at_points(np.asarray(change))]
+        columns = [self.at_points(change)]
         if len(turns) <= MOST_TURNS:
             leg = np.searchsorted(turns, self.data.runs[self.index], "right")
             columns += [np.where(leg == each, columns[0], 0.0) for each in range(1, len(turns) + 1)]
         return self.weighted(np.column_stack(columns))
+
+    def turned(self, effects: Sequence[Effect], start: Start) -> tuple[IntArray, FloatArray]:
+        """Returns the turning points and what their errors change in each sample, arcsec, shape (n,)."""
+        full, loops = self.data.full, [each for each in effects if each.tracker().memory_deg > 0.0]
+        turning, signs = branches(full.motor_deg, start)
+        turns = np.array(turning[1:-1] if loops else (), dtype=np.intp)
+        count = full.reading.resolution_deg if full.commanded else CHATTER_COUNTS * full.reading.unaided_deg
+        moved = full.motor_deg.copy()
+        moved[turns] += (COUNTS * count + missed_deg(full.motor_deg, turns)) * np.array(signs[:-1])[
+            : len(turns)
+        ]
+        other, change = replace(full.motion, motor_deg=moved), np.zeros(len(full))
+        for each in loops:
+            change += each.predict(other, start) - each.predict(full.motion, start)
+        return turns, change
 
     def begins_of(self, effects: Sequence[Effect]) -> Nuisances | None:
         """Returns a column for the elastic state at the start of each part: half of what it can change.

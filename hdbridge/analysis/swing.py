@@ -157,7 +157,7 @@ def settled(estimator: Estimator, fitted: Fitted, found: Swing | None) -> Observ
 
     The error of a ``found`` swing scales with the wind-up. Its share is regressed on the squares of the
     residual in motion. Nothing is known of waves of the gear's error that are too fast for the sampling.
-    The calmest samples always stay, with these errors in their noise.
+    The calmest samples always stay. These errors, and those of the turning points, are in their noise.
     """
     data, weight = estimator.data, estimator.weight
     hertz = ORDINARY_HZ if found is None else found.frequency_hz
@@ -171,9 +171,9 @@ def settled(estimator: Estimator, fitted: Fitted, found: Swing | None) -> Observ
         unknown = np.hypot(unknown, _aliased(data.full, fitted.hypothesis.effects, data.period_s, found))
     most = max(estimator.scales.floor_arcsec, float(np.quantile(unknown[data.full.usable], CALMEST)))
     usable = data.full.usable & (unknown <= most)
-    if np.all(usable == data.full.usable):
-        return data
-    full = replace(data.full, usable=usable, sigma_arcsec=np.hypot(data.full.sigma_arcsec, unknown))
+    _, turned = estimator.turned(fitted.hypothesis.effects, fitted.hypothesis.start)
+    sigma = np.sqrt(data.full.sigma_arcsec**2 + unknown**2 + turned**2)
+    full = replace(data.full, usable=usable, sigma_arcsec=sigma)
     return replace(data, full=full, points=averaged(full, data.runs))
 
 
