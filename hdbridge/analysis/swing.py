@@ -35,6 +35,8 @@ DAMPING = (0.05, 0.2, 0.5)
 MOST_DAMPED = 0.9
 USUALLY_DAMPED = 0.2
 """Damping ratio of a swing that is too fast for the sampling to show it."""
+LEAST_SEEN = 0.1
+"""Share of the squares of a residual that a swing explains: anything that moves explains a little."""
 CALMEST = 0.05
 """Share of a record that is always used."""
 RESOLVED = 4.0
@@ -119,11 +121,11 @@ def seen_swing(full: Samples, effects: Sequence[Effect], scales: Scales) -> Swin
     def cost(residual: FloatArray, rows: slice) -> float:
         return float(weight[rows] @ about_zeros(residual, full.zero[rows], weight[rows]) ** 2)
 
-    whole = slice(0, len(full))
+    every = slice(0, len(full))
     errors = [
         sum((each.predict(full.motion, start) for each in effects), np.zeros(len(full))) for start in Start
     ]
-    error = min(errors, key=lambda each: cost(left(each, whole), whole))
+    error = min(errors, key=lambda each: cost(left(each, every), every))
     bend = bend_of(ARCSEC_PER_DEG / full.ratio * full.motor_deg + error, step_s, parts)
     size = np.concatenate([[0.0], np.cumsum(bend**2)])
     begin = int(np.argmax(size[LONGEST:] - size[:-LONGEST])) if len(full) > LONGEST else 0
@@ -140,7 +142,8 @@ def seen_swing(full: Samples, effects: Sequence[Effect], scales: Scales) -> Swin
     found = minimize(
         lambda x: tried(*np.exp(x).tolist()), np.log(start), method="Nelder-Mead", options={"maxfev": REFINED}
     )
-    if cost(residual, rows) - found.fun < scales.enter + 2.0 * scales.penalty:
+    whole = cost(residual, rows)
+    if whole - found.fun < max(scales.enter + 2.0 * scales.penalty, LEAST_SEEN * whole):
         return None
     hertz, damping = np.exp(found.x).tolist()
     return swing(bend, step_s, [each.start for each in parts], hertz, min(damping, MOST_DAMPED))
