@@ -162,19 +162,18 @@ def settled(estimator: Estimator, fitted: Fitted, found: Swing | None) -> Observ
     residual in motion. Nothing is known of waves of the gear's error that are too fast for the sampling.
     The calmest samples always stay. These errors, and those of the turning points, are in their noise.
     """
-    data, weight = estimator.data, estimator.weight
-    hertz = ORDINARY_HZ if found is None else found.frequency_hz
-    wind_up = _accelerated(data.full, data.period_s) / (math.tau * hertz) ** 2
-    moving = (data.points.speed_deg_s != 0.0)[estimator.index]
-    square, size = (fitted.residual / weight)[moving] ** 2, estimator.at_points(wind_up**2)[moving]
-    about = size - np.mean(size) if len(size) else size
-    share = min(max(float(about @ square) / max(float(about @ about), 1e-300), 0.0), 1.0)
-    unknown = math.sqrt(share) * wind_up
+    data, weight, unknown = estimator.data, estimator.weight, np.zeros(len(estimator.data.full))
+    effects = fitted.hypothesis.effects
     if found is not None:
-        unknown = np.hypot(unknown, _aliased(data.full, fitted.hypothesis.effects, data.period_s, found))
+        wind_up = _accelerated(data.full, data.period_s) / (math.tau * found.frequency_hz) ** 2
+        moving = (data.points.speed_deg_s != 0.0)[estimator.index]
+        square, size = (fitted.residual / weight)[moving] ** 2, estimator.at_points(wind_up**2)[moving]
+        about = size - np.mean(size) if len(size) else size
+        share = min(max(float(about @ square) / max(float(about @ about), 1e-300), 0.0), 1.0)
+        unknown = np.hypot(math.sqrt(share) * wind_up, _aliased(data.full, effects, data.period_s, found))
     most = max(estimator.scales.floor_arcsec, float(np.quantile(unknown[data.full.usable], CALMEST)))
     usable = data.full.usable & (unknown <= most)
-    _, turned = estimator.turned(fitted.hypothesis.effects, fitted.hypothesis.start)
+    _, turned = estimator.turned(effects, fitted.hypothesis.start)
     sigma = np.sqrt(data.full.sigma_arcsec**2 + unknown**2 + turned**2)
     full = replace(data.full, usable=usable, sigma_arcsec=sigma)
     return replace(data, full=full, points=averaged(full, data.runs))
