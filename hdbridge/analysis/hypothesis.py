@@ -149,12 +149,9 @@ class Estimator:
 
     @property
     def floor_arcsec(self) -> float:
-        """Smallest peak that matters: a compensation acts in counts of the motor, and a reading shows it."""
-        return max(
-            self.scales.floor_arcsec,
-            self.data.motor_count_arcsec / math.sqrt(12.0),
-            0.5 * self.data.noise_arcsec,
-        )
+        """Smallest peak that matters: at rest, the rounding of both encoders is the same in all readings."""
+        rounded = math.hypot(self.data.motor_count_arcsec, self.data.load_count_arcsec) / math.sqrt(12.0)
+        return max(self.scales.floor_arcsec, rounded, 0.5 * self.data.noise_arcsec)
 
     def half_span(self, values: FloatArray) -> float:
         """Returns half the span of values without the rare extremes."""

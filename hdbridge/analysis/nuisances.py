@@ -12,7 +12,7 @@ the amplitudes of the orders; at one speed these are less certain.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from functools import reduce
 from itertools import pairwise
 
@@ -117,11 +117,12 @@ def is_turn(name: str) -> bool:
 def swing(
     rate: FloatArray,
     waves: Iterable[tuple[float, FloatArray, FloatArray]],
+    mean: Callable[[FloatArray], FloatArray] = lambda columns: columns,
 ) -> Nuisances:
     """Returns the swing of the load beyond the waves that excite it, arcsec per ms squared and per ms cubed.
 
     ``rate`` (n,) is the motor speed, radians per second. ``waves`` are orders, their contribution, (n,), and
-    the same a quarter of a wave later. Driven by a
+    the same a quarter of a wave later. ``mean`` averages columns (n, 2) like the observations. Driven by a
     cos(w t) well below its natural frequency f, a load on a spring with damping ratio z responds with (1 +
     (w / 2 pi f)^2) a cos(w t) + 2 z (w / 2 pi f)^3 a sin(w t): larger, and later in both directions.
     """
@@ -130,7 +131,7 @@ def swing(
         columns[:, 0] += (1e-3 * order * rate) ** 2 * wave
         columns[:, 1] += (1e-3 * order * rate) ** 3 * later
     known = tuple(Prior(0.0, each**-2) for each in (SWING_MS2, SWING_MS3))
-    return Nuisances(columns, (SWING, SWING_LAG), known)
+    return Nuisances(mean(columns), (SWING, SWING_LAG), known)
 
 
 def speeds_differ(speed_deg_s: FloatArray, count: FloatArray) -> bool:

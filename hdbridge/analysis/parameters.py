@@ -20,11 +20,13 @@ from hdbridge.analysis.acceptance import BLOCKS_S
 from hdbridge.analysis.findings import Parameter
 from hdbridge.analysis.hypothesis import Estimator, Fitted
 from hdbridge.analysis.intervals import NORMAL_95, half_widths, joined, labelled, leaves
-from hdbridge.analysis.linear import FOUND, Column, Effort, of_length, sandwich, sums
+from hdbridge.analysis.linear import FOUND, Column, Effort, Nuisances, of_length, sandwich, sums
+from hdbridge.analysis.nuisances import speeds_differ, swing
 from hdbridge.analysis.screening import proposed
 from hdbridge.analysis.search import lookalikes
 from hdbridge.analysis.separable import shape_value
 from hdbridge.axis.effects import CATALOGUE, Effect, FloatArray, IntArray, Moves, aliases_of
+from hdbridge.axis.effects.orders import RAD_PER_DEG
 from hdbridge.units import unit_of
 
 
@@ -97,13 +99,37 @@ def _alike(estimator: Estimator, fitted: Fitted, place: int) -> Iterator[tuple[E
         yield other, estimator.weighted(columns * typical), noise
 
 
+# Final fit for the parameters, including the swing of the load.
+
+
 def precisely(estimator: Estimator, fitted: Fitted) -> Fitted:
-    """Refits a hypothesis for its parameters: with the tangents of all shapes, without a free-form loop."""
-    plain = estimator.fit(replace(fitted.hypothesis, nuisances=None))
+    """Refits a hypothesis with the swing that its waves excite, and with the tangents of all shapes.
+
+    At a single speed the swing is left out, because it is part of the orders.
+    """
+    plain = estimator.fit(replace(fitted.hypothesis, nuisances=_shaken(estimator, fitted)))
     found = estimator.fit(plain.hypothesis, moves=FOUND)
     if any(each.violations() for each in found.hypothesis.effects):
         return estimator.fit(plain.hypothesis, FOUND, Effort(steps=1))
     return found
+
+
+def _shaken(estimator: Estimator, fitted: Fitted) -> Nuisances | None:
+    """Returns columns of the load's swing: in phase by frequency squared, lagging by frequency cubed.
+
+    The second is odd in the direction. None without orders, or at a single speed.
+    """
+    motion = estimator.data.full.motion
+    speed = motion.motor_speed_deg_s
+    waves = [wave for each in fitted.hypothesis.effects for wave in each.waves()]
+    slow = estimator.motion.motor_speed_deg_s
+    moving = np.empty(0) if slow is None else slow[estimator.index]
+    moving = moving[moving != 0.0]
+    if speed is None or not waves or not speeds_differ(moving, np.ones(len(moving))):
+        return None
+    angles = ((turns, size, RAD_PER_DEG * (turns * motion.motor_deg + phase)) for turns, size, phase in waves)
+    both = ((turns, size * np.cos(angle), size * np.sin(angle)) for turns, size, angle in angles)
+    return swing(RAD_PER_DEG * speed, both, estimator.at_points)
 
 
 # Parameters of a fitted effect with 95 % intervals, valid for coloured noise.

@@ -10,7 +10,6 @@ statistics over blocks of seconds.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from itertools import pairwise
@@ -20,7 +19,6 @@ import numpy as np
 
 from hdbridge.analysis.cuts import observed
 from hdbridge.analysis.driving import kinematics, reading_of_all, reversals, settling
-from hdbridge.analysis.linear import counted
 from hdbridge.analysis.readings import Reading, quantum_deg, third_deviation
 from hdbridge.axis.effects import BoolArray, FloatArray, IntArray, Motion, Start
 from hdbridge.errors import InputError
@@ -296,8 +294,6 @@ AVERAGED_POINTS = 50_000
 SHORT = 0.77
 """Length of every other run as a share of the mean run length; the others have 1.6 times as many samples."""
 LEAST_SAMPLES = 60
-ONE_REST_S = 1.0
-"""Duration for which a rest repeats one reading; later ones show that the load creeps."""
 LEAST_SETTLED = 0.2
 """Minimum share of samples outside fast moves; below it, fast moves are used as well."""
 
@@ -315,6 +311,8 @@ class Observed:
     """First sample of each point's run, shape (points,)."""
     motor_count_arcsec: float
     """One count of the motor encoder at the load; if none is visible, the count with equal jitter."""
+    load_count_arcsec: float
+    """One count of the load encoder; 0 if none is visible."""
     noise_arcsec: float
     """White noise of a point."""
     period_s: float
@@ -385,55 +383,18 @@ def gather(
     period_s = float(np.median(steps[steps > 0])) if np.any(steps > 0) else 1.0
     runs = _runs(len(time), record.starts)
     noise_arcsec = float(np.sqrt(np.mean(averaged(full, runs).sigma_arcsec ** 2)))
-    full = replace(full, sigma_arcsec=np.hypot(full.sigma_arcsec, rounded_at_rest(full, period_s)))
     return Observed(
         ratio=ratio,
         points=averaged(full, runs),
         full=full,
         runs=runs,
         motor_count_arcsec=full.reading.resolution_deg / ratio * ARCSEC_PER_DEG,
+        load_count_arcsec=quantum_deg(full.load_deg) * ARCSEC_PER_DEG,
         noise_arcsec=noise_arcsec,
         period_s=period_s,
         standstill=standstill,
         reversals=turns,
         remarks=tuple(remarks),
-    )
-
-
-def rounded_at_rest(full: Samples, period_s: float) -> FloatArray:
-    """Returns the rounding error of both encoders in samples at rest, arcsec, shape (n,); 0 in motion.
-
-    At one place it is the same in all of them, so their mean has it too: each gets the error of the mean
-    times the root of their number. Of a long rest only the first `ONE_REST_S` count.
-    """
-    still, count = full.speed_deg_s == 0.0, full.reading.resolution_deg
-    result = np.zeros(len(full))
-    if not np.any(still):
-        return result
-    noise_deg = math.sqrt(max(full.reading.jitter_deg**2 - count**2 / 12.0, 0.0))
-    load_count, sigma = quantum_deg(full.load_deg) * ARCSEC_PER_DEG, float(np.min(full.sigma_arcsec[still]))
-    load_noise = math.sqrt(max(sigma**2 - load_count**2 / 12.0, 0.0))
-    common = math.hypot(
-        mean_rounding(count, noise_deg) / full.ratio * ARCSEC_PER_DEG, mean_rounding(load_count, load_noise)
-    )
-    rows, (_, place) = (
-        np.flatnonzero(still),
-        np.unique(np.round(full.motor_deg[still] / max(count, 1e-6)), return_inverse=True),
-    )
-    visit = counted(np.cumsum((np.diff(rows, prepend=-2) != 1) | (np.diff(place, prepend=-1) != 0)))
-    length = np.minimum(np.bincount(visit), max(1.0, ONE_REST_S / period_s))
-    places = place[np.flatnonzero(np.diff(visit, prepend=-1))]
-    result[rows] = common * np.sqrt(np.bincount(places, length)[place])
-    return result
-
-
-def mean_rounding(count: float, noise: float) -> float:
-    """Returns the standard deviation of what rounding leaves in the mean of many noisy readings.
-
-    It is the first harmonic of the rounding error, which the noise smooths; in the units of both.
-    """
-    return (
-        count / (math.pi * math.sqrt(2.0)) * math.exp(-2.0 * (math.pi * noise / count) ** 2) if count else 0.0
     )
 
 
