@@ -172,10 +172,8 @@ class _Judge:
         findings = self._with_unexplained(findings, judged.left)
         refitted = estimator.fit(Hypothesis(given, fitted.hypothesis.start))
         fitted, findings, extended = self._written(fitted, findings)
-        # Residual of the given model from the best-fitting elastic start.
-        each_start = (self._left_by(given, start) for start in Start)
-        before = min(each_start, key=lambda error: float(error @ error))
-        after = self._left_by(extended.effects, fitted.hypothesis.start)
+        before, _ = self._left_by(given)
+        after, start = self._left_by(extended.effects)
         measured = estimator.observed - estimator.level - fitted.zeros[estimator.zero]
         visible = identifiability(estimator, refitted, given)
         return Diagnosis(
@@ -197,7 +195,7 @@ class _Judge:
                 rows=estimator.index,
                 samples=estimator.data.full.motion,
                 runs=estimator.data.runs,
-                start=fitted.hypothesis.start,
+                start=start,
             ),
             considered=tuple(dict.fromkeys(self.considered)),
             scales=estimator.scales,
@@ -389,11 +387,20 @@ class _Judge:
         largest = max((each.peak_arcsec for each in findings), default=0.0)
         return [*findings, unknown] if largest > size else [unknown, *findings]
 
-    def _left_by(self, effects: Sequence[Effect], start: Start) -> FloatArray:
-        """Returns observed minus predicted at the usable points, about the best-fitting zeros."""
+    def _left_by(self, effects: Sequence[Effect]) -> tuple[FloatArray, Start]:
+        """Returns observed minus predicted at the usable points from the best elastic start, which it names.
+
+        It is about the best-fitting zeros.
+        """
         estimator = self.estimator
-        left = estimator.observed - estimator.predict(effects, start)
-        return about_zeros(left, estimator.zero, estimator.weight**2)
+        left = {
+            start: about_zeros(
+                estimator.observed - estimator.predict(effects, start), estimator.zero, estimator.weight**2
+            )
+            for start in Start
+        }
+        best = min(left, key=lambda start: float(left[start] @ left[start]))
+        return left[best], best
 
     def _by_kind(self, given: FloatArray, after: FloatArray) -> dict[str, tuple[Figures, Figures]]:
         estimator = self.estimator

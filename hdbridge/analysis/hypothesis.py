@@ -148,9 +148,14 @@ class Estimator:
         return self.scales.rare / max(len(self.data.full), SHORT)
 
     @property
+    def count_arcsec(self) -> float:
+        """One count of the motor encoder at the load; 0 if none is visible."""
+        return self.data.full.count_deg / self.data.ratio * ARCSEC_PER_DEG
+
+    @property
     def floor_arcsec(self) -> float:
         """Smallest peak that matters: at rest, the rounding of both encoders is the same in all readings."""
-        rounded = math.hypot(self.data.motor_count_arcsec, self.data.load_count_arcsec) / math.sqrt(12.0)
+        rounded = math.hypot(self.count_arcsec, self.data.load_count_arcsec) / math.sqrt(12.0)
         return max(self.scales.floor_arcsec, rounded, 0.5 * self.data.noise_arcsec)
 
     def half_span(self, values: FloatArray) -> float:

@@ -238,7 +238,7 @@ def _seen(
     If there are none, a remark on the best one that is too small to act on: below a count of the motor.
     """
     scales, start, weight = estimator.scales, fitted.hypothesis.start, estimator.weight[rows]
-    count_arcsec = estimator.data.motor_count_arcsec
+    count_arcsec = estimator.count_arcsec
     gain, peak = scales.enter + scales.penalty, max(scales.plain_arcsec, count_arcsec)
     laws = [each for each in fitted.hypothesis.effects if each.part is None]
     for law in laws:  # the larger its contribution, the larger the error of its formula
