@@ -75,3 +75,11 @@ def test_what_settles_by_less_than_the_narrowest_loop_does_not_reverse() -> None
     assert reversals(settles, 0.0) == 0
     back = np.concatenate([settles, np.linspace(360.0, 359.0, 20)])
     assert reversals(back, 0.0) == 1
+
+
+def test_moves_that_bend_within_a_sample_are_no_jitter_of_a_counted_angle() -> None:
+    """Fast moves at 14 Hz, with rests in which the reading flickers by a third of a count."""
+    rng = np.random.default_rng(4)
+    angle = np.repeat(np.cumsum(rng.choice([-90.0, 90.0], 120)), 8) + np.tile([-50.0, *[0.0] * 7], 120)
+    counted = np.round(angle / 0.018 + 0.33 * rng.normal(size=len(angle))) * 0.018
+    assert reading_of(counted).jitter_deg == pytest.approx(0.018 * np.hypot(0.33, 0.29), rel=0.3)

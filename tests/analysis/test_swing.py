@@ -8,9 +8,14 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
+from hdbridge.analysis.diagnosis import diagnose
 from hdbridge.analysis.driving import kinematics
 from hdbridge.analysis.readings import Reading
 from hdbridge.analysis.swing import bend_of, swing
+from hdbridge.axis.effects import Hysteresis, Motion, Start, Synchronous
+from hdbridge.axis.effects.orders import MotorOrder
+from hdbridge.axis.model import TransmissionModel
+from hdbridge.records.record import Record
 
 COUNT_DEG = 0.018
 
@@ -59,3 +64,44 @@ def test_a_lag_that_changes_within_a_few_samples_is_no_noise_of_the_encoder() ->
     driven = kinematics(counted, target, time_s, Reading(COUNT_DEG, COUNT_DEG / math.sqrt(12.0)))
     moving = np.abs(np.gradient(motor, time_s)) > 300.0
     assert np.max(np.abs(driven.motor_deg - counted)[moving]) <= 0.501 * COUNT_DEG
+
+
+def test_fast_moves_of_a_healthy_axis_are_silent_and_its_swing_is_a_remark() -> None:
+    """The record begins in the middle of a move, with the elastic state of what went before."""
+    step_s, fine = 0.004, 8
+    clock_s = np.arange(round(24.0 / step_s) * fine) * step_s / fine
+    part = np.clip(np.mod(clock_s, 0.5) / 0.2, 0.0, 1.0)
+    way = part**3 * (10.0 + part * (6.0 * part - 15.0))
+    places = np.cumsum(np.random.default_rng(5).choice([-1.0, 1.0], 50) * 211.0)
+    motor = (
+        np.interp(np.floor(clock_s / 0.5), np.arange(50), places)
+        + way * np.diff(places)[np.floor(clock_s / 0.5).astype(int)]
+    )
+    model = TransmissionModel(
+        50.0,
+        (
+            Synchronous(orders=(MotorOrder(order=2, amplitude_arcsec=6.0, phase_deg=30.0),)),
+            Hysteresis(offset_arcsec=20.0, width_deg=20.0, exponent=1.8),
+        ),
+    )
+    error = model.predict(Motion(motor), Start.VIRGIN)
+    base = 72.0 * motor + error
+    natural, lag, rate, lags = math.tau * 55.0, 0.0, 0.0, np.zeros(len(base))
+    for row, bend in enumerate(np.gradient(np.gradient(base, clock_s), clock_s).tolist()):
+        rate -= (bend + 0.2 * natural * rate + natural**2 * lag) * step_s / fine
+        lag += rate * step_s / fine
+        lags[row] = lag
+    rows = np.arange(round(0.6 / step_s) * fine, len(base), fine)
+    load = (base + lags)[rows] + 0.5 * np.random.default_rng(6).normal(size=len(rows))
+    record = Record(
+        {
+            "time_s": clock_s[rows],
+            "motor_position_deg": np.round(motor[rows] / 0.001) * 0.001,
+            "motor_target_deg": motor[rows],
+            "load_position_deg": load / 3600.0,
+        }
+    )
+    found = diagnose(record, model)
+    assert np.max(np.abs(lags)) > 10.0
+    assert not found.findings
+    assert any("swings on its spring at 5" in each for each in found.remarks)
