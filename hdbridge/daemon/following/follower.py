@@ -136,9 +136,8 @@ class Follower:
         cycle, times_s = samples["cycle"], 1e-9 * samples["time_ns"].astype(np.float64)
         self._now_s = float(times_s[-1])
         joined = self._next_cycle in {None, int(cycle[0])} and int(cycle[-1] - cycle[0]) == len(cycle) - 1
+        self._servo.believed = status.fault is None
         servo = self._servo.take(axis, joined=joined)
-        if status.fault is not None:
-            self._servo.forget_load()
         first = self._begin_of_path(axis, cycle)
         raised: list[Raised] = []
         if servo is not None:

@@ -47,6 +47,8 @@ class ServoWatch:
     def __init__(self, axis: AxisConfig, model: TransmissionModel) -> None:
         self.retuned = False
         """True while the servo does not answer as when the response was measured."""
+        self.believed = True
+        """False during a fault of the load encoder."""
         self.refinements = 0
         """Number of responses that have replaced the committed one, one after the other."""
         self._ratio, self._period_s = model.ratio, axis.drive.cycle_s
@@ -139,7 +141,11 @@ class ServoWatch:
         if not np.all(np.isfinite(run["issued_deg"])):
             return None
         names = ("load_target_deg", "issued_deg", "motor_position_deg", "load_position_deg")
-        answers.take(speed_deg_s, *(run[each] for each in names))
+        target, issued, motor, load = (run[each] for each in names)
+        if not self.believed:
+            self.forget_load()
+            load = np.full(len(run), np.nan)
+        answers.take(speed_deg_s, target, issued, motor, load)
         if len(answers.lags_ms) < MIN_RUNS:
             return None
         apart, lag_ms = answers.difference, median(answers.lags_ms)
