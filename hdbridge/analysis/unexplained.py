@@ -239,7 +239,10 @@ def _seen(
     """
     scales, start, weight = estimator.scales, fitted.hypothesis.start, estimator.weight[rows]
     count_arcsec = estimator.count_arcsec
-    gain, peak = scales.enter + scales.penalty, max(scales.plain_arcsec, count_arcsec)
+    gain, peak = (
+        scales.enter + scales.penalty,
+        max(count_arcsec, math.hypot(scales.plain_arcsec, 0.5 * _angle_step_arcsec(estimator))),
+    )
     laws = [each for each in fitted.hypothesis.effects if each.part is None]
     for law in laws:  # the larger its contribution, the larger the error of its formula
         does = estimator.columns(law, start)[rows] @ law.coefficients()
