@@ -137,7 +137,9 @@ class Laws:
             self._last_sequence = int(sample["sequence"])
             for axis, laws in zip(sample["axes"], self.axes.values(), strict=True):
                 AxisState(axis["state"])
-                values = [axis[name] for name in axis.dtype.names[6:-3]]
+                names = axis.dtype.names
+                known = names[names.index("load_target_deg") : names.index("reading0")]
+                values = [axis[name] for name in known]
                 assert all(map(math.isfinite, values)), axis
                 if axis["state"] == AxisState.ENABLED:
                     limits = laws.axis.config.limits
