@@ -97,17 +97,19 @@ def diagnose(
     )
     scales = scales or Scales()
     swing = seen_swing(data.full, model.effects, scales)
-    if swing is not None and swing.frequency_hz > ORDINARY_HZ:  # one that is softer is a cause to be found
-        data = without(data, swing)
-    search, soft = _search(data, model, scales), swing is not None and swing.frequency_hz <= ORDINARY_HZ
+    soft = swing is not None and swing.frequency_hz <= ORDINARY_HZ  # a cause to be found
+    ordinary = None if soft else swing
+    if ordinary is not None:
+        data = without(data, ordinary)
+    search = _search(data, model, scales)
     if not soft:
-        search = _search(settled(search.estimator, search.begun(), swing), model, scales)
+        search = _search(settled(search.estimator, search.begun(), ordinary), model, scales)
     estimator = search.estimator
     first = unfitted(estimator, model.effects)
     held = beyond_limit(model.effects, data.full.motion)
-    own = [swing.remark()] if swing is not None and swing.frequency_hz > ORDINARY_HZ else []
-    told = (*((first,) if first else ()), *held, *data.remarks, *own)
-    estimator.data = replace(estimator.data, remarks=told)
+    dynamics = () if ordinary is None else (ordinary.remark(),)
+    of_record = (*((first,) if first else ()), *held, *data.remarks, *dynamics)
+    estimator.data = replace(estimator.data, remarks=of_record)
     progress("searching for causes")
     found = search.run()
     progress("judging what was found")
@@ -206,8 +208,8 @@ class _Judge:
     ) -> tuple[Fitted, list[Finding], TransmissionModel]:
         """Returns the extended model, its fit, and the findings that it contains.
 
-        A finding that cannot be written is none: its parameters are out of bounds, the compensation could not
-        invert the model with it, or the record does not determine it.
+        A finding that cannot be written is dropped: its parameters are out of bounds, the compensation could
+        not invert the model with it, or the record does not determine it.
         """
         estimator, given = self.estimator, self.model.effects
         while True:

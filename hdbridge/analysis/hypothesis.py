@@ -193,9 +193,8 @@ class Estimator:
         full = self.data.full
         other = replace(full.motion, motor_deg=full.rested_deg)
         change = (full.rested_deg - full.motor_deg) * (ARCSEC_PER_DEG / full.ratio)
-        for each in effects:
-            if each.tracker().memory_deg > 0.0:
-                change = change + each.predict(other, start) - each.predict(full.motion, start)
+        for each in with_memory(effects):
+            change = change + each.predict(other, start) - each.predict(full.motion, start)
         return self.weighted(self.at_points(change)[:, np.newaxis])
 
     def turn_discrepancy(self, effects: Sequence[Effect], start: Start) -> FloatArray:
@@ -215,15 +214,16 @@ class Estimator:
 
     def turned(self, effects: Sequence[Effect], start: Start) -> tuple[IntArray, FloatArray]:
         """Returns the turning points and what their errors change in each sample, arcsec, shape (n,)."""
-        full, loops = self.data.full, [each for each in effects if each.tracker().memory_deg > 0.0]
+        full, loops = self.data.full, with_memory(effects)
+        change = np.zeros(len(full))
+        if not loops:
+            return np.empty(0, dtype=np.intp), change
         turning, signs = branches(full.motor_deg, start)
-        turns = np.array(turning[1:-1] if loops else (), dtype=np.intp)
+        turns = np.array(turning[1:-1], dtype=np.intp)
         count = full.reading.resolution_deg if full.commanded else CHATTER_COUNTS * full.reading.unaided_deg
         moved = full.motor_deg.copy()
-        moved[turns] += (COUNTS * count + missed_deg(full.motor_deg, turns)) * np.array(signs[:-1])[
-            : len(turns)
-        ]
-        other, change = replace(full.motion, motor_deg=moved), np.zeros(len(full))
+        moved[turns] += (COUNTS * count + missed_deg(full.motor_deg, turns)) * np.array(signs[:-1])
+        other = replace(full.motion, motor_deg=moved)
         for each in loops:
             change += each.predict(other, start) - each.predict(full.motion, start)
         return turns, change
@@ -233,7 +233,7 @@ class Estimator:
 
         The state is anywhere between those of a saturated start either way. None without a loop.
         """
-        full, loops = self.data.full, [each for each in effects if each.tracker().memory_deg > 0.0]
+        full, loops = self.data.full, with_memory(effects)
         columns = []
         for chain in full.chains[:MOST_PARTS]:
             motion, change = full.along(chain), np.zeros(len(full))
@@ -242,10 +242,10 @@ class Estimator:
                 change[chain.rows] += 0.5 * (ends[0] - ends[1])
             if np.any(change):
                 columns.append(self.at_points(change))
+        if not columns:
+            return None
         names = tuple(f"state {each}" for each in range(len(columns)))
-        return (
-            Nuisances(np.stack(columns, axis=1), names, (Prior(0.0, 1.0),) * len(names)) if columns else None
-        )
+        return Nuisances(np.stack(columns, axis=1), names, (Prior(0.0, 1.0),) * len(names))
 
     def free_loop(self, start: Start) -> Nuisances:
         """Returns a free-form hysteresis: stop operators of `STOPS_DEG`, which form any loop shape."""
@@ -366,6 +366,11 @@ class Estimator:
         points = replace(data.points, motion=replace(data.points.motion, load_deg=data.mean(load_deg)))
         self.data = replace(data, full=full, points=points)
         self._regressors.along([full.motion])
+
+
+def with_memory(effects: Sequence[Effect]) -> list[Effect]:
+    """Returns the effects whose contribution depends on earlier motion."""
+    return [each for each in effects if each.tracker().memory_deg > 0.0]
 
 
 def _smooth(values: FloatArray) -> FloatArray:

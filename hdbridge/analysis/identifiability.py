@@ -10,7 +10,7 @@ from typing import Any, Final
 import numpy as np
 
 from hdbridge.analysis.capability import Capability, Identifiability, capability
-from hdbridge.analysis.hypothesis import Estimator, Fitted, Hypothesis
+from hdbridge.analysis.hypothesis import Estimator, Fitted, Hypothesis, with_memory
 from hdbridge.analysis.linear import Effort, orthonormal, side_by_side
 from hdbridge.analysis.orders import NOT_APART
 from hdbridge.analysis.prepared import gather
@@ -128,8 +128,7 @@ class _Background:
         start = fitted.hypothesis.start
         before = [
             estimator.weighted(estimator.columns(each, other) - estimator.columns(each, start))
-            for each in base
-            if each.tracker().memory_deg > 0.0
+            for each in with_memory(base)
             for other in Start
             if other is not start
         ]

@@ -325,7 +325,11 @@ class Observed:
 
     def over(self, runs: IntArray) -> Observed:
         """Returns the same samples averaged over other runs, given by their first samples."""
-        return replace(self, points=averaged(self.full, runs), runs=runs)
+        return replace(self, points=_averaged(self.full, runs), runs=runs)
+
+    def having(self, full: Samples) -> Observed:
+        """Returns the same record with other values of its samples."""
+        return replace(self, full=full, points=_averaged(full, self.runs))
 
     @property
     def motion(self) -> Motion:
@@ -382,15 +386,15 @@ def gather(
     steps = np.diff(time)
     period_s = float(np.median(steps[steps > 0])) if np.any(steps > 0) else 1.0
     runs = _runs(len(time), record.starts)
-    noise_arcsec = float(np.sqrt(np.mean(averaged(full, runs).sigma_arcsec ** 2)))
+    points = _averaged(full, runs)
     return Observed(
         ratio=ratio,
-        points=averaged(full, runs),
+        points=points,
         full=full,
         runs=runs,
         motor_count_arcsec=full.reading.resolution_deg / ratio * ARCSEC_PER_DEG,
         load_count_arcsec=quantum_deg(full.load_deg) * ARCSEC_PER_DEG,
-        noise_arcsec=noise_arcsec,
+        noise_arcsec=float(np.sqrt(np.mean(points.sigma_arcsec**2))),
         period_s=period_s,
         standstill=standstill,
         reversals=turns,
@@ -432,7 +436,7 @@ def means(values: FloatArray, runs: IntArray) -> FloatArray:
     return np.asarray(total / (size if values.ndim == 1 else size[:, np.newaxis]))
 
 
-def averaged(full: Samples, runs: IntArray) -> Samples:
+def _averaged(full: Samples, runs: IntArray) -> Samples:
     """Averages samples over runs; a run with unusable samples becomes an unusable point of the path."""
     if len(runs) == len(full):
         return full

@@ -174,7 +174,7 @@ def harmonics(run: EvenRun, orders: Sequence[int], ratio: float) -> Harmonics:
 
 
 def samples_needed(orders: int) -> int:
-    """Returns the minimum number of samples of a run for so many orders."""
+    """Returns the minimum number of samples of a run that shows this number of orders."""
     return 4 * (2 * orders + 2)
 
 

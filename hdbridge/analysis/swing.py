@@ -21,7 +21,7 @@ from scipy.optimize import minimize
 from hdbridge.analysis.driving import SETTLE_S
 from hdbridge.analysis.hypothesis import Estimator, Fitted
 from hdbridge.analysis.linear import about_zeros
-from hdbridge.analysis.prepared import Observed, Samples, averaged
+from hdbridge.analysis.prepared import Observed, Samples
 from hdbridge.analysis.scales import Scales
 from hdbridge.axis.effects import Effect, FloatArray, Part, Start
 from hdbridge.units import ARCSEC_PER_DEG, DEG_PER_TURN
@@ -115,9 +115,6 @@ def seen_swing(full: Samples, effects: Sequence[Effect], scales: Scales) -> Swin
     weight = full.usable / full.sigma_arcsec**2
     step_s, parts = np.maximum(np.diff(full.time_s), 1e-9), [each.rows for each in full.chains]
 
-    def left(error: FloatArray, rows: slice) -> FloatArray:
-        return about_zeros(full.error_arcsec[rows] - error[rows], full.zero[rows], weight[rows])
-
     def cost(residual: FloatArray, rows: slice) -> float:
         return float(weight[rows] @ about_zeros(residual, full.zero[rows], weight[rows]) ** 2)
 
@@ -125,13 +122,13 @@ def seen_swing(full: Samples, effects: Sequence[Effect], scales: Scales) -> Swin
     errors = [
         sum((each.predict(full.motion, start) for each in effects), np.zeros(len(full))) for start in Start
     ]
-    error = min(errors, key=lambda each: cost(left(each, every), every))
+    error = min(errors, key=lambda each: cost(full.error_arcsec - each, every))
     bend = bend_of(ARCSEC_PER_DEG / full.ratio * full.motor_deg + error, step_s, parts)
     size = np.concatenate([[0.0], np.cumsum(bend**2)])
     begin = int(np.argmax(size[LONGEST:] - size[:-LONGEST])) if len(full) > LONGEST else 0
     rows = slice(begin, min(begin + LONGEST, len(full)))
     first = [begin, *(each.start for each in parts if rows.start < each.start < rows.stop)]
-    residual = left(error, rows)
+    residual = (full.error_arcsec - error)[rows]
 
     def tried(hertz: float, damping: float) -> float:
         begins = [each - begin for each in first]
@@ -151,8 +148,7 @@ def seen_swing(full: Samples, effects: Sequence[Effect], scales: Scales) -> Swin
 
 def without(data: Observed, found: Swing) -> Observed:
     """Returns the data less the swing."""
-    full = replace(data.full, error_arcsec=data.full.error_arcsec - found.does_arcsec)
-    return replace(data, full=full, points=averaged(full, data.runs))
+    return data.having(replace(data.full, error_arcsec=data.full.error_arcsec - found.does_arcsec))
 
 
 def settled(estimator: Estimator, fitted: Fitted, found: Swing | None) -> Observed:
@@ -175,8 +171,7 @@ def settled(estimator: Estimator, fitted: Fitted, found: Swing | None) -> Observ
     usable = data.full.usable & (unknown <= most)
     _, turned = estimator.turned(effects, fitted.hypothesis.start)
     sigma = np.sqrt(data.full.sigma_arcsec**2 + unknown**2 + turned**2)
-    full = replace(data.full, usable=usable, sigma_arcsec=sigma)
-    return replace(data, full=full, points=averaged(full, data.runs))
+    return data.having(replace(data.full, usable=usable, sigma_arcsec=sigma))
 
 
 def _accelerated(full: Samples, period_s: float) -> FloatArray:

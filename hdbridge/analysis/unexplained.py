@@ -60,7 +60,7 @@ class Rest:
     seen: bool
     """True if that dependence passes the criteria for a cause, apart from the reversals."""
     remark: str
-    """Dependence that passes them, too, but is too small to act on; empty if there is none."""
+    """Describes a dependence that passes the criteria but is too small to act on; else empty."""
 
 
 class _View(NamedTuple):
@@ -235,14 +235,12 @@ def _seen(
 ) -> tuple[list[_View], str]:
     """Returns the views that pass the criteria for a cause and are large enough to be reported.
 
-    If there are none, a remark on the best one that is too small to act on: below a count of the motor.
+    Without such a view, also returns a remark on the best one below that size; else an empty remark.
     """
     scales, start, weight = estimator.scales, fitted.hypothesis.start, estimator.weight[rows]
     count_arcsec = estimator.count_arcsec
-    gain, peak = (
-        scales.enter + scales.penalty,
-        max(count_arcsec, math.hypot(scales.plain_arcsec, 0.5 * _angle_step_arcsec(estimator))),
-    )
+    gain = scales.enter + scales.penalty
+    peak = max(count_arcsec, math.hypot(scales.plain_arcsec, 0.5 * _angle_step_arcsec(estimator)))
     laws = [each for each in fitted.hypothesis.effects if each.part is None]
     for law in laws:  # the larger its contribution, the larger the error of its formula
         does = estimator.columns(law, start)[rows] @ law.coefficients()
