@@ -45,7 +45,7 @@ class LssSlave:
         """Next request of an identity that agreed so far; part of the identity that is scanned."""
 
     def respond(self, request: bytes) -> bytes | None:
-        """Returns the answer to a request; None if there is none."""
+        """Returns the answer to a request; None for a request that is not answered."""
         if len(request) != 8:
             return None
         command, number, *_ = _NUMBER.unpack(request)

@@ -130,7 +130,7 @@ def _outer(outer: OuterState) -> str:
     from hdbridge.drive.states import decode
 
     if not outer.alive:
-        return "the gateway process does not run; it is started again by itself"
+        return "the gateway process does not run; the daemon restarts it"
     sync = "no SYNC" if outer.period_s is None else f"SYNC every {1e3 * outer.period_s:.3f} ms"
     error = f", error {outer.error_code:04X}h (docs/gateway.md)" if outer.error_code else ""
     state = decode(outer.statusword).value

@@ -61,7 +61,7 @@ class ServoWatch:
         self._response = response
         self._answers = None if response is None else Answers(response, self._orders, self._ratio, earlier)
         self._before_arcsec2: dict[tuple[int, int], float] = {}
-        """What the committed response left of each order at each frequency."""
+        """Mean square of each order at each frequency that the committed response left."""
         self._run: list[NDArray[Any]] = []
         self._speed_deg_s = 0.0
         self._even = 0

@@ -93,9 +93,8 @@ class Controller:
         # Waiting commands, frames and knots were meant for an earlier loop with the axes in other states.
         memory.commands.clear()
         memory.outgoing.clear()
-        for knots in memory.knots:
+        for knots, followed in zip(memory.knots, memory.followed, strict=True):
             knots.clear()
-        for followed in memory.followed:
             followed.clear()
         memory.status.set(Cell.LOOP_PID, os.getpid())
 

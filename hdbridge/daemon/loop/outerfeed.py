@@ -11,7 +11,7 @@ from hdbridge.daemon.memory.layout import OuterKnot
 KNOTS_A_TURN: Final = 64
 LONGEST_SPACING_S: Final = 0.05
 BRIDGED: Final = 0.2
-"""Share of the patience at rest for which an axis in motion goes on without a set-point."""
+"""Time for which a moving axis keeps its speed without a set-point, as a share of the time-out at rest."""
 FIRST_KNOT_S: Final = 2.0
 """Longest time from the begin to the first set-point."""
 

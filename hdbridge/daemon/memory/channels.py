@@ -240,8 +240,7 @@ class Queue(_Slots[T]):
         """Removes and returns the next item; None if there is none."""
         item = self.peek()
         if item is not None:
-            self._misses = 0
-            self._tail[0] += 1
+            self.drop()
         return item
 
     def clear(self) -> None:

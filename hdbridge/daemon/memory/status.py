@@ -97,4 +97,4 @@ class OuterCells:
     @property
     def view(self) -> OuterView:
         """The view of the outer master."""
-        return OuterView(*OUTER_VIEW.unpack_from(self._buffer, self._at))
+        return OuterView._make(OUTER_VIEW.unpack_from(self._buffer, self._at))
