@@ -38,5 +38,4 @@ def register(app: typer.Typer) -> None:
     for each in signed:
         group.command(context_settings=_SIGNED)(each)
     group.command("set", context_settings=_SIGNED)(objects.put)
-    group.command(hidden=True, context_settings={**_SIGNED, "allow_extra_args": True})(objects.job)
     app.add_typer(group, name="ctl")

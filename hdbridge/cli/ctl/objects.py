@@ -1,11 +1,9 @@
-"""Objects of a daemon's drives; the commands that run procedures in place of its former jobs."""
+"""Objects of a daemon's drives."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
-
-import typer
+from typing import TYPE_CHECKING
 
 from hdbridge.cli.ctl.common import (
     AtOption,
@@ -16,23 +14,9 @@ from hdbridge.cli.ctl.common import (
     moving,
 )
 from hdbridge.cli.options import JsonOption, ObjectArgument, ValueArgument, print_object, write_json
-from hdbridge.errors import InputError, RefusedError
 
 if TYPE_CHECKING:
     from hdbridge.client.messages import SdoValue
-
-
-def job(
-    axis: AxisArgument, kind: Annotated[str, typer.Argument(metavar="KIND")], at: AtOption = None
-) -> None:
-    """Name the command that runs a procedure, which the daemon no longer runs as a job."""
-    from hdbridge.client.messages import PROCEDURES
-
-    if kind not in PROCEDURES:
-        raise InputError(f"KIND: found {kind!r}; expected one of: {', '.join(PROCEDURES)}")
-    with connected(at) as client:
-        state = client.axis(axis).state()
-        raise RefusedError(state.in_place_of_job(kind, simulated=client.state().simulated))
 
 
 def get(

@@ -41,7 +41,6 @@ from hdbridge.client.messages.requests import (
     SwitchLoadLoop,
 )
 from hdbridge.client.messages.state import (
-    PROCEDURES,
     AdaptationState,
     AxisState,
     BusState,
@@ -63,7 +62,6 @@ from hdbridge.client.messages.values import (
 )
 
 __all__ = [
-    "PROCEDURES",
     "ActivateModel",
     "Adapt",
     "AdaptationMode",

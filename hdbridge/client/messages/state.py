@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import shlex
 from datetime import datetime
-from typing import Final
 
 from pydantic import Field
 
@@ -18,9 +16,6 @@ from hdbridge.client.messages.values import (
     Report,
     Scheme,
 )
-
-PROCEDURES: Final = ("calibrate", "step", "improve")
-"""Commands that a daemon once ran as jobs."""
 
 
 class Fault(Report):
@@ -158,15 +153,6 @@ class AxisState(Report):
         examples=[["recalibrate: the residual left what the model's intervals allow"]],
     )
     queued: int = Field(0, ge=0, description="way points that wait")
-
-    def in_place_of_job(self, kind: str, *, simulated: bool) -> str:
-        """Explains how to run a procedure, which is a command and no longer a job of the daemon."""
-        option = "--simulate" if simulated else "--borrow"
-        return (
-            f"axis '{self.name}': the daemon runs no jobs: run 'hdbridge {kind} {shlex.quote(self.profile)} "
-            f"{option}' on its computer; a model that it offers is committed by 'hdbridge ctl model "
-            f"{self.name} pending'"
-        )
 
 
 class BusState(Report):

@@ -133,16 +133,6 @@ def test_a_move_that_is_waited_for_keeps_the_lease(api):
         assert bridge.lease.ended() == ()
 
 
-@pytest.mark.parametrize("body", [{"kind": "step", "options": {"count": 60}}, {}, {"kind": 7}, None])
-def test_an_old_client_that_asks_for_a_job_learns_the_command(api, leased, body):
-    refused = leased.post("/axes/joint-1/jobs", json=body)
-    assert refused.status_code == 409
-    kind = "step" if body and body.get("kind") == "step" else "calibrate"
-    assert f"'hdbridge {kind} profiles/joint-1 --simulate'" in refused.json()["detail"]
-    assert "'hdbridge ctl model joint-1 pending'" in refused.json()["detail"]
-    assert api.bridge.moved == []
-
-
 def test_an_object_is_read_without_a_lease(api):
     with api.over_socket() as client:
         read = client.get("/axes/joint-1/objects/6041h").json()

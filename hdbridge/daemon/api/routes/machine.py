@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+from typing import Annotated
 
-from fastapi import APIRouter, Body, Query, Request
+from fastapi import APIRouter, Query, Request
 
 from hdbridge.client import messages
 from hdbridge.daemon.api.routes.parts import (
     MOVING,
     STOPPING,
-    AxisName,
     Holder,
     kept,
     port,
@@ -19,7 +18,6 @@ from hdbridge.daemon.api.routes.parts import (
 )
 from hdbridge.daemon.service.bridge import ServiceBridge
 from hdbridge.drive.interfacelock import user_name
-from hdbridge.errors import RefusedError
 
 
 def machine_routes(bridge: ServiceBridge) -> APIRouter:
@@ -121,14 +119,6 @@ def _add_loan(routes: APIRouter, bridge: ServiceBridge) -> None:
         """
         await kept(bridge, holder, request, bridge.lend_bus(holder))
         return bridge.state()
-
-    @routes.post("/axes/{axis}/jobs", include_in_schema=False)
-    async def start_job(axis: AxisName, wanted: Annotated[dict[str, Any] | None, Body()] = None) -> None:
-        """Refuse a client of an earlier version: name the command that runs the procedure."""
-        kinds, kind = messages.PROCEDURES, (wanted or {}).get("kind")
-        command = kind if isinstance(kind, str) and kind in kinds else kinds[0]
-        state = port(bridge, axis).state()
-        raise RefusedError(state.in_place_of_job(command, simulated=bridge.state().simulated))
 
 
 def _who(request: Request, name: str) -> str:
