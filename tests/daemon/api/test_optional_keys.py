@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import asyncio
 import copy
-import random
 from collections.abc import Iterable, Iterator
 from contextlib import AsyncExitStack, suppress
+from itertools import combinations
+from math import comb
 from pathlib import Path
 from typing import Any
 
@@ -172,8 +173,8 @@ def call_everything(machine: Machine, folder: Path) -> list[str]:
 
 
 def test_every_optional_key_may_be_left_out(tmp_path: Path) -> None:
-    """All at once, and random halves: of most two keys, each is left out where the other is there."""
-    whole, chance = files(tmp_path), random.Random(1)
+    """Together with others: of each two keys, each is left out once where the other is there."""
+    whole = files(tmp_path)
     tried = {content(machine_of(tmp_path, *whole))}
     optional = []
     for number, file in enumerate(whole):
@@ -186,14 +187,17 @@ def test_every_optional_key_may_be_left_out(tmp_path: Path) -> None:
                     tried.add(one)
                     optional.append((number, place))
     assert len(optional) > 12
-    halves = [[each for each in optional if chance.random() < 0.5] for _ in range(2)]
-    missing = [[], optional, *halves, [each for each in optional if each not in halves[0]]]
+    runs = next(count for count in range(99) if comb(count, count // 2) >= len(optional))
+    missing: list[list[tuple[int, tuple[Any, ...]]]] = [[] for _ in range(runs)]
+    for key, chosen in zip(optional, combinations(missing, runs // 2), strict=False):
+        for each in chosen:
+            each.append(key)
     complaints = {}
-    for each in missing:
+    for each in ([], *missing):
         left = [without(file, [p for n, p in each if n == number]) for number, file in enumerate(whole)]
         complaints[str(each)] = call_everything(machine_of(tmp_path, *left), tmp_path)
     assert {without: said for without, said in complaints.items() if said} == {}
-    assert len(complaints) == len(missing)
+    assert len(complaints) == 1 + runs
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf")])
