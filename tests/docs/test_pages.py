@@ -8,7 +8,7 @@ RUN = {
     path: pages.read(path.read_text(encoding="utf-8"))
     for path in sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")])
 }
-QUICK = {"README.md", "docs/daemon.md"}
+QUICK = {"README.md", "docs/bring-up.md", "docs/daemon.md"}
 """Pages that take seconds; the others take minutes."""
 
 
