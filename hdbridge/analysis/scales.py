@@ -1,8 +1,7 @@
 """Thresholds of the diagnosis in one table, each with its unit and source.
 
 They are passed to a diagnosis and included in its JSON, so that a result documents its criteria. At its
-``neutral`` value a threshold has no effect; tools/ablation.py sets each to it in turn and measures the
-loss.
+``neutral`` value a threshold has no effect.
 """
 
 from __future__ import annotations

@@ -15,7 +15,6 @@ from hdbridge.drive import State
 from hdbridge.drive.supervision import Fault
 from hdbridge.errors import InputError, SafetyStop
 from hdbridge.motion.procedures.moves import Dwell, MoveTo
-from hdbridge.motion.procedures.sine import Sines
 from hdbridge.motion.procedures.stepping import Stepping
 
 PROFILE = Path(__file__).parents[2] / "profiles" / "article"
@@ -152,23 +151,3 @@ def test_one_lost_tpdo_freezes_the_correction_and_two_stop_the_axis(axis, model,
     with pytest.raises(SafetyStop, match="a TPDO is missing"):
         bench.run(Moves(MoveTo(5.0)))
     assert motor_deg(node, axis) < 100
-
-
-def test_switching_the_compensation_on_does_not_jump(axis, model, bench_on):
-    drive, _ = bench_on
-    bench = Bench(drive, compensation_for(axis, model))
-    run = bench.run(Moves(Dwell(1.0)))
-    demand = run.record.columns["motor_target_deg"]
-    # The ramp takes 0.5 s to bring in a correction of about a dozen arcseconds at the load.
-    assert np.abs(np.diff(demand)).max() < 0.1
-
-
-def test_sines_run_and_repeat_bit_for_bit(axis, model):
-    def once():
-        with booted(axis, PROFILE / "truth.yaml", 5) as (drive, _):
-            bench = Bench(drive, compensation_for(axis, model))
-            return bench.run(Sines(amplitudes_deg=(5.0,), frequency_hz=1.0)).record
-
-    first, second = once(), once()
-    for name, column in first.columns.items():
-        assert column.tobytes() == second.columns[name].tobytes()

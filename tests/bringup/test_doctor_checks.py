@@ -225,7 +225,7 @@ def test_an_object_that_repeats_the_motor_encoder(case: Callable[..., Any]) -> N
 def test_a_load_encoder_that_jitters_at_rest(case: Callable[..., Any]) -> None:
     verdicts = case(
         truth={"    direction: 1\n    coupling": "    direction: 1\n    noise_arcsec: 60\n    coupling"}
-    ).run()
+    ).run(until="hold")
     assert failures(verdicts) == ["rest"]
     assert "load_encoder.source" in verdicts["rest"].remedies[0]
     assert verdicts["hold"].outcome is NOT_POSSIBLE
@@ -256,7 +256,7 @@ def test_a_torque_sensor_that_is_not_connected(case: Callable[..., Any]) -> None
 
 
 def test_a_torque_that_the_drive_does_not_have(case: Callable[..., Any]) -> None:
-    verdicts = case(axis=CHANNELS, spoil=_without((0x2101, 0))).run()
+    verdicts = case(axis=CHANNELS, spoil=_without((0x2101, 0))).run(until="eds")
     assert failures(verdicts)[0] == "eds"
     verdicts = case(axis=CHANNELS, eds={"[2101]": "[2111]"}).run()
     assert failures(verdicts) == ["files"]
@@ -264,7 +264,7 @@ def test_a_torque_that_the_drive_does_not_have(case: Callable[..., Any]) -> None
 
 
 def test_the_eds_of_another_drive(case: Callable[..., Any]) -> None:
-    verdicts = case(spoil=_without((0x6085, 0), (0x6007, 0))).run()
+    verdicts = case(spoil=_without((0x6085, 0), (0x6007, 0))).run(until="eds")
     assert failures(verdicts) == ["eds"]
     assert "axis.yaml:13:3: drive.eds: found hdbridge-402.eds" in verdicts["eds"].remedies[0]
     assert {"6085h", "6007h"} <= {
@@ -273,7 +273,7 @@ def test_the_eds_of_another_drive(case: Callable[..., Any]) -> None:
 
 
 def test_a_drive_at_another_node_id_is_found(case: Callable[..., Any]) -> None:
-    verdicts = case(node_id=5).run()
+    verdicts = case(node_id=5).run(until="node")
     assert failures(verdicts) == ["node"]
     told = "\n".join(verdicts["node"].remedies)
     assert "axis.yaml:12:3: drive.node_id: found 1; the drive with this identity is node 5" in told
@@ -381,5 +381,5 @@ def test_an_interrupt_stops_the_axis(case: Callable[..., Any]) -> None:
 
 
 def test_a_drive_in_fault_is_reset_and_checked(case: Callable[..., Any]) -> None:
-    verdicts = case(spoil=lambda node: node.faults.raise_error(0x3210)).run()
+    verdicts = case(spoil=lambda node: node.faults.raise_error(0x3210)).run(until="hold")
     assert failures(verdicts) == []

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gzip
 import math
 import struct
 from collections.abc import Callable
@@ -31,6 +30,12 @@ EPOCH_S = 1.7e9
 CYCLES = 1500
 
 
+def frame(time_s: float, can_id: int, data: bytes, channel: int = 0, **more: bool) -> can.Message:
+    return can.Message(
+        timestamp=time_s, arbitration_id=can_id, data=data, is_extended_id=False, channel=channel, **more
+    )
+
+
 @dataclass
 class Logged:
     """Frames of the bus, and the master's own values."""
@@ -55,20 +60,11 @@ class Master:
         self.bus, self.clock, self.log = bus, clock, Logged()
 
     def keep(self, message: can.Message, *, is_rx: bool) -> None:
-        copy = can.Message(
-            timestamp=EPOCH_S + message.timestamp,
-            arbitration_id=message.arbitration_id,
-            data=message.data,
-            is_extended_id=False,
-            is_rx=is_rx,
-            channel=0,
-        )
+        copy = frame(EPOCH_S + message.timestamp, message.arbitration_id, message.data, is_rx=is_rx)
         self.log.messages.append(copy)
 
     def send(self, can_id: int, data: bytes = b"") -> None:
-        message = can.Message(
-            arbitration_id=can_id, data=data, is_extended_id=False, timestamp=self.clock.now()
-        )
+        message = frame(self.clock.now(), can_id, data)
         self.keep(message, is_rx=False)
         self.bus.send(message)
 
@@ -221,15 +217,6 @@ def test_an_mf4_log_without_its_reader_names_the_extra(tmp_path: Path) -> None:
         import_log(tmp_path / "bus.mf4", AXIS)
 
 
-def test_fit_and_diagnose_read_it(tmp_path: Path, logged: Logged) -> None:
-    path = logged.write(tmp_path / "bus.log")
-    run("record", "import", path, ARTICLE, "--out", tmp_path / "made")
-    run("fit", tmp_path / "made", "--out", tmp_path / "model.yaml", "--json", tmp_path / "fit.json")
-    said = run("diagnose", tmp_path / "made", "--model", tmp_path / "model.yaml")
-    assert "Error" not in said
-    assert (tmp_path / "model.yaml").is_file()
-
-
 def test_without_a_position_demand_the_target_that_was_sent_is_the_command(
     tmp_path: Path, without_demand: Logged, logged: Logged
 ) -> None:
@@ -246,13 +233,7 @@ def test_targets_that_are_ends_of_moves_are_no_command(tmp_path: Path, without_d
     """A drive in profile position mode plans the move itself."""
     constant = replace(without_demand)
     constant.messages = [
-        can.Message(
-            timestamp=each.timestamp,
-            arbitration_id=each.arbitration_id,
-            data=struct.pack("<i", 32000) + each.data[4:],
-            is_extended_id=False,
-            channel=0,
-        )
+        frame(each.timestamp, each.arbitration_id, struct.pack("<i", 32000) + each.data[4:])
         if each.arbitration_id == 0x231
         else each
         for each in without_demand.messages
@@ -274,11 +255,7 @@ def in_order_of_axis_file(logged: Logged, *, swapped: bool = False) -> Logged:
     latest: dict[int, bytes] = {}
 
     def add(like: can.Message, can_id: int, data: bytes) -> None:
-        messages.append(
-            can.Message(
-                timestamp=like.timestamp, arbitration_id=can_id, data=data, is_extended_id=False, channel=0
-            )
-        )
+        messages.append(frame(like.timestamp, can_id, data))
 
     for each in logged.messages:
         can_id, data = each.arbitration_id, bytes(each.data)
@@ -369,14 +346,7 @@ def test_a_log_that_was_cut_off_is_read_up_to_there(tmp_path: Path, logged: Logg
 def test_two_buses_in_one_log_need_a_choice(tmp_path: Path, logged: Logged) -> None:
     twice = Logged([*logged.messages], logged.rows)
     for each in logged.messages:
-        other = can.Message(
-            timestamp=each.timestamp,
-            arbitration_id=each.arbitration_id,
-            data=each.data,
-            is_extended_id=False,
-            channel=1,
-        )
-        twice.messages.append(other)
+        twice.messages.append(frame(each.timestamp, each.arbitration_id, each.data, channel=1))
     twice.messages.sort(key=lambda each: each.timestamp)
     path = twice.write(tmp_path / "bus.blf")
     with pytest.raises(InputError, match="node 1 is on the channels 0, 1; choose one: --channel"):
@@ -392,13 +362,7 @@ def test_parts_begin_at_gaps_and_when_the_drive_boots(tmp_path: Path, logged: Lo
     assert len(cut.record.parts()) == 2
     assert "zeros_may_differ" not in cut.notes
     place = next(place for place, each in enumerate(logged.messages) if each.timestamp >= middle_s)
-    boot = can.Message(
-        timestamp=logged.messages[place].timestamp,
-        arbitration_id=0x701,
-        data=b"\0",
-        is_extended_id=False,
-        channel=0,
-    )
+    boot = frame(logged.messages[place].timestamp, 0x701, b"\0")
     booted = Logged([*logged.messages[:place], boot, *logged.messages[place:]])
     again = import_log(booted.write(tmp_path / "boot.log"), AXIS)
     assert len(again.record.parts()) == 2
@@ -410,25 +374,10 @@ def test_a_refused_write_is_not_the_mapping(tmp_path: Path, logged: Logged) -> N
     request = struct.pack("<BHBI", 0x23, 0x1A00, 1, 0x6041_0010)
     abort = struct.pack("<BHBI", 0x80, 0x1A00, 1, 0x0800_0022)
     place = next(n for n, each in enumerate(logged.messages) if each.arbitration_id == 0x1A1)
-    frames = [
-        can.Message(
-            timestamp=logged.messages[place].timestamp,
-            arbitration_id=can_id,
-            data=data,
-            is_extended_id=False,
-            channel=0,
-        )
-        for can_id, data in ((0x601, request), (0x581, abort))
-    ]
+    now_s = logged.messages[place].timestamp
+    frames = [frame(now_s, can_id, data) for can_id, data in ((0x601, request), (0x581, abort))]
     tried = Logged([*logged.messages[:place], *frames, *logged.messages[place:]], logged.rows)
     check_angles(import_log(tried.write(tmp_path / "bus.log"), AXIS), logged)
-
-
-def test_gzip_is_read(tmp_path: Path, logged: Logged) -> None:
-    path = logged.write(tmp_path / "bus.log")
-    packed = tmp_path / "packed.log.gz"
-    packed.write_bytes(gzip.compress(path.read_bytes()))
-    check_angles(import_log(packed, AXIS), logged)
 
 
 def synthetic(count: int = 200) -> tuple[np.ndarray, np.ndarray]:
@@ -440,9 +389,7 @@ def synthetic(count: int = 200) -> tuple[np.ndarray, np.ndarray]:
 def write_frames(path: Path, frames: list[tuple[float, int, bytes]]) -> Path:
     with can.Logger(path) as logger:
         for time_s, can_id, data in frames:
-            logger.on_message_received(
-                can.Message(timestamp=time_s, arbitration_id=can_id, data=data, is_extended_id=False)
-            )
+            logger.on_message_received(frame(time_s, can_id, data))
     return path
 
 

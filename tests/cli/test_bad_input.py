@@ -1,10 +1,6 @@
 """Bad input gives one clear line and a documented exit status, and nothing is written."""
 
-import re
-
 import pytest
-
-from hdbridge.files.bundled import bundled_folder
 
 
 def refused(done, status: int, *texts: str) -> None:
@@ -72,19 +68,6 @@ def test_absent_interface(hdbridge, profile):
     refused(done, 3, "socketcan:nocan7")
 
 
-@pytest.mark.parametrize(
-    ("options", "texts"),
-    [
-        (("--count", 1000), ("400", "nothing was moved")),
-        (("--start-deg", "nan"), ("nan",)),
-        (("--step-deg", "inf"), ("inf",)),
-        (("--start-deg", "-399"), ("-401", "nothing was moved")),
-    ],
-)
-def test_targets_outside_the_limits_never_reach_the_axis(hdbridge, options, texts):
-    refused(hdbridge("step", "article", "--simulate", *options), 2, *texts)
-
-
 def test_truth_without_simulation(hdbridge, profile):
     refused(hdbridge("step", "article", "--truth", profile.folder / "truth.yaml"), 2, "--simulate")
 
@@ -112,32 +95,6 @@ def test_the_virtual_bus_without_a_drive_is_refused_at_once(hdbridge, command):
     assert done.returncode == 2
     assert "bus.interface: found virtual, which reaches nothing outside this process" in done.stderr
     assert "--simulate" in done.stderr
-
-
-def lacking(profile, *indices):
-    """The article's profile with an EDS of its own that lacks these objects."""
-    eds = (bundled_folder("eds") / "hdbridge-402.eds").read_text()
-    for index in indices:
-        eds = re.sub(rf"^\[{index:04X}(sub\d+)?\]$", "[no object]", eds, flags=re.MULTILINE, count=1)
-    (profile.folder / "own.eds").write_text(eds)
-    return profile("eds: hdbridge-402.eds", "eds: own.eds")
-
-
-def test_check_says_beforehand_what_the_eds_lacks(hdbridge, profile):
-    done = hdbridge("check", lacking(profile, 0x6072))
-    assert done.returncode == 0, done.stderr
-    assert "left to the drive  6072h:00, which own.eds lacks: torque limit" in done.stdout
-    assert ": limits.torque_percent)" in done.stdout
-
-
-def test_an_eds_that_lacks_what_is_needed_is_not_all_right(hdbridge, profile):
-    refused(
-        hdbridge("check", lacking(profile, 0x6064)), 2, "axis.yaml:13:3: drive.eds", "own.eds lacks 6064h:00"
-    )
-    (profile.folder / "own.eds").write_text("[DeviceInfo]\n")
-    refused(hdbridge("check", profile.folder), 2, "lacks 6040h:00 controlword", "more, which")
-    (profile.folder / "own.eds").write_text("")
-    refused(hdbridge("check", profile.folder), 2, "own.eds: cannot be read as an EDS")
 
 
 def test_a_model_of_another_axis_is_refused_before_anything_is_connected(hdbridge, profile):

@@ -189,7 +189,7 @@ def test_the_machine_is_named_if_it_was_not_given(hdbridge, machine, place, monk
     assert done.stderr == f"machine 'cell' at {found}\n"
 
 
-@pytest.mark.parametrize("width", [60, 80, 120])
+@pytest.mark.parametrize("width", [60, 120])
 @pytest.mark.parametrize("line", ["status", "watch --count 1"])
 def test_tables_are_whole_at_any_width(ctl, process, machine, monkeypatch, line, width):
     shown = (

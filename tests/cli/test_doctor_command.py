@@ -6,18 +6,6 @@ from dataclasses import replace
 from hdbridge.cli.session import Session
 
 
-def test_doctor_passes_a_sound_axis(hdbridge, tmp_path):
-    done = hdbridge("doctor", "article", "--simulate", "--json", "out.json")
-    assert done.returncode == 0, done.stdout + done.stderr
-    assert "all right" in done.stdout
-    result = json.loads((tmp_path / "out.json").read_text())
-    assert result["schema"] == "hdbridge.doctor/1"
-    assert result["passed"] is True
-    assert {each["outcome"] for each in result["checks"]} == {"pass"}
-    turn = next(each for each in result["checks"] if each["name"] == "turn")
-    assert abs(turn["figures"]["ratio_measured"] - 50) < 0.1
-
-
 def test_doctor_names_the_line_to_change(hdbridge, profile, tmp_path):
     folder = profile(
         "    counts_per_turn: 2880000\n    direction: 1",

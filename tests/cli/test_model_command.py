@@ -1,12 +1,6 @@
 """`hdbridge model`: look, compare, commit, go back; and what a kill leaves."""
 
 import json
-import os
-import random
-import signal
-import subprocess
-import sys
-import time
 
 import pytest
 
@@ -117,36 +111,3 @@ def test_a_model_of_another_axis_is_not_committed(hdbridge, propose, profile, ol
     assert f"provenance.{word}" in done.stderr
     assert not (folder / "model.yaml").exists()
     assert (folder / "pending.yaml").exists()
-
-
-def test_a_commit_killed_at_any_moment_leaves_the_old_model_or_the_new_one(hdbridge, propose):
-    folder = propose(40.0)
-    hdbridge("model", "commit", folder)
-    worker = (
-        "import sys\nfrom hdbridge.cli import app, load\nload('model')\n"
-        "print('ready', flush=True)\nsys.stdin.readline()\n"
-        "app(['model', 'commit', sys.argv[1]])\n"
-    )
-    rng = random.Random(3)
-    before = 40.0
-    for number in range(4):
-        after = 41.0 + number
-        propose(after)
-        process = subprocess.Popen(
-            [sys.executable, "-c", worker, str(folder)],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            env={**os.environ, "OPENBLAS_NUM_THREADS": "1"},
-        )
-        assert process.stdout.readline() == b"ready\n"
-        process.stdin.write(b"go\n")
-        process.stdin.flush()
-        time.sleep(rng.uniform(0.0, 0.03))
-        process.send_signal(signal.SIGKILL)
-        process.communicate()
-        found = offset(folder)
-        assert found in {before, after}
-        before = found
-    (folder / "pending.yaml").write_text(PENDING.format(offset=60.0))
-    assert hdbridge("model", "commit", folder).returncode == 0
-    assert offset(folder) == 60.0

@@ -3,6 +3,7 @@
 import ast
 import json
 import re
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -46,37 +47,15 @@ def test_without_a_fault_nothing_is_done(hdbridge):
     assert "there is no fault to reset" in done.stdout
 
 
-def _texts(tree: ast.Module) -> list[str]:
-    """Every text of a module but its docstrings; an inserted `RESET` counts as its value."""
-    docstrings = {
-        id(node.body[0].value)
-        for node in ast.walk(tree)
-        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef)
-        and node.body
-        and isinstance(node.body[0], ast.Expr)
-    } | {
-        id(node.value)
-        for node in ast.walk(tree)
-        if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant)
-    }
-    joined = [node for node in ast.walk(tree) if isinstance(node, ast.JoinedStr)]
-    parts = {id(part) for each in joined for part in each.values}
-    found = [
-        node.value
-        for node in ast.walk(tree)
-        if isinstance(node, ast.Constant)
-        and isinstance(node.value, str)
-        and id(node) not in docstrings | parts
-    ]
-    for each in joined:
-        found.append(
-            "".join(
-                str(part.value) if isinstance(part, ast.Constant) else
-                RESET if isinstance(part, ast.FormattedValue) and ast.unparse(part.value) == "RESET" else "{}"
-                for part in each.values
-            )
-        )  # fmt: skip
-    return found
+def texts(tree: ast.Module) -> Iterator[str]:
+    """Every text of a module but its docstrings; an f-string with the expressions in it."""
+    skipped = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
+    for node in ast.walk(tree):
+        if isinstance(node, ast.JoinedStr):
+            skipped |= {id(each) for each in node.values}
+            yield ast.unparse(node)
+        elif isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in skipped:
+            yield node.value
 
 
 def test_every_message_that_asks_for_a_reset_names_the_command():
@@ -84,10 +63,9 @@ def test_every_message_that_asks_for_a_reset_names_the_command():
         (path.name, text)
         for path in sorted(PACKAGE.rglob("*.py"))
         if "reset" in (code := path.read_text(encoding="utf-8"))
-        for text in _texts(ast.parse(code))
+        for text in texts(ast.parse(code))
         if ASKS.search(text)
     ]
     assert len(asking) >= 8
-    assert [
-        each for each in asking if "hdbridge reset" not in each[1] and "hdbridge ctl reset" not in each[1]
-    ] == []
+    named = ("hdbridge reset", "hdbridge ctl reset", "{RESET}")
+    assert [each for each in asking if not any(name in each[1] for name in named)] == []

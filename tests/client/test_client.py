@@ -31,40 +31,6 @@ def test_the_state_is_typed(client):
     assert client.axis("joint-2").state().state is messages.ControlState.DISABLED
 
 
-def test_what_moves_is_asked_for_as_it_was_given(client, api):
-    axis = client.axis("joint-1")
-    with client.lease():
-        axis.move(5, velocity_deg_s=10, wait=False)
-        axis.jog(-3.0)
-        axis.queue([1.0, messages.QueueItem(target_deg=2.0, dwell_s=1.0)], wait=False)
-        axis.clear_queue()
-        axis.compensate("both")
-        axis.activate_model("pending")
-        axis.load_loop(True)
-        axis.adapt("observe")
-        axis.adaptation_back()
-        axis.write("6041h", 1)
-        axis.disable()
-        axis.home(37, offset_deg=1.0)
-        axis.reset()
-        axis.enable()
-    assert [each[1:] for each in api.bridge.moved] == [
-        ("move", 5.0, 10.0), ("jog", -3.0, 0.5), ("queue", 2), ("clear queue",), ("compensate", "both"),
-        ("model", "pending"), ("load loop", True), ("adapt", "observe"), ("adaptation back",),
-        ("write", "6041h", "1"), ("disable",), ("home", 37), ("reset",), ("enable",),
-    ]  # fmt: skip
-
-
-def test_stopping_needs_no_lease(client, api):
-    api.bridge.lease.take("somebody else")
-    client.axis("joint-2").stop()
-    client.axis("joint-2").quick_stop()
-    client.stop()
-    client.quick_stop()
-    assert len(api.bridge.stopped) == 6
-    assert api.bridge.moved == []
-
-
 def test_a_coordinated_move_and_an_object_and_marks(client, api):
     client.axis("joint-2").enable()
     client.coordinated({"joint-1": 1, "joint-2": 2}, speed=0.5)

@@ -8,7 +8,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hdbridge.axis.effects import (
-    CATALOGUE,
     Backlash,
     Hysteresis,
     HysteresisMemory,
@@ -274,22 +273,9 @@ def test_hold_freezes_the_correction():
     assert motor == pytest.approx(50 * (loads[400] - frozen / 3600))
 
 
-def test_a_new_one_is_the_plain_gear():
-    compensation = Compensation(model(), CompensationLimits(), PERIOD)
-    assert compensation.command(0.1, NOW) == pytest.approx(5.0, abs=1e-9)
-
-
 def test_reset_begins_without_a_correction_wherever_the_motor_stands():
     compensation = Compensation(model(), CompensationLimits(), PERIOD)
     compensation.reset(1234.5)
     compensation.engage()
     first = compensation.command(1234.5 / 50)
     assert abs(first - 1234.5) < 0.05
-
-
-def test_errors_of_the_measurement_are_not_compensated():
-    effect = CATALOGUE["channel_skew"].candidate(50.0)
-    assert not effect.is_compensable()
-    inverse = Inverse(TransmissionModel(50.0, (effect,)))
-    inverse.advance(0.0)
-    assert inverse.solve(1.0, Moment(motor_speed_deg_s=500.0)) == pytest.approx(50.0, abs=1e-9)

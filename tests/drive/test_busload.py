@@ -104,12 +104,6 @@ def test_more_axes_than_the_bus_carries_are_refused_with_what_would_fit() -> Non
         check_bus_load(fast[:4], 1_000_000)
 
 
-@pytest.mark.parametrize("count", range(1, 6))
-def test_the_load_grows_by_the_same_with_each_axis(count: int) -> None:
-    more = cycle_bits(axes(count + 1)) - cycle_bits(axes(count))
-    assert more == pytest.approx(cycle_bits(axes(2)) - cycle_bits(axes(1)))
-
-
 def test_axes_that_disagree_are_refused() -> None:
     with pytest.raises(InputError, match=r"drive\.cycle_ms gives 8.*gives 4"):
         bus_load([axis_of(1), axis_of(2, cycle_ms=8.0)], 1_000_000)

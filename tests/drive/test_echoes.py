@@ -2,14 +2,9 @@
 
 from __future__ import annotations
 
-import shutil
-import signal
 import socket
-import subprocess
-import sys
 from collections.abc import Iterator
 from contextlib import ExitStack
-from pathlib import Path
 
 import can
 import pytest
@@ -20,7 +15,6 @@ from hdbridge.drive import Link, open_bus
 from hdbridge.drive.fastlink import fast_link
 
 GROUP = "239.74.163.77"
-PROFILE = Path(__file__).parents[2] / "profiles" / "article"
 
 
 def free_port() -> int:
@@ -97,38 +91,3 @@ def test_other_back_ends_send_unmarked_frames() -> None:
         message = far.recv(1.0)
         assert message is not None
         assert message.channel in (None, "unmarked")
-
-
-def test_master_and_simulated_drive_in_two_processes(multicast: BusConfig, tmp_path: Path) -> None:
-    """A slow cycle, so that the test says something about echoes and nothing about the machine's load."""
-    folder = tmp_path / "axis"
-    shutil.copytree(PROFILE, folder)
-    file = folder / "axis.yaml"
-    text = file.read_text()
-    for old, new in (
-        ("interface: virtual", "interface: udp_multicast"),
-        ("channel: hdbridge", f"channel: {GROUP}\n  options: {{port: {multicast.options['port']}}}"),
-        ("cycle_ms: 4", "cycle_ms: 50"),
-        ("heartbeat_ms: 50", "heartbeat_ms: 1000"),
-    ):
-        assert old in text
-        text = text.replace(old, new, 1)
-    file.write_text(text)
-    program = [sys.executable, "-m", "hdbridge"]
-    with subprocess.Popen(
-        [*program, "simulate", str(folder), "--duration", "100"], stderr=subprocess.PIPE, text=True
-    ) as drive:
-        try:
-            assert drive.stderr is not None
-            assert f"node 1 on udp_multicast:{GROUP}" in drive.stderr.readline()
-            done = subprocess.run(
-                [*program, "step", str(folder), "--count", "2", "--scheme", "both"],
-                capture_output=True,
-                text=True,
-                check=False,
-            )
-        finally:
-            drive.send_signal(signal.SIGINT)
-            drive.wait()
-    assert done.returncode == 0, done.stderr
-    assert "quantisation floor" in done.stdout

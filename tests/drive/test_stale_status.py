@@ -90,6 +90,15 @@ def test_power_and_modes_are_what_the_drive_has_not_what_it_showed(delay_ms: flo
         drive.enable(Mode.PP)
 
 
+def test_an_enabled_drive_stays_so_while_the_master_waits_and_stops_while_it_sleeps() -> None:
+    with drive_that_shows_late(0.0) as (drive, _):
+        drive.move_to(0.2)
+        drive.wait(1.0)
+        assert drive.state() is State.OPERATION_ENABLED
+        drive.link.clock.sleep_until(drive.link.clock.now() + 0.2)
+        assert drive.state() is not State.OPERATION_ENABLED
+
+
 @pytest.mark.parametrize("delay_ms", DELAYS_MS)
 def test_a_drive_that_stops_in_a_move_is_not_set_in_motion_again(delay_ms: float) -> None:
     holding = AXIS.model_copy(update={"drive": AXIS.drive.model_copy(update={"quick_stop_option": 6})})

@@ -7,7 +7,6 @@ import pytest
 
 from hdbridge.axis.effects import (
     CATALOGUE,
-    SLOT,
     AmplitudeDrift,
     Backlash,
     Channel,
@@ -21,20 +20,15 @@ from hdbridge.axis.effects import (
     Motion,
     MotorOrder,
     MotorOrders,
-    Observer,
     RateDependence,
-    Start,
-    Synchronous,
     TorqueModulation,
     compensable,
     conflicts,
     extended,
     fall_bound,
-    readings,
     refreshed,
 )
 from hdbridge.axis.model import TransmissionModel
-from hdbridge.control.compensation import Inverse
 
 RATIO = 50.0
 BASE = (CATALOGUE["synchronous"].candidate(RATIO), CATALOGUE["hysteresis"].candidate(RATIO))
@@ -131,49 +125,3 @@ def test_a_scheme_that_asks_for_hysteresis_gets_the_law_that_stands_in_its_place
     model = TransmissionModel(ratio=RATIO, effects=extended(BASE, HysteresisMemory.candidate(RATIO, BASE)))
     assert names(model.only(["hysteresis"]).effects) == ["hysteresis_memory"]
     assert names(model.only(["synchronous"]).effects) == ["synchronous"]
-
-
-INVERTIBLE = sorted(
-    name
-    for name, kind in CATALOGUE.items()
-    if kind.candidate(RATIO, BASE).is_compensable()
-    and math.isfinite(kind.candidate(RATIO, BASE).slope_bound_arcsec_per_deg())
-)
-
-
-@pytest.mark.parametrize("name", INVERTIBLE)
-def test_the_compensation_puts_the_load_on_its_target_whatever_the_cause(name):
-    """There and back with rests, under torque, warming up: whatever the error, it is made up for."""
-    effect = CATALOGUE[name].candidate(RATIO, BASE)
-    base = tuple(each for each in BASE if each.name not in {name, effect.replaces})
-    model = TransmissionModel(ratio=RATIO, effects=(*base, effect))
-    inverse, observer = Inverse(model, Start.BACKWARD), Observer()
-    issued, targets, seen = [], [], []
-    for i in range(300):
-        time_s = 0.01 * i
-        target = 4.0 * round(math.sin(3.0 * time_s), 1) + 0.2 * math.sin(9.0 * time_s)
-        moment = observer.moment(
-            RATIO * target,
-            time_s,
-            measured=readings({Channel.LOAD_TORQUE: 20 * math.sin(time_s), Channel.TEMPERATURE: 20 + time_s}),
-        )
-        motor = inverse.solve(target, moment) if i else RATIO * target
-        inverse.advance(motor, moment)
-        issued.append(motor)
-        targets.append(target)
-        seen.append(moment)
-    motion = Motion(
-        np.array(issued),
-        np.array([each.time_s for each in seen]),
-        {channel: np.array([each.measured[slot] for each in seen]) for channel, slot in SLOT.items()},
-        motor_speed_deg_s=np.array([each.motor_speed_deg_s for each in seen]),
-        motor_acceleration_deg_s2=np.array([each.motor_acceleration_deg_s2 for each in seen]),
-    )
-    load = np.array(issued) / RATIO * 3600 + model.predict(motion, Start.BACKWARD)
-    np.testing.assert_allclose(load[1:], 3600 * np.array(targets)[1:], atol=1e-4)
-
-
-def test_most_causes_can_be_inverted():
-    assert len(INVERTIBLE) == 18
-    assert {"backlash", "hysteresis_memory", "creep", "zero_drift"} <= set(INVERTIBLE)
-    assert Synchronous.name in INVERTIBLE

@@ -17,8 +17,6 @@ from hdbridge.axis.effects import (
     Moment,
     Motion,
     Start,
-    Synchronous,
-    causes,
     moments,
     readings,
     unmet,
@@ -238,18 +236,3 @@ def fields(model: type[BaseModel]):
         for inner in getattr(field.annotation, "__args__", (field.annotation,)):
             if isinstance(inner, type) and issubclass(inner, BaseModel):
                 yield from fields(inner)
-
-
-def test_the_causes_are_those_that_findings_use():
-    assert set(causes()) == {
-        "motor_order", "motor_encoder_eccentricity", "load_order", "flexspline_order", "direction_phase",
-        "torque_modulation", "compliance", "inertial_windup", "velocity_windup", "channel_skew", "backlash",
-        "hysteresis_memory", "hysteresis_parameters", "rate_dependence", "subdivisional_error", "zero_drift",
-        "amplitude_drift", "wear", "creep", "ratio_error", "count_loss", "vibration", "local_defect",
-    }  # fmt: skip
-
-
-def test_errors_of_the_measurement_and_the_unforeseeable_are_not_compensated():
-    left_out = {name for name in NAMES if not CATALOGUE[name].candidate(50.0, BASE).is_compensable()}
-    assert left_out == {"channel_skew", "subdivisional_error", "load_order", "count_loss", "vibration"}
-    assert Synchronous.compensable.possible

@@ -3,13 +3,13 @@
 import hashlib
 import json
 import re
-from html.parser import HTMLParser
 from importlib.resources import files
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from support.reader import Reader
 
 from hdbridge.commissioning.evaluation.stepping import Scheme, SchemeResult
 from hdbridge.motion.procedures.stepping import Standing, SteppingOutcome
@@ -29,28 +29,6 @@ from hdbridge.report.page import (
     thinned,
 )
 from hdbridge.report.stepping import stepping_page
-
-
-class Reader(HTMLParser):
-    """Tags with their attributes, and text outside of script and style."""
-
-    def __init__(self, text):
-        super().__init__()
-        self.tags, self.text, self._inside = [], [], []
-        self.feed(text)
-
-    def handle_starttag(self, tag, attrs):
-        self.tags.append((tag, dict(attrs)))
-        if tag in {"script", "style"}:
-            self._inside.append(tag)
-
-    def handle_endtag(self, tag):
-        if self._inside and self._inside[-1] == tag:
-            self._inside.pop()
-
-    def handle_data(self, data):
-        if not self._inside:
-            self.text.append(data)
 
 
 def page_of(*blocks, title="T", verdict="V"):

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from support.hidden import CAUSES, UNKNOWN, Hidden, Run, hide, hide_all
+from support.hidden import CAUSES, UNKNOWN, Run, hide
 
 from hdbridge.sim.exercise import Exercise
 from hdbridge.sim.machine import Machine
@@ -189,62 +189,3 @@ def test_a_hidden_cause_has_the_size_that_it_states(cause: str) -> None:
     measure, least, most = EXPECTED[cause]
     measured = measure(Errors(known), here)
     assert least * hidden.size_arcsec < measured < most * hidden.size_arcsec, hidden.text
-
-
-@pytest.mark.parametrize("cause", EXPECTED)
-def test_the_same_chance_hides_the_same_and_another_one_something_else(cause: str) -> None:
-    def drawn(seed: int) -> tuple[Truth, Hidden]:
-        return hide(axis(), cause, random.Random(seed), 4.0, RUN)
-
-    assert drawn(1) == drawn(1)
-    assert any(drawn(seed)[0] != drawn(1)[0] for seed in range(2, 12))
-    assert drawn(1)[0] != axis()
-
-
-def test_pairs_are_hidden_one_beside_the_other() -> None:
-    names = list(CAUSES)
-    rng = random.Random(5)
-    for first in names:
-        second = rng.choice([each for each in names if each != first])
-        known, hidden = hide_all(axis(), [(first, 3.0), (second, 5.0)], rng, RUN)
-        assert [each.cause for each in hidden] == [first, second]
-        assert Machine(known, 1).load_counts is not None
-
-
-def test_unexplained_draws_one_of_several() -> None:
-    drawn = {
-        tuple(hide(axis(), "unexplained", random.Random(seed), 4.0, RUN)[1].parameters) for seed in range(20)
-    }
-    assert len(drawn) == len(UNKNOWN)
-    kinds = {tuple(sorted(hide(axis(), name, random.Random(1), 4.0, RUN)[1].parameters)) for name in UNKNOWN}
-    assert len(kinds) == len(UNKNOWN)
-
-
-def no_hysteresis(data: dict[str, Any]) -> None:
-    data["gear"]["hysteresis"] = None
-
-
-def no_orders(data: dict[str, Any]) -> None:
-    data["gear"]["motor_orders"] = []
-
-
-@pytest.mark.parametrize(
-    ("cause", "size", "changes", "complaint"),
-    [
-        ("gremlins", 3.0, None, "found 'gremlins'"),
-        ("creep", 0.0, None, "size_arcsec: found 0"),
-        ("hysteresis_memory", 3.0, no_hysteresis, "needs an axis with the hysteresis law"),
-        ("rate_dependence", 3.0, no_hysteresis, "needs an axis with hysteresis"),
-        ("direction_phase", 3.0, no_orders, "has no tooth error"),
-    ],
-)
-def test_what_cannot_be_hidden_is_refused(
-    cause: str, size: float, changes: Callable[[dict[str, Any]], None] | None, complaint: str
-) -> None:
-    with pytest.raises(ValueError, match=complaint):
-        hide(axis(changes), cause, random.Random(1), size, RUN)
-
-
-def test_a_size_beyond_what_the_axis_can_have_is_stated_as_it_is() -> None:
-    _, hidden = hide(axis(), "direction_phase", random.Random(1), 500.0, RUN)
-    assert 5.0 < hidden.size_arcsec < 40.0

@@ -1,23 +1,19 @@
 """Clients of a running daemon, in one process: pollers, watchers of the live samples, a page, one that moves.
 
-    python tools/bench/clients.py SOCKET [--polling 4] [--watching 5] [--moving stream|story|none]
+    python tools/bench/clients.py SOCKET
 
-What each does:
-
-  polling   the machine's state five times a second
-  watching  every sample of every axis, over a WebSocket
-  page      as the live page: a WebSocket with what a screen can use, the state and the events once a second
-  stream    set-points of a slow sine to the first axis, 100 a second, without an end
-  story     moves, a re-target in motion, jogs, a queue, a stream, compensation off and on, now and then a
+  4 poll    the machine's state five times a second
+  5 watch   every sample of every axis, over a WebSocket
+  1 page    as the live page: a WebSocket with what a screen can use, the state and the events once a second
+  1 story   moves, a re-target in motion, jogs, a queue, a stream, compensation off and on, now and then a
             quick stop and a reset: again and again
 
-A line ``on`` on standard input lets them begin, ``off`` ends them (answered by ``on`` and ``off``); at its
-end what they saw is printed as JSON: samples, lost ones, requests, longest answer, errors.
+They run until standard input ends; then what they saw is printed as JSON: samples, lost ones, requests,
+longest answer, errors.
 """
 
 from __future__ import annotations
 
-import argparse
 import asyncio
 import json
 import math
@@ -26,7 +22,7 @@ import sys
 import time
 from collections import Counter
 from collections.abc import AsyncIterator, Callable, Coroutine
-from contextlib import asynccontextmanager, suppress
+from contextlib import asynccontextmanager
 from typing import Any, Final
 
 from hdbridge.client import AsyncClient
@@ -109,31 +105,21 @@ async def ready(axis: AsyncAxis) -> None:
         await axis.enable()
 
 
-async def sine(axis: AsyncAxis, seen: Seen, knots: int | None) -> None:
-    """Streams ``knots`` set-points on a sine of 1 deg from the present position; without end if None."""
+async def sine(axis: AsyncAxis, seen: Seen, knots: int) -> None:
+    """Streams ``knots`` set-points on a sine of 1 deg from the present position."""
     middle_deg = (await axis.state()).load_target_deg
     assert middle_deg is not None
     async with axis.stream() as stream:
         place, begin_s = 0, time.monotonic()
-        while knots is None or place < knots:
+        while place < knots:
             points = []
-            for _ in range(AT_A_TIME if knots is None else min(AT_A_TIME, knots - place)):
+            for _ in range(min(AT_A_TIME, knots - place)):
                 time_s, phase = place / KNOTS_HZ, math.pi * place / KNOTS_HZ
                 points.append((time_s, middle_deg + math.sin(phase) ** 2, math.pi * math.sin(2.0 * phase)))
                 place += 1
             await stream.put(points)
             seen.points += len(points)
             await asyncio.sleep(max(begin_s + place / KNOTS_HZ - AHEAD_S - time.monotonic(), 0.0))
-
-
-async def stream_on(client: AsyncClient, seen: Seen) -> None:
-    """Streams set-points to the first axis."""
-    async with client.lease(force=True):
-        axis = next(iter((await client.axes()).values()))
-        await ready(axis)
-        await axis.stop()
-        await axis.rest()
-        await sine(axis, seen, None)
 
 
 async def story(client: AsyncClient, seen: Seen) -> None:
@@ -178,53 +164,17 @@ async def persistent(
             await asyncio.sleep(0.5)
 
 
-async def serve(options: argparse.Namespace) -> None:
-    """Starts and stops clients on command from standard input."""
+async def serve(socket: str) -> None:
+    """Runs the clients until standard input ends."""
     seen = Seen()
-    moving = {"stream": [stream_on], "story": [story], "none": []}[options.moving]
-    wanted = [poll] * options.polling + [watch] * options.watching + [page] * options.pages + moving
-    tasks: list[asyncio.Task[None]] = []
-    async for line in lines():
-        if line == "on" and not tasks:
-            tasks = [asyncio.create_task(persistent(options.socket, seen, each)) for each in wanted]
-        elif line == "off":
-            await end(tasks)
-            tasks = []
-        print(line, flush=True)
-    await end(tasks)
+    async with asyncio.TaskGroup() as group:
+        wanted = [poll] * 4 + [watch] * 5 + [page, story]
+        tasks = [group.create_task(persistent(socket, seen, each)) for each in wanted]
+        await asyncio.to_thread(sys.stdin.read)
+        for task in tasks:
+            task.cancel()
     print(json.dumps(seen.report()), flush=True)
 
 
-async def lines() -> AsyncIterator[str]:
-    """Yields the lines of standard input."""
-    loop = asyncio.get_running_loop()
-    reader = asyncio.StreamReader()
-    await loop.connect_read_pipe(lambda: asyncio.StreamReaderProtocol(reader), sys.stdin)
-    while line := await reader.readline():
-        yield line.decode().strip()
-
-
-async def end(tasks: list[asyncio.Task[None]]) -> None:
-    """Stops the clients and waits for their end."""
-    for task in tasks:
-        task.cancel()
-    for task in tasks:
-        with suppress(asyncio.CancelledError):
-            await task
-
-
-def main() -> int:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("socket")
-    parser.add_argument("--polling", type=int, default=4)
-    parser.add_argument("--watching", type=int, default=5)
-    parser.add_argument("--pages", type=int, default=1)
-    parser.add_argument("--moving", choices=("stream", "story", "none"), default="stream")
-    asyncio.run(serve(parser.parse_args()))
-    return 0
-
-
 if __name__ == "__main__":
-    raise SystemExit(main())
+    asyncio.run(serve(sys.argv[1]))

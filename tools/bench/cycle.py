@@ -43,13 +43,15 @@ from can.interfaces.socketcan import SocketcanBus
 from can.interfaces.socketcan.constants import SO_TIMESTAMPNS
 from can.interfaces.socketcan.socketcan import build_can_frame
 from can.interfaces.virtual import VirtualBus
-from harness import PROFILE, block_us, in_turn, keep, medians, parser, undisturbed
+from harness import PROFILE, Busy, block_us, in_turn, keep, medians, parser, undisturbed
 
 from hdbridge.axis import AxisConfig
 from hdbridge.axis.effects import InertialWindup, Observer
 from hdbridge.axis.model import TransmissionModel
 from hdbridge.axis.model.response import LeadFilter, Response
 from hdbridge.clock import Clock
+from hdbridge.control.axiscycle import AxisCycle
+from hdbridge.control.buscycle import BusCycle
 from hdbridge.control.compensation import Compensation, CompensationLimits
 from hdbridge.control.cycle import Cycle, Feedback
 from hdbridge.drive.image import ProcessImage
@@ -210,6 +212,56 @@ def response_of_usual_length(cycle_ms: float) -> Response:
             lead_cycles=8, per_cycle=2, full_speed_deg_s=1.0, weights=(0.01,) * 55, feedback=(-0.5, 0.05)
         ),
     )
+
+
+class Axes:
+    """Enabled axes on one bus, each on its own slow sine."""
+
+    def __init__(
+        self, bus: can.BusABC, count: int, model: TransmissionModel, clock: Clock | None = None
+    ) -> None:
+        self.bus = bus
+        self.clock = clock if clock is not None else NeverSleeping()
+        axis = AxisConfig.load(PROFILE)
+        self.period_s = axis.drive.cycle_s
+        self.cycle = BusCycle(Link(bus, self.clock), self.clock, self.period_s, bitrate_bps=1_000_000)
+        self.answers: list[Callable[[Feedback], int]] = []
+        for node_id in range(1, count + 1):
+            drive = axis.drive.model_copy(update={"node_id": node_id})
+            image = ProcessImage(axis.model_copy(update={"drive": drive}))
+            each = AxisCycle(image, Supervision())
+            self.cycle.join(each)
+            each.begin()
+            self.answers.append(self._answer(image, model, float(node_id)))
+
+    def _answer(
+        self, image: ProcessImage, model: TransmissionModel, phase: float
+    ) -> Callable[[Feedback], int]:
+        compensation = Compensation(model, CompensationLimits(), self.period_s)
+        compensation.engage()
+        sin, command, counts_for = math.sin, compensation.command, image.target_counts_for
+        return lambda feedback: counts_for(command(2.0 * sin(feedback.time_s + phase)))
+
+    def start(self) -> None:
+        """Prepares a block: latches released, power on."""
+        while self.bus.recv(0.0) is not None:
+            pass
+        for axis, answer in zip(self.cycle.axes, self.answers, strict=True):
+            axis.reset(verified=True)
+            axis.begin()
+            axis.command = answer
+        self.cycle.restart()
+        for _ in range(20):
+            self.cycle.exchange()
+            if all(axis.feedback.fresh for axis in self.cycle.axes):
+                break
+        for axis in self.cycle.axes:
+            axis.image.power.go(State.OPERATION_ENABLED)
+
+    def check(self) -> None:
+        """Raises `Busy` if an axis was stopped within the block."""
+        if any(axis.supervision.stop is not None for axis in self.cycle.axes):
+            raise Busy
 
 
 class Variants:

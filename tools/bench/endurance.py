@@ -1,49 +1,85 @@
-"""Endurance run of the daemon: growth of its processes, and an account of every missed cycle.
+"""Endurance run of the daemon: growth of its processes, cost of its clients, account of every missed cycle.
 
-    python tools/bench/endurance.py stepped [--hours 24] [--every MINUTES] [--json FILE]
-    python tools/bench/endurance.py real [--minutes 30] [--every SECONDS] [--json FILE]
+    python tools/bench/endurance.py [--minutes 30] [--every SECONDS] [--idle SECONDS] [--json FILE]
 
-``stepped`` (`stepped_day.py`): control loop, simulated drive and service in one thread on virtual time, as
-fast as the processor runs. ``real``: `hdbridge run --simulate` as it is, its processes, its flight recorder,
-with four clients that poll, five that watch, a live page, and one that moves (the story of `clients.py`).
+`hdbridge run --simulate` as it is, its processes, its flight recorder; first without clients, then with four
+that poll, five that watch, a live page, and one that moves (the story of `clients.py`).
 
 A figure grows when its median over the last quarter of the run is above that over the second quarter by more
 than is allowed. The first quarter is for what fills up: rings, queues of bounded length, caches.
 
-Exit status 1 where something grows, or a cycle is missing without a word.
+Exit status 1 if something grows, or a cycle is missing without a report.
 """
 
 from __future__ import annotations
 
-import argparse
 import json
-import math
+import os
+import shutil
+import signal
 import statistics
+import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from accounts import Accounts
-from rundaemon import CONTROL, KEEPER, SERVICE, Cost, running
+from harness import PROFILE, keep, parser
 
-RECORDER = "size_mb: 8, file_mb: 2, file_s: 60, kept_mb: 4, before_s: 10, after_s: 5"
-"""Recorder settings with a small ring, which is full within minutes."""
+from hdbridge.client import Client
+from hdbridge.daemon.memory import Memory
+from hdbridge.errors import DaemonError
+
+PATIENCE_S = 180.0
+CONTROL, SERVICE, KEEPER = "control", "service", "keeper"
+MACHINE = """schema: hdbridge.machine/1
+name: endurance
+axes: [{profile: article}]
+recorder: {size_mb: 8, file_mb: 2, file_s: 60, kept_mb: 4, before_s: 10, after_s: 5}
+"""
+"""Machine file with a small recorder ring, which is full within minutes."""
+ALLOWED = {"rss_kb": 1024.0, "descriptors": 2.0, "threads": 2.0}
+"""Allowed growth of each figure of a process."""
+
+
+@dataclass(frozen=True)
+class Cost:
+    """Figures of a process, from the kernel."""
+
+    cpu_s: float
+    rss_kb: int
+    """Private resident memory, without files and shared pages."""
+    descriptors: int
+    threads: int
+
+    @classmethod
+    def of(cls, pid: int) -> Cost:
+        """Reads the figures of a process; raises OSError if it has ended."""
+        proc = Path(f"/proc/{pid}")
+        lines = (proc / "status").read_text(encoding="ascii").splitlines()
+        fields = dict(line.split(":", 1) for line in lines)
+        run_ns = (int((task / "schedstat").read_text().split()[0]) for task in (proc / "task").iterdir())
+        return cls(
+            sum(run_ns) / 1e9,
+            int(fields["RssAnon"].split()[0]),
+            len(list((proc / "fd").iterdir())),
+            int(fields["Threads"]),
+        )
 
 
 @dataclass(frozen=True)
 class Growth:
-    """Growth of one figure over a run."""
+    """Growth of one figure over a run: first value, medians of the second and of the last quarter."""
 
     name: str
     first: float
     second: float
-    """Median of the second quarter."""
     last: float
-    """Median of the last quarter."""
     allowed: float
 
     @classmethod
@@ -61,131 +97,194 @@ class Growth:
     def __str__(self) -> str:
         verdict = "GROWS" if self.grows else "no growth"
         return (
-            f"  {self.name:<34} {self.first:>10.0f} {self.second:>10.0f} {self.last:>10.0f} "
+            f"  {self.name:<34} {self.first:>10.0f} {self.second:>12.0f} {self.last:>13.0f} "
             f"{self.last - self.second:>+9.0f} (allowed {self.allowed:.0f}): {verdict}"
         )
 
 
-HEAD = f"  {'':<34} {'first':>10} {'2nd quarter':>10} {'last quarter':>10}"
+class Accounts:
+    """Account of the cycles: each has a sample, was reported as skipped, or was lost by this reader."""
+
+    def __init__(self) -> None:
+        self.samples = self.lost = self.missing = self.skipped = 0
+        self._last: tuple[int, int] | None = None
+
+    def take(self, samples: Any, lost: int) -> None:
+        """Counts the samples of one read."""
+        self.lost += lost
+        self.samples += len(samples)
+        for cycle, skipped in zip(samples["cycle"].tolist(), samples["skipped"].tolist(), strict=True):
+            if self._last is not None:
+                self.missing += cycle - self._last[0] - 1
+                self.skipped += skipped - self._last[1]
+            self._last = cycle, skipped
+
+    def report(self) -> dict[str, int | bool]:
+        """Returns the JSON object."""
+        counts = {name: value for name, value in vars(self).items() if name != "_last"}
+        return {**counts, "balanced": self.missing == self.skipped + self.lost}
 
 
-def real(minutes: float, every_s: float) -> tuple[list[Growth], dict[str, Any]]:
+class RunningDaemon:
+    """Daemon of the article's axis in its own processes; its log is the file ``log``."""
+
+    def __init__(self, folder: Path) -> None:
+        own = folder / "endurance"
+        shutil.copytree(PROFILE, own / "article")
+        (own / "machine.yaml").write_text(MACHINE, encoding="utf-8")
+        self.log = folder / "daemon.log"
+        self.socket = folder / "hdbridge" / "endurance.sock"
+        environment = {**os.environ, "XDG_RUNTIME_DIR": str(folder), "XDG_STATE_HOME": str(folder)}
+        with self.log.open("wb") as log:
+            self.process = subprocess.Popen(
+                [sys.executable, "-m", "hdbridge", "run", str(own / "machine.yaml"), "--simulate"],
+                env=environment, cwd=folder, stderr=log, stdout=subprocess.DEVNULL,
+            )  # fmt: skip
+
+    def until_disabled(self) -> None:
+        """Waits until every drive is verified."""
+        end_s = time.monotonic() + PATIENCE_S
+        while True:
+            with suppress(DaemonError), Client(str(self.socket)) as client:
+                if all(axis.state == "disabled" for axis in client.state().axes):
+                    return
+            if self.process.poll() is not None or time.monotonic() > end_s:
+                raise SystemExit("\n".join(["the drives are not verified", *self.last_words()]))
+            time.sleep(0.05)
+
+    def events(self) -> Iterator[dict[str, Any]]:
+        """Returns the events of the log."""
+        for line in self.log.read_text(encoding="utf-8").splitlines():
+            with suppress(ValueError):
+                yield json.loads(line)
+
+    def last_words(self) -> list[str]:
+        """Returns the end of the log, without the requests."""
+        lines = self.log.read_text(encoding="utf-8").splitlines()
+        return [line for line in lines if '"request"' not in line][-30:]
+
+    def pids(self) -> dict[str, int]:
+        """Returns the running processes of the daemon."""
+        started = {f"{name} process started": name for name in (CONTROL, SERVICE)}
+        found = {started[each["event"]]: each["pid"] for each in self.events() if each["event"] in started}
+        return {KEEPER: self.process.pid, **found}
+
+    @contextmanager
+    def memory(self) -> Iterator[Memory]:
+        """Opens the keeper's shared memory for reading, as the service does."""
+        fds = Path(f"/proc/{self.process.pid}/fd")
+        found = next(each for each in fds.iterdir() if str(each.readlink()).startswith("/memfd:hdbridge "))
+        with Memory.attach(os.open(found, os.O_RDWR)) as memory:  # which closes it
+            yield memory
+
+    def close(self) -> None:
+        """Ends the daemon in order."""
+        self.process.send_signal(signal.SIGTERM)
+        with suppress(subprocess.TimeoutExpired):
+            self.process.wait(60.0)
+        self.process.kill()
+        self.process.wait()
+
+
+@contextmanager
+def clients(socket: Path) -> Iterator[Callable[[], dict[str, Any]]]:
+    """Runs the process of `clients.py`; yields a function that ends it and returns what it saw."""
+    program = Path(__file__).with_name("clients.py")
+    process = subprocess.Popen(
+        [sys.executable, str(program), str(socket)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    )
+    assert process.stdin is not None
+    assert process.stdout is not None
+
+    def seen() -> dict[str, Any]:
+        assert process.stdin is not None
+        assert process.stdout is not None
+        process.stdin.close()
+        return dict(json.loads(process.stdout.readline()))
+
+    try:
+        yield seen
+    finally:
+        process.kill()
+        process.wait()
+
+
+def turn_us(memory: Memory, pid: int, work: Callable[[], object]) -> float:
+    """Returns the CPU time of the control process for a turn while ``work`` runs, us."""
+    before, turns = Cost.of(pid), memory.status.loop_count
+    work()
+    return 1e6 * (Cost.of(pid).cpu_s - before.cpu_s) / (memory.status.loop_count - turns)
+
+
+def run(minutes: float, every_s: float, idle_s: float) -> tuple[list[Growth], dict[str, Any]]:
     """Runs the processes; returns their growth and the account of cycles."""
     rows: list[dict[str, Cost]] = []
     accounts = Accounts()
-    with tempfile.TemporaryDirectory(prefix="endurance-") as text:
+    with tempfile.TemporaryDirectory(prefix="endurance-") as text, ExitStack() as stack:
         folder = Path(text)
-        with (
-            running(folder, "--moving", "story", recorder=RECORDER) as (daemon, clients),
-            daemon.memory() as memory,
-        ):
-            reader = memory.reader()
-            pids = daemon.pids()
-            clients.say("on")
-            begin_s = time.monotonic()
-            due_s = begin_s + every_s
-            first_turns = memory.status.loop_count
+        daemon = RunningDaemon(folder)
+        stack.callback(daemon.close)
+        daemon.until_disabled()
+        memory = stack.enter_context(daemon.memory())
+        pids, reader = daemon.pids(), memory.reader()
+
+        def watch() -> None:
+            begin_s = due_s = time.monotonic()
             while (now_s := time.monotonic()) < begin_s + 60.0 * minutes:
                 accounts.take(*reader.read())
                 if now_s >= due_s:
                     due_s += every_s
                     rows.append({name: Cost.of(pid) for name, pid in pids.items()})
-                    print(
-                        f"{(now_s - begin_s) / 60.0:6.1f} min  "
-                        + "  ".join(
-                            f"{name} {cost.rss_kb} kB {cost.descriptors} fd"
-                            for name, cost in rows[-1].items()
-                        ),
-                        flush=True,
-                    )
+                    memories = (f"{name} {cost.rss_kb} kB" for name, cost in rows[-1].items())
+                    print(f"{(now_s - begin_s) / 60.0:6.1f} min ", *memories, flush=True)
                 if daemon.pids() != pids:
-                    raise SystemExit("a process was started again")
+                    raise SystemExit("\n".join(["a process was started again", *daemon.last_words()]))
                 time.sleep(1.0)
-            wall_s = time.monotonic() - begin_s
-            turns = memory.status.loop_count - first_turns
-            state = json.loads(_state(daemon.socket))
-            seen = clients.seen()
-            recorded = sum(each.stat().st_size for each in folder.rglob("*.mcap"))
-        events = list(daemon.told())
-    growths = []
-    for name in (KEEPER, CONTROL, SERVICE):
-        growths.append(Growth.of(f"{name}: own memory, kB", [row[name].rss_kb for row in rows], 1024.0))
-        growths.append(Growth.of(f"{name}: descriptors", [row[name].descriptors for row in rows], 2.0))
-        growths.append(Growth.of(f"{name}: threads", [row[name].threads for row in rows], 2.0))
-    problems = {}
-    for event in events:
-        if event.get("level") in ("warning", "error", "critical"):
-            key = f"{event['event']}: {event.get('text', event.get('why', ''))}"
-            problems[key] = problems.get(key, 0) + 1
-    cpu = {
-        name: (rows[-1][name].cpu_s - rows[0][name].cpu_s) / ((len(rows) - 1) * every_s) for name in rows[0]
-    }
-    found = {
-        "minutes": wall_s / 60.0,
-        "turns": turns,
-        "of real time": turns * memory_period(state) / wall_s,
-        "cpu share": cpu,
-        "accounts": accounts.report(),
-        "recorder": state["recorder"],
-        "recorded bytes": recorded,
-        "clients": seen,
-        "problems in the log": problems,
-        "rows": [{name: vars(cost) for name, cost in row.items()} for row in rows],
-    }
+
+        idle_us = turn_us(memory, pids[CONTROL], lambda: time.sleep(idle_s))
+        accounts.take(*reader.read())
+        seen = stack.enter_context(clients(daemon.socket))
+        first_turn, begin_s = memory.status.loop_count, time.monotonic()
+        busy_us = turn_us(memory, pids[CONTROL], watch)
+        turns, wall_s = memory.status.loop_count - first_turn, time.monotonic() - begin_s
+        with Client(str(daemon.socket), timeout_s=60.0) as client:
+            state = client.state()
+        found = {
+            "minutes": wall_s / 60.0,
+            "turns": turns,
+            "of real time": turns * state.cycle.period_s / wall_s,
+            "turn without clients, us": idle_us,
+            "turn with clients, us": busy_us,
+            "accounts": accounts.report(),
+            "recorder": state.recorder.model_dump(mode="json"),
+            "recorded bytes": sum(each.stat().st_size for each in folder.rglob("*.mcap")),
+            "clients": seen(),
+            "problems in the log": Counter(
+                f"{event['event']}: {event.get('text', event.get('why', ''))}"
+                for event in daemon.events()
+                if event.get("level") in ("warning", "error", "critical")
+            ),
+        }
+    growths = [
+        Growth.of(f"{name}: {figure}", [getattr(row[name], figure) for row in rows], allowed)
+        for name in pids
+        for figure, allowed in ALLOWED.items()
+    ]
     return growths, found
 
 
-def _state(socket: Path) -> str:
-    from hdbridge.client import Client  # noqa: PLC0415
-
-    with Client(str(socket), timeout_s=60.0) as client:
-        return client.state().model_dump_json()
-
-
-def memory_period(state: dict[str, Any]) -> float:
-    """Turn time, s."""
-    return float(state["cycle"]["period_s"])
-
-
-def stepped(options: argparse.Namespace) -> tuple[list[Growth], dict[str, Any]]:
-    """Runs hours of axis time; returns growth and the account of cycles."""
-    from stepped_day import run  # noqa: PLC0415 - needs the tests' support
-
-    def say(row: dict[str, float]) -> None:
-        print("  ".join(f"{name} {value:.10g}" for name, value in row.items()), flush=True)
-
-    found = run(options.hours, 60.0 * options.every, options.seed, say, 60.0 * options.at_most)
-    rows = found["rows"]
-    allowed = {"rss_kb": 4096.0, "blocks": 5000.0, "objects": 2000.0, "descriptors": 2.0}
-    return [Growth.of(name, [row[name] for row in rows], most) for name, most in allowed.items()], found
-
-
 def main() -> int:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--json", type=Path)
-    kinds = parser.add_subparsers(dest="kind", required=True)
-    axis_time = kinds.add_parser("stepped")
-    axis_time.add_argument("--hours", type=float, default=24.0, help="of axis time")
-    axis_time.add_argument("--every", type=float, default=15.0, help="minutes of axis time between two looks")
-    axis_time.add_argument("--seed", type=int, default=1)
-    axis_time.add_argument("--at-most", type=float, default=math.inf, help="minutes by the clock")
-    processes = kinds.add_parser("real")
-    processes.add_argument("--minutes", type=float, default=30.0)
-    processes.add_argument("--every", type=float, default=20.0, help="seconds between two looks")
-    options = parser.parse_args()
-    if options.kind == "real":
-        growths, found = real(options.minutes, options.every)
-        balanced = found["accounts"]["balanced"]
-    else:
-        growths, found = stepped(options)
-        balanced = found["accounts"]["balanced"] and found["skipped"] == found["skipped told in events"]
-    print("\n".join([HEAD, *map(str, growths)]))
-    print(json.dumps({name: value for name, value in found.items() if name != "rows"}, indent=2))
-    if options.json is not None:
-        options.json.write_text(json.dumps(found, indent=2) + "\n", encoding="utf-8")
-    return int(not balanced or any(each.grows for each in growths))
+    given = parser(__doc__)
+    given.add_argument("--minutes", type=float, default=30.0)
+    given.add_argument("--every", type=float, default=20.0, help="seconds between two looks")
+    given.add_argument("--idle", type=float, default=60.0, help="seconds without clients")
+    options = given.parse_args()
+    growths, found = run(options.minutes, options.every, options.idle)
+    print(f"  {'':<34} {'first':>10} {'2nd quarter':>12} {'last quarter':>13}")
+    print(*growths, sep="\n")
+    print(json.dumps(found, indent=2))
+    keep(found, options.json)
+    return int(not found["accounts"]["balanced"] or any(each.grows for each in growths))
 
 
 if __name__ == "__main__":

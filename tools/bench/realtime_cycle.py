@@ -7,7 +7,7 @@ Runs on the kernel of `tools/realtime/run.sh`, on which an instruction is a nano
 one commit can be compared with another. The exchanges are those of `cycle.py` and one in C (`master.c`). The
 kernel's gateway answers as the drive. Each has SCHED_FIFO, locked memory and absolute deadlines.
 
-Then six axes on one bus, compensated, at 250 Hz (`buscycle.py`).
+Then six axes on one bus, compensated, at 250 Hz.
 
   late    from the deadline to the first instruction of the cycle
   busy    from there to its last one, system calls included
@@ -25,8 +25,7 @@ from pathlib import Path
 
 import can
 import numpy as np
-from buscycle import COMPENSATED, Axes
-from cycle import Variants, answering_kernel
+from cycle import Axes, Variants, answering_kernel
 from harness import PROFILE, Waking, keep, parser
 
 from hdbridge.axis import AxisConfig
@@ -90,7 +89,7 @@ def of_axes(channel: str, model: TransmissionModel, clock: Waking, cycles: int) 
         prepare_realtime(),
     ):
         axes = Axes(bus, AXES, model, clock)
-        axes.start(COMPENSATED)
+        axes.start()
         figures = timed(f"{AXES} axes, compensated", axes.cycle.exchange, clock, cycles, axes.period_s)
         axes.check()
         if axes.cycle.skipped:

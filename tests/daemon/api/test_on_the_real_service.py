@@ -4,7 +4,6 @@ Virtual time runs as fast as it can while the clients think, so the lease is a l
 """
 
 import asyncio
-import math
 from collections.abc import Callable
 from contextlib import asynccontextmanager
 
@@ -74,25 +73,3 @@ def test_a_client_lives_a_day(service):
         assert axis.disable().power is messages.PowerState.SWITCH_ON_DISABLED
 
     with_client(service, day)
-
-
-def test_a_path_is_streamed_and_seen_in_the_samples(service):
-    def stream(client: Client) -> None:
-        axis = client.axis("axis1")
-        axis.enable()
-        begin_deg = axis.state().load_target_deg
-        duration_s, depth_deg = 2.0, 0.5
-
-        def at(time_s: float) -> tuple[float, float, float]:
-            phase = math.tau * time_s / duration_s
-            position_deg = begin_deg + depth_deg * (1 - math.cos(phase))
-            return time_s, position_deg, depth_deg * math.tau / duration_s * math.sin(phase)
-
-        with axis.stream(timeout_s=5.0) as points:
-            points.put(at(0.02 * number) for number in range(101))
-        assert axis.rest().load_target_deg == pytest.approx(begin_deg, abs=1e-3)
-        samples = next(iter(client.live(axes=["axis1"])))
-        assert samples.axes["axis1"].load_target_deg[-1] == pytest.approx(begin_deg, abs=1e-3)
-        axis.disable()
-
-    with_client(service, stream)

@@ -264,31 +264,6 @@ def test_after_power_was_off_the_path_has_to_be_known_again():
     assert axis.waiting is None
 
 
-def test_back_is_back_to_the_committed_model_and_stays_there():
-    axis = Axis()
-    for seed in range(3):
-        axis.works(worn(4.0), seed=seed)
-    assert axis.adaptation.model != MODEL
-    proposal = axis.follower.revert()
-    assert proposal.apply
-    assert proposal.model == axis.adaptation.model == MODEL
-    axis.proposals.clear()
-    axis.works(worn(4.0), seed=5)
-    assert not any(each.apply for each in axis.proposals)
-    assert axis.adaptation.model == MODEL
-
-
-def test_it_goes_on_after_a_restart():
-    axis = Axis()
-    for seed in range(3):
-        axis.works(worn(4.0), seed=seed)
-    axis.follower.save()
-    again = Axis(History(axis.adaptation.learned())).adaptation
-    assert again.model.effects == axis.adaptation.model.effects
-    assert again.estimate_arcsec.tolist() == axis.adaptation.estimate_arcsec.tolist()
-    assert Axis(History(axis.adaptation.learned()), mode="observe").adaptation.model == MODEL
-
-
 @settings(max_examples=12)
 @given(
     offset=st.floats(-60.0, 60.0),

@@ -14,7 +14,6 @@ from hdbridge.daemon.following.follower import Follower
 from hdbridge.daemon.following.health import EncoderFault, EncoderStatus
 from hdbridge.daemon.following.settings import AdaptationSettings
 from hdbridge.daemon.following.statefile import AdaptationFiles
-from hdbridge.errors import InputError
 
 SETTINGS = AdaptationSettings(mode="on", interval_s=2.0, rate_arcsec_per_hour=900.0, half_life_turns=10.0)
 NOON = datetime(2026, 3, 1, 12, tzinfo=UTC)
@@ -151,9 +150,3 @@ def test_a_disk_that_is_full_costs_the_history_and_nothing_else(tmp_path, monkey
     machine.works(worn(4.0), seed=4)
     machine.follower.save()
     assert (tmp_path / "article.json").exists()
-
-
-def test_a_parameter_that_the_model_does_not_have_is_refused_by_name(tmp_path):
-    settings = SETTINGS.model_copy(update={"parameters": ("backlash.gap_arcsec",)})
-    with pytest.raises(InputError, match=r"'backlash.gap_arcsec' is nothing that wear or temperature moves"):
-        on(tmp_path, settings=settings)

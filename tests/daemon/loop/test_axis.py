@@ -105,18 +105,6 @@ def test_the_sample_says_what_was_sent_and_what_the_model_says(enabled: SteppedD
     assert np.isnan(axis["reading0"]).all()
 
 
-def test_a_move_is_re_targeted_without_a_stop(enabled: SteppedDaemon) -> None:
-    enabled.move(40.0)
-    enabled.run(1.0)
-    record(enabled)
-    id_ = enabled.move(-10.0)
-    enabled.until(lambda: enabled.ended(id_), 10.0)
-    axis = record(enabled)
-    jumps = np.abs(np.diff(axis["velocity_deg_s"]))
-    assert jumps.max() <= 200.0 * 0.004 * (1 + 1e-6)
-    assert axis["load_target_deg"][-1] == -10.0
-
-
 def test_a_jog_runs_out_when_nobody_renews_it(enabled: SteppedDaemon) -> None:
     enabled.done(K.JOG, a=5.0, b=0.2)
     enabled.run(0.15)
@@ -126,17 +114,6 @@ def test_a_jog_runs_out_when_nobody_renews_it(enabled: SteppedDaemon) -> None:
     assert axis["velocity_deg_s"].max() == pytest.approx(5.0)
     assert 1.0 < axis["load_target_deg"][-1] < 3.0
     assert enabled.told(E.MOTION_ENDED)[-1].code == MotionMode.STOP
-
-
-def test_stop_brakes_within_the_limits_and_keeps_power(enabled: SteppedDaemon) -> None:
-    enabled.move(100.0)
-    enabled.run(1.0)
-    enabled.done(K.STOP)
-    enabled.until(lambda: bool(enabled.told(E.MOTION_ENDED)))
-    assert enabled.states == [S.ENABLED]
-    axis = record(enabled)
-    assert np.abs(np.diff(axis["velocity_deg_s"])).max() <= 200.0 * 0.004 * (1 + 1e-6)
-    assert enabled.order(K.STOP).kind is E.DONE
 
 
 def test_disabling_in_motion_brakes_first(enabled: SteppedDaemon) -> None:
@@ -152,17 +129,6 @@ def test_disabling_in_motion_brakes_first(enabled: SteppedDaemon) -> None:
     place = axis["load_position_deg"][-1]
     enabled.run(0.5)
     assert abs(record(enabled)["load_position_deg"][-1] - place) < 0.01
-
-
-def test_after_disabling_it_begins_from_where_it_was_turned_to(enabled: SteppedDaemon) -> None:
-    enabled.done(K.DISABLE)
-    enabled.run(0.2)
-    with_power_off = enabled.seeds(0)["i"]
-    enabled.enable()
-    enabled.run(0.1)
-    axis = record(enabled)
-    assert abs(axis["issued_deg"][-1] - with_power_off * 360 / 8000) < 1.0
-    assert axis["load_target_deg"][-1] == pytest.approx(with_power_off * 360 / 8000 / 50, abs=0.01)
 
 
 @pytest.mark.parametrize(
@@ -186,20 +152,6 @@ def test_a_move_that_makes_no_sense_is_refused_and_moves_nothing(
     enabled.run(0.1)
     assert len({target for _, target in sent}) == 1
     assert enabled.states == [S.ENABLED]
-
-
-@pytest.mark.parametrize(
-    ("kind", "axis", "words"),
-    [
-        (99, 0, "99 is not a valid CommandKind"),
-        (K.MOVE, 7, "there is no axis 7"),
-        (K.ENABLE, -1, "no axis -1"),
-    ],
-)
-def test_a_command_that_is_none_is_refused(enabled: SteppedDaemon, kind: int, axis: int, words: str) -> None:
-    answer = enabled.order(kind, axis)  # type: ignore[arg-type]
-    assert answer.kind is E.REFUSED
-    assert words in answer.text
 
 
 @pytest.mark.parametrize("statusword", [0x0008, 0x0027, 0x0000, -1, 1 << 40])
@@ -232,20 +184,6 @@ def test_a_drive_that_does_not_come_to_power_is_given_up(daemon: SteppedDaemon) 
     assert answer.kind is E.REFUSED
     assert "did not reach 'operation enabled'" in answer.text
     daemon.until(lambda: daemon.states == [S.DISABLED])
-
-
-def test_the_axis_is_lent_for_homing_and_given_back(daemon: SteppedDaemon) -> None:
-    daemon.verify()
-    daemon.done(K.LEND)
-    sent = rpdos(daemon)
-    drive = daemon.drive(0)
-    drive.home(37, 1.0, 1.0)
-    drive.disable()
-    assert sent == []
-    daemon.done(K.UNLEND, **daemon.seeds(0))
-    assert daemon.states == [S.DISABLED]
-    daemon.enable()
-    assert sent
 
 
 def test_a_lent_axis_is_quick_stopped_by_the_loop(daemon: SteppedDaemon) -> None:
@@ -284,20 +222,6 @@ def test_quick_stop_is_latched_until_reset(enabled: SteppedDaemon) -> None:
     enabled.until(lambda: enabled.ended(id_), 10.0)
 
 
-def test_a_quick_stopped_axis_is_not_disabled_but_reset_which_switches_power_off(
-    enabled: SteppedDaemon,
-) -> None:
-    enabled.done(K.QUICK_STOP)
-    enabled.run(0.5)
-    answer = enabled.order(K.DISABLE)
-    assert answer.kind is E.REFUSED
-    assert "then reset it" in answer.text
-    enabled.done(K.RESET)
-    enabled.run(0.5)
-    assert enabled.states == [S.DISABLED]
-    assert enabled.axes[0].image.power.state is State.SWITCH_ON_DISABLED
-
-
 def quintic(duration_s: float, travel_deg: float, step_s: float = 0.02) -> list[tuple[float, float, float]]:
     """Knots of a smooth move from rest to rest."""
     times = np.linspace(0.0, duration_s, round(duration_s / step_s) + 1)
@@ -307,49 +231,11 @@ def quintic(duration_s: float, travel_deg: float, step_s: float = 0.02) -> list[
     return [(float(t), float(p), float(v)) for t, p, v in zip(times, place, speed, strict=True)]
 
 
-def test_a_stream_follows_its_knots(enabled: SteppedDaemon) -> None:
-    begin = enabled.axes[0].set_point.position_deg
-    knots = [(t, begin + p, v) for t, p, v in quintic(1.0, 4.0)]
-    record(enabled)
-    assert enabled.stream({0: knots}, timeout_s=0.1).kind is E.DONE
-    enabled.until(lambda: bool(enabled.told(E.MOTION_ENDED)))
-    axis = record(enabled)
-    streamed = axis[axis["mode"] == MotionMode.STREAM]
-    assert streamed["load_target_deg"][-1] == knots[-1][1]
-    assert enabled.told(E.MOTION_ENDED)[-1].code == MotionMode.STREAM
-    times = np.array([t for t, _, _ in knots])
-    exact = np.interp(np.arange(250) * 0.004, times, [p for _, p, _ in knots])
-    assert np.abs(streamed["load_target_deg"][:250] - exact).max() < 0.01
-    assert enabled.told(E.UNDERRUN) == []
-
-
 def test_a_stream_that_is_ended_by_its_client_ends_at_once_when_it_rests(enabled: SteppedDaemon) -> None:
     begin = enabled.axes[0].set_point.position_deg
     enabled.stream({0: [(t, begin + p, v) for t, p, v in quintic(0.4, 1.0)]}, timeout_s=30.0)
     enabled.done(K.STREAM_END)
     enabled.until(lambda: bool(enabled.told(E.MOTION_ENDED)), 1.0)
-
-
-def test_a_stream_without_further_knots_brakes_and_says_so(enabled: SteppedDaemon) -> None:
-    begin = enabled.axes[0].set_point.position_deg
-    knots = [(t, begin + p, v) for t, p, v in quintic(1.0, 4.0)][:25]
-    enabled.stream({0: knots})
-    enabled.until(lambda: bool(enabled.told(E.MOTION_ENDED)))
-    assert len(enabled.told(E.UNDERRUN)) == 1
-    axis = record(enabled)
-    assert np.abs(np.diff(axis["load_target_deg"])).max() <= 20.0 * 0.004
-    assert enabled.states == [S.ENABLED]
-
-
-def test_a_knot_beyond_the_limits_ends_the_stream(enabled: SteppedDaemon) -> None:
-    begin = enabled.axes[0].set_point.position_deg
-    knots = [*((t, begin + p, v) for t, p, v in quintic(1.0, 4.0)[:10]), (0.3, 500.0, 0.0)]
-    enabled.stream({0: knots})
-    enabled.until(lambda: bool(enabled.told(E.STREAM_REFUSED)))
-    assert "deg/s" in enabled.told(E.STREAM_REFUSED)[0].text
-    enabled.until(lambda: enabled.axes[0].set_point.at_rest)
-    enabled.run(0.1)
-    assert len(enabled.memory.knots[0]) == 0
 
 
 def test_knots_of_an_earlier_stream_are_thrown_away(enabled: SteppedDaemon) -> None:
@@ -422,47 +308,6 @@ def test_a_fault_of_one_axis_stops_those_that_move_with_it_in_order(pair: Steppe
     velocity = samples["axes"]["velocity_deg_s"][:, 1]
     assert np.abs(np.diff(velocity)).max() <= 200.0 * 0.004 * 1.06
     assert not pair.told(E.UNDERRUN)
-
-
-def test_an_axis_by_itself_goes_on_when_another_stops(pair: SteppedDaemon) -> None:
-    pair.move(5.0, 0)
-    id_ = pair.move(20.0, 1)
-    pair.nodes[0].faults.raise_error(0x3210)
-    pair.until(lambda: pair.ended(id_))
-    assert pair.states == [S.QUICK_STOPPED, S.ENABLED]
-
-
-def test_compensation_is_faded_out_and_in(enabled: SteppedDaemon) -> None:
-    enabled.run(1.0)
-    id_ = enabled.move(7.3)
-    enabled.until(lambda: enabled.ended(id_))
-    record(enabled)
-    enabled.use(enabled.setting(scheme=Scheme.NONE))
-    enabled.run(1.0)
-    axis = record(enabled)
-    assert axis["weight"][-1] == 0.0
-    assert axis["correction_arcsec"][-1] == 0.0
-    assert not axis["flags"][-1] & SampleFlag.COMPENSATING
-    assert np.abs(np.diff(axis["issued_deg"])).max() < 50 * 20_000 * 0.004 / 3600
-    enabled.use(enabled.setting())
-    enabled.run(1.0)
-    assert record(enabled)["weight"][-1] == 1.0
-
-
-def test_another_model_takes_over_without_a_jump(enabled: SteppedDaemon) -> None:
-    enabled.run(1.0)
-    enabled.move(30.0, velocity_deg_s=5.0)
-    enabled.run(1.0)
-    record(enabled)
-    enabled.use(enabled.setting(scheme=Scheme.SYNCHRONOUS))
-    enabled.run(2.0)
-    assert len(enabled.told(E.CHANGED)) == 1
-    axis = record(enabled)
-    assert (axis["flags"] & SampleFlag.CHANGING).any()
-    assert not axis["flags"][-1] & SampleFlag.CHANGING
-    steps = np.diff(axis["issued_deg"])
-    assert np.abs(steps - 50 * 5.0 * 0.004).max() < 0.5  # a jump of the correction would be 5 deg
-    assert enabled.states == [S.ENABLED]
 
 
 def test_a_model_of_another_axis_is_refused(enabled: SteppedDaemon) -> None:

@@ -45,19 +45,6 @@ def test_a_bus_that_goes_down_while_nothing_moves(daemon: SteppedDaemon, lent: b
     daemon.enable()
 
 
-def test_one_late_cycle_costs_a_period_and_nothing_else(enabled: SteppedDaemon) -> None:
-    moving(enabled)
-    enabled.hang(0.007)
-    enabled.turn(2)
-    enabled.run(0.2)
-    assert enabled.states == [S.ENABLED]
-    samples, _ = enabled.samples.read()
-    assert samples["skipped"][-1] >= 1
-    assert samples["late_us"].max() > 2000
-    (event,) = [each for each in enabled.told(E.FAULT) if each.code == FAULT_INDEX[Fault.OVERRUN]]
-    assert event.id == Reaction.GO
-
-
 def each_cycle(can_id: int, data: bytes = b"", **kind: bool) -> Callable[[SteppedDaemon], None]:
     """A frame of another node in each of 500 cycles."""
 
@@ -139,15 +126,3 @@ def test_a_drive_fault_is_reset_by_command_after_the_stop_was(enabled: SteppedDa
     enabled.run(0.1)
     assert enabled.order(K.DRIVE_FAULT_RESET).kind is E.REFUSED
     enabled.enable()
-
-
-def test_the_axis_waits_at_the_end_of_its_move_when_the_service_is_gone(enabled: SteppedDaemon) -> None:
-    """Nothing is taken from or put into the memory on the service's side any more."""
-    enabled.post(K.MOVE, a=15.0, b=20.0, c=200.0)
-    for _ in range(1000):
-        enabled.controller.turn()
-    assert enabled.states == [S.ENABLED]
-    assert enabled.axes[0].set_point.position_deg == 15.0
-    for _ in range(3000):
-        enabled.controller.turn()
-    assert enabled.states == [S.ENABLED]

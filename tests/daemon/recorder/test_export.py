@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from support.axis_samples import SampleMaker, moves_and_rests
 from support.command import run_here
-from support.flight import START_NS, about, event, flight_log, samples
+from support.flight import START_NS, event, flight_log, samples
 
 from hdbridge.axis import AxisConfig
 from hdbridge.axis.model import TransmissionModel
@@ -191,21 +191,6 @@ def test_diagnose_takes_flight_recordings_with_the_model_in_use_and_a_time(worke
         ]
 
 
-@pytest.mark.parametrize(
-    ("arguments", "complaint"),
-    [
-        (["--axis", "nose"], "no axis 'nose'"),
-        (["--to", "2020-01-01"], "nothing was recorded between"),
-        (["--from", "noon"], "--from: found 'noon'"),
-    ],
-)
-def test_diagnose_refuses_an_axis_or_a_time_that_the_flight_does_not_have(worked, arguments, complaint):
-    done = command("diagnose", str(worked), *arguments)
-    assert done.returncode == 2
-    assert done.stderr.count("\n") == 1
-    assert complaint in done.stderr
-
-
 def test_diagnose_refuses_options_of_flight_recordings_for_other_records(tmp_path):
     (tmp_path / "bench.csv").write_text("time_s,motor_position_deg,load_position_deg\n")
     done = command("diagnose", str(tmp_path / "bench.csv"), "--to", "2026-01-01", "--model", "article")
@@ -258,20 +243,6 @@ def test_without_the_extra_it_says_what_to_install(worked, tmp_path, monkeypatch
     done = command("record", "list", str(worked))
     assert done.returncode == 2
     assert "pip install 'hdbridge[daemon]'" in done.stderr
-
-
-def test_mending_by_hand(tmp_path):
-    log, _ = flight_log(tmp_path)
-    log.put(Batch(samples(250)))
-    log.flush()
-    done = command("record", "mend", str(tmp_path))
-    assert done.returncode == 2
-    assert "is being written" in done.stderr
-    log._file.abandon()
-    assert command("record", "mend", str(tmp_path)).returncode == 0
-    (path,) = tmp_path.iterdir()
-    assert read(path).finished
-    assert read(path).about.axes == about().axes
 
 
 def test_an_axis_without_an_encoder_at_its_load_is_refused(tmp_path):

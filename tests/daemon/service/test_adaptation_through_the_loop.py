@@ -79,83 +79,71 @@ def offset_arcsec(bridge: ServiceBridge) -> float:
     return next(each.offset_arcsec for each in effects if isinstance(each, Hysteresis))
 
 
-def test_the_model_in_the_loop_follows_and_goes_back(service: Service) -> None:
-    async def story() -> None:
-        async with adapting(service) as (bridge, token, _):
-            reader = service.daemon.memory.reader()
-            await work(bridge, token, 70)
-            samples, _ = reader.read()
-            samples = samples["axes"][:, 0]
-            stands = (samples["velocity_deg_s"] == 0.0) & (samples["weight"] == 1.0)
-            changed = np.abs(np.diff(samples["correction_arcsec"]))[stands[1:] & stands[:-1]]
-            assert 0.0 < float(np.max(changed)) < 0.2  # a cycle: some arcsec are faded in, never at once
-            assert offset_arcsec(bridge) == pytest.approx(44.0, abs=1.0)
-            assert service.daemon.told(EventKind.CHANGED)
-            state = bridge.axis_state("axis1").adaptation
-            assert state.mode == messages.AdaptationMode.ON
-            assert state.frozen is None
-            assert state.updated is not None
-            assert state.parameters["hysteresis.offset_arcsec"] == pytest.approx(4.0, abs=1.0)
+async def test_the_model_in_the_loop_follows_and_goes_back(service: Service) -> None:
+    async with adapting(service) as (bridge, token, _):
+        reader = service.daemon.memory.reader()
+        await work(bridge, token, 70)
+        samples, _ = reader.read()
+        samples = samples["axes"][:, 0]
+        stands = (samples["velocity_deg_s"] == 0.0) & (samples["weight"] == 1.0)
+        changed = np.abs(np.diff(samples["correction_arcsec"]))[stands[1:] & stands[:-1]]
+        assert 0.0 < float(np.max(changed)) < 0.2  # a cycle: some arcsec are faded in, never at once
+        assert offset_arcsec(bridge) == pytest.approx(44.0, abs=1.0)
+        assert service.daemon.told(EventKind.CHANGED)
+        state = bridge.axis_state("axis1").adaptation
+        assert state.mode == messages.AdaptationMode.ON
+        assert state.frozen is None
+        assert state.updated is not None
+        assert state.parameters["hysteresis.offset_arcsec"] == pytest.approx(4.0, abs=1.0)
 
-            await bridge.axes["axis1"].revert_adaptation(token)
-            assert offset_arcsec(bridge) == 40.0
-            await work(bridge, token, 20, seed=1)
-            assert offset_arcsec(bridge) == 40.0
-            assert bridge.axis_state("axis1").adaptation.mode == messages.AdaptationMode.OBSERVE
-
-    play(story())
+        await bridge.axes["axis1"].revert_adaptation(token)
+        assert offset_arcsec(bridge) == 40.0
+        await work(bridge, token, 20, seed=1)
+        assert offset_arcsec(bridge) == 40.0
+        assert bridge.axis_state("axis1").adaptation.mode == messages.AdaptationMode.OBSERVE
 
 
-def test_a_service_that_begins_anew_goes_on_with_what_was_learnt(service: Service) -> None:
-    async def story() -> None:
-        async with adapting(service) as (bridge, token, _):
-            await work(bridge, token, 50)
-            learnt = offset_arcsec(bridge)
-            assert learnt > 42.0
-        folder = service.machine.axes[0].profile.folder / "adaptation"
-        assert (folder / "axis1.json").exists()
-        assert len((folder / "axis1.log.jsonl").read_text().splitlines()) >= 1
-        async with service.bridge() as bridge:
-            assert offset_arcsec(bridge) == learnt  # what the control process still uses
-            made = begin(service, bridge)
-            await until(bridge, lambda: bridge.axis_state("axis1").adaptation.frozen is not None)
-            await made.apply()
-            assert offset_arcsec(bridge) == pytest.approx(learnt)
-            made.close()
-
-    play(story())
+async def test_a_service_that_begins_anew_goes_on_with_what_was_learnt(service: Service) -> None:
+    async with adapting(service) as (bridge, token, _):
+        await work(bridge, token, 50)
+        learnt = offset_arcsec(bridge)
+        assert learnt > 42.0
+    folder = service.machine.axes[0].profile.folder / "adaptation"
+    assert (folder / "axis1.json").exists()
+    assert len((folder / "axis1.log.jsonl").read_text().splitlines()) >= 1
+    async with service.bridge() as bridge:
+        assert offset_arcsec(bridge) == learnt  # what the control process still uses
+        made = begin(service, bridge)
+        await until(bridge, lambda: bridge.axis_state("axis1").adaptation.frozen is not None)
+        await made.apply()
+        assert offset_arcsec(bridge) == pytest.approx(learnt)
+        made.close()
 
 
-def test_a_load_encoder_that_stands_still_freezes_it(service: Service) -> None:
-    async def story() -> None:
-        async with adapting(service) as (bridge, token, _):
-            await work(bridge, token, 6)
-            stuck = service.daemon.nodes[0].firmware.motion.load_counts
-            service.daemon.nodes[0].faults.load_reading = lambda _: stuck
-            await work(bridge, token, 6, seed=1)
-            frozen = bridge.axis_state("axis1").adaptation.frozen
-            assert frozen is not None
-            assert frozen.startswith("load encoder frozen: it reads")
-
-    play(story())
+async def test_a_load_encoder_that_stands_still_freezes_it(service: Service) -> None:
+    async with adapting(service) as (bridge, token, _):
+        await work(bridge, token, 6)
+        stuck = service.daemon.nodes[0].firmware.motion.load_counts
+        service.daemon.nodes[0].faults.load_reading = lambda _: stuck
+        await work(bridge, token, 6, seed=1)
+        frozen = bridge.axis_state("axis1").adaptation.frozen
+        assert frozen is not None
+        assert frozen.startswith("load encoder frozen: it reads")
 
 
-def test_what_was_adapted_stays_with_another_part_of_the_model_and_a_new_loop(service: Service) -> None:
-    async def story() -> None:
-        async with adapting(service) as (bridge, token, made):
-            await work(bridge, token, 50)
-            axis = bridge.axes["axis1"]
-            learnt = offset_arcsec(bridge)
-            assert learnt > 42.0
-            await made.set_mode(messages.AdaptationMode.OBSERVE)
-            await axis.compensate(token, Scheme.HYSTERESIS)
-            assert offset_arcsec(bridge) == learnt
-            assert len(axis.models.in_use.compensating.effects) == 1
-            service.daemon.begin_again()
-            await until(bridge, lambda: axis.models.settled)
-            assert offset_arcsec(bridge) == learnt
-
-    play(story())
+async def test_what_was_adapted_stays_with_another_part_of_the_model_and_a_new_loop(service: Service) -> None:
+    async with adapting(service) as (bridge, token, made):
+        await work(bridge, token, 50)
+        axis = bridge.axes["axis1"]
+        learnt = offset_arcsec(bridge)
+        assert learnt > 42.0
+        await made.set_mode(messages.AdaptationMode.OBSERVE)
+        await axis.compensate(token, Scheme.HYSTERESIS)
+        assert offset_arcsec(bridge) == learnt
+        assert len(axis.models.in_use.compensating.effects) == 1
+        service.daemon.begin_again()
+        await until(bridge, lambda: axis.models.settled)
+        assert offset_arcsec(bridge) == learnt
 
 
 def test_an_axis_works_without_an_adaptation_that_cannot_be(service: Service) -> None:

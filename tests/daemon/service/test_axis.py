@@ -1,53 +1,47 @@
 """One axis through the service: power, moves, jogs, what is refused and in which words."""
 
 import pytest
-from support.service import Service, play
+from support.service import Service
 
 from hdbridge.daemon.service.commissioning import HomingRun
 from hdbridge.errors import InputError, LeaseError, RefusedError
 
 
-def test_nothing_moves_without_the_lease(service: Service) -> None:
-    async def story() -> None:
-        async with service.enabled() as (bridge, token):
-            axis = bridge.axes["axis1"]
-            before = axis.state().load_target_deg
-            for attempt in (axis.enable, axis.disable, axis.reset):
-                with pytest.raises(LeaseError):
-                    await attempt("guessed")
+async def test_nothing_moves_without_the_lease(service: Service) -> None:
+    async with service.enabled() as (bridge, token):
+        axis = bridge.axes["axis1"]
+        before = axis.state().load_target_deg
+        for attempt in (axis.enable, axis.disable, axis.reset):
             with pytest.raises(LeaseError):
-                await axis.move("guessed", 5.0)
-            with pytest.raises(LeaseError):
-                await axis.jog("guessed", 5.0)
-            with pytest.raises(LeaseError):
-                await axis.stream("guessed")
-            bridge.lease.release(token)
-            with pytest.raises(LeaseError):
-                await axis.move(token, 5.0)
-            await bridge.core.timing.sleep(0.5)
-            assert axis.state().load_target_deg == before
-
-    play(story())
+                await attempt("guessed")
+        with pytest.raises(LeaseError):
+            await axis.move("guessed", 5.0)
+        with pytest.raises(LeaseError):
+            await axis.jog("guessed", 5.0)
+        with pytest.raises(LeaseError):
+            await axis.stream("guessed")
+        bridge.lease.release(token)
+        with pytest.raises(LeaseError):
+            await axis.move(token, 5.0)
+        await bridge.core.timing.sleep(0.5)
+        assert axis.state().load_target_deg == before
 
 
-def test_what_cannot_be_is_refused_in_the_loops_words(service: Service) -> None:
-    async def story() -> None:
-        async with service.ready() as bridge:
-            axis = bridge.axes["axis1"]
-            token = bridge.lease.take("test")
-            with pytest.raises(RefusedError, match="enable it first"):
-                await axis.move(token, 5.0)
-            await axis.enable(token)
-            with pytest.raises(InputError, match="position limits"):
-                await axis.move(token, 1e6)
-            with pytest.raises(RefusedError, match="disable it first"):
-                await axis.home(token, HomingRun(35))
-            with pytest.raises(RefusedError, match="disable it first"):
-                await axis.sdo_write(token, "6081h", "100")
-            assert axis.state().at_rest
-            _, value = await axis.sdo_read("6064h")
-            assert isinstance(value, int)
-            with pytest.raises(InputError):
-                await axis.sdo_read("no such object")
-
-    play(story())
+async def test_what_cannot_be_is_refused_in_the_loops_words(service: Service) -> None:
+    async with service.ready() as bridge:
+        axis = bridge.axes["axis1"]
+        token = bridge.lease.take("test")
+        with pytest.raises(RefusedError, match="enable it first"):
+            await axis.move(token, 5.0)
+        await axis.enable(token)
+        with pytest.raises(InputError, match="position limits"):
+            await axis.move(token, 1e6)
+        with pytest.raises(RefusedError, match="disable it first"):
+            await axis.home(token, HomingRun(35))
+        with pytest.raises(RefusedError, match="disable it first"):
+            await axis.sdo_write(token, "6081h", "100")
+        assert axis.state().at_rest
+        _, value = await axis.sdo_read("6064h")
+        assert isinstance(value, int)
+        with pytest.raises(InputError):
+            await axis.sdo_read("no such object")

@@ -13,7 +13,6 @@ from hdbridge.control.bench import axis_view
 from hdbridge.daemon.following.settings import AdaptationSettings
 from hdbridge.daemon.service.bridge import ServiceBridge
 from hdbridge.daemon.service.following import Following
-from hdbridge.daemon.service.moves import WayPoint
 from hdbridge.daemon.service.streams import StreamPoint
 from hdbridge.motion.procedures.moves import MoveTo
 from hdbridge.sim.truth import Truth
@@ -36,12 +35,6 @@ async def jog(bridge: ServiceBridge, token: str) -> None:
     axis = bridge.axes["axis1"]
     await axis.jog(token, SPEED_DEG_S, timeout_s=1.8)
     await until(bridge, lambda: axis.state().at_rest)
-
-
-async def queue(bridge: ServiceBridge, token: str) -> None:
-    axis = bridge.axes["axis1"]
-    await axis.queue(token, [WayPoint(-5.0), WayPoint(FAR_DEG, SPEED_DEG_S)])
-    await until(bridge, lambda: axis.motion.activity.over != "")
 
 
 async def stream(bridge: ServiceBridge, token: str) -> None:
@@ -73,7 +66,7 @@ async def ripple(
     return ripple_arcsec(samples["axes"][:, 0], SPEED_DEG_S)
 
 
-@pytest.mark.parametrize("motion", [goto, jog, queue, stream, coordinated])
+@pytest.mark.parametrize("motion", [jog, stream, coordinated])
 def test_it_removes_the_ripple(motion, profile: Path, tmp_path: Path) -> None:
     async def story(service: Service) -> tuple[float, float]:
         async with service.enabled() as (bridge, token):

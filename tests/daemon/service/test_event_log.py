@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from support.service import Service, play
+from support.service import Service
 
 from hdbridge.daemon.memory import Event, EventKind
 from hdbridge.daemon.service.bridge import EVENTS_TOLD
@@ -41,18 +41,15 @@ def test_routine_does_not_push_out_what_stopped_an_axis() -> None:
     assert log.answer(7) is not None
 
 
-def test_of_many_the_newest_are_told_and_the_others_counted(service: Service) -> None:
-    async def story() -> None:
-        async with service.ready() as bridge:
-            before = bridge.events(0).newest
-            for number in range(EVENTS_TOLD + 5):
-                bridge.mark(f"remark {number}")
-            found = bridge.events(before)
-            assert found.events[-1].text.endswith(f"remark {EVENTS_TOLD + 4}")
-            assert len(found.events) == EVENTS_TOLD
-            assert found.lost == 5
-            assert bridge.events(found.newest).events == []
-            bridge.mark("one more")
-            assert [each.text.endswith("one more") for each in bridge.events(found.newest).events] == [True]
-
-    play(story())
+async def test_of_many_the_newest_are_told_and_the_others_counted(service: Service) -> None:
+    async with service.ready() as bridge:
+        before = bridge.events(0).newest
+        for number in range(EVENTS_TOLD + 5):
+            bridge.mark(f"remark {number}")
+        found = bridge.events(before)
+        assert found.events[-1].text.endswith(f"remark {EVENTS_TOLD + 4}")
+        assert len(found.events) == EVENTS_TOLD
+        assert found.lost == 5
+        assert bridge.events(found.newest).events == []
+        bridge.mark("one more")
+        assert [each.text.endswith("one more") for each in bridge.events(found.newest).events] == [True]

@@ -13,35 +13,20 @@ from unittest.mock import MagicMock
 import numpy as np
 import pytest
 from support.axis_samples import SampleMaker, moves_and_rests
-from support.service import Service, play, stepped_service, until
+from support.service import play, stepped_service, until
 
 from hdbridge.axis import AxisConfig
 from hdbridge.axis.effects import Hysteresis
 from hdbridge.axis.model import TransmissionModel
 from hdbridge.client.messages import AdaptationMode
 from hdbridge.commissioning.evaluation.stepping import Scheme
-from hdbridge.daemon.following.follower import Follower
 from hdbridge.daemon.following.settings import AdaptationSettings
-from hdbridge.daemon.following.statefile import AdaptationFiles
 from hdbridge.daemon.memory import EventKind
 from hdbridge.daemon.serve import follow
 from hdbridge.daemon.service.bridge import ServiceBridge
 from hdbridge.daemon.service.following import Following
 
-MOVED_ARCSEC = 2.0
 DEMO = Path("profiles/demo/axis.yaml")
-
-
-def learnt(service: Service, folder: Path, settings: AdaptationSettings) -> None:
-    """Leave what an earlier service has learnt: the first coefficient moved, and in use so."""
-    axis = service.machine.axes[0]
-    model = axis.model()
-    files = AdaptationFiles(folder, axis.name, model, settings.parameters)
-    follower = Follower(axis.config, model, settings=settings)
-    follower.adapt("on", files)
-    before = follower.adaptation.learned()
-    estimate, applied = ((MOVED_ARCSEC, *each[1:]) for each in (before.estimate, before.applied))
-    files.write([], replace(before, estimate=estimate, applied=applied, windows=5))
 
 
 def following(bridge: ServiceBridge, settings: AdaptationSettings, folder: Path) -> Following:
@@ -55,37 +40,6 @@ def following(bridge: ServiceBridge, settings: AdaptationSettings, folder: Path)
 def changes(bridge: ServiceBridge) -> int:
     entries = bridge.core.log.since(0)
     return sum(each.event is not None and each.event.kind is EventKind.CHANGED for each in entries)
-
-
-def test_what_was_learnt_is_used_again_and_taken_back(tmp_path: Path) -> None:
-    settings = AdaptationSettings(mode="on")
-    folder = tmp_path / "adaptation"
-    with stepped_service(tmp_path) as service:
-        learnt(service, folder, settings)
-
-        async def story() -> None:
-            async with service.ready() as bridge:
-                (axis,) = bridge.axes.values()
-                in_use = axis.models.in_use
-                made = following(bridge, settings, folder)
-                before = changes(bridge)
-                await until(bridge, lambda: bool(made.state.parameters))
-                assert axis.state().adaptation.mode is AdaptationMode.ON
-
-                await made.apply()
-                assert changes(bridge) == before + 1
-                await made.apply()  # it is in use already
-                assert changes(bridge) == before + 1
-                assert axis.models.in_use.model is in_use.model  # by its name, the committed one
-
-                token = bridge.lease.take("test")
-                await axis.revert_adaptation(token)
-                assert changes(bridge) == before + 2
-                assert made.state.mode is AdaptationMode.OBSERVE
-                assert not made.state.parameters
-                made.close()
-
-        play(story())
 
 
 def test_an_adaptation_that_is_off_learns_and_writes_nothing(tmp_path: Path) -> None:

@@ -47,75 +47,66 @@ def steps(samples: np.ndarray) -> np.ndarray:
     return np.abs(np.diff(samples["axes"][:, 0]["correction_arcsec"]))
 
 
-def test_schemes_are_faded_over_in_motion(service: Service) -> None:
-    async def story() -> None:
-        async with service.enabled() as (bridge, token):
-            axis = bridge.axes["axis1"]
-            assert axis.state().scheme == "extended"
-            await axis.move(token, 2.0)
-            await axis.move(token, 200.0, velocity_deg_s=0.5, wait=False)
+async def test_schemes_are_faded_over_in_motion(service: Service) -> None:
+    async with service.enabled() as (bridge, token):
+        axis = bridge.axes["axis1"]
+        assert axis.state().scheme == "extended"
+        await axis.move(token, 2.0)
+        await axis.move(token, 200.0, velocity_deg_s=0.5, wait=False)
+        await bridge.core.timing.sleep(1.0)
+        reader = service.daemon.memory.reader()
+        for scheme in (Scheme.SYNCHRONOUS, Scheme.NONE, Scheme.HYSTERESIS, Scheme.EXTENDED):
+            await axis.compensate(token, scheme)
+            assert axis.state().scheme == scheme.value
+            assert axis.state().compensating is (scheme is not Scheme.NONE)
             await bridge.core.timing.sleep(1.0)
-            reader = service.daemon.memory.reader()
-            for scheme in (Scheme.SYNCHRONOUS, Scheme.NONE, Scheme.HYSTERESIS, Scheme.EXTENDED):
-                await axis.compensate(token, scheme)
-                assert axis.state().scheme == scheme.value
-                assert axis.state().compensating is (scheme is not Scheme.NONE)
-                await bridge.core.timing.sleep(1.0)
-                if scheme is Scheme.NONE:
-                    assert axis.state().correction_arcsec == pytest.approx(0.0, abs=1e-6)
-                assert not axis.state().at_rest
-            samples, lost = reader.read()
-            assert lost == 0
-            assert steps(samples).max() < 1.0
-            assert not service.daemon.axes[0].supervision.stop
-
-    play(story())
+            if scheme is Scheme.NONE:
+                assert axis.state().correction_arcsec == pytest.approx(0.0, abs=1e-6)
+            assert not axis.state().at_rest
+        samples, lost = reader.read()
+        assert lost == 0
+        assert steps(samples).max() < 1.0
+        assert not service.daemon.axes[0].supervision.stop
 
 
-def test_another_model_is_committed_and_used_in_motion(service: Service) -> None:
-    async def story() -> None:
-        async with service.enabled() as (bridge, token):
-            axis = bridge.axes["axis1"]
-            first = axis.state().model
-            commit(service, wider(axis.models.in_use.model))
-            await axis.move(token, 200.0, velocity_deg_s=0.5, wait=False)
-            await bridge.core.timing.sleep(1.0)
-            reader = service.daemon.memory.reader()
+async def test_another_model_is_committed_and_used_in_motion(service: Service) -> None:
+    async with service.enabled() as (bridge, token):
+        axis = bridge.axes["axis1"]
+        first = axis.state().model
+        commit(service, wider(axis.models.in_use.model))
+        await axis.move(token, 200.0, velocity_deg_s=0.5, wait=False)
+        await bridge.core.timing.sleep(1.0)
+        reader = service.daemon.memory.reader()
+        await axis.activate_model(token, "pending")
+        in_use = axis.state().model
+        assert in_use.version is not None
+        assert in_use.reason == "a test"
+        assert in_use.age_s > 0.0
+        folder = service.machine.axes[0].profile.folder
+        assert store.find(folder, "active").number == in_use.version
+        samples, _ = reader.read()
+        assert steps(samples).max() < 1.0
+        await axis.activate_model(token, in_use.version - 1)
+        assert axis.state().model.version == in_use.version - 1
+        assert axis.state().model.effects == first.effects
+        assert store.find(folder, "active").number == in_use.version - 1
+
+
+async def test_a_model_that_is_not_there_or_not_of_this_axis_changes_nothing(service: Service) -> None:
+    async with service.enabled() as (bridge, token):
+        axis = bridge.axes["axis1"]
+        before = axis.state().model
+        with pytest.raises(InputError, match="no model '7'"):
+            await axis.activate_model(token, 7)
+        with pytest.raises(InputError, match="no model 'pending'"):
             await axis.activate_model(token, "pending")
-            in_use = axis.state().model
-            assert in_use.version is not None
-            assert in_use.reason == "a test"
-            assert in_use.age_s > 0.0
-            folder = service.machine.axes[0].profile.folder
-            assert store.find(folder, "active").number == in_use.version
-            samples, _ = reader.read()
-            assert steps(samples).max() < 1.0
-            await axis.activate_model(token, in_use.version - 1)
-            assert axis.state().model.version == in_use.version - 1
-            assert axis.state().model.effects == first.effects
-            assert store.find(folder, "active").number == in_use.version - 1
-
-    play(story())
-
-
-def test_a_model_that_is_not_there_or_not_of_this_axis_changes_nothing(service: Service) -> None:
-    async def story() -> None:
-        async with service.enabled() as (bridge, token):
-            axis = bridge.axes["axis1"]
-            before = axis.state().model
-            with pytest.raises(InputError, match="no model '7'"):
-                await axis.activate_model(token, 7)
-            with pytest.raises(InputError, match="no model 'pending'"):
-                await axis.activate_model(token, "pending")
-            other = axis.models.in_use.model
-            text = replace(other, provenance={**other.provenance, "axis": "another"})
-            text.save(service.machine.axes[0].profile.folder / "pending.yaml")
-            with pytest.raises(InputError, match="another"):
-                await axis.activate_model(token, "pending")
-            after = axis.state().model
-            assert (after.version, after.effects, after.file) == (before.version, before.effects, before.file)
-
-    play(story())
+        other = axis.models.in_use.model
+        text = replace(other, provenance={**other.provenance, "axis": "another"})
+        text.save(service.machine.axes[0].profile.folder / "pending.yaml")
+        with pytest.raises(InputError, match="another"):
+            await axis.activate_model(token, "pending")
+        after = axis.state().model
+        assert (after.version, after.effects, after.file) == (before.version, before.effects, before.file)
 
 
 def test_an_axis_without_a_model_runs_uncompensated(tmp_path: Path) -> None:
@@ -185,125 +176,106 @@ async def choose(bridge: ServiceBridge, token: str) -> None:
         await bridge.axes[name].compensate(token, Scheme(scheme))
 
 
-def test_each_axis_gets_its_own_compensation_back_after_each_restart_of_the_control_process(
+async def test_each_axis_gets_its_own_compensation_back_after_each_restart_of_the_control_process(
     pair: Service,
 ) -> None:
-    async def story() -> None:
-        async with pair.enabled() as (bridge, token):
-            await choose(bridge, token)
-            for _ in range(7):
-                begin_uncompensated(pair)
-                assert [axis.state().scheme for axis in bridge.axes.values()] == ["none", "none"]
-                assert not any(axis.state().load_loop.on for axis in bridge.axes.values())
-                await until(bridge, lambda: settled(bridge))
-                assert used(pair) == [["synchronous"], ["hysteresis"]]
-                assert [axis.state().scheme for axis in bridge.axes.values()] == [*SCHEMES.values()]
-                assert [axis.state().load_loop.on for axis in bridge.axes.values()] == [False, True]
-            told = [each.text for each in bridge.events().events]
-            assert "the control process was started again: every axis is disabled" in told
-
-    play(story())
-
-
-def test_an_axis_is_not_enabled_with_another_compensation_than_the_chosen_one(pair: Service) -> None:
-    async def story() -> None:
-        async with pair.ready() as bridge:
-            token = bridge.lease.take("test")
-            await choose(bridge, token)
+    async with pair.enabled() as (bridge, token):
+        await choose(bridge, token)
+        for _ in range(7):
             begin_uncompensated(pair)
-            await bridge.axes["axis2"].enable(token)
-            assert used(pair)[1] == ["hysteresis"]
+            assert [axis.state().scheme for axis in bridge.axes.values()] == ["none", "none"]
+            assert not any(axis.state().load_loop.on for axis in bridge.axes.values())
+            await until(bridge, lambda: settled(bridge))
+            assert used(pair) == [["synchronous"], ["hysteresis"]]
+            assert [axis.state().scheme for axis in bridge.axes.values()] == [*SCHEMES.values()]
+            assert [axis.state().load_loop.on for axis in bridge.axes.values()] == [False, True]
+        told = [each.text for each in bridge.events().events]
+        assert "the control process was started again: every axis is disabled" in told
 
-    play(story())
+
+async def test_an_axis_is_not_enabled_with_another_compensation_than_the_chosen_one(pair: Service) -> None:
+    async with pair.ready() as bridge:
+        token = bridge.lease.take("test")
+        await choose(bridge, token)
+        begin_uncompensated(pair)
+        await bridge.axes["axis2"].enable(token)
+        assert used(pair)[1] == ["hysteresis"]
 
 
 @pytest.mark.parametrize("lost", range(1, 4))
-def test_a_setting_that_is_lost_is_sent_again(pair: Service, lost: int) -> None:
-    async def story() -> None:
-        async with pair.ready() as bridge:
-            token = bridge.lease.take("test")
-            await choose(bridge, token)
-            begin_uncompensated(pair)
-            for _ in range(lost):  # each time the new control process dies before it has read a command
-                await bridge.core.timing.sleep(0.0)
-                bridge.core.observer.poll()
-                begin_uncompensated(pair)
-            await until(bridge, lambda: settled(bridge))
-            assert used(pair) == [["synchronous"], ["hysteresis"]]
-
-    play(story())
-
-
-def test_a_new_service_finds_what_the_control_process_uses(pair: Service) -> None:
-    async def story() -> None:
-        async with pair.enabled() as (bridge, token):
-            await choose(bridge, token)
-            await bridge.axes["axis2"].switch_load_loop(token, on=False)
-            chosen = [axis.models.chosen for axis in bridge.axes.values()]
-        for axis in pair.machine.axes:
-            axis.profile.model.unlink()  # the next one needs no file for it
-        before = pair.daemon.memory.settings[0].number
-        async with pair.bridge() as bridge:
-            assert [axis.models.in_use for axis in bridge.axes.values()] == chosen
-            assert [axis.state().scheme for axis in bridge.axes.values()] == [*SCHEMES.values()]
-            assert not bridge.axes["axis2"].state().load_loop.on
-            assert pair.daemon.memory.settings[0].number == before  # nothing was sent again
-            # Both processes die.
+async def test_a_setting_that_is_lost_is_sent_again(pair: Service, lost: int) -> None:
+    async with pair.ready() as bridge:
+        token = bridge.lease.take("test")
+        await choose(bridge, token)
         begin_uncompensated(pair)
-        async with pair.bridge() as bridge:
-            assert settled(bridge)
-            assert used(pair) == [["synchronous"], ["hysteresis"]]
-
-    play(story())
-
-
-def test_a_service_that_died_while_it_wrote_a_setting_starts_with_the_machine_file(pair: Service) -> None:
-    async def story() -> None:
-        async with pair.enabled() as (bridge, token):
-            await choose(bridge, token)
-        slot = pair.daemon.memory.settings[0]
-        slot._sent[0] = -slot.number - 1
-        async with pair.bridge() as bridge:
-            assert settled(bridge)
-            assert [axis.state().scheme for axis in bridge.axes.values()] == ["extended", "hysteresis"]
-            assert used(pair) == [["synchronous", "hysteresis"], ["hysteresis"]]
-
-    play(story())
+        for _ in range(lost):  # each time the new control process dies before it has read a command
+            await bridge.core.timing.sleep(0.0)
+            bridge.core.observer.poll()
+            begin_uncompensated(pair)
+        await until(bridge, lambda: settled(bridge))
+        assert used(pair) == [["synchronous"], ["hysteresis"]]
 
 
-def test_a_refused_setting_is_never_reported_and_does_not_come_back(pair: Service) -> None:
-    async def story() -> None:
-        async with pair.enabled() as (bridge, token):
-            await choose(bridge, token)
-            axis = bridge.axes["axis1"]
-            other = replace(axis.models.chosen, model=replace(axis.models.chosen.model, ratio=50.1))
-            with pytest.raises(RefusedError, match="ratio"):
-                await axis._use(other)
-            assert axis.state().scheme == "synchronous"
-            assert not watched(pair, bridge)
-            await until(bridge, lambda: settled(bridge))
-        async with pair.bridge() as bridge:
-            assert [axis.state().scheme for axis in bridge.axes.values()] == [*SCHEMES.values()]
+async def test_a_new_service_finds_what_the_control_process_uses(pair: Service) -> None:
+    async with pair.enabled() as (bridge, token):
+        await choose(bridge, token)
+        await bridge.axes["axis2"].switch_load_loop(token, on=False)
+        chosen = [axis.models.chosen for axis in bridge.axes.values()]
+    for axis in pair.machine.axes:
+        axis.profile.model.unlink()  # the next one needs no file for it
+    before = pair.daemon.memory.settings[0].number
+    async with pair.bridge() as bridge:
+        assert [axis.models.in_use for axis in bridge.axes.values()] == chosen
+        assert [axis.state().scheme for axis in bridge.axes.values()] == [*SCHEMES.values()]
+        assert not bridge.axes["axis2"].state().load_loop.on
+        assert pair.daemon.memory.settings[0].number == before  # nothing was sent again
+        # Both processes die.
+    begin_uncompensated(pair)
+    async with pair.bridge() as bridge:
+        assert settled(bridge)
+        assert used(pair) == [["synchronous"], ["hysteresis"]]
 
-    play(story())
+
+async def test_a_service_that_died_while_it_wrote_a_setting_starts_with_the_machine_file(
+    pair: Service,
+) -> None:
+    async with pair.enabled() as (bridge, token):
+        await choose(bridge, token)
+    slot = pair.daemon.memory.settings[0]
+    slot._sent[0] = -slot.number - 1
+    async with pair.bridge() as bridge:
+        assert settled(bridge)
+        assert [axis.state().scheme for axis in bridge.axes.values()] == ["extended", "hysteresis"]
+        assert used(pair) == [["synchronous", "hysteresis"], ["hysteresis"]]
 
 
-def test_an_answer_that_comes_too_late_changes_nothing_that_is_reported(pair: Service) -> None:
-    async def story() -> None:
-        async with pair.enabled() as (bridge, token):
-            await choose(bridge, token)
-            daemon = pair.daemon
-            turn, daemon.controller.turn = daemon.controller.turn, lambda: daemon.hang(daemon.period_s)
-            axis = bridge.axes["axis1"]
-            with pytest.raises(DaemonError, match="did not answer"):
-                await axis.compensate(token, Scheme.EXTENDED)
-            assert axis.state().scheme == "synchronous"
-            daemon.controller.turn = turn
-            assert not watched(pair, bridge)
-            await until(bridge, lambda: settled(bridge))
-            assert used(pair) == [["synchronous"], ["hysteresis"]]
+async def test_a_refused_setting_is_never_reported_and_does_not_come_back(pair: Service) -> None:
+    async with pair.enabled() as (bridge, token):
+        await choose(bridge, token)
+        axis = bridge.axes["axis1"]
+        other = replace(axis.models.chosen, model=replace(axis.models.chosen.model, ratio=50.1))
+        with pytest.raises(RefusedError, match="ratio"):
+            await axis._use(other)
+        assert axis.state().scheme == "synchronous"
+        assert not watched(pair, bridge)
+        await until(bridge, lambda: settled(bridge))
+    async with pair.bridge() as bridge:
+        assert [axis.state().scheme for axis in bridge.axes.values()] == [*SCHEMES.values()]
 
-    play(story())
+
+async def test_an_answer_that_comes_too_late_changes_nothing_that_is_reported(pair: Service) -> None:
+    async with pair.enabled() as (bridge, token):
+        await choose(bridge, token)
+        daemon = pair.daemon
+        turn, daemon.controller.turn = daemon.controller.turn, lambda: daemon.hang(daemon.period_s)
+        axis = bridge.axes["axis1"]
+        with pytest.raises(DaemonError, match="did not answer"):
+            await axis.compensate(token, Scheme.EXTENDED)
+        assert axis.state().scheme == "synchronous"
+        daemon.controller.turn = turn
+        assert not watched(pair, bridge)
+        await until(bridge, lambda: settled(bridge))
+        assert used(pair) == [["synchronous"], ["hysteresis"]]
 
 
 @given(data=st.data())

@@ -13,85 +13,70 @@ from hdbridge.daemon.service.streams import StreamPoint
 from hdbridge.errors import InputError, LeaseError, RefusedError
 
 
-def test_way_points_are_stood_at_one_after_the_other(service: Service) -> None:
-    async def story() -> None:
-        async with service.enabled() as (bridge, token):
-            axis = bridge.axes["axis1"]
-            reader = service.daemon.memory.reader()
-            assert await axis.queue(token, [WayPoint(2.0, dwell_s=0.3), WayPoint(-1.0)]) == 2
-            assert await axis.queue(token, [WayPoint(1.0)]) >= 2
-            await until(bridge, lambda: axis.motion.activity.over != "")
-            samples, lost = reader.read()
-            assert lost == 0
-            stands = samples["axes"][:, 0]
-            standing = stands["load_target_deg"][stands["velocity_deg_s"] == 0.0]
-            order = [value for value, before in zip(standing[1:], standing, strict=False) if value != before]
-            assert order == pytest.approx([2.0, -1.0, 1.0])
-            assert np.count_nonzero(np.isclose(standing, 2.0)) * service.daemon.period_s >= 0.3
-
-    play(story())
+async def test_way_points_are_stood_at_one_after_the_other(service: Service) -> None:
+    async with service.enabled() as (bridge, token):
+        axis = bridge.axes["axis1"]
+        reader = service.daemon.memory.reader()
+        assert await axis.queue(token, [WayPoint(2.0, dwell_s=0.3), WayPoint(-1.0)]) == 2
+        assert await axis.queue(token, [WayPoint(1.0)]) >= 2
+        await until(bridge, lambda: axis.motion.activity.over != "")
+        samples, lost = reader.read()
+        assert lost == 0
+        stands = samples["axes"][:, 0]
+        standing = stands["load_target_deg"][stands["velocity_deg_s"] == 0.0]
+        order = [value for value, before in zip(standing[1:], standing, strict=False) if value != before]
+        assert order == pytest.approx([2.0, -1.0, 1.0])
+        assert np.count_nonzero(np.isclose(standing, 2.0)) * service.daemon.period_s >= 0.3
 
 
-def test_a_move_takes_the_place_of_the_queue(service: Service) -> None:
-    async def story() -> None:
-        async with service.enabled() as (bridge, token):
-            axis = bridge.axes["axis1"]
-            await axis.queue(token, [WayPoint(20.0), WayPoint(-20.0)])
-            await bridge.core.timing.sleep(0.2)
-            await axis.move(token, 1.0)
-            assert axis.state().queued == 0
-            await bridge.core.timing.sleep(1.0)
-            assert axis.state().load_target_deg == pytest.approx(1.0)
-
-    play(story())
+async def test_a_move_takes_the_place_of_the_queue(service: Service) -> None:
+    async with service.enabled() as (bridge, token):
+        axis = bridge.axes["axis1"]
+        await axis.queue(token, [WayPoint(20.0), WayPoint(-20.0)])
+        await bridge.core.timing.sleep(0.2)
+        await axis.move(token, 1.0)
+        assert axis.state().queued == 0
+        await bridge.core.timing.sleep(1.0)
+        assert axis.state().load_target_deg == pytest.approx(1.0)
 
 
-def test_a_bad_way_point_takes_none(service: Service) -> None:
-    async def story() -> None:
-        async with service.enabled() as (bridge, token):
-            axis = bridge.axes["axis1"]
-            for bad in (
-                WayPoint(1e6),
-                WayPoint(math.nan),
-                WayPoint(1.0, velocity_deg_s=0.0),
-                WayPoint(1.0, dwell_s=-1),
-            ):
-                with pytest.raises(InputError):
-                    await axis.queue(token, [WayPoint(2.0), bad])
-            await bridge.core.timing.sleep(0.5)
-            assert axis.state().load_target_deg == pytest.approx(0.0, abs=0.01)
-
-    play(story())
+async def test_a_bad_way_point_takes_none(service: Service) -> None:
+    async with service.enabled() as (bridge, token):
+        axis = bridge.axes["axis1"]
+        for bad in (
+            WayPoint(1e6),
+            WayPoint(math.nan),
+            WayPoint(1.0, velocity_deg_s=0.0),
+            WayPoint(1.0, dwell_s=-1),
+        ):
+            with pytest.raises(InputError):
+                await axis.queue(token, [WayPoint(2.0), bad])
+        await bridge.core.timing.sleep(0.5)
+        assert axis.state().load_target_deg == pytest.approx(0.0, abs=0.01)
 
 
 @pytest.mark.parametrize("steps", range(3))
-def test_a_queue_may_be_forgotten_while_its_move_begins(service: Service, steps: int) -> None:
-    async def story() -> None:
-        async with service.enabled() as (bridge, token):
-            axis = bridge.axes["axis1"]
-            await axis.queue(token, [WayPoint(4.0)])
-            for _ in range(steps):
-                await asyncio.sleep(0)
-            await axis.clear_queue(token)
-            await until(bridge, lambda: axis.motion.activity.over != "")
-            state = axis.state()
-            assert state.load_target_deg == pytest.approx(4.0 if state.load_target_deg > 1.0 else 0.0)
-            assert state.at_rest
-
-    play(story())
+async def test_a_queue_may_be_forgotten_while_its_move_begins(service: Service, steps: int) -> None:
+    async with service.enabled() as (bridge, token):
+        axis = bridge.axes["axis1"]
+        await axis.queue(token, [WayPoint(4.0)])
+        for _ in range(steps):
+            await asyncio.sleep(0)
+        await axis.clear_queue(token)
+        await until(bridge, lambda: axis.motion.activity.over != "")
+        state = axis.state()
+        assert state.load_target_deg == pytest.approx(4.0 if state.load_target_deg > 1.0 else 0.0)
+        assert state.at_rest
 
 
-def test_a_forgotten_queue_ends_after_the_present_move(service: Service) -> None:
-    async def story() -> None:
-        async with service.enabled() as (bridge, token):
-            axis = bridge.axes["axis1"]
-            await axis.queue(token, [WayPoint(4.0), WayPoint(-20.0), WayPoint(20.0)])
-            await bridge.core.timing.sleep(0.1)
-            assert await axis.clear_queue(token) == 2
-            await until(bridge, lambda: axis.motion.activity.over != "")
-            assert axis.state().load_target_deg == pytest.approx(4.0)
-
-    play(story())
+async def test_a_forgotten_queue_ends_after_the_present_move(service: Service) -> None:
+    async with service.enabled() as (bridge, token):
+        axis = bridge.axes["axis1"]
+        await axis.queue(token, [WayPoint(4.0), WayPoint(-20.0), WayPoint(20.0)])
+        await bridge.core.timing.sleep(0.1)
+        assert await axis.clear_queue(token) == 2
+        await until(bridge, lambda: axis.motion.activity.over != "")
+        assert axis.state().load_target_deg == pytest.approx(4.0)
 
 
 def test_the_end_of_a_lease_stops_a_queue_and_not_a_move(tmp_path: Path) -> None:
@@ -120,18 +105,15 @@ def test_the_end_of_a_lease_stops_a_queue_and_not_a_move(tmp_path: Path) -> None
         play(story(service))
 
 
-def test_a_lease_taken_by_force_stops_the_jog_of_the_other(service: Service) -> None:
-    async def story() -> None:
-        async with service.enabled() as (bridge, token):
-            axis = bridge.axes["axis1"]
-            await axis.jog(token, 10.0, timeout_s=5.0)
-            await bridge.core.timing.sleep(0.2)
-            bridge.lease.take("other", force=True)
-            await until(bridge, lambda: axis.state().at_rest, 1.0)
-            with pytest.raises(LeaseError, match="'other'"):
-                await axis.jog(token, 10.0)
-
-    play(story())
+async def test_a_lease_taken_by_force_stops_the_jog_of_the_other(service: Service) -> None:
+    async with service.enabled() as (bridge, token):
+        axis = bridge.axes["axis1"]
+        await axis.jog(token, 10.0, timeout_s=5.0)
+        await bridge.core.timing.sleep(0.2)
+        bridge.lease.take("other", force=True)
+        await until(bridge, lambda: axis.state().at_rest, 1.0)
+        with pytest.raises(LeaseError, match="'other'"):
+            await axis.jog(token, 10.0)
 
 
 def sine(count: int, period_s: float = 0.05, amplitude_deg: float = 3.0) -> list[StreamPoint]:
@@ -143,47 +125,39 @@ def sine(count: int, period_s: float = 0.05, amplitude_deg: float = 3.0) -> list
     ]
 
 
-def test_a_stream_follows_its_set_points(service: Service) -> None:
-    async def story() -> None:
-        async with service.enabled() as (bridge, token):
-            axis = bridge.axes["axis1"]
-            await axis.move(token, 0.0)
-            reader = service.daemon.memory.reader()
-            points = sine(41)
-            async with await axis.stream(token) as stream:
-                for place in range(0, len(points), 7):
-                    await stream.put(points[place : place + 7])
-                assert stream.buffered_s > 0.5
-            state = axis.state()
-            assert state.at_rest
-            assert state.mode == "hold"
-            samples, _ = reader.read()
-            target = samples["axes"][:, 0]["load_target_deg"]
-            moving = target[np.flatnonzero(np.diff(target))[0] :]
-            times = service.daemon.period_s * np.arange(len(moving))
-            wanted = np.interp(
-                times, [each.time_s for each in points], [each.position_deg for each in points]
-            )
-            assert np.max(np.abs(moving - wanted)) < 0.01  # the cubic is not the chord
-            with pytest.raises(RefusedError, match="over"):
-                await stream.put([StreamPoint(9.0, 0.0)])
-
-    play(story())
+async def test_a_stream_follows_its_set_points(service: Service) -> None:
+    async with service.enabled() as (bridge, token):
+        axis = bridge.axes["axis1"]
+        await axis.move(token, 0.0)
+        reader = service.daemon.memory.reader()
+        points = sine(41)
+        async with await axis.stream(token) as stream:
+            for place in range(0, len(points), 7):
+                await stream.put(points[place : place + 7])
+            assert stream.buffered_s > 0.5
+        state = axis.state()
+        assert state.at_rest
+        assert state.mode == "hold"
+        samples, _ = reader.read()
+        target = samples["axes"][:, 0]["load_target_deg"]
+        moving = target[np.flatnonzero(np.diff(target))[0] :]
+        times = service.daemon.period_s * np.arange(len(moving))
+        wanted = np.interp(times, [each.time_s for each in points], [each.position_deg for each in points])
+        assert np.max(np.abs(moving - wanted)) < 0.01  # the cubic is not the chord
+        with pytest.raises(RefusedError, match="over"):
+            await stream.put([StreamPoint(9.0, 0.0)])
 
 
-def test_a_stream_that_dries_up_brakes_and_says_so(service: Service) -> None:
-    async def story() -> None:
-        async with service.enabled() as (bridge, token):
-            axis = bridge.axes["axis1"]
-            await axis.move(token, 0.0)
-            stream = await axis.stream(token)
-            await stream.put([StreamPoint(0.1 * number, 0.05 * number * number) for number in range(6)])
-            await until(bridge, lambda: axis.state().underrun, 2.0)
-            await until(bridge, lambda: axis.state().at_rest, 2.0)
-            with pytest.raises(RefusedError, match="ran out"):
-                await stream.put([StreamPoint(1.0, 2.0)])
-
-    play(story())
+async def test_a_stream_that_dries_up_brakes_and_says_so(service: Service) -> None:
+    async with service.enabled() as (bridge, token):
+        axis = bridge.axes["axis1"]
+        await axis.move(token, 0.0)
+        stream = await axis.stream(token)
+        await stream.put([StreamPoint(0.1 * number, 0.05 * number * number) for number in range(6)])
+        await until(bridge, lambda: axis.state().underrun, 2.0)
+        await until(bridge, lambda: axis.state().at_rest, 2.0)
+        with pytest.raises(RefusedError, match="ran out"):
+            await stream.put([StreamPoint(1.0, 2.0)])
 
 
 @pytest.mark.parametrize(
@@ -196,36 +170,30 @@ def test_a_stream_that_dries_up_brakes_and_says_so(service: Service) -> None:
         ([StreamPoint(0.0, 0.0, 1.0)], "begin at rest"),
     ],
 )
-def test_bad_set_points_are_refused_before_anything_moves(
+async def test_bad_set_points_are_refused_before_anything_moves(
     service: Service, points: list[StreamPoint], words: str
 ) -> None:
-    async def story() -> None:
-        async with service.enabled() as (bridge, token):
-            axis = bridge.axes["axis1"]
-            await axis.move(token, 0.0)
-            stream = await axis.stream(token)
-            with pytest.raises(InputError, match=words):
-                await stream.put(points)
-            await bridge.core.timing.sleep(0.5)
-            assert axis.state().load_target_deg == 0.0
-
-    play(story())
+    async with service.enabled() as (bridge, token):
+        axis = bridge.axes["axis1"]
+        await axis.move(token, 0.0)
+        stream = await axis.stream(token)
+        with pytest.raises(InputError, match=words):
+            await stream.put(points)
+        await bridge.core.timing.sleep(0.5)
+        assert axis.state().load_target_deg == 0.0
 
 
-def test_set_points_beyond_the_limits_end_the_stream_braking(service: Service) -> None:
-    async def story() -> None:
-        async with service.enabled() as (bridge, token):
-            axis = bridge.axes["axis1"]
-            await axis.move(token, 0.0)
-            stream = await axis.stream(token)
-            await stream.put([StreamPoint(0.2, 0.5), StreamPoint(0.4, 1.0), StreamPoint(0.41, 300.0)])
-            with pytest.raises((InputError, RefusedError), match="deg/s"):
-                await stream.end()
-            await until(bridge, lambda: axis.state().at_rest, 2.0)
-            assert axis.state().state == "enabled"
-            assert axis.state().load_target_deg < 10.0
-
-    play(story())
+async def test_set_points_beyond_the_limits_end_the_stream_braking(service: Service) -> None:
+    async with service.enabled() as (bridge, token):
+        axis = bridge.axes["axis1"]
+        await axis.move(token, 0.0)
+        stream = await axis.stream(token)
+        await stream.put([StreamPoint(0.2, 0.5), StreamPoint(0.4, 1.0), StreamPoint(0.41, 300.0)])
+        with pytest.raises((InputError, RefusedError), match="deg/s"):
+            await stream.end()
+        await until(bridge, lambda: axis.state().at_rest, 2.0)
+        assert axis.state().state == "enabled"
+        assert axis.state().load_target_deg < 10.0
 
 
 def test_two_axes_arrive_together(tmp_path: Path) -> None:

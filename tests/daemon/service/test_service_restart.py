@@ -63,49 +63,26 @@ def test_nothing_is_asked_of_an_axis_before_its_state_is_known(service: Service)
     play(story())
 
 
-def test_without_a_control_process_nothing_is_sent(service: Service) -> None:
+async def test_without_a_control_process_nothing_is_sent(service: Service) -> None:
     """A request between two control processes is refused, and the next one does not find it."""
-
-    async def story() -> None:
-        async with service.ready() as bridge:
-            axis, token = bridge.axes["axis1"], bridge.lease.take("test")
-            status = service.daemon.memory.status
-            pid = status.loop_pid
-            status.set(Cell.LOOP_PID, 0)
-            with pytest.raises(RefusedError, match="there is no control process"):
-                await axis.enable(token)
-            status.set(Cell.LOOP_PID, pid)
-            assert axis.state().state == "disabled"
+    async with service.ready() as bridge:
+        axis, token = bridge.axes["axis1"], bridge.lease.take("test")
+        status = service.daemon.memory.status
+        pid = status.loop_pid
+        status.set(Cell.LOOP_PID, 0)
+        with pytest.raises(RefusedError, match="there is no control process"):
             await axis.enable(token)
-
-    play(story())
-
-
-def test_what_was_lent_is_taken_back(service: Service) -> None:
-    async def story() -> None:
-        async with service.ready() as bridge:
-            await bridge.axes["axis1"].link.do(CommandKind.LEND)
-        async with service.bridge() as bridge:
-            axis = bridge.axes["axis1"]
-            await until(bridge, lambda: axis.state().state == "disabled")
-            token = bridge.lease.take("test")
-            await axis.enable(token)
-            await axis.move(token, 1.0)
-
-    play(story())
+        status.set(Cell.LOOP_PID, pid)
+        assert axis.state().state == "disabled"
+        await axis.enable(token)
 
 
-def test_the_choice_outlives_both_processes(service: Service) -> None:
-    async def first() -> None:
-        async with service.enabled() as (bridge, token):
-            await bridge.axes["axis1"].compensate(token, Scheme.SYNCHRONOUS)
-
-    play(first())
-    service.daemon.begin_again()
-    service.daemon.memory.status.set(Cell.LOOP_PID, 4711)
-
-    async def second() -> None:
-        async with service.bridge() as bridge:
-            assert bridge.axes["axis1"].state().scheme == "synchronous"
-
-    play(second())
+async def test_what_was_lent_is_taken_back(service: Service) -> None:
+    async with service.ready() as bridge:
+        await bridge.axes["axis1"].link.do(CommandKind.LEND)
+    async with service.bridge() as bridge:
+        axis = bridge.axes["axis1"]
+        await until(bridge, lambda: axis.state().state == "disabled")
+        token = bridge.lease.take("test")
+        await axis.enable(token)
+        await axis.move(token, 1.0)

@@ -5,7 +5,7 @@ from collections.abc import Callable
 
 import pytest
 from support.daemon import SteppedDaemon
-from support.service import Service, play, until
+from support.service import Service, until
 
 from hdbridge.cli.ctl.look import _event as printed
 from hdbridge.client import messages
@@ -55,39 +55,36 @@ LATCHED = [
 
 
 @pytest.mark.parametrize(("spoil", "fault"), LATCHED, ids=[each.name.lower() for _, each in LATCHED])
-def test_a_quick_stop_is_latched_until_a_reset(
+async def test_a_quick_stop_is_latched_until_a_reset(
     service: Service, spoil: Callable[[SteppedDaemon], None], fault: Fault
 ) -> None:
-    async def story() -> None:
-        async with service.enabled() as (bridge, token):
-            axis = bridge.axes["axis1"]
-            await axis.move(token, 100.0, wait=False)
-            await bridge.core.timing.sleep(1.0)
-            spoil(service.daemon)
-            with pytest.raises(SafetyStop, match=fault.value) as raised:
-                await axis.move(token, 150.0)
-            state = axis.state()
-            assert state.state == "quick-stopped"
-            said_once(bridge, state.fault, str(raised.value))
-            assert state.fault is not None
-            assert state.fault.name == fault.name
-            assert state.fault.hint
-            assert not state.fault.needs_verification
-            with pytest.raises(RefusedError, match="reset"):
-                await axis.move(token, 0.0)
-            with pytest.raises(RefusedError, match="reset"):
-                await axis.enable(token)
-            await axis.reset(token)
-            state = axis.state()
-            assert state.state == "disabled"
-            assert state.fault is None
-            place_deg = state.load_position_deg
-            await bridge.core.timing.sleep(1.0)
-            assert axis.state().load_position_deg == pytest.approx(place_deg, abs=0.01)
+    async with service.enabled() as (bridge, token):
+        axis = bridge.axes["axis1"]
+        await axis.move(token, 100.0, wait=False)
+        await bridge.core.timing.sleep(1.0)
+        spoil(service.daemon)
+        with pytest.raises(SafetyStop, match=fault.value) as raised:
+            await axis.move(token, 150.0)
+        state = axis.state()
+        assert state.state == "quick-stopped"
+        said_once(bridge, state.fault, str(raised.value))
+        assert state.fault is not None
+        assert state.fault.name == fault.name
+        assert state.fault.hint
+        assert not state.fault.needs_verification
+        with pytest.raises(RefusedError, match="reset"):
+            await axis.move(token, 0.0)
+        with pytest.raises(RefusedError, match="reset"):
             await axis.enable(token)
-            await axis.move(token, place_deg + 1.0)
-
-    play(story())
+        await axis.reset(token)
+        state = axis.state()
+        assert state.state == "disabled"
+        assert state.fault is None
+        place_deg = state.load_position_deg
+        await bridge.core.timing.sleep(1.0)
+        assert axis.state().load_position_deg == pytest.approx(place_deg, abs=0.01)
+        await axis.enable(token)
+        await axis.move(token, place_deg + 1.0)
 
 
 def boot_up(daemon: SteppedDaemon) -> None:
@@ -99,135 +96,112 @@ def pre_operational(daemon: SteppedDaemon) -> None:
 
 
 @pytest.mark.parametrize("spoil", [boot_up, pre_operational])
-def test_a_drive_that_restarts_is_verified_again_and_stays_disabled(
+async def test_a_drive_that_restarts_is_verified_again_and_stays_disabled(
     service: Service, spoil: Callable[[SteppedDaemon], None]
 ) -> None:
-    async def story() -> None:
-        async with service.enabled() as (bridge, token):
-            axis = bridge.axes["axis1"]
-            await axis.move(token, 100.0, wait=False)
-            await bridge.core.timing.sleep(1.0)
-            spoil(service.daemon)
-            with pytest.raises(SafetyStop):
-                await axis.move(token, 150.0)
-            await until(bridge, lambda: axis.state().state == "disabled")
-            told = [each.text for each in bridge.events().events if each.kind == "note"]
-            assert "the drive was verified; the axis is disabled" in told
-            await bridge.core.timing.sleep(1.0)
-            assert axis.state().power == "switch on disabled"
-            with pytest.raises(RefusedError, match="enable it first"):
-                await axis.move(token, 0.0)
-            await axis.enable(token)
-            await axis.move(token, axis.state().load_target_deg + 1.0)
-
-    play(story())
+    async with service.enabled() as (bridge, token):
+        axis = bridge.axes["axis1"]
+        await axis.move(token, 100.0, wait=False)
+        await bridge.core.timing.sleep(1.0)
+        spoil(service.daemon)
+        with pytest.raises(SafetyStop):
+            await axis.move(token, 150.0)
+        await until(bridge, lambda: axis.state().state == "disabled")
+        told = [each.text for each in bridge.events().events if each.kind == "note"]
+        assert "the drive was verified; the axis is disabled" in told
+        await bridge.core.timing.sleep(1.0)
+        assert axis.state().power == "switch on disabled"
+        with pytest.raises(RefusedError, match="enable it first"):
+            await axis.move(token, 0.0)
+        await axis.enable(token)
+        await axis.move(token, axis.state().load_target_deg + 1.0)
 
 
-def test_an_interface_that_comes_back_is_found_again(service: Service) -> None:
-    async def story() -> None:
-        async with service.enabled() as (bridge, token):
-            axis = bridge.axes["axis1"]
-            await axis.move(token, 100.0, wait=False)
-            await bridge.core.timing.sleep(0.5)
-            service.daemon.bus.down = errno.ENETDOWN
-            with pytest.raises(HdbridgeError):
-                await axis.move(token, 150.0)
-            await bridge.core.timing.sleep(1.0)
-            assert not bridge.state().bus.up
-            assert any("bus is down" in each for each in bridge.state().warnings)
-            assert axis.state().state == "latched"
-            assert axis.state().fault.needs_verification
-            service.daemon.bus.down = None
-            await until(bridge, lambda: axis.state().state == "disabled")
-            assert bridge.state().bus.up
-            await axis.enable(token)
-            await axis.move(token, axis.state().load_target_deg + 1.0)
-
-    play(story())
+async def test_an_interface_that_comes_back_is_found_again(service: Service) -> None:
+    async with service.enabled() as (bridge, token):
+        axis = bridge.axes["axis1"]
+        await axis.move(token, 100.0, wait=False)
+        await bridge.core.timing.sleep(0.5)
+        service.daemon.bus.down = errno.ENETDOWN
+        with pytest.raises(HdbridgeError):
+            await axis.move(token, 150.0)
+        await bridge.core.timing.sleep(1.0)
+        assert not bridge.state().bus.up
+        assert any("bus is down" in each for each in bridge.state().warnings)
+        assert axis.state().state == "latched"
+        assert axis.state().fault.needs_verification
+        service.daemon.bus.down = None
+        await until(bridge, lambda: axis.state().state == "disabled")
+        assert bridge.state().bus.up
+        await axis.enable(token)
+        await axis.move(token, axis.state().load_target_deg + 1.0)
 
 
-def test_a_drive_that_is_not_there_yet_is_waited_for(service: Service) -> None:
-    async def story() -> None:
-        service.daemon.nodes[0].faults.silent = True
-        async with service.bridge() as bridge:
-            axis = bridge.axes["axis1"]
-            await until(
-                bridge, lambda: any("does not answer" in each.text for each in bridge.events().events)
-            )
-            assert axis.state().state == "unverified"
-            service.daemon.nodes[0].faults.silent = False
-            await until(bridge, lambda: axis.state().state == "disabled", 60.0)
-
-    play(story())
+async def test_a_drive_that_is_not_there_yet_is_waited_for(service: Service) -> None:
+    service.daemon.nodes[0].faults.silent = True
+    async with service.bridge() as bridge:
+        axis = bridge.axes["axis1"]
+        await until(bridge, lambda: any("does not answer" in each.text for each in bridge.events().events))
+        assert axis.state().state == "unverified"
+        service.daemon.nodes[0].faults.silent = False
+        await until(bridge, lambda: axis.state().state == "disabled", 60.0)
 
 
-def test_a_jog_that_has_run_out_costs_the_next_client_nothing(service: Service) -> None:
-    async def story() -> None:
-        async with service.ready() as bridge:
-            axis = bridge.axes["axis1"]
-            token = bridge.lease.take("first")
-            await axis.enable(token)
-            await axis.jog(token, 5.0, 0.2)
-            await bridge.core.timing.sleep(1.0)
-            token = bridge.lease.take("second", force=True)
-            await axis.move(token, 8.0)
-            assert axis.state().load_target_deg == 8.0
-            notes = [each.text for each in bridge.events(0).events if each.kind == "note"]
-            assert not [each for each in notes if "lease of its client has ended" in each]
-
-    play(story())
+async def test_a_jog_that_has_run_out_costs_the_next_client_nothing(service: Service) -> None:
+    async with service.ready() as bridge:
+        axis = bridge.axes["axis1"]
+        token = bridge.lease.take("first")
+        await axis.enable(token)
+        await axis.jog(token, 5.0, 0.2)
+        await bridge.core.timing.sleep(1.0)
+        token = bridge.lease.take("second", force=True)
+        await axis.move(token, 8.0)
+        assert axis.state().load_target_deg == 8.0
+        notes = [each.text for each in bridge.events(0).events if each.kind == "note"]
+        assert not [each for each in notes if "lease of its client has ended" in each]
 
 
-def test_homes_and_stays_disabled(service: Service) -> None:
-    async def story() -> None:
-        async with service.ready() as bridge:
-            axis = bridge.axes["axis1"]
-            token = bridge.lease.take("test")
-            await axis.enable(token)
-            await axis.move(token, 5.0)
-            await axis.disable(token)
+async def test_homes_and_stays_disabled(service: Service) -> None:
+    async with service.ready() as bridge:
+        axis = bridge.axes["axis1"]
+        token = bridge.lease.take("test")
+        await axis.enable(token)
+        await axis.move(token, 5.0)
+        await axis.disable(token)
+        await axis.home(token, HomingRun(35))
+        assert axis.state().state == "disabled"
+        await bridge.core.timing.sleep(0.1)
+        assert axis.state().motor_position_deg == pytest.approx(0.0, abs=1.0)
+        await axis.enable(token)
+        await axis.move(token, 1.0)
+        with pytest.raises(RefusedError):
             await axis.home(token, HomingRun(35))
-            assert axis.state().state == "disabled"
-            await bridge.core.timing.sleep(0.1)
-            assert axis.state().motor_position_deg == pytest.approx(0.0, abs=1.0)
-            await axis.enable(token)
-            await axis.move(token, 1.0)
-            with pytest.raises(RefusedError):
-                await axis.home(token, HomingRun(35))
-
-    play(story())
 
 
-def test_a_homing_that_fails_leaves_the_axis_disabled(service: Service) -> None:
-    async def story() -> None:
-        async with service.ready() as bridge:
-            axis = bridge.axes["axis1"]
-            token = bridge.lease.take("test")
-            with pytest.raises(HdbridgeError):
-                await axis.home(token, HomingRun(1))
-            await until(bridge, lambda: axis.state().state == "disabled")
-            assert axis.state().power == "switch on disabled"
-            await axis.enable(token)
-            await axis.move(token, 1.0)
-
-    play(story())
+async def test_a_homing_that_fails_leaves_the_axis_disabled(service: Service) -> None:
+    async with service.ready() as bridge:
+        axis = bridge.axes["axis1"]
+        token = bridge.lease.take("test")
+        with pytest.raises(HdbridgeError):
+            await axis.home(token, HomingRun(1))
+        await until(bridge, lambda: axis.state().state == "disabled")
+        assert axis.state().power == "switch on disabled"
+        await axis.enable(token)
+        await axis.move(token, 1.0)
 
 
 @pytest.mark.parametrize("obeys", [True, False])
-def test_a_quick_stop_by_a_client_says_once_how_to_release_it(service: Service, obeys: bool) -> None:
-    async def story() -> None:
-        async with service.enabled() as (bridge, token):
-            axis = bridge.axes["axis1"]
-            await axis.move(token, 100.0, wait=False)
-            await bridge.core.timing.sleep(1.0)
-            if not obeys:
-                service.daemon.nodes[0].dictionary[0x605A, 0].put(0)  # a quick stop does nothing
-            await axis.quick_stop()
-            await until(bridge, lambda: any(each.kind == "stopped" for each in bridge.events().events))
-            fault = axis.state().fault
-            assert fault is not None
-            assert fault.text.startswith("quick stop by command: latched")
-            assert fault.hint.endswith("hdbridge ctl reset axis1")
-            said_once(bridge, fault)
-
-    play(story())
+async def test_a_quick_stop_by_a_client_says_once_how_to_release_it(service: Service, obeys: bool) -> None:
+    async with service.enabled() as (bridge, token):
+        axis = bridge.axes["axis1"]
+        await axis.move(token, 100.0, wait=False)
+        await bridge.core.timing.sleep(1.0)
+        if not obeys:
+            service.daemon.nodes[0].dictionary[0x605A, 0].put(0)  # a quick stop does nothing
+        await axis.quick_stop()
+        await until(bridge, lambda: any(each.kind == "stopped" for each in bridge.events().events))
+        fault = axis.state().fault
+        assert fault is not None
+        assert fault.text.startswith("quick stop by command: latched")
+        assert fault.hint.endswith("hdbridge ctl reset axis1")
+        said_once(bridge, fault)
