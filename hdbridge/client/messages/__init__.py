@@ -53,6 +53,7 @@ from hdbridge.client.messages.state import (
     ModelInUse,
     OuterState,
     RecorderState,
+    RefinedResponse,
 )
 from hdbridge.client.messages.values import (
     AdaptationMode,
@@ -98,6 +99,7 @@ __all__ = [
     "Queue",
     "QueueItem",
     "RecorderState",
+    "RefinedResponse",
     "Samples",
     "Scheme",
     "SdoValue",
