@@ -79,7 +79,9 @@ COMMANDS: Final[Format[Command]] = Format(
     COMMAND, lambda command: command[1:], lambda sequence, values: Command(sequence, *values)
 )
 KNOTS: Final[Format[Knot]] = Format(KNOT, lambda knot: knot, lambda _, values: Knot(*values))
-FOLLOWED: Final[Format[OuterKnot]] = Format(KNOT, lambda knot: knot, lambda _, values: cast("OuterKnot", values))
+FOLLOWED: Final[Format[OuterKnot]] = Format(
+    KNOT, lambda knot: knot, lambda _, values: cast("OuterKnot", values)
+)
 """Read as plain tuples, because the control loop takes one in each cycle."""
 
 
