@@ -19,7 +19,8 @@ from hdbridge.conformance.tester import (
 
 CHECKS: Final = Table()
 _REQUEST, _ANSWER = 0x7E5, 0x7E4
-_WAITING: Final = bytes((0x04, 0))
+_WAITING: Final = b"\x04".ljust(8, b"\0")
+"""Request that leads all nodes to waiting state."""
 _NO_NODE_ID: Final = 255
 _PARTS: Final = ("vendor", "product", "revision", "serial")
 _Function = Callable[[NodeTester, list[int]], None]
@@ -63,7 +64,7 @@ def _check(name: str, text: str, *, stores: bool = False) -> Callable[[_Function
             try:
                 function(t, identity)
             finally:
-                t.send(_REQUEST, _WAITING.ljust(8, b"\0"))
+                t.send(_REQUEST, _WAITING)
 
     return add
 
@@ -75,13 +76,12 @@ def _numbered(t: NodeTester, identity: list[int], node_id: int) -> None:
 
 
 def _back(t: NodeTester, identity: list[int], now: int) -> None:
-    """Gives the node its own node id again."""
-    t.send(_REQUEST, _WAITING.ljust(8, b"\0"))
-    _numbered(t, identity, t.node_id)
-    since = t.mark()
-    if now == _NO_NODE_ID:
-        t.send(_REQUEST, _WAITING.ljust(8, b"\0"))
-    else:
+    """Gives the node its own node id again; by frames alone, which an end of the run does not keep back."""
+    requests = [struct.pack("<BI3x", 0x40 + part, number) for part, number in enumerate(identity)]
+    since = len(t.log)
+    for request in (_WAITING, *requests, bytes((0x11, t.node_id)).ljust(8, b"\0"), _WAITING):
+        t.send(_REQUEST, request)
+    if now != _NO_NODE_ID:
         t.nmt(NMT_RESET_COMMUNICATION, now)
     t.boot_up(since)
     t.answers(t.timing.boot_s)
@@ -89,20 +89,20 @@ def _back(t: NodeTester, identity: list[int], now: int) -> None:
 
 @_check("select", "The node is selected by the four numbers in 1018h")
 def _(t: NodeTester, identity: list[int]) -> None:
-    t.send(_REQUEST, _WAITING.ljust(8, b"\0"))
+    t.send(_REQUEST, _WAITING)
     _answered(t, _select(t, identity), 0x44)
 
 
 @_check("waiting", "In waiting state no inquiry is answered")
 def _(t: NodeTester, _: list[int]) -> None:
-    t.send(_REQUEST, _WAITING.ljust(8, b"\0"))
+    t.send(_REQUEST, _WAITING)
     t.equal(_ask(t, 0x5E), None, "answer")
 
 
 def _of_part(place: int, part: str) -> None:
     @_check(f"select.{part}", f"Another {part} number does not select the node")
     def _(t: NodeTester, identity: list[int]) -> None:
-        t.send(_REQUEST, _WAITING.ljust(8, b"\0"))
+        t.send(_REQUEST, _WAITING)
         identity[place] ^= 1
         t.equal(_select(t, identity), None, "answer")
         t.equal(_ask(t, 0x5E), None, "answer of a node that is not selected")
@@ -151,7 +151,7 @@ def _(t: NodeTester, identity: list[int]) -> None:
     try:
         t.true(t.ask(upload_request(0x1000)), "no SDO answer", "one at the node id in use")
     finally:
-        _numbered(t, identity, t.node_id)
+        _back(t, identity, t.node_id)
 
 
 @_check("node-id.used", "After a reset of the communication the node boots with its new node id")
@@ -173,7 +173,7 @@ def _(t: NodeTester, identity: list[int]) -> None:
     t.nmt(NMT_RESET_COMMUNICATION)
     try:
         t.equal(t.hears(0x700 + t.node_id, since=since), None, "boot-up message")
-        t.send(_REQUEST, _WAITING.ljust(8, b"\0"))
+        t.send(_REQUEST, _WAITING)
         _answered(t, _ask(t, 0x4C), 0x50)
         _answered(t, _ask(t, 0x51, 0x80, 0, 0, number=0), 0x4F)
         for part, number in enumerate(identity):
@@ -186,7 +186,7 @@ def _(t: NodeTester, identity: list[int]) -> None:
 
 @_check("fast-scan.configured", "A node with a node id does not answer a fast scan")
 def _(t: NodeTester, _: list[int]) -> None:
-    t.send(_REQUEST, _WAITING.ljust(8, b"\0"))
+    t.send(_REQUEST, _WAITING)
     t.equal(_ask(t, 0x4C), None, "answer to identify non-configured")
     t.equal(_ask(t, 0x51, 0x80, 0, 0, number=0), None, "answer to a fast scan")
 
