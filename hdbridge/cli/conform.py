@@ -12,6 +12,7 @@ from rich.table import Table
 from hdbridge.cli.options import (
     BorrowOption,
     ForceOption,
+    GatewayAxisOption,
     JsonOption,
     SeedOption,
     SimulateOption,
@@ -62,12 +63,7 @@ def conform(
             "--eds", metavar="FILE", help="EDS of the node, which is compared with it; else the axis file's."
         ),
     ] = None,
-    axis: Annotated[
-        str | None,
-        typer.Option(
-            "--axis", help="Name of the axis; needed if the gateway has several.", show_default=False
-        ),
-    ] = None,
+    axis: GatewayAxisOption = None,
     motion: Annotated[
         bool,
         typer.Option("--motion", help="Also switch power on and move the axis; else power stays off."),

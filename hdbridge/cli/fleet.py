@@ -79,6 +79,12 @@ PagesOption = Annotated[
     bool,
     typer.Option("--pages", help="Also write the page of each listed joint, into OUT/pages."),
 ]
+TimeoutOption = Annotated[
+    float,
+    typer.Option(
+        "--timeout", metavar="SECONDS", min=0.1, max=3600.0, help="Longest wait for a server of SOURCE, s."
+    ),
+]
 MemoryOption = Annotated[str, typer.Option("--memory", metavar="SIZE", help="Memory limit of each process.")]
 
 
@@ -110,6 +116,7 @@ class Fleet:
     memory: MemoryOption = "2GB"
     limit_arcsec: LimitOption = 10.0
     pages: PagesOption = False
+    timeout_s: TimeoutOption = 20.0
 
     def __post_init__(self) -> None:
         from hdbridge.axis.model import TransmissionModel
@@ -150,7 +157,9 @@ class Fleet:
         """Returns the recordings that are there; raises `InputError` for a wrong source or manifest."""
         from hdbridge.fleet.sources import find_sources
 
-        return find_sources(self.sources or [], self.manifest, stored, may_be_empty=may_be_empty)
+        return find_sources(
+            self.sources or [], self.manifest, stored, may_be_empty=may_be_empty, timeout_s=self.timeout_s
+        )
 
     def diagnose(
         self,
@@ -184,9 +193,9 @@ class Fleet:
         counts = f"{end.done} recordings, {end.known} of them known already, {end.failed} newly failed"
         _say(f"{self.dataset.folder}: {counts}{memory}")
 
-    def summarise(self) -> None:
-        """Prints and writes the summary of the data set."""
-        _summarise(self.dataset, self.limit_arcsec, pages=self.pages)
+    def summarise(self) -> Summary:
+        """Prints, writes and returns the summary of the data set."""
+        return _summarise(self.dataset, self.limit_arcsec, pages=self.pages)
 
     def say_interrupted(self) -> None:
         """Reports that the finished part is kept."""
@@ -198,10 +207,9 @@ def run(fleet: Fleet) -> None:
 
     A joint without a model gets one fitted to its earliest recording. An unusable recording is a row with the
     reason. Ctrl-C keeps finished results; the same command continues.
+
+    Exit status 2 if no recording could be diagnosed.
     """
-    for each in fleet.sources or ():
-        if "://" in each:  # a server that does not answer takes minutes
-            _note(f"listing {each}")
     found = fleet.find(fleet.dataset.stored())
     fleet.dataset.create()
     with deferred_interrupt() as interrupted:
@@ -210,7 +218,10 @@ def run(fleet: Fleet) -> None:
         except KeyboardInterrupt:
             fleet.say_interrupted()
             raise
-    fleet.summarise()
+    summary = fleet.summarise()
+    if len(summary.failed) == summary.recordings:
+        reason = summary.failed[0][2]
+        raise InputError(f"none of {summary.recordings} recordings has a diagnosis; the first: {reason}")
 
 
 def watch(
@@ -302,8 +313,8 @@ def _summarise(
     *,
     pages: bool = False,
     joints: Sequence[str] = (),
-) -> None:
-    """Prints and writes the summary, the pages of these joints, and those of all listed joints."""
+) -> Summary:
+    """Prints, writes and returns the summary; writes the pages of these joints and of all listed ones."""
     from rich.table import Table
 
     from hdbridge.fleet.prior import write_prior
@@ -345,6 +356,7 @@ def _summarise(
     if not beside:  # pages are in OUT
         found = {joint: (dataset.folder.resolve() / each).as_uri() for joint, each in found.items()}
     write_result(target, render(fleet_page(summary, dataset.folder, found)))
+    return summary
 
 
 def _with_pages(folder: Path, latest: Mapping[str, Row], wanted: Collection[str]) -> dict[str, str]:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from hdbridge.cli.options import JsonOption, MachineArgument, console, notes, write_json
+from hdbridge.cli.options import GatewayAxisOption, JsonOption, MachineArgument, console, notes, write_json
 from hdbridge.errors import DriveError, InputError
 
 if TYPE_CHECKING:
@@ -29,18 +29,11 @@ def register(app: typer.Typer) -> None:
         rich_markup_mode="markdown",
     )
     group.command("eds")(eds)
-    group.command("simulate")(simulate)
     group.command("doctor")(doctor)
     app.add_typer(group, name="gateway")
 
 
-AxisOption = Annotated[
-    str | None,
-    typer.Option("--axis", help="Name of the axis; needed if the gateway has several.", show_default=False),
-]
-
-
-def eds(machine: MachineArgument, axis: AxisOption = None) -> None:
+def eds(machine: MachineArgument, axis: GatewayAxisOption = None) -> None:
     """Print the EDS of an axis on the gateway's bus, for the tool that configures the other master.
 
     hdbridge gateway eds cell > axis1.eds
@@ -50,47 +43,9 @@ def eds(machine: MachineArgument, axis: AxisOption = None) -> None:
     typer.echo(text_of(*gateway_axis(machine, axis)), nl=False)
 
 
-def simulate(
-    machine: MachineArgument,
-    axis: AxisOption = None,
-    duration_s: Annotated[
-        float | None,
-        typer.Option("--duration", min=0.0, help="Stop after this time, s; else at Ctrl-C."),
-    ] = None,
-) -> None:
-    """Run an ideal drive in place of the gateway, in real time, until Ctrl-C.
-
-    It has the bus, node id and objects of the gateway, and needs no daemon: for tests of another master's
-    program.
-    """
-    from hdbridge.cli.interrupt import deferred_interrupt
-    from hdbridge.clock import MonotonicClock
-    from hdbridge.daemon.gateway.ideal import IdealAxis
-    from hdbridge.daemon.gateway.objects import nameplate, write_eds
-    from hdbridge.daemon.gateway.slave import BEHAVIOUR
-    from hdbridge.device.node import DriveNode
-    from hdbridge.device.run import run
-    from hdbridge.drive.link import open_bus
-
-    config, settings = gateway_axis(machine, axis)
-    plate, node_id, clock = nameplate(config, settings), settings.nodes[config.name], MonotonicClock()
-    scale = config.gear.ratio * plate.load_counts_per_turn / plate.motor_counts_per_turn
-    with (
-        deferred_interrupt() as interrupted,
-        open_bus(settings.bus, shared=True) as bus,
-        TemporaryDirectory(prefix="hdbridge-gateway-") as folder,
-    ):
-        path = write_eds(Path(folder), config, settings)
-        rate_bps = settings.bus.bitrate_bps
-        node = DriveNode(bus, IdealAxis(scale), path, node_id, clock, plate, BEHAVIOUR, bit_rate_bps=rate_bps)
-        notes.print(f"ideal drive: node {node_id} on {bus.channel_info}; Ctrl-C ends it")
-        end = float("inf") if duration_s is None else clock.now() + duration_s
-        run(bus, node, clock, lambda: interrupted() or clock.now() >= end)
-
-
 def doctor(
     machine: MachineArgument,
-    axis: AxisOption = None,
+    axis: GatewayAxisOption = None,
     duration_s: Annotated[
         float,
         typer.Option("--duration", min=0.1, max=86_400.0, help="Time to listen, s; Ctrl-C ends it earlier."),

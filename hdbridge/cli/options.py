@@ -50,6 +50,10 @@ ProfileArgument = Annotated[
         help="Folder with axis.yaml (and model.yaml), axis file, or bundled profile: article, demo.",
     ),
 ]
+GatewayAxisOption = Annotated[
+    str | None,
+    typer.Option("--axis", help="Name of the axis; needed if the gateway has several.", show_default=False),
+]
 MachineArgument = Annotated[
     str,
     typer.Argument(

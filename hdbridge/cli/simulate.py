@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from collections.abc import Callable
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Annotated
 
+import can
 import typer
 
 from hdbridge.cli.interrupt import deferred_interrupt
 from hdbridge.cli.options import (
     ChannelOption,
+    GatewayAxisOption,
     InterfaceOption,
     ProfileArgument,
     SeedOption,
@@ -16,8 +21,14 @@ from hdbridge.cli.options import (
     notes,
 )
 from hdbridge.cli.session import Session, simulated_by
-from hdbridge.clock import MonotonicClock
+from hdbridge.clock import Clock, MonotonicClock
 from hdbridge.errors import InputError
+
+if TYPE_CHECKING:
+    from hdbridge.axis import BusConfig
+    from hdbridge.device.node import DriveNode
+
+    Maker = Callable[[can.BusABC, Clock, Path], DriveNode]
 
 
 def register(app: typer.Typer) -> None:
@@ -31,6 +42,14 @@ def simulate(
     seed: SeedOption = 0,
     interface: InterfaceOption = None,
     channel: ChannelOption = None,
+    gateway: Annotated[
+        bool,
+        typer.Option(
+            "--gateway",
+            help="PROFILE is a machine with a gateway: an ideal drive with the bus and objects of that.",
+        ),
+    ] = False,
+    axis: GatewayAxisOption = None,
     duration_s: Annotated[
         float | None,
         typer.Option("--duration", min=0.0, help="Stop after this time, s; else at Ctrl-C."),
@@ -43,10 +62,38 @@ def simulate(
         hdbridge simulate article --interface socketcan --channel vcan0 &
 
         hdbridge step article --interface socketcan --channel vcan0
+
+    With --gateway no daemon is needed: for tests of another master's program.
     """
-    from hdbridge.device.node import DriveNode
     from hdbridge.device.run import run
     from hdbridge.drive.link import open_bus
+
+    if gateway and (truth, interface, channel) != (None, None, None):
+        raise InputError(
+            "--gateway: the drive is ideal and its bus is the gateway's; leave out --truth, --interface and "
+            "--channel"
+        )
+    if axis and not gateway:
+        raise InputError("--axis: names an axis of a gateway; add --gateway, or leave it out")
+    name, config, make = (
+        _ideal(profile, axis) if gateway else _simulated(profile, truth, seed, interface, channel)
+    )
+    clock = MonotonicClock()
+    with (
+        deferred_interrupt() as interrupted,
+        open_bus(config, shared=True) as bus,
+        TemporaryDirectory(prefix="hdbridge-gateway-") as folder,
+    ):
+        node = make(bus, clock, Path(folder))
+        notes.print(f"{name} drive: node {node.node_id} on {bus.channel_info}; Ctrl-C ends it")
+        end = float("inf") if duration_s is None else clock.now() + duration_s
+        run(bus, node, clock, lambda: interrupted() or clock.now() >= end)
+
+
+def _simulated(
+    profile: str, truth: Path | None, seed: int, interface: str | None, channel: str | None
+) -> tuple[str, BusConfig, Maker]:
+    from hdbridge.device.node import DriveNode
     from hdbridge.sim.lockstep import nameplate_of
     from hdbridge.sim.machine import Machine
     from hdbridge.sim.truth import Truth
@@ -60,19 +107,32 @@ def simulate(
             "or use 'hdbridge step --simulate'"
         )
     known = Truth.load(simulated_by(session.files, truth))
-    clock = MonotonicClock()
-    with deferred_interrupt() as interrupted, open_bus(axis.bus, shared=True) as bus:
-        nameplate = nameplate_of(known, load_object=axis.load_encoder.source.address)
-        node = DriveNode(
-            bus,
-            Machine(known, seed),
-            axis.eds_path,
-            axis.drive.node_id,
-            clock,
-            nameplate,
-            known.firmware,
+
+    def make(bus: can.BusABC, clock: Clock, _: Path) -> DriveNode:
+        plate = nameplate_of(known, load_object=axis.load_encoder.source.address)
+        return DriveNode(
+            bus, Machine(known, seed), axis.eds_path, axis.drive.node_id, clock, plate, known.firmware,
             bit_rate_bps=axis.bus.bitrate_bps,
-        )
-        notes.print(f"simulated drive: node {axis.drive.node_id} on {bus.channel_info}; Ctrl-C ends it")
-        end = float("inf") if duration_s is None else clock.now() + duration_s
-        run(bus, node, clock, lambda: interrupted() or clock.now() >= end)
+        )  # fmt: skip
+
+    return "simulated", axis.bus, make
+
+
+def _ideal(machine: str, name: str | None) -> tuple[str, BusConfig, Maker]:
+    from hdbridge.cli.gateway import gateway_axis
+    from hdbridge.daemon.gateway.ideal import IdealAxis
+    from hdbridge.daemon.gateway.objects import nameplate, write_eds
+    from hdbridge.daemon.gateway.slave import BEHAVIOUR
+    from hdbridge.device.node import DriveNode
+
+    axis, settings = gateway_axis(machine, name)
+
+    def make(bus: can.BusABC, clock: Clock, folder: Path) -> DriveNode:
+        plate = nameplate(axis, settings)
+        plant = IdealAxis(axis.gear.ratio * plate.load_counts_per_turn / plate.motor_counts_per_turn)
+        return DriveNode(
+            bus, plant, write_eds(folder, axis, settings), settings.nodes[axis.name], clock, plate, BEHAVIOUR,
+            bit_rate_bps=settings.bus.bitrate_bps,
+        )  # fmt: skip
+
+    return "ideal", settings.bus, make

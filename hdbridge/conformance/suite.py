@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 
-from hdbridge.conformance import description, drive, emergency, motion, network, pdo, sdo
+from hdbridge.conformance import description, drive, emergency, lss, motion, network, pdo, sdo
 from hdbridge.conformance.tester import (
     FAULT_REACTION_ACTIVE,
     OPERATION_ENABLED,
@@ -29,7 +29,7 @@ def checks(*, moves: bool = False, stores: bool = False) -> list[Check]:
 
     Checks that switch power on or write to non-volatile memory are included only on request.
     """
-    subjects = (network, sdo, pdo, emergency, description, drive, motion)
+    subjects = (network, lss, sdo, pdo, emergency, description, drive, motion)
     every = [check for subject in subjects for check in subject.CHECKS]
     return [check for check in every if (moves or not check.moves) and (stores or not check.stores)]
 

@@ -50,6 +50,10 @@ MARKS: Final = ("size", "ETag", "mtime", "LastModified", "created")
 """Attributes of a remote file that change with its content, as fsspec's file systems name them."""
 
 
+TIMEOUT_S: Final = 20.0
+"""Default of the longest wait for the first answer of a server."""
+
+
 @dataclass(frozen=True)
 class Source:
     """One recording of one joint, with the data known before it is read."""
@@ -120,17 +124,19 @@ def find_sources(
     stored: Stored = NOTHING_STORED,
     *,
     may_be_empty: bool = False,
+    timeout_s: float = TIMEOUT_S,
 ) -> list[Source]:
     """Returns all recordings at the given places and in the manifest, each once, sorted by path.
 
     InputError for a place that does not exist or holds no recording (unless it ``may_be_empty``), and for a
-    wrong manifest. A recording that is ``stored`` unchanged is not opened.
+    wrong manifest. A recording that is ``stored`` unchanged is not opened. ``timeout_s`` is the longest wait
+    for the first answer of a server.
     """
     found: dict[tuple[str, str | None], Source] = dict(read_manifest(manifest)) if manifest else {}
     described = {path for path, _ in found}
     marks: dict[str, str] = {}
     for place in given:
-        marked = _recordings(_listing(place), described)
+        marked = _recordings(_listing(place, timeout_s), described)
         if not marked and not may_be_empty:
             raise InputError(
                 f"{place}: no recording; expected recording folders, or files that end in .csv, .csv.gz "
@@ -141,7 +147,7 @@ def find_sources(
         for path in marked:
             if path not in described:
                 found[path, None] = Source(path)
-    marks |= _marks_of(described - marks.keys())
+    marks |= _marks_of(described - marks.keys(), timeout_s)
     sources = [
         _with_about(replace(each, stamp=_stamp(each, marks.get(each.path))), stored)
         for each in found.values()
@@ -156,16 +162,16 @@ def _recordings(files: Mapping[str, str], described: Collection[str]) -> dict[st
     return {path: "\n".join(f"{each} {files[each]}" for each in own) for path, own in found.items()}
 
 
-def _marks_of(paths: Collection[str]) -> dict[str, str]:
+def _marks_of(paths: Collection[str], timeout_s: float) -> dict[str, str]:
     """Returns the marks of the recordings that a manifest names; a missing one has none."""
     files: dict[str, str] = {}
     for place in {posixpath.dirname(path) if "://" in path else path for path in paths}:
         with suppress(InputError):  # the worker that reads the recording reports the error
-            files |= _listing(place) if "://" in place else dict(_local(Path(place)))
+            files |= _listing(place, timeout_s) if "://" in place else dict(_local(Path(place)))
     return _recordings(files, paths)
 
 
-def _listing(place: str) -> dict[str, str]:
+def _listing(place: str, timeout_s: float) -> dict[str, str]:
     """Returns all files at or below a place (folder, glob, file or URL), each with its mark: size and times.
 
     InputError if there is nothing.
@@ -175,11 +181,21 @@ def _listing(place: str) -> dict[str, str]:
         matched = sorted(glob.glob(place, recursive=True)) if glob.has_magic(place) else [place]  # noqa: PTH207
         return {file: mark for each in matched for file, mark in _local(Path(each))}
     import fsspec
+    from fsspec.exceptions import FSTimeoutError
 
     try:
         system, root = fsspec.core.url_to_fs(place)
         host = place.rstrip("/").removesuffix(root)  # protocol and host, which `system` paths lack
         system.invalidate_cache()
+        if system.async_impl:  # the others have time-outs of their own, of 15 s for SFTP
+            try:
+                system.info(root.partition("*")[0], timeout=timeout_s)
+            except FSTimeoutError:
+                raise TimeoutError(
+                    f"no answer in {timeout_s:g} s; is it the right server? see --timeout"
+                ) from None
+            except Exception:  # the listing reports it
+                pass
         files: dict[str, Any] = {}
         for each in system.glob(root) if glob.has_magic(root) else [root]:
             found = system.find(each, detail=True)

@@ -49,7 +49,7 @@ def test_the_eds_has_the_scale_and_the_limits_of_the_load(tmp_path):
 def test_the_ideal_drive_answers_on_the_bus_of_the_gateway(tmp_path):
     path = machine(tmp_path)
     with can.Bus(interface="udp_multicast", channel="239.74.163.11", port=43210) as bus:
-        done = run_here(tmp_path, "gateway", "simulate", path, "--duration", "0.5")
+        done = run_here(tmp_path, "simulate", path, "--gateway", "--duration", "0.5")
         assert done.returncode == 0, done.stderr
         assert "ideal drive: node 5" in done.stderr
         seen = []

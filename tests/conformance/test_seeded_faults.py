@@ -274,6 +274,44 @@ WATCHING = (
 )
 
 
+def lss_answers(check: str, text: str, command: int, *values: int) -> Fault:
+    """An answer of LSS with other bytes."""
+    return sends(check, text, when(lambda i, d: i == 0x7E4 and d[0] == command,
+                                   lambda i, d: [(i, bytes(values).ljust(8, b"\0"))]))  # fmt: skip
+
+
+def lss(check: str, text: str, name: str, make: Callable[[Method, Any], Method]) -> Fault:
+    """Another method of the LSS slave, made of the right one and the slave."""
+    return wraps(check, text, f"_lss.{name}", lambda right, node: make(right, node._lss))
+
+
+LSS = (
+    *(lss(f"lss.select.{part}", f"any {part} number selects", "_agrees", lambda right, _, command=command:
+          lambda c, span, agrees: right(c, span, agrees or c == command))
+      for command, part in enumerate(("vendor", "product", "revision", "serial"), start=0x40)),
+    *(lss_answers(f"lss.inquire.{part}", f"another {part} number", command, command, 9)
+      for command, part in enumerate(("vendor", "product", "revision", "serial"), start=0x5A)),
+    lss_answers("lss.select", "a selection has another answer", 0x44, 0x4F),
+    lss_answers("lss.inquire.node-id", "another node id", 0x5E, 0x5E, 9),
+    lss_answers("lss.node-id.range", "node id 0 is accepted", 0x11, 0x11, 0),
+    lss_answers("lss.bit-timing.reserved", "a reserved bit timing is accepted", 0x13, 0x13, 0),
+    lss_answers("lss.store", "storing has an error code of its own", 0x17, 0x17, 2),
+    lss("lss.waiting", "inquiries are answered in waiting state", "respond", lambda right, slave:
+        lambda d: slave._configure(d[0], d) if d[0] == 0x5E else right(d)),
+    lss("lss.short", "short requests are obeyed", "respond",
+        lambda right, _: lambda d: right(d.ljust(8, b"\0"))),
+    lss("lss.identify", "every range contains the identity", "_in_range", lambda right, _: lambda c, n: True),
+    lss("lss.node-id.pending", "a node id acts at once", "respond", lambda right, slave:
+        then(right, lambda: setattr(slave, "node_id", slave.pending))),
+    receives("lss.node-id.used", "a node id never acts", lambda m: renamed(m, 0x7E5, b"\x11\1" + bytes(6))
+             if m.arbitration_id == 0x7E5 and m.data[0] == 0x11 else m),
+    lss("lss.fast-scan", "a fast scan compares nothing", "_fast_scan", lambda right, slave:
+        lambda n, bit, part, following: b"\x4f" + bytes(7)),
+    lss("lss.fast-scan.configured", "a node with a node id says that it has none", "respond", lambda right, _:
+        lambda d: b"\x50" + bytes(7) if d[0] == 0x4C else right(d)),
+)  # fmt: skip
+
+
 def any_toggle(check: Method, node: DriveNode) -> Method:
     return lambda command, *, uploading: check(command & ~0x10 | node._sdo._toggle, uploading=uploading)
 
@@ -661,7 +699,7 @@ MOTION = (
 )  # fmt: skip
 
 FAULTS: tuple[Fault, ...] = (
-    *NETWORK, *WATCHING, *SDO, *PDO, *ERRORS_STORAGE_IDENTITY, *POWER, *MOTION,
+    *NETWORK, *WATCHING, *LSS, *SDO, *PDO, *ERRORS_STORAGE_IDENTITY, *POWER, *MOTION,
 )  # fmt: skip
 
 

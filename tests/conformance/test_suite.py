@@ -138,6 +138,14 @@ def test_a_run_that_is_ended_in_a_move_stops_the_axis_and_changes_everything_bac
         assert node.dictionary.value(0x6081) == speed
 
 
+@pytest.mark.parametrize("name", ["lss.node-id.used", "lss.fast-scan"])
+def test_a_run_that_is_ended_gives_the_node_its_node_id_again(name):
+    renumbered = [each for each in EVERY if each.id == name]
+    with simulated_drive(stopped=lambda: node.node_id != 1) as (tester, node, _):
+        run(tester, renumbered)
+        assert node.node_id == 1
+
+
 # ---------------------------------------------------------------- the command
 
 

@@ -27,6 +27,16 @@ def test_run_and_report_print_and_write_what_they_say(fleet, scheduler, tmp_path
     check_pages(tmp_path)
 
 
+def test_a_run_without_any_diagnosis_is_bad_input(scheduler, tmp_path):
+    for name in ("a", "b"):
+        (tmp_path / f"{name}.csv").write_text("time_s\n1\n")
+    done = run_here(tmp_path, "fleet", "run", ".", "--out", "out", "--scheduler", scheduler)
+    assert done.returncode == 2
+    words = "hdbridge: none of 2 recordings has a diagnosis; the first: .*: columns .* are missing"
+    assert re.match(words, done.stderr.splitlines()[-1])
+    assert (tmp_path / "out" / "fleet.html").exists()
+
+
 def check_pages(folder):
     """The page of a joint is written on demand, and its link still works after the folder was moved."""
     assert 'href="pages' not in (folder / "out" / "fleet.html").read_text()

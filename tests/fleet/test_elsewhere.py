@@ -2,6 +2,7 @@
 
 import asyncio
 import gc
+import re
 import socket
 import threading
 from contextlib import suppress
@@ -107,25 +108,39 @@ def test_recordings_behind_sftp(files, monkeypatch, tmp_path):
         thread.join(60)
 
 
-@pytest.mark.parametrize("place", ["s3://bucket/x", "sftp://u:p@127.0.0.1:{}/x", "http://127.0.0.1:{}/x/"])
-def test_a_server_of_something_else_is_an_error_of_one_line(place, monkeypatch):
+@pytest.mark.parametrize(
+    ("place", "words"),
+    [
+        ("s3://bucket/x", b"220 mail\r\n"),
+        ("sftp://u:p@127.0.0.1:{}/x", b"220 mail\r\n"),
+        ("http://127.0.0.1:{}/x/", b"220 mail\r\n"),
+        ("s3://bucket/x", b""),
+        ("http://127.0.0.1:{}/x/*.csv", b""),
+    ],
+)
+def test_a_server_of_something_else_or_a_silent_one_is_an_error_of_one_line(place, words, monkeypatch):
     pytest.importorskip("s3fs")
     pytest.importorskip("paramiko")
     with socket.create_server(("127.0.0.1", 0)) as server:
 
         def answer():
+            held = []
             with suppress(OSError):
                 while True:
-                    with server.accept()[0] as line:
-                        line.sendall(b"220 mail\r\n")
+                    line, _ = server.accept()
+                    if words:
+                        with line:
+                            line.sendall(words)
+                    held.append(line)
 
         threading.Thread(target=answer, daemon=True).start()
         port = server.getsockname()[1]
         once = {"config_kwargs": {"retries": {"max_attempts": 0}}, "key": "k", "secret": "s"}
         monkeypatch.setitem(fsspec.config.conf, "s3", {"endpoint_url": f"http://127.0.0.1:{port}", **once})
         place = place.format(port)
-        with pytest.raises(InputError, match=f"^{place}: cannot be listed: .+$"):
-            find_sources([place])
+        reason = ".+" if words else "no answer in 0.2 s; .+ --timeout"
+        with pytest.raises(InputError, match=f"^{re.escape(place)}: cannot be listed: {reason}$"):
+            find_sources([place], timeout_s=30.0 if words else 0.2)
         server.shutdown(socket.SHUT_RDWR)
 
 

@@ -171,6 +171,16 @@ def no_heartbeat(outer):
     outer.get(0x6041)
 
 
+def stored_by_lss(outer):
+    for part in range(4):
+        value = outer.node.dictionary.value(0x1018, part + 1)
+        outer.send(0x7E5, struct.pack("<BI3x", 0x40 + part, value))
+    outer.send(0x7E5, b"\x11\x09" + bytes(6))
+    outer.send(0x7E5, b"\x17" + bytes(7))
+    texts = [each.text for each in outer.lines]
+    assert texts[-3:-1] == ["LSS: a node is selected by its identity", "LSS node id 9"]
+
+
 def rpdo_too_early(outer):
     outer.begin()
     outer.put(0x1017, 0, 10, 2)
@@ -196,6 +206,7 @@ def rpdo_too_early(outer):
         (beyond_a_range, "expected 0 to 8"),
         (no_heartbeat, "let the master send its heartbeat"),
         (rpdo_too_early, "NMT start first"),
+        (stored_by_lss, "the node id that lasts is that of the machine file"),
     ],
 )
 def test_a_mistake_is_named_once_with_what_to_do(outer, does, words):

@@ -23,7 +23,7 @@ def test_conform_checks_a_drive_in_another_process(interface, tmp_path):
     only = [each for name in CHECKS for each in ("--only", name)]
     conform = [*hdbridge, "conform", str(machine), "--motion", "--json", str(result), *only]
     with subprocess.Popen(
-        [*hdbridge, "gateway", "simulate", str(machine)], stderr=subprocess.PIPE, text=True
+        [*hdbridge, "simulate", str(machine), "--gateway"], stderr=subprocess.PIPE, text=True
     ) as drive:
         try:
             assert "ideal drive: node 5" in drive.stderr.readline()

@@ -58,8 +58,8 @@ class Laws:
         """Last event that may stop the axis; last time that the master sent another controlword."""
         self.word = 0
         self.following = False
-        self.framed = False
-        """A random RPDO may have been a controlword, in the default mapping after a reset."""
+        self.mapped = self.operational = True
+        """Mapped by the master, an RPDO waits for SYNC, and the cycle replaces it; by default it acts now."""
         self.unasked = ""
         """Reason why the present following, once it moves, is motion that nobody asked for."""
         self.lowest = self.highest = self.began_deg = 0.0
@@ -67,10 +67,14 @@ class Laws:
         """Cycles judged, cycles with a moving set-point, and enablings by the master."""
         self.before: tuple[int, float] | None = None
 
+    def sent(self, word: int) -> None:
+        """Another controlword on the bus is a request."""
+        if word != self.word:
+            self.word, self.asked_s = word, self.bench.now_s
+
     def look(self) -> None:
-        bench, plc = self.bench, self.bench.plc
-        if plc.controlword != self.word:
-            self.word, self.asked_s = plc.controlword, bench.now_s
+        plc = self.bench.plc
+        self.sent(plc.controlword)
         samples, _ = self.reader.read()
         target_deg = plc.target / COUNTS_PER_DEG
         self.lowest, self.highest = min(self.lowest, target_deg), max(self.highest, target_deg)
@@ -95,9 +99,7 @@ class Laws:
         if following and not self.following:
             self.enabled += 1
             self.unasked = ""
-            if self.framed:
-                pass
-            elif self.word & 0x8F != 0x0F:
+            if self.word & 0x8F != 0x0F:
                 self.unasked = "followed without 'enable operation'"
             elif self.asked_s <= self.disturbed_s:
                 self.unasked = "followed without a new controlword"
@@ -126,7 +128,7 @@ async def happen(bench: GatewayBench, laws: Laws, kind: str, value) -> None:
         laws.disturbed_s = bench.now_s
         await bench.configure()  # a reset has removed it
         laws.look()
-        laws.framed = False
+        laws.mapped = laws.operational = True
         for word, wait_s in ((0x00, 0.1), (0x80, 1.5), (0x06, 0.05), (0x07, 0.05), (0x0F, 0.2)):
             plc.controlword = word
             plc.target = plc.position
@@ -138,6 +140,8 @@ async def happen(bench: GatewayBench, laws: Laws, kind: str, value) -> None:
         plc.send(0x600 + NODE, struct.pack("<BHBb3x", 0x2F, 0x6060, 0, value))
     elif kind == "nmt":
         plc.send(0, bytes((value, NODE)))
+        laws.operational = value == 1
+        laws.mapped &= value not in (129, 130)
     elif kind == "pause":
         plc.cycling = False
         await rest(bench, laws, 1e-3 * value)
@@ -146,6 +150,7 @@ async def happen(bench: GatewayBench, laws: Laws, kind: str, value) -> None:
         bench.kill_gateway()
         await rest(bench, laws, 1e-3 * value)
         bench.start_gateway()
+        laws.mapped, laws.operational = False, True
         laws.disturbed_s = bench.now_s  # until then the loop cannot know
         plc.send(0, bytes((1, NODE)))
     elif kind == "loop":
@@ -169,7 +174,8 @@ async def happen(bench: GatewayBench, laws: Laws, kind: str, value) -> None:
         with suppress(HdbridgeError):
             bench.bridge.lease.release(token)
     elif kind == "frame":
-        laws.framed = True
+        if laws.operational and not laws.mapped and len(value) >= 2:
+            laws.sent(int.from_bytes(value[:2], "little"))
         plc.send(0x200 + NODE, value)
     elif kind == "wait":
         await rest(bench, laws, 1e-3 * value)

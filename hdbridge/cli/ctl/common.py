@@ -158,6 +158,8 @@ def tell(state: AxisState, json_file: Path | None) -> None:
     console.print(f"axis '{state.name}' is {state.state}{target}", markup=False, soft_wrap=True)
     if state.fault is not None:
         console.print(f"stopped: {state.fault}", markup=False, soft_wrap=True)
+    if state.adaptation.response is not None:
+        console.print(str(state.adaptation.response), markup=False, soft_wrap=True)
 
 
 def concerns(state: AxisState) -> Iterator[str]:
@@ -166,6 +168,8 @@ def concerns(state: AxisState) -> Iterator[str]:
         yield f"axis '{state.name}' stopped: {state.fault}"
     if state.adaptation.frozen is not None:
         yield f"axis '{state.name}' does not adapt: {state.adaptation.frozen}"
+    if state.adaptation.response is not None:
+        yield f"axis '{state.name}': {state.adaptation.response}"
     if state.load_loop.on and state.load_loop.doubt is not None:
         yield f"the load loop of axis '{state.name}' does not act: {state.load_loop.doubt}"
     for each in state.advice:

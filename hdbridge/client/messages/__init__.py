@@ -52,6 +52,7 @@ from hdbridge.client.messages.state import (
     ModelInUse,
     OuterState,
     RecorderState,
+    RefinedResponse,
 )
 from hdbridge.client.messages.values import (
     AdaptationMode,
@@ -96,6 +97,7 @@ __all__ = [
     "Queue",
     "QueueItem",
     "RecorderState",
+    "RefinedResponse",
     "Samples",
     "Scheme",
     "SdoValue",

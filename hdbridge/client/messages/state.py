@@ -68,6 +68,23 @@ class LoadLoopState(Report):
     )
 
 
+class RefinedResponse(Report):
+    """Response in motion that is used in place of the model's."""
+
+    date: datetime | None = Field(None, description="when it was refined last; None: before the daemon began")
+    low_hz: float = Field(description="lowest frequency at which it differs by 1 % or more")
+    high_hz: float = Field(description="highest one", examples=[62.0])
+    percent: float = Field(description="largest difference", examples=[12.0])
+    at_hz: float = Field(description="frequency of the largest difference")
+
+    def __str__(self) -> str:
+        when = "" if self.date is None else f" at {self.date:%Y-%m-%d %H:%M}"
+        return (
+            f"response in motion refined{when}: {self.low_hz:.0f} to {self.high_hz:.0f} Hz, by at most "
+            f"{self.percent:.0f} % (at {self.at_hz:.0f} Hz)"
+        )
+
+
 class AdaptationState(Report):
     """State of the adaptation of the model's parameters to the load encoder."""
 
@@ -81,6 +98,7 @@ class AdaptationState(Report):
         description="estimated change of each parameter since the model was activated, in its own unit",
         examples=[{"hysteresis.offset_arcsec": 1.3}],
     )
+    response: RefinedResponse | None = Field(None, description="None while the model's is used")
 
 
 class OuterState(Report):

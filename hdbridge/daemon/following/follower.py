@@ -17,6 +17,7 @@ import numpy as np
 from hdbridge.axis import AxisConfig
 from hdbridge.axis.channels import BY_KEY
 from hdbridge.axis.model import TransmissionModel
+from hdbridge.axis.model.response import Response
 from hdbridge.client import messages
 from hdbridge.daemon.following.adaptation import Adaptation, Entry, Proposal
 from hdbridge.daemon.following.health import DRIVEN, EncoderHealth, EncoderStatus, held_out_arcsec, in_states
@@ -36,6 +37,8 @@ ZERO_LOST: Final = (AxisState.UNVERIFIED, AxisState.LENT, AxisState.LATCHED)
 NEEDED: Final = SampleFlag.FRESH | SampleFlag.MEMORY_KNOWN
 SAVE_S: Final = 300.0
 """Maximum interval in axis time between stores of a changing state."""
+LEAST_CHANGE: Final = 0.01
+"""Smallest change of the response in motion that is reported, as a share."""
 UNIFORM: Final = 12.0**0.5
 """Range of a uniform distribution, relative to its standard deviation."""
 
@@ -92,6 +95,7 @@ class Follower:
         self._saved_windows = 0
         self._saved_s = -math.inf
         self._now_s = 0.0
+        self._refined_at: datetime | None = None
 
     def adapt(self, mode: Mode, files: AdaptationFiles | None = None) -> None:
         """Changes the mode of the adaptation, or starts it, from the state in ``files`` if there is one.
@@ -190,7 +194,26 @@ class Follower:
             frozen=adaptation.waiting_reason(path_known=self._measuring.known),
             updated=self.updated,
             parameters=adaptation.estimated_changes(),
+            response=self._refined(adaptation.model.response),
         )
+
+    def _refined(self, used: Response | None) -> messages.RefinedResponse | None:
+        """Compares the response in use with the committed one, lags apart; None if they agree within 1 %."""
+        committed = self.model.response
+        if committed is None or used is None:
+            return None
+        hertz = np.array(committed.frequency_hz)
+        later_deg = 0.36 * hertz * (used.following_lag_ms - committed.following_lag_ms)
+        turned = np.radians(np.subtract(used.phase_deg, committed.phase_deg) + later_deg)
+        change = abs(np.array(used.gain) / committed.gain * np.exp(1j * turned) - 1.0)
+        largest = int(np.argmax(change))
+        changed = hertz[change >= LEAST_CHANGE]
+        if not len(changed):
+            return None
+        return messages.RefinedResponse(
+            date=self._refined_at, low_hz=changed[0], high_hz=changed[-1],
+            percent=100.0 * change[largest], at_hz=hertz[largest],
+        )  # fmt: skip
 
     def save(self) -> None:
         """Writes the history, and the state if it has changed."""
@@ -221,6 +244,8 @@ class Follower:
 
     def _applied(self, proposal: Proposal) -> None:
         self.updated = self._files.now() if self._files is not None else None
+        if not proposal.changes:
+            self._refined_at = self.updated
         self.save()
 
 

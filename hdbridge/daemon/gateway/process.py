@@ -6,16 +6,19 @@ the set-points of its axes end, so they brake and lose their power.
 
 from __future__ import annotations
 
+import logging
 import os
 import signal
 import sys
 import time
+from contextlib import nullcontext
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from types import FrameType
 from typing import TYPE_CHECKING, Final
 
 from hdbridge.clock import Clock, MonotonicClock
+from hdbridge.control.realtime import prepare_realtime
 from hdbridge.daemon.gateway.slave import Gateway
 from hdbridge.daemon.logs import begin_log
 from hdbridge.daemon.memory import Cell, Memory
@@ -28,6 +31,7 @@ from hdbridge.files.atomic import make_folder
 if TYPE_CHECKING:
     from hdbridge.axis import AxisConfig
 
+_LOG: Final = logging.getLogger(__name__)
 ALIVE_S: Final = 0.1
 
 
@@ -111,7 +115,11 @@ def serve(start: Start) -> None:
                 status.set(Cell.GATEWAY_TIME_NS, time.monotonic_ns())
             return terminated
 
-        run(bus, gateway, clock, should_stop, longest_wait_s=machine.cycle_s)
+        # One below the control loop, which is not to wait for it on a shared processor.
+        priority, cpus = max(machine.realtime.priority - 1, 0), machine.realtime.cpus
+        with prepare_realtime(priority, cpus) if simulation is None else nullcontext() as conditions:
+            _LOG.info("gateway process", {"conditions": str(conditions or "simulated")})
+            run(bus, gateway, clock, should_stop, longest_wait_s=machine.cycle_s)
 
 
 if __name__ == "__main__":

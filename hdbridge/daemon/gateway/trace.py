@@ -47,6 +47,20 @@ _ADVICE: Final = {
     0x0609_0011: "the gateway does not have the sub-index: use the EDS of 'hdbridge gateway eds'",
     0x0800_0022: "not in this state: disable the drive first",
 }
+_LSS: Final = {
+    0x11: (
+        "node id",
+        "node ids are 1 to 127, or 255 for none",
+    ),
+    0x13: ("bit timing", "the bit rate is that of the interface: 'bitrate_bps' in the machine file"),
+    0x17: ("store configuration", "the node id that lasts is that of the machine file: change it there"),
+}
+"""Names of LSS services that change something, and the advice if they are refused."""
+_LSS_FOUND: Final = {
+    0x44: "LSS: a node is selected by its identity",
+    0x4F: "LSS: a node is identified",
+    0x50: "LSS: a node has no node id",
+}
 
 
 @dataclass(frozen=True)
@@ -72,6 +86,8 @@ class Trace:
         self.written: dict[tuple[int, int], int] = {}
         """Parameters that the master has written, in the order of the first write."""
         self._pending: tuple[int, int, bytes | None] | None = None
+        self._lss = bytes(8)
+        """Last LSS request."""
         self._nmt: int | None = None
         self._state: State | None = None
         self._word: int | None = None
@@ -108,6 +124,10 @@ class Trace:
             self._on_request(data)
         elif can_id == 0x580 + node and len(data) == 8:
             self._on_answer(frame.time_s, data)
+        elif can_id == 0x7E5 and len(data) == 8:
+            self._lss = data
+        elif can_id == 0x7E4 and len(data) == 8:
+            self._on_lss_answer(frame.time_s, data)
         elif can_id == self._value(0x1014) & 0x7FF and len(data) == 8:
             code = int.from_bytes(data[:2], "little")
             self._say(frame.time_s, f"EMCY {code:04X}h: {error_name(code)}" if code else "EMCY: error reset")
@@ -191,6 +211,17 @@ class Trace:
             self._values[index, sub] = value
             if index == 0x6064:
                 self._position = wrap_int32(value)
+
+    def _on_lss_answer(self, time_s: float, data: bytes) -> None:
+        """Reports a change by LSS, and a node that was found; inquiries change nothing."""
+        command, value = self._lss[:2]
+        if data[0] in (0x44, 0x4F, 0x50):
+            self._say_once(time_s, f"LSS {data[0]}", _LSS_FOUND[data[0]], "")
+        elif data[0] == command and command in _LSS:
+            name, advice = _LSS[command]
+            words = f"LSS {name}" + f" {value}" * (command == 0x11)
+            refused = f": refused with error {data[1]}" if data[1] else ""
+            self._say(time_s, words + refused, advice if refused else "")
 
     # ---------------------------------------------------------------- PDO and SYNC
 

@@ -15,7 +15,7 @@ import struct
 import threading
 import zlib
 from collections.abc import Callable, Iterable
-from typing import Any, Final, Generic, NamedTuple, TypeVar
+from typing import Any, Final, Generic, NamedTuple, TypeVar, cast
 
 from hdbridge.daemon.memory.layout import (
     COMMAND,
@@ -80,8 +80,9 @@ COMMANDS: Final[Format[Command]] = Format(
 )
 KNOTS: Final[Format[Knot]] = Format(KNOT, lambda knot: knot, lambda _, values: Knot(*values))
 FOLLOWED: Final[Format[OuterKnot]] = Format(
-    KNOT, lambda knot: knot, lambda _, values: OuterKnot._make(values)
+    KNOT, lambda knot: knot, lambda _, values: cast("OuterKnot", values)
 )
+"""Read as plain tuples, because the control loop takes one in each cycle."""
 
 
 class _Slots(Generic[T]):
@@ -223,13 +224,13 @@ class Queue(_Slots[T]):
         if sequence > self._head[0]:
             return None
         values = self._copy(sequence)
-        if values is None:
-            # Not completely visible yet. If it stays so, it must not block the slots behind it.
-            self._misses += 1
-            if self._misses >= MISSES:
-                self.drop()
-            return None
-        return self._unpack(sequence, values)
+        if values is not None:
+            return self._unpack(sequence, values)
+        # Not completely visible yet. If it stays so, it must not block the slots behind it.
+        self._misses += 1
+        if self._misses >= MISSES:
+            self.drop()
+        return None
 
     def drop(self) -> None:
         """Removes the item that `peek` returned."""
@@ -238,10 +239,14 @@ class Queue(_Slots[T]):
 
     def take(self) -> T | None:
         """Removes and returns the next item; None if there is none."""
-        item = self.peek()
-        if item is not None:
-            self.drop()
-        return item
+        sequence: int = self._tail[0] + 1
+        if sequence > self._head[0]:
+            return None
+        values = self._copy(sequence)
+        if values is None:
+            return self.peek()
+        self._misses, self._tail[0] = 0, sequence
+        return self._unpack(sequence, values)
 
     def clear(self) -> None:
         """Discards waiting items, at the consumer's end; they were meant for an earlier loop."""

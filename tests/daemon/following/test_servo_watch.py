@@ -86,6 +86,14 @@ def test_a_retuned_servo_is_reported_and_the_response_refined(profile: Path, ser
         assert each.model.response is not None
         change = abs(without_lag(committed) / without_lag(each.model.response) - 1.0)
         assert 0.02 < change.max() < 1.01 * AdaptationSettings().bound_share
+    shown, last = found.state.response, found.proposals[-1].model.response
+    assert shown is not None
+    assert last is not None
+    change = abs(without_lag(last) / without_lag(committed) - 1.0)
+    assert shown.percent == pytest.approx(100.0 * change.max())
+    assert shown.at_hz == committed.frequency_hz[change.argmax()]
+    assert change[np.searchsorted(committed.frequency_hz, shown.low_hz)] >= 0.01
+    assert f"{shown.low_hz:.0f} to {shown.high_hz:.0f} Hz" in str(shown)
 
 
 def without_lag(response: Response) -> np.ndarray:
@@ -104,6 +112,7 @@ def test_nothing_is_refined_without_a_believed_encoder_and_permission(
     assert not any(each.apply for each in found.proposals)
     assert len(found.proposals) == (mode == "observe")
     assert ("load encoder" in (found.state.frozen or "")) == stuck
+    assert found.state.response is None
 
 
 @given(

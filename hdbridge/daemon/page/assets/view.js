@@ -68,7 +68,13 @@ function facts(list, rows) {
 
 function adaptation(state) {
   if (state.mode === "off") return "off";
-  return state.frozen ? `${state.mode}; frozen: ${state.frozen}` : state.mode;
+  const { response } = state;
+  const when = response?.date ? ` at ${new Date(response.date).toLocaleString()}` : "";
+  return [
+    state.mode,
+    ...(state.frozen ? [`frozen: ${state.frozen}`] : []),
+    ...(response ? [`response in motion refined${when}: ${response.low_hz.toFixed(0)} to ${response.high_hz.toFixed(0)} Hz, by at most ${response.percent.toFixed(0)} % (at ${response.at_hz.toFixed(0)} Hz)`] : []),
+  ].join("; ");
 }
 
 export function machine(state) {

@@ -1,0 +1,212 @@
+"""Checks of the layer setting services: selection, identity, node id, bit timing, fast scan.
+
+Only the node with the identity in 1018h is selected, so no other node on the bus takes a command.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable
+from typing import Final
+
+from hdbridge.conformance.tester import (
+    NMT_RESET_COMMUNICATION,
+    NodeTester,
+    NotApplicableError,
+    Table,
+    upload_request,
+)
+
+CHECKS: Final = Table()
+_REQUEST, _ANSWER = 0x7E5, 0x7E4
+_WAITING: Final = b"\x04".ljust(8, b"\0")
+"""Request that leads all nodes to waiting state."""
+_NO_NODE_ID: Final = 255
+_PARTS: Final = ("vendor", "product", "revision", "serial")
+_Function = Callable[[NodeTester, list[int]], None]
+
+
+def _ask(t: NodeTester, command: int, *values: int, number: int | None = None) -> bytes | None:
+    """Sends a request with bytes, or with a number of 32 bits first; returns the answer, None without one."""
+    data = bytes(values) if number is None else struct.pack("<I", number) + bytes(values)
+    since = t.mark()
+    t.send(_REQUEST, (bytes((command,)) + data).ljust(8, b"\0"))
+    frame = t.hears(_ANSWER, since=since)
+    return None if frame is None else frame.data
+
+
+def _identity(t: NodeTester) -> list[int]:
+    for sub in range(1, 5):
+        t.require(0x1018, sub)
+    return [t.read(0x1018, sub) for sub in range(1, 5)]
+
+
+def _select(t: NodeTester, identity: list[int]) -> bytes | None:
+    for part in range(3):
+        t.send(_REQUEST, struct.pack("<BI3x", 0x40 + part, identity[part]))
+    return _ask(t, 0x43, number=identity[3])
+
+
+def _answered(t: NodeTester, answer: bytes | None, command: int, *values: int) -> None:
+    """Fails unless the answer is ``command`` with these bytes."""
+    found = None if answer is None else answer[: 1 + len(values)]
+    t.equal("no answer" if found is None else found, bytes((command, *values)))
+
+
+def _check(name: str, text: str, *, stores: bool = False) -> Callable[[_Function], None]:
+    """Adds a check that begins with the node in configuration state and ends in waiting state."""
+
+    def add(function: _Function) -> None:
+        @CHECKS.check(f"lss.{name}", text, "CiA 305", stores=stores)
+        def _(t: NodeTester) -> None:
+            identity = _identity(t)
+            t.need(_select(t, identity), "no answer to LSS switch state selective: the node has no LSS")
+            try:
+                function(t, identity)
+            finally:
+                t.send(_REQUEST, _WAITING)
+
+    return add
+
+
+def _numbered(t: NodeTester, identity: list[int], node_id: int) -> None:
+    """Sets the node id in use from the next reset of the communication on."""
+    _select(t, identity)
+    _answered(t, _ask(t, 0x11, node_id), 0x11, 0)
+
+
+def _back(t: NodeTester, identity: list[int], now: int) -> None:
+    """Gives the node its own node id again; by frames alone, which an end of the run does not keep back."""
+    requests = [struct.pack("<BI3x", 0x40 + part, number) for part, number in enumerate(identity)]
+    since = len(t.log)
+    for request in (_WAITING, *requests, bytes((0x11, t.node_id)).ljust(8, b"\0"), _WAITING):
+        t.send(_REQUEST, request)
+    if now != _NO_NODE_ID:
+        t.nmt(NMT_RESET_COMMUNICATION, now)
+    t.boot_up(since)
+    t.answers(t.timing.boot_s)
+
+
+@_check("select", "The node is selected by the four numbers in 1018h")
+def _(t: NodeTester, identity: list[int]) -> None:
+    t.send(_REQUEST, _WAITING)
+    _answered(t, _select(t, identity), 0x44)
+
+
+@_check("waiting", "In waiting state no inquiry is answered")
+def _(t: NodeTester, _: list[int]) -> None:
+    t.send(_REQUEST, _WAITING)
+    t.equal(_ask(t, 0x5E), None, "answer")
+
+
+def _of_part(place: int, part: str) -> None:
+    @_check(f"select.{part}", f"Another {part} number does not select the node")
+    def _(t: NodeTester, identity: list[int]) -> None:
+        t.send(_REQUEST, _WAITING)
+        identity[place] ^= 1
+        t.equal(_select(t, identity), None, "answer")
+        t.equal(_ask(t, 0x5E), None, "answer of a node that is not selected")
+
+    @_check(f"inquire.{part}", f"The inquired {part} number is that of 1018h")
+    def _(t: NodeTester, identity: list[int]) -> None:
+        _answered(t, _ask(t, 0x5A + place), 0x5A + place, *struct.pack("<I", identity[place]))
+
+
+for _place, _part in enumerate(_PARTS):
+    _of_part(_place, _part)
+
+
+@_check("inquire.node-id", "The inquired node id is the one in use")
+def _(t: NodeTester, _: list[int]) -> None:
+    _answered(t, _ask(t, 0x5E), 0x5E, t.node_id)
+
+
+@_check("identify", "A range of identities that contains the node's is answered, another one is not")
+def _(t: NodeTester, identity: list[int]) -> None:
+    vendor, product, revision, serial = identity
+    for low, high, found in ((serial, serial, b"\x4f"), (serial ^ 1, serial ^ 1, None)):
+        for command, number in enumerate((vendor, product, revision, revision, low), start=0x46):
+            t.send(_REQUEST, struct.pack("<BI3x", command, number))
+        answer = _ask(t, 0x4B, number=high)
+        t.equal(answer and answer[:1], found, "answer")
+
+
+@_check("short", "A request of fewer than eight bytes is ignored")
+def _(t: NodeTester, _: list[int]) -> None:
+    since = t.mark()
+    t.send(_REQUEST, b"\x5e")
+    t.equal(t.hears(_ANSWER, since=since), None, "answer")
+
+
+@_check("node-id.range", "Node ids 0 and 128 are refused with error 1")
+def _(t: NodeTester, _: list[int]) -> None:
+    for value in (0, 128):
+        _answered(t, _ask(t, 0x11, value), 0x11, 1)
+
+
+@_check("node-id.pending", "A new node id waits for a reset of the communication")
+def _(t: NodeTester, identity: list[int]) -> None:
+    other = _free_node_id(t)
+    _numbered(t, identity, other)
+    try:
+        t.true(t.ask(upload_request(0x1000)), "no SDO answer", "one at the node id in use")
+    finally:
+        _back(t, identity, t.node_id)
+
+
+@_check("node-id.used", "After a reset of the communication the node boots with its new node id")
+def _(t: NodeTester, identity: list[int]) -> None:
+    other = _free_node_id(t)
+    _numbered(t, identity, other)
+    since = t.mark()
+    t.nmt(NMT_RESET_COMMUNICATION)
+    try:
+        t.true(t.hears(0x700 + other, t.timing.boot_s, since), "no boot-up message", f"one of node {other}")
+    finally:
+        _back(t, identity, other)
+
+
+@_check("fast-scan", "Without a node id the node is silent until a fast scan finds it")
+def _(t: NodeTester, identity: list[int]) -> None:
+    _numbered(t, identity, _NO_NODE_ID)
+    since = t.mark()
+    t.nmt(NMT_RESET_COMMUNICATION)
+    try:
+        t.equal(t.hears(0x700 + t.node_id, since=since), None, "boot-up message")
+        t.send(_REQUEST, _WAITING)
+        _answered(t, _ask(t, 0x4C), 0x50)
+        _answered(t, _ask(t, 0x51, 0x80, 0, 0, number=0), 0x4F)
+        for part, number in enumerate(identity):
+            t.equal(_ask(t, 0x51, 31, part, part, number=number ^ 1 << 31), None, "answer to another number")
+            _answered(t, _ask(t, 0x51, 0, part, (part + 1) % 4, number=number), 0x4F)
+        _answered(t, _ask(t, 0x5E), 0x5E, _NO_NODE_ID)
+    finally:
+        _back(t, identity, _NO_NODE_ID)
+
+
+@_check("fast-scan.configured", "A node with a node id does not answer a fast scan")
+def _(t: NodeTester, _: list[int]) -> None:
+    t.send(_REQUEST, _WAITING)
+    t.equal(_ask(t, 0x4C), None, "answer to identify non-configured")
+    t.equal(_ask(t, 0x51, 0x80, 0, 0, number=0), None, "answer to a fast scan")
+
+
+@_check("bit-timing.reserved", "A reserved bit timing is refused with error 1")
+def _(t: NodeTester, _: list[int]) -> None:
+    _answered(t, _ask(t, 0x13, 0, 200), 0x13, 1)
+
+
+@_check("store", "Storing is carried out, or refused with error 1", stores=True)
+def _(t: NodeTester, _: list[int]) -> None:
+    answer = _ask(t, 0x17)
+    t.true(answer is not None and answer[:2] in (b"\x17\0", b"\x17\1"), answer, "17h with error 0 or 1")
+
+
+def _free_node_id(t: NodeTester) -> int:
+    """Returns a node id that no node on the bus answers to."""
+    for node_id in range(127, 0, -1):
+        since = t.mark()
+        t.send(0x600 + node_id, upload_request(0x1000))
+        if node_id != t.node_id and t.hears(0x580 + node_id, since=since) is None:
+            return node_id
+    raise NotApplicableError("every node id is in use")
