@@ -533,15 +533,27 @@ class _Problem:
 
     def stepped(self, place: FloatArray, steps: int) -> FloatArray:
         """Returns the best place after at most so many trust-region steps, the first as long as a spread."""
+        left, latest = 1 + steps, np.empty(0)
 
         def at(move: FloatArray) -> FloatArray:
             there: FloatArray = np.clip(place + move * self.spread, self.low, self.high)
             return there
 
+        def residuals(move: FloatArray) -> FloatArray:
+            nonlocal left
+            left -= 1
+            return self.residuals(at(move))
+
+        def slopes(move: FloatArray) -> FloatArray:
+            nonlocal latest
+            if left:  # `least_squares` also asks for them after the last step, and does not use them
+                latest = self.slopes(at(move))
+            return latest
+
         end = least_squares(
-            lambda move: self.residuals(at(move)),
+            residuals,
             np.zeros(len(place)),
-            lambda move: self.slopes(at(move)),
+            slopes,
             ((self.low - place) / self.spread - EDGE, (self.high - place) / self.spread + EDGE),
             max_nfev=1 + steps,
             gtol=None,
@@ -571,6 +583,7 @@ def solve(
     loops: Loops | None = None,
     tempered: bool = False,
     wide: bool = False,
+    linear: bool = True,
 ) -> Fitted:
     """Fits parameters by `scipy.optimize.least_squares` in at most ``steps`` steps; with none, linearises.
 
@@ -579,7 +592,8 @@ def solve(
     weight. ``tempered``: known scales grow with the residuals on the way to the minimum.
     Held-out legs count only with ``everything``. ``near`` is a fit of the same parameters that gives the
     directions of the first differences, ``loops`` the deviation of a drive's quantised loops from smooth
-    ones. ``wide``: the covariance uses wide differences.
+    ones. ``wide``: the covariance uses wide differences. Without ``linear`` it is the prior's, and there is
+    no Jacobian.
     """
     data = replays.data
     rows = fitted_rows(data, everything=everything)
@@ -601,10 +615,12 @@ def solve(
         idle = idle + 1 if 0.5 * float(before @ before - after @ after) < WORTH else 0
         done += taken
         progress(done / steps)
-    problem.longer = 1.0
-    slopes = problem.slopes(place, wide=wide)[: -len(parameters)] / problem.spread
     left = told(found, problem.scale, rows)
-    covariance = sandwich(slopes, left, legs_of_rows(data, rows), problem.spread)
+    slopes, covariance = np.empty((0, len(parameters))), np.diag(problem.spread**2)
+    if linear:
+        problem.longer = 1.0
+        slopes = problem.slopes(place, wide=wide)[: -len(parameters)] / problem.spread
+        covariance = sandwich(slopes, left, legs_of_rows(data, rows), problem.spread)
     truth = at_coordinates(start, parameters, place.tolist())
     return Fitted(truth, parameters, place, covariance, problem.scale, found, rows, left, slopes)
 
@@ -811,7 +827,7 @@ def with_blocks(few: Replays, best: Fitted) -> Fitted:
 
 def _in_units(replays: Replays, start: Fitting, steps: int) -> Fitted:
     """Fits in `units`, far from the noise."""
-    return solve(replays, *start, steps, known=Scales(units(replays.data)), tempered=True)
+    return solve(replays, *start, steps, known=Scales(units(replays.data)), tempered=True, linear=False)
 
 
 def starts(truth: Truth, cycle_ms: float) -> Iterator[Fitting]:
