@@ -172,7 +172,7 @@ def _values(before: Truth, after: Truth) -> list[Learned]:
     fitted, assumed = after.provenance["fit"]["parameters"], Values.of(before) is Values.USUAL
     rows = []
     for each in {parameter.path: parameter for parameter in (*PARAMETERS, *THERMAL)}.values():
-        now, interval = value_in(after, each), after.intervals.get(".".join(each.path))
+        now, interval = value_in(after, each), after.intervals.get(each.path)
         if now is not None and (interval is not None or each.name in fitted):
             was = None if assumed else value_in(before, each)
             rows.append(Learned(each.name, each.unit, was, now, interval))
@@ -233,7 +233,7 @@ def _check(
             "sentence": found.sentence,
             "changes": [{"cause": each.cause, "text": each.text} for each in found.changes],
             "misfit_growth": dict(found.growth_before),
-            "unexplained": found.unexplained | found.grown,
+            "unexplained": found.unexplained,
             "unseen": list(found.unseen),
         },
     )

@@ -40,7 +40,8 @@ from hdbridge.twin.misfit import (
     rounding,
 )
 from hdbridge.twin.naming import FALSE_ALARM, Finding, Moved, finding, told_apart
-from hdbridge.twin.parameters import BY_NAME, Parameter, at_coordinates, coordinates
+from hdbridge.twin.parameters import BY_NAME, Parameter, at_coordinates, coordinates, intervals_of
+from hdbridge.units import figure
 
 # ----------------------------------------------------------------
 # How sure a change against a twin is: by the new recording, and by what the twin's own recordings left open.
@@ -234,17 +235,15 @@ NOTICEABLE = 2.5
 
 @dataclass(frozen=True, slots=True)
 class Check:
-    """Result of a check: the changes, and the misfit that they leave."""
+    """Result of a check: the changes, and the growth of the misfit that they leave."""
 
     changes: tuple[Finding, ...]
-    misfit_after: Mapping[str, float]
-    """Rms residual of the twin with the changes, by channel, in units of the noise of its own fit."""
+    growth_before: Mapping[str, float]
+    """Ratio, by channel, of the twin's misfit to this recording and to its own recordings."""
+    growth_after: Mapping[str, float]
+    """The same with the changes."""
     unseen: tuple[str, ...] = ()
     """Causes of which even a large change would not show, in this motion or with this twin."""
-    growth_before: Mapping[str, float] = field(default_factory=dict)
-    """Ratio, by channel, of the twin's misfit to this recording and to its own recordings."""
-    growth_after: Mapping[str, float] = field(default_factory=dict)
-    """The same with the changes."""
     blind: bool = False
     """True if no change of any cause would show."""
 
@@ -254,18 +253,13 @@ class Check:
         found = ["Nothing has changed since the twin was made"]
         if self.changes:
             found = [f"Changed since the twin was made: {'. '.join(each.text for each in self.changes)}"]
-        elif self.unexplained or self.grown:
+        elif self.unexplained:
             found = ["Something has changed since the twin was made that no change of a cause explains"]
         elif self.blind:
             found = ["The twin explains too little of this axis to show a change"]
         found += [
-            f"Unexplained: {name}, {times:.0f} times what the twin was off by when it was made"
+            f"The twin leaves {figure(times, 3)} times as much of the {name} as when it was made"
             for name, times in self.unexplained.items()
-        ]
-        found += [
-            f"The twin leaves {times:.1f} times as much of the {name} as when it was made"
-            for name, times in self.grown.items()
-            if name not in self.unexplained
         ]
         if self.unseen and not self.blind:
             found.append(f"A change of {', '.join(self.unseen)} would not have shown")
@@ -273,11 +267,6 @@ class Check:
 
     @property
     def unexplained(self) -> dict[str, float]:
-        """Channels that the changes do not explain, with their values of `misfit_after`."""
-        return {name: times for name, times in self.misfit_after.items() if times > SOFT}
-
-    @property
-    def grown(self) -> dict[str, float]:
         """Channels whose misfit has grown in spite of the changes, with their ratios."""
         return {name: times for name, times in self.growth_after.items() if times > GROWN}
 
@@ -310,12 +299,9 @@ def check(
         (after,) = replays([best.truth])
         if search.worsens(best):
             best, after = search.unchanged, before
-        now = _in_scales(after, scale)
     progress(1.0)
-    gain = (_rms(before, scale), _rms(after, scale))
-    changes = tuple(search.change(cause, best, gain) for cause in best.causes)
-    left = growth(data, after, known.misfit, scale)
-    return Check(changes, now, search.unseen(best), grown, left)
+    changes = tuple(search.change(cause, best) for cause in best.causes)
+    return Check(changes, grown, growth(data, after, known.misfit, scale), search.unseen(best))
 
 
 def _by_ratio(
@@ -339,7 +325,7 @@ def _by_ratio(
     unseen = tuple(cause for cause, own in groups.items() if not _shows(replays, twin, own, misfit, noise))
     blind = len(unseen) == len(groups)
     if max(grown.values(), default=0.0) <= GROWN:
-        return Check((), {}, unseen, grown, grown, blind)
+        return Check((), grown, grown, unseen, blind)
     scale, legs = (
         Scales(scales_by_kind(data, misfit, noise)),
         legs_of_rows(data, fitted_rows(data, everything=True)),
@@ -372,7 +358,7 @@ def _by_ratio(
             break
     progress(1.0)
     changes = tuple(_ratio(groups[cause], twin, best.truth) for cause in named) if best else ()
-    return Check(changes, {}, unseen, grown, now)
+    return Check(changes, grown, now, unseen)
 
 
 def _excess(grown: Mapping[str, float]) -> float:
@@ -410,13 +396,12 @@ def _ratio(own: Sequence[Parameter], before: Truth, after: Truth) -> Finding:
             moved.append((abs(now - was) / each.least_change, times))
     size = max(size for size, _ in moved)
     shown = tuple(each for times, each in moved if times >= min(1.0, size))
-    channels = tuple(name for name in CHANNELS if any(name in each.shows_in for each in own))
-    return Finding(own[0].cause, shown, channels, size, (1.0, 1.0))
+    return Finding(own[0].cause, shown)
 
 
 def _own(data: Data, twin: Truth) -> list[str]:
     """Returns the parameters of `OWN` that are unknown; a recorded temperature is not a change."""
-    path = ".".join(BY_NAME[KNOWN_WARMTH].path)
+    path = BY_NAME[KNOWN_WARMTH].path
     told = path in twin.intervals and all(each.commands.start_c is not None for each in data.pieces)
     return [each for each in OWN if not (told and each == KNOWN_WARMTH)]
 
@@ -626,18 +611,13 @@ class _Search:
         own = [number for number, each in enumerate(self._every) if each.cause == cause]
         return float(chdtrc(len(own), self._pull(own, best))) < FALSE_ALARM / len(self._causes)
 
-    def change(self, cause: str, best: _Place, gain: tuple[float, float]) -> Finding:
+    def change(self, cause: str, best: _Place) -> Finding:
         """Returns the finding of a cause, with intervals of its parameters."""
         moved = self._moved(cause, best)
         parameters = [self._every[place] for place in moved.places]
         now = np.array(coordinates(self._twin, parameters)) + moved.off
-        reach = NORMAL_95 * np.sqrt(np.diag(moved.covariance))
-        intervals = {
-            each.name: (each.value(float(at - r)), each.value(float(at + r)))
-            for each, at, r in zip(parameters, now, reach, strict=True)
-        }
         after = at_coordinates(best.truth, parameters, now.tolist())
-        return finding(parameters, self._twin, after, intervals, moved.distance, gain)
+        return finding(parameters, self._twin, after, intervals_of(parameters, now, moved.covariance))
 
     def unseen(self, best: _Place) -> tuple[str, ...]:
         """Returns the causes whose parameters the recording does not determine better than the prior."""
@@ -765,11 +745,3 @@ def _shifted(truth: Truth, parameter: Parameter, by: float) -> Truth:
     low, high = parameter.bounds
     (now,) = coordinates(truth, [parameter])
     return at_coordinates(truth, [parameter], [min(max(now + by, low), high)])
-
-
-def _in_scales(found: Mapping[str, FloatArray], scale: Mapping[str, float]) -> dict[str, float]:
-    return {name: float(np.sqrt(np.mean(np.square(found[name])))) / scale[name] for name in CHANNELS}
-
-
-def _rms(found: Mapping[str, FloatArray], scale: Mapping[str, float]) -> float:
-    return math.sqrt(sum(each**2 for each in _in_scales(found, scale).values()) / len(CHANNELS))

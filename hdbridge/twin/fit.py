@@ -20,7 +20,6 @@ from numpy.typing import NDArray
 from pydantic import TypeAdapter
 from scipy.optimize import brentq, least_squares
 
-from hdbridge.analysis.intervals import NORMAL_95
 from hdbridge.analysis.linear import counted as numbered
 from hdbridge.analysis.linear import sums
 from hdbridge.axis.effects import FloatArray
@@ -63,6 +62,7 @@ from hdbridge.twin.parameters import (
     at_coordinates,
     coordinates,
     free_value,
+    intervals_of,
     value_in,
     with_sections,
     with_values,
@@ -478,11 +478,7 @@ class Fitted:
 
     def intervals(self) -> dict[str, tuple[float, float]]:
         """Returns 95 % intervals by parameter name."""
-        spread = NORMAL_95 * np.sqrt(np.diag(self.covariance))
-        return {
-            each.name: (each.value(float(x - s)), each.value(float(x + s)))
-            for each, x, s in zip(self.parameters, self.place, spread, strict=True)
-        }
+        return intervals_of(self.parameters, self.place, self.covariance)
 
 
 class _Problem:

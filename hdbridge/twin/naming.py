@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.special import chdtrc, ndtri
+from scipy.special import ndtri
 
 from hdbridge.axis.effects import FloatArray
 from hdbridge.sim.truth import Truth
@@ -26,7 +26,7 @@ from hdbridge.twin.fit import (
     solve,
     told,
 )
-from hdbridge.twin.misfit import CHANNELS, Replays, counted
+from hdbridge.twin.misfit import Replays, counted
 from hdbridge.twin.parameters import Parameter, at_coordinates, coordinates, free_value
 from hdbridge.units import figure
 
@@ -132,11 +132,6 @@ class Finding:
 
     cause: str
     parameters: tuple[Moved, ...]
-    shows_in: tuple[str, ...]
-    evidence: float
-    """Negative natural logarithm of the probability of so large a change by chance."""
-    gain: tuple[float, float]
-    """Rms of the scaled residuals on held-out legs without the change, and with it."""
     aliases: tuple[str, ...] = ()
     """Other parameters that the motion does not separate from these."""
     move: str = ""
@@ -199,9 +194,9 @@ def name_causes(
         if (instead or cause in needed) and not any(
             each.name in other.aliases for each in own for other in found
         ):
-            gain = (rms(contest.left_by(shown[cause])), rms(contest.left))
-            found.append(finding(own, start, fitted.truth, intervals, distances[cause], gain, instead))
-    return tuple(sorted(found, key=lambda each: -each.gain[0])), tuple(dict.fromkeys(sets))
+            found.append(finding(own, start, fitted.truth, intervals, instead))
+    found.sort(key=lambda each: -rms(contest.left_by(shown[each.cause])))
+    return tuple(found), tuple(dict.fromkeys(sets))
 
 
 class _Contest:
@@ -233,33 +228,15 @@ def finding(
     before: Truth,
     after: Truth,
     intervals: Mapping[str, tuple[float, float]],
-    distance: float,
-    gain: tuple[float, float],
     instead: Sequence[Parameter] = (),
 ) -> Finding:
-    """Returns the finding of one cause's parameters; ``distance`` is squared, in standard deviations.
-
-    ``instead`` holds parameters that may have changed in their place.
-    """
+    """Returns the finding of one cause's parameters; those ``instead`` may have changed in their place."""
     moved = tuple(
         Moved(each.name, each.unit, free_value(before, each), free_value(after, each), *intervals[each.name])
         for each in parameters
     )
-    return Finding(
-        parameters[0].cause,
-        moved,
-        tuple(name for name in CHANNELS if any(name in each.shows_in for each in parameters)),
-        _evidence(distance, len(parameters)),
-        gain,
-        tuple(each.name for each in instead),
-        "; ".join(dict.fromkeys(each.move for each in instead)),
-    )
-
-
-def _evidence(distance: float, count: int) -> float:
-    """Returns the negative natural logarithm of the probability of a distance by chance."""
-    chance = float(chdtrc(count, distance))
-    return -math.log(chance) if chance > 0.0 else 0.5 * distance
+    names, moves = (each.name for each in instead), dict.fromkeys(each.move for each in instead)
+    return Finding(parameters[0].cause, moved, tuple(names), "; ".join(moves))
 
 
 def alike(fitted: Fitted, legs: FloatArray) -> tuple[Alike, ...]:

@@ -11,7 +11,11 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
+import numpy as np
+
+from hdbridge.analysis.intervals import NORMAL_95
 from hdbridge.axis import AxisConfig
+from hdbridge.axis.effects import FloatArray
 from hdbridge.sim.truth import Truth
 from hdbridge.sim.truth.encoder import TrueCoupling
 from hdbridge.sim.truth.motor import TrueNotch, TrueObserver
@@ -31,22 +35,20 @@ class Parameter:
     """A parameter of the plant that a fit may change."""
 
     name: str
-    path: tuple[str, ...]
-    """Keys of the truth file."""
+    path: str
+    """Dotted keys of the truth file."""
     unit: str
     least: float
     most: float
     """Bounds of the value in a fit."""
     spread: float
     """Prior standard deviation about the start: of the natural logarithm, or in ``unit`` if `linear`."""
-    cause: str
-    """Cause that is reported if it has changed; several parameters may share one."""
-    shows_in: tuple[str, ...]
-    """Channels that depend on it."""
-    move: str
-    """Motion that separates it from parameters with similar effects."""
     least_change: float
     """Smallest change that matters in practice, in the unit of `spread`; smaller ones are not reported."""
+    cause: str
+    """Cause that is reported if it has changed; several parameters may share one."""
+    move: str
+    """Motion that separates it from parameters with similar effects."""
     linear: bool = False
 
     def coordinate(self, value: float) -> float:
@@ -78,162 +80,71 @@ FEEDFORWARD: Final = "feed-forward"
 ELASTIC: Final = "elastic loop"
 
 PARAMETERS: Final[tuple[Parameter, ...]] = (
-    Parameter(
-        "motor inertia", ("motor", "inertia_kg_m2"), "kg m2", 1e-9, 10.0, 0.7, "motor inertia",
-        (TORQUE, FOLLOWING), _STEPS, 0.10,
-    ),
-    Parameter(
-        "Coulomb friction", ("motor", "coulomb_nm"), "Nm", 1e-6, 1e3, 0.7, FRICTION,
-        (TORQUE, FOLLOWING), _REVERSALS, 0.15,
-    ),
-    Parameter(
-        "viscous friction", ("motor", "viscous_nm_s_per_rad"), "Nm s/rad", 1e-9, 100.0, 0.7, FRICTION,
-        (TORQUE,), _SPEEDS, 0.25,
-    ),
-    Parameter(
-        "friction's rise at rest", ("motor", "stribeck", "rise"), "", 0.0, 10.0, 0.3, FRICTION,
-        (TORQUE, FOLLOWING), _REVERSALS, 0.1, linear=True,
-    ),
-    Parameter(
-        "Stribeck speed", ("motor", "stribeck", "speed_rad_s"), "rad/s", 0.01, 1e3, 0.7, FRICTION,
-        (TORQUE, FOLLOWING), _SPEEDS, 0.5,
-    ),
-    Parameter(
-        "friction growth", ("temperature", "friction_growth_per_k"), "1/K", -0.1, 0.1, 0.01, FRICTION,
-        (TORQUE,), _WARM, 0.005, linear=True,
-    ),
-    Parameter(
-        "load inertia", ("load", "inertia_kg_m2"), "kg m2", 1e-7, 1e5, 0.7, "load inertia",
-        (TORQUE, LOAD), _STEPS, 0.10,
-    ),
-    Parameter(
-        "gear stiffness", ("gear", "stiffness_nm_per_rad"), "Nm/rad", 1.0, 1e9, 0.7, "gear stiffness",
-        (LOAD, TORQUE), _STEPS, 0.10,
-    ),
-    Parameter(
-        "gear damping", ("gear", "damping_nm_s_per_rad"), "Nm s/rad", 1e-6, 1e6, 0.7, "gear damping",
-        (LOAD,), _STEPS, 0.40,
-    ),
-    Parameter(
-        "position gain", ("servo", "position_gain_per_s"), "1/s", 1.0, 5_000.0, 0.7, SERVO,
-        (FOLLOWING, TORQUE), _SINES, 0.15,
-    ),
-    Parameter(
-        "velocity gain", ("servo", "velocity_gain_nm_s_per_rad"), "Nm s/rad", 1e-6, 1e3, 0.7, SERVO,
-        (FOLLOWING, TORQUE), _SINES, 0.15,
-    ),
-    Parameter(
-        "integral time", ("servo", "integral_time_ms"), "ms", 0.1, 1e4, 0.7, SERVO,
-        (FOLLOWING, TORQUE), _REVERSALS, 0.25,
-    ),
-    Parameter(
-        "command filter", ("servo", "command_filter_ms"), "ms", 0.05, 100.0, 0.7, "command filter",
-        (FOLLOWING,), _SINES, 0.30,
-    ),
-    Parameter(
-        "moving average", ("servo", "moving_average_ms"), "ms", 0.0, 7.0, 2.0, "command filter",
-        (FOLLOWING,), _SINES, 0.5, linear=True,
-    ),
-    Parameter(
-        "speed filter", ("servo", "speed_filter_ms"), "ms", 0.02, 20.0, 0.7, SERVO,
-        (FOLLOWING, TORQUE), _SINES, 0.4,
-    ),
-    Parameter(
-        "torque filter", ("servo", "torque_filter_ms"), "ms", 0.02, 20.0, 0.7, SERVO,
-        (FOLLOWING, TORQUE), _SINES, 0.4,
-    ),
-    Parameter(
-        "notch frequency", ("servo", "notch", "frequency_hz"), "Hz", 5.0, 800.0, 0.3, SERVO,
-        (TORQUE, FOLLOWING), _STEPS, 0.1,
-    ),
-    Parameter(
-        "notch depth", ("servo", "notch", "depth"), "", 0.0, 1.0, 0.3, SERVO,
-        (TORQUE, FOLLOWING), _STEPS, 0.2, linear=True,
-    ),
-    Parameter(
-        "notch width", ("servo", "notch", "width"), "", 0.05, 5.0, 0.7, SERVO,
-        (TORQUE, FOLLOWING), _STEPS, 0.4,
-    ),
-    Parameter(
-        "observer frequency", ("servo", "observer", "frequency_hz"), "Hz", 1.0, 300.0, 0.7, SERVO,
-        (TORQUE, FOLLOWING), _REVERSALS, 0.3,
-    ),
-    Parameter(
-        "observer share", ("servo", "observer", "share"), "", 0.0, 1.0, 0.3, SERVO,
-        (TORQUE, FOLLOWING), _REVERSALS, 0.2, linear=True,
-    ),
-    Parameter(
-        "observer inertia", ("servo", "observer", "inertia_kg_m2"), "kg m2", 1e-9, 10.0, 0.7, SERVO,
-        (TORQUE, FOLLOWING), _STEPS, 0.3,
-    ),
-    Parameter(
-        "velocity feed-forward", ("servo", "velocity_feedforward"), "", 0.0, 1.5, 0.1, FEEDFORWARD,
-        (FOLLOWING,), _SPEEDS, 0.03, linear=True,
-    ),
-    Parameter(
-        "inertia feed-forward", ("servo", "inertia_feedforward_kg_m2"), "kg m2", 1e-9, 10.0, 0.7,
-        FEEDFORWARD, (FOLLOWING, TORQUE), _STEPS, 0.20,
-    ),
-    Parameter(
-        "load feed-forward", ("servo", "load_feedforward", "inertia_kg_m2"), "kg m2", 1e-9, 10.0, 0.7,
-        FEEDFORWARD, (FOLLOWING, TORQUE), _STEPS, 0.20,
-    ),
-    Parameter(
-        "load feed-forward frequency", ("servo", "load_feedforward", "frequency_hz"), "Hz", 1.0, 500.0, 0.7,
-        FEEDFORWARD, (FOLLOWING, TORQUE), _STEPS, 0.20,
-    ),
-    Parameter(
-        "viscous feed-forward", ("servo", "viscous_feedforward_nm_s_per_rad"), "Nm s/rad", 1e-9, 100.0, 0.7,
-        FEEDFORWARD, (FOLLOWING,), _SPEEDS, 0.50,
-    ),
-    Parameter(
-        "friction feed-forward", ("servo", "friction_feedforward_nm"), "Nm", 1e-6, 1e3, 0.7, FEEDFORWARD,
-        (FOLLOWING, TORQUE), _REVERSALS, 0.20,
-    ),
-    Parameter(
-        "servo dead time", ("servo", "dead_time_ms"), "ms", 0.0, 20.0, 2.0, "servo dead time",
-        (FOLLOWING, TORQUE, LOAD), _SINES, 0.3, linear=True,
-    ),
-    Parameter(
-        "load encoder delay", ("load", "encoder", "late_ms"), "ms", 0.0, 20.0, 2.0, "load encoder delay",
-        (LOAD,), _SPEEDS, 0.3, linear=True,
-    ),
-    Parameter(
-        "encoder coupling", ("load", "encoder", "coupling", "frequency_hz"), "Hz", 10.0, 5_000.0, 0.7,
-        "encoder coupling", (LOAD,), _STEPS, 0.2,
-    ),
-    Parameter(
-        "motor encoder delay", ("motor", "encoder", "late_ms"), "ms", 0.0, 20.0, 2.0, "motor encoder delay",
-        (FOLLOWING, LOAD), _SPEEDS, 0.3, linear=True,
-    ),
-    Parameter(
-        "current limit", ("servo", "torque_limit_percent"), "%", 1.0, 1000.0, 0.7, "current limit",
-        (TORQUE, FOLLOWING), _FULL, 0.05,
-    ),
-    Parameter(
-        "loop offset", ("gear", "hysteresis", "offset_arcsec"), "arcsec", 0.01, 3.6e4, 0.3, ELASTIC,
-        (LOAD,), _LOOPS, 0.05,
-    ),
-    Parameter(
-        "loop width", ("gear", "hysteresis", "width_deg"), "deg", 0.01, 3.6e3, 0.7, ELASTIC,
-        (LOAD,), _LOOPS, 0.15,
-    ),
-    Parameter(
-        "loop yield", ("gear", "hysteresis", "yield_deg"), "deg", 0.01, 3.6e3, 0.7, ELASTIC,
-        (LOAD,), _LOOPS, 0.15,
-    ),
-    Parameter(
-        "loop exponent", ("gear", "hysteresis", "exponent"), "", 1.0, 5.0, 0.5, ELASTIC,
-        (LOAD,), _LOOPS, 0.20,
-    ),
-    Parameter(
-        "load friction", ("load", "coulomb_nm"), "Nm", 0.0, 1e4, 5.0, "load friction",
-        (LOAD, TORQUE), _REVERSALS, 0.5, linear=True,
-    ),
-    Parameter(
-        "temperature", ("temperature", "ambient_c"), "\N{DEGREE SIGN}C", -60.0, 100.0, 15.0, "warmth",
-        (TORQUE, LOAD), "the same motion with the temperature recorded", 3.0, linear=True,
-    ),
+    Parameter("motor inertia", "motor.inertia_kg_m2", "kg m2", 1e-9, 10.0, 0.7, 0.1, "motor inertia", _STEPS),
+    Parameter("Coulomb friction", "motor.coulomb_nm", "Nm", 1e-6, 1e3, 0.7, 0.15, FRICTION, _REVERSALS),
+    Parameter("viscous friction", "motor.viscous_nm_s_per_rad", "Nm s/rad", 1e-9, 100.0, 0.7, 0.25, FRICTION,
+        _SPEEDS),
+    Parameter("friction's rise at rest", "motor.stribeck.rise", "", 0.0, 10.0, 0.3, 0.1, FRICTION, _REVERSALS,
+        linear=True),
+    Parameter("Stribeck speed", "motor.stribeck.speed_rad_s", "rad/s", 0.01, 1e3, 0.7, 0.5, FRICTION,
+        _SPEEDS),
+    Parameter("friction growth", "temperature.friction_growth_per_k", "1/K", -0.1, 0.1, 0.01, 0.005, FRICTION,
+        _WARM, linear=True),
+    Parameter("load inertia", "load.inertia_kg_m2", "kg m2", 1e-7, 1e5, 0.7, 0.1, "load inertia", _STEPS),
+    Parameter("gear stiffness", "gear.stiffness_nm_per_rad", "Nm/rad", 1.0, 1e9, 0.7, 0.1, "gear stiffness",
+        _STEPS),
+    Parameter("gear damping", "gear.damping_nm_s_per_rad", "Nm s/rad", 1e-6, 1e6, 0.7, 0.4, "gear damping",
+        _STEPS),
+    Parameter("position gain", "servo.position_gain_per_s", "1/s", 1.0, 5e3, 0.7, 0.15, SERVO, _SINES),
+    Parameter("velocity gain", "servo.velocity_gain_nm_s_per_rad", "Nm s/rad", 1e-6, 1e3, 0.7, 0.15, SERVO,
+        _SINES),
+    Parameter("integral time", "servo.integral_time_ms", "ms", 0.1, 1e4, 0.7, 0.25, SERVO, _REVERSALS),
+    Parameter("command filter", "servo.command_filter_ms", "ms", 0.05, 100.0, 0.7, 0.3, "command filter",
+        _SINES),
+    Parameter("moving average", "servo.moving_average_ms", "ms", 0.0, 7.0, 2.0, 0.5, "command filter", _SINES,
+        linear=True),
+    Parameter("speed filter", "servo.speed_filter_ms", "ms", 0.02, 20.0, 0.7, 0.4, SERVO, _SINES),
+    Parameter("torque filter", "servo.torque_filter_ms", "ms", 0.02, 20.0, 0.7, 0.4, SERVO, _SINES),
+    Parameter("notch frequency", "servo.notch.frequency_hz", "Hz", 5.0, 800.0, 0.3, 0.1, SERVO, _STEPS),
+    Parameter("notch depth", "servo.notch.depth", "", 0.0, 1.0, 0.3, 0.2, SERVO, _STEPS, linear=True),
+    Parameter("notch width", "servo.notch.width", "", 0.05, 5.0, 0.7, 0.4, SERVO, _STEPS),
+    Parameter("observer frequency", "servo.observer.frequency_hz", "Hz", 1.0, 300.0, 0.7, 0.3, SERVO,
+        _REVERSALS),
+    Parameter("observer share", "servo.observer.share", "", 0.0, 1.0, 0.3, 0.2, SERVO, _REVERSALS,
+        linear=True),
+    Parameter("observer inertia", "servo.observer.inertia_kg_m2", "kg m2", 1e-9, 10.0, 0.7, 0.3, SERVO,
+        _STEPS),
+    Parameter("velocity feed-forward", "servo.velocity_feedforward", "", 0.0, 1.5, 0.1, 0.03, FEEDFORWARD,
+        _SPEEDS, linear=True),
+    Parameter("inertia feed-forward", "servo.inertia_feedforward_kg_m2", "kg m2", 1e-9, 10.0, 0.7, 0.2,
+        FEEDFORWARD, _STEPS),
+    Parameter("load feed-forward", "servo.load_feedforward.inertia_kg_m2", "kg m2", 1e-9, 10.0, 0.7, 0.2,
+        FEEDFORWARD, _STEPS),
+    Parameter("load feed-forward frequency", "servo.load_feedforward.frequency_hz", "Hz", 1.0, 500.0, 0.7,
+        0.2, FEEDFORWARD, _STEPS),
+    Parameter("viscous feed-forward", "servo.viscous_feedforward_nm_s_per_rad", "Nm s/rad", 1e-9, 100.0, 0.7,
+        0.5, FEEDFORWARD, _SPEEDS),
+    Parameter("friction feed-forward", "servo.friction_feedforward_nm", "Nm", 1e-6, 1e3, 0.7, 0.2,
+        FEEDFORWARD, _REVERSALS),
+    Parameter("servo dead time", "servo.dead_time_ms", "ms", 0.0, 20.0, 2.0, 0.3, "servo dead time", _SINES,
+        linear=True),
+    Parameter("load encoder delay", "load.encoder.late_ms", "ms", 0.0, 20.0, 2.0, 0.3, "load encoder delay",
+        _SPEEDS, linear=True),
+    Parameter("encoder coupling", "load.encoder.coupling.frequency_hz", "Hz", 10.0, 5e3, 0.7, 0.2,
+        "encoder coupling", _STEPS),
+    Parameter("motor encoder delay", "motor.encoder.late_ms", "ms", 0.0, 20.0, 2.0, 0.3,
+        "motor encoder delay", _SPEEDS, linear=True),
+    Parameter("current limit", "servo.torque_limit_percent", "%", 1.0, 1e3, 0.7, 0.05, "current limit",
+        _FULL),
+    Parameter("loop offset", "gear.hysteresis.offset_arcsec", "arcsec", 0.01, 3.6e4, 0.3, 0.05, ELASTIC,
+        _LOOPS),
+    Parameter("loop width", "gear.hysteresis.width_deg", "deg", 0.01, 3.6e3, 0.7, 0.15, ELASTIC, _LOOPS),
+    Parameter("loop yield", "gear.hysteresis.yield_deg", "deg", 0.01, 3.6e3, 0.7, 0.15, ELASTIC, _LOOPS),
+    Parameter("loop exponent", "gear.hysteresis.exponent", "", 1.0, 5.0, 0.5, 0.2, ELASTIC, _LOOPS),
+    Parameter("load friction", "load.coulomb_nm", "Nm", 0.0, 1e4, 5.0, 0.5, "load friction", _REVERSALS,
+        linear=True),
+    Parameter("temperature", "temperature.ambient_c", "\N{DEGREE SIGN}C", -60.0, 100.0, 15.0, 3.0, "warmth",
+        "the same motion with the temperature recorded", linear=True),
 )  # fmt: skip
 """All parameters, in the order of a fit."""
 
@@ -243,7 +154,7 @@ BY_NAME: Final[Mapping[str, Parameter]] = {each.name: each for each in PARAMETER
 def value_in(truth: Truth, parameter: Parameter) -> float | None:
     """Returns a parameter's value in a truth; None if its section is missing or the law does not have it."""
     place: Any = truth
-    for key in parameter.path:
+    for key in parameter.path.split("."):
         place = getattr(place, "load_" if key == "load" else key, None)
         if place is None:
             return None
@@ -272,7 +183,7 @@ def _with(truth: Truth, values: Mapping[str, float]) -> dict[str, Any]:
     """Returns the content of the truth with other values."""
     data = truth.model_dump(by_alias=True, exclude_none=True)
     for name, value in values.items():
-        *sections, key = BY_NAME[name].path
+        *sections, key = BY_NAME[name].path.split(".")
         place = data
         for section in sections:
             place = place.setdefault(section, {})
@@ -287,6 +198,17 @@ def coordinates(truth: Truth, parameters: Iterable[Parameter]) -> list[float]:
         value = free_value(truth, each)
         found.append(each.coordinate(min(max(value, each.least), each.most)))
     return found
+
+
+def intervals_of(
+    parameters: Sequence[Parameter], place: Sequence[float] | FloatArray, covariance: FloatArray
+) -> dict[str, tuple[float, float]]:
+    """Returns 95 % intervals by parameter name, from coordinates and their covariance."""
+    reach = NORMAL_95 * np.sqrt(np.diag(covariance))
+    return {
+        each.name: (each.value(float(x - r)), each.value(float(x + r)))
+        for each, x, r in zip(parameters, place, reach, strict=True)
+    }
 
 
 def at_coordinates(truth: Truth, parameters: Sequence[Parameter], place: Sequence[float]) -> Truth:
@@ -415,7 +337,7 @@ def default_truth(axis: AxisConfig) -> Truth:
 
 def with_sections(truth: Truth, parameters: Iterable[Parameter]) -> Truth:
     """Returns the truth with the sections of these parameters added, without effect where possible."""
-    wanted = {section for each in parameters for section in each.path}
+    wanted = {section for each in parameters for section in each.path.split(".")}
     if truth.motor.stribeck is None and "stribeck" in wanted:
         truth = with_values(truth, {"friction's rise at rest": 0.0, "Stribeck speed": STRIBECK_RAD_S.value})
     if truth.load_.encoder.coupling is None and "coupling" in wanted:

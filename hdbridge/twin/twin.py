@@ -428,7 +428,7 @@ def with_knowledge(fitted: Fitted, data: Data, values: Values = Values.AXIS) -> 
     truth = with_load_noise(fitted.truth, fitted.residuals[LOAD])
     return truth.model_copy(
         update={
-            "intervals": {".".join(each.path): intervals[each.name] for each in fitted.parameters},
+            "intervals": {each.path: intervals[each.name] for each in fitted.parameters},
             "provenance": {
                 **truth.provenance, "values": str(values), "versions": versions_here(), "fit": about,
                 **({"interrupted": True} if fitted.interrupted else {}),

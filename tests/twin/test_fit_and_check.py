@@ -115,7 +115,7 @@ def test_a_twin_has_the_noise_of_the_load_encoder_and_says_how_sure_it_is() -> N
     known = twin()
     assert known.load_.encoder.noise_arcsec == pytest.approx(TRUTH.load_.encoder.noise_arcsec, rel=0.15)
     for name in NAMES:
-        lower, upper = known.intervals[".".join(BY_NAME[name].path)]
+        lower, upper = known.intervals[BY_NAME[name].path]
         found = value_in(known, BY_NAME[name])
         assert found is not None
         assert lower <= found <= upper, name
@@ -256,12 +256,12 @@ def test_a_twin_that_leaves_all_of_a_signal_shows_no_change() -> None:
 
 
 def test_what_no_cause_explains_is_no_nothing() -> None:
-    before = {"following error": 1.1, "motor torque": 21.0, "load error": 242.0}
-    told = Check((), before, ("warmth",))
+    grown = {"following error": 1.1, "motor torque": 21.0, "load error": 242.0}
+    told = Check((), grown, grown, ("warmth",))
     assert told.sentence == (
         "Something has changed since the twin was made that no change of a cause explains. "
-        "Unexplained: motor torque, 21 times what the twin was off by when it was made. "
-        "Unexplained: load error, 242 times what the twin was off by when it was made. "
+        "The twin leaves 21 times as much of the motor torque as when it was made. "
+        "The twin leaves 242 times as much of the load error as when it was made. "
         "A change of warmth would not have shown."
     )
 

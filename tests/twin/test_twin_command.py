@@ -175,7 +175,7 @@ def fitted(truth: Truth, values: str = "axis", times_noise: float = 2.5) -> Call
             for each in (start, truth)
         )
         moved = Moved("Coulomb friction", "Nm", start.motor.coulomb_nm, truth.motor.coulomb_nm, 0.033, 0.035)
-        finding = Finding("friction", (moved,), ("motor torque",), 99.0, (5.0, 1.0))
+        finding = Finding("friction", (moved,))
         about = {"values": values, "fit": {"parameters": ["Coulomb friction"]}}
         intervals = {"motor.coulomb_nm": (0.033, 0.035)} if values == "axis" else {}
         known = truth.model_copy(update={"intervals": intervals, "provenance": about})
