@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any, Final
 
 import numpy as np
@@ -98,11 +98,6 @@ OVER_S: Final = 0.04
 """Window of the rms amplitude: half a period of the slowest ringing, 15 Hz."""
 SHORTEST_SWING: Final = 4
 DRAWS: Final = 24
-
-
-def band_arcsec(noise_arcsec: float) -> float:
-    """Returns the amplitude below which a load with this noise has settled."""
-    return max(SETTLED_ARCSEC, SETTLED_NOISE * noise_arcsec)
 
 
 def settling_s(time_s: FloatArray, load_arcsec: FloatArray, noise_arcsec: float, band: float) -> float:
@@ -212,21 +207,7 @@ class Comparison:
 
     def as_dict(self) -> dict[str, Any]:
         """Returns the figures for JSON."""
-        return {
-            "figures": [
-                {
-                    "channel": each.channel,
-                    "kind": each.kind,
-                    "unit": each.unit,
-                    "measured": each.measured,
-                    "simulated": each.simulated,
-                    "difference": each.difference,
-                    "noise": each.noise,
-                    "count": each.count,
-                }
-                for each in self.rows
-            ]
-        }
+        return {"figures": [asdict(each) for each in self.rows]}
 
 
 @dataclass(frozen=True, eq=False)
@@ -436,7 +417,7 @@ def _stops(real: _Signals, twin: _Signals, parts: Sequence[slice]) -> Iterator[_
             noises = [noise_of(each.load_arcsec, rest, [part]) for each in (real, twin)]
             loads = [each.load_arcsec[stop:end] for each in (real, twin)]
             times = real.time_s[stop:end]
-            band = band_arcsec(noises[0])
+            band = max(SETTLED_ARCSEC, SETTLED_NOISE * noises[0])
             settled = [settling_s(times, *each, band) for each in zip(loads, noises, strict=True)]
             scatter = scatter_s(times, loads[1], noises[1], band, noises)
             beyond = [overshoot_arcsec(each, way) for each in loads]

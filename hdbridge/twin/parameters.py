@@ -11,11 +11,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
-import numpy as np
-
-from hdbridge.analysis.intervals import NORMAL_95
 from hdbridge.axis import AxisConfig
-from hdbridge.axis.effects import FloatArray
 from hdbridge.sim.truth import Truth
 from hdbridge.sim.truth.encoder import TrueCoupling
 from hdbridge.sim.truth.motor import TrueNotch, TrueObserver
@@ -198,17 +194,6 @@ def coordinates(truth: Truth, parameters: Iterable[Parameter]) -> list[float]:
         value = free_value(truth, each)
         found.append(each.coordinate(min(max(value, each.least), each.most)))
     return found
-
-
-def intervals_of(
-    parameters: Sequence[Parameter], place: Sequence[float] | FloatArray, covariance: FloatArray
-) -> dict[str, tuple[float, float]]:
-    """Returns 95 % intervals by parameter name, from coordinates and their covariance."""
-    reach = NORMAL_95 * np.sqrt(np.diag(covariance))
-    return {
-        each.name: (each.value(float(x - r)), each.value(float(x + r)))
-        for each, x, r in zip(parameters, place, reach, strict=True)
-    }
 
 
 def at_coordinates(truth: Truth, parameters: Sequence[Parameter], place: Sequence[float]) -> Truth:

@@ -25,10 +25,10 @@ from hdbridge.axis.effects import Channel, FloatArray
 from hdbridge.records.recording import Recording
 from hdbridge.sim.truth import Truth
 from hdbridge.twin.compare import least_change
-from hdbridge.twin.fit import Fitted, sandwich
+from hdbridge.twin.fit import Fitted, intervals_of, sandwich
 from hdbridge.twin.misfit import held_out_legs
 from hdbridge.twin.naming import FALSE_ALARM, Finding, finding
-from hdbridge.twin.parameters import BY_NAME, Parameter, coordinates, intervals_of
+from hdbridge.twin.parameters import BY_NAME, Parameter, coordinates
 from hdbridge.twin.replay import continuous, replay
 
 AMBIENT: Final = replace(BY_NAME["temperature"], name="ambient temperature")

@@ -156,12 +156,12 @@ def test_a_start_has_the_lag_that_was_read_off_and_a_dead_time_that_is_possible(
 ) -> None:
     usual = default_truth(AxisConfig.load(Path(__file__).parents[2] / "profiles" / "demo"))
     late = with_values(usual, {"servo dead time": dead_time_ms, "command filter": 2.0})
-    for start in starts(late, cycle_ms):
-        servo = start.truth.servo
+    for truth, parameters in starts(late, cycle_ms):
+        servo = truth.servo
         assert servo.dead_time_ms <= MOST_DEAD_CYCLES * cycle_ms
         lag_ms = servo.dead_time_ms + 2.0 * servo.command_filter_ms + 0.5 * servo.moving_average_ms
         assert lag_ms == pytest.approx(dead_time_ms + 4.0, abs=1e-6)
-        (dead,) = (each for each in start.parameters if each.name == "servo dead time")
+        (dead,) = (each for each in parameters if each.name == "servo dead time")
         assert dead.most <= MOST_DEAD_CYCLES * cycle_ms
 
 

@@ -16,7 +16,7 @@ from hdbridge.sim.truth import Truth
 from hdbridge.sim.truth.truth import TrueTemperature
 from hdbridge.twin.fit import Fitted, solve
 from hdbridge.twin.misfit import Replays, prepare
-from hdbridge.twin.parameters import BY_NAME, coordinates
+from hdbridge.twin.parameters import BY_NAME
 from hdbridge.twin.thermal import THERMAL, with_warmth
 
 DEMO = Path(__file__).parents[2] / "profiles" / "demo"
@@ -61,7 +61,7 @@ def fitted(recording: Recording) -> Fitted:
     """Its friction, where it is, and how sure a fit of it is."""
     few = recording.record.rows(0, 500)
     with Replays(prepare(Recording(few), AXIS, TRUTH), 1) as replays:
-        return solve(replays, TRUTH, FRICTION, np.array(coordinates(TRUTH, FRICTION)), 0)
+        return solve(replays, TRUTH, FRICTION, 0)
 
 
 HEATS = (
