@@ -50,7 +50,7 @@ from hdbridge.twin.misfit import (
     rounding,
 )
 from hdbridge.twin.naming import FALSE_ALARM, Finding, Moved, finding, put_back, told_apart
-from hdbridge.twin.parameters import BY_NAME, Parameter, at_coordinates, coordinates
+from hdbridge.twin.parameters import BY_NAME, Parameter, at_coordinates, by_cause, coordinates
 from hdbridge.units import figure
 
 # ----------------------------------------------------------------
@@ -61,21 +61,17 @@ STRAY = 4.0
 time is not a change of the axis."""
 
 
-def growth(
-    data: Data, residuals: Mapping[str, FloatArray], known: Misfit, noise: Mapping[str, float]
-) -> dict[str, float]:
-    """Returns, by channel, the rms residual relative to that of the same kinds of leg in the twin's own fit.
+def growth(data: Data, residuals: Mapping[str, FloatArray], was: Mapping[str, Any]) -> dict[str, float]:
+    """Returns, by channel, the rms residual relative to ``was`` (`scales_by_kind`).
 
-    A kind that the twin has not seen is compared with the largest of the others; ``noise`` is the minimum of
-    each reference. A row counts as no more than `STRAY` times the typical residual of its leg, because single
-    rows may be readings that are wrong, but a whole leg is not.
+    A row counts as no more than `STRAY` times the typical residual of its leg, because single rows may be
+    readings that are wrong, but a whole leg is not.
     """
-    was, found = scales_by_kind(data, known, noise), {}
+    found = {}
     for name, counts in counted(data).items():
         inside = counts > 0.0
         if inside.any():
-            scale = was[name][inside]
-            now, legs = np.abs(residuals[name][inside]), data.leg[inside]
+            scale, now, legs = was[name][inside], np.abs(residuals[name][inside]), data.leg[inside]
             typical = np.zeros_like(now)
             for leg in np.unique(legs):
                 typical[legs == leg] = median_deviation(now[legs == leg])
@@ -85,14 +81,16 @@ def growth(
 
 
 def scales_by_kind(data: Data, known: Misfit, noise: Mapping[str, float]) -> dict[str, Any]:
-    """Returns, by channel and row, the twin's own misfit on this kind of leg, or the noise if larger."""
-    kinds = np.array(data.kinds)[data.leg.astype(np.intp)]
-    found: dict[str, Any] = {}
+    """Returns, by channel and row, the twin's own misfit on this kind of leg, or the noise if larger.
+
+    A kind that the twin has not seen is compared with the largest of the others.
+    """
+    found = {}
     for name in CHANNELS:
         before = known.get(name, {})
         otherwise = max(before.values(), default=0.0)
-        by_kind = {kind: max(before.get(kind, otherwise), noise[name]) for kind in dict.fromkeys(data.kinds)}
-        found[name] = np.array([by_kind[str(kind)] for kind in kinds])
+        by_leg = np.array([max(before.get(kind, otherwise), noise[name]) for kind in data.kinds])
+        found[name] = by_leg[data.leg.astype(np.intp)]
     return found
 
 
@@ -177,10 +175,10 @@ LEAST_SUSPECT = 0.25
 TOLERATED = (1.0 / 3.0) ** 2
 """Minimum mean square that a cause must explain in some channel, in squares of its noise: a twin may be off
 by a third of the noise, which nobody at the bench would see."""
-OWN = ("load friction", "temperature", "current limit", "velocity feed-forward")
-"""Parameters checked in addition to those that a fit changes."""
-KNOWN_WARMTH = "temperature"
-"""Parameter of `OWN` that is known if both twin and recording have the temperature."""
+WARMTH = "temperature"
+OWN = ("load friction", WARMTH, "current limit", "velocity feed-forward")
+"""Parameters checked in addition to those that a fit changes; the temperature unless twin and recording have
+it."""
 GROWN = 1.5
 """Ratio of two misfits above which an axis has changed; smaller ones come from noise and different legs."""
 EXPLAINED = 0.25
@@ -249,12 +247,17 @@ def check(
     data = coarse(prepare(recording, axis, twin), CHECK_S)
     floor = noise_floor(data)
     scale = {name: max(known.noise.get(name, 0.0), floor[name]) for name in CHANNELS}
-    parameters = free_parameters(twin, _own(data, twin))
+    # A recorded temperature is not a change.
+    known_warmth = BY_NAME[WARMTH].path in twin.intervals and all(
+        each.commands.start_c is not None for each in data.pieces
+    )
+    parameters = free_parameters(twin, [each for each in OWN if not (known_warmth and each == WARMTH)])
     with Replays(data, workers) as replays:
         (before,) = replays([twin])
-        grown = growth(data, before, known.misfit, scale)
+        was = scales_by_kind(data, known.misfit, scale)
+        grown = growth(data, before, was)
         if not known.of_axis:
-            return _by_ratio(replays, twin, known.misfit, scale, parameters, grown, progress)
+            return _by_ratio(replays, twin, was, parameters, grown, progress)
         search = _Search(replays, twin, known, scale, parameters)
         best = search.found(progress)
         (after,) = replays([best.truth])
@@ -262,14 +265,13 @@ def check(
             best, after = search.unchanged, before
     progress(1.0)
     changes = tuple(search.change(cause, best) for cause in best.causes)
-    return Check(changes, grown, growth(data, after, known.misfit, scale), search.unseen(best))
+    return Check(changes, grown, growth(data, after, was), search.unseen(best))
 
 
 def _by_ratio(
     replays: Replays,
     twin: Truth,
-    misfit: Misfit,
-    noise: Mapping[str, float],
+    was: Mapping[str, Any],
     parameters: Sequence[Parameter],
     grown: dict[str, float],
     progress: Callable[[float], None],
@@ -280,17 +282,12 @@ def _by_ratio(
     no other cause does so equally well within the scatter of the legs.
     """
     data = replays.data
-    groups: dict[str, tuple[Parameter, ...]] = {}
-    for each in parameters:
-        groups[each.cause] = (*groups.get(each.cause, ()), each)
-    unseen = tuple(cause for cause, own in groups.items() if not _shows(replays, twin, own, misfit, noise))
+    groups = by_cause(parameters)
+    unseen = tuple(cause for cause, own in groups.items() if not _shows(replays, twin, own, was))
     blind = len(unseen) == len(groups)
     if max(grown.values(), default=0.0) <= GROWN:
         return Check((), grown, grown, unseen, blind)
-    scale, legs = (
-        Scales(scales_by_kind(data, misfit, noise)),
-        legs_of_rows(data, fitted_rows(data, everything=True)),
-    )
+    legs = legs_of_rows(data, fitted_rows(data, everything=True))
     named: list[str] = []
     best: Fitted | None = None
     left, now = _excess(grown), grown
@@ -300,11 +297,19 @@ def _by_ratio(
             own = tuple(each for name in (*named, cause) for each in groups[name])
             start, prior = best.truth if best else twin, np.array(coordinates(twin, own))
             fits[cause] = solve(
-                replays, start, own, STEPS, prior, known=scale, everything=True, tempered=True
+                replays,
+                start,
+                own,
+                STEPS,
+                prior,
+                known=Scales(was),
+                everything=True,
+                tempered=True,
+                linear=False,
             )
             progress((number + len(fits) / len(groups)) / MOST_NAMED)
         cause = min(fits, key=lambda each: fits[each].cost)
-        now_grown = growth(data, fits[cause].residuals, misfit, noise)
+        now_grown = growth(data, fits[cause].residuals, was)
         near = fits[cause].vector
         rivals = [
             each
@@ -327,20 +332,16 @@ def _excess(grown: Mapping[str, float]) -> float:
     return sum(max(each**2 - 1.0, 0.0) for each in grown.values())
 
 
-def _shows(
-    replays: Replays, twin: Truth, own: Sequence[Parameter], misfit: Misfit, noise: Mapping[str, float]
-) -> bool:
+def _shows(replays: Replays, twin: Truth, own: Sequence[Parameter], was: Mapping[str, Any]) -> bool:
     """Returns True if a noticeable change of one of the parameters would make the misfit grow."""
     moved = [
         _shifted(twin, each, way * NOTICEABLE * each.least_change) for each in own for way in (-1.0, 1.0)
     ]
     here, *there = replays([twin, *moved])
-    data = replays.data
-    was = scales_by_kind(data, misfit, noise)
     for found in there:
         # The change is uncorrelated with the twin's residuals, so squares add.
         change = {name: np.hypot(found[name] - here[name], was[name]) for name in CHANNELS}
-        if max(growth(data, change, misfit, noise).values(), default=0.0) > GROWN:
+        if max(growth(replays.data, change, was).values(), default=0.0) > GROWN:
             return True
     return False
 
@@ -358,13 +359,6 @@ def _ratio(own: Sequence[Parameter], before: Truth, after: Truth) -> Finding:
     size = max(size for size, _ in moved)
     shown = tuple(each for times, each in moved if times >= min(1.0, size))
     return Finding(own[0].cause, shown)
-
-
-def _own(data: Data, twin: Truth) -> list[str]:
-    """Returns the parameters of `OWN` that are unknown; a recorded temperature is not a change."""
-    path = BY_NAME[KNOWN_WARMTH].path
-    told = path in twin.intervals and all(each.commands.start_c is not None for each in data.pieces)
-    return [each for each in OWN if not (told and each == KNOWN_WARMTH)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -543,7 +537,7 @@ class _Search:
             known = Scales(self._scales_of(apart, off), steps)
             fit = solve(
                 self._replays, start, parameters, STEPS, self._prior, known=known, everything=True, near=fit,
-                tempered=True,
+                tempered=True, linear=False,
             )  # fmt: skip
             # Samples that are still beyond `SOFT` cannot be explained and would bias all parameters.
             start, apart = fit.truth, np.where(np.abs(fit.vector) > SOFT, np.inf, apart)
@@ -697,8 +691,8 @@ class _Search:
 
     def _significant(self, cause: str, at: _Place) -> bool:
         """Returns True if a cause's change is significant and as large as matters in practice."""
-        moved, off = self._moved(cause, at), np.abs(self._moved(cause, at).off)
-        large = (off > self._least[self._numbers(cause)]) & (off > 2.0 * moved.errors)
+        moved = self._moved(cause, at)
+        large = np.abs(moved.off) > np.maximum(self._least[self._numbers(cause)], 2.0 * moved.errors)
         return self._certain(moved) and bool(np.any(large))
 
 

@@ -245,15 +245,20 @@ def compare(measured: Record, simulated: Record, legs: Sequence[Segment], ratio:
         offset = np.median(real.by_name[LOAD_ERROR][part] - twin.by_name[LOAD_ERROR][part])
         twin.by_name[LOAD_ERROR][part] += offset
     moves = _moving(real, parts)
-    calm = ~moves & (_since_motion_s(real.time_s, moves, parts) > CALM_S)
+    calm = ~moves
     for part in parts:
+        moved_s = np.maximum.accumulate(np.where(moves[part], real.time_s[part], -np.inf))
+        calm[part] &= real.time_s[part] - moved_s > CALM_S
         if np.count_nonzero(calm[part]) >= LEAST_SAMPLES:
             apart = real.by_name[FOLLOWING_ERROR][part] - twin.by_name[FOLLOWING_ERROR][part]
             twin.by_name[FOLLOWING_ERROR][part] += np.median(apart[calm[part]])
     motor = measured.motor_position_deg
     count_deg = least_change(np.concatenate([np.diff(motor[part]) for part in parts]), motor)
     groups = _groups(measured.time_s, legs, ~unknown_rows(measured, count_deg))
-    goes = ~_stands(measured, parts, count_deg)
+    # At standstill, the torque depends on a thousandth of a count.
+    target, reach_deg = real.command_deg, STANDS_COUNTS * count_deg
+    moved = np.concatenate([np.diff(target[part], prepend=target[part.start]) != 0.0 for part in parts])
+    goes = ~np.concatenate([stands(moved[part], motor[part], reach_deg) for part in parts])
     rows = [
         row
         for kind, inside in groups.items()
@@ -304,17 +309,6 @@ def _moving(real: _Signals, parts: Sequence[slice]) -> Rows:
     return moves
 
 
-def _since_motion_s(time_s: FloatArray, moves: Rows, parts: Sequence[slice]) -> FloatArray:
-    """Returns the time since the command last moved, by part; infinite before its first motion."""
-    since = np.full(len(time_s), np.inf)
-    for part in parts:
-        rows = np.where(moves[part], np.arange(part.start, part.stop), -1)
-        last = np.maximum.accumulate(rows)
-        seen = np.flatnonzero(last >= 0)
-        since[part.start + seen] = time_s[part.start + seen] - time_s[last[seen]]
-    return since
-
-
 def _of_signal(
     name: str,
     kind: str,
@@ -363,19 +357,6 @@ def noise_of(values: FloatArray, which: Rows, parts: Sequence[slice]) -> float:
     third = np.concatenate(thirds)
     spread = third_deviation(third) if len(third) >= LEAST_SAMPLES else 0.0
     return max(spread, resolution / math.sqrt(12.0) if math.isfinite(resolution) else 0.0)
-
-
-def _stands(measured: Record, parts: Sequence[slice], count_deg: float) -> Rows:
-    """Returns the mask of rows at standstill, where the torque depends on a thousandth of a count."""
-    target, motor = measured.motor_target_deg, measured.motor_position_deg
-    assert target is not None
-    still = [
-        stands(
-            np.diff(target[part], prepend=target[part.start]) != 0.0, motor[part], STANDS_COUNTS * count_deg
-        )
-        for part in parts
-    ]
-    return np.concatenate(still)
 
 
 def least_change(changes: FloatArray, values: FloatArray) -> float:

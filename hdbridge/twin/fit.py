@@ -39,7 +39,6 @@ from hdbridge.twin.misfit import (
     Scales,
     Values,
     counted,
-    demand_deg,
     expected,
     least_deviation,
     misfit,
@@ -68,7 +67,7 @@ from hdbridge.twin.parameters import (
     with_sections,
     with_values,
 )
-from hdbridge.twin.replay import MOVING_DEG_S
+from hdbridge.twin.replay import MOVING_DEG_S, demand_deg
 from hdbridge.units import ARCSEC_PER_DEG
 
 # ----------------------------------------------------------------
@@ -305,7 +304,10 @@ def _like(own: Hysteresis, unit: dict[str, Any]) -> Hysteresis:
     """Returns a loop of another law with the same height and the same travel to half crossing."""
     travel_deg = _half_crossed_deg(own) / _half_crossed_deg(_TRUE.validate_python(unit))
     size = "width_deg" if "width_deg" in unit else "yield_deg"
-    return _TRUE.validate_python(unit | {"offset_arcsec": _offset_arcsec(own), size: travel_deg})
+    offset_arcsec = (
+        sum(each.limit_arcsec for each in own.elements) if isinstance(own, MaxwellSlip) else own.offset_arcsec
+    )
+    return _TRUE.validate_python(unit | {"offset_arcsec": offset_arcsec, size: travel_deg})
 
 
 def _half_crossed_deg(loop: Hysteresis) -> float:
@@ -319,12 +321,6 @@ def _half_crossed_deg(loop: Hysteresis) -> float:
         return law.advance(far_deg - travel_deg)
 
     return float(brentq(left, 0.0, far_deg))
-
-
-def _offset_arcsec(loop: Hysteresis) -> float:
-    if isinstance(loop, MaxwellSlip):
-        return sum(each.limit_arcsec for each in loop.elements)
-    return loop.offset_arcsec
 
 
 def _width_deg(loop: Hysteresis) -> float:
@@ -599,7 +595,7 @@ def solve(
     idle = done = 0
     while True:
         found = problem.found(place)
-        problem.scale = known if known is not None else _capped(scales(data, found, loops), most)
+        problem.scale = known if known is not None else scales(data, found, loops, most)
         if done >= steps or idle == SETTLED:
             break
         if known is not None and tempered:
@@ -653,13 +649,10 @@ def counting(off: FloatArray, scale: Scales, rows: NDArray[np.bool_]) -> tuple[F
     """Transforms scaled residuals by their likelihood and softens them; returns also the derivative."""
     half, stray = (each[rows] for each in scale.halves(len(rows) // len(CHANNELS)))
     root, slope = rooted(off, half, stray)
-    return softened(root), slope * _softening(root)
-
-
-def _capped(found: Scales, most: Scales | None) -> Scales:
-    if most is None:
-        return found
-    return replace(found, deviation={n: min(s, most.deviation[n]) for n, s in found.deviation.items()})
+    # Beyond `SOFT`, squares grow linearly (Huber loss).
+    size = np.maximum(np.abs(root) / SOFT, 1.0)
+    soft = np.sqrt(2.0 * size - 1.0)
+    return np.where(size > 1.0, np.sign(root) * SOFT * soft, root), slope / soft
 
 
 def _tempered(known: Scales, found: dict[str, FloatArray], rows: NDArray[np.bool_]) -> Scales:
@@ -714,19 +707,6 @@ def _moves(slopes: FloatArray, spread: FloatArray, times: float = 1.0) -> FloatA
     far = np.minimum(times * RESPONSE / np.sqrt(worth), FARTHEST)
     moves: FloatArray = (directions * far).T * spread
     return moves
-
-
-def softened(values: FloatArray) -> FloatArray:
-    """Softens residuals: their squares grow linearly beyond `SOFT` (Huber loss)."""
-    size = np.abs(values) / SOFT
-    bent = np.where(size > 1.0, np.sqrt(np.maximum(2.0 * size - 1.0, 1.0)), size)
-    return np.sign(values) * SOFT * bent
-
-
-def _softening(values: FloatArray) -> FloatArray:
-    """Returns the derivative of `softened`."""
-    size = np.maximum(np.abs(values) / SOFT, 1.0)
-    return np.where(size > 1.0, 1.0 / np.sqrt(2.0 * size - 1.0), 1.0)
 
 
 # ----------------------------------------------------------------
@@ -855,7 +835,7 @@ def starts(truth: Truth, cycle_ms: float) -> Iterator[Start]:
     plain = split(truth.servo.dead_time_ms, filtered_ms)
     averaged = {"moving_average_ms": averaged_ms, **split(max(late_ms - 2.0 * SHORT_MS, 0.0), SHORT_MS)}
     whole = truth.motor.inertia_kg_m2 + truth.load_.whole_inertia_kg_m2 / truth.gear.ratio**2
-    fastest = VELOCITY_BANDWIDTH_RAD_S.value * truth.motor.inertia_kg_m2
+    fastest = VELOCITY_BANDWIDTH_RAD_S * truth.motor.inertia_kg_m2
     commands = (
         (plain, 0.0, ()),
         (plain, whole, ("inertia feed-forward",)),
@@ -1252,9 +1232,12 @@ def _in_best_minimum(replays: Replays, best: Fitted, begun: Truth, most: Scales)
         other = continued(replays, best, MORE_STEPS, most, there)
         return _ended(replays, other, most) if other.loss + EARNED < best.loss else best
 
+    data = replays.data
+    noise = least_deviation(data) | {LOAD: expected(data).deviation[LOAD]}
     for _ in range(MINIMA):
         last = best
-        if _leaves_more(replays.data, best):
+        # If the residuals of any channel exceed those of the true axis.
+        if any(best.scales.deviation[name] > MORE * noise[name] for name in CHANNELS):
             best = reduce(
                 better, better_places(replays.rough, best, elsewhere(best.truth, begun), begun), best
             )
@@ -1269,12 +1252,6 @@ def _in_best_minimum(replays: Replays, best: Fitted, begun: Truth, most: Scales)
 def _ended(replays: Replays, near: Fitted, most: Scales) -> Fitted:
     """Continues a fit to its minimum, with the loops' deviation estimated there."""
     return continued(replays, near, STEPS, most, near=near, loops=loops_about(replays, near))
-
-
-def _leaves_more(data: Data, best: Fitted) -> bool:
-    """Returns True if the residuals of any channel exceed those of the true axis."""
-    least = least_deviation(data) | {LOAD: expected(data).deviation[LOAD]}
-    return any(best.scales.deviation[name] > MORE * least[name] for name in CHANNELS)
 
 
 def better_places(

@@ -40,6 +40,7 @@ from hdbridge.twin.replay import (
     begins_in_motion,
     commands_of,
     continuous,
+    demand_deg,
     held_rows,
     legs_of,
     run,
@@ -200,12 +201,11 @@ def traces_of(data: Data, truth: Truth, seed: Seed = None) -> list[dict[str, Flo
         commands = piece.commands
         draw = len(data.pieces) * seed + number if isinstance(seed, int) else 0
         traces = run(commands, data.axis, simulated, draw, smooth=not isinstance(seed, int))
-        wanted = demand_deg(commands, data.axis)
         shown.append(
             {
-                FOLLOWING: wanted - traces.motor_deg,
-                TORQUE: traces.torque_nm,
-                LOAD: traces.load_deg * ARCSEC_PER_DEG,
+                FOLLOWING: demand_deg(commands, data.axis) - traces["motor_position_deg"],
+                TORQUE: traces["motor_torque_nm"],
+                LOAD: traces["load_position_deg"] * ARCSEC_PER_DEG,
             }
         )
     return shown
@@ -376,14 +376,6 @@ def _legs(part: Record, legs: Sequence[Segment]) -> tuple[FloatArray, tuple[str,
     starts.sort(key=lambda each: each[0])
     places = np.searchsorted([start for start, _ in starts], part.time_s, side="right") - 1
     return np.maximum(places, 0).astype(np.float64), tuple(kind for _, kind in starts)
-
-
-def demand_deg(commands: Commands, axis: AxisConfig) -> FloatArray:
-    """Returns the commanded motor angle at each row; degrees."""
-    counts = np.asarray(commands.counts[commands.lead :], dtype=np.float64)
-    encoder = axis.motor_encoder
-    deg = encoder.direction * counts * 360.0 / encoder.counts_per_turn
-    return np.interp(commands.row_cycles, np.arange(len(counts)), deg)
 
 
 # ----------------------------------------------------------------
@@ -613,8 +605,10 @@ def _shaken_nm(truth: Truth, off_rad: float) -> float:
     return gain * off_rad / step_s * norm
 
 
-def scales(data: Data, found: Mapping[str, FloatArray], loops: Loops = SMOOTH) -> Scales:
-    """Estimates the scales of the residuals in motion; at least the error of a smooth replay.
+def scales(
+    data: Data, found: Mapping[str, FloatArray], loops: Loops = SMOOTH, most: Scales | None = None
+) -> Scales:
+    """Estimates the scales of the residuals in motion; from the error of a smooth replay up to ``most``.
 
     Residuals at rest are excluded, because they would dominate a recording that rests half of the time.
     """
@@ -630,6 +624,8 @@ def scales(data: Data, found: Mapping[str, FloatArray], loops: Loops = SMOOTH) -
             typical = median_deviation(beyond(inside, 0.5 * steps[name]))
             spread = np.broadcast_to(loops.spread[name], len(rows))[rows]
             given[name], stray[name] = deviation(inside, steps[name], max(least[name], typical), spread)
+    if most is not None:
+        given = {name: min(each, most.deviation[name]) for name, each in given.items()}
     return Scales(given, steps, stray, loops)
 
 

@@ -28,7 +28,7 @@ from hdbridge.twin.fit import (
     told,
 )
 from hdbridge.twin.misfit import Replays, judged_rows
-from hdbridge.twin.parameters import Parameter, at_coordinates, coordinates, free_value
+from hdbridge.twin.parameters import Parameter, at_coordinates, by_cause, coordinates, free_value
 from hdbridge.units import figure
 
 # ----------------------------------------------------------------
@@ -87,7 +87,7 @@ def without(
     costs = [float(np.sum(np.square(told(each, fitted.scales, rows)))) for each in replays(begun)]
     near = replace(fitted, parameters=others, jacobian=slopes)
     prior, nearest = np.array(coordinates(start, others)), begun[int(np.argmin(costs))]
-    return solve(replays, nearest, others, STEPS, prior, known=fitted.scales, near=near).truth
+    return solve(replays, nearest, others, STEPS, prior, known=fitted.scales, near=near, linear=False).truth
 
 
 # ----------------------------------------------------------------
@@ -177,9 +177,7 @@ def name_causes(
     def worse(others: Iterable[FloatArray], than: FloatArray = left) -> list[bool]:
         return [told_apart(than, other - than, legs) for other in others]
 
-    groups: dict[str, list[Parameter]] = {}
-    for each in fitted.parameters:
-        groups.setdefault(each.cause, []).append(each)
+    groups = by_cause(fitted.parameters)
     suspects = {cause: own for cause, own in groups.items() if _further(start, fitted.truth, own)}
     alone = left_by(put_back(start, fitted.truth, own) for own in suspects.values())
     matter = list(compress(suspects, worse(alone)))

@@ -99,15 +99,6 @@ class _Part:
         return np.asarray(np.add.reduceat(counted, self.firsts) / lengths, dtype=np.float64)
 
 
-@dataclass(frozen=True, eq=False)
-class _Losses:
-    """Heat input to the body, accumulated by row."""
-
-    friction_j: FloatArray
-    torque_squares: FloatArray
-    """Integral of the squared torque over rated torque; seconds."""
-
-
 def with_warmth(
     recording: Recording, axis: AxisConfig, fitted: Fitted, truth: Truth
 ) -> tuple[Truth, Finding | None]:
@@ -119,7 +110,7 @@ def with_warmth(
     record = recording.record
     if Channel.TEMPERATURE.value not in record.columns:
         return truth, None
-    parts = _parts(recording, _losses(recording, axis, truth), truth)
+    parts = _parts(recording, truth, *_losses(recording, axis, truth))
     if not parts:
         return truth, None
     readings = record.columns[Channel.TEMPERATURE.value]
@@ -222,8 +213,14 @@ def _body(goal_c: FloatArray, start_c: float, time_s: float) -> FloatArray:
     return np.append(start_c, way_c)
 
 
-def _parts(recording: Recording, losses: _Losses, truth: Truth) -> list[_Part]:
-    """Prepares the continuous parts; skips those that are too short or without readings that count."""
+def _parts(
+    recording: Recording, truth: Truth, friction_j: FloatArray, torque_squares: FloatArray
+) -> list[_Part]:
+    """Prepares the continuous parts; skips those that are too short or without readings that count.
+
+    The losses are accumulated by row: the friction's work, and the integral of the squared torque over the
+    rated one in seconds.
+    """
     record, heat = recording.record, truth.temperature
     counts = np.ones(len(record), dtype=np.bool_)
     for leg in held_out_legs(recording):
@@ -237,20 +234,20 @@ def _parts(recording: Recording, losses: _Losses, truth: Truth) -> list[_Part]:
         if len(at_s) < MINIMUM_STEPS or not len(inside):
             continue
         reading_c = record.columns[Channel.TEMPERATURE.value][rows][nearest]
-        friction_w, torque_squares = (
+        friction_w, squares = (
             np.append(0.0, np.diff(np.interp(at_s, time_s, each[rows])) / STEP_S)
-            for each in (losses.friction_j, losses.torque_squares)
+            for each in (friction_j, torque_squares)
         )
         weather_k = heat.ambient_k_per_hour * at_s / 3600.0
         weather_k = weather_k + heat.ambient_swing_k * np.sin(math.tau * at_s / heat.ambient_period_s)
         new = (np.diff(reading_c[inside]) != 0.0) | (np.diff(inside) > 1)
         firsts = np.append(0, np.flatnonzero(new) + 1)
-        found.append(_Part(friction_w, torque_squares, weather_k, reading_c, inside, firsts))
+        found.append(_Part(friction_w, squares, weather_k, reading_c, inside, firsts))
     return found
 
 
-def _losses(recording: Recording, axis: AxisConfig, truth: Truth) -> _Losses:
-    """Computes the losses by two replays with a body so large that it hardly warms.
+def _losses(recording: Recording, axis: AxisConfig, truth: Truth) -> tuple[FloatArray, FloatArray]:
+    """Computes the accumulated losses by two replays with a body so large that it hardly warms.
 
     Replays are needed because a recording has the torque at the end of each cycle, while the torque within it
     heats the motor. The friction's work is corrected to the recorded temperature.
@@ -273,7 +270,7 @@ def _losses(recording: Recording, axis: AxisConfig, truth: Truth) -> _Losses:
         cooled_j = np.append(0.0, np.cumsum(above_k * np.diff(time_s)))
         taken_j.append(LARGE_S * warm_c + cooled_j)
     friction_j = np.diff(taken_j[0]) * (_grown(truth, told_c) / _grown(truth, warm_c))[1:]
-    return _Losses(np.append(0.0, np.cumsum(friction_j)), taken_j[1] - taken_j[0])
+    return np.append(0.0, np.cumsum(friction_j)), taken_j[1] - taken_j[0]
 
 
 def _grown(truth: Truth, warm_c: FloatArray) -> FloatArray:

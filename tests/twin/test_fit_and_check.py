@@ -236,12 +236,12 @@ def test_growth_follows_a_change_of_any_size_and_not_a_single_reading() -> None:
     scale = scales_by_kind(data, {}, noise)
     white = {name: each * rng.standard_normal(len(each)) for name, each in scale.items()}
     for factor in (1.0, 3.0, 30.0):
-        found = growth(data, {name: factor * each for name, each in white.items()}, {}, noise)
+        found = growth(data, {name: factor * each for name, each in white.items()}, scale)
         assert found == pytest.approx(dict.fromkeys(found, factor), rel=0.1)
     stray = {name: each.copy() for name, each in white.items()}
     for each in stray.values():
         each[len(each) // 2] *= 1e3
-    assert max(growth(data, stray, {}, noise).values()) < 1.1
+    assert max(growth(data, stray, scale).values()) < 1.1
 
 
 def test_a_twin_that_leaves_all_of_a_signal_shows_no_change() -> None:

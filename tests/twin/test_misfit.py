@@ -22,7 +22,6 @@ from hdbridge.twin.misfit import (
     CHANNELS,
     Data,
     Replays,
-    demand_deg,
     noise_floor,
     noise_in_motion,
     prepare,
@@ -33,7 +32,7 @@ from hdbridge.twin.misfit import (
     what_is_left,
 )
 from hdbridge.twin.parameters import BY_NAME, FOLLOWING, LOAD, TORQUE, free_value, with_values
-from hdbridge.twin.replay import replay
+from hdbridge.twin.replay import demand_deg, replay
 
 DEMO = Path(__file__).parents[2] / "profiles" / "demo"
 AXIS = AxisConfig.load(DEMO)
