@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -288,16 +289,7 @@ def as_dict(report: TwinReport) -> dict[str, Any]:
         "axis": report.axis,
         "verdict": report.verdict,
         "values": report.values,
-        "left": [
-            {
-                "channel": each.channel,
-                "share": each.share,
-                "times_noise": each.times_noise,
-                "kind": each.kind,
-                "explained": each.explained,
-            }
-            for each in report.left
-        ],
+        "left": [{**asdict(each), "explained": each.explained} for each in report.left],
         "before": report.before.as_dict(),
         "after": report.after.as_dict() if report.after is not None else None,
         "parameters": [
@@ -311,10 +303,7 @@ def as_dict(report: TwinReport) -> dict[str, Any]:
             for each in report.learned
         ],
         "findings": [{"cause": each.cause, "text": each.text} for each in report.named],
-        "from_model": [
-            {"effect": each.effect, "counterpart": each.counterpart, "note": each.note}
-            for each in report.translated
-        ],
+        "from_model": [asdict(each) for each in report.translated],
     }
 
 

@@ -143,7 +143,7 @@ class Known:
 
 # ----------------------------------------------------------------
 
-CHECK_S = 20.0
+CHECK_S = 17.0
 """Duration of the pieces on which a longer recording is checked."""
 SIZES = (1.0, 2.5, 4.0, 6.0)
 """Trial changes of each parameter, in both directions, in units of its least change. Slopes do not cover
@@ -430,7 +430,8 @@ class _Search:
             np.clip(here.place + self._known @ rng.standard_normal(self._known.shape[1]), low, high)
             for _ in range(DRAWS)
         ]
-        drawn = self._replays.drawn([at_coordinates(truth, self._every, each.tolist()) for each in places])
+        truths = [at_coordinates(truth, self._every, each.tolist()) for each in places]
+        drawn = self._replays(truths, range(1, DRAWS + 1))
         left = np.stack(
             [
                 told(shown, scale, self._rows) - here.jacobian @ (each - here.place)

@@ -90,68 +90,59 @@ LEAST_SHARE = 0.15
 """Maximum relative standard error of a coefficient that is used: a fifth of the prior's width."""
 
 
-@dataclass(frozen=True, slots=True)
-class Readings:
-    """Results of the regressions; None for values that the motion does not show."""
+def read_off(data: Data) -> dict[str, float]:
+    """Returns the values that the regressions over all pieces show, by name.
 
-    lag_s: float | None
-    """Age of the demand: following error over speed."""
-    load_inertia_kg_m2: float | None
-    coulomb_nm: float | None
-    viscous_nm_s_per_rad: float | None
-    held_nm: float | None
-    """Highest motor torque, if it is held while the motor moves."""
-
-
-def read_off(data: Data) -> Readings:
-    """Runs the regressions over all pieces."""
-    return Readings(_lag_s(data), *_mechanics(data), _held_nm(data))
+    ``lag_s`` is the age of the demand, following error over speed; ``held_nm`` the highest motor torque if it
+    is held while the motor moves.
+    """
+    found = _mechanics(data) | {"lag_s": _lag_s(data), "held_nm": _held_nm(data)}
+    return {name: value for name, value in found.items() if value is not None}
 
 
 def start_of(truth: Truth, data: Data) -> Truth:
     """Returns the truth with the values that the regressions give."""
     found = read_off(data)
-    values: dict[str, float] = {}
+    values: dict[str, float] = {
+        name: found[name] for name in ("Coulomb friction", "viscous friction") if name in found
+    }
     load, servo = truth.load_, truth.servo
-    if found.load_inertia_kg_m2 is not None:
-        scale = found.load_inertia_kg_m2 / load.whole_inertia_kg_m2
-        values["load inertia"] = load.inertia_kg_m2 * scale
+    if "load inertia" in found:
         # Spring and damping are scaled to keep the resonance frequency of the start.
+        scale = found["load inertia"] / load.whole_inertia_kg_m2
+        values["load inertia"] = load.inertia_kg_m2 * scale
         values["gear stiffness"] = truth.gear.stiffness_nm_per_rad * scale
         values["gear damping"] = truth.gear.damping_nm_s_per_rad * scale
-    if found.coulomb_nm is not None:
-        values["Coulomb friction"] = found.coulomb_nm
-    if found.viscous_nm_s_per_rad is not None:
-        values["viscous friction"] = found.viscous_nm_s_per_rad
-    if found.held_nm is not None:
-        held_percent = 100.0 * found.held_nm / truth.motor.rated_torque_nm
-        if held_percent < min(servo.torque_limit_percent, data.axis.limits.torque_percent):
-            values["current limit"] = held_percent
-    if found.lag_s is not None:
-        filtered_ms = 2.0 * servo.command_filter_ms
-        dead_ms = 1e3 * found.lag_s - filtered_ms
-        if dead_ms >= 0.0:
-            values["servo dead time"] = dead_ms
-        else:
-            values |= {"servo dead time": 0.0, "command filter": max(500.0 * found.lag_s, 0.1)}
+    held_percent = 100.0 * found.get("held_nm", math.inf) / truth.motor.rated_torque_nm
+    if held_percent < min(servo.torque_limit_percent, data.axis.limits.torque_percent):
+        values["current limit"] = held_percent
+    if "lag_s" in found:
+        dead_ms = 1e3 * found["lag_s"] - 2.0 * servo.command_filter_ms
+        values["servo dead time"] = max(dead_ms, 0.0)
+        if dead_ms < 0.0:
+            values["command filter"] = max(500.0 * found["lag_s"], 0.1)
     return with_values(truth, values)
 
 
-def _mechanics(data: Data) -> tuple[float | None, float | None, float | None]:
-    """Returns load inertia, Coulomb friction and viscous friction."""
+def _mechanics(data: Data) -> dict[str, float | None]:
+    """Returns load inertia, Coulomb friction and viscous friction; None for what the motion does not show."""
     tables, torques = zip(*(_torques(piece, data) for piece in data.pieces), strict=True)
     table, torque = np.concatenate(tables), np.concatenate(torques)
     if not table[:, -1].any():
         table = table[:, :-1]
     if len(torque) <= LEAST_ROWS:
-        return None, None, None
+        return {}
     columns = list(table.T)
     found = _slope(torque, columns, LEAST_SHARE)
     if found and (found[0] is None or found[0] <= 0.0):
         # The motor inertia is not visible: estimate the load's without it.
-        found = [None, *(_slope(torque, columns[1:], LEAST_SHARE) or [None] * 4)]
-    load, coulomb, viscous = found[1:4] if found else (None, None, None)
-    return _positive(load), _positive(coulomb), _positive(viscous)
+        found = [None, *(_slope(torque, columns[1:], LEAST_SHARE) or ())]
+    names = ("load inertia", "Coulomb friction", "viscous friction")
+    return {
+        name: value
+        for name, value in zip(names, (found or [])[1:4], strict=False)
+        if value is not None and value > 0.0
+    }
 
 
 def _torques(piece: Piece, data: Data) -> tuple[FloatArray, FloatArray]:
@@ -201,34 +192,26 @@ def _held_nm(data: Data) -> float | None:
 
 
 def _lag_s(data: Data) -> float | None:
-    """Returns the ratio of following error and speed."""
-    lag_s: float | None = None
+    """Returns the ratio of following error and speed of the command."""
+    lag: list[float | None] | None = None
     for _ in range(2):  # the second time with the command delayed by the lag
-        late_s = min(max(lag_s or 0.0, 0.0), 0.1)
-        rows = [_following(piece, data, late_s) for piece in data.pieces]
-        speed, following = (np.concatenate(each) for each in zip(*rows, strict=True))
+        late_s = min(max((lag and lag[0]) or 0.0, 0.0), 0.1)
+        speeds, followings = [], []
+        for piece in data.pieces:
+            commands = piece.commands
+            demand, width = demand_deg(commands, data.axis), _width(commands.cycle_s)
+            late = np.interp(commands.row_cycles - late_s / commands.cycle_s, commands.row_cycles, demand)
+            speeds.append(np.gradient(_smoothed(late, width), commands.cycle_s))
+            followings.append(_smoothed(piece.measured[FOLLOWING], width))
+        speed, following = np.concatenate(speeds), np.concatenate(followings)
         moving = np.abs(speed) > MOVING_DEG_S
         lag = _slope(following[moving], [speed[moving]])
-        lag_s = lag[0] if lag else None
-    return lag_s
-
-
-def _following(piece: Piece, data: Data, late_s: float) -> tuple[FloatArray, FloatArray]:
-    """Returns the speed of the command, delayed by ``late_s``, and the following error."""
-    commands = piece.commands
-    demand = demand_deg(commands, data.axis)
-    late = np.interp(commands.row_cycles - late_s / commands.cycle_s, commands.row_cycles, demand)
-    width = _width(commands.cycle_s)
-    return np.gradient(_smoothed(late, width), commands.cycle_s), _smoothed(piece.measured[FOLLOWING], width)
+    return lag[0] if lag else None
 
 
 def _width(cycle_s: float) -> int:
     """Returns the number of rows to average."""
     return max(3, round(SMOOTHED_S / cycle_s))
-
-
-def _positive(value: float | None) -> float | None:
-    return value if value is not None and value > 0.0 else None
 
 
 def _smoothed(column: FloatArray, width: int) -> FloatArray:

@@ -62,7 +62,7 @@ UNKNOWN_DEG = 60.0
 recording, if they are not known (from a gear without such a state, or from the holding torque)."""
 LONGEST_LEG_S = 2.0
 """Maximum length of a leg; a longer one is split, because residuals further apart are uncorrelated."""
-COARSE_S = 20.0
+COARSE_S = 17.0
 """Duration of the pieces on which the first steps of a fit are made: a sweep, steps and a sine of the plan
 `dynamics`, each after its run-in."""
 WITHOUT_MOTION = frozenset({"standstill", "reference", "settle"})
@@ -421,10 +421,6 @@ class Replays:
         if self._pool is None or self.data.duration_s <= WORTH_S:
             return [residuals(self.data, each, seed) for each, seed in zip(truths, seeds, strict=False)]
         return list(self._pool.map(_residuals, truths, seeds, repeat(self._place)))
-
-    def drawn(self, truths: Sequence[Truth]) -> list[dict[str, FloatArray]]:
-        """Returns the residuals of each truth, in order, from rounded and noisy replays."""
-        return self(truths, range(1, len(truths) + 1))
 
 
 def _begin(data: tuple[Data, Data]) -> None:

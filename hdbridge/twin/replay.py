@@ -169,9 +169,9 @@ def unknown_rows(record: Record, count_deg: float) -> NDArray[np.bool_]:
 # Commands of a part of a recording, on the grid of its own cycle, preceded by an approach.
 
 STANDING_S = 0.3
-"""Standstill between the approach and a recording that begins at rest."""
+"""Standstill before the approach, and between it and a recording that begins at rest."""
 SETTLING_S = 1.5
-"""The same if the recording begins with the drive on: long enough for loops with a gain of 4/s."""
+"""The latter if the recording begins with the drive on: long enough for loops with a gain of 4/s."""
 UNEVEN = 0.25
 """Maximum deviation of a sample's time from the grid; cycles."""
 MOSTLY = 0.95
@@ -315,7 +315,7 @@ def _approach(
     way = [round(per_load_deg * float(trajectory.at_time(each)[0][0])) for each in times]
     here = round(per_load_deg * start_deg)
     rest = [way[-1] if way else here] if speed else [round(axis.motor_encoder.counts(1.0) * demand_deg[0])]
-    return [here] * standing + way + (rest * standing if not speed else [])
+    return [here] * math.ceil(STANDING_S / cycle_s) + way + (rest * standing if not speed else [])
 
 
 def counted_cycles(time_s: FloatArray, cycle_s: float) -> FloatArray:

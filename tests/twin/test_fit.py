@@ -92,8 +92,8 @@ def test_where_the_weight_is_told_one_way_is_enough_for_friction() -> None:
         bench.move(900.0, 1200.0, 6000.0)
 
     found = read_off(prepare(Recording(record_of(VISCOUS, one_way), axis="demo", ratio=50.0), AXIS, VISCOUS))
-    assert found.coulomb_nm == pytest.approx(VISCOUS.motor.coulomb_nm, rel=0.1)
-    assert found.viscous_nm_s_per_rad == pytest.approx(VISCOUS.motor.viscous_nm_s_per_rad, rel=0.2)
+    assert found["Coulomb friction"] == pytest.approx(VISCOUS.motor.coulomb_nm, rel=0.1)
+    assert found["viscous friction"] == pytest.approx(VISCOUS.motor.viscous_nm_s_per_rad, rel=0.2)
 
 
 Rows = NDArray[np.float64]

@@ -84,7 +84,7 @@ def test_a_drawn_recording_is_as_rounded_and_noisy_as_a_measured_one() -> None:
     data = prepare(recorded(), AXIS, TRUTH)
     with Replays(data, 1) as replays:
         (smooth,) = replays([TRUTH])
-        one, other = (each["load error"] for each in replays.drawn([TRUTH, TRUTH]))
+        one, other = (each["load error"] for each in replays([TRUTH, TRUTH], (1, 2)))
     counts = counted(data)["load error"] > 0.0
     noise_arcsec = noise_floor(data)["load error"]
     assert np.std(smooth["load error"][counts]) == pytest.approx(noise_arcsec, rel=0.2)
@@ -94,9 +94,9 @@ def test_a_drawn_recording_is_as_rounded_and_noisy_as_a_measured_one() -> None:
 
 def test_regressions_read_inertia_friction_and_lag_off_the_recording() -> None:
     found = read_off(prepare(recorded(), AXIS, TRUTH))
-    assert found.load_inertia_kg_m2 == pytest.approx(TRUTH.load_.inertia_kg_m2, rel=0.2)
-    assert found.coulomb_nm == pytest.approx(TRUTH.motor.coulomb_nm, rel=0.02)
-    assert found.lag_s == pytest.approx(2e-3 * TRUTH.servo.command_filter_ms, rel=0.1)
+    assert found["load inertia"] == pytest.approx(TRUTH.load_.inertia_kg_m2, rel=0.2)
+    assert found["Coulomb friction"] == pytest.approx(TRUTH.motor.coulomb_nm, rel=0.02)
+    assert found["lag_s"] == pytest.approx(2e-3 * TRUTH.servo.command_filter_ms, rel=0.1)
 
 
 def test_least_squares_lead_from_wrong_values_to_the_true_ones() -> None:
