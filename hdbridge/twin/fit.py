@@ -125,7 +125,7 @@ def start_of(truth: Truth, data: Data) -> Truth:
 
 
 def _mechanics(data: Data) -> dict[str, float | None]:
-    """Returns load inertia, Coulomb friction and viscous friction; None for what the motion does not show."""
+    """Returns those of load inertia, Coulomb and viscous friction that the motion shows."""
     tables, torques = zip(*(_torques(piece, data) for piece in data.pieces), strict=True)
     table, torque = np.concatenate(tables), np.concatenate(torques)
     if not table[:, -1].any():
