@@ -62,7 +62,7 @@ UNKNOWN_DEG = 60.0
 recording, if they are not known (from a gear without such a state, or from the holding torque)."""
 LONGEST_LEG_S = 2.0
 """Maximum length of a leg; a longer one is split, because residuals further apart are uncorrelated."""
-COARSE_S = 17.0
+COARSE_S = 15.5
 """Duration of the pieces on which the first steps of a fit are made: a sweep, steps and a sine of the plan
 `dynamics`, each after its run-in."""
 WITHOUT_MOTION = frozenset({"standstill", "reference", "settle"})
