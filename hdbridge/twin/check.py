@@ -143,7 +143,7 @@ class Known:
 
 # ----------------------------------------------------------------
 
-CHECK_S = 15.5
+CHECK_S = 17.0
 """Duration of the pieces on which a longer recording is checked."""
 SIZES = (1.0, 2.5, 4.0, 6.0)
 """Trial changes of each parameter, in both directions, in units of its least change. Slopes do not cover

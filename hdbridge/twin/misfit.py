@@ -62,7 +62,7 @@ UNKNOWN_DEG = 60.0
 recording, if they are not known (from a gear without such a state, or from the holding torque)."""
 LONGEST_LEG_S = 2.0
 """Maximum length of a leg; a longer one is split, because residuals further apart are uncorrelated."""
-COARSE_S = 15.5
+COARSE_S = 17.0
 """Duration of the pieces on which the first steps of a fit are made: a sweep, steps and a sine of the plan
 `dynamics`, each after its run-in."""
 WITHOUT_MOTION = frozenset({"standstill", "reference", "settle"})
@@ -166,7 +166,7 @@ def coarse(data: Data, wanted_s: float = COARSE_S) -> Data:
 
     while left:
         seen = WITHOUT_MOTION.union(*(pieces[each].kind for each in taken))
-        place = max(left, key=lambda each: len({*pieces[each].kind} - seen) / lengths_s[each])
+        place = max(left, key=lambda each: (len({*pieces[each].kind} - seen), -lengths_s[each]))
         if taken and seen.issuperset(pieces[place].kind):
             break
         left.remove(place)
