@@ -151,7 +151,7 @@ def _twins(folder: Path) -> None:
                     left.setdefault((row.channel, "measured"), []).append(row.measured)
                     left.setdefault((row.channel, name), []).append(row.difference)
             for finding in twin.findings:
-                print(f"  {finding.text}")
+                print(f"  {finding}")
             for rest in twin.unexplained:
                 print(f"  unexplained: {rest.channel}, {rest.times_noise:.3g} times its noise")
             for alike in twin.alike:

@@ -176,7 +176,7 @@ def main() -> None:
             twin = fit_twin([recording], axis, start(axis, foreign), workers=options.workers)
             took_s = time.process_time() - began_s
             true = foreign.by_place()
-            inside = {place: pair for place, pair in twin.intervals.items() if place in true}
+            inside = {place: pair for place, pair in twin.truth.intervals.items() if place in true}
             held = [place for place, (low, high) in inside.items() if low <= true[place] <= high]
             figures = shares(other, axis, twin.truth, seed)
             print(f"{structure} {seed}: {figures}; {len(held)} of {len(inside)} intervals; ", end="")

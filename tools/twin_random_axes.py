@@ -246,7 +246,7 @@ def one(
         if row is not None:
             found.channels[name] = (row.share, row.in_noise)
     for name, each in BY_NAME.items():
-        interval = twin.intervals.get(".".join(each.path))
+        interval = twin.truth.intervals.get(each.path)
         true = value_in(truth, each)
         if interval is not None and true is not None:
             found.intervals += 1

@@ -101,8 +101,8 @@ def main() -> None:
         warm_c = recording.record.columns["temperature_c"]
         cells = [f"{seed:4d} {warm_c[0]:.1f}, {np.min(warm_c):.1f} to {np.max(warm_c):.1f} C"]
         for number, each in enumerate(THERMAL):
-            true, now = (getattr(t.temperature, each.path[-1]) for t in (truth, after))
-            lower, upper = after.intervals[".".join(each.path)]
+            true, now = (getattr(t.temperature, each.path.split(".")[-1]) for t in (truth, after))
+            lower, upper = after.intervals[each.path]
             held[number] += lower <= true <= upper
             missed = "" if lower <= true <= upper else " missed"
             cells.append(f"{each.name} {true:.4g}: {now:.4g} ({lower:.4g} to {upper:.4g}){missed}")

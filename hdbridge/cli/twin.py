@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -32,10 +33,9 @@ from hdbridge.units import figure
 if TYPE_CHECKING:
     from hdbridge.axis import AxisConfig
     from hdbridge.records.recording import Recording
-    from hdbridge.report.twin import Learned, Named, TwinReport
+    from hdbridge.report.twin import Learned, TwinReport
     from hdbridge.sim.truth import Truth
     from hdbridge.twin.translate import Translation
-    from hdbridge.twin.twin import Twin
 
 
 def register(app: typer.Typer) -> None:
@@ -151,7 +151,8 @@ def _learned(
         twin.before,
         twin.after,
         learned=_values(begun.truth, twin.truth) if verdict.kept else (),
-        named=_named(twin) if verdict.kept else _left(twin),
+        # The residual is all there is to report about a twin that is no better.
+        named=[*twin.findings, *twin.alike, *twin.unexplained] if verdict.kept else twin.unexplained,
         translated=begun.rows,
         facts=facts,
         verdict=verdict.text,
@@ -172,37 +173,11 @@ def _values(before: Truth, after: Truth) -> list[Learned]:
     fitted, assumed = after.provenance["fit"]["parameters"], Values.of(before) is Values.USUAL
     rows = []
     for each in {parameter.path: parameter for parameter in (*PARAMETERS, *THERMAL)}.values():
-        now, interval = value_in(after, each), after.intervals.get(".".join(each.path))
+        now, interval = value_in(after, each), after.intervals.get(each.path)
         if now is not None and (interval is not None or each.name in fitted):
             was = None if assumed else value_in(before, each)
             rows.append(Learned(each.name, each.unit, was, now, interval))
     return rows
-
-
-def _named(twin: Twin) -> list[Named]:
-    """Returns causes, parameter sets that the motion cannot separate, and the unexplained residual."""
-    from hdbridge.report.twin import Named
-
-    named = [Named(each.cause, each.text.removeprefix(f"{each.cause}: ")) for each in twin.findings]
-    named += [
-        Named("not separable", f"{', '.join(each.names)}; {'; '.join(each.moves)} would separate them")
-        for each in twin.alike
-    ]
-    return [*named, *_left(twin)]
-
-
-def _left(twin: Twin) -> list[Named]:
-    """Returns the unexplained residual, which is all there is to report about a twin that is no better."""
-    from hdbridge.report.twin import Named
-
-    return [
-        Named(
-            "unexplained",
-            f"{each.channel} is left with {each.times_noise:.3g} times its noise, most of it in legs of the "
-            f"kind {each.kind}",
-        )
-        for each in twin.unexplained
-    ]
 
 
 def _check(
@@ -231,9 +206,9 @@ def _check(
             "axis": axis.name,
             "twin": str(files.twin),
             "sentence": found.sentence,
-            "changes": [{"cause": each.cause, "text": each.text} for each in found.changes],
+            "changes": [{"cause": each.cause, "text": str(each)} for each in found.changes],
             "misfit_growth": dict(found.growth_before),
-            "unexplained": found.unexplained | found.grown,
+            "unexplained": found.unexplained,
             "unseen": list(found.unseen),
         },
     )
@@ -314,16 +289,7 @@ def as_dict(report: TwinReport) -> dict[str, Any]:
         "axis": report.axis,
         "verdict": report.verdict,
         "values": report.values,
-        "left": [
-            {
-                "channel": each.channel,
-                "share": each.share,
-                "times_noise": each.times_noise,
-                "kind": each.kind,
-                "explained": each.explained,
-            }
-            for each in report.left
-        ],
+        "left": [{**asdict(each), "explained": each.explained} for each in report.left],
         "before": report.before.as_dict(),
         "after": report.after.as_dict() if report.after is not None else None,
         "parameters": [
@@ -337,10 +303,7 @@ def as_dict(report: TwinReport) -> dict[str, Any]:
             for each in report.learned
         ],
         "findings": [{"cause": each.cause, "text": each.text} for each in report.named],
-        "from_model": [
-            {"effect": each.effect, "counterpart": each.counterpart, "note": each.note}
-            for each in report.translated
-        ],
+        "from_model": [asdict(each) for each in report.translated],
     }
 
 

@@ -30,6 +30,7 @@ from hdbridge.report.page import (
 from hdbridge.report.words import figure, sentence
 from hdbridge.twin.compare import ALL, TITLES, UNITS, Comparison, Row, Spectrum, Trace
 from hdbridge.twin.misfit import Left, Values
+from hdbridge.twin.naming import Alike, Finding
 from hdbridge.twin.translate import Row as Translated
 
 WINDOW_S: Final = 1.0
@@ -56,14 +57,6 @@ class Learned:
         return f"estimate: {self.name} {_figure(self.after)}{f' {self.unit}' if self.unit else ''}{between}"
 
 
-@dataclass(frozen=True, slots=True)
-class Named:
-    """An error of the simulation, as text."""
-
-    cause: str
-    text: str
-
-
 @dataclass(frozen=True, eq=False)
 class TwinReport:
     """Content of the page."""
@@ -74,7 +67,7 @@ class TwinReport:
     after: Comparison | None = None
     """Comparison with the fitted simulation; None if it was only compared."""
     learned: Sequence[Learned] = ()
-    named: Sequence[Named] = ()
+    named: Sequence[Finding | Alike | Left] = ()
     translated: Sequence[Translated] = ()
     facts: Sequence[tuple[str, str]] = ()
     verdict: str = ""

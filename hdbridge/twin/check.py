@@ -24,7 +24,17 @@ from hdbridge.axis.effects import FloatArray
 from hdbridge.errors import InputError
 from hdbridge.records.recording import Recording
 from hdbridge.sim.truth import Truth
-from hdbridge.twin.fit import SOFT, Fitted, fitted_rows, free_parameters, legs_of_rows, over_legs, solve, told
+from hdbridge.twin.fit import (
+    SOFT,
+    Fitted,
+    fitted_rows,
+    free_parameters,
+    intervals_of,
+    legs_of_rows,
+    over_legs,
+    solve,
+    told,
+)
 from hdbridge.twin.misfit import (
     CHANNELS,
     Data,
@@ -39,8 +49,9 @@ from hdbridge.twin.misfit import (
     prepare,
     rounding,
 )
-from hdbridge.twin.naming import FALSE_ALARM, Finding, Moved, finding, told_apart
-from hdbridge.twin.parameters import BY_NAME, Parameter, at_coordinates, coordinates
+from hdbridge.twin.naming import FALSE_ALARM, Finding, Moved, finding, put_back, told_apart
+from hdbridge.twin.parameters import BY_NAME, Parameter, at_coordinates, by_cause, coordinates
+from hdbridge.units import figure
 
 # ----------------------------------------------------------------
 # How sure a change against a twin is: by the new recording, and by what the twin's own recordings left open.
@@ -50,21 +61,17 @@ STRAY = 4.0
 time is not a change of the axis."""
 
 
-def growth(
-    data: Data, residuals: Mapping[str, FloatArray], known: Misfit, noise: Mapping[str, float]
-) -> dict[str, float]:
-    """Returns, by channel, the rms residual relative to that of the same kinds of leg in the twin's own fit.
+def growth(data: Data, residuals: Mapping[str, FloatArray], was: Mapping[str, Any]) -> dict[str, float]:
+    """Returns, by channel, the rms residual relative to ``was`` (`scales_by_kind`).
 
-    A kind that the twin has not seen is compared with the largest of the others; ``noise`` is the minimum of
-    each reference. A row counts as no more than `STRAY` times the typical residual of its leg, because single
-    rows may be readings that are wrong, but a whole leg is not.
+    A row counts as no more than `STRAY` times the typical residual of its leg, because single rows may be
+    readings that are wrong, but a whole leg is not.
     """
-    was, found = scales_by_kind(data, known, noise), {}
+    found = {}
     for name, counts in counted(data).items():
         inside = counts > 0.0
         if inside.any():
-            scale = was[name][inside]
-            now, legs = np.abs(residuals[name][inside]), data.leg[inside]
+            scale, now, legs = was[name][inside], np.abs(residuals[name][inside]), data.leg[inside]
             typical = np.zeros_like(now)
             for leg in np.unique(legs):
                 typical[legs == leg] = median_deviation(now[legs == leg])
@@ -74,14 +81,16 @@ def growth(
 
 
 def scales_by_kind(data: Data, known: Misfit, noise: Mapping[str, float]) -> dict[str, Any]:
-    """Returns, by channel and row, the twin's own misfit on this kind of leg, or the noise if larger."""
-    kinds = np.array(data.kinds)[data.leg.astype(np.intp)]
-    found: dict[str, Any] = {}
+    """Returns, by channel and row, the twin's own misfit on this kind of leg, or the noise if larger.
+
+    A kind that the twin has not seen is compared with the largest of the others.
+    """
+    found = {}
     for name in CHANNELS:
         before = known.get(name, {})
         otherwise = max(before.values(), default=0.0)
-        by_kind = {kind: max(before.get(kind, otherwise), noise[name]) for kind in dict.fromkeys(data.kinds)}
-        found[name] = np.array([by_kind[str(kind)] for kind in kinds])
+        by_leg = np.array([max(before.get(kind, otherwise), noise[name]) for kind in data.kinds])
+        found[name] = by_leg[data.leg.astype(np.intp)]
     return found
 
 
@@ -132,58 +141,9 @@ class Known:
         return root
 
 
-@dataclass(frozen=True, eq=False)
-class Change:
-    """Estimate of some coordinates from a recording, the others held to the twin."""
-
-    by: FloatArray
-    """Their distances from the point of linearisation."""
-    covariance: FloatArray
-
-
-def change_of(
-    places: Sequence[int],
-    slopes: FloatArray,
-    left: FloatArray,
-    legs: FloatArray,
-    root: FloatArray,
-    precision: FloatArray,
-    off: FloatArray,
-) -> Change:
-    """Estimates the coordinates with these indices by generalised least squares.
-
-    ``left`` are the scaled residuals, ``slopes`` their derivatives with respect to all coordinates, ``legs``
-    the leg number of each residual, ``root`` a root of the twin's covariance. ``precision`` is the prior's,
-    and ``off`` the distance of all coordinates from the prior's mean.
-    """
-    count = slopes.shape[1]
-    gram, some = slopes.T @ slopes, list(places)
-    noise = left - slopes @ np.linalg.lstsq(slopes, left, rcond=None)[0]
-    variance = max(1.0, float(noise @ noise) / max(len(left) - count, 1))
-    seen = gram @ root
-    inner = variance * np.eye(root.shape[1]) + root.T @ seen
-    # Residual weights are the slopes times this matrix.
-    weights = ((np.eye(count) - root @ np.linalg.solve(inner, seen.T)) / variance)[:, some]
-    held = np.diag(precision[some])
-    inverse = np.linalg.inv(weights.T @ gram[:, some] + held)
-    by = -inverse @ (weights.T @ (slopes.T @ left) + precision[some] * off[some])
-    louder = _louder(slopes, noise, legs, variance)
-    spread = variance * gram * np.outer(louder, louder) + seen @ seen.T
-    covariance = inverse @ (weights.T @ spread @ weights + held) @ inverse
-    return Change(np.asarray(by, dtype=np.float64), np.asarray(covariance, dtype=np.float64))
-
-
-def _louder(slopes: FloatArray, noise: FloatArray, legs: FloatArray, variance: float) -> FloatArray:
-    """Returns, by coordinate, the factor by which correlation within legs inflates the standard error."""
-    white = variance * np.sum(np.square(slopes), axis=0)
-    squares = np.sum(np.square(over_legs(slopes * noise[:, None], legs)), axis=0)
-    times = np.divide(squares, white, out=np.ones_like(white), where=white > 0.0)
-    return np.asarray(np.sqrt(np.maximum(times, 1.0)), dtype=np.float64)
-
-
 # ----------------------------------------------------------------
 
-CHECK_S = 20.0
+CHECK_S = 17.0
 """Duration of the pieces on which a longer recording is checked."""
 SIZES = (1.0, 2.5, 4.0, 6.0)
 """Trial changes of each parameter, in both directions, in units of its least change. Slopes do not cover
@@ -215,10 +175,10 @@ LEAST_SUSPECT = 0.25
 TOLERATED = (1.0 / 3.0) ** 2
 """Minimum mean square that a cause must explain in some channel, in squares of its noise: a twin may be off
 by a third of the noise, which nobody at the bench would see."""
-OWN = ("load friction", "temperature", "current limit", "velocity feed-forward")
-"""Parameters checked in addition to those that a fit changes."""
-KNOWN_WARMTH = "temperature"
-"""Parameter of `OWN` that is known if both twin and recording have the temperature."""
+WARMTH = "temperature"
+OWN = ("load friction", WARMTH, "current limit", "velocity feed-forward")
+"""Parameters checked in addition to those that a fit changes; the temperature unless twin and recording have
+it."""
 GROWN = 1.5
 """Ratio of two misfits above which an axis has changed; smaller ones come from noise and different legs."""
 EXPLAINED = 0.25
@@ -234,17 +194,15 @@ NOTICEABLE = 2.5
 
 @dataclass(frozen=True, slots=True)
 class Check:
-    """Result of a check: the changes, and the misfit that they leave."""
+    """Result of a check: the changes, and the growth of the misfit that they leave."""
 
     changes: tuple[Finding, ...]
-    misfit_after: Mapping[str, float]
-    """Rms residual of the twin with the changes, by channel, in units of the noise of its own fit."""
+    growth_before: Mapping[str, float]
+    """Ratio, by channel, of the twin's misfit to this recording and to its own recordings."""
+    growth_after: Mapping[str, float]
+    """The same with the changes."""
     unseen: tuple[str, ...] = ()
     """Causes of which even a large change would not show, in this motion or with this twin."""
-    growth_before: Mapping[str, float] = field(default_factory=dict)
-    """Ratio, by channel, of the twin's misfit to this recording and to its own recordings."""
-    growth_after: Mapping[str, float] = field(default_factory=dict)
-    """The same with the changes."""
     blind: bool = False
     """True if no change of any cause would show."""
 
@@ -253,19 +211,14 @@ class Check:
         """Summary in words: the changes, channels whose misfit has grown, and causes that cannot show."""
         found = ["Nothing has changed since the twin was made"]
         if self.changes:
-            found = [f"Changed since the twin was made: {'. '.join(each.text for each in self.changes)}"]
-        elif self.unexplained or self.grown:
+            found = [f"Changed since the twin was made: {'. '.join(map(str, self.changes))}"]
+        elif self.unexplained:
             found = ["Something has changed since the twin was made that no change of a cause explains"]
         elif self.blind:
             found = ["The twin explains too little of this axis to show a change"]
         found += [
-            f"Unexplained: {name}, {times:.0f} times what the twin was off by when it was made"
+            f"The twin leaves {figure(times, 3)} times as much of the {name} as when it was made"
             for name, times in self.unexplained.items()
-        ]
-        found += [
-            f"The twin leaves {times:.1f} times as much of the {name} as when it was made"
-            for name, times in self.grown.items()
-            if name not in self.unexplained
         ]
         if self.unseen and not self.blind:
             found.append(f"A change of {', '.join(self.unseen)} would not have shown")
@@ -273,11 +226,6 @@ class Check:
 
     @property
     def unexplained(self) -> dict[str, float]:
-        """Channels that the changes do not explain, with their values of `misfit_after`."""
-        return {name: times for name, times in self.misfit_after.items() if times > SOFT}
-
-    @property
-    def grown(self) -> dict[str, float]:
         """Channels whose misfit has grown in spite of the changes, with their ratios."""
         return {name: times for name, times in self.growth_after.items() if times > GROWN}
 
@@ -299,30 +247,31 @@ def check(
     data = coarse(prepare(recording, axis, twin), CHECK_S)
     floor = noise_floor(data)
     scale = {name: max(known.noise.get(name, 0.0), floor[name]) for name in CHANNELS}
-    parameters = free_parameters(twin, _own(data, twin))
+    # A recorded temperature is not a change.
+    known_warmth = BY_NAME[WARMTH].path in twin.intervals and all(
+        each.commands.start_c is not None for each in data.pieces
+    )
+    parameters = free_parameters(twin, [each for each in OWN if not (known_warmth and each == WARMTH)])
     with Replays(data, workers) as replays:
         (before,) = replays([twin])
-        grown = growth(data, before, known.misfit, scale)
+        was = scales_by_kind(data, known.misfit, scale)
+        grown = growth(data, before, was)
         if not known.of_axis:
-            return _by_ratio(replays, twin, known.misfit, scale, parameters, grown, progress)
+            return _by_ratio(replays, twin, was, parameters, grown, progress)
         search = _Search(replays, twin, known, scale, parameters)
         best = search.found(progress)
         (after,) = replays([best.truth])
         if search.worsens(best):
             best, after = search.unchanged, before
-        now = _in_scales(after, scale)
     progress(1.0)
-    gain = (_rms(before, scale), _rms(after, scale))
-    changes = tuple(search.change(cause, best, gain) for cause in best.causes)
-    left = growth(data, after, known.misfit, scale)
-    return Check(changes, now, search.unseen(best), grown, left)
+    changes = tuple(search.change(cause, best) for cause in best.causes)
+    return Check(changes, grown, growth(data, after, was), search.unseen(best))
 
 
 def _by_ratio(
     replays: Replays,
     twin: Truth,
-    misfit: Misfit,
-    noise: Mapping[str, float],
+    was: Mapping[str, Any],
     parameters: Sequence[Parameter],
     grown: dict[str, float],
     progress: Callable[[float], None],
@@ -333,17 +282,12 @@ def _by_ratio(
     no other cause does so equally well within the scatter of the legs.
     """
     data = replays.data
-    groups: dict[str, tuple[Parameter, ...]] = {}
-    for each in parameters:
-        groups[each.cause] = (*groups.get(each.cause, ()), each)
-    unseen = tuple(cause for cause, own in groups.items() if not _shows(replays, twin, own, misfit, noise))
+    groups = by_cause(parameters)
+    unseen = tuple(cause for cause, own in groups.items() if not _shows(replays, twin, own, was))
     blind = len(unseen) == len(groups)
     if max(grown.values(), default=0.0) <= GROWN:
-        return Check((), {}, unseen, grown, grown, blind)
-    scale, legs = (
-        Scales(scales_by_kind(data, misfit, noise)),
-        legs_of_rows(data, fitted_rows(data, everything=True)),
-    )
+        return Check((), grown, grown, unseen, blind)
+    legs = legs_of_rows(data, fitted_rows(data, everything=True))
     named: list[str] = []
     best: Fitted | None = None
     left, now = _excess(grown), grown
@@ -353,11 +297,19 @@ def _by_ratio(
             own = tuple(each for name in (*named, cause) for each in groups[name])
             start, prior = best.truth if best else twin, np.array(coordinates(twin, own))
             fits[cause] = solve(
-                replays, start, own, prior, STEPS, known=scale, everything=True, tempered=True
+                replays,
+                start,
+                own,
+                STEPS,
+                prior,
+                known=Scales(was),
+                everything=True,
+                tempered=True,
+                linear=False,
             )
             progress((number + len(fits) / len(groups)) / MOST_NAMED)
         cause = min(fits, key=lambda each: fits[each].cost)
-        now_grown = growth(data, fits[cause].residuals, misfit, noise)
+        now_grown = growth(data, fits[cause].residuals, was)
         near = fits[cause].vector
         rivals = [
             each
@@ -372,7 +324,7 @@ def _by_ratio(
             break
     progress(1.0)
     changes = tuple(_ratio(groups[cause], twin, best.truth) for cause in named) if best else ()
-    return Check(changes, {}, unseen, grown, now)
+    return Check(changes, grown, now, unseen)
 
 
 def _excess(grown: Mapping[str, float]) -> float:
@@ -380,20 +332,16 @@ def _excess(grown: Mapping[str, float]) -> float:
     return sum(max(each**2 - 1.0, 0.0) for each in grown.values())
 
 
-def _shows(
-    replays: Replays, twin: Truth, own: Sequence[Parameter], misfit: Misfit, noise: Mapping[str, float]
-) -> bool:
+def _shows(replays: Replays, twin: Truth, own: Sequence[Parameter], was: Mapping[str, Any]) -> bool:
     """Returns True if a noticeable change of one of the parameters would make the misfit grow."""
     moved = [
         _shifted(twin, each, way * NOTICEABLE * each.least_change) for each in own for way in (-1.0, 1.0)
     ]
     here, *there = replays([twin, *moved])
-    data = replays.data
-    was = scales_by_kind(data, misfit, noise)
     for found in there:
         # The change is uncorrelated with the twin's residuals, so squares add.
         change = {name: np.hypot(found[name] - here[name], was[name]) for name in CHANNELS}
-        if max(growth(data, change, misfit, noise).values(), default=0.0) > GROWN:
+        if max(growth(replays.data, change, was).values(), default=0.0) > GROWN:
             return True
     return False
 
@@ -410,15 +358,7 @@ def _ratio(own: Sequence[Parameter], before: Truth, after: Truth) -> Finding:
             moved.append((abs(now - was) / each.least_change, times))
     size = max(size for size, _ in moved)
     shown = tuple(each for times, each in moved if times >= min(1.0, size))
-    channels = tuple(name for name in CHANNELS if any(name in each.shows_in for each in own))
-    return Finding(own[0].cause, shown, channels, size, (1.0, 1.0))
-
-
-def _own(data: Data, twin: Truth) -> list[str]:
-    """Returns the parameters of `OWN` that are unknown; a recorded temperature is not a change."""
-    path = ".".join(BY_NAME[KNOWN_WARMTH].path)
-    told = path in twin.intervals and all(each.commands.start_c is not None for each in data.pieces)
-    return [each for each in OWN if not (told and each == KNOWN_WARMTH)]
+    return Finding(own[0].cause, shown)
 
 
 @dataclass(frozen=True, eq=False)
@@ -439,9 +379,9 @@ class _Place:
 
 @dataclass(frozen=True, eq=False)
 class _Moved:
-    """Change of a cause's parameters: their indices, distances from the twin's and covariance."""
+    """Change of a cause's parameters: distances of their coordinates from the twin's, and covariance."""
 
-    places: list[int]
+    parameters: list[Parameter]
     off: FloatArray
     covariance: FloatArray
 
@@ -449,6 +389,11 @@ class _Moved:
     def distance(self) -> float:
         """Mahalanobis distance, squared."""
         return float(self.off @ np.linalg.solve(self.covariance, self.off))
+
+    @property
+    def errors(self) -> FloatArray:
+        """Standard errors, shape (p,)."""
+        return np.asarray(np.sqrt(np.diag(self.covariance)), dtype=np.float64)
 
 
 class _Search:
@@ -463,42 +408,39 @@ class _Search:
         parameters: tuple[Parameter, ...],
     ) -> None:
         self._replays, self._twin, self._scale = replays, twin, scale
-        self._steps, least = rounding(replays.data.axis), least_deviation(replays.data)
-        rounded = {name: step / 12.0**0.5 for name, step in self._steps.items()}
-        self._fine = {
-            name: max(least[name], math.sqrt(max(scale[name] ** 2 - rounded[name] ** 2, 0.0)))
-            for name in CHANNELS
-        }
         self._every = parameters
+        self._prior = np.array(coordinates(twin, parameters))
         self._causes = tuple(dict.fromkeys(each.cause for each in parameters))
-        tolerated = TOLERANCE / NORMAL_95 * np.array([each.least_change for each in parameters])
+        self._least = np.array([each.least_change for each in parameters])
+        self._spread = np.array([each.spread for each in parameters])
         self._known = known.root(parameters)
+        self._root = np.hstack([self._known, np.diag(TOLERANCE / NORMAL_95 * self._least)])
         self._reached: list[_Place] = []
-        self._root = np.hstack([self._known, np.diag(tolerated)])
         self._rows = fitted_rows(replays.data, everything=True)
         self._legs = legs_of_rows(replays.data, self._rows)
         self._channels = np.repeat(np.arange(len(CHANNELS)), len(self._rows) // len(CHANNELS))[self._rows]
 
     def at(self, causes: tuple[str, ...], truth: Truth) -> _Place:
         """Linearises the residuals at a truth that was fitted with these causes free."""
-        twin = np.array(coordinates(self._twin, self._every))
-        here = solve(self._replays, truth, self._every, twin, 0, known=Scales(self._scale), everything=True)
+        scale = Scales(self._scale)
+        here = solve(self._replays, truth, self._every, 0, self._prior, known=scale, everything=True)
         rng = np.random.default_rng(0)
         low, high = np.array([each.bounds for each in self._every]).T
         places = [
             np.clip(here.place + self._known @ rng.standard_normal(self._known.shape[1]), low, high)
             for _ in range(DRAWS)
         ]
-        drawn = self._replays.drawn([at_coordinates(truth, self._every, each.tolist()) for each in places])
+        truths = [at_coordinates(truth, self._every, each.tolist()) for each in places]
+        drawn = self._replays(truths, range(1, DRAWS + 1))
         left = np.stack(
             [
-                told(shown, Scales(self._scale), self._rows) - here.jacobian @ (each - here.place)
+                told(shown, scale, self._rows) - here.jacobian @ (each - here.place)
                 for each, shown in zip(places, drawn, strict=True)
             ]
         )
         apart = np.maximum(np.std(left, axis=0, ddof=1), 1.0)
         slopes, mean = here.jacobian / apart[:, None], np.mean(left, axis=0) / apart
-        return _Place(causes, truth, here.place - twin, slopes, mean, apart)
+        return _Place(causes, truth, here.place - self._prior, slopes, mean, apart)
 
     @cached_property
     def unchanged(self) -> _Place:
@@ -523,14 +465,14 @@ class _Search:
             pulled = [each for each in self._causes if each not in best.causes and self._pulled(each, best)]
             if not pulled and best.causes:
                 break
-            more = tuple(dict.fromkeys([*best.causes, *pulled, *(cause for cause, _ in starts)]))
-            for start in (best.truth, *(start for _, start in starts)):
+            more = tuple(dict.fromkeys([*best.causes, *pulled, *starts]))
+            for start in (best.truth, *starts.values()):
                 self._settle(more, start, best)
             step, last = self._needed(more), self._as(best.causes)
             if not step.causes or self._evidence(last) <= self._evidence(step):
                 best = last
                 break
-            best, starts = step, []
+            best, starts = step, {}
         return best if best.causes else unchanged
 
     def worsens(self, place: _Place) -> bool:
@@ -540,11 +482,34 @@ class _Search:
         )
         return bool(np.any(now > np.maximum(was, LOST)))
 
+    def change(self, cause: str, best: _Place) -> Finding:
+        """Returns the finding of a cause, with intervals of its parameters."""
+        moved = self._moved(cause, best)
+        now = np.array(coordinates(self._twin, moved.parameters)) + moved.off
+        after = at_coordinates(best.truth, moved.parameters, now.tolist())
+        intervals = intervals_of(moved.parameters, now, moved.covariance)
+        return finding(moved.parameters, self._twin, after, intervals)
+
+    def unseen(self, best: _Place) -> tuple[str, ...]:
+        """Returns the causes whose parameters the recording does not determine better than the prior."""
+        return tuple(
+            cause
+            for cause in self._causes
+            if cause not in best.causes
+            and np.all(
+                NORMAL_95 * self._moved(cause, best, cause).errors > self._spread[self._numbers(cause)]
+            )
+        )
+
+    def _numbers(self, *causes: str) -> list[int]:
+        """Returns the numbers of the parameters of some causes."""
+        return [number for number, each in enumerate(self._every) if each.cause in causes]
+
     def _needed(self, causes: tuple[str, ...]) -> _Place:
         """Removes causes that the other causes and the twin's uncertainty can replace."""
         best, tried = self._as(causes), set[str]()
-        while rest := sorted(set(best.causes) - tried, key=lambda cause: self._moved(cause, best).distance):
-            cause = rest[0]
+        while rest := set(best.causes) - tried:
+            cause = min(rest, key=lambda each: self._moved(each, best).distance)
             kept = tuple(each for each in best.causes if each != cause)
             self._settle(kept, self._without(cause, kept, best), best)
             best, without = self._as(best.causes), self._as(kept)
@@ -561,38 +526,29 @@ class _Search:
             replace(each, spread=float(spread))
             for each, spread in zip(self._every, self._spreads(causes), strict=True)
         )
-        prior, apart = np.array(coordinates(self._twin, parameters)), near.apart
-        fit: Fitted | None = None
+        steps, least = rounding(self._replays.data.axis), least_deviation(self._replays.data)
+        # Rounding is not noise here: it is in the likelihood.
+        fine = {
+            name: max(least[name], math.sqrt(max(self._scale[name] ** 2 - steps[name] ** 2 / 12.0, 0.0)))
+            for name in CHANNELS
+        }
+        apart, fit = near.apart, None
         for share in BLUNT:
+            off = {name: max(fine[name], share * self._scale[name]) for name in CHANNELS}
+            known = Scales(self._scales_of(apart, off), steps)
             fit = solve(
-                self._replays,
-                start,
-                parameters,
-                prior,
-                STEPS,
-                known=self._rounded(apart, share),
-                everything=True,
-                near=fit,
-                tempered=True,
-            )
+                self._replays, start, parameters, STEPS, self._prior, known=known, everything=True, near=fit,
+                tempered=True, linear=False,
+            )  # fmt: skip
             # Samples that are still beyond `SOFT` cannot be explained and would bias all parameters.
             start, apart = fit.truth, np.where(np.abs(fit.vector) > SOFT, np.inf, apart)
         self._reached.append(self.at(causes, start))
 
-    def _rounded(self, apart: FloatArray, blunt: float) -> Scales:
-        """Returns scales with the rounding of the readings, and the error of replays by row."""
-        off = {name: max(self._fine[name], blunt * self._scale[name]) for name in CHANNELS}
-        return Scales(self._scales_of(apart, off), self._steps)
-
     def _spreads(self, causes: tuple[str, ...]) -> FloatArray:
         """Returns the prior standard deviation of each parameter about the twin if these causes are free."""
-        open_by = np.sqrt(np.sum(np.square(self._root), axis=1))
-        return np.array(
-            [
-                each.spread if each.cause in causes else min(each.spread, float(most))
-                for each, most in zip(self._every, open_by, strict=True)
-            ]
-        )
+        held = np.sqrt(np.sum(np.square(self._root), axis=1))
+        held[self._numbers(*causes)] = np.inf
+        return np.asarray(np.minimum(held, self._spread), dtype=np.float64)
 
     def _without(self, cause: str, kept: tuple[str, ...], at: _Place) -> Truth:
         """Returns the truth with a cause reset to the twin and the others moved to their linear optimum.
@@ -600,7 +556,7 @@ class _Search:
         Without that move, the others would still compensate for the removed change, and a fit from there
         might not converge.
         """
-        own = np.array([each.cause == cause for each in self._every])
+        own = np.isin(np.arange(len(self._every)), self._numbers(cause))
         weak = np.diag(1.0 / self._spreads(kept)[~own])
         rows = np.vstack([at.slopes[:, ~own], weak])
         # Relative to the twin's values, so that the prior's mean is zero.
@@ -608,13 +564,12 @@ class _Search:
         others = [each for each in self._every if each.cause != cause]
         off = -np.linalg.lstsq(rows, left, rcond=None)[0]
         low, high = np.array([each.bounds for each in others]).T
-        there = np.clip(np.array(coordinates(self._twin, others)) + off, low, high)
+        there = np.clip(self._prior[~own] + off, low, high)
         return at_coordinates(self._put_back(cause, at.truth), others, there.tolist())
 
     def _put_back(self, cause: str, truth: Truth) -> Truth:
         """Returns a truth with a cause's parameters reset to the twin's."""
-        own = [each for each in self._every if each.cause == cause]
-        return at_coordinates(truth, own, coordinates(self._twin, own))
+        return put_back(self._twin, truth, [each for each in self._every if each.cause == cause])
 
     def _pull(self, numbers: Sequence[int], at: _Place) -> float:
         """Returns the squared Mahalanobis distance of parameters from the twin, by the twin's covariance."""
@@ -623,33 +578,10 @@ class _Search:
 
     def _pulled(self, cause: str, best: _Place) -> bool:
         """Returns True if a cause that is held to the twin has moved by more than chance."""
-        own = [number for number, each in enumerate(self._every) if each.cause == cause]
+        own = self._numbers(cause)
         return float(chdtrc(len(own), self._pull(own, best))) < FALSE_ALARM / len(self._causes)
 
-    def change(self, cause: str, best: _Place, gain: tuple[float, float]) -> Finding:
-        """Returns the finding of a cause, with intervals of its parameters."""
-        moved = self._moved(cause, best)
-        parameters = [self._every[place] for place in moved.places]
-        now = np.array(coordinates(self._twin, parameters)) + moved.off
-        reach = NORMAL_95 * np.sqrt(np.diag(moved.covariance))
-        intervals = {
-            each.name: (each.value(float(at - r)), each.value(float(at + r)))
-            for each, at, r in zip(parameters, now, reach, strict=True)
-        }
-        after = at_coordinates(best.truth, parameters, now.tolist())
-        return finding(parameters, self._twin, after, intervals, moved.distance, gain)
-
-    def unseen(self, best: _Place) -> tuple[str, ...]:
-        """Returns the causes whose parameters the recording does not determine better than the prior."""
-        found = []
-        for cause in (each for each in self._causes if each not in best.causes):
-            moved = self._moved(cause, best, cause)
-            spread = np.array([self._every[place].spread for place in moved.places])
-            if np.all(NORMAL_95 * np.sqrt(np.diag(moved.covariance)) > spread):
-                found.append(cause)
-        return tuple(found)
-
-    def _contenders(self, best: _Place, suspects: Sequence[str]) -> list[tuple[str, Truth]]:
+    def _contenders(self, best: _Place, suspects: Sequence[str]) -> dict[str, Truth]:
         """Returns suspects that explain more than they cost by one moved parameter, with these truths."""
         moves = [
             (each, way * size * each.least_change)
@@ -659,19 +591,16 @@ class _Search:
             for way in (-1.0, 1.0)
         ]
         truths = [self._twin, *(_shifted(self._twin, each, by) for each, by in moves)]
-        scale = self._scales_of(best.apart)
-        here, *costs = (self._cost(found, scale) for found in self._replays(truths))
+        scale = Scales(self._scales_of(best.apart))
+        lefts = (told(found, scale, self._rows) for found in self._replays(truths))
+        here, *costs = (0.5 * float(left @ left) for left in lefts)
         nearest: dict[str, tuple[float, Truth]] = {}
         for (each, _), cost, there in zip(moves, costs, truths[1:], strict=True):
             price = 0.5 * self._price(each.cause)
             if cost + price < nearest.get(each.cause, (here, there))[0]:
                 nearest[each.cause] = (cost + price, there)
         ranked = sorted(nearest, key=lambda cause: nearest[cause][0])
-        return [(cause, nearest[cause][1]) for cause in ranked[:CONTENDERS]]
-
-    def _cost(self, found: dict[str, FloatArray], scale: dict[str, Any]) -> float:
-        left = told(found, Scales(scale), self._rows)
-        return 0.5 * float(left @ left)
+        return {cause: nearest[cause][1] for cause in ranked[:CONTENDERS]}
 
     def _scales_of(self, apart: FloatArray, scale: Mapping[str, float] | None = None) -> dict[str, Any]:
         """Returns the scale of each row by channel: ``scale`` (default: the noise) times ``apart``."""
@@ -682,29 +611,42 @@ class _Search:
         return {name: scale[name] * each for name, each in by_channel}
 
     def _moved(self, cause: str, at: _Place, *more: str, trusted: bool = False) -> _Moved:
-        """Estimates a cause's change with the place's causes free and the others held to the posterior.
+        """Estimates a cause's change by generalised least squares, with the place's causes free.
 
-        ``trusted``: without the tolerance for errors of the twin beyond its covariance.
+        The others are held to the twin by a root of its covariance. ``trusted``: without the tolerance for
+        errors of the twin beyond its covariance. Residuals that are correlated within legs inflate the
+        standard errors.
         """
-        free = [number for number, each in enumerate(self._every) if each.cause in (*at.causes, *more)]
-        precision = np.array([each.spread for each in self._every]) ** -2.0
-        along = np.where(np.isin(np.arange(len(self._every)), free), 0.0, at.off)
-        left = at.left - at.slopes @ along
-        root = self._known if trusted else self._root
-        found = change_of(free, at.slopes, left, self._legs, root, precision, at.off)
-        own = [number for number, place in enumerate(free) if self._every[place].cause == cause]
-        places = [free[number] for number in own]
-        return _Moved(places, at.off[places] + found.by[own], found.covariance[np.ix_(own, own)])
+        free, count = self._numbers(*at.causes, *more), len(self._every)
+        root, slopes = self._known if trusted else self._root, at.slopes
+        left = at.left - slopes @ np.where(np.isin(np.arange(count), free), 0.0, at.off)
+        gram = slopes.T @ slopes
+        noise = left - slopes @ np.linalg.lstsq(slopes, left, rcond=None)[0]
+        variance = max(1.0, float(noise @ noise) / max(len(left) - count, 1))
+        seen = gram @ root
+        inner = variance * np.eye(root.shape[1]) + root.T @ seen
+        # Residual weights are the slopes times this matrix.
+        weights = ((np.eye(count) - root @ np.linalg.solve(inner, seen.T)) / variance)[:, free]
+        held = self._spread[free] ** -2.0
+        inverse = np.linalg.inv(weights.T @ gram[:, free] + np.diag(held))
+        by = -inverse @ (weights.T @ (slopes.T @ left) + held * at.off[free])
+        white = variance * np.diag(gram)
+        by_leg = np.sum(np.square(over_legs(slopes * noise[:, None], self._legs)), axis=0)
+        louder = np.sqrt(np.maximum(np.divide(by_leg, white, out=np.ones(count), where=white > 0.0), 1.0))
+        spread = variance * gram * np.outer(louder, louder) + seen @ seen.T
+        covariance = inverse @ (weights.T @ spread @ weights + np.diag(held)) @ inverse
+        own = [place for place, number in enumerate(free) if self._every[number].cause == cause]
+        numbers = [free[place] for place in own]
+        parameters = [self._every[number] for number in numbers]
+        return _Moved(parameters, at.off[numbers] + by[own], covariance[np.ix_(own, own)])
 
     def _price(self, cause: str) -> float:
         """Returns the penalty of a cause for its number of parameters (Schwarz criterion, BIC)."""
-        count = sum(each.cause == cause for each in self._every)
-        return count * math.log(max(len(self._replays.data.leg), 2))
+        return len(self._numbers(cause)) * math.log(max(len(self._replays.data.leg), 2))
 
     def _suspect(self, cause: str, best: _Place) -> bool:
         """Returns True if a cause may be relevant by the linearised fit."""
-        free = [number for number, each in enumerate(self._every) if each.cause in (*best.causes, cause)]
-        slopes = best.slopes[:, free]
+        slopes = best.slopes[:, self._numbers(*best.causes, cause)]
         after = best.left - slopes @ np.linalg.lstsq(slopes, best.left, rcond=None)[0]
         explained = self._squares(best.left) - self._squares(after)
         return bool(np.any(explained > LEAST_SUSPECT * TOLERATED)) and self._certain(
@@ -713,11 +655,8 @@ class _Search:
 
     def _matters(self, cause: str, found: _Place) -> bool:
         """Returns True if a cause explains more than the tolerated error of a twin."""
-        back = self._put_back(cause, found.truth)
-        with_it, without = (
-            told(each, Scales(self._scales_of(found.apart)), self._rows)
-            for each in self._replays([found.truth, back])
-        )
+        back, scale = self._put_back(cause, found.truth), Scales(self._scales_of(found.apart))
+        with_it, without = (told(each, scale, self._rows) for each in self._replays([found.truth, back]))
         return bool(np.any(self._squares(without) - self._squares(with_it) > TOLERATED))
 
     def _as(self, causes: tuple[str, ...]) -> _Place:
@@ -737,10 +676,9 @@ class _Search:
         larger ones come from a motor that broke away at another time, and a few would outweigh all others.
         """
         left = np.minimum(np.abs(at.left), SOFT)
-        others = [number for number, each in enumerate(self._every) if each.cause not in at.causes]
-        along = self._pull(others, at)
+        others = self._numbers(*(each for each in self._causes if each not in at.causes))
         wide = 2.0 * float(np.sum(np.log(at.apart)))
-        return 0.5 * (float(left @ left) + wide + along + sum(map(self._price, at.causes)))
+        return 0.5 * (float(left @ left) + wide + self._pull(others, at) + sum(map(self._price, at.causes)))
 
     def _squares(self, left: FloatArray) -> FloatArray:
         """Returns the mean square by channel."""
@@ -750,14 +688,13 @@ class _Search:
 
     def _certain(self, moved: _Moved) -> bool:
         """Returns True if a change is significant."""
-        return float(chdtrc(len(moved.places), moved.distance)) < FALSE_ALARM / len(self._causes)
+        return float(chdtrc(len(moved.off), moved.distance)) < FALSE_ALARM / len(self._causes)
 
     def _significant(self, cause: str, at: _Place) -> bool:
         """Returns True if a cause's change is significant and as large as matters in practice."""
         moved = self._moved(cause, at)
-        off, spread = np.abs(moved.off), np.sqrt(np.diag(moved.covariance))
-        least = np.array([self._every[place].least_change for place in moved.places])
-        return self._certain(moved) and bool(np.any((off > least) & (off > 2.0 * spread)))
+        large = np.abs(moved.off) > np.maximum(self._least[self._numbers(cause)], 2.0 * moved.errors)
+        return self._certain(moved) and bool(np.any(large))
 
 
 def _shifted(truth: Truth, parameter: Parameter, by: float) -> Truth:
@@ -765,11 +702,3 @@ def _shifted(truth: Truth, parameter: Parameter, by: float) -> Truth:
     low, high = parameter.bounds
     (now,) = coordinates(truth, [parameter])
     return at_coordinates(truth, [parameter], [min(max(now + by, low), high)])
-
-
-def _in_scales(found: Mapping[str, FloatArray], scale: Mapping[str, float]) -> dict[str, float]:
-    return {name: float(np.sqrt(np.mean(np.square(found[name])))) / scale[name] for name in CHANNELS}
-
-
-def _rms(found: Mapping[str, FloatArray], scale: Mapping[str, float]) -> float:
-    return math.sqrt(sum(each**2 for each in _in_scales(found, scale).values()) / len(CHANNELS))

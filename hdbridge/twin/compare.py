@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any, Final
 
 import numpy as np
@@ -98,11 +98,6 @@ OVER_S: Final = 0.04
 """Window of the rms amplitude: half a period of the slowest ringing, 15 Hz."""
 SHORTEST_SWING: Final = 4
 DRAWS: Final = 24
-
-
-def band_arcsec(noise_arcsec: float) -> float:
-    """Returns the amplitude below which a load with this noise has settled."""
-    return max(SETTLED_ARCSEC, SETTLED_NOISE * noise_arcsec)
 
 
 def settling_s(time_s: FloatArray, load_arcsec: FloatArray, noise_arcsec: float, band: float) -> float:
@@ -212,21 +207,7 @@ class Comparison:
 
     def as_dict(self) -> dict[str, Any]:
         """Returns the figures for JSON."""
-        return {
-            "figures": [
-                {
-                    "channel": each.channel,
-                    "kind": each.kind,
-                    "unit": each.unit,
-                    "measured": each.measured,
-                    "simulated": each.simulated,
-                    "difference": each.difference,
-                    "noise": each.noise,
-                    "count": each.count,
-                }
-                for each in self.rows
-            ]
-        }
+        return {"figures": [asdict(each) for each in self.rows]}
 
 
 @dataclass(frozen=True, eq=False)
@@ -264,15 +245,20 @@ def compare(measured: Record, simulated: Record, legs: Sequence[Segment], ratio:
         offset = np.median(real.by_name[LOAD_ERROR][part] - twin.by_name[LOAD_ERROR][part])
         twin.by_name[LOAD_ERROR][part] += offset
     moves = _moving(real, parts)
-    calm = ~moves & (_since_motion_s(real.time_s, moves, parts) > CALM_S)
+    calm = ~moves
     for part in parts:
+        moved_s = np.maximum.accumulate(np.where(moves[part], real.time_s[part], -np.inf))
+        calm[part] &= real.time_s[part] - moved_s > CALM_S
         if np.count_nonzero(calm[part]) >= LEAST_SAMPLES:
             apart = real.by_name[FOLLOWING_ERROR][part] - twin.by_name[FOLLOWING_ERROR][part]
             twin.by_name[FOLLOWING_ERROR][part] += np.median(apart[calm[part]])
     motor = measured.motor_position_deg
     count_deg = least_change(np.concatenate([np.diff(motor[part]) for part in parts]), motor)
     groups = _groups(measured.time_s, legs, ~unknown_rows(measured, count_deg))
-    goes = ~_stands(measured, parts, count_deg)
+    # At standstill, the torque depends on a thousandth of a count.
+    target, reach_deg = real.command_deg, STANDS_COUNTS * count_deg
+    moved = np.concatenate([np.diff(target[part], prepend=target[part.start]) != 0.0 for part in parts])
+    goes = ~np.concatenate([stands(moved[part], motor[part], reach_deg) for part in parts])
     rows = [
         row
         for kind, inside in groups.items()
@@ -321,17 +307,6 @@ def _moving(real: _Signals, parts: Sequence[slice]) -> Rows:
             speed = np.abs(np.diff(real.command_deg[part])) / step
             moves[part] = np.concatenate([speed[:1], speed]) > MOVING_DEG_S
     return moves
-
-
-def _since_motion_s(time_s: FloatArray, moves: Rows, parts: Sequence[slice]) -> FloatArray:
-    """Returns the time since the command last moved, by part; infinite before its first motion."""
-    since = np.full(len(time_s), np.inf)
-    for part in parts:
-        rows = np.where(moves[part], np.arange(part.start, part.stop), -1)
-        last = np.maximum.accumulate(rows)
-        seen = np.flatnonzero(last >= 0)
-        since[part.start + seen] = time_s[part.start + seen] - time_s[last[seen]]
-    return since
 
 
 def _of_signal(
@@ -384,19 +359,6 @@ def noise_of(values: FloatArray, which: Rows, parts: Sequence[slice]) -> float:
     return max(spread, resolution / math.sqrt(12.0) if math.isfinite(resolution) else 0.0)
 
 
-def _stands(measured: Record, parts: Sequence[slice], count_deg: float) -> Rows:
-    """Returns the mask of rows at standstill, where the torque depends on a thousandth of a count."""
-    target, motor = measured.motor_target_deg, measured.motor_position_deg
-    assert target is not None
-    still = [
-        stands(
-            np.diff(target[part], prepend=target[part.start]) != 0.0, motor[part], STANDS_COUNTS * count_deg
-        )
-        for part in parts
-    ]
-    return np.concatenate(still)
-
-
 def least_change(changes: FloatArray, values: FloatArray) -> float:
     """Returns the smallest change of a reading above rounding errors."""
     beyond, size = 1e-9 * float(np.max(np.abs(values), initial=1.0)), np.abs(changes)
@@ -436,7 +398,7 @@ def _stops(real: _Signals, twin: _Signals, parts: Sequence[slice]) -> Iterator[_
             noises = [noise_of(each.load_arcsec, rest, [part]) for each in (real, twin)]
             loads = [each.load_arcsec[stop:end] for each in (real, twin)]
             times = real.time_s[stop:end]
-            band = band_arcsec(noises[0])
+            band = max(SETTLED_ARCSEC, SETTLED_NOISE * noises[0])
             settled = [settling_s(times, *each, band) for each in zip(loads, noises, strict=True)]
             scatter = scatter_s(times, loads[1], noises[1], band, noises)
             beyond = [overshoot_arcsec(each, way) for each in loads]

@@ -11,9 +11,9 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import reduce
 from itertools import product
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,6 +31,7 @@ from hdbridge.sim.truth.motor import TrueNotch, TrueObserver
 from hdbridge.twin.misfit import (
     CHANNELS,
     FINE,
+    SMOOTH,
     Data,
     Loops,
     Piece,
@@ -38,7 +39,6 @@ from hdbridge.twin.misfit import (
     Scales,
     Values,
     counted,
-    demand_deg,
     expected,
     least_deviation,
     misfit,
@@ -67,7 +67,7 @@ from hdbridge.twin.parameters import (
     with_sections,
     with_values,
 )
-from hdbridge.twin.replay import MOVING_DEG_S
+from hdbridge.twin.replay import MOVING_DEG_S, demand_deg
 from hdbridge.units import ARCSEC_PER_DEG
 
 # ----------------------------------------------------------------
@@ -90,68 +90,59 @@ LEAST_SHARE = 0.15
 """Maximum relative standard error of a coefficient that is used: a fifth of the prior's width."""
 
 
-@dataclass(frozen=True, slots=True)
-class Readings:
-    """Results of the regressions; None for values that the motion does not show."""
+def read_off(data: Data) -> dict[str, float]:
+    """Returns the values that the regressions over all pieces show, by name.
 
-    lag_s: float | None
-    """Age of the demand: following error over speed."""
-    load_inertia_kg_m2: float | None
-    coulomb_nm: float | None
-    viscous_nm_s_per_rad: float | None
-    held_nm: float | None
-    """Highest motor torque, if it is held while the motor moves."""
-
-
-def read_off(data: Data) -> Readings:
-    """Runs the regressions over all pieces."""
-    return Readings(_lag_s(data), *_mechanics(data), _held_nm(data))
+    ``lag_s`` is the age of the demand, following error over speed; ``held_nm`` the highest motor torque if it
+    is held while the motor moves.
+    """
+    found = _mechanics(data) | {"lag_s": _lag_s(data), "held_nm": _held_nm(data)}
+    return {name: value for name, value in found.items() if value is not None}
 
 
 def start_of(truth: Truth, data: Data) -> Truth:
     """Returns the truth with the values that the regressions give."""
     found = read_off(data)
-    values: dict[str, float] = {}
+    values: dict[str, float] = {
+        name: found[name] for name in ("Coulomb friction", "viscous friction") if name in found
+    }
     load, servo = truth.load_, truth.servo
-    if found.load_inertia_kg_m2 is not None:
-        scale = found.load_inertia_kg_m2 / load.whole_inertia_kg_m2
-        values["load inertia"] = load.inertia_kg_m2 * scale
+    if "load inertia" in found:
         # Spring and damping are scaled to keep the resonance frequency of the start.
+        scale = found["load inertia"] / load.whole_inertia_kg_m2
+        values["load inertia"] = load.inertia_kg_m2 * scale
         values["gear stiffness"] = truth.gear.stiffness_nm_per_rad * scale
         values["gear damping"] = truth.gear.damping_nm_s_per_rad * scale
-    if found.coulomb_nm is not None:
-        values["Coulomb friction"] = found.coulomb_nm
-    if found.viscous_nm_s_per_rad is not None:
-        values["viscous friction"] = found.viscous_nm_s_per_rad
-    if found.held_nm is not None:
-        held_percent = 100.0 * found.held_nm / truth.motor.rated_torque_nm
-        if held_percent < min(servo.torque_limit_percent, data.axis.limits.torque_percent):
-            values["current limit"] = held_percent
-    if found.lag_s is not None:
-        filtered_ms = 2.0 * servo.command_filter_ms
-        dead_ms = 1e3 * found.lag_s - filtered_ms
-        if dead_ms >= 0.0:
-            values["servo dead time"] = dead_ms
-        else:
-            values |= {"servo dead time": 0.0, "command filter": max(500.0 * found.lag_s, 0.1)}
+    held_percent = 100.0 * found.get("held_nm", math.inf) / truth.motor.rated_torque_nm
+    if held_percent < min(servo.torque_limit_percent, data.axis.limits.torque_percent):
+        values["current limit"] = held_percent
+    if "lag_s" in found:
+        dead_ms = 1e3 * found["lag_s"] - 2.0 * servo.command_filter_ms
+        values["servo dead time"] = max(dead_ms, 0.0)
+        if dead_ms < 0.0:
+            values["command filter"] = max(500.0 * found["lag_s"], 0.1)
     return with_values(truth, values)
 
 
-def _mechanics(data: Data) -> tuple[float | None, float | None, float | None]:
-    """Returns load inertia, Coulomb friction and viscous friction."""
+def _mechanics(data: Data) -> dict[str, float | None]:
+    """Returns those of load inertia, Coulomb and viscous friction that the motion shows."""
     tables, torques = zip(*(_torques(piece, data) for piece in data.pieces), strict=True)
     table, torque = np.concatenate(tables), np.concatenate(torques)
     if not table[:, -1].any():
         table = table[:, :-1]
     if len(torque) <= LEAST_ROWS:
-        return None, None, None
+        return {}
     columns = list(table.T)
     found = _slope(torque, columns, LEAST_SHARE)
     if found and (found[0] is None or found[0] <= 0.0):
         # The motor inertia is not visible: estimate the load's without it.
-        found = [None, *(_slope(torque, columns[1:], LEAST_SHARE) or [None] * 4)]
-    load, coulomb, viscous = found[1:4] if found else (None, None, None)
-    return _positive(load), _positive(coulomb), _positive(viscous)
+        found = [None, *(_slope(torque, columns[1:], LEAST_SHARE) or ())]
+    names = ("load inertia", "Coulomb friction", "viscous friction")
+    return {
+        name: value
+        for name, value in zip(names, (found or [])[1:4], strict=False)
+        if value is not None and value > 0.0
+    }
 
 
 def _torques(piece: Piece, data: Data) -> tuple[FloatArray, FloatArray]:
@@ -201,34 +192,26 @@ def _held_nm(data: Data) -> float | None:
 
 
 def _lag_s(data: Data) -> float | None:
-    """Returns the ratio of following error and speed."""
-    lag_s: float | None = None
+    """Returns the ratio of following error and speed of the command."""
+    lag: list[float | None] | None = None
     for _ in range(2):  # the second time with the command delayed by the lag
-        late_s = min(max(lag_s or 0.0, 0.0), 0.1)
-        rows = [_following(piece, data, late_s) for piece in data.pieces]
-        speed, following = (np.concatenate(each) for each in zip(*rows, strict=True))
+        late_s = min(max((lag and lag[0]) or 0.0, 0.0), 0.1)
+        speeds, followings = [], []
+        for piece in data.pieces:
+            commands = piece.commands
+            demand, width = demand_deg(commands, data.axis), _width(commands.cycle_s)
+            late = np.interp(commands.row_cycles - late_s / commands.cycle_s, commands.row_cycles, demand)
+            speeds.append(np.gradient(_smoothed(late, width), commands.cycle_s))
+            followings.append(_smoothed(piece.measured[FOLLOWING], width))
+        speed, following = np.concatenate(speeds), np.concatenate(followings)
         moving = np.abs(speed) > MOVING_DEG_S
         lag = _slope(following[moving], [speed[moving]])
-        lag_s = lag[0] if lag else None
-    return lag_s
-
-
-def _following(piece: Piece, data: Data, late_s: float) -> tuple[FloatArray, FloatArray]:
-    """Returns the speed of the command, delayed by ``late_s``, and the following error."""
-    commands = piece.commands
-    demand = demand_deg(commands, data.axis)
-    late = np.interp(commands.row_cycles - late_s / commands.cycle_s, commands.row_cycles, demand)
-    width = _width(commands.cycle_s)
-    return np.gradient(_smoothed(late, width), commands.cycle_s), _smoothed(piece.measured[FOLLOWING], width)
+    return lag[0] if lag else None
 
 
 def _width(cycle_s: float) -> int:
     """Returns the number of rows to average."""
     return max(3, round(SMOOTHED_S / cycle_s))
-
-
-def _positive(value: float | None) -> float | None:
-    return value if value is not None and value > 0.0 else None
 
 
 def _smoothed(column: FloatArray, width: int) -> FloatArray:
@@ -304,7 +287,10 @@ def _like(own: Hysteresis, unit: dict[str, Any]) -> Hysteresis:
     """Returns a loop of another law with the same height and the same travel to half crossing."""
     travel_deg = _half_crossed_deg(own) / _half_crossed_deg(_TRUE.validate_python(unit))
     size = "width_deg" if "width_deg" in unit else "yield_deg"
-    return _TRUE.validate_python(unit | {"offset_arcsec": _offset_arcsec(own), size: travel_deg})
+    offset_arcsec = (
+        sum(each.limit_arcsec for each in own.elements) if isinstance(own, MaxwellSlip) else own.offset_arcsec
+    )
+    return _TRUE.validate_python(unit | {"offset_arcsec": offset_arcsec, size: travel_deg})
 
 
 def _half_crossed_deg(loop: Hysteresis) -> float:
@@ -318,12 +304,6 @@ def _half_crossed_deg(loop: Hysteresis) -> float:
         return law.advance(far_deg - travel_deg)
 
     return float(brentq(left, 0.0, far_deg))
-
-
-def _offset_arcsec(loop: Hysteresis) -> float:
-    if isinstance(loop, MaxwellSlip):
-        return sum(each.limit_arcsec for each in loop.elements)
-    return loop.offset_arcsec
 
 
 def _width_deg(loop: Hysteresis) -> float:
@@ -341,11 +321,6 @@ def _with_loop(truth: Truth, loop: Hysteresis) -> Truth:
 
 LEAST = 1e-9
 """Regularisation of the jackknife: share of the information that a single leg cannot have alone."""
-
-
-def information_of(slopes: FloatArray, spread: FloatArray) -> FloatArray:
-    """Returns the information matrix of unit-variance residuals and the prior, shape (p, p)."""
-    return np.asarray(slopes.T @ slopes + np.diag(spread**-2.0), dtype=np.float64)
 
 
 def over_legs(rows: FloatArray, legs: FloatArray) -> FloatArray:
@@ -393,13 +368,9 @@ def sandwich(slopes: FloatArray, left: FloatArray, legs: FloatArray, spread: Flo
 
 def eigen(slopes: FloatArray, spread: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Returns information and principal directions of the coordinates, in units of their spreads."""
-    _, size, directions = np.linalg.svd(root_of(slopes * spread, np.eye(len(spread))))
+    root = np.linalg.qr(np.concatenate([slopes * spread, np.eye(len(spread))]), mode="r")
+    _, size, directions = np.linalg.svd(root)
     return size**2, np.asarray(directions.T, dtype=np.float64)
-
-
-def root_of(*tables: FloatArray) -> FloatArray:
-    """Returns the upper triangular R with R'R equal to the sum of the tables' A'A."""
-    return np.asarray(np.linalg.qr(np.concatenate(tables), mode="r"), dtype=np.float64)
 
 
 # ----------------------------------------------------------------
@@ -439,6 +410,8 @@ class Fitted:
 
     truth: Truth
     parameters: tuple[Parameter, ...]
+    prior: FloatArray
+    """Mean of the prior of their coordinates, shape (p,)."""
     place: FloatArray
     """Coordinates of the parameters, shape (p,)."""
     covariance: FloatArray
@@ -461,11 +434,6 @@ class Fitted:
         return 0.5 * float(self.vector @ self.vector)
 
     @property
-    def inflation(self) -> float:
-        """Mean square of the scaled residuals, at least 1."""
-        return max(1.0, float(self.vector @ self.vector) / max(len(self.vector), 1))
-
-    @property
     def loss(self) -> float:
         """Negative log likelihood of the fitted readings by the fit's own scales, which must have steps.
 
@@ -478,11 +446,18 @@ class Fitted:
 
     def intervals(self) -> dict[str, tuple[float, float]]:
         """Returns 95 % intervals by parameter name."""
-        spread = NORMAL_95 * np.sqrt(np.diag(self.covariance))
-        return {
-            each.name: (each.value(float(x - s)), each.value(float(x + s)))
-            for each, x, s in zip(self.parameters, self.place, spread, strict=True)
-        }
+        return intervals_of(self.parameters, self.place, self.covariance)
+
+
+def intervals_of(
+    parameters: Sequence[Parameter], place: FloatArray, covariance: FloatArray
+) -> dict[str, tuple[float, float]]:
+    """Returns 95 % intervals by parameter name, from coordinates and their covariance."""
+    reach = NORMAL_95 * np.sqrt(np.diag(covariance))
+    return {
+        each.name: (each.value(float(x - r)), each.value(float(x + r)))
+        for each, x, r in zip(parameters, place, reach, strict=True)
+    }
 
 
 class _Problem:
@@ -533,15 +508,27 @@ class _Problem:
 
     def stepped(self, place: FloatArray, steps: int) -> FloatArray:
         """Returns the best place after at most so many trust-region steps, the first as long as a spread."""
+        left, latest = 1 + steps, np.empty(0)
 
         def at(move: FloatArray) -> FloatArray:
             there: FloatArray = np.clip(place + move * self.spread, self.low, self.high)
             return there
 
+        def residuals(move: FloatArray) -> FloatArray:
+            nonlocal left
+            left -= 1
+            return self.residuals(at(move))
+
+        def slopes(move: FloatArray) -> FloatArray:
+            nonlocal latest
+            if left:  # `least_squares` also asks for them after the last step, and does not use them
+                latest = self.slopes(at(move))
+            return latest
+
         end = least_squares(
-            lambda move: self.residuals(at(move)),
+            residuals,
             np.zeros(len(place)),
-            lambda move: self.slopes(at(move)),
+            slopes,
             ((self.low - place) / self.spread - EDGE, (self.high - place) / self.spread + EDGE),
             max_nfev=1 + steps,
             gtol=None,
@@ -561,35 +548,37 @@ def solve(
     replays: Replays,
     start: Truth,
     parameters: tuple[Parameter, ...],
-    prior: FloatArray,
     steps: int,
-    progress: Progress = lambda _: None,
+    prior: FloatArray | None = None,
     known: Scales | None = None,
     everything: bool = False,
     most: Scales | None = None,
     near: Fitted | None = None,
-    loops: Loops | None = None,
+    loops: Loops = SMOOTH,
     tempered: bool = False,
     wide: bool = False,
+    linear: bool = True,
 ) -> Fitted:
     """Fits parameters by `scipy.optimize.least_squares` in at most ``steps`` steps; with none, linearises.
 
-    ``prior`` is the prior's mean, shape (p,). ``known`` are the channels' scales; by default they are
-    estimated from the residuals before each round, at most ``most``, so that a worse channel does not lose
-    weight. ``tempered``: known scales grow with the residuals on the way to the minimum.
+    ``prior`` is the prior's mean, shape (p,), by default the start. ``known`` are the channels' scales; by
+    default they are estimated from the residuals before each round, at most ``most``, so that a worse channel
+    does not lose weight. ``tempered``: known scales grow with the residuals on the way to the minimum.
     Held-out legs count only with ``everything``. ``near`` is a fit of the same parameters that gives the
     directions of the first differences, ``loops`` the deviation of a drive's quantised loops from smooth
-    ones. ``wide``: the covariance uses wide differences.
+    ones. ``wide``: the covariance uses wide differences. Without ``linear`` it is the prior's, and the
+    Jacobian that of the last place but one.
     """
     data = replays.data
     rows = fitted_rows(data, everything=everything)
+    place = np.array(coordinates(start, parameters))
+    prior = place if prior is None else prior
     problem = _Problem(replays, start, parameters, prior, rows)
-    place = np.clip(coordinates(start, parameters), problem.low, problem.high)
     problem.along = None if near is None else near.jacobian
     idle = done = 0
     while True:
         found = problem.found(place)
-        problem.scale = known if known is not None else _capped(scales(data, found, loops), most)
+        problem.scale = known if known is not None else scales(data, found, loops, most)
         if done >= steps or idle == SETTLED:
             break
         if known is not None and tempered:
@@ -600,13 +589,27 @@ def solve(
         after = problem.residuals(place)
         idle = idle + 1 if 0.5 * float(before @ before - after @ after) < WORTH else 0
         done += taken
-        progress(done / steps)
-    problem.longer = 1.0
-    slopes = problem.slopes(place, wide=wide)[: -len(parameters)] / problem.spread
     left = told(found, problem.scale, rows)
-    covariance = sandwich(slopes, left, legs_of_rows(data, rows), problem.spread)
+    slopes, covariance = problem.along, np.diag(problem.spread**2)
+    if linear or slopes is None:
+        problem.longer = 1.0
+        slopes = problem.slopes(place, wide=wide)[: -len(parameters)] / problem.spread
+        covariance = sandwich(slopes, left, legs_of_rows(data, rows), problem.spread)
     truth = at_coordinates(start, parameters, place.tolist())
-    return Fitted(truth, parameters, place, covariance, problem.scale, found, rows, left, slopes)
+    return Fitted(truth, parameters, prior, place, covariance, problem.scale, found, rows, left, slopes)
+
+
+def continued(
+    replays: Replays,
+    best: Fitted,
+    steps: int,
+    most: Scales | None = None,
+    truth: Truth | None = None,
+    **options: Any,
+) -> Fitted:
+    """Continues a fit, at ``truth`` if given, with its loops' deviation; ``options`` are those of `solve`."""
+    options = {"loops": best.scales.loops, "most": most, **options}
+    return solve(replays, truth or best.truth, best.parameters, steps, best.prior, **options)
 
 
 def fitted_rows(data: Data, *, everything: bool = False) -> NDArray[np.bool_]:
@@ -629,13 +632,10 @@ def counting(off: FloatArray, scale: Scales, rows: NDArray[np.bool_]) -> tuple[F
     """Transforms scaled residuals by their likelihood and softens them; returns also the derivative."""
     half, stray = (each[rows] for each in scale.halves(len(rows) // len(CHANNELS)))
     root, slope = rooted(off, half, stray)
-    return softened(root), slope * _softening(root)
-
-
-def _capped(found: Scales, most: Scales | None) -> Scales:
-    if most is None:
-        return found
-    return replace(found, deviation={n: min(s, most.deviation[n]) for n, s in found.deviation.items()})
+    # Beyond `SOFT`, squares grow linearly (Huber loss).
+    size = np.maximum(np.abs(root) / SOFT, 1.0)
+    soft = np.sqrt(2.0 * size - 1.0)
+    return np.where(size > 1.0, np.sign(root) * SOFT * soft, root), slope / soft
 
 
 def _tempered(known: Scales, found: dict[str, FloatArray], rows: NDArray[np.bool_]) -> Scales:
@@ -692,19 +692,6 @@ def _moves(slopes: FloatArray, spread: FloatArray, times: float = 1.0) -> FloatA
     return moves
 
 
-def softened(values: FloatArray) -> FloatArray:
-    """Softens residuals: their squares grow linearly beyond `SOFT` (Huber loss)."""
-    size = np.abs(values) / SOFT
-    bent = np.where(size > 1.0, np.sqrt(np.maximum(2.0 * size - 1.0, 1.0)), size)
-    return np.sign(values) * SOFT * bent
-
-
-def _softening(values: FloatArray) -> FloatArray:
-    """Returns the derivative of `softened`."""
-    size = np.maximum(np.abs(values) / SOFT, 1.0)
-    return np.where(size > 1.0, 1.0 / np.sqrt(2.0 * size - 1.0), 1.0)
-
-
 # ----------------------------------------------------------------
 # Servo structures: the simulated servo is put together from blocks (`hdbridge.sim.servo`). A servo far from
 # the start is a minimum of its own. Blocks are added one at a time, and kept if they reduce what is left of
@@ -725,6 +712,9 @@ VELOCITY_FEEDFORWARD: Final = 0.9
 """Start value between none (rare) and the full speed."""
 FEW_STEPS, WHOLE_STEPS = 3, 25
 """Maximum steps of a fit: from each start between two halvings, and over the whole recording."""
+HOPELESS: Final = 2.0
+"""Ratio to the least cost after as many steps above which a start is dropped as well: the starts that won on
+three foreign servos had at most 1.8."""
 GAIN: Final = 0.97
 """Maximum ratio of the misfits with and without a block for keeping it; mere extra parameters gain less."""
 MECHANICS: Final = (
@@ -745,19 +735,8 @@ PLACES: Final = (0.7, 1.0, 1.4)
 """Start values of the notch frequency, relative to the resonance of motor and load."""
 
 
-class Fitting(NamedTuple):
-    """Start of a fit."""
-
-    truth: Truth
-    parameters: tuple[Parameter, ...]
-    prior: FloatArray
-    """Mean of the prior, shape (p,)."""
-
-
-def begun_at(truth: Truth, parameters: tuple[Parameter, ...]) -> Fitting:
-    """Returns a start whose prior is about its own values."""
-    low, high = np.array([each.bounds for each in parameters]).T
-    return Fitting(truth, parameters, np.clip(coordinates(truth, parameters), low, high))
+Start = tuple[Truth, tuple[Parameter, ...]]
+"""Start of a fit of a servo, whose prior is about its own values."""
 
 
 def in_best_structure(
@@ -778,11 +757,11 @@ def in_best_structure(
     best = with_blocks(few, best)
     keep(best)
     progress(0.8)
-    return _in_units(replays, begun_at(best.truth, best.parameters), WHOLE_STEPS)
+    return _in_units(replays, (best.truth, best.parameters), WHOLE_STEPS)
 
 
 def by_halving(
-    few: Replays, begun: Iterable[Fitting], keep: Callable[[Fitted], None] = lambda _: None
+    few: Replays, begun: Iterable[Start], keep: Callable[[Fitted], None] = lambda _: None
 ) -> Fitted:
     """Fits from each start for a few steps, from the better half for as many more, until one is left.
 
@@ -793,8 +772,9 @@ def by_halving(
     tried = [_in_units(few, each, FEW_STEPS) for each in begun]
     while True:
         tried = sorted(tried, key=lambda each: each.cost)[: (len(tried) + 1) // 2]
+        tried = [each for each in tried if each.cost <= HOPELESS * tried[0].cost]
         keep(tried[0])
-        tried = [_in_units(few, begun_at(each.truth, each.parameters), FEW_STEPS) for each in tried]
+        tried = [_in_units(few, (each.truth, each.parameters), FEW_STEPS) for each in tried]
         if len(tried) == 1:
             return tried[0]
 
@@ -809,12 +789,12 @@ def with_blocks(few: Replays, best: Fitted) -> Fitted:
     return best
 
 
-def _in_units(replays: Replays, start: Fitting, steps: int) -> Fitted:
+def _in_units(replays: Replays, start: Start, steps: int) -> Fitted:
     """Fits in `units`, far from the noise."""
-    return solve(replays, *start, steps, known=Scales(units(replays.data)), tempered=True)
+    return solve(replays, *start, steps, known=Scales(units(replays.data)), tempered=True, linear=False)
 
 
-def starts(truth: Truth, cycle_ms: float) -> Iterator[Fitting]:
+def starts(truth: Truth, cycle_ms: float) -> Iterator[Start]:
     """Yields the servos at which a fit starts.
 
     An acceleration feed-forward uses the filtered demand, or differences over whole SYNC cycles, which is a
@@ -838,7 +818,7 @@ def starts(truth: Truth, cycle_ms: float) -> Iterator[Fitting]:
     plain = split(truth.servo.dead_time_ms, filtered_ms)
     averaged = {"moving_average_ms": averaged_ms, **split(max(late_ms - 2.0 * SHORT_MS, 0.0), SHORT_MS)}
     whole = truth.motor.inertia_kg_m2 + truth.load_.whole_inertia_kg_m2 / truth.gear.ratio**2
-    fastest = VELOCITY_BANDWIDTH_RAD_S.value * truth.motor.inertia_kg_m2
+    fastest = VELOCITY_BANDWIDTH_RAD_S * truth.motor.inertia_kg_m2
     commands = (
         (plain, 0.0, ()),
         (plain, whole, ("inertia feed-forward",)),
@@ -863,10 +843,10 @@ def starts(truth: Truth, cycle_ms: float) -> Iterator[Fitting]:
                 }
             )
             parameters = (*known.values(), *(BY_NAME[each] for each in more))
-            yield begun_at(with_sections(truth.model_copy(update={"servo": servo}), parameters), parameters)
+            yield with_sections(truth.model_copy(update={"servo": servo}), parameters), parameters
 
 
-def more_blocks(best: Fitted) -> Iterator[Fitting]:
+def more_blocks(best: Fitted) -> Iterator[Start]:
     """Yields the servo with one more or a replaced block."""
     truth, servo = best.truth, best.truth.servo
     if servo.notch is None:
@@ -877,25 +857,25 @@ def more_blocks(best: Fitted) -> Iterator[Fitting]:
             notch = TrueNotch(frequency_hz=min(place * free_hz, 600.0), depth=0.5, width=0.7)
             notched = servo.model_copy(update={"notch": notch})
             parameters = (*best.parameters, *(BY_NAME[each] for each in NOTCH))
-            yield begun_at(truth.model_copy(update={"servo": notched}), parameters)
+            yield truth.model_copy(update={"servo": notched}), parameters
     if servo.observer is None:
         whole = truth.motor.inertia_kg_m2 + truth.load_.whole_inertia_kg_m2 / truth.gear.ratio**2
         for hz in OBSERVERS_HZ:
             observer = TrueObserver(frequency_hz=hz, share=0.5, inertia_kg_m2=whole)
             observed = servo.model_copy(update={"observer": observer})
             parameters = (*best.parameters, *(BY_NAME[each] for each in OBSERVER))
-            yield begun_at(truth.model_copy(update={"servo": observed}), parameters)
+            yield truth.model_copy(update={"servo": observed}), parameters
     if BY_NAME["moving average"] not in best.parameters:
         lag_ms = min(max(2.0 * servo.command_filter_ms, 0.5), 3.0)
         averaged = servo.model_copy(update={"moving_average_ms": 2.0 * lag_ms, "command_filter_ms": SHORT_MS})
         parameters = (*best.parameters, BY_NAME["moving average"])
-        yield begun_at(truth.model_copy(update={"servo": averaged}), parameters)
+        yield truth.model_copy(update={"servo": averaged}), parameters
     filters = tuple(BY_NAME[each] for each in ("speed filter", "torque filter"))
     if not {*filters} & {*best.parameters}:
-        yield begun_at(with_sections(truth, filters), (*best.parameters, *filters))
+        yield with_sections(truth, filters), (*best.parameters, *filters)
     if BY_NAME["friction feed-forward"] not in best.parameters:
         with_friction = with_values(truth, {"friction feed-forward": 0.3 * truth.motor.coulomb_nm})
-        yield begun_at(with_friction, (*best.parameters, BY_NAME["friction feed-forward"]))
+        yield with_friction, (*best.parameters, BY_NAME["friction feed-forward"])
 
 
 # ----------------------------------------------------------------
@@ -1029,21 +1009,21 @@ LOOP_STEPS = 10
 """Steps of a trial fit of each loop law on a few legs, all else held."""
 
 
-def with_last(replays: Replays, best: Fitted, prior: FloatArray) -> tuple[Fitted, FloatArray]:
-    """Adds the significant groups of `LAST`; returns the fit, not yet at its minimum, and its prior."""
+def with_last(replays: Replays, best: Fitted) -> Fitted:
+    """Adds the significant groups of `LAST`; the fit returned is not yet at its minimum."""
     for names in LAST:
         extra = [BY_NAME[name] for name in names if BY_NAME[name] not in best.parameters]
         if not extra or (GROWTH in names and not _warms(replays.data)):
             continue
         wider, there = (*best.parameters, *extra), with_sections(best.truth, extra)
-        around = np.append(prior, coordinates(there, extra))
-        tried = solve(replays, there, wider, around, EARNED_STEPS, known=best.scales)
+        around = np.append(best.prior, coordinates(there, extra))
+        tried = solve(replays, there, wider, EARNED_STEPS, around, known=best.scales)
         new = len(best.parameters)
         off = abs(float(tried.place[new] - around[new]))
         sure = off > SURE * math.sqrt(float(tried.covariance[new, new]))
         if sure and best.cost - tried.cost > EARNED:
-            best, prior = tried, around
-    return best, prior
+            best = tried
+    return best
 
 
 def _warms(data: Data) -> bool:
@@ -1053,8 +1033,8 @@ def _warms(data: Data) -> bool:
     return len(known_c) == len(begun) and max(known_c) - min(known_c) > BY_NAME["temperature"].least_change
 
 
-def with_loop(replays: Replays, best: Fitted, prior: FloatArray) -> Fitting | None:
-    """Returns the start of a fit with another loop law of the gear, or None if none is better.
+def with_loop(replays: Replays, best: Fitted, most: Scales | None = None) -> Fitted | None:
+    """Returns the fit with another loop law of the gear, or None if none is better.
 
     There is none if the load's residuals are as small as those of the true axis, or if no law reduces them.
     Each law is fitted to a few legs, all else held. Call again after a new fit, because another law may then
@@ -1063,35 +1043,32 @@ def with_loop(replays: Replays, best: Fitted, prior: FloatArray) -> Fitting | No
     noise, few = expected(replays.data), replays.rough
     if best.scales.deviation[LOAD] <= noise.deviation[LOAD]:
         return None
-    led, fitted = [], any(each.cause == ELASTIC for each in best.parameters)
-    for there in by_each_law(best.truth)[fitted:]:
-        own = loop_parameters(there)
-        if own:
-            around = np.array(coordinates(there, own))
-            led.append((solve(few, there, own, around, LOOP_STEPS, known=noise), around))
-    if not led:
-        return None
-    nearest, around = min(led, key=lambda each: each[0].cost)
-    if best.cost - _cost(replays, nearest.truth, best) < EARNED:
+    fitted = any(each.cause == ELASTIC for each in best.parameters)
+    laws = [(there, loop_parameters(there)) for there in by_each_law(best.truth)[fitted:]]
+    led = [solve(few, there, own, LOOP_STEPS, known=noise, linear=False) for there, own in laws if own]
+    nearest = min(led, key=lambda each: each.cost, default=None)
+    if nearest is None or best.cost - _cost(replays, nearest.truth, best) < EARNED:
         return None
     rest = [number for number, each in enumerate(best.parameters) if each.cause != ELASTIC]
     parameters = (*(best.parameters[number] for number in rest), *nearest.parameters)
-    return Fitting(nearest.truth, parameters, np.append(prior[rest], around))
+    prior, loops = np.append(best.prior[rest], nearest.prior), best.scales.loops
+    return solve(replays, nearest.truth, parameters, STEPS, prior, most=most, loops=loops)
 
 
-def with_limit(replays: Replays, best: Fitted, prior: FloatArray, usual: Truth) -> Fitting:
-    """Returns the start of a fit of the drive's torque limit if the recording shows it, else the usual limit.
+def with_limit(replays: Replays, best: Fitted, usual: Truth, most: Scales | None = None) -> Fitted:
+    """Fits the drive's torque limit if the recording shows it, else sets the usual limit.
 
-    So far the fit used the highest recorded torque as the limit (`regressions`). It is the drive's limit, and
+    So far the fit used the highest recorded torque as the limit (`start_of`). It is the drive's limit, and
     not just the torque that the motion needed, if a replay without it has larger residuals.
     """
-    highest, unchanged = free_value(usual, LIMIT), Fitting(best.truth, best.parameters, prior)
+    highest = free_value(usual, LIMIT)
     if free_value(best.truth, LIMIT) >= highest or LIMIT in best.parameters:
-        return unchanged
+        return best
     without = with_values(best.truth, {LIMIT.name: highest})
-    if _cost(replays, without, best) - best.cost > EARNED:
-        return Fitting(best.truth, (*best.parameters, LIMIT), np.append(prior, coordinates(usual, [LIMIT])))
-    return unchanged._replace(truth=without)
+    if _cost(replays, without, best) - best.cost <= EARNED:
+        return replace(best, truth=without)
+    parameters, prior = (*best.parameters, LIMIT), np.append(best.prior, coordinates(usual, [LIMIT]))
+    return solve(replays, best.truth, parameters, STEPS, prior, most=most, loops=best.scales.loops)
 
 
 def _cost(replays: Replays, truth: Truth, best: Fitted) -> float:
@@ -1166,7 +1143,7 @@ def fit(replays: Replays, progress: Progress = lambda _: None, more: Sequence[st
         last = reached[-1]
         best = replace(_linearised(replays, last), interrupted=True)
     # The loops' deviation belongs to these rows; later callers use others.
-    return replace(best, scales=replace(best.scales, loops=None))
+    return replace(best, scales=replace(best.scales, loops=SMOOTH))
 
 
 def _fit(replays: Replays, progress: Progress, more: Sequence[str], keep: Callable[[Fitted], None]) -> Fitted:
@@ -1174,10 +1151,8 @@ def _fit(replays: Replays, progress: Progress, more: Sequence[str], keep: Callab
     start = data.base
     begun = start_of(start, data)
     parameters = free_parameters(begun, more)
-    prior = np.array(coordinates(begun, parameters))
-    begun_on_spring = _at_best_frequency(roughly, begun)
     progress(0.05)
-    first = _best_of(roughly, [begun_on_spring, *lags(begun_on_spring)], parameters, prior)
+    first = _best_of(roughly, begun, parameters)
     keep(first[-1])
     progress(0.2)
     (before,) = replays([start])
@@ -1186,10 +1161,10 @@ def _fit(replays: Replays, progress: Progress, more: Sequence[str], keep: Callab
     for number, each in enumerate(first):
         # The residuals of a wrong simulation are no estimate of the noise: they would reduce the weight of
         # the very channel that shows the error.
-        if each.inflation < SOFT**2:
-            about = loops_about(replays, each)
-            near = _led(replays, parameters, prior, each.truth, NEAR_STEPS, each, about)
-            ends.append(_ended(replays, near, prior, most))
+        if np.mean(np.square(each.vector)) < SOFT**2:
+            noise = replace(expected(data), loops=loops_about(replays, each))
+            near = continued(replays, each, NEAR_STEPS, known=noise, near=each, tempered=True)
+            ends.append(_ended(replays, near, most))
         progress(0.2 + 0.4 * (number + 1) / len(first))
     if not ends:
         found = in_best_structure(replays, begun, keep, lambda share: progress(0.2 + 0.8 * share))
@@ -1198,95 +1173,72 @@ def _fit(replays: Replays, progress: Progress, more: Sequence[str], keep: Callab
     keep(best)
     laws = len(LAWS)  # maximum number of changes
     while True:
-        best = _in_best_minimum(replays, best, begun, prior, most)
-        wider, prior = with_last(replays, best, prior)
+        best = _in_best_minimum(replays, best, begun, most)
+        wider = with_last(replays, best)
         if wider is not best:
-            best = _ended(replays, wider, prior, most)
+            best = _ended(replays, wider, most)
             continue
         keep(best)
         # The loop comes last, because a wrong spring also leaves residuals of the load angle.
-        other = with_loop(replays, best, prior) if laws else None
+        other = with_loop(replays, best, most) if laws else None
         if other is None:
             break
-        laws, prior = laws - 1, other.prior
-        best = solve(replays, other.truth, other.parameters, prior, STEPS, most=most, loops=best.scales.loops)
-    best, prior = _limited(replays, best, prior, most)
+        laws, best = laws - 1, other
+    best = with_limit(replays, best, start, most)
     keep(best)
     progress(0.85)
     for _ in range(ROUNDS):
-        last = best
-        best = _ended(replays, best, prior, most)
+        last, best = best, _ended(replays, best, most)
         if np.all(np.abs(best.place - last.place) < SAME * np.sqrt(np.diag(best.covariance))):
             break
     if values_of(what_is_left(data, best.residuals, noise_in_motion(data))) is Values.REPLAY:
         wider = with_blocks(roughly, best)
         if wider is not best:
-            whole = _in_units(replays, begun_at(wider.truth, wider.parameters), WHOLE_STEPS)
+            whole = _in_units(replays, (wider.truth, wider.parameters), WHOLE_STEPS)
             if misfit(data, whole.residuals) < misfit(data, best.residuals):
                 return _linearised(replays, whole)
     # Wide differences only for the covariance: near a minimum the loops may be unstable.
-    loops, there = best.scales.loops, best.truth
-    best = solve(replays, there, best.parameters, prior, 0, most=most, near=best, loops=loops, wide=True)
+    best = continued(replays, best, 0, most, near=best, wide=True)
     progress(1.0)
     return best
 
 
-def _limited(replays: Replays, best: Fitted, prior: FloatArray, most: Scales) -> tuple[Fitted, FloatArray]:
-    """Fits the drive's torque limit if the recording shows it."""
-    limited = with_limit(replays, best, prior, replays.data.base)
-    best = replace(best, truth=limited.truth)
-    if limited.parameters == best.parameters:
-        return best, prior
-    loops = best.scales.loops
-    fitted = solve(replays, best.truth, limited.parameters, limited.prior, STEPS, most=most, loops=loops)
-    return fitted, limited.prior
-
-
 def _linearised(replays: Replays, found: Fitted) -> Fitted:
     """Returns a fit at the same place, by the scales that its residuals have on these recordings."""
-    place = np.array(coordinates(found.truth, found.parameters))
-    return solve(replays, found.truth, found.parameters, place, 0)
+    return solve(replays, found.truth, found.parameters, 0)
 
 
-def _in_best_minimum(replays: Replays, best: Fitted, begun: Truth, prior: FloatArray, most: Scales) -> Fitted:
-    """Moves the fit to better neighbouring minima until there are none."""
+def _in_best_minimum(replays: Replays, best: Fitted, begun: Truth, most: Scales) -> Fitted:
+    """Moves the fit to significantly better neighbouring minima until there are none."""
+
+    def better(best: Fitted, there: Truth) -> Fitted:
+        other = continued(replays, best, MORE_STEPS, most, there)
+        return _ended(replays, other, most) if other.loss + EARNED < best.loss else best
+
+    data = replays.data
+    noise = least_deviation(data) | {LOAD: expected(data).deviation[LOAD]}
     for _ in range(MINIMA):
         last = best
-        if _leaves_more(replays.data, best):
-            for there in better_places(replays.rough, best, elsewhere(best.truth, begun), begun, prior):
-                best = _better(replays, best, there, prior, most)
+        # If the residuals of any channel exceed those of the true axis.
+        if any(best.scales.deviation[name] > MORE * noise[name] for name in CHANNELS):
+            best = reduce(
+                better, better_places(replays.rough, best, elsewhere(best.truth, begun), begun), best
+            )
         # Always tried: exchanged gains differ only at rest, which a few legs hardly show, and a dead time in
         # the next substep increases the residuals too little for any channel to show it.
-        for there in (exchanged(best.truth), *neighbours(best.truth)):
-            best = _better(replays, best, there, prior, most)
+        best = reduce(better, (exchanged(best.truth), *neighbours(best.truth)), best)
         if best is last:
             break
     return best
 
 
-def _better(replays: Replays, best: Fitted, there: Truth, prior: FloatArray, most: Scales) -> Fitted:
-    """Returns the fit from another place if it is significantly better, else ``best``."""
-    loops = best.scales.loops
-    other = solve(replays, there, best.parameters, prior, MORE_STEPS, most=most, loops=loops)
-    if other.loss + EARNED >= best.loss:
-        return best
-    return _ended(replays, other, prior, most)
-
-
-def _ended(replays: Replays, near: Fitted, prior: FloatArray, most: Scales) -> Fitted:
+def _ended(replays: Replays, near: Fitted, most: Scales) -> Fitted:
     """Continues a fit to its minimum, with the loops' deviation estimated there."""
-    loops = loops_about(replays, near)
-    return solve(replays, near.truth, near.parameters, prior, STEPS, most=most, near=near, loops=loops)
-
-
-def _leaves_more(data: Data, best: Fitted) -> bool:
-    """Returns True if the residuals of any channel exceed those of the true axis."""
-    least = least_deviation(data) | {LOAD: expected(data).deviation[LOAD]}
-    return any(best.scales.deviation[name] > MORE * least[name] for name in CHANNELS)
+    return continued(replays, near, STEPS, most, near=near, loops=loops_about(replays, near))
 
 
 def better_places(
-    roughly: Replays, best: Fitted, kinds: Iterable[Sequence[Truth]], begun: Truth, prior: FloatArray
+    roughly: Replays, best: Fitted, kinds: Iterable[Sequence[Truth]], begun: Truth
 ) -> list[Truth]:
     """Fits a few legs from the best places of each kind; returns competitive results, the best first.
 
@@ -1297,7 +1249,7 @@ def better_places(
     most = scales(roughly.data, before)
 
     def led(truth: Truth, steps: int, near: Fitted | None = None) -> Fitted:
-        return solve(roughly, truth, best.parameters, prior, steps, most=most, near=near)
+        return continued(roughly, best, steps, most, truth, near=near, loops=SMOOTH, linear=False)
 
     def loss(fitted: Fitted) -> float:
         return fitted.loss
@@ -1336,42 +1288,30 @@ def loops_about(replays: Replays, fitted: Fitted) -> Loops:
     )
 
 
-def _led(
-    replays: Replays,
-    parameters: tuple[Parameter, ...],
-    prior: FloatArray,
-    start: Truth,
-    steps: int,
-    near: Fitted | None = None,
-    loops: Loops | None = None,
-) -> Fitted:
-    """Fits for at most ``steps`` steps with the expected noise."""
-    noise = replace(expected(replays.data), loops=loops)
-    return solve(replays, start, parameters, prior, steps, known=noise, near=near, tempered=True)
+def _best_of(replays: Replays, begun: Truth, parameters: tuple[Parameter, ...]) -> tuple[Fitted, ...]:
+    """Returns the fit from the start, and the best from another place if it is better so far.
 
-
-def _best_of(
-    replays: Replays, starts: Sequence[Truth], parameters: tuple[Parameter, ...], prior: FloatArray
-) -> tuple[Fitted, ...]:
-    """Returns the fit from the first start, and the best from another start if it is better so far.
-
-    The first start is the present simulation: parameters that the motion does not show keep their values
-    unless another place is significantly better in the end. Worse starts are dropped on the way.
+    The start is the present simulation, with the spring that leaves least of the load angle: parameters that
+    the motion does not show keep their values unless another place is significantly better in the end. Worse
+    places are dropped on the way.
     """
-    led = partial(_led, replays, parameters, prior)
+    prior, noise = np.array(coordinates(begun, parameters)), expected(replays.data)
+
+    def led(truth: Truth, steps: int, near: Fitted | None = None, *, linear: bool = False) -> Fitted:
+        return solve(
+            replays, truth, parameters, steps, prior, known=noise, near=near, tempered=True, linear=linear
+        )
 
     def cost(fitted: Fitted) -> float:
         return fitted.cost
 
-    own, *others = (led(each, FIRST_STEPS) for each in starts)
+    sprung = [begun, *springs(begun)]
+    off = [float(np.mean(np.abs(found[LOAD]))) for found in replays(sprung)]
+    first = sprung[int(np.argmin(off))]
+    own, *others = (led(each, FIRST_STEPS) for each in (first, *lags(first)))
     own, other = (led(each.truth, FIRST_STEPS, each) for each in (own, min(others, key=cost)))
     third = led(exchanged(min(own, other, key=cost).truth), FIRST_STEPS)
-    own, other = (led(each.truth, MORE_STEPS, each) for each in (own, min(other, third, key=cost)))
+    own, other = (
+        led(each.truth, MORE_STEPS, each, linear=True) for each in (own, min(other, third, key=cost))
+    )
     return (own, other) if other.cost < own.cost else (own,)
-
-
-def _at_best_frequency(replays: Replays, truth: Truth) -> Truth:
-    """Returns the truth with the spring that gives the smallest residuals of the load angle."""
-    tried = [truth, *springs(truth)]
-    off = [float(np.mean(np.abs(found[LOAD]))) for found in replays(tried)]
-    return tried[int(np.argmin(off))]

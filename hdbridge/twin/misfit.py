@@ -17,7 +17,7 @@ from copy import copy
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from itertools import pairwise, repeat
-from typing import Any, Final, Literal, Self
+from typing import Any, ClassVar, Final, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,6 +40,7 @@ from hdbridge.twin.replay import (
     begins_in_motion,
     commands_of,
     continuous,
+    demand_deg,
     held_rows,
     legs_of,
     run,
@@ -61,7 +62,7 @@ UNKNOWN_DEG = 60.0
 recording, if they are not known (from a gear without such a state, or from the holding torque)."""
 LONGEST_LEG_S = 2.0
 """Maximum length of a leg; a longer one is split, because residuals further apart are uncorrelated."""
-COARSE_S = 20.0
+COARSE_S = 17.0
 """Duration of the pieces on which the first steps of a fit are made: a sweep, steps and a sine of the plan
 `dynamics`, each after its run-in."""
 WITHOUT_MOTION = frozenset({"standstill", "reference", "settle"})
@@ -146,16 +147,7 @@ def prepare(recording: Recording, axis: AxisConfig, base: Truth) -> Data:
         led = int(np.searchsorted(record.time_s, record.time_s[first] - RUN_IN_S))
         led = max(led, *(begin for begin in begins if begin <= first))
         part = record.rows(led, end)
-        commands = commands_of(part, axis, base)
-        numbers, kinds = _legs(part, [(each.kind, each.start_s, each.end_s) for each in legs])
-        out = np.zeros(len(part))
-        for each in held:
-            out[(part.time_s >= each.start_s) & (part.time_s <= each.end_s)] = 1.0
-        judged = np.arange(led, end) >= first
-        forgets_deg = UNKNOWN_DEG if remembers(base) else 0.0
-        pieces.append(
-            _piece(part, commands, numbers, kinds, out, judged, unknown[led:end], forgets_deg, axis)
-        )
+        pieces.append(_piece(part, legs, held, np.arange(led, end) >= first, unknown[led:end], axis, base))
         first = end
     return Data(axis, base, tuple(pieces))
 
@@ -164,43 +156,37 @@ def coarse(data: Data, wanted_s: float = COARSE_S) -> Data:
     """Selects pieces of about ``wanted_s`` in total with as many kinds of motion as possible, and then with
     different temperatures.
     """
-    taken: list[Piece] = []
-    left = sorted(data.pieces, key=_replayed_s)
+    pieces = data.pieces
+    lengths_s, left = [_replayed_s(each) for each in pieces], list(range(len(pieces)))
+    left.sort(key=lambda each: lengths_s[each])
+    taken: list[int] = []
+
+    def fits(place: int) -> bool:
+        return sum(lengths_s[each] for each in (*taken, place)) <= wanted_s
+
     while left:
-        seen = WITHOUT_MOTION.union(*(each.kind for each in taken))
-        piece = max(left, key=lambda each: len({*each.kind} - seen) / _replayed_s(each))
-        if taken and seen.issuperset(piece.kind):
+        seen = WITHOUT_MOTION.union(*(pieces[each].kind for each in taken))
+        place = max(left, key=lambda each: (len({*pieces[each].kind} - seen), -lengths_s[each]))
+        if taken and seen.issuperset(pieces[place].kind):
             break
-        left = [each for each in left if each is not piece]
-        if not taken or sum(map(_replayed_s, taken)) + _replayed_s(piece) <= wanted_s:
-            taken.append(piece)
-    left = [piece for piece in data.pieces if not any(piece is each for each in taken)]
-    for piece in _by_warmth(sorted(left, key=_replayed_s), taken):
-        if sum(map(_replayed_s, taken)) + _replayed_s(piece) <= wanted_s:
-            taken.append(piece)
-    return replace(data, pieces=tuple(piece for piece in data.pieces if any(piece is each for each in taken)))
+        left.remove(place)
+        if not taken or fits(place):
+            taken.append(place)
+    warm_c = np.array([each.commands.start_c for each in pieces], dtype=np.float64)
+    left = sorted({*range(len(pieces))} - {*taken}, key=lambda each: lengths_s[each])
+    near_k = np.min(np.abs(warm_c[:, None] - warm_c[taken]), axis=1)
+    while left:
+        # The piece that differs most in temperature from those before it, or the shortest.
+        place = left.pop(0 if np.isnan(warm_c).any() else int(np.argmax(near_k[left])))
+        near_k = np.minimum(near_k, np.abs(warm_c - warm_c[place]))
+        if fits(place):
+            taken.append(place)
+    return replace(data, pieces=tuple(pieces[each] for each in sorted(taken)))
 
 
 def _replayed_s(piece: Piece) -> float:
     """Returns the duration of a piece with its run-in."""
     return len(piece.commands.counts) * piece.commands.cycle_s
-
-
-def _by_warmth(pieces: list[Piece], taken: Sequence[Piece]) -> list[Piece]:
-    """Orders pieces so that each differs most in temperature from those before it and those taken."""
-    warm_c = np.array([each.commands.start_c for each in pieces], dtype=np.float64)
-    if np.isnan(warm_c).any():
-        return pieces
-    near_k = np.full(len(pieces), np.inf)
-    for number, piece in enumerate(pieces):
-        if any(piece is each for each in taken):
-            near_k = np.minimum(near_k, np.abs(warm_c - warm_c[number]))
-    left, order = list(range(len(pieces))), []
-    while left:
-        farthest = left.pop(int(np.argmax(near_k[left])))
-        order.append(pieces[farthest])
-        near_k = np.minimum(near_k, np.abs(warm_c - warm_c[farthest]))
-    return order
 
 
 def traces_of(data: Data, truth: Truth, seed: Seed = None) -> list[dict[str, FloatArray]]:
@@ -215,12 +201,11 @@ def traces_of(data: Data, truth: Truth, seed: Seed = None) -> list[dict[str, Flo
         commands = piece.commands
         draw = len(data.pieces) * seed + number if isinstance(seed, int) else 0
         traces = run(commands, data.axis, simulated, draw, smooth=not isinstance(seed, int))
-        wanted = demand_deg(commands, data.axis)
         shown.append(
             {
-                FOLLOWING: wanted - traces.motor_deg,
-                TORQUE: traces.torque_nm,
-                LOAD: traces.load_deg * ARCSEC_PER_DEG,
+                FOLLOWING: demand_deg(commands, data.axis) - traces["motor_position_deg"],
+                TORQUE: traces["motor_torque_nm"],
+                LOAD: traces["load_position_deg"] * ARCSEC_PER_DEG,
             }
         )
     return shown
@@ -318,15 +303,19 @@ def silent(truth: Truth) -> Truth:
 
 def _piece(
     part: Record,
-    commands: Commands,
-    leg: FloatArray,
-    kinds: tuple[str, ...],
-    out: FloatArray,
+    legs: Sequence[Segment],
+    held_out: Sequence[Segment],
     judged: NDArray[np.bool_],
     unknown: NDArray[np.bool_],
-    forgets_deg: float,
     axis: AxisConfig,
+    base: Truth,
 ) -> Piece:
+    """Prepares a part; only ``judged`` rows count, and none that is ``unknown``."""
+    commands = commands_of(part, axis, base)
+    leg, kinds = _legs(part, legs)
+    out = np.zeros(len(part))
+    for each in held_out:
+        out[(part.time_s >= each.start_s) & (part.time_s <= each.end_s)] = 1.0
     target = part.motor_target_deg
     assert target is not None  # commands_of has refused it
     moved = np.abs(np.diff(target, prepend=target[0]))
@@ -335,7 +324,7 @@ def _piece(
     last_moved_s = np.maximum.accumulate(np.where(moved > 0.0, part.time_s, before_s))
     stuck = part.time_s - last_moved_s > RINGING_S
     everywhere = np.where(judged, 1.0, 0.0)
-    elastic = unknown | (np.cumsum(travelled) < forgets_deg)
+    elastic = unknown | (np.cumsum(travelled) < (UNKNOWN_DEG if remembers(base) else 0.0))
     # Between two parts the drive's loops may have been restarted.
     loops = elastic | (np.cumsum(np.where(judged, travelled, 0.0)) <= UNKNOWN_DEG)
     count_deg = 360.0 / axis.motor_encoder.counts_per_turn
@@ -374,27 +363,19 @@ def remembers(truth: Truth) -> bool:
     )  # fmt: skip
 
 
-def _legs(part: Record, legs: Sequence[tuple[str, float, float]]) -> tuple[FloatArray, tuple[str, ...]]:
+def _legs(part: Record, legs: Sequence[Segment]) -> tuple[FloatArray, tuple[str, ...]]:
     """Returns the leg number of each row, from zero, and the legs' kinds; gaps belong to the leg before."""
     starts: list[tuple[float, str]] = []
-    for kind, start_s, end_s in legs:
-        if end_s < part.time_s[0] or start_s > part.time_s[-1]:
-            continue
-        pieces = max(1, int((end_s - start_s) // LONGEST_LEG_S))
-        starts += [(start_s + each * (end_s - start_s) / pieces, kind) for each in range(pieces)]
+    for each in legs:
+        if each.end_s >= part.time_s[0] and each.start_s <= part.time_s[-1]:
+            length_s = each.end_s - each.start_s
+            pieces = max(1, int(length_s // LONGEST_LEG_S))
+            starts += [(each.start_s + place * length_s / pieces, each.kind) for place in range(pieces)]
     if not starts:
         starts = [(float(part.time_s[0]), "motion")]
     starts.sort(key=lambda each: each[0])
     places = np.searchsorted([start for start, _ in starts], part.time_s, side="right") - 1
     return np.maximum(places, 0).astype(np.float64), tuple(kind for _, kind in starts)
-
-
-def demand_deg(commands: Commands, axis: AxisConfig) -> FloatArray:
-    """Returns the commanded motor angle at each row; degrees."""
-    counts = np.asarray(commands.counts[commands.lead :], dtype=np.float64)
-    encoder = axis.motor_encoder
-    deg = encoder.direction * counts * 360.0 / encoder.counts_per_turn
-    return np.interp(commands.row_cycles, np.arange(len(counts)), deg)
 
 
 # ----------------------------------------------------------------
@@ -440,10 +421,6 @@ class Replays:
         if self._pool is None or self.data.duration_s <= WORTH_S:
             return [residuals(self.data, each, seed) for each, seed in zip(truths, seeds, strict=False)]
         return list(self._pool.map(_residuals, truths, seeds, repeat(self._place)))
-
-    def drawn(self, truths: Sequence[Truth]) -> list[dict[str, FloatArray]]:
-        """Returns the residuals of each truth, in order, from rounded and noisy replays."""
-        return self(truths, range(1, len(truths) + 1))
 
 
 def _begin(data: tuple[Data, Data]) -> None:
@@ -509,19 +486,17 @@ def surprise(size: FloatArray, half: FloatArray, stray: FloatArray) -> FloatArra
     return np.asarray(-np.logaddexp(np.where(inner < -1.0, near, beyond), anyhow), dtype=np.float64)
 
 
-def deviation(
-    off: FloatArray, step: float, least: float, spread: FloatArray | None = None
-) -> tuple[float, float]:
+def deviation(off: FloatArray, step: float, least: float, spread: FloatArray) -> tuple[float, float]:
     """Estimates a simulation's standard deviation from rounded readings (maximum likelihood, >= ``least``).
 
     ``spread`` is the additional known deviation of each reading. Also returns the probability of an outlier.
     """
-    size, known = np.abs(off), np.zeros_like(off) if spread is None else spread
+    size = np.abs(off)
     farthest = max(float(np.max(size)), least)
     stray = STRAY / (1.0 - STRAY) * step / (2.0 * farthest + step)
 
     def cost(log_deviation: float) -> float:
-        each = np.hypot(np.exp(log_deviation), known)
+        each = np.hypot(np.exp(log_deviation), spread)
         half = 0.5 * step / each
         times = np.minimum(1.0, half / FINE)
         return float(
@@ -547,12 +522,15 @@ class Loops:
     The break-away of a stuck motor depends on the value of the integral within an encoder step.
     """
 
-    mean: Mapping[str, FloatArray]
-    spread: Mapping[str, FloatArray]
+    mean: Mapping[str, FloatArray | float]
+    spread: Mapping[str, FloatArray | float]
 
     def taken_off(self, found: Mapping[str, FloatArray]) -> dict[str, FloatArray]:
         """Returns the residuals of a smooth replay corrected by the mean deviation."""
         return {name: found[name] + self.mean[name] for name in CHANNELS}
+
+
+SMOOTH: Final = Loops(dict.fromkeys(CHANNELS, 0.0), dict.fromkeys(CHANNELS, 0.0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -566,13 +544,12 @@ class Scales:
     step: Mapping[str, float] = field(default_factory=lambda: dict.fromkeys(CHANNELS, 0.0))
     stray: Mapping[str, float] = field(default_factory=lambda: dict.fromkeys(CHANNELS, 0.0))
     """Probability of an outlier."""
-    loops: Loops | None = None
+    loops: Loops = SMOOTH
 
     def scaled(self, found: Mapping[str, FloatArray]) -> FloatArray:
         """Returns the residuals of all channels, one after the other, in standard deviations."""
-        if self.loops is None:
-            return np.concatenate([found[name] / self.deviation[name] for name in CHANNELS])
-        return np.concatenate([self.loops.taken_off(found)[name] / self._rows(name) for name in CHANNELS])
+        corrected = self.loops.taken_off(found)
+        return np.concatenate([corrected[name] / self._rows(name) for name in CHANNELS])
 
     def halves(self, length: int) -> tuple[FloatArray, FloatArray]:
         """Returns half the resolution in standard deviations and `stray`, for ``length`` rows per channel."""
@@ -581,7 +558,7 @@ class Scales:
         return np.concatenate(by_channel), np.repeat(strays, length)
 
     def _rows(self, name: str) -> FloatArray | np.float64:
-        return np.hypot(self.deviation[name], 0.0 if self.loops is None else self.loops.spread[name])
+        return np.hypot(self.deviation[name], self.loops.spread[name])
 
     @property
     def noise(self) -> dict[str, float]:
@@ -624,15 +601,16 @@ def _shaken_nm(truth: Truth, off_rad: float) -> float:
     return gain * off_rad / step_s * norm
 
 
-def scales(data: Data, found: Mapping[str, FloatArray], loops: Loops | None = None) -> Scales:
-    """Estimates the scales of the residuals in motion; at least the error of a smooth replay.
+def scales(
+    data: Data, found: Mapping[str, FloatArray], loops: Loops = SMOOTH, most: Scales | None = None
+) -> Scales:
+    """Estimates the scales of the residuals in motion; from the error of a smooth replay up to ``most``.
 
     Residuals at rest are excluded, because they would dominate a recording that rests half of the time.
     """
     least, counts, steps = least_deviation(data), counted(data), rounding(data.axis)
-    found = found if loops is None else loops.taken_off(found)
+    found = loops.taken_off(found)
     moving = np.concatenate([each.rest for each in data.pieces]) == 0.0
-    unsteady = None if loops is None else loops.spread
     given, stray = dict(least), dict.fromkeys(CHANNELS, 0.0)
     for name in CHANNELS:
         rows = moving & (counts[name] > 0.0)
@@ -640,8 +618,10 @@ def scales(data: Data, found: Mapping[str, FloatArray], loops: Loops | None = No
         if len(inside):
             # At least half of the readings in motion are not outliers.
             typical = median_deviation(beyond(inside, 0.5 * steps[name]))
-            spread = None if unsteady is None else unsteady[name][rows]
+            spread = np.broadcast_to(loops.spread[name], len(rows))[rows]
             given[name], stray[name] = deviation(inside, steps[name], max(least[name], typical), spread)
+    if most is not None:
+        given = {name: min(each, most.deviation[name]) for name, each in given.items()}
     return Scales(given, steps, stray, loops)
 
 
@@ -697,16 +677,17 @@ Misfit = Mapping[str, Mapping[str, float]]
 """Rms of the residuals by channel, in its unit, and kind of leg."""
 
 
-def misfit_of(data: Data, residuals: Mapping[str, FloatArray]) -> dict[str, dict[str, float]]:
-    """Returns the rms of the residuals of each recorded channel, by kind of leg."""
+def misfit_of(
+    data: Data, residuals: Mapping[str, FloatArray], rows: Mapping[str, NDArray[np.bool_]] | None = None
+) -> dict[str, dict[str, float]]:
+    """Returns the rms of the residuals of each recorded channel, by kind of leg; ``rows``: by default all."""
     kinds = np.array(data.kinds)[data.leg.astype(np.intp)]
     found: dict[str, dict[str, float]] = {}
     for name, counts in counted(data).items():
-        for kind in dict.fromkeys(data.kinds):
-            inside = (counts > 0.0) & (kinds == kind)
-            if inside.any():
-                rms = math.sqrt(float(np.mean(np.square(residuals[name][inside]))))
-                found.setdefault(name, {})[kind] = float(f"{rms:.6g}")
+        inside = counts > 0.0 if rows is None else rows[name]
+        for kind in dict.fromkeys(kinds[inside].tolist()):
+            each = rms(residuals[name][inside & (kinds == kind)])
+            found.setdefault(name, {})[kind] = float(f"{each:.6g}")
     return found
 
 
@@ -747,13 +728,8 @@ def judged_rows(data: Data) -> dict[str, NDArray[np.bool_]]:
 
 def misfit(data: Data, left: Mapping[str, FloatArray]) -> float:
     """Returns the root mean square over the channels in `units`, on held-out legs if there are any."""
-    scale = units(data)
-    squares = [
-        float(np.mean(np.square(left[name][inside] / scale[name])))
-        for name, inside in judged_rows(data).items()
-        if inside.any()
-    ]
-    return math.sqrt(sum(squares) / len(squares))
+    scale, rows = units(data), judged_rows(data)
+    return rms(np.array([rms(left[name][each] / scale[name]) for name, each in rows.items() if each.any()]))
 
 
 # ----------------------------------------------------------------
@@ -790,6 +766,7 @@ class Values(StrEnum):
 class Left:
     """Residual of a channel."""
 
+    cause: ClassVar[str] = "unexplained"
     channel: str
     share: float
     """Rms residual over rms signal."""
@@ -797,6 +774,14 @@ class Left:
     """Rms residual over the noise in motion."""
     kind: str
     """Kind of the legs with the largest residual."""
+
+    @property
+    def text(self) -> str:
+        """In words."""
+        return (
+            f"{self.channel} is left with {self.times_noise:.3g} times its noise, most of it in legs of the "
+            f"kind {self.kind}"
+        )
 
     @property
     def explained(self) -> bool:
@@ -813,14 +798,10 @@ def what_is_left(
 
     ``residuals`` by channel over all rows of the data, ``noise`` by channel in its unit (`noise_in_motion`).
     """
-    kinds = np.array(data.kinds)[data.leg.astype(np.intp)]
-    signals, found = signals_of(data), []
-    for name, inside in judged_rows(data).items():
-        if not inside.any():
-            continue
-        squares, signal = np.square(residuals[name][inside]), rms(signals[name][inside])
-        by_kind = {str(kind): float(squares[kinds[inside] == kind].mean()) for kind in set(kinds[inside])}
-        left = math.sqrt(float(squares.mean()))
+    rows, signals = judged_rows(data), signals_of(data)
+    found = []
+    for name, by_kind in misfit_of(data, residuals, rows).items():
+        left, signal = rms(residuals[name][rows[name]]), rms(signals[name][rows[name]])
         share = left / signal if signal else math.inf
         found.append(Left(name, share, left / noise[name], max(by_kind, key=lambda kind: by_kind[kind])))
     return tuple(found)

@@ -7,11 +7,13 @@ that keeps them reset.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import compress
+from typing import ClassVar
 
 import numpy as np
-from scipy.special import chdtrc, ndtri
+from scipy.special import ndtri
 
 from hdbridge.axis.effects import FloatArray
 from hdbridge.sim.truth import Truth
@@ -20,14 +22,13 @@ from hdbridge.twin.fit import (
     Fitted,
     as_late,
     fitted_rows,
-    information_of,
     legs_of_rows,
     over_legs,
     solve,
     told,
 )
-from hdbridge.twin.misfit import CHANNELS, Replays, counted
-from hdbridge.twin.parameters import Parameter, at_coordinates, coordinates, free_value
+from hdbridge.twin.misfit import Replays, judged_rows
+from hdbridge.twin.parameters import Parameter, at_coordinates, by_cause, coordinates, free_value
 from hdbridge.units import figure
 
 # ----------------------------------------------------------------
@@ -75,7 +76,9 @@ def without(
         return before
     off = np.array(coordinates(before, own)) - fitted.place[back]
     slopes, spread = fitted.jacobian[:, free], np.array([each.spread for each in others])
-    along = np.linalg.solve(information_of(slopes, spread), slopes.T @ (fitted.jacobian[:, back] @ off))
+    along = np.linalg.solve(
+        slopes.T @ slopes + np.diag(spread**-2.0), slopes.T @ (fitted.jacobian[:, back] @ off)
+    )
     low, high = np.array([each.bounds for each in others]).T
     led = at_coordinates(before, others, np.clip(fitted.place[free] - along, low, high).tolist())
     kept = [coordinates(fitted.truth if each in moved else start, [each])[0] for each in others]
@@ -84,18 +87,7 @@ def without(
     costs = [float(np.sum(np.square(told(each, fitted.scales, rows)))) for each in replays(begun)]
     near = replace(fitted, parameters=others, jacobian=slopes)
     prior, nearest = np.array(coordinates(start, others)), begun[int(np.argmin(costs))]
-    return solve(replays, nearest, others, prior, STEPS, known=fitted.scales, near=near).truth
-
-
-def held_out(replays: Replays, found: dict[str, FloatArray], fitted: Fitted) -> tuple[FloatArray, FloatArray]:
-    """Returns the softened scaled residuals on held-out legs, and their leg numbers.
-
-    Uses all legs if none was held out.
-    """
-    data = replays.data
-    out = data.out if data.out.any() else np.ones(len(data.out))
-    rows = np.concatenate([each * out > 0.0 for each in counted(data).values()])
-    return told(found, fitted.scales, rows), legs_of_rows(data, rows)
+    return solve(replays, nearest, others, STEPS, prior, known=fitted.scales, near=near, linear=False).truth
 
 
 # ----------------------------------------------------------------
@@ -132,11 +124,6 @@ class Finding:
 
     cause: str
     parameters: tuple[Moved, ...]
-    shows_in: tuple[str, ...]
-    evidence: float
-    """Negative natural logarithm of the probability of so large a change by chance."""
-    gain: tuple[float, float]
-    """Rms of the scaled residuals on held-out legs without the change, and with it."""
     aliases: tuple[str, ...] = ()
     """Other parameters that the motion does not separate from these."""
     move: str = ""
@@ -144,19 +131,28 @@ class Finding:
 
     @property
     def text(self) -> str:
-        """One sentence."""
+        """The change in words."""
         telling = [each for each in self.parameters if not each.lower <= each.before <= each.upper]
         moved = "; ".join(each.sentence for each in telling or self.parameters)
         rest = f", or {' or '.join(self.aliases)}: {self.move} would tell" if self.aliases else ""
-        return f"{self.cause}: {moved}{rest}"
+        return f"{moved}{rest}"
+
+    def __str__(self) -> str:
+        return f"{self.cause}: {self.text}"
 
 
 @dataclass(frozen=True, slots=True)
 class Alike:
     """Parameters that the motion does not separate, and motions that would separate them."""
 
+    cause: ClassVar[str] = "not separable"
     names: tuple[str, ...]
     moves: tuple[str, ...]
+
+    @property
+    def text(self) -> str:
+        """In words."""
+        return f"{', '.join(self.names)}; {'; '.join(self.moves)} would separate them"
 
 
 def name_causes(
@@ -168,26 +164,38 @@ def name_causes(
     not suffice, the others are named with the parameters that may replace them. If they do, the remaining
     parameters are not separable from their start and form a set. Rivals are fitted to a few of the legs.
     """
-    contest = _Contest(replays, start, fitted)
-    groups: dict[str, list[Parameter]] = {}
-    for each in fitted.parameters:
-        groups.setdefault(each.cause, []).append(each)
+    # Judged on held-out legs, or on all legs if none was held out.
+    data = replays.data
+    rows = np.concatenate(list(judged_rows(data).values()))
+    legs = legs_of_rows(data, rows)
+
+    def left_by(truths: Iterable[Truth]) -> list[FloatArray]:
+        return [told(shown, fitted.scales, rows) for shown in replays(truths)]
+
+    (left,) = left_by([fitted.truth])
+
+    def worse(others: Iterable[FloatArray], than: FloatArray = left) -> list[bool]:
+        return [told_apart(than, other - than, legs) for other in others]
+
+    groups = by_cause(fitted.parameters)
     suspects = {cause: own for cause, own in groups.items() if _further(start, fitted.truth, own)}
-    alone = replays([put_back(start, fitted.truth, own) for own in suspects.values()])
-    matter = [cause for cause, there in zip(suspects, alone, strict=True) if contest.lost(there)]
+    alone = left_by(put_back(start, fitted.truth, own) for own in suspects.values())
+    matter = list(compress(suspects, worse(alone)))
     moved = [each for own in suspects.values() for each in own]
     rivals = {cause: without(replays.rough, start, fitted, groups[cause], moved) for cause in matter}
-    shown = dict(zip(rivals, replays(rivals.values()), strict=True))
-    needed = {cause: groups[cause] for cause in matter if contest.lost(shown[cause])}
+    by_rival = dict(zip(rivals, left_by(rivals.values()), strict=True))
+    needed = list(compress(matter, worse(by_rival.values())))
     aliases: dict[str, list[Parameter]] = {cause: [] for cause in needed}
     rest = [each for each in fitted.parameters if each.cause not in needed]
     least = without(replays.rough, start, fitted, rest, moved) if rest else fitted.truth
     sets: list[Alike] = []
-    (shown_least,) = replays([least])
-    if contest.lost(shown_least):
+    if worse(left_by([least]))[0]:
         for cause in (each for each in matter if each not in needed):
             others = [each for each in rest if each.cause != cause]
-            aliases[cause] = contest.needed(rivals[cause], _further(start, rivals[cause], others))
+            # A rival needs a parameter if it gets worse when that one is reset.
+            rival, moved_too = rivals[cause], _further(start, rivals[cause], others)
+            back = left_by(put_back(start, rival, [each]) for each in moved_too)
+            aliases[cause] = list(compress(moved_too, worse(back, by_rival[cause])))
             sets.append(_set([*groups[cause], *aliases[cause]]))
     elif apart := _further(fitted.truth, least, rest):
         sets.append(_set(apart))
@@ -199,33 +207,9 @@ def name_causes(
         if (instead or cause in needed) and not any(
             each.name in other.aliases for each in own for other in found
         ):
-            gain = (rms(contest.left_by(shown[cause])), rms(contest.left))
-            found.append(finding(own, start, fitted.truth, intervals, distances[cause], gain, instead))
-    return tuple(sorted(found, key=lambda each: -each.gain[0])), tuple(dict.fromkeys(sets))
-
-
-class _Contest:
-    """Comparison of a fit with its rivals on held-out legs."""
-
-    def __init__(self, replays: Replays, start: Truth, fitted: Fitted) -> None:
-        self._replays, self._start, self._fitted = replays, start, fitted
-        (shown,) = replays([fitted.truth])
-        self.left, self._legs = held_out(replays, shown, fitted)
-
-    def left_by(self, shown: dict[str, FloatArray]) -> FloatArray:
-        """Returns the scaled residuals of a rival."""
-        return held_out(self._replays, shown, self._fitted)[0]
-
-    def lost(self, shown: dict[str, FloatArray]) -> bool:
-        """Returns True if a rival is significantly worse than the fit."""
-        return told_apart(self.left, self.left_by(shown) - self.left, self._legs)
-
-    def needed(self, rival: Truth, parameters: Sequence[Parameter]) -> list[Parameter]:
-        """Returns the parameters that a rival needs: it gets worse when one of them is reset."""
-        truths = [rival, *(put_back(self._start, rival, [each]) for each in parameters)]
-        left, *without = (self.left_by(shown) for shown in self._replays(truths))
-        pairs = zip(parameters, without, strict=True)
-        return [each for each, worse in pairs if told_apart(left, worse - left, self._legs)]
+            found.append(finding(own, start, fitted.truth, intervals, instead))
+    found.sort(key=lambda each: -rms(by_rival[each.cause]))
+    return tuple(found), tuple(dict.fromkeys(sets))
 
 
 def finding(
@@ -233,33 +217,15 @@ def finding(
     before: Truth,
     after: Truth,
     intervals: Mapping[str, tuple[float, float]],
-    distance: float,
-    gain: tuple[float, float],
     instead: Sequence[Parameter] = (),
 ) -> Finding:
-    """Returns the finding of one cause's parameters; ``distance`` is squared, in standard deviations.
-
-    ``instead`` holds parameters that may have changed in their place.
-    """
+    """Returns the finding of one cause's parameters; those ``instead`` may have changed in their place."""
     moved = tuple(
         Moved(each.name, each.unit, free_value(before, each), free_value(after, each), *intervals[each.name])
         for each in parameters
     )
-    return Finding(
-        parameters[0].cause,
-        moved,
-        tuple(name for name in CHANNELS if any(name in each.shows_in for each in parameters)),
-        _evidence(distance, len(parameters)),
-        gain,
-        tuple(each.name for each in instead),
-        "; ".join(dict.fromkeys(each.move for each in instead)),
-    )
-
-
-def _evidence(distance: float, count: int) -> float:
-    """Returns the negative natural logarithm of the probability of a distance by chance."""
-    chance = float(chdtrc(count, distance))
-    return -math.log(chance) if chance > 0.0 else 0.5 * distance
+    names, moves = (each.name for each in instead), dict.fromkeys(each.move for each in instead)
+    return Finding(parameters[0].cause, moved, tuple(names), "; ".join(moves))
 
 
 def alike(fitted: Fitted, legs: FloatArray) -> tuple[Alike, ...]:

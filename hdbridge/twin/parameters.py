@@ -31,22 +31,20 @@ class Parameter:
     """A parameter of the plant that a fit may change."""
 
     name: str
-    path: tuple[str, ...]
-    """Keys of the truth file."""
+    path: str
+    """Dotted keys of the truth file."""
     unit: str
     least: float
     most: float
     """Bounds of the value in a fit."""
     spread: float
     """Prior standard deviation about the start: of the natural logarithm, or in ``unit`` if `linear`."""
-    cause: str
-    """Cause that is reported if it has changed; several parameters may share one."""
-    shows_in: tuple[str, ...]
-    """Channels that depend on it."""
-    move: str
-    """Motion that separates it from parameters with similar effects."""
     least_change: float
     """Smallest change that matters in practice, in the unit of `spread`; smaller ones are not reported."""
+    cause: str
+    """Cause that is reported if it has changed; several parameters may share one."""
+    move: str
+    """Motion that separates it from parameters with similar effects."""
     linear: bool = False
 
     def coordinate(self, value: float) -> float:
@@ -78,172 +76,89 @@ FEEDFORWARD: Final = "feed-forward"
 ELASTIC: Final = "elastic loop"
 
 PARAMETERS: Final[tuple[Parameter, ...]] = (
-    Parameter(
-        "motor inertia", ("motor", "inertia_kg_m2"), "kg m2", 1e-9, 10.0, 0.7, "motor inertia",
-        (TORQUE, FOLLOWING), _STEPS, 0.10,
-    ),
-    Parameter(
-        "Coulomb friction", ("motor", "coulomb_nm"), "Nm", 1e-6, 1e3, 0.7, FRICTION,
-        (TORQUE, FOLLOWING), _REVERSALS, 0.15,
-    ),
-    Parameter(
-        "viscous friction", ("motor", "viscous_nm_s_per_rad"), "Nm s/rad", 1e-9, 100.0, 0.7, FRICTION,
-        (TORQUE,), _SPEEDS, 0.25,
-    ),
-    Parameter(
-        "friction's rise at rest", ("motor", "stribeck", "rise"), "", 0.0, 10.0, 0.3, FRICTION,
-        (TORQUE, FOLLOWING), _REVERSALS, 0.1, linear=True,
-    ),
-    Parameter(
-        "Stribeck speed", ("motor", "stribeck", "speed_rad_s"), "rad/s", 0.01, 1e3, 0.7, FRICTION,
-        (TORQUE, FOLLOWING), _SPEEDS, 0.5,
-    ),
-    Parameter(
-        "friction growth", ("temperature", "friction_growth_per_k"), "1/K", -0.1, 0.1, 0.01, FRICTION,
-        (TORQUE,), _WARM, 0.005, linear=True,
-    ),
-    Parameter(
-        "load inertia", ("load", "inertia_kg_m2"), "kg m2", 1e-7, 1e5, 0.7, "load inertia",
-        (TORQUE, LOAD), _STEPS, 0.10,
-    ),
-    Parameter(
-        "gear stiffness", ("gear", "stiffness_nm_per_rad"), "Nm/rad", 1.0, 1e9, 0.7, "gear stiffness",
-        (LOAD, TORQUE), _STEPS, 0.10,
-    ),
-    Parameter(
-        "gear damping", ("gear", "damping_nm_s_per_rad"), "Nm s/rad", 1e-6, 1e6, 0.7, "gear damping",
-        (LOAD,), _STEPS, 0.40,
-    ),
-    Parameter(
-        "position gain", ("servo", "position_gain_per_s"), "1/s", 1.0, 5_000.0, 0.7, SERVO,
-        (FOLLOWING, TORQUE), _SINES, 0.15,
-    ),
-    Parameter(
-        "velocity gain", ("servo", "velocity_gain_nm_s_per_rad"), "Nm s/rad", 1e-6, 1e3, 0.7, SERVO,
-        (FOLLOWING, TORQUE), _SINES, 0.15,
-    ),
-    Parameter(
-        "integral time", ("servo", "integral_time_ms"), "ms", 0.1, 1e4, 0.7, SERVO,
-        (FOLLOWING, TORQUE), _REVERSALS, 0.25,
-    ),
-    Parameter(
-        "command filter", ("servo", "command_filter_ms"), "ms", 0.05, 100.0, 0.7, "command filter",
-        (FOLLOWING,), _SINES, 0.30,
-    ),
-    Parameter(
-        "moving average", ("servo", "moving_average_ms"), "ms", 0.0, 7.0, 2.0, "command filter",
-        (FOLLOWING,), _SINES, 0.5, linear=True,
-    ),
-    Parameter(
-        "speed filter", ("servo", "speed_filter_ms"), "ms", 0.02, 20.0, 0.7, SERVO,
-        (FOLLOWING, TORQUE), _SINES, 0.4,
-    ),
-    Parameter(
-        "torque filter", ("servo", "torque_filter_ms"), "ms", 0.02, 20.0, 0.7, SERVO,
-        (FOLLOWING, TORQUE), _SINES, 0.4,
-    ),
-    Parameter(
-        "notch frequency", ("servo", "notch", "frequency_hz"), "Hz", 5.0, 800.0, 0.3, SERVO,
-        (TORQUE, FOLLOWING), _STEPS, 0.1,
-    ),
-    Parameter(
-        "notch depth", ("servo", "notch", "depth"), "", 0.0, 1.0, 0.3, SERVO,
-        (TORQUE, FOLLOWING), _STEPS, 0.2, linear=True,
-    ),
-    Parameter(
-        "notch width", ("servo", "notch", "width"), "", 0.05, 5.0, 0.7, SERVO,
-        (TORQUE, FOLLOWING), _STEPS, 0.4,
-    ),
-    Parameter(
-        "observer frequency", ("servo", "observer", "frequency_hz"), "Hz", 1.0, 300.0, 0.7, SERVO,
-        (TORQUE, FOLLOWING), _REVERSALS, 0.3,
-    ),
-    Parameter(
-        "observer share", ("servo", "observer", "share"), "", 0.0, 1.0, 0.3, SERVO,
-        (TORQUE, FOLLOWING), _REVERSALS, 0.2, linear=True,
-    ),
-    Parameter(
-        "observer inertia", ("servo", "observer", "inertia_kg_m2"), "kg m2", 1e-9, 10.0, 0.7, SERVO,
-        (TORQUE, FOLLOWING), _STEPS, 0.3,
-    ),
-    Parameter(
-        "velocity feed-forward", ("servo", "velocity_feedforward"), "", 0.0, 1.5, 0.1, FEEDFORWARD,
-        (FOLLOWING,), _SPEEDS, 0.03, linear=True,
-    ),
-    Parameter(
-        "inertia feed-forward", ("servo", "inertia_feedforward_kg_m2"), "kg m2", 1e-9, 10.0, 0.7,
-        FEEDFORWARD, (FOLLOWING, TORQUE), _STEPS, 0.20,
-    ),
-    Parameter(
-        "load feed-forward", ("servo", "load_feedforward", "inertia_kg_m2"), "kg m2", 1e-9, 10.0, 0.7,
-        FEEDFORWARD, (FOLLOWING, TORQUE), _STEPS, 0.20,
-    ),
-    Parameter(
-        "load feed-forward frequency", ("servo", "load_feedforward", "frequency_hz"), "Hz", 1.0, 500.0, 0.7,
-        FEEDFORWARD, (FOLLOWING, TORQUE), _STEPS, 0.20,
-    ),
-    Parameter(
-        "viscous feed-forward", ("servo", "viscous_feedforward_nm_s_per_rad"), "Nm s/rad", 1e-9, 100.0, 0.7,
-        FEEDFORWARD, (FOLLOWING,), _SPEEDS, 0.50,
-    ),
-    Parameter(
-        "friction feed-forward", ("servo", "friction_feedforward_nm"), "Nm", 1e-6, 1e3, 0.7, FEEDFORWARD,
-        (FOLLOWING, TORQUE), _REVERSALS, 0.20,
-    ),
-    Parameter(
-        "servo dead time", ("servo", "dead_time_ms"), "ms", 0.0, 20.0, 2.0, "servo dead time",
-        (FOLLOWING, TORQUE, LOAD), _SINES, 0.3, linear=True,
-    ),
-    Parameter(
-        "load encoder delay", ("load", "encoder", "late_ms"), "ms", 0.0, 20.0, 2.0, "load encoder delay",
-        (LOAD,), _SPEEDS, 0.3, linear=True,
-    ),
-    Parameter(
-        "encoder coupling", ("load", "encoder", "coupling", "frequency_hz"), "Hz", 10.0, 5_000.0, 0.7,
-        "encoder coupling", (LOAD,), _STEPS, 0.2,
-    ),
-    Parameter(
-        "motor encoder delay", ("motor", "encoder", "late_ms"), "ms", 0.0, 20.0, 2.0, "motor encoder delay",
-        (FOLLOWING, LOAD), _SPEEDS, 0.3, linear=True,
-    ),
-    Parameter(
-        "current limit", ("servo", "torque_limit_percent"), "%", 1.0, 1000.0, 0.7, "current limit",
-        (TORQUE, FOLLOWING), _FULL, 0.05,
-    ),
-    Parameter(
-        "loop offset", ("gear", "hysteresis", "offset_arcsec"), "arcsec", 0.01, 3.6e4, 0.3, ELASTIC,
-        (LOAD,), _LOOPS, 0.05,
-    ),
-    Parameter(
-        "loop width", ("gear", "hysteresis", "width_deg"), "deg", 0.01, 3.6e3, 0.7, ELASTIC,
-        (LOAD,), _LOOPS, 0.15,
-    ),
-    Parameter(
-        "loop yield", ("gear", "hysteresis", "yield_deg"), "deg", 0.01, 3.6e3, 0.7, ELASTIC,
-        (LOAD,), _LOOPS, 0.15,
-    ),
-    Parameter(
-        "loop exponent", ("gear", "hysteresis", "exponent"), "", 1.0, 5.0, 0.5, ELASTIC,
-        (LOAD,), _LOOPS, 0.20,
-    ),
-    Parameter(
-        "load friction", ("load", "coulomb_nm"), "Nm", 0.0, 1e4, 5.0, "load friction",
-        (LOAD, TORQUE), _REVERSALS, 0.5, linear=True,
-    ),
-    Parameter(
-        "temperature", ("temperature", "ambient_c"), "\N{DEGREE SIGN}C", -60.0, 100.0, 15.0, "warmth",
-        (TORQUE, LOAD), "the same motion with the temperature recorded", 3.0, linear=True,
-    ),
+    Parameter("motor inertia", "motor.inertia_kg_m2", "kg m2", 1e-9, 10.0, 0.7, 0.1, "motor inertia", _STEPS),
+    Parameter("Coulomb friction", "motor.coulomb_nm", "Nm", 1e-6, 1e3, 0.7, 0.15, FRICTION, _REVERSALS),
+    Parameter("viscous friction", "motor.viscous_nm_s_per_rad", "Nm s/rad", 1e-9, 100.0, 0.7, 0.25, FRICTION,
+        _SPEEDS),
+    Parameter("friction's rise at rest", "motor.stribeck.rise", "", 0.0, 10.0, 0.3, 0.1, FRICTION, _REVERSALS,
+        linear=True),
+    Parameter("Stribeck speed", "motor.stribeck.speed_rad_s", "rad/s", 0.01, 1e3, 0.7, 0.5, FRICTION,
+        _SPEEDS),
+    Parameter("friction growth", "temperature.friction_growth_per_k", "1/K", -0.1, 0.1, 0.01, 0.005, FRICTION,
+        _WARM, linear=True),
+    Parameter("load inertia", "load.inertia_kg_m2", "kg m2", 1e-7, 1e5, 0.7, 0.1, "load inertia", _STEPS),
+    Parameter("gear stiffness", "gear.stiffness_nm_per_rad", "Nm/rad", 1.0, 1e9, 0.7, 0.1, "gear stiffness",
+        _STEPS),
+    Parameter("gear damping", "gear.damping_nm_s_per_rad", "Nm s/rad", 1e-6, 1e6, 0.7, 0.4, "gear damping",
+        _STEPS),
+    Parameter("position gain", "servo.position_gain_per_s", "1/s", 1.0, 5e3, 0.7, 0.15, SERVO, _SINES),
+    Parameter("velocity gain", "servo.velocity_gain_nm_s_per_rad", "Nm s/rad", 1e-6, 1e3, 0.7, 0.15, SERVO,
+        _SINES),
+    Parameter("integral time", "servo.integral_time_ms", "ms", 0.1, 1e4, 0.7, 0.25, SERVO, _REVERSALS),
+    Parameter("command filter", "servo.command_filter_ms", "ms", 0.05, 100.0, 0.7, 0.3, "command filter",
+        _SINES),
+    Parameter("moving average", "servo.moving_average_ms", "ms", 0.0, 7.0, 2.0, 0.5, "command filter", _SINES,
+        linear=True),
+    Parameter("speed filter", "servo.speed_filter_ms", "ms", 0.02, 20.0, 0.7, 0.4, SERVO, _SINES),
+    Parameter("torque filter", "servo.torque_filter_ms", "ms", 0.02, 20.0, 0.7, 0.4, SERVO, _SINES),
+    Parameter("notch frequency", "servo.notch.frequency_hz", "Hz", 5.0, 800.0, 0.3, 0.1, SERVO, _STEPS),
+    Parameter("notch depth", "servo.notch.depth", "", 0.0, 1.0, 0.3, 0.2, SERVO, _STEPS, linear=True),
+    Parameter("notch width", "servo.notch.width", "", 0.05, 5.0, 0.7, 0.4, SERVO, _STEPS),
+    Parameter("observer frequency", "servo.observer.frequency_hz", "Hz", 1.0, 300.0, 0.7, 0.3, SERVO,
+        _REVERSALS),
+    Parameter("observer share", "servo.observer.share", "", 0.0, 1.0, 0.3, 0.2, SERVO, _REVERSALS,
+        linear=True),
+    Parameter("observer inertia", "servo.observer.inertia_kg_m2", "kg m2", 1e-9, 10.0, 0.7, 0.3, SERVO,
+        _STEPS),
+    Parameter("velocity feed-forward", "servo.velocity_feedforward", "", 0.0, 1.5, 0.1, 0.03, FEEDFORWARD,
+        _SPEEDS, linear=True),
+    Parameter("inertia feed-forward", "servo.inertia_feedforward_kg_m2", "kg m2", 1e-9, 10.0, 0.7, 0.2,
+        FEEDFORWARD, _STEPS),
+    Parameter("load feed-forward", "servo.load_feedforward.inertia_kg_m2", "kg m2", 1e-9, 10.0, 0.7, 0.2,
+        FEEDFORWARD, _STEPS),
+    Parameter("load feed-forward frequency", "servo.load_feedforward.frequency_hz", "Hz", 1.0, 500.0, 0.7,
+        0.2, FEEDFORWARD, _STEPS),
+    Parameter("viscous feed-forward", "servo.viscous_feedforward_nm_s_per_rad", "Nm s/rad", 1e-9, 100.0, 0.7,
+        0.5, FEEDFORWARD, _SPEEDS),
+    Parameter("friction feed-forward", "servo.friction_feedforward_nm", "Nm", 1e-6, 1e3, 0.7, 0.2,
+        FEEDFORWARD, _REVERSALS),
+    Parameter("servo dead time", "servo.dead_time_ms", "ms", 0.0, 20.0, 2.0, 0.3, "servo dead time", _SINES,
+        linear=True),
+    Parameter("load encoder delay", "load.encoder.late_ms", "ms", 0.0, 20.0, 2.0, 0.3, "load encoder delay",
+        _SPEEDS, linear=True),
+    Parameter("encoder coupling", "load.encoder.coupling.frequency_hz", "Hz", 10.0, 5e3, 0.7, 0.2,
+        "encoder coupling", _STEPS),
+    Parameter("motor encoder delay", "motor.encoder.late_ms", "ms", 0.0, 20.0, 2.0, 0.3,
+        "motor encoder delay", _SPEEDS, linear=True),
+    Parameter("current limit", "servo.torque_limit_percent", "%", 1.0, 1e3, 0.7, 0.05, "current limit",
+        _FULL),
+    Parameter("loop offset", "gear.hysteresis.offset_arcsec", "arcsec", 0.01, 3.6e4, 0.3, 0.05, ELASTIC,
+        _LOOPS),
+    Parameter("loop width", "gear.hysteresis.width_deg", "deg", 0.01, 3.6e3, 0.7, 0.15, ELASTIC, _LOOPS),
+    Parameter("loop yield", "gear.hysteresis.yield_deg", "deg", 0.01, 3.6e3, 0.7, 0.15, ELASTIC, _LOOPS),
+    Parameter("loop exponent", "gear.hysteresis.exponent", "", 1.0, 5.0, 0.5, 0.2, ELASTIC, _LOOPS),
+    Parameter("load friction", "load.coulomb_nm", "Nm", 0.0, 1e4, 5.0, 0.5, "load friction", _REVERSALS,
+        linear=True),
+    Parameter("temperature", "temperature.ambient_c", "\N{DEGREE SIGN}C", -60.0, 100.0, 15.0, 3.0, "warmth",
+        "the same motion with the temperature recorded", linear=True),
 )  # fmt: skip
 """All parameters, in the order of a fit."""
 
 BY_NAME: Final[Mapping[str, Parameter]] = {each.name: each for each in PARAMETERS}
 
 
+def by_cause(parameters: Iterable[Parameter]) -> dict[str, tuple[Parameter, ...]]:
+    """Groups parameters by their cause."""
+    groups: dict[str, tuple[Parameter, ...]] = {}
+    for each in parameters:
+        groups[each.cause] = (*groups.get(each.cause, ()), each)
+    return groups
+
+
 def value_in(truth: Truth, parameter: Parameter) -> float | None:
     """Returns a parameter's value in a truth; None if its section is missing or the law does not have it."""
     place: Any = truth
-    for key in parameter.path:
+    for key in parameter.path.split("."):
         place = getattr(place, "load_" if key == "load" else key, None)
         if place is None:
             return None
@@ -272,7 +187,7 @@ def _with(truth: Truth, values: Mapping[str, float]) -> dict[str, Any]:
     """Returns the content of the truth with other values."""
     data = truth.model_dump(by_alias=True, exclude_none=True)
     for name, value in values.items():
-        *sections, key = BY_NAME[name].path
+        *sections, key = BY_NAME[name].path.split(".")
         place = data
         for section in sections:
             place = place.setdefault(section, {})
@@ -310,65 +225,59 @@ def at_coordinates(truth: Truth, parameters: Sequence[Parameter], place: Sequenc
 # Default plant from the axis file alone: the twin before any measurement.
 
 
-@dataclass(frozen=True, slots=True)
-class Usual:
-    """An assumed value, with its unit and source."""
-
-    value: float
-    unit: str
-    source: str
-
-
-TORQUE_PER_INERTIA: Final = Usual(
-    10_000.0, "rad/s^2", "small brushless servo motors: rated torque accelerates the bare rotor at about 1e4"
-)
-INERTIA_RATIO: Final = Usual(3.0, "", "load over motor inertia seen by the motor; the article's bench has 3")
-RESONANCE_HZ: Final = Usual(
-    40.0, "Hz", "load on the gear's spring: 15 to 80 Hz for arms on strain wave gears"
-)
-DAMPING_RATIO: Final = Usual(0.2, "", "of that resonance: material and grease; the article's bench has 0.2")
-COULOMB_SHARE: Final = Usual(
-    0.1, "of the rated torque", "no-load running torque of strain wave gears at the motor: 5 to 15 %"
-)
-VISCOUS_SHARE: Final = Usual(
-    0.2, "of the rated torque at 3000 rpm", "grease of strain wave gears at 20 deg C"
-)
-RATED_SPEED_RAD_S: Final = Usual(3000.0 * math.tau / 60.0, "rad/s", "rated speed of small servo motors")
-STRIBECK_RAD_S: Final = Usual(
-    5.0, "rad/s", "bearings and teeth in grease: a film carries from some tens of turns a minute on"
-)
-COUPLING_HZ: Final = Usual(
-    1000.0, "Hz", "an encoder whose coupling is not known: stiffer than a recording shows"
-)
-COUPLING_DAMPING: Final = Usual(
-    0.1, "", "metal bellows couplings: 0.05 to 0.2 with the bearings of the encoder"
-)
-NOTCH_HZ: Final = Usual(100.0, "Hz", "a notch on the resonance of motor and load: 40 to 200 Hz")
-OBSERVER_HZ: Final = Usual(50.0, "Hz", "disturbance observers: one to three velocity loops, 20 to 150 Hz")
-SHORTEST_FILTER_MS: Final = Usual(0.02, "ms", "a filter that is as good as none: a tenth of a short substep")
-BRAKE_SHARE: Final = Usual(
-    3.0, "of the rated torque", "holding brakes are built for more than the motor gives"
-)
-POSITION_GAIN_PER_S: Final = Usual(200.0, "1/s", "stiff position loop of a direct sine/cosine feedback drive")
-VELOCITY_BANDWIDTH_RAD_S: Final = Usual(1000.0, "rad/s", "velocity loop on the motor's own inertia: 160 Hz")
-INTEGRAL_TIME_MS: Final = Usual(15.0, "ms", "some three times the period of the velocity loop's bandwidth")
-COMMAND_FILTER_MS: Final = Usual(1.0, "ms", "drives interpolate the demand between SYNCs by a short filter")
-FRICTION_TOLD: Final = Usual(
-    0.8, "of the friction", "as much as is fed forward without overshoot at reversals"
-)
-TORQUE_LIMIT_PERCENT: Final = Usual(300.0, "%", "peak over rated torque of small servo motors")
-NOISE_COUNTS: Final = Usual(0.3, "counts rms", "an encoder's noise is below its count as a rule")
+TORQUE_PER_INERTIA: Final = 10_000.0
+"""Acceleration of the bare rotor of a small brushless servo motor at its rated torque, rad/s^2: about 1e4."""
+INERTIA_RATIO: Final = 3.0
+"""Load over motor inertia seen by the motor; the article's bench has 3."""
+RESONANCE_HZ: Final = 40.0
+"""Load on the gear's spring: 15 to 80 Hz for arms on strain wave gears."""
+DAMPING_RATIO: Final = 0.2
+"""Damping ratio of that resonance: material and grease; the article's bench has 0.2."""
+COULOMB_SHARE: Final = 0.1
+"""No-load running torque of strain wave gears at the motor, as a share of the rated torque: 5 to 15 %."""
+VISCOUS_SHARE: Final = 0.2
+"""Grease of strain wave gears at 20 deg C, as a share of the rated torque at 3000 rpm."""
+RATED_SPEED_RAD_S: Final = 3000.0 * math.tau / 60.0
+"""Rated speed of small servo motors."""
+STRIBECK_RAD_S: Final = 5.0
+"""Bearings and teeth in grease: a film carries from some tens of turns a minute on."""
+COUPLING_HZ: Final = 1000.0
+"""An encoder whose coupling is not known: stiffer than a recording shows."""
+COUPLING_DAMPING: Final = 0.1
+"""Metal bellows couplings: 0.05 to 0.2 with the bearings of the encoder."""
+NOTCH_HZ: Final = 100.0
+"""A notch on the resonance of motor and load: 40 to 200 Hz."""
+OBSERVER_HZ: Final = 50.0
+"""Disturbance observers: one to three velocity loops, 20 to 150 Hz."""
+SHORTEST_FILTER_MS: Final = 0.02
+"""A negligible filter: a tenth of a short substep."""
+BRAKE_SHARE: Final = 3.0
+"""Torque of a holding brake, as a share of the rated torque: more than the motor gives."""
+POSITION_GAIN_PER_S: Final = 200.0
+"""Stiff position loop of a direct sine/cosine feedback drive."""
+VELOCITY_BANDWIDTH_RAD_S: Final = 1000.0
+"""Velocity loop on the motor's own inertia: 160 Hz."""
+INTEGRAL_TIME_MS: Final = 15.0
+"""Some three times the period of the velocity loop's bandwidth."""
+COMMAND_FILTER_MS: Final = 1.0
+"""Drives interpolate the demand between SYNCs by a short filter."""
+FRICTION_TOLD: Final = 0.8
+"""Friction feed-forward as a share of the friction: without overshoot at reversals."""
+TORQUE_LIMIT_PERCENT: Final = 300.0
+"""Peak over rated torque of small servo motors."""
+NOISE_COUNTS: Final = 0.3
+"""Rms noise of an encoder in counts: usually below one."""
 SUBSTEP_MS: Final = 0.5
 
 
 def default_truth(axis: AxisConfig) -> Truth:
     """Returns the simulated drive for an axis file: no transmission error, usual mechanics."""
     ratio, rated_nm = axis.gear.ratio, axis.drive.rated_torque_nm
-    inertia = rated_nm / TORQUE_PER_INERTIA.value
-    load_inertia = INERTIA_RATIO.value * inertia * ratio**2
-    turn = math.tau * RESONANCE_HZ.value
-    coulomb = COULOMB_SHARE.value * rated_nm
-    viscous = VISCOUS_SHARE.value * rated_nm / RATED_SPEED_RAD_S.value
+    inertia = rated_nm / TORQUE_PER_INERTIA
+    load_inertia = INERTIA_RATIO * inertia * ratio**2
+    turn = math.tau * RESONANCE_HZ
+    coulomb = COULOMB_SHARE * rated_nm
+    viscous = VISCOUS_SHARE * rated_nm / RATED_SPEED_RAD_S
     data: dict[str, Any] = {
         "schema": "hdbridge.truth/1",
         "name": axis.name,
@@ -379,33 +288,33 @@ def default_truth(axis: AxisConfig) -> Truth:
             "rated_torque_nm": rated_nm,
             "coulomb_nm": coulomb,
             "viscous_nm_s_per_rad": viscous,
-            "brake_nm": BRAKE_SHARE.value * rated_nm,
+            "brake_nm": BRAKE_SHARE * rated_nm,
             "encoder": _encoder(axis.motor_encoder),
         },
         "servo": {
-            "position_gain_per_s": POSITION_GAIN_PER_S.value,
-            "velocity_gain_nm_s_per_rad": inertia * VELOCITY_BANDWIDTH_RAD_S.value,
-            "integral_time_ms": INTEGRAL_TIME_MS.value,
-            "command_filter_ms": COMMAND_FILTER_MS.value,
+            "position_gain_per_s": POSITION_GAIN_PER_S,
+            "velocity_gain_nm_s_per_rad": inertia * VELOCITY_BANDWIDTH_RAD_S,
+            "integral_time_ms": INTEGRAL_TIME_MS,
+            "command_filter_ms": COMMAND_FILTER_MS,
             "inertia_feedforward_kg_m2": inertia,
             "load_feedforward": {
                 "inertia_kg_m2": load_inertia / ratio**2,
-                "frequency_hz": RESONANCE_HZ.value,
-                "damping_ratio": DAMPING_RATIO.value,
+                "frequency_hz": RESONANCE_HZ,
+                "damping_ratio": DAMPING_RATIO,
             },
             "viscous_feedforward_nm_s_per_rad": viscous,
-            "friction_feedforward_nm": FRICTION_TOLD.value * coulomb,
-            "torque_limit_percent": max(TORQUE_LIMIT_PERCENT.value, axis.limits.torque_percent),
+            "friction_feedforward_nm": FRICTION_TOLD * coulomb,
+            "torque_limit_percent": max(TORQUE_LIMIT_PERCENT, axis.limits.torque_percent),
         },
         "gear": {
             "ratio": ratio,
             "stiffness_nm_per_rad": load_inertia * turn**2,
-            "damping_nm_s_per_rad": 2.0 * DAMPING_RATIO.value * load_inertia * turn,
+            "damping_nm_s_per_rad": 2.0 * DAMPING_RATIO * load_inertia * turn,
         },
         "load": {
             "inertia_kg_m2": load_inertia,
             "encoder": _encoder(axis.load_encoder)
-            | {"noise_arcsec": NOISE_COUNTS.value * axis.load_encoder.resolution_arcsec},
+            | {"noise_arcsec": NOISE_COUNTS * axis.load_encoder.resolution_arcsec},
         },
     }
     if axis.gear.teeth is not None:
@@ -415,23 +324,21 @@ def default_truth(axis: AxisConfig) -> Truth:
 
 def with_sections(truth: Truth, parameters: Iterable[Parameter]) -> Truth:
     """Returns the truth with the sections of these parameters added, without effect where possible."""
-    wanted = {section for each in parameters for section in each.path}
+    wanted = {section for each in parameters for section in each.path.split(".")}
     if truth.motor.stribeck is None and "stribeck" in wanted:
-        truth = with_values(truth, {"friction's rise at rest": 0.0, "Stribeck speed": STRIBECK_RAD_S.value})
+        truth = with_values(truth, {"friction's rise at rest": 0.0, "Stribeck speed": STRIBECK_RAD_S})
     if truth.load_.encoder.coupling is None and "coupling" in wanted:
-        rigid = TrueCoupling(frequency_hz=COUPLING_HZ.value, damping_ratio=COUPLING_DAMPING.value)
+        rigid = TrueCoupling(frequency_hz=COUPLING_HZ, damping_ratio=COUPLING_DAMPING)
         truth = with_load_encoder(truth, coupling=rigid)
     servo: dict[str, Any] = {}
     if truth.servo.notch is None and "notch" in wanted:
-        servo["notch"] = TrueNotch(frequency_hz=NOTCH_HZ.value, depth=1.0, width=1.0)
+        servo["notch"] = TrueNotch(frequency_hz=NOTCH_HZ, depth=1.0, width=1.0)
     if truth.servo.observer is None and "observer" in wanted:
         inertia_kg_m2 = truth.motor.inertia_kg_m2
-        servo["observer"] = TrueObserver(
-            frequency_hz=OBSERVER_HZ.value, share=0.0, inertia_kg_m2=inertia_kg_m2
-        )
+        servo["observer"] = TrueObserver(frequency_hz=OBSERVER_HZ, share=0.0, inertia_kg_m2=inertia_kg_m2)
     for name in ("speed_filter_ms", "torque_filter_ms"):
         if name in wanted and not getattr(truth.servo, name):
-            servo[name] = SHORTEST_FILTER_MS.value
+            servo[name] = SHORTEST_FILTER_MS
     return truth.model_copy(update={"servo": truth.servo.model_copy(update=servo)}) if servo else truth
 
 

@@ -20,8 +20,9 @@ from hdbridge.axis.effects import FloatArray
 from hdbridge.sim.truth import Truth
 from hdbridge.sim.truth.motor import TrueResponse
 from hdbridge.twin.fit import Fitted
-from hdbridge.twin.misfit import Data, Piece, Replays, demand_deg, misfit
+from hdbridge.twin.misfit import Data, Piece, Replays, misfit
 from hdbridge.twin.parameters import FOLLOWING, TORQUE
+from hdbridge.twin.replay import demand_deg
 
 SPEED_S: Final = 0.4
 """Length of the responses to the speed: a load that rings at 15 Hz with a damping ratio of 0.06 decays to a

@@ -25,32 +25,36 @@ from hdbridge.axis.effects import Channel, FloatArray
 from hdbridge.records.recording import Recording
 from hdbridge.sim.truth import Truth
 from hdbridge.twin.compare import least_change
-from hdbridge.twin.fit import Fitted, sandwich
+from hdbridge.twin.fit import Fitted, intervals_of, sandwich
 from hdbridge.twin.misfit import held_out_legs
 from hdbridge.twin.naming import FALSE_ALARM, Finding, finding
 from hdbridge.twin.parameters import BY_NAME, Parameter, coordinates
 from hdbridge.twin.replay import continuous, replay
 
-TEMPERATURE: Final = "temperature"
-"""Channel in which these constants show."""
 AMBIENT: Final = replace(BY_NAME["temperature"], name="ambient temperature")
 _WARM_UP = "a warm-up of half an hour and more, and a rest after it, with the temperature recorded"
-RESISTANCE: Final = Parameter(
-    "thermal resistance", ("temperature", "resistance_k_per_w"), "K/W", 1e-4, 1e3, 0.7, AMBIENT.cause,
-    (), _WARM_UP, 0.25,
-)  # fmt: skip
-TIME_CONSTANT: Final = Parameter(
-    "thermal time constant", ("temperature", "time_constant_s"), "s", 1.0, 1e6, 0.7, AMBIENT.cause,
-    (), _WARM_UP, 0.25,
-)  # fmt: skip
 RISE_K: Final = 100.0
 """Temperature rise of a winding at rated torque (IEC 60034-1 allows 105 K for class F by the resistance
 method, and motors are rated by it). The housing warms less."""
 MATTERS_K: Final = 5.0
 """Smallest change of that temperature rise that matters in practice."""
+RESISTANCE: Final = Parameter(
+    "thermal resistance",
+    "temperature.resistance_k_per_w",
+    "K/W",
+    1e-4,
+    1e3,
+    0.7,
+    0.25,
+    AMBIENT.cause,
+    _WARM_UP,
+)
+TIME_CONSTANT: Final = Parameter(
+    "thermal time constant", "temperature.time_constant_s", "s", 1.0, 1e6, 0.7, 0.25, AMBIENT.cause, _WARM_UP
+)
 COPPER_LOSS: Final = Parameter(
-    "copper loss", ("temperature", "copper_loss_w"), "W", 0.0, 1e5, RISE_K, AMBIENT.cause, (), _WARM_UP,
-    MATTERS_K, linear=True,
+    "copper loss", "temperature.copper_loss_w", "W", 0.0, 1e5, RISE_K, MATTERS_K, AMBIENT.cause, _WARM_UP,
+    linear=True,
 )  # fmt: skip
 """Spread and least change are those at one kelvin per watt."""
 THERMAL: Final = (AMBIENT, RESISTANCE, TIME_CONSTANT, COPPER_LOSS)
@@ -58,8 +62,6 @@ THERMAL: Final = (AMBIENT, RESISTANCE, TIME_CONSTANT, COPPER_LOSS)
 STEP_S: Final = 1.0
 """Time step with constant losses: a hundredth of the time constant of the smallest motor."""
 MINIMUM_STEPS: Final = 3
-LONGER: Final = 1e-4
-"""Step of the finite difference, in the logarithm of the time constant."""
 LARGE_S: Final = 1e6
 """Time constant of a body at one kelvin per watt that hardly warms: in an hour at 10 W by 0.04 K."""
 LEAST_ERROR: Final = 1e-4
@@ -97,25 +99,6 @@ class _Part:
         return np.asarray(np.add.reduceat(counted, self.firsts) / lengths, dtype=np.float64)
 
 
-@dataclass(frozen=True, eq=False)
-class _Losses:
-    """Heat input to the body, accumulated by row."""
-
-    friction_j: FloatArray
-    torque_squares: FloatArray
-    """Integral of the squared torque over rated torque; seconds."""
-
-
-@dataclass(frozen=True, eq=False)
-class _Fit:
-    """Fitted coordinates of `THERMAL` and their covariance."""
-
-    place: FloatArray
-    covariance: FloatArray
-    left: tuple[float, float]
-    """Rms residual of the readings over their noise, before and after the fit."""
-
-
 def with_warmth(
     recording: Recording, axis: AxisConfig, fitted: Fitted, truth: Truth
 ) -> tuple[Truth, Finding | None]:
@@ -127,48 +110,40 @@ def with_warmth(
     record = recording.record
     if Channel.TEMPERATURE.value not in record.columns:
         return truth, None
-    parts = _parts(recording, _losses(recording, axis, truth), truth)
+    parts = _parts(recording, truth, *_losses(recording, axis, truth))
     if not parts:
         return truth, None
     readings = record.columns[Channel.TEMPERATURE.value]
     step_k = min(least_change(np.diff(readings), readings), START_K)
-    found = _fit(parts, truth, step_k, _friction_error(recording, fitted))
-    heat = dict(zip((each.path[-1] for each in THERMAL), _values(found.place), strict=True))
+    place, covariance = _fit(parts, truth, step_k, _friction_error(recording, fitted))
+    heat = dict(zip((each.path.split(".")[-1] for each in THERMAL), _values(place), strict=True))
     if truth.temperature.friction_growth_per_k or truth.temperature.tooth_growth_per_k:
         # Keep the growth of friction and tooth error unchanged by the new ambient temperature.
         heat["reference_c"] = truth.temperature.unchanged_c
-    reach = NORMAL_95 * np.sqrt(np.diag(found.covariance))
-    intervals = {
-        ".".join(each.path): (each.value(float(at - r)), each.value(float(at + r)))
-        for each, at, r in zip(THERMAL, found.place, reach, strict=True)
-    }
+    intervals = intervals_of(THERMAL, place, covariance)
     after = truth.model_copy(
         update={
             "temperature": truth.temperature.model_copy(update=heat),
-            "intervals": {**truth.intervals, **intervals},
+            "intervals": truth.intervals | {each.path: intervals[each.name] for each in THERMAL},
         }
     )
-    return after, _named(truth, after, found)
-
-
-def _named(before: Truth, after: Truth, found: _Fit) -> Finding | None:
-    """Returns a finding if a constant has changed significantly and by a relevant amount."""
-    off = found.place - np.array(coordinates(before, THERMAL))
-    spread = np.sqrt(np.diag(found.covariance))
-    least = np.array([each.least_change for each in _scaled(before)])
-    distance = float(off @ np.linalg.solve(found.covariance, off))
+    # A finding is a constant that has changed significantly and by a relevant amount.
+    off, spread = place - np.array(coordinates(truth, THERMAL)), np.sqrt(np.diag(covariance))
+    least = np.array([each.least_change for each in _scaled(truth)])
+    distance = float(off @ np.linalg.solve(covariance, off))
     moved = (np.abs(off) > least) & (np.abs(off) > NORMAL_95 * spread)
     if not np.any(moved) or float(chdtrc(len(off), distance)) > FALSE_ALARM:
-        return None
-    intervals = {each.name: after.intervals[".".join(each.path)] for each in THERMAL}
-    told = finding(THERMAL, before, after, intervals, distance, found.left)
-    return replace(told, shows_in=(TEMPERATURE,))
+        return after, None
+    return after, finding(THERMAL, truth, after, intervals)
 
 
-def _fit(parts: Sequence[_Part], truth: Truth, step_k: float, friction_error: float) -> _Fit:
+def _fit(
+    parts: Sequence[_Part], truth: Truth, step_k: float, friction_error: float
+) -> tuple[FloatArray, FloatArray]:
     """Fits the constants, a factor of the friction's work, and the initial temperature of each part.
 
-    Each run of equal readings counts as one, because their rounding error is common.
+    Each run of equal readings counts as one, because their rounding error is common. Returns the coordinates
+    of `THERMAL` and their covariance.
     """
     parameters = _scaled(truth)
     count = len(parameters)
@@ -183,10 +158,7 @@ def _fit(parts: Sequence[_Part], truth: Truth, step_k: float, friction_error: fl
     noise_k = step_k / math.sqrt(12.0)
 
     def left(place: FloatArray) -> FloatArray:
-        return np.asarray((_shown(parts, place)[0] - read) / noise_k, dtype=np.float64)
-
-    def slopes(place: FloatArray) -> FloatArray:
-        return np.asarray(_shown(parts, place)[1] / noise_k, dtype=np.float64)
+        return np.append((_shown(parts, place) - read) / noise_k, (place - prior) / spread)
 
     for _ in range(ROUNDS):
         fits = []
@@ -194,20 +166,13 @@ def _fit(parts: Sequence[_Part], truth: Truth, step_k: float, friction_error: fl
             begin = prior.copy()
             begin[2] = np.clip(begin[2] + shift, low[2], high[2])
             inside = np.clip(begin, low + 1e-9, high - 1e-9)
-            fits.append(
-                least_squares(
-                    lambda place: np.append(left(place), (place - prior) / spread),
-                    inside,
-                    lambda place: np.concatenate([slopes(place), np.diag(1.0 / spread)]),
-                    (low, high),
-                    x_scale=spread,
-                )
-            )
-        place = min(fits, key=lambda each: float(each.cost)).x
-        rest_k = noise_k * float(np.sqrt(np.mean(np.square(left(place)))))
+            fits.append(least_squares(left, inside, bounds=(low, high), x_scale=spread))
+        end = min(fits, key=lambda each: float(each.cost))
+        place, off, slopes = end.x, end.fun[: len(read)], end.jac[: len(read)]
+        rest_k = noise_k * float(np.sqrt(np.mean(np.square(off))))
         if rest_k <= noise_k:
             break
-        noise_k = rest_k
+        noise_k, off, slopes = rest_k, off * noise_k / rest_k, slopes * noise_k / rest_k
     numbers, goes_on = [], 0
     together_s = TOGETHER * _values(place[:count])[2]
     for each in parts:
@@ -215,10 +180,8 @@ def _fit(parts: Sequence[_Part], truth: Truth, step_k: float, friction_error: fl
         numbers.append(goes_on + number)
         goes_on += int(number[-1]) + 1
     legs = np.concatenate(numbers).astype(np.float64)
-    covariance = sandwich(slopes(place), left(place), legs, spread)
-    before = np.concatenate([coordinates(truth, parameters), place[count:]])
-    sizes = [float(np.sqrt(np.mean(np.square(left(each))))) for each in (before, place)]
-    return _Fit(place[:count], covariance[:count, :count], (sizes[0], sizes[1]))
+    covariance = sandwich(slopes, off, legs, spread)
+    return place[:count], covariance[:count, :count]
 
 
 def _values(place: FloatArray) -> list[float]:
@@ -232,30 +195,15 @@ def _scaled(truth: Truth) -> list[Parameter]:
     return [AMBIENT, RESISTANCE, TIME_CONSTANT, copper]
 
 
-def _shown(parts: Sequence[_Part], place: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Returns the body's mean temperature of each run, and its derivatives by the coordinates."""
+def _shown(parts: Sequence[_Part], place: FloatArray) -> FloatArray:
+    """Returns the body's mean temperature of each run."""
     count = len(THERMAL)
     ambient_c, k_per_w, time_s, copper_w = _values(place[:count])
-    friction, starts = math.exp(place[count]), place[count + 1 :]
-    shown, tables = [], []
-    for number, (part, start_c) in enumerate(zip(parts, starts.tolist(), strict=True)):
-        rubbed_k, copper_k = k_per_w * friction * part.friction_w, k_per_w * part.torque_squares
-        goal_c = ambient_c + part.weather_k + rubbed_k + copper_w * copper_k
-        warm_c, none = _body(goal_c, start_c, time_s), np.zeros(len(goal_c))
-        slower_c = _body(goal_c, start_c, time_s * math.exp(LONGER))
-        columns = [
-            _body(none + 1.0, 0.0, time_s),
-            _body(rubbed_k + copper_w * copper_k, 0.0, time_s),
-            (slower_c - warm_c) / LONGER,
-            _body(copper_k, 0.0, time_s),
-            _body(rubbed_k, 0.0, time_s),
-        ]
-        shown.append(part.runs(warm_c))
-        table = np.zeros((len(shown[-1]), len(place)))
-        table[:, : len(columns)] = np.stack([part.runs(each) for each in columns], axis=1)
-        table[:, len(columns) + number] = part.runs(_body(none, 1.0, time_s))
-        tables.append(table)
-    return np.concatenate(shown), np.concatenate(tables)
+    friction, shown = math.exp(place[count]), []
+    for part, start_c in zip(parts, place[count + 1 :].tolist(), strict=True):
+        losses_w = friction * part.friction_w + copper_w * part.torque_squares
+        shown.append(part.runs(_body(ambient_c + part.weather_k + k_per_w * losses_w, start_c, time_s)))
+    return np.concatenate(shown)
 
 
 def _body(goal_c: FloatArray, start_c: float, time_s: float) -> FloatArray:
@@ -265,8 +213,14 @@ def _body(goal_c: FloatArray, start_c: float, time_s: float) -> FloatArray:
     return np.append(start_c, way_c)
 
 
-def _parts(recording: Recording, losses: _Losses, truth: Truth) -> list[_Part]:
-    """Prepares the continuous parts; skips those that are too short or without readings that count."""
+def _parts(
+    recording: Recording, truth: Truth, friction_j: FloatArray, torque_squares: FloatArray
+) -> list[_Part]:
+    """Prepares the continuous parts; skips those that are too short or without readings that count.
+
+    The losses are accumulated by row: the friction's work, and the integral of the squared torque over the
+    rated one in seconds.
+    """
     record, heat = recording.record, truth.temperature
     counts = np.ones(len(record), dtype=np.bool_)
     for leg in held_out_legs(recording):
@@ -280,20 +234,20 @@ def _parts(recording: Recording, losses: _Losses, truth: Truth) -> list[_Part]:
         if len(at_s) < MINIMUM_STEPS or not len(inside):
             continue
         reading_c = record.columns[Channel.TEMPERATURE.value][rows][nearest]
-        friction_w, torque_squares = (
+        friction_w, squares = (
             np.append(0.0, np.diff(np.interp(at_s, time_s, each[rows])) / STEP_S)
-            for each in (losses.friction_j, losses.torque_squares)
+            for each in (friction_j, torque_squares)
         )
         weather_k = heat.ambient_k_per_hour * at_s / 3600.0
         weather_k = weather_k + heat.ambient_swing_k * np.sin(math.tau * at_s / heat.ambient_period_s)
         new = (np.diff(reading_c[inside]) != 0.0) | (np.diff(inside) > 1)
         firsts = np.append(0, np.flatnonzero(new) + 1)
-        found.append(_Part(friction_w, torque_squares, weather_k, reading_c, inside, firsts))
+        found.append(_Part(friction_w, squares, weather_k, reading_c, inside, firsts))
     return found
 
 
-def _losses(recording: Recording, axis: AxisConfig, truth: Truth) -> _Losses:
-    """Computes the losses by two replays with a body so large that it hardly warms.
+def _losses(recording: Recording, axis: AxisConfig, truth: Truth) -> tuple[FloatArray, FloatArray]:
+    """Computes the accumulated losses by two replays with a body so large that it hardly warms.
 
     Replays are needed because a recording has the torque at the end of each cycle, while the torque within it
     heats the motor. The friction's work is corrected to the recorded temperature.
@@ -316,7 +270,7 @@ def _losses(recording: Recording, axis: AxisConfig, truth: Truth) -> _Losses:
         cooled_j = np.append(0.0, np.cumsum(above_k * np.diff(time_s)))
         taken_j.append(LARGE_S * warm_c + cooled_j)
     friction_j = np.diff(taken_j[0]) * (_grown(truth, told_c) / _grown(truth, warm_c))[1:]
-    return _Losses(np.append(0.0, np.cumsum(friction_j)), taken_j[1] - taken_j[0])
+    return np.append(0.0, np.cumsum(friction_j)), taken_j[1] - taken_j[0]
 
 
 def _grown(truth: Truth, warm_c: FloatArray) -> FloatArray:

@@ -11,8 +11,9 @@ from __future__ import annotations
 
 import cmath
 import math
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import partial
 from itertools import pairwise
 from types import MappingProxyType
 from typing import Any, Final, NamedTuple
@@ -20,37 +21,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from pydantic import ValidationError
 
-from hdbridge.axis import AxisConfig
-from hdbridge.axis.effects import (
-    CATALOGUE,
-    AmplitudeDrift,
-    Backlash,
-    ChannelSkew,
-    Compliance,
-    CountLoss,
-    Creep,
-    DirectionPhase,
-    Effect,
-    FlexsplineOrders,
-    Hysteresis,
-    HysteresisMemory,
-    HysteresisParameters,
-    InertialWindup,
-    LoadOrders,
-    LocalDefect,
-    MotorEncoderEccentricity,
-    MotorOrder,
-    MotorOrders,
-    RateDependence,
-    RatioError,
-    SubdivisionalError,
-    Synchronous,
-    TorqueModulation,
-    VelocityWindup,
-    Vibration,
-    Wear,
-    ZeroDrift,
-)
+from hdbridge.axis import AxisConfig, effects
 from hdbridge.axis.effects.base import FloatArray
 from hdbridge.axis.effects.direction_phase import STEEPEST
 from hdbridge.axis.effects.elastic_loop import rise
@@ -68,19 +39,6 @@ from hdbridge.units import ARCSEC_PER_DEG
 ARCSEC_PER_RAD = math.degrees(1.0) * ARCSEC_PER_DEG
 
 
-@dataclass(frozen=True, slots=True)
-class Said:
-    """Result of translating an effect: its place in the truth file, and notes on differences."""
-
-    counterpart: str | None
-    notes: tuple[str, ...] = ()
-
-
-def none(why: str) -> Said:
-    """Returns the result for an effect without a counterpart in the plant."""
-    return Said(None, (why,))
-
-
 @dataclass(slots=True)
 class Draft:
     """Content of a truth file, `data`, which is changed in place."""
@@ -89,6 +47,19 @@ class Draft:
     axis: AxisConfig
     tells_servo: bool
     """True if the drive's feed-forward is set to the load that is written, as after commissioning."""
+    place: str | None = None
+    """Place of the present effect in the truth file; None if the plant has no counterpart."""
+    notes: list[str] = field(default_factory=list)
+    """Differences of the present effect there."""
+
+    def note(self, difference: str) -> None:
+        """Notes a difference of the present effect, once."""
+        if difference not in self.notes:
+            self.notes.append(difference)
+
+    def refuse(self, why: str) -> None:
+        """Notes that the plant has no counterpart of the present effect."""
+        self.place, self.notes = None, [why]
 
     @property
     def gear(self) -> dict[str, Any]:
@@ -205,91 +176,76 @@ MOST_YIELD: Final = 0.9
 """Maximum compliance of the teeth, as a share of the spring's; at one the plant is unstable."""
 
 
-def ratio_error(effect: RatioError, draft: Draft) -> Said:
+def ratio_error(effect: effects.RatioError, draft: Draft) -> None:
     """Sets the true ratio of the gear."""
     draft.gear["ratio"] = effect.true_ratio(draft.ratio)
-    return Said("gear.ratio")
 
 
-def motor_orders(effect: Synchronous | MotorOrders, draft: Draft) -> Said:
-    """Sets the tooth error by motor angle; orders in two effects are added."""
-    return _orders(effect.orders, draft, "motor_orders")
+def orders(key: str, effect: Any, draft: Draft) -> None:
+    """Sets the tooth error by the angle of this key; orders in two effects are added."""
+    _add_orders(effect.orders, draft, key)
 
 
-def flexspline_orders(effect: FlexsplineOrders, draft: Draft) -> Said:
-    """Sets the tooth error by the angle between wave generator and flexspline."""
-    return _orders(effect.orders, draft, "flexspline_orders")
-
-
-def gear_load_orders(orders: Iterable[MotorOrder], draft: Draft) -> Said:
-    """Sets the tooth error by load angle."""
-    return _orders(orders, draft, "load_orders")
-
-
-def direction_phase(effect: DirectionPhase, draft: Draft) -> Said:
+def direction_phase(effect: effects.DirectionPhase, draft: Draft) -> None:
     """Sets two flanks; the model's orders are the mean of both, the plant's those of each."""
     held = []
-    orders: list[dict[str, Any]] = []
+    flanks: list[dict[str, Any]] = []
     for each in draft.gear.get("motor_orders", ()):
         shift = math.radians(each["order"] * effect.shift_deg)
         share = math.cos(shift)
         if abs(math.tan(shift)) > STEEPEST or share <= 0.0:
             held.append(str(each["order"]))
             share = 1.0 / math.hypot(1.0, STEEPEST)
-        orders.append({**each, "amplitude_arcsec": each["amplitude_arcsec"] / share})
-    draft.gear["motor_orders"] = orders
+        flanks.append({**each, "amplitude_arcsec": each["amplitude_arcsec"] / share})
+    draft.gear["motor_orders"] = flanks
     draft.gear["flank"] = {"shift_deg": effect.shift_deg, "travel_deg": FLANK_TRAVEL_DEG}
-    notes = [f"crosses within {FLANK_TRAVEL_DEG:g} motor deg, where the model jumps"]
+    draft.note(f"crosses within {FLANK_TRAVEL_DEG:g} motor deg, where the model jumps")
     if held:
-        notes.append(f"order {', '.join(held)}: shifted by too much to be told by its mean")
-    return Said("gear.flank", tuple(notes))
+        draft.note(f"order {', '.join(held)}: shifted by too much to be told by its mean")
 
 
-def torque_modulation(effect: TorqueModulation, draft: Draft) -> Said:
+def torque_modulation(effect: effects.TorqueModulation, draft: Draft) -> None:
     """Sets the growth of the tooth error with the magnitude of the torque."""
     if effect.signed:
-        return none("the plant's teeth grow with the size of the torque, not with its sign")
+        draft.refuse("the plant's teeth grow with the size of the torque, not with its sign")
+        return
     per_nm = 0.01 * effect.growth_percent_per_nm
-    notes = []
     if effect.torque == "motor_torque_nm":
         per_nm /= draft.ratio
-        notes.append("by the motor's torque times the ratio, its own friction included")
-    orders = draft.gear.get("motor_orders", ())
+        draft.note("by the motor's torque times the ratio, its own friction included")
+    teeth = draft.gear.get("motor_orders", ())
     carried = {each.order for each in effect.orders}
-    if any(each["order"] not in carried for each in orders):
-        notes.append("all motor orders grow, also those that the effect does not carry")
-    yields = sum(each["amplitude_arcsec"] for each in orders) / ARCSEC_PER_RAD * draft.stiffness_nm_per_rad
+    if any(each["order"] not in carried for each in teeth):
+        draft.note("all motor orders grow, also those that the effect does not carry")
+    yields = sum(each["amplitude_arcsec"] for each in teeth) / ARCSEC_PER_RAD * draft.stiffness_nm_per_rad
     if yields * abs(per_nm) > MOST_YIELD:
         held = math.copysign(MOST_YIELD / yields, per_nm)
-        notes.append(
+        draft.note(
             f"held at {100 * held:.3g} %/Nm: with {100 * per_nm:.3g} teeth would yield more than the spring"
         )
         per_nm = held
     draft.gear["torque_growth_per_nm"] = per_nm
-    return Said("gear.torque_growth_per_nm", tuple(notes))
 
 
-def local_defect(effect: LocalDefect, draft: Draft) -> Said:
+def local_defect(effect: effects.LocalDefect, draft: Draft) -> None:
     """Sets a damaged tooth with the same raised cosine."""
     width = min(180.0, 2.0 * effect.half_width_deg)
     bump = {"at_deg": effect.centre_deg, "width_deg": width, "height_arcsec": effect.height_arcsec}
     draft.gear["damage"] = [*draft.gear.get("damage", ()), bump]
-    wide = 2.0 * effect.half_width_deg > width
-    return Said("gear.damage", ("no wider than half a turn",) if wide else ())
+    if 2.0 * effect.half_width_deg > width:
+        draft.note("no wider than half a turn")
 
 
-def _orders(orders: Iterable[MotorOrder], draft: Draft, key: str) -> Said:
+def _add_orders(more: Sequence[effects.MotorOrder], draft: Draft, key: str) -> None:
     sums: dict[int, complex] = {
         each["order"]: cmath.rect(each["amplitude_arcsec"], math.radians(each["phase_deg"]))
         for each in draft.gear.get(key, ())
     }
-    beyond = []
-    for each in orders:
-        if each.order > HIGHEST_ORDER:
-            beyond.append(str(each.order))
-            continue
-        phasor = cmath.rect(each.amplitude_arcsec, math.radians(each.phase_deg))
-        sums[each.order] = sums.get(each.order, 0j) + phasor
+    beyond = [str(each.order) for each in more if each.order > HIGHEST_ORDER]
+    for each in more:
+        if each.order <= HIGHEST_ORDER:
+            phasor = cmath.rect(each.amplitude_arcsec, math.radians(each.phase_deg))
+            sums[each.order] = sums.get(each.order, 0j) + phasor
     draft.gear[key] = [
         {
             "order": order,
@@ -298,8 +254,9 @@ def _orders(orders: Iterable[MotorOrder], draft: Draft, key: str) -> Said:
         }
         for order in sorted(sums)
     ]
-    notes = (f"without order {', '.join(beyond)}: the plant's go up to {HIGHEST_ORDER}",) if beyond else ()
-    return Said(f"gear.{key}", notes)
+    draft.place = f"gear.{key}"
+    if beyond:
+        draft.note(f"without order {', '.join(beyond)}: the plant's go up to {HIGHEST_ORDER}")
 
 
 # ----------------------------------------------------------------
@@ -316,7 +273,7 @@ _LIMITS: Final = {
 }  # fmt: skip
 
 
-def motor_eccentricity(effect: MotorEncoderEccentricity, draft: Draft) -> Said:
+def motor_eccentricity(effect: effects.MotorEncoderEccentricity, draft: Draft) -> None:
     """Sets the disc of the motor encoder. The drive controls its reading, so the load has the opposite error.
 
     A disc reads (e / r) sin(a - a0) too much, so the load lags by this divided by the ratio.
@@ -324,27 +281,28 @@ def motor_eccentricity(effect: MotorEncoderEccentricity, draft: Draft) -> Said:
     # -sin(a - a0) = cos(a + 90 deg - a0), and the same for twice the angle.
     disc = _disc(effect.orders, draft.ratio, lambda phase_deg: 90.0 - phase_deg)
     draft.part("motor", "encoder")["disc"] = disc
-    return Said("motor.encoder.disc", (f"radius assumed as {RADIUS_MM:g} mm",))
+    draft.note(f"radius assumed as {RADIUS_MM:g} mm")
 
 
-def load_orders(effect: LoadOrders, draft: Draft) -> Said:
+def load_orders(effect: effects.LoadOrders, draft: Draft) -> None:
     """Sets the load encoder's disc if it is the known origin, else a pitch error of the spline."""
     if effect.origin != "load_encoder":
-        said = gear_load_orders(effect.orders, draft)
-        unknown = ("origin unknown: taken for the gear's",) if effect.origin == "unknown" else ()
-        return Said(said.counterpart, (*unknown, *said.notes))
+        if effect.origin == "unknown":
+            draft.note("origin unknown: taken for the gear's")
+        _add_orders(effect.orders, draft, "load_orders")
+        return
     few = [each for each in effect.orders if each.order <= 2]
     more = [each for each in effect.orders if each.order > 2]
     # sin(a - a0) = cos(a - a0 - 90 deg)
     draft.part("load", "encoder")["disc"] = _disc(few, 1.0, lambda phase_deg: -90.0 - phase_deg)
-    notes = [f"radius assumed as {RADIUS_MM:g} mm"]
     if more:
-        gear_load_orders(more, draft)
-        notes.append("orders beyond 2 go to gear.load_orders: a disc has none")
-    return Said("load.encoder.disc", tuple(notes))
+        _add_orders(more, draft, "load_orders")
+        draft.notes.insert(0, "orders beyond 2 go to gear.load_orders: a disc has none")
+    draft.notes.insert(0, f"radius assumed as {RADIUS_MM:g} mm")
+    draft.place = "load.encoder.disc"
 
 
-def _disc(orders: Iterable[MotorOrder], ratio: float, at_deg: Any) -> dict[str, Any]:
+def _disc(orders: Iterable[effects.MotorOrder], ratio: float, at_deg: Any) -> dict[str, Any]:
     disc: dict[str, Any] = {"radius_mm": RADIUS_MM}
     for each in orders:
         off_um = each.amplitude_arcsec * ratio / ARCSEC_PER_RAD * RADIUS_MM * 1000.0
@@ -356,24 +314,23 @@ def _disc(orders: Iterable[MotorOrder], ratio: float, at_deg: Any) -> dict[str, 
     return disc
 
 
-def channel_skew(effect: ChannelSkew, draft: Draft) -> Said:
+def channel_skew(effect: effects.ChannelSkew, draft: Draft) -> None:
     """Sets the delay of the other encoder: a load that is read later has an older motor reading."""
     delay_ms = effect.delay_ms
     late = "motor" if delay_ms > 0.0 else "load"
     draft.part(late, "encoder")["late_ms"] = min(abs(delay_ms), LATEST_MS)
-    notes = []
+    draft.place = f"{late}.encoder.late_ms"
     if abs(delay_ms) > LATEST_MS:
-        notes.append(f"no more than {LATEST_MS:g} ms")
+        draft.note(f"no more than {LATEST_MS:g} ms")
     rest_ms2 = effect.second_order_ms2 - delay_ms**2
     most = 0.5e-6 * abs(rest_ms2) * draft.axis.limits.acceleration_deg_s2 * 3600.0
     if most > SMALL_ARCSEC:
-        notes.append(
+        draft.note(
             f"a pure delay: up to {most:.2g} arcsec of the model's part by acceleration are not of a delay"
         )
-    return Said(f"{late}.encoder.late_ms", tuple(notes))
 
 
-def subdivisional_error(effect: SubdivisionalError, draft: Draft) -> Said:
+def subdivisional_error(effect: effects.SubdivisionalError, draft: Draft) -> None:
     """Sets offsets, gain, phase and third harmonic of the signals, to first order.
 
     The angle read from (1 + g) sin p - t sin 3p + s and cos(p + d) + t cos 3p + c is off by
@@ -392,18 +349,16 @@ def subdivisional_error(effect: SubdivisionalError, draft: Draft) -> Said:
         else:
             signals["third_harmonic"] = sine
             lost_arcsec = abs(cosine) * line_arcsec
-    notes = []
     if lost_arcsec > SMALL_ARCSEC:
-        notes.append(f"{lost_arcsec:.2g} arcsec of the fourth order are no third harmonic of either signal")
+        draft.note(f"{lost_arcsec:.2g} arcsec of the fourth order are no third harmonic of either signal")
     for name, limit in _LIMITS.items():
         if abs(signals.get(name, 0.0)) > limit:
-            notes.append(f"{name} held at {limit:g}: {signals[name]:.2g} is no signal any more")
+            draft.note(f"{name} held at {limit:g}: {signals[name]:.2g} is no signal any more")
             signals[name] = math.copysign(limit, signals[name])
     draft.part("load", "encoder")["signals"] = signals
-    return Said("load.encoder.signals", tuple(notes))
 
 
-def count_loss(effect: CountLoss, draft: Draft) -> Said:
+def count_loss(effect: effects.CountLoss, draft: Draft) -> None:
     """Sets count losses of the load encoder at the same times after switching on."""
     counts_per_arcsec = draft.axis.load_encoder.counts(1.0) / 3600.0
     losses = [
@@ -412,11 +367,10 @@ def count_loss(effect: CountLoss, draft: Draft) -> Said:
         if each.time_s >= 0.0
     ]
     if not losses:
-        return none("it was before the record's time zero, and is in the encoders' zero by now")
+        draft.refuse("it was before the record's time zero, and is in the encoders' zero by now")
+        return
     draft.part("load", "encoder")["losses"] = losses
-    return Said(
-        "load.encoder.losses", ("each time again, so long after the axis is switched on; whole counts",)
-    )
+    draft.note("each time again, so long after the axis is switched on; whole counts")
 
 
 # ----------------------------------------------------------------
@@ -426,73 +380,63 @@ LINEAR_BUILD_UP: Final = 0.5
 """Build-up ratio below which the plant's element, with equal times of strain and release, differs."""
 
 
-def zero_drift(effect: ZeroDrift, draft: Draft) -> Said:
+def zero_drift(effect: effects.ZeroDrift, draft: Draft) -> None:
     """Sets a shift with the temperature, delayed as in the model and zero at the ambient temperature."""
     heat = draft.part("temperature")
     heat["zero_drift_arcsec_per_k"] = effect.drift_arcsec_per_k
     if effect.driven_by == "time":
-        return Said("temperature.zero_drift_arcsec_per_k", (_warms_up(effect, draft),))
-    heat["zero_time_constant_s"] = effect.tau_s
-    return Said("temperature.zero_drift_arcsec_per_k", ("zero at the ambient temperature: an offset",))
+        _warm_up(effect, draft)
+    else:
+        heat["zero_time_constant_s"] = effect.tau_s
+        draft.note("zero at the ambient temperature: an offset")
 
 
-def amplitude_drift(effect: AmplitudeDrift, draft: Draft) -> Said:
+def amplitude_drift(effect: effects.AmplitudeDrift, draft: Draft) -> None:
     """Sets the growth of tooth error and friction with the temperature."""
     heat = draft.part("temperature")
-    heat["tooth_growth_per_k"] = _share(effect.ripple_percent_per_k)
-    heat["friction_growth_per_k"] = _share(effect.friction_percent_per_k)
-    notes = []
+    heat["tooth_growth_per_k"] = 0.01 * effect.ripple_percent_per_k
+    heat["friction_growth_per_k"] = 0.01 * effect.friction_percent_per_k
     if effect.driven_by == "time":
-        notes.append(_warms_up(effect, draft))
+        _warm_up(effect, draft)
         heat["reference_c"] = heat["start_c"]
     else:
         heat["reference_c"] = effect.reference_c
-        notes.append(f"at once with the temperature, where the model follows it in {effect.tau_s:.3g} s")
+        draft.note(f"at once with the temperature, where the model follows it in {effect.tau_s:.3g} s")
     if effect.friction_percent_per_k:
-        notes.append("the motor's friction grows with the loop")
-    return Said("temperature.tooth_growth_per_k, temperature.friction_growth_per_k", tuple(notes))
+        draft.note("the motor's friction grows with the loop")
 
 
-def wear(effect: Wear, draft: Draft) -> Said:
+def wear(effect: effects.Wear, draft: Draft) -> None:
     """Sets a gap between the teeth that grows with the travel; the model's loop may also widen."""
     if effect.growth_arcsec_per_kiloturn > 0.0:
-        return none("the loop widens in the sense of the elastic one: the plant's teeth wear to a gap only")
+        draft.refuse("the loop widens in the sense of the elastic one: the plant's teeth wear to a gap only")
+        return
     draft.gear["wear"] = {
         "arcsec_per_1000_turns": -0.5 * effect.growth_arcsec_per_kiloturn,
         "exponent": effect.exponent,
     }
-    notes = ["crossed within the gap's own travel"]
+    draft.note("crossed within the gap's own travel")
     if effect.turns_before:
-        notes.append(f"from zero turns on: the {effect.turns_before:.0f} turns before are not in it")
-    return Said("gear.wear", tuple(notes))
+        draft.note(f"from zero turns on: the {effect.turns_before:.0f} turns before are not in it")
 
 
-def creep(effect: Creep, draft: Draft) -> Said:
+def creep(effect: effects.Creep, draft: Draft) -> None:
     """Sets Kelvin-Voigt elements. The model's strain leads in motion, the plant's yields to the drag."""
     parts = [
         {"time_constant_s": each.tau_s, "amplitude_arcsec": -each.amplitude_arcsec} for each in effect.parts
     ]
     draft.gear["creep"] = [*draft.gear.get("creep", ()), *parts]
-    fast = effect.build_up < LINEAR_BUILD_UP
-    return Said(
-        "gear.creep",
-        (f"strained as slowly as it lets go, where the model needs {effect.build_up:.2g} of that",)
-        if fast or effect.build_up > 1.0 / LINEAR_BUILD_UP
-        else (),
-    )
+    if not LINEAR_BUILD_UP <= effect.build_up <= 1.0 / LINEAR_BUILD_UP:
+        draft.note(f"strained as slowly as it lets go, where the model needs {effect.build_up:.2g} of that")
 
 
-def _warms_up(effect: Warmed, draft: Draft) -> str:
-    """Sets the plant's initial temperature below ambient by the model's warm-up; returns a note."""
+def _warm_up(effect: Warmed, draft: Draft) -> None:
+    """Sets the plant's initial temperature below ambient by the model's warm-up."""
     heat = draft.part("temperature")
     ambient_c = heat.get("ambient_c", 22.0)
     heat["start_c"] = max(-60.0, ambient_c - effect.warm_up_k)
     heat["time_constant_s"] = effect.tau_s
-    return f"started {effect.warm_up_k:g} K below the ambient temperature, in {effect.tau_s:.3g} s"
-
-
-def _share(percent_per_k: float) -> float:
-    return 0.01 * percent_per_k
+    draft.note(f"started {effect.warm_up_k:g} K below the ambient temperature, in {effect.tau_s:.3g} s")
 
 
 # ----------------------------------------------------------------
@@ -511,13 +455,12 @@ MOST_HELD: Final = 0.3
 """Maximum wind-up of the spring by this friction, as a share of half the gap."""
 
 
-def compliance(effect: Compliance, draft: Draft) -> Said:
+def compliance(effect: effects.Compliance, draft: Draft) -> None:
     """Sets the spring in up to three stages, within the torque range of the effect.
 
     Motor torque is load torque divided by the ratio.
     """
     times = draft.ratio if effect.torque == "motor_torque_nm" else 1.0
-    notes = []
     stages: list[float] = []
     zones = (
         (0.0, effect.c1_arcsec_per_nm),
@@ -531,9 +474,7 @@ def compliance(effect: Compliance, draft: Draft) -> Said:
         wanted = ARCSEC_PER_RAD * times / softness if softness else math.inf
         stages.append(min(wanted, draft.highest_stiffness_nm_per_rad))
         if stages[-1] < wanted:
-            notes.append(
-                f"{stages[-1]:.3g} Nm/rad is the stiffest spring that the plant's time step resolves"
-            )
+            draft.note(f"{stages[-1]:.3g} Nm/rad is the stiffest spring that the plant's time step resolves")
     draft.set_stiffness(stages[0])
     draft.gear.pop("stiffening", None)
     if len(set(stages)) > 1:
@@ -544,22 +485,20 @@ def compliance(effect: Compliance, draft: Draft) -> Said:
             "third_stiffness_nm_per_rad": stages[2],
         }
     if times != 1.0:
-        notes.append("by the motor's torque times the ratio, friction included")
+        draft.note("by the motor's torque times the ratio, friction included")
     else:
         draft.load["torque_sense"] = effect.sense
-    return Said("gear.stiffness_nm_per_rad, gear.stiffening", tuple(dict.fromkeys(notes)))
 
 
-def inertial_windup(effect: InertialWindup, draft: Draft) -> Said:
+def inertial_windup(effect: effects.InertialWindup, draft: Draft) -> None:
     """Sets J / K of the load on its spring, minus the wind-up of the load encoder's coupling."""
     seconds2 = effect.inertia_over_stiffness_s2
     coupling = draft.part("load", "encoder").get("coupling")
     if coupling:
         seconds2 -= 1.0 / (math.tau * coupling["frequency_hz"]) ** 2
     least = draft.inertia_kg_m2 / draft.highest_stiffness_nm_per_rad
-    notes = []
     if seconds2 < least:
-        notes.append(
+        draft.note(
             f"{math.sqrt(1 / least) / math.tau:.0f} Hz is the highest resonance that the plant resolves"
         )
         seconds2 = least
@@ -567,14 +506,15 @@ def inertial_windup(effect: InertialWindup, draft: Draft) -> Said:
     known = draft.gear.get("stiffening") is not None or not draft.tells_servo
     if known and inertia > draft.hanging_kg_m2:
         draft.set_inertia(inertia)
-        return Said(
-            "load.inertia_kg_m2", (*notes, "the spring is known otherwise, so the load follows from it")
-        )
+        draft.place = "load.inertia_kg_m2"
+        draft.note("the spring is known otherwise, so the load follows from it")
+        return
     draft.set_stiffness(draft.inertia_kg_m2 / seconds2)
-    return Said("gear.stiffness_nm_per_rad", (*notes, "with the load's inertia as assumed"))
+    draft.place = "gear.stiffness_nm_per_rad"
+    draft.note("with the load's inertia as assumed")
 
 
-def velocity_windup(effect: VelocityWindup, draft: Draft) -> Said:
+def velocity_windup(effect: effects.VelocityWindup, draft: Draft) -> None:
     """Sets shear-thinning viscous friction at the load, and the dry part as a fast creep element.
 
     Coulomb friction at the load would keep its wind-up at rest, which the model does not.
@@ -591,47 +531,39 @@ def velocity_windup(effect: VelocityWindup, draft: Draft) -> Said:
         dry = {"time_constant_s": DRY_TIME_S, "amplitude_arcsec": effect.coulomb_arcsec}
         draft.gear["creep"] = [*draft.gear.get("creep", ()), dry]
         places.append("gear.creep")
-    return Said(", ".join(places) or "load.viscous_nm_s_per_rad")
+    draft.place = ", ".join(places) or "load.viscous_nm_s_per_rad"
 
 
-def hysteresis(effect: Hysteresis, draft: Draft) -> Said:
-    """Sets the same law if the load leads, or friction at the load if it lags."""
-    return _loop(effect, draft, memory=False)
-
-
-def hysteresis_memory(effect: HysteresisMemory, draft: Draft) -> Said:
-    """Sets parallel sliders, which have return-point memory."""
-    return _loop(effect, draft, memory=True)
-
-
-def hysteresis_parameters(effect: HysteresisParameters, draft: Draft) -> Said:
+def hysteresis_parameters(effect: effects.HysteresisParameters, draft: Draft) -> None:
     """Replaces the model's loop by the changed one."""
     draft.gear.pop("hysteresis", None)
     draft.load.pop("presliding", None)
-    return _loop(effect.changed().law(), draft, memory=effect.base.memory)
+    hysteresis(effect.changed().law(), draft)
 
 
-def _loop(effect: Hysteresis | HysteresisMemory, draft: Draft, *, memory: bool) -> Said:
+def hysteresis(effect: effects.Hysteresis | effects.HysteresisMemory, draft: Draft) -> None:
+    """Sets the same law if the load leads (parallel sliders for one with memory), or friction at the load."""
+    draft.place = "gear.hysteresis"
     if effect.offset_arcsec < 0.0:
-        return _lagging(effect, draft, memory=memory)
-    if memory:
+        _lagging(effect, draft)
+    elif isinstance(effect, effects.HysteresisMemory):
         xi, height = branch(effect.exponent, NODES)
         # The virgin curve, half the size of a branch: offset g(2 x / width).
         parts = elements(0.5 * effect.width_deg * xi, effect.offset_arcsec * height)
         slips = [{"limit_arcsec": limit, "yield_deg": travel} for limit, travel in parts]
         if slips:
             draft.gear["hysteresis"] = {"law": "maxwell_slip", "elements": slips}
-        return Said("gear.hysteresis", (f"straight between {NODES} points of a branch",))
-    draft.gear["hysteresis"] = {
-        "law": "rolling_friction",
-        "offset_arcsec": effect.offset_arcsec,
-        "width_deg": effect.width_deg,
-        "exponent": effect.exponent,
-    }
-    return Said("gear.hysteresis")
+        draft.note(f"straight between {NODES} points of a branch")
+    else:
+        draft.gear["hysteresis"] = {
+            "law": "rolling_friction",
+            "offset_arcsec": effect.offset_arcsec,
+            "width_deg": effect.width_deg,
+            "exponent": effect.exponent,
+        }
 
 
-def _lagging(effect: Hysteresis | HysteresisMemory, draft: Draft, *, memory: bool) -> Said:
+def _lagging(effect: effects.Hysteresis | effects.HysteresisMemory, draft: Draft) -> None:
     """Sets presliding friction at the load, which winds up the gear's spring, so that the load lags.
 
     Over a branch the motor moves by x and the load's lag grows by 2 offset g(x / width). The rest of x is the
@@ -659,13 +591,13 @@ def _lagging(effect: Hysteresis | HysteresisMemory, draft: Draft, *, memory: boo
     draft.load["presliding"] = [
         {"limit_nm": limit, "travel_deg": travel_arcsec / ARCSEC_PER_DEG} for limit, travel_arcsec in parts
     ]
-    notes = ["friction at the load; after a fast stop the load's inertia pushes it on"]
-    if not memory:
-        notes.append("with return-point memory, which the model's law has not")
-    return Said("load.presliding, load.coulomb_nm", tuple(notes))
+    draft.place = "load.presliding, load.coulomb_nm"
+    draft.note("friction at the load; after a fast stop the load's inertia pushes it on")
+    if not isinstance(effect, effects.HysteresisMemory):
+        draft.note("with return-point memory, which the model's law has not")
 
 
-def backlash(effect: Backlash, draft: Draft) -> Said:
+def backlash(effect: effects.Backlash, draft: Draft) -> None:
     """Sets a dead zone between spring and load, with friction that holds the load in it."""
     half, per_nm = 0.5 * effect.gap_arcsec, ARCSEC_PER_RAD / draft.stiffness_nm_per_rad
     acceleration = math.radians(draft.axis.limits.acceleration_deg_s2)
@@ -674,30 +606,29 @@ def backlash(effect: Backlash, draft: Draft) -> Said:
     friction_nm = max(friction_nm - already_nm, 0.0)
     draft.load["coulomb_nm"] = already_nm + friction_nm
     draft.gear["backlash_arcsec"] = effect.gap_arcsec - 2.0 * friction_nm * per_nm
-    return Said(
-        "gear.backlash_arcsec, load.coulomb_nm",
-        (
-            f"{friction_nm:.2g} Nm of friction hold the load on its side; a stop that is harder than "
-            f"{math.degrees(friction_nm / draft.inertia_kg_m2):.0f} deg/s^2 throws it across",
-        ),
+    draft.note(
+        f"{friction_nm:.2g} Nm of friction hold the load on its side; a stop that is harder than "
+        f"{math.degrees(friction_nm / draft.inertia_kg_m2):.0f} deg/s^2 throws it across"
     )
 
 
-def rate_dependence(effect: RateDependence, draft: Draft) -> Said:
+def rate_dependence(effect: effects.RateDependence, draft: Draft) -> None:
     """Sets the growth of the loop with speed."""
     if draft.gear.get("hysteresis") is None:
-        return none("there is no leading loop that could grow")
+        draft.refuse("there is no leading loop that could grow")
+        return
     draft.gear["rate_dependence"] = {
         "growth_per_decade": 0.01 * effect.growth_percent,
         "from_deg_s": effect.reference_deg_s,
     }
-    return Said("gear.rate_dependence", ("follows the speed within 50 ms",))
+    draft.note("follows the speed within 50 ms")
 
 
-def vibration(effect: Vibration, draft: Draft) -> Said:
+def vibration(effect: effects.Vibration, draft: Draft) -> None:
     """Sets a torque that shakes the load by the same amplitude with the motor held."""
     if effect.frequency_hz > HIGHEST_SHAKE_HZ:
-        return none(f"the plant is shaken by up to {HIGHEST_SHAKE_HZ:g} Hz")
+        draft.refuse(f"the plant is shaken by up to {HIGHEST_SHAKE_HZ:g} Hz")
+        return
     turn = math.tau * effect.frequency_hz
     # Load on its spring, then the encoder on its coupling.
     dynamic = complex(
@@ -717,7 +648,7 @@ def vibration(effect: Vibration, draft: Draft) -> Said:
         "phase_deg": math.remainder(phase, 360.0),
     }
     draft.load["vibration"] = [*draft.load.get("vibration", ()), shake]
-    return Said("load.vibration", ("phase at the moment when the axis is switched on",))
+    draft.note("phase at the moment when the axis is switched on")
 
 
 # ----------------------------------------------------------------
@@ -760,8 +691,8 @@ class Entry(NamedTuple):
 
     counterpart: str
     """Dotted paths in the truth file."""
-    write: Callable[[Any, Draft], Said]
-    """Writes an effect of this kind to a draft, and returns the place and differences."""
+    write: Callable[[Any, Draft], None]
+    """Writes an effect of this kind to a draft, with the place (if there are several) and differences."""
 
 
 TABLE: Final[Mapping[str, Entry]] = MappingProxyType(
@@ -771,15 +702,15 @@ TABLE: Final[Mapping[str, Entry]] = MappingProxyType(
         "compliance": Entry("gear.stiffness_nm_per_rad, gear.stiffening", compliance),
         "inertial_windup": Entry("gear.stiffness_nm_per_rad or load.inertia_kg_m2", inertial_windup),
         "velocity_windup": Entry("load.viscous_nm_s_per_rad, load.thinning, gear.creep", velocity_windup),
-        "synchronous": Entry("gear.motor_orders", motor_orders),
-        "motor_order": Entry("gear.motor_orders", motor_orders),
-        "flexspline_order": Entry("gear.flexspline_orders", flexspline_orders),
+        "synchronous": Entry("gear.motor_orders", partial(orders, "motor_orders")),
+        "motor_order": Entry("gear.motor_orders", partial(orders, "motor_orders")),
+        "flexspline_order": Entry("gear.flexspline_orders", partial(orders, "flexspline_orders")),
         "load_order": Entry("gear.load_orders or load.encoder.disc", load_orders),
         "motor_encoder_eccentricity": Entry("motor.encoder.disc", motor_eccentricity),
         "direction_phase": Entry("gear.flank", direction_phase),
         "torque_modulation": Entry("gear.torque_growth_per_nm", torque_modulation),
         "hysteresis": Entry("gear.hysteresis or load.presliding", hysteresis),
-        "hysteresis_memory": Entry("gear.hysteresis or load.presliding", hysteresis_memory),
+        "hysteresis_memory": Entry("gear.hysteresis or load.presliding", hysteresis),
         "hysteresis_parameters": Entry("gear.hysteresis", hysteresis_parameters),
         "backlash": Entry("gear.backlash_arcsec, load.coulomb_nm", backlash),
         "rate_dependence": Entry("gear.rate_dependence", rate_dependence),
@@ -797,8 +728,7 @@ TABLE: Final[Mapping[str, Entry]] = MappingProxyType(
     }
 )
 """One row per effect of the catalogue."""
-UNKNOWN: Final = none("the simulated drive has no part for an effect that is not of hdbridge's own catalogue")
-"""Result for an effect that was registered by an extension."""
+UNKNOWN: Final = "the simulated drive has no part for an effect that is not of hdbridge's own catalogue"
 
 
 def translate(
@@ -816,19 +746,14 @@ def translate(
     model.check_ratio(axis)
     draft = Draft(_without_error(truth, axis), axis, tells_servo=base is None)
     by_name = {each.name: each for each in model.effects}
-    said = {
-        name: entry.write(by_name[name], draft)
-        for name, entry in TABLE.items()
-        if by_name.get(name) is not None
-    }
+    rows = {name: Row(name, None, UNKNOWN) for name in (*effects.CATALOGUE, *by_name) if name in by_name}
+    for name, entry in TABLE.items():
+        if name in by_name:
+            draft.place, draft.notes = entry.counterpart, []
+            entry.write(by_name[name], draft)
+            rows[name] = Row(name, draft.place, "; ".join(draft.notes))
     draft.finish()
-    order = [name for name in (*CATALOGUE, *by_name) if name in by_name]
-    rows = tuple(_row(by_name[name], said.get(name, UNKNOWN)) for name in dict.fromkeys(order))
-    return Translation(_validated(draft.data), rows)
-
-
-def _row(effect: Effect, said: Said) -> Row:
-    return Row(effect.name, said.counterpart, "; ".join(said.notes))
+    return Translation(_validated(draft.data), tuple(rows.values()))
 
 
 def _validated(data: dict[str, Any]) -> Truth:

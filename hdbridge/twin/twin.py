@@ -98,16 +98,6 @@ class Twin:
         """Channels with residuals above their noise."""
         return tuple(each for each in self.left if each.times_noise > NOISE_LEVEL)
 
-    @property
-    def intervals(self) -> dict[str, tuple[float, float]]:
-        """95 % intervals by path in the truth file; empty unless the values are the axis's."""
-        return self.truth.intervals
-
-    @property
-    def provenance(self) -> dict[str, Any]:
-        """Provenance of the truth."""
-        return self.truth.provenance
-
 
 # ----------------------------------------------------------------
 # Verdict on a twin, from its residuals in each channel on held-out legs. Pure.
@@ -152,31 +142,32 @@ def impossible(truth: Truth, axis: AxisConfig, cycle_s: float) -> tuple[str, ...
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """Decision to keep a twin or not, with its reason."""
+    """Decision about a fit or a twin, with its reason."""
 
     kept: bool
     text: str
-    """Reason in a sentence or two, beginning with the validity of the values."""
+    """Reason in a sentence or two."""
 
 
 def judge(twin: Twin) -> Verdict:
-    """Decides if a twin is kept, and states the validity of its values."""
+    """Decides if a twin is kept, and states the validity of its values first."""
     gain = better(twin.before, twin.after)
     if twin.impossible:
         return Verdict(False, f"the twin is not kept: no axis has these values: {'; '.join(twin.impossible)}")
-    if not gain.better:
+    if not gain.kept:
         return Verdict(False, f"the twin is not kept: {gain.text}")
     text = f"the twin is kept as pending: {gain.text}"
     if twin.values is not Values.AXIS:
         text = f"{replays_only(twin)}; {text}"
-    if twin.provenance.get("interrupted"):
+    if twin.truth.provenance.get("interrupted"):
         text = f"the fit was interrupted, so this is the best place so far; {text}"
     return Verdict(True, text)
 
 
 def replays_only(twin: Twin) -> str:
     """Returns the headline of a twin whose values are not the axis's."""
-    shown = ", ".join(f"{each.channel} to {_percent(each.share)}" for each in twin.left)
+    measured = [each for each in twin.left if math.isfinite(each.share)]
+    shown = ", ".join(f"{each.channel} to {figure(100.0 * each.share, 2)} %" for each in measured)
     lost = [
         f"{each.channel} is left with {figure(each.times_noise, 3)} times its noise"
         for each in twin.left
@@ -188,19 +179,7 @@ def replays_only(twin: Twin) -> str:
     return f"the twin replays this drive ({shown}), but its values are not the axis's{why}"
 
 
-def _percent(share: float) -> str:
-    return f"{figure(100.0 * share, 2)} %" if math.isfinite(share) else "no share"
-
-
-@dataclass(frozen=True, slots=True)
-class Gain:
-    """Improvement by a fit."""
-
-    better: bool
-    text: str
-
-
-def better(before: Comparison, after: Comparison) -> Gain:
+def better(before: Comparison, after: Comparison) -> Verdict:
     """Compares the rms differences of load error, following error, torque and temperature, if recorded.
 
     On held-out legs, or on all legs if none was held out.
@@ -229,10 +208,12 @@ def better(before: Comparison, after: Comparison) -> Gain:
     ]
     gain = 1.0 - math.exp(sum(ratios) / len(ratios)) if ratios else 0.0
     if worse:
-        return Gain(False, f"{where}, {'; '.join(worse)}")
+        return Verdict(False, f"{where}, {'; '.join(worse)}")
     if gain < LEAST_GAIN:
-        return Gain(False, f"{where} it is no nearer to the axis than the simulation was")
-    return Gain(True, f"{where} the differences from the axis are {100.0 * gain:.0f} % smaller in the mean")
+        return Verdict(False, f"{where} it is no nearer to the axis than the simulation was")
+    return Verdict(
+        True, f"{where} the differences from the axis are {100.0 * gain:.0f} % smaller in the mean"
+    )
 
 
 # ----------------------------------------------------------------
@@ -428,7 +409,7 @@ def with_knowledge(fitted: Fitted, data: Data, values: Values = Values.AXIS) -> 
     truth = with_load_noise(fitted.truth, fitted.residuals[LOAD])
     return truth.model_copy(
         update={
-            "intervals": {".".join(each.path): intervals[each.name] for each in fitted.parameters},
+            "intervals": {each.path: intervals[each.name] for each in fitted.parameters},
             "provenance": {
                 **truth.provenance, "values": str(values), "versions": versions_here(), "fit": about,
                 **({"interrupted": True} if fitted.interrupted else {}),

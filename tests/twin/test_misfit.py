@@ -22,7 +22,6 @@ from hdbridge.twin.misfit import (
     CHANNELS,
     Data,
     Replays,
-    demand_deg,
     noise_floor,
     noise_in_motion,
     prepare,
@@ -32,8 +31,8 @@ from hdbridge.twin.misfit import (
     traces_of,
     what_is_left,
 )
-from hdbridge.twin.parameters import BY_NAME, FOLLOWING, LOAD, TORQUE, coordinates, with_values
-from hdbridge.twin.replay import replay
+from hdbridge.twin.parameters import BY_NAME, FOLLOWING, LOAD, TORQUE, free_value, with_values
+from hdbridge.twin.replay import demand_deg, replay
 
 DEMO = Path(__file__).parents[2] / "profiles" / "demo"
 AXIS = AxisConfig.load(DEMO)
@@ -43,10 +42,9 @@ COUNT_DEG = 360.0 / 8000
 
 
 def moves(bench: Exercise) -> None:
-    bench.hold(1.2)
-    bench.move(400.0, 600.0, 6000.0)
-    bench.hold(1.2)
-    bench.move(-400.0, 600.0, 6000.0)
+    for distance in (400.0, -400.0):
+        bench.hold(1.2)
+        bench.move(distance, 600.0, 6000.0)
     bench.hold(1.2)
 
 
@@ -77,12 +75,9 @@ def test_a_count_is_no_other_zero() -> None:
     data = prepare(told_by_another_zero(1), AXIS, TRUTH)
     counts = np.concatenate([each.counts[FOLLOWING] for each in data.pieces]) > 0.0
     assert np.median(residuals(data, TRUTH)[FOLLOWING][counts]) == pytest.approx(COUNT_DEG, rel=0.3)
-
-
-def test_nor_is_it_in_a_comparison() -> None:
+    # Nor is it in a comparison.
     for recording in (recorded(), told_by_another_zero()):
-        simulated = replay(recording, AXIS, TRUTH)
-        row = compare(recording.record, simulated, (), 50.0).row(FOLLOWING_ERROR)
+        row = compare(recording.record, replay(recording, AXIS, TRUTH), (), 50.0).row(FOLLOWING_ERROR)
         assert row is not None
         assert row.difference < 0.1, "motor degrees: two counts"
 
@@ -96,11 +91,7 @@ def test_a_motor_that_is_late_says_nothing_of_the_load_error() -> None:
 
 @pytest.mark.parametrize(("name", "factor"), [("gear stiffness", 0.5), ("load inertia", 2.0)])
 def test_a_wrong_spring_or_load_stays_in_the_load_error(name: str, factor: float) -> None:
-    value = {
-        "gear stiffness": TRUTH.gear.stiffness_nm_per_rad,
-        "load inertia": TRUTH.load_.inertia_kg_m2,
-    }[name]
-    wrong = with_values(TRUTH, {name: factor * value})
+    wrong = with_values(TRUTH, {name: factor * free_value(TRUTH, BY_NAME[name])})
     simulated = replay(recorded(), AXIS, wrong)
     row = compare(recorded().record, simulated, (), 50.0).row(LOAD_ERROR)
     assert row is not None
@@ -122,11 +113,10 @@ def test_a_channel_that_a_fit_has_made_worse_counts_as_before() -> None:
     data = prepare(recorded(), AXIS, TRUTH)
     worse = with_values(TRUTH, {"gear stiffness": 0.3 * TRUTH.gear.stiffness_nm_per_rad})
     parameters = (BY_NAME["gear stiffness"],)
-    prior = np.array(coordinates(TRUTH, parameters))
     with Replays(data, 1) as replays:
         most = scales(data, *replays([TRUTH]))
         assert scales(data, *replays([worse])).deviation[LOAD] > 1.3 * most.deviation[LOAD]
-        kept = solve(replays, worse, parameters, prior, 0, most=most).scales
+        kept = solve(replays, worse, parameters, 0, most=most).scales
         assert kept.deviation[LOAD] == most.deviation[LOAD]
 
 
@@ -200,19 +190,9 @@ NOISE = {FOLLOWING: 0.5, TORQUE: 0.02, LOAD: 7.0}
 """Some ten times the rounding."""
 
 
-def moves_and_rests(bench: Exercise) -> None:
-    bench.move(400.0, 600.0, 6000.0)
-    bench.hold(0.6)
-    bench.move(-400.0, 600.0, 6000.0)
-    bench.hold(0.6)
-
-
 @cache
 def as_measured() -> Data:
-    truth = Truth.load(DEMO)
-    return prepare(
-        Recording(record_of(truth, moves_and_rests), axis="demo", ratio=50.0), AxisConfig.load(DEMO), truth
-    )
+    return prepare(recorded(), AXIS, TRUTH)
 
 
 def noisy(where: str) -> Data:
@@ -234,27 +214,20 @@ def test_a_smooth_replay_is_off_by_as_much_as_is_expected_of_a_drives_steps() ->
     """The torque by more than the gain alone would have it, for the motor answers."""
     data = as_measured()
     (piece,), (even,), (steps,) = data.pieces, traces_of(data, data.base), traces_of(data, data.base, "loops")
-    moves_and_rests = np.abs(np.gradient(demand_deg(piece.commands, data.axis))) > 0.5
-    assert float(np.std((steps[TORQUE] - even[TORQUE])[moves_and_rests])) == pytest.approx(
+    moving = np.abs(np.gradient(demand_deg(piece.commands, data.axis))) > 0.5
+    assert float(np.std((steps[TORQUE] - even[TORQUE])[moving])) == pytest.approx(
         noise_floor(data)[TORQUE], rel=0.1
     )
     # By a whole step, a motor within a step of a count's edge would count against the true values.
-    off_deg = float(np.std((steps[FOLLOWING] - even[FOLLOWING])[moves_and_rests]))
+    off_deg = float(np.std((steps[FOLLOWING] - even[FOLLOWING])[moving]))
     least = scales(data, {name: np.zeros(len(data.leg)) for name in CHANNELS})
     assert off_deg < least.deviation[FOLLOWING] < 4.0 * off_deg
 
 
 def test_noise_in_motion_is_found_whatever_the_motion_is() -> None:
-    found = noise_in_motion(noisy("motion"))
-    for name in CHANNELS:
-        assert found[name] == pytest.approx(NOISE[name], rel=0.25), name
-
-
-def test_noise_at_rest_says_nothing_of_it() -> None:
+    assert noise_in_motion(noisy("motion")) == pytest.approx(NOISE, rel=0.25)
+    # At rest it says nothing of it, and none is less than the rounding.
     assert noise_in_motion(noisy("rest")) == pytest.approx(noise_in_motion(as_measured()), rel=0.1)
-
-
-def test_no_noise_is_less_than_the_rounding() -> None:
     still = [
         replace(each, measured={name: 0.0 * column for name, column in each.measured.items()})
         for each in as_measured().pieces

@@ -15,7 +15,7 @@ from hdbridge.sim.truth import Truth
 from hdbridge.twin.fit import fitted_rows, legs_of_rows, solve
 from hdbridge.twin.misfit import Scales
 from hdbridge.twin.naming import Alike, Finding, alike, name_causes, put_back, told_apart
-from hdbridge.twin.parameters import BY_NAME, FOLLOWING, LOAD, TORQUE, coordinates, with_values
+from hdbridge.twin.parameters import BY_NAME, FOLLOWING, LOAD, TORQUE, with_values
 
 TRUTH = Truth.load(Path(__file__).parents[2] / "profiles" / "demo")
 NAMES = ("Coulomb friction", "servo dead time", "command filter")
@@ -62,9 +62,8 @@ def named(axis: Truth, quick: float) -> tuple[tuple[Finding, ...], tuple[Alike, 
     """Findings about an axis from a fit that starts at `TRUTH`, and those that slopes cannot separate."""
     replays: Any = Known(axis, quick)
     parameters = tuple(BY_NAME[name] for name in NAMES)
-    prior = np.array(coordinates(TRUTH, parameters))
     noise = dict.fromkeys((FOLLOWING, TORQUE, LOAD), 1.0)
-    fitted = solve(replays, TRUTH, parameters, prior, 12, known=Scales(noise))
+    fitted = solve(replays, TRUTH, parameters, 12, known=Scales(noise))
     found, sets = name_causes(replays, TRUTH, fitted)
     return found, (*sets, *alike(fitted, legs_of_rows(replays.data, fitted_rows(replays.data))))
 

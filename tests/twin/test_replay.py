@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -45,6 +46,7 @@ from hdbridge.twin.replay import (
 )
 
 DEMO = Path(__file__).parents[2] / "profiles" / "demo"
+AXIS, TRUTH = AxisConfig.load(DEMO), Truth.load(DEMO)
 SENSOR = ChannelSource(index=0x2100, type="int16", via="tpdo")
 CHANNELS = ("time_s", "motor_target_deg", "motor_position_deg", "load_position_deg", "motor_torque_nm")
 
@@ -171,13 +173,9 @@ def test_a_dead_time_delays_torque_and_motion_alike() -> None:
 
 def test_commands_at_uneven_times_are_met_to_the_last_row() -> None:
     """A recording that ends in motion, between two cycles."""
-    axis, truth = demo()
     time_s = 0.01 * np.arange(60) + 0.00037 * np.arange(60)
     target_deg = 300.0 * np.maximum(time_s - 0.1, 0.0)
-    columns = {"time_s": time_s, "motor_target_deg": target_deg}
-    record = Record(columns | {"motor_position_deg": target_deg, "load_position_deg": target_deg / 50.0})
-    told = replay(Recording(record, ratio=50.0), axis, truth).motor_target_deg
-    assert told is not None
+    told = replay(Recording(record_at(time_s, target_deg), ratio=50.0), *demo()).columns["motor_target_deg"]
     assert np.max(np.abs(told - target_deg)) < 0.06, "motor degrees: a count and its rounding"
 
 
@@ -214,13 +212,12 @@ def moves(bench: Exercise) -> None:
 
 
 def recorded() -> Recording:
-    return Recording(record_of(Truth.load(DEMO), moves), axis="demo", ratio=50.0)
+    return Recording(record_of(TRUTH, moves), axis="demo", ratio=50.0)
 
 
 def test_two_processes_give_what_one_gives() -> None:
-    truth = Truth.load(DEMO)
-    truths = [with_values(truth, {"Coulomb friction": each}) for each in (0.034, 0.05)]
-    data = prepare(recorded(), AxisConfig.load(DEMO), truth)
+    truths = [with_values(TRUTH, {"Coulomb friction": each}) for each in (0.034, 0.05)]
+    data = prepare(recorded(), AXIS, TRUTH)
     with Replays(data, 1) as alone, Replays(data, 2) as together:
         for few in (False, True):
             ones, others = (each.rough(truths) if few else each(truths) for each in (alone, together))
@@ -239,9 +236,6 @@ def test_workers_end_when_the_process_that_began_them_is_killed(tmp_path: Path) 
         process.communicate()
 
 
-AXIS = AxisConfig.load(DEMO)
-
-
 def there_and_back(bench: Exercise) -> None:
     for distance in (200.0, -150.0, 90.0, -140.0, 60.0):
         bench.move(distance, 600.0, 6000.0)
@@ -251,11 +245,7 @@ def there_and_back(bench: Exercise) -> None:
 @pytest.fixture(scope="module")
 def bare() -> Record:
     """A record without any legs, as a CSV file is."""
-    return record_of(Truth.load(DEMO), there_and_back)
-
-
-def changed(record: Record, **columns: np.ndarray) -> Recording:
-    return Recording(Record({**record.columns, **columns}), axis="demo", ratio=50.0)
+    return record_of(TRUTH, there_and_back)
 
 
 @given(
@@ -280,56 +270,69 @@ def test_rows_that_follow_no_cycle_stay_where_they_are() -> None:
     assert counted_cycles(time_s, 0.004) == pytest.approx((time_s - time_s[0]) / 0.004)
 
 
+def record_at(time_s: np.ndarray, target: np.ndarray, motor: np.ndarray | None = None) -> Record:
+    """A record of a command and of a motor and a load that follow it."""
+    motor = target if motor is None else motor
+    return Record({"time_s": time_s, "motor_target_deg": target, "motor_position_deg": motor,
+                   "load_position_deg": motor / 50.0})  # fmt: skip
+
+
 def test_legs_of_a_bare_record_are_cut_where_its_command_sets_out(bare: Record) -> None:
     legs = legs_of(Recording(bare, axis="demo", ratio=50.0))
     assert len(legs) == 5
-    assert legs[0].start_s == bare.time_s[0]
-    assert legs[-1].end_s == bare.time_s[-1]
-    target = bare.motor_target_deg
-    assert target is not None
+    assert (legs[0].start_s, legs[-1].end_s) == (bare.time_s[0], bare.time_s[-1])
+    target = bare.columns["motor_target_deg"]
     for leg in legs[1:]:
         row = int(np.searchsorted(bare.time_s, leg.start_s))
         assert target[row] == target[row - 1] != target[row + 1]
 
 
-def test_a_long_standstill_belongs_to_no_leg() -> None:
-    """Motion is held out, not the hour in which a gear cools down."""
-    time_s = np.arange(0.0, 20.0, 0.01)
-    angle = np.interp(time_s, [0.0, 1.0, 15.0, 16.0], [0.0, 90.0, 90.0, 0.0])
-    record = Record({"time_s": time_s, "motor_target_deg": angle, "motor_position_deg": angle,
-                     "load_position_deg": angle / 50.0})  # fmt: skip
-    spans = [(leg.start_s, leg.end_s) for leg in legs_of(Recording(record, ratio=50.0))]
-    assert spans == [pytest.approx((0.0, 2.0), abs=0.02), pytest.approx((15.0, 17.0), abs=0.02)]
+LONG_REST_S = np.arange(0.0, 20.0, 0.01)
+SINE_S = np.arange(0.0, 6.0, 0.004)
 
 
-def test_an_oscillation_without_rest_is_cut_at_its_turns() -> None:
-    time_s = np.arange(0.0, 6.0, 0.004)
-    angle = 20.0 * np.sin(2.0 * np.pi * 0.5 * time_s)
-    record = Record({"time_s": time_s, "motor_target_deg": angle, "motor_position_deg": angle,
-                     "load_position_deg": angle / 50.0})  # fmt: skip
-    turns = [leg.start_s for leg in legs_of(Recording(record, ratio=50.0))[1:]]
-    assert turns == pytest.approx([0.5, 1.5, 2.5, 3.5, 4.5, 5.5], abs=0.01)
+@pytest.mark.parametrize(
+    ("time_s", "angle", "spans"),
+    [
+        # Motion is held out, not the hour in which a gear cools down.
+        (
+            LONG_REST_S,
+            np.interp(LONG_REST_S, [0.0, 1.0, 15.0, 16.0], [0.0, 90.0, 90.0, 0.0]),
+            [(0.0, 2.0), (15.0, 17.0)],
+        ),
+        # An oscillation without rest is cut at its turns.
+        (
+            SINE_S,
+            20.0 * np.sin(np.pi * SINE_S),
+            [(0.0, 0.5), *((0.5 + k, 1.5 + k) for k in range(5)), (5.5, 6.0)],
+        ),
+    ],
+)
+def test_a_leg_is_a_motion(time_s: np.ndarray, angle: np.ndarray, spans: list[tuple[float, float]]) -> None:
+    found = [(leg.start_s, leg.end_s) for leg in legs_of(Recording(record_at(time_s, angle), ratio=50.0))]
+    assert found == [pytest.approx(each, abs=0.02) for each in spans]
 
 
-def test_a_recording_in_order_raises_no_doubt(bare: Record) -> None:
-    assert doubts(changed(bare), AXIS) == ()
-
-
-def test_a_torque_with_the_wrong_sign_or_unit_is_noticed(bare: Record) -> None:
-    torque = bare.columns["motor_torque_nm"]
-    (sign,) = doubts(changed(bare, motor_torque_nm=-torque), AXIS)
-    assert "change its sign" in sign
-    percent = 100.0 * torque / AXIS.drive.rated_torque_nm
-    (unit,) = doubts(changed(bare, motor_torque_nm=percent), AXIS)
-    assert "per cent" in unit
-
-
-def test_a_command_that_was_logged_late_is_noticed(bare: Record) -> None:
-    target = bare.motor_target_deg
-    assert target is not None
-    late = np.concatenate([np.full(4, target[0]), target[:-4]])
-    (said,) = doubts(changed(bare, motor_target_deg=late), AXIS)
-    assert "move motor_target_deg earlier" in said
+@pytest.mark.parametrize(
+    ("name", "wrong", "says"),
+    [
+        ("motor_torque_nm", lambda torque: torque, None),
+        ("motor_torque_nm", lambda torque: -torque, "change its sign"),
+        ("motor_torque_nm", lambda torque: 100.0 * torque / AXIS.drive.rated_torque_nm, "per cent"),
+        (
+            "motor_target_deg",
+            lambda target: np.append(np.full(4, target[0]), target[:-4]),
+            "earlier by as many",
+        ),
+    ],
+)
+def test_a_wrong_torque_or_a_late_command_is_noticed(
+    bare: Record, name: str, wrong: Callable[[np.ndarray], np.ndarray], says: str | None
+) -> None:
+    recording = Recording(Record({**bare.columns, name: wrong(bare.columns[name])}), axis="demo", ratio=50.0)
+    found = doubts(recording, AXIS)
+    assert len(found) == (says is not None)
+    assert all(str(says) in each for each in found)
 
 
 CYCLE_S = 0.01
@@ -341,26 +344,19 @@ def moved_twice(creeps_deg: float) -> tuple[Record, np.ndarray]:
     target = np.concatenate([np.linspace(0.0, 20.0, 50), np.full(50, 20.0), np.linspace(20.4, 40.0, 49)])
     motor = target.copy()
     motor[60:100] += creeps_deg * np.linspace(0.0, 1.0, 40)
-    time_s = CYCLE_S * np.arange(len(target))
-    columns = {"time_s": time_s, "motor_target_deg": target, "motor_position_deg": motor}
     moved = np.diff(target, prepend=target[0]) != 0.0
-    return Record(columns | {"load_position_deg": motor / 50.0}), moved
+    return record_at(CYCLE_S * np.arange(len(target)), target, motor), moved
 
 
-def test_a_standing_motor_tells_its_torque_again_and_again_and_at_last() -> None:
+@pytest.mark.parametrize(("creeps_deg", "count"), [(COUNT_DEG, 5), (100.0 * COUNT_DEG, 1)])
+def test_a_standing_motor_tells_its_torque_again_and_again_and_at_last(creeps_deg: float, count: int) -> None:
     """The integral goes on meanwhile: what it comes to at the end may be after the motor broke away."""
-    record, moved = moved_twice(COUNT_DEG)
+    record, moved = moved_twice(creeps_deg)
     held = held_rows(record, moved, stands(moved, record.motor_position_deg, 1.5 * COUNT_DEG))
     assert held[-1] == 99, "the last row of the rest"
     assert np.all(np.abs(np.diff(record.time_s[held[:-1]]) - HELD_S) < 1.5 * CYCLE_S)
-    assert len(held) == 5
+    assert len(held) == count
     assert not moved[held].any()
-
-
-def test_a_motor_that_is_still_under_way_tells_none() -> None:
-    record, moved = moved_twice(100.0 * COUNT_DEG)
-    held = held_rows(record, moved, stands(moved, record.motor_position_deg, 1.5 * COUNT_DEG))
-    assert held.tolist() == [99]
 
 
 def ended_in_motion(first_s: float, then_s: float) -> Record:
@@ -368,9 +364,7 @@ def ended_in_motion(first_s: float, then_s: float) -> Record:
     parts = []
     for length_s, place in ((first_s, 0.0), (then_s, 7.0)):
         time_s = CYCLE_S * np.arange(round(length_s / CYCLE_S))
-        target = place + 5.0 * np.maximum(time_s - 0.5, 0.0)
-        columns = {"time_s": time_s, "motor_target_deg": target, "motor_position_deg": target}
-        parts.append(Record(columns | {"load_position_deg": target / 50.0}))
+        parts.append(record_at(time_s, place + 5.0 * np.maximum(time_s - 0.5, 0.0)))
     return concatenate(parts)
 
 
@@ -396,9 +390,8 @@ LEGS = (
 
 def swinging(duration_s: float = 130.0) -> Recording:
     time_s = CYCLE_S * np.arange(round(duration_s / CYCLE_S))
-    motor_deg = 90.0 * np.sin(2.0 * np.pi * time_s / 40.0)
-    columns = {"time_s": time_s, "motor_target_deg": motor_deg, "motor_position_deg": motor_deg}
-    return Recording(Record({**columns, "load_position_deg": motor_deg / 50.0}), LEGS, ratio=50.0)
+    record = record_at(time_s, 90.0 * np.sin(2.0 * np.pi * time_s / 40.0))
+    return Recording(record, LEGS, ratio=50.0)
 
 
 def test_stretches_are_all_rows_in_order_and_begin_with_legs() -> None:
@@ -408,44 +401,30 @@ def test_stretches_are_all_rows_in_order_and_begin_with_legs() -> None:
     assert all(5.0 <= each.time_s[-1] - each.time_s[0] + CYCLE_S <= 16.0 for each in cut)
     firsts = [float(each.time_s[0]) for each in cut]
     assert [each for each in firsts if each >= 100.0] == pytest.approx([100.0, 106.0, 112.0, 118.0, 124.0])
-
-
-def test_a_short_part_stays_whole() -> None:
-    record = swinging(25.0).record
-    assert stretches(record, LEGS) == [record]
+    short = swinging(25.0).record
+    assert stretches(short, LEGS) == [short]
 
 
 def test_a_fit_takes_some_of_each_kind_of_motion() -> None:
-    data = prepare(swinging(), AxisConfig.load(DEMO), Truth.load(DEMO))
+    data = prepare(swinging(), AXIS, TRUTH)
     taken = coarse(data, 40.0)
     assert taken.duration_s <= 40.0
     assert {"sweep", "step"} <= set(taken.kinds)
     assert data.duration_s > 130.0
+    # This axis never stands, and a stretch that begins in motion does not rest in its first row.
+    assert len(data.pieces) > 5
+    assert not any(each.rest.any() for each in data.pieces)
 
 
 def test_a_fit_takes_pieces_of_a_warm_up_at_both_its_ends() -> None:
     record = swinging().record
     warm_c = 20.0 + 0.1 * np.floor(record.time_s)
     warms = Recording(Record({**record.columns, "temperature_c": warm_c}), LEGS, ratio=50.0)
-    axis, truth = AxisConfig.load(DEMO), Truth.load(DEMO)
-    apart_k = {}
-    for name, each in {"untold": swinging(), "told": warms}.items():
-        whole, taken = prepare(each, axis, truth), coarse(prepare(each, axis, truth), 60.0)
-        begun_c = [20.0 + 0.1 * float(piece.commands.time_s[0]) for piece in taken.pieces]
-        apart_k[name] = max(begun_c) - min(begun_c)
-        assert whole.duration_s > 130.0
-    assert apart_k["untold"] < apart_k["told"]
-    assert apart_k["told"] > 11.0
-
-
-def test_a_stretch_that_begins_in_motion_does_not_rest_in_its_first_row() -> None:
-    """This axis never stands; the zero of a command is told by where it does."""
-    data = prepare(swinging(), AxisConfig.load(DEMO), Truth.load(DEMO))
-    assert len(data.pieces) > 5
-    assert not any(each.rest.any() for each in data.pieces)
-
-
-TRUTH = Truth.load(DEMO)
+    apart_k = []
+    for each in (swinging(), warms):
+        taken = coarse(prepare(each, AXIS, TRUTH), 60.0)
+        apart_k.append(0.1 * np.ptp([float(piece.commands.time_s[0]) for piece in taken.pieces]))
+    assert apart_k[0] < 11.0 < apart_k[1]
 
 
 @cache

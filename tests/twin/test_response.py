@@ -20,7 +20,7 @@ from hdbridge.sim.truth import Truth
 from hdbridge.sim.truth.motor import TrueResponse
 from hdbridge.twin.fit import Fitted, solve
 from hdbridge.twin.misfit import Data, Replays, misfit, prepare
-from hdbridge.twin.parameters import BY_NAME, coordinates
+from hdbridge.twin.parameters import BY_NAME
 from hdbridge.twin.response import with_response
 
 DEMO = Path(__file__).parents[2] / "profiles" / "demo"
@@ -103,4 +103,4 @@ def test_what_a_servo_leaves_is_taken_over_by_a_response_that_held_out_legs_conf
 
 def found_at(replays: Replays, truth: Truth) -> Fitted:
     friction = (BY_NAME["Coulomb friction"],)
-    return solve(replays, truth, friction, np.array(coordinates(truth, friction)), 0)
+    return solve(replays, truth, friction, 0)

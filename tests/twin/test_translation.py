@@ -14,40 +14,7 @@ from hypothesis import strategies as st
 from support.effect_examples import EXAMPLES
 from support.exercised import record_of
 
-from hdbridge.axis import AxisConfig
-from hdbridge.axis.effects import (
-    CATALOGUE,
-    AmplitudeDrift,
-    Backlash,
-    ChannelSkew,
-    Compliance,
-    CountLoss,
-    Creep,
-    DirectionPhase,
-    Effect,
-    FlexsplineOrders,
-    Hysteresis,
-    HysteresisMemory,
-    HysteresisParameters,
-    InertialWindup,
-    LoadOrders,
-    LocalDefect,
-    Loop,
-    MotorEncoderEccentricity,
-    MotorOrder,
-    MotorOrders,
-    RateDependence,
-    RatioError,
-    Relaxation,
-    Step,
-    SubdivisionalError,
-    Synchronous,
-    TorqueModulation,
-    VelocityWindup,
-    Vibration,
-    Wear,
-    ZeroDrift,
-)
+from hdbridge.axis import AxisConfig, effects
 from hdbridge.axis.model import TransmissionModel
 from hdbridge.errors import InputError
 from hdbridge.records.record import Record
@@ -72,64 +39,54 @@ def fine_axis() -> AxisConfig:
 
 AXIS = fine_axis()
 ORDERS = tuple(
-    MotorOrder(order=k, amplitude_arcsec=a, phase_deg=p) for k, a, p in [(1, 6.4, 38.0), (2, 13.7, 161.5)]
+    effects.MotorOrder(order=k, amplitude_arcsec=a, phase_deg=p)
+    for k, a, p in [(1, 6.4, 38.0), (2, 13.7, 161.5)]
 )
 FURTHER = tuple(
-    MotorOrder(order=k, amplitude_arcsec=a, phase_deg=p) for k, a, p in [(1, 9.0, -70.0), (2, 5.0, 25.0)]
+    effects.MotorOrder(order=k, amplitude_arcsec=a, phase_deg=p)
+    for k, a, p in [(1, 9.0, -70.0), (2, 5.0, 25.0)]
 )
 LOOP = {"offset_arcsec": 30.0, "width_deg": 25.0, "exponent": 1.7}
-BASIC: tuple[Effect, ...] = (Synchronous(orders=ORDERS), Hysteresis(**LOOP))
+BASIC: tuple[effects.Effect, ...] = (effects.Synchronous(orders=ORDERS), effects.Hysteresis(**LOOP))
 
 
-def to_and_fro(bench: Exercise) -> None:
-    """Slow moves both ways, with reversals inside the loop."""
-    for distance in (150.0, -200.0, 100.0, -10.0, 12.0, -20.0, 150.0):
-        bench.move(distance, 60.0, 200.0)
-        bench.hold(0.5)
+def moved(*rows: tuple[float, float, float, float]) -> Callable[[Exercise], None]:
+    """Leads a bench by distances (degrees of the motor), speeds, accelerations, and rests after them (s)."""
+
+    def lead(bench: Exercise) -> None:
+        for distance, speed, acceleration, rest_s in rows:
+            bench.move(distance, speed, acceleration)
+            if rest_s:
+                bench.hold(rest_s)
+
+    return lead
 
 
-def far(bench: Exercise) -> None:
-    """A load turn each way."""
-    for distance in (360.0 * N, -360.0 * N):
-        bench.move(distance, 900.0, 400.0)
+to_and_fro = moved(*((each, 60.0, 200.0, 0.5) for each in (150.0, -200.0, 100.0, -10.0, 12.0, -20.0, 150.0)))
+"""Slow moves both ways, with reversals inside the loop."""
+far = moved((360.0 * N, 900.0, 400.0, 0.0), (-360.0 * N, 900.0, 400.0, 0.0))
+"""A load turn each way."""
+several_speeds = moved(
+    *((way * (200.0 + speed), speed, 1500.0, 0.4) for speed in (60.0, 200.0, 900.0) for way in (1.0, -1.0))
+)
+nested = moved(
+    (60.0, 30.0, 200.0, 0.0),
+    *((way, 30.0, 200.0, 0.0) for k in (2.0, 4.0, 8.0, 12.0) for way in (-60.0, 60.0 - k, -k, k, k)),
+)
+"""Small back-steps within the loop, each undone."""
+rests = moved((800.0, 200.0, 800.0, 8.0), (-800.0, 200.0, 800.0, 8.0))
+within_lines = moved((60.0, 20.0, 100.0, 0.0))
+"""Slowly over some lines of the load encoder."""
 
 
-def several_speeds(bench: Exercise) -> None:
-    """Back and forth at several speeds."""
-    for speed in (60.0, 200.0, 900.0):
-        for distance in (1.0, -1.0):
-            bench.move(distance * (200.0 + speed), speed, 1500.0)
-            bench.hold(0.4)
+def stand(bench: Exercise) -> None:
+    bench.hold(4.0)
 
 
 def brisk(bench: Exercise) -> None:
     """Sines: much acceleration, no step of it that would make the load ring."""
     bench.sine(200.0, 0.5, 3.0)
     bench.sine(100.0, 1.0, 3.0)
-
-
-def nested(bench: Exercise) -> None:
-    """Small back-steps within the loop, each undone."""
-    bench.move(60.0, 30.0, 200.0)
-    for back in (2.0, 4.0, 8.0, 12.0):
-        for distance in (-60.0, 60.0 - back, -back, back, back):
-            bench.move(distance, 30.0, 200.0)
-
-
-def rests(bench: Exercise) -> None:
-    """Moves of seconds, and long rests."""
-    for distance in (800.0, -800.0):
-        bench.move(distance, 200.0, 800.0)
-        bench.hold(8.0)
-
-
-def within_lines(bench: Exercise) -> None:
-    """Slowly over some lines of the load encoder."""
-    bench.move(60.0, 20.0, 100.0)
-
-
-def stand(bench: Exercise) -> None:
-    bench.hold(4.0)
 
 
 def warming(truth: Truth) -> Truth:
@@ -149,7 +106,7 @@ def hanging(truth: Truth) -> Truth:
 class Case:
     """An effect in its place in a model, a motion that shows it, and how much of it may be left."""
 
-    effects: tuple[Effect, ...]
+    parts: tuple[effects.Effect, ...]
     lead: Callable[[Exercise], None] = to_and_fro
     left: float = 0.03
     """Share of the effect's own part, rms, that a translation of another shape may leave."""
@@ -160,43 +117,52 @@ class Case:
     """Its law has more elements than others: to compile an axis with room for them takes far longer."""
 
 
-SPRING = Compliance(
+SPRING = effects.Compliance(
     c1_arcsec_per_nm=14.0, c2_arcsec_per_nm=10.0, c3_arcsec_per_nm=8.0, torque1_nm=2.0, torque2_nm=4.0
 )
 BY_TEMPERATURE = {"tau_s": 3.0, "reference_c": 24.0}
 CASES = {
-    "synchronous": Case((Synchronous(orders=ORDERS),)),
-    "hysteresis": Case((Hysteresis(**LOOP),)),
-    "motor_order": Case((*BASIC, MotorOrders(orders=FURTHER))),
-    "motor_encoder_eccentricity": Case((*BASIC, MotorEncoderEccentricity(orders=FURTHER))),
-    "load_order": Case((*BASIC, LoadOrders(ratio=N, orders=FURTHER, origin="load_encoder")), far),
-    "flexspline_order": Case((*BASIC, FlexsplineOrders(ratio=N, orders=FURTHER)), far),
-    "direction_phase": Case((*BASIC, DirectionPhase(orders=ORDERS, shift_deg=4.0))),
+    "synchronous": Case((effects.Synchronous(orders=ORDERS),)),
+    "hysteresis": Case((effects.Hysteresis(**LOOP),)),
+    "motor_order": Case((*BASIC, effects.MotorOrders(orders=FURTHER))),
+    "motor_encoder_eccentricity": Case((*BASIC, effects.MotorEncoderEccentricity(orders=FURTHER))),
+    "load_order": Case((*BASIC, effects.LoadOrders(ratio=N, orders=FURTHER, origin="load_encoder")), far),
+    "flexspline_order": Case((*BASIC, effects.FlexsplineOrders(ratio=N, orders=FURTHER)), far),
+    "direction_phase": Case((*BASIC, effects.DirectionPhase(orders=ORDERS, shift_deg=4.0))),
     "torque_modulation": Case(
-        (*BASIC, SPRING, TorqueModulation(orders=ORDERS, growth_percent_per_nm=8.0)), far, plant=hanging
+        (*BASIC, SPRING, effects.TorqueModulation(orders=ORDERS, growth_percent_per_nm=8.0)),
+        far,
+        plant=hanging,
     ),
     "compliance": Case((*BASIC, SPRING), far, plant=hanging),
-    "inertial_windup": Case((BASIC[0], InertialWindup(ratio=N, inertia_over_stiffness_s2=4e-5)), brisk),
+    "inertial_windup": Case(
+        (BASIC[0], effects.InertialWindup(ratio=N, inertia_over_stiffness_s2=4e-5)), brisk
+    ),
     "velocity_windup": Case(
         (
             *BASIC,
-            VelocityWindup(coulomb_arcsec=8.0, viscous_arcsec_s_per_deg=0.1, shear_deg_s=300.0),
-            InertialWindup(ratio=N, inertia_over_stiffness_s2=2e-5),
+            effects.VelocityWindup(coulomb_arcsec=8.0, viscous_arcsec_s_per_deg=0.1, shear_deg_s=300.0),
+            effects.InertialWindup(ratio=N, inertia_over_stiffness_s2=2e-5),
         ),
         several_speeds,
         left=0.05,
     ),
-    "channel_skew": Case((*BASIC, ChannelSkew.of_delay(2.0, N)), several_speeds, floor_arcsec=2.0),
-    "backlash": Case((*BASIC, Backlash.of_gap(40.0, N, softness=1.0)), left=0.15),
-    "hysteresis_memory": Case((BASIC[0], HysteresisMemory(**LOOP)), nested, in_python=True),
+    "channel_skew": Case((*BASIC, effects.ChannelSkew.of_delay(2.0, N)), several_speeds, floor_arcsec=2.0),
+    "backlash": Case((*BASIC, effects.Backlash.of_gap(40.0, N, softness=1.0)), left=0.15),
+    "hysteresis_memory": Case((BASIC[0], effects.HysteresisMemory(**LOOP)), nested, in_python=True),
     "hysteresis_parameters": Case(
         (
             *BASIC,
-            HysteresisParameters(base=Loop(**LOOP), **{**LOOP, "offset_arcsec": 50.0, "width_deg": 12.0}),
+            effects.HysteresisParameters(
+                base=effects.Loop(**LOOP), **{**LOOP, "offset_arcsec": 50.0, "width_deg": 12.0}
+            ),
         )
     ),
     "rate_dependence": Case(
-        (*BASIC, RateDependence(loop=Loop(**LOOP), growth_percent=40.0, reference_deg_s=30.0)),
+        (
+            *BASIC,
+            effects.RateDependence(loop=effects.Loop(**LOOP), growth_percent=40.0, reference_deg_s=30.0),
+        ),
         several_speeds,
         left=0.15,
         floor_arcsec=1.5,
@@ -204,10 +170,10 @@ CASES = {
     "subdivisional_error": Case(
         (
             *BASIC,
-            SubdivisionalError(
+            effects.SubdivisionalError(
                 lines_per_turn=9000,
                 orders=tuple(
-                    MotorOrder(order=k, amplitude_arcsec=1.5, phase_deg=p)
+                    effects.MotorOrder(order=k, amplitude_arcsec=1.5, phase_deg=p)
                     for k, p in [(1, 50.0), (2, -110.0), (4, 90.0)]
                 ),
             ),
@@ -215,13 +181,15 @@ CASES = {
         within_lines,
         left=0.15,
     ),
-    "zero_drift": Case((*BASIC, ZeroDrift(drift_arcsec_per_k=3.0, **BY_TEMPERATURE)), rests, plant=warming),
+    "zero_drift": Case(
+        (*BASIC, effects.ZeroDrift(drift_arcsec_per_k=3.0, **BY_TEMPERATURE)), rests, plant=warming
+    ),
     "amplitude_drift": Case(
         (
             *BASIC,
-            AmplitudeDrift(
+            effects.AmplitudeDrift(
                 orders=ORDERS,
-                loop=Loop(**LOOP),
+                loop=effects.Loop(**LOOP),
                 ripple_percent_per_k=5.0,
                 friction_percent_per_k=-3.0,
                 tau_s=0.02,
@@ -231,18 +199,20 @@ CASES = {
         plant=warming,
     ),
     "wear": Case(
-        (*BASIC, Wear(growth_arcsec_per_kiloturn=-1000.0, width_deg=0.3, exponent=0.9)),
+        (*BASIC, effects.Wear(growth_arcsec_per_kiloturn=-1000.0, width_deg=0.3, exponent=0.9)),
         several_speeds,
         left=0.1,
     ),
-    "creep": Case((*BASIC, Creep(parts=(Relaxation(amplitude_arcsec=-12.0, tau_s=1.5),))), rests),
-    "ratio_error": Case((*BASIC, RatioError(ramp_arcsec_per_turn=20.0))),
-    "count_loss": Case((*BASIC, CountLoss(steps=(Step(time_s=8.0, size_arcsec=-25.0),)))),
+    "creep": Case(
+        (*BASIC, effects.Creep(parts=(effects.Relaxation(amplitude_arcsec=-12.0, tau_s=1.5),))), rests
+    ),
+    "ratio_error": Case((*BASIC, effects.RatioError(ramp_arcsec_per_turn=20.0))),
+    "count_loss": Case((*BASIC, effects.CountLoss(steps=(effects.Step(time_s=8.0, size_arcsec=-25.0),)))),
     "vibration": Case(
-        (*BASIC, Vibration(frequency_hz=7.0, amplitude_arcsec=9.0, phase_deg=40.0)), stand, left=0.1
+        (*BASIC, effects.Vibration(frequency_hz=7.0, amplitude_arcsec=9.0, phase_deg=40.0)), stand, left=0.1
     ),
     "local_defect": Case(
-        (*BASIC, LocalDefect(ratio=N, height_arcsec=-30.0, centre_deg=80.0, half_width_deg=6.0)), far
+        (*BASIC, effects.LocalDefect(ratio=N, height_arcsec=-30.0, centre_deg=80.0, half_width_deg=6.0)), far
     ),
 }
 
@@ -267,7 +237,7 @@ def exercised(truth: Truth, lead: Callable[[Exercise], None]) -> Record:
     return record_of(truth, both)
 
 
-def predicted(effects: tuple[Effect, ...], record: Record) -> np.ndarray:
+def predicted(parts: tuple[effects.Effect, ...], record: Record) -> np.ndarray:
     target, time_s = record.columns["motor_target_deg"], record.time_s
     speed = np.round(np.gradient(target, time_s), 6)  # a target that rests is not quite the same float
     motion = dataclasses.replace(
@@ -277,7 +247,7 @@ def predicted(effects: tuple[Effect, ...], record: Record) -> np.ndarray:
         motor_acceleration_deg_s2=np.gradient(speed, time_s),
         load_deg=record.load_position_deg,
     )
-    return after(record, TransmissionModel(N, effects).predict(motion))
+    return after(record, TransmissionModel(N, parts).predict(motion))
 
 
 def after(record: Record, error: np.ndarray) -> np.ndarray:
@@ -287,8 +257,8 @@ def after(record: Record, error: np.ndarray) -> np.ndarray:
 
 
 def test_every_effect_of_the_catalogue_has_its_row() -> None:
-    assert set(TABLE) == set(CATALOGUE)
-    assert set(CASES) == set(CATALOGUE), "a new effect needs a case here that shows its translation"
+    assert set(TABLE) == set(effects.CATALOGUE)
+    assert set(CASES) == set(effects.CATALOGUE), "a new effect needs a case here that shows its translation"
 
 
 @pytest.mark.parametrize("name", CASES)
@@ -299,12 +269,12 @@ def test_the_simulated_drive_errs_as_the_model_says(name: str, monkeypatch: pyte
     base = case.plant(default_truth(AXIS))
     # A spring that nothing asks for would wind up without the model's knowledge.
     translation = translate(
-        AXIS, TransmissionModel(N, case.effects), base if base != default_truth(AXIS) else None
+        AXIS, TransmissionModel(N, case.parts), base if base != default_truth(AXIS) else None
     )
     record = exercised(quiet(translation.truth), case.lead)
     error = after(record, record.transmission_error_arcsec(N))
-    told = predicted(case.effects, record)
-    own = told - predicted(tuple(each for each in case.effects if each.name != name), record)
+    told = predicted(case.parts, record)
+    own = told - predicted(tuple(each for each in case.parts if each.name != name), record)
     size = float(np.sqrt(np.mean(own**2)))
     left = float(np.sqrt(np.mean((error - told) ** 2)))
     allowed = case.left * size + case.floor_arcsec
@@ -316,26 +286,28 @@ def test_the_simulated_drive_errs_as_the_model_says(name: str, monkeypatch: pyte
 LAG = {"offset_arcsec": -25.0, "width_deg": 25.0, "exponent": 2.5}
 
 
-@pytest.mark.parametrize("law", [Hysteresis, HysteresisMemory])
-def test_a_loop_in_which_the_load_lags_is_friction_at_the_load(law: type[Effect]) -> None:
-    effects = (law(**LAG),)
-    translation = translate(AXIS, TransmissionModel(N, effects))
+@pytest.mark.parametrize("law", [effects.Hysteresis, effects.HysteresisMemory])
+def test_a_loop_in_which_the_load_lags_is_friction_at_the_load(law: type[effects.Effect]) -> None:
+    parts = (law(**LAG),)
+    translation = translate(AXIS, TransmissionModel(N, parts))
     record = exercised(quiet(translation.truth), to_and_fro)
-    error, told = after(record, record.transmission_error_arcsec(N)), predicted(effects, record)
+    error, told = after(record, record.transmission_error_arcsec(N)), predicted(parts, record)
     assert np.std(error - told) < 0.08 * np.std(told)
     assert translation.truth.gear.hysteresis is None
     assert translation.truth.load_.presliding
 
 
 def test_what_the_plant_cannot_do_is_said() -> None:
-    effects = (
-        Synchronous(orders=(*ORDERS, MotorOrder(order=600, amplitude_arcsec=1.0, phase_deg=0.0))),
-        TorqueModulation(orders=ORDERS, growth_percent_per_nm=1.0, signed=True),
-        Wear(growth_arcsec_per_kiloturn=10.0, width_deg=2.0),
-        CountLoss(steps=(Step(time_s=-5.0, size_arcsec=3.0),)),
-        Vibration(frequency_hz=900.0, amplitude_arcsec=1.0, phase_deg=0.0),
+    parts = (
+        effects.Synchronous(
+            orders=(*ORDERS, effects.MotorOrder(order=600, amplitude_arcsec=1.0, phase_deg=0.0))
+        ),
+        effects.TorqueModulation(orders=ORDERS, growth_percent_per_nm=1.0, signed=True),
+        effects.Wear(growth_arcsec_per_kiloturn=10.0, width_deg=2.0),
+        effects.CountLoss(steps=(effects.Step(time_s=-5.0, size_arcsec=3.0),)),
+        effects.Vibration(frequency_hz=900.0, amplitude_arcsec=1.0, phase_deg=0.0),
     )
-    rows = {row.effect: row for row in translate(AXIS, TransmissionModel(N, effects)).rows}
+    rows = {row.effect: row for row in translate(AXIS, TransmissionModel(N, parts)).rows}
     assert "600" in rows["synchronous"].note
     for name in ("torque_modulation", "wear", "count_loss", "vibration"):
         assert rows[name].counterpart is None
@@ -344,7 +316,7 @@ def test_what_the_plant_cannot_do_is_said() -> None:
 
 def test_a_stage_of_the_spring_that_no_torque_reaches_is_left_out() -> None:
     """A diagnosis names a linear spring so: the other stages begin beyond any torque."""
-    linear = Compliance(
+    linear = effects.Compliance(
         c1_arcsec_per_nm=31.0,
         c2_arcsec_per_nm=0.0,
         c3_arcsec_per_nm=0.0,
@@ -359,12 +331,12 @@ def test_a_stage_of_the_spring_that_no_torque_reaches_is_left_out() -> None:
 
 
 def test_of_an_effect_of_ones_own_it_is_said_that_it_has_no_counterpart() -> None:
-    class Draught(Synchronous):
+    class Draught(effects.Synchronous):
         """Not of the catalogue."""
 
         name: ClassVar[str] = "draught"
 
-    model = TransmissionModel(N, (Draught(orders=ORDERS), Synchronous(orders=ORDERS)))
+    model = TransmissionModel(N, (Draught(orders=ORDERS), effects.Synchronous(orders=ORDERS)))
     translation = translate(AXIS, model)
     assert [(row.effect, row.counterpart) for row in translation.rows] == [
         ("synchronous", TABLE["synchronous"].counterpart),
@@ -374,7 +346,7 @@ def test_of_an_effect_of_ones_own_it_is_said_that_it_has_no_counterpart() -> Non
     assert translation.truth == translate(AXIS, TransmissionModel(N, model.effects[1:])).truth
 
 
-@pytest.mark.parametrize("name", CATALOGUE)
+@pytest.mark.parametrize("name", effects.CATALOGUE)
 @given(st.data())
 @settings(max_examples=10, deadline=None)
 def test_any_effect_makes_a_plant_that_moves(name: str, data: st.DataObject) -> None:

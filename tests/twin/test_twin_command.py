@@ -97,13 +97,9 @@ def test_what_the_simulation_gets_wrong_is_told_channel_by_channel(profile: Path
     page = (profile / "page.html").read_text()
     assert "Twin of axis" in page
     assert "truth.yaml" in page
-
-
-def test_that_no_transmission_error_is_simulated_is_said(profile: Path, recording: Path) -> None:
-    """Its torque and following error would be taken for motor and loops."""
+    # Without a transmission error, its torque and following error would be taken for motor and loops.
     (profile / "truth.yaml").unlink()
     done = run_here(profile, "twin", profile, recording, "--compare")
-    assert done.returncode == 0, done.stderr
     assert "no transmission error is simulated" in done.stderr
     assert f"hdbridge calibrate {profile}" in done.stderr
 
@@ -148,21 +144,19 @@ def test_what_makes_no_sense_is_refused(
 def test_a_recording_of_another_axis_or_without_commands_is_refused(profile: Path, tmp_path: Path) -> None:
     record = record_of(Truth.load(DEMO), moves)
     Recording(record, axis="arm", ratio=50.0).save(tmp_path / "other")
-    done = run_here(profile, "twin", profile, tmp_path / "other")
-    assert done.returncode == 2
-    assert "a recording of axis 'arm'" in done.stderr
     bare = {name: column for name, column in record.columns.items() if name != "motor_target_deg"}
-    type(record)(bare).write_csv(tmp_path / "bare.csv")
-    done = run_here(profile, "twin", profile, tmp_path / "bare.csv")
-    assert done.returncode == 2
-    assert "no column motor_target_deg" in done.stderr
-    assert "pass --columns target=COLUMN" in done.stderr
-    named = {{"motor_target_deg": "demand"}.get(name, name): each for name, each in record.columns.items()}
-    write_columns(tmp_path / "named.csv", named)
-    options = ("--columns", "target=demand", "--units", "target=deg")
-    done = run_here(profile, "twin", profile, tmp_path / "named.csv", *options, "--check")
-    assert done.returncode == 2
-    assert "there is no active twin" in done.stderr
+    write_columns(tmp_path / "bare.csv", bare)
+    write_columns(tmp_path / "named.csv", {**bare, "demand": record.columns["motor_target_deg"]})
+    named = ("named.csv", "--columns", "target=demand", "--units", "target=deg", "--check")
+    for (path, *options), complaint in (
+        (("other",), "a recording of axis 'arm'"),
+        (("bare.csv",), "no column motor_target_deg"),
+        (("bare.csv",), "pass --columns target=COLUMN"),
+        (named, "there is no active twin"),
+    ):
+        done = run_here(profile, "twin", profile, tmp_path / path, *options)
+        assert done.returncode == 2
+        assert complaint in done.stderr
 
 
 def fitted(truth: Truth, values: str = "axis", times_noise: float = 2.5) -> Callable[..., Twin]:
@@ -175,7 +169,7 @@ def fitted(truth: Truth, values: str = "axis", times_noise: float = 2.5) -> Call
             for each in (start, truth)
         )
         moved = Moved("Coulomb friction", "Nm", start.motor.coulomb_nm, truth.motor.coulomb_nm, 0.033, 0.035)
-        finding = Finding("friction", (moved,), ("motor torque",), 99.0, (5.0, 1.0))
+        finding = Finding("friction", (moved,))
         about = {"values": values, "fit": {"parameters": ["Coulomb friction"]}}
         intervals = {"motor.coulomb_nm": (0.033, 0.035)} if values == "axis" else {}
         known = truth.model_copy(update={"intervals": intervals, "provenance": about})
@@ -187,63 +181,66 @@ def fitted(truth: Truth, values: str = "axis", times_noise: float = 2.5) -> Call
     return fit_twin
 
 
+Run = Callable[..., tuple[str, dict[str, Any], str]]
+
+
+@pytest.fixture
+def run(profile: Path, recording: Path, monkeypatch: pytest.MonkeyPatch) -> Run:
+    """Runs the command with this fit; returns its output, its data and its page."""
+
+    def run(fit: Callable[..., Twin], *options: str) -> tuple[str, dict[str, Any], str]:
+        monkeypatch.setattr("hdbridge.twin.twin.fit_twin", fit)
+        files = ("--json", "told.json", "--html", "page.html")
+        done = run_here(profile, "twin", profile, recording, *files, *options)
+        assert done.returncode == 0, done.stderr
+        told = json.loads((profile / "told.json").read_text())
+        return done.stdout, told, (profile / "page.html").read_text()
+
+    return run
+
+
 def test_a_twin_that_is_better_is_kept_as_pending_with_all_that_is_known(
-    profile: Path, recording: Path, monkeypatch: pytest.MonkeyPatch
+    profile: Path, recording: Path, run: Run
 ) -> None:
-    monkeypatch.setattr("hdbridge.twin.twin.fit_twin", fitted(Truth.load(DEMO)))
-    done = run_here(profile, "twin", profile, recording, "--json", "told.json", "--html", "page.html")
-    assert done.returncode == 0, done.stderr
-    assert "friction: Coulomb friction 0.068 -> 0.034 Nm" in done.stdout
-    assert "unexplained: motor torque is left with 2.5 times its noise" in done.stdout
-    assert f"hdbridge model commit {profile} --twin" in done.stdout
+    said, told, page = run(fitted(Truth.load(DEMO)))
+    assert "friction: Coulomb friction 0.068 -> 0.034 Nm" in said
+    assert "unexplained: motor torque is left with 2.5 times its noise" in said
+    assert f"hdbridge model commit {profile} --twin" in said
     pending = KeptTwin.load(profile / "pending-twin.yaml")
     assert pending.truth.motor.coulomb_nm == 0.034
     assert pending.provenance["recordings"] == [str(recording)]
     assert pending.provenance["axis"] == "demo"
-    told = json.loads((profile / "told.json").read_text())
     assert figures(told, "after")["motor_torque"]["difference"] < 0.008
     (friction,) = told["parameters"]
     assert (friction["before"], friction["value"], friction["ci95"]) == (0.068, 0.034, [0.033, 0.035])
-    page = (profile / "page.html").read_text()
     assert "What was wrong with the simulation" in page
     assert "model commit" in page
 
 
-def test_a_twin_that_is_no_better_is_not_kept(
-    profile: Path, recording: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("hdbridge.twin.twin.fit_twin", fitted(Truth.load(profile)))
-    done = run_here(profile, "twin", profile, recording, "--json", "told.json", "--html", "page.html")
-    assert done.returncode == 0, done.stderr
-    assert "not kept" in done.stdout
-    assert "Coulomb friction" not in done.stdout, "nothing is known of it"
-    assert "unexplained: motor torque" in done.stdout
-    told = json.loads((profile / "told.json").read_text())
+def test_a_twin_that_is_no_better_is_not_kept(profile: Path, run: Run) -> None:
+    said, told, page = run(fitted(Truth.load(profile)))
+    assert "not kept" in said
+    assert "Coulomb friction" not in said, "nothing is known of it"
+    assert "unexplained: motor torque" in said
     assert [each["cause"] for each in told["findings"]] == ["unexplained"]
     assert told["parameters"] == []
-    assert "What the plant is" not in (profile / "page.html").read_text()
+    assert "What the plant is" not in page
     assert not (profile / "pending-twin.yaml").exists()
 
 
-def test_values_that_are_not_the_axis_s_are_offered_as_a_replay_only(
-    profile: Path, recording: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("hdbridge.twin.twin.fit_twin", fitted(Truth.load(DEMO), "replay", 22.0))
-    done = run_here(profile, "twin", profile, recording, "--json", "told.json", "--html", "page.html")
-    assert done.returncode == 0, done.stderr
+def test_values_that_are_not_the_axis_s_are_offered_as_a_replay_only(profile: Path, run: Run) -> None:
+    said, told, page = run(fitted(Truth.load(DEMO), "replay", 22.0))
     headline = (
         "The twin replays this drive (motor torque to 4 %), but its values are not the axis's: motor torque "
         "is left with 22 times its noise; the twin is kept as pending:"
     )
-    assert done.stdout.startswith(headline)
-    assert "friction:" not in done.stdout, "no value is called a finding"
-    told = json.loads((profile / "told.json").read_text())
+    assert said.startswith(headline)
+    assert "friction:" not in said, "no value is called a finding"
     assert told["values"] == "replay"
     assert told["verdict"].lower().startswith(headline.lower())
     assert [(each["channel"], each["explained"]) for each in told["left"]] == [("motor torque", False)]
     assert [each["cause"] for each in told["findings"]] == ["unexplained"]
     assert [each["ci95"] for each in told["parameters"]] == [None]
-    page = (profile / "page.html").read_text()
     assert headline.replace("'", "&#x27;") in page or headline.replace("'", "&#39;") in page
     assert "They are not the axis" in page
     pending = KeptTwin.load(profile / "pending-twin.yaml").truth
@@ -251,35 +248,27 @@ def test_values_that_are_not_the_axis_s_are_offered_as_a_replay_only(
     assert pending.intervals == {}
 
 
-def test_values_that_no_axis_has_are_refused(
-    profile: Path, recording: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_values_that_no_axis_has_are_refused(profile: Path, run: Run) -> None:
     demo = Truth.load(DEMO)
     for values, complaint in (
         ({"friction feed-forward": 3.0}, "friction feed-forward 3 Nm; expected at most the friction"),
         ({"motor inertia": 1e-3}, "motor inertia 0.001 kg m2; expected within a decade"),
         ({"load inertia": 10.0}, "load inertia seen by the motor"),
     ):
-        monkeypatch.setattr("hdbridge.twin.twin.fit_twin", fitted(with_values(demo, values), "replay"))
-        done = run_here(profile, "twin", profile, recording)
-        assert done.returncode == 0, done.stderr
-        assert done.stdout.startswith("The twin is not kept: no axis has these values:")
-        assert complaint in done.stdout
+        said, *_ = run(fitted(with_values(demo, values), "replay"))
+        assert said.startswith("The twin is not kept: no axis has these values:")
+        assert complaint in said
         assert not (profile / "pending-twin.yaml").exists()
     late, axis = with_values(demo, {"servo dead time": 5.0}), AxisConfig.load(DEMO)
     assert impossible(late, axis, 0.0025) == ()
     assert impossible(late, axis, 0.002) == ("dead time 5 ms; expected at most two cycles, 4",)
 
 
-def test_from_usual_values_a_fit_gives_estimates_and_no_changes(
-    profile: Path, recording: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("hdbridge.twin.twin.fit_twin", fitted(Truth.load(DEMO)))
-    done = run_here(profile, "twin", profile, recording, "--afresh", "--json", "told.json")
-    assert done.returncode == 0, done.stderr
-    assert "estimate: Coulomb friction 0.034 Nm (0.033 to 0.035)" in done.stdout
-    assert "->" not in done.stdout
-    (friction,) = json.loads((profile / "told.json").read_text())["parameters"]
+def test_from_usual_values_a_fit_gives_estimates_and_no_changes(run: Run) -> None:
+    said, told, _ = run(fitted(Truth.load(DEMO)), "--afresh")
+    assert "estimate: Coulomb friction 0.034 Nm (0.033 to 0.035)" in said
+    assert "->" not in said
+    (friction,) = told["parameters"]
     assert friction["before"] is None
 
 
