@@ -20,7 +20,6 @@ from hdbridge.analysis.hypothesis import Estimator, Fitted
 from hdbridge.analysis.linear import Column
 from hdbridge.analysis.parameters import named_parameters, parameters_of
 from hdbridge.analysis.search import Search, together
-from hdbridge.analysis.unexplained import near_reversals
 from hdbridge.axis.effects import CATALOGUE, Effect, FloatArray, Part, Start
 from hdbridge.axis.model import TransmissionModel
 
@@ -65,7 +64,6 @@ class _Change(NamedTuple):
     parameters: Mapping[str, Parameter]
     note: str
     aliases: tuple[str, ...] = ()
-    taken_arcsec: float = 0.0
     left_alone: bool = False
 
 
@@ -94,8 +92,8 @@ def _finding(
     return Finding(
         name, UNWEIGHED, change.aliases, change.parameters, held_out(estimator, fitted, without),
         next_experiment(name, change.aliases), change.peak_arcsec,
-        robust=as_it_was.chi_square - loose.chi_square, taken_arcsec=change.taken_arcsec,
-        left_alone=change.left_alone, within=True, note=change.note, effect=change.effect, gate=gate,
+        robust=as_it_was.chi_square - loose.chi_square, left_alone=change.left_alone,
+        within=True, note=change.note, effect=change.effect, gate=gate,
     )  # fmt: skip
 
 
@@ -134,15 +132,12 @@ def _loop(
         return None
     # A loop that follows neither law exactly may follow the other one in part.
     laws = [kind.name for kind in CATALOGUE.values() if kind.part is Part.LOOP and kind.changes is Part.LOOP]
-    residual, near = fitted.residual / estimator.weight, near_reversals(estimator, fitted)
-    taken = float(np.mean(((residual + change - np.mean(change)) ** 2 - residual**2)[near]))
     return _Change(
         causes[0],
         max(peak, lawless),
         parameters_of(estimator, precise, place, spread),
         "the baseline's own loop takes over the new parameters",
         tuple(laws) if lawless else (),
-        taken_arcsec=math.sqrt(max(taken, 0.0)),
     )
 
 

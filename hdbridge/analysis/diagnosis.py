@@ -40,10 +40,7 @@ from hdbridge.analysis.search import (
 )
 from hdbridge.analysis.swing import ORDINARY_HZ, seen_swing, settled, without
 from hdbridge.analysis.unexplained import (
-    LESS,
     Rest,
-    does_more,
-    doubtful_loops,
     is_unexplained,
     many_of_one,
     of_the_loop,
@@ -163,7 +160,6 @@ class _Judge:
         """Turns the result of the search into a diagnosis."""
         estimator, given = self.estimator, self.model.effects
         fitted = self.search.eliminated(fitted, self._stopped, self.considered)
-        fitted = self.search.eliminated(fitted, self._shadow, self.considered)
         fitted = with_measured(self.search, fitted)
         fitted = as_calibrated(estimator, fitted, given)
         judged = self._likely_only(fitted)
@@ -244,23 +240,6 @@ class _Judge:
                 return place, reason
         return None
 
-    def _shadow(self, fitted: Fitted) -> tuple[int, str] | None:
-        """Returns the cause with the least effect relative to the residual, if it may be an artefact."""
-        estimator, base = self.estimator, len(self.model.effects)
-        left = replace(rest(estimator, fitted), fast_arcsec=0.0)  # fast residuals cause no artefacts
-        if len(fitted.hypothesis.effects) == base or not is_unexplained(estimator, left):
-            return None
-        share = {
-            place: does_more(estimator, fitted, place)
-            for place, effect in enumerate(fitted.hypothesis.effects[base:], base)
-            # Exempt: spectral lines, which the residual does not resemble, and effects of any normal axis.
-            if not (effect.sought is not None and effect.sought.is_line) and not effect.ordinary_arcsec
-        }
-        place = min(share, key=lambda each: share[each], default=-1)
-        if place < 0 or share[place] > estimator.scales.shadow:
-            return None
-        return place, LESS
-
     def _likely_only(self, fitted: Fitted) -> _Judged:
         """Judges the findings and removes those that are improbable or normal for any axis.
 
@@ -268,7 +247,7 @@ class _Judge:
         """
         base = len(self.model.effects)
         while True:
-            judged, words = self._judged(fitted)
+            judged = self._judged(fitted)
             likely = [
                 each for each in judged.findings if each.probability >= self.estimator.scales.named_from
             ]
@@ -287,11 +266,11 @@ class _Judge:
                 break  # the others are changes of the baseline, which stay in it
             fitted = self.estimator.fit(replace(fitted.hypothesis, effects=tuple(kept)))
         usual = {each.cause for each in likely if _ordinary(each)}
-        self.considered.extend([*words, *(f"{cause}: no more than usual" for cause in sorted(usual))])
+        self.considered.extend(f"{cause}: no more than usual" for cause in sorted(usual))
         return replace(judged, findings=[each for each in likely if each.cause not in usual])
 
-    def _judged(self, fitted: Fitted) -> tuple[_Judged, list[str]]:
-        """Judges the findings of a hypothesis; also returns the causes not reported, with reasons."""
+    def _judged(self, fitted: Fitted) -> _Judged:
+        """Judges the findings of a hypothesis."""
         estimator, base = self.estimator, len(self.model.effects)
         precise = precisely(estimator, fitted)
         spread = covariance(estimator, precise)
@@ -306,24 +285,11 @@ class _Judge:
         fitted = estimator.fit(replace(fitted.hypothesis, nuisances=None))
         left = rest(estimator, fitted)
         unknown = is_unexplained(estimator, left) or many_of_one(findings, estimator.scales) is not None
-        doubtful = doubtful_loops(estimator, findings, left) if unknown else []
-        if doubtful:  # their contribution counts as residual too
-            findings = [each for each in findings if each not in doubtful]
-            left = rest(estimator, self._with_given_loop(fitted))
-        words = [f"{each.cause}: {LESS}" for each in doubtful]
         findings = weighed(findings, Context(left.arcsec, excess, unknown), estimator.scales, self.prior)
         if estimator.data.reversals < 2:  # speed, torque, place and time are correlated
             most = estimator.scales.one_way
             findings = [replace(each, probability=min(each.probability, most)) for each in findings]
-        return _Judged(fitted, findings, left), words
-
-    def _with_given_loop(self, fitted: Fitted) -> Fitted:
-        given = self.model.effects
-        hypothesis, loops = fitted.hypothesis, {i for i, each in enumerate(given) if each.part is Part.LOOP}
-        for place in loops:
-            hypothesis = hypothesis.instead(place, given[place])
-        with self.search.held(loops):
-            return self.estimator.fit(hypothesis)
+        return _Judged(fitted, findings, left)
 
     def _finding(self, fitted: Fitted, place: int) -> Finding:
         effect = fitted.hypothesis.effects[place]

@@ -134,8 +134,6 @@ class Finding:
     """Fall in chi square due to it; for a change within the model, due to the change."""
     left_arcsec: float = 0.0
     """Root mean square beyond the noise, for an unexplained residual."""
-    taken_arcsec: float = 0.0
-    """Root mean square that a changed loop explains near the reversals, in the fit."""
     left_alone: bool = False
     """True if either a part of the model has changed or another cause is present: the model keeps its
     part."""

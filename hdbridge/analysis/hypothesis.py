@@ -228,20 +228,40 @@ class Estimator:
             change += each.predict(other, start) - each.predict(full.motion, start)
         return turns, change
 
+    def begun(self, effects: Sequence[Effect]) -> FloatArray:
+        """Returns half of what the elastic state at the start of its part can change in each sample, (n,)."""
+        change = np.zeros(len(self.data.full))
+        for chain in self.data.full.chains:
+            motion = self.data.full.along(chain)
+            for each in with_memory(effects):
+                ends = [each.predict(motion, start) for start in (Start.FORWARD, Start.BACKWARD)]
+                change[chain.rows] += 0.5 * (ends[0] - ends[1])
+        return change
+
+    def first_branch(self, effects: Sequence[Effect]) -> FloatArray:
+        """Returns the error of the first branch of each part, standard deviations, arcsec, shape (n,).
+
+        The level at the start is fitted, but its fading along the branch depends on the motion before.
+        """
+        begun, result = np.abs(self.begun(effects)), np.zeros(len(self.data.full))
+        for chain in self.data.full.chains:
+            first = chain.rows.start
+            turns, _ = branches(self.data.full.motor_deg[chain.rows])
+            rows = slice(first, first + turns[min(1, len(turns) - 1)] + 1)
+            result[rows] = np.minimum(begun[rows], begun[first] - begun[rows])
+        return result
+
     def begins_of(self, effects: Sequence[Effect]) -> Nuisances | None:
-        """Returns a column for the elastic state at the start of each part: half of what it can change.
+        """Returns a column for the elastic state at the start of each part.
 
         The state is anywhere between those of a saturated start either way. None without a loop.
         """
-        full, loops = self.data.full, with_memory(effects)
-        columns = []
-        for chain in full.chains[:MOST_PARTS]:
-            motion, change = full.along(chain), np.zeros(len(full))
-            for each in loops:
-                ends = [each.predict(motion, start) for start in (Start.FORWARD, Start.BACKWARD)]
-                change[chain.rows] += 0.5 * (ends[0] - ends[1])
-            if np.any(change):
-                columns.append(self.at_points(change))
+        change, columns = self.begun(effects), []
+        for chain in self.data.full.chains[:MOST_PARTS]:
+            if np.any(change[chain.rows]):
+                column = np.zeros(len(change))
+                column[chain.rows] = change[chain.rows]
+                columns.append(self.at_points(column))
         if not columns:
             return None
         names = tuple(f"state {each}" for each in range(len(columns)))

@@ -81,20 +81,8 @@ class Scales:
         0.85, "share of a wave's squares", 2.0, "waves a fifth of a period apart explain 0.87 of each other"
     )
     noisy: float = _scale(1.5, "times what a channel's noise costs", 0.0, "that cost is itself estimated")
-    foot_lines: float = _scale(
-        50.0,
-        "lines of the record's resolution",
-        0.0,
-        "k lines off, a wave switched on has 1 / (pi k) of its amplitude: of 78 arcsec the floor",
-    )
-
     # Unexplained residual.
     plain_arcsec: float = _scale(1.0, "arcsec", math.inf, "twice the floor, for what has no name")
-    shadow: float = _scale(2.0, "times the square of what is left", 0.0, "a name does more than it misses")
-    episodes: float = _scale(
-        0.1, "share of a record", 0.0, "what is left in so little casts no shadow elsewhere"
-    )
-    acts: float = _scale(0.1, "share of an effect's peak", 0.0, "where it is a good part of itself")
     near: float = _scale(
         0.4,
         "share of the largest piece",

@@ -15,7 +15,6 @@ import numpy as np
 
 from hdbridge.analysis.hypothesis import Estimator, Fitted
 from hdbridge.analysis.readings import median_deviation
-from hdbridge.analysis.separable import shape_value
 from hdbridge.axis.effects import CATALOGUE, Effect, FloatArray, Observations, Sought, Start, causes, unmet
 from hdbridge.axis.effects.orders import HIGHEST_MOTOR_ORDER
 from hdbridge.units import DEG_PER_TURN
@@ -123,7 +122,6 @@ def filtered(estimator: Estimator, fitted: Fitted) -> list[Effect]:
     """Returns the most promising candidates of the kinds that are found by matched filters."""
     residual, load_deg = fast_residual(estimator, fitted)
     estimator.with_load_angle(load_deg)
-    present = fitted.hypothesis.effects
     result: list[Effect] = []
     shapes: Iterator[tuple[float, ...]]
     for kind in CATALOGUE.values():
@@ -133,7 +131,7 @@ def filtered(estimator: Estimator, fitted: Fitted) -> list[Effect]:
             case Sought.BUMP:
                 shapes = bump(estimator, fitted)
             case Sought.TONE:
-                shapes = tones(estimator, residual, [each for each in present if each.sought is Sought.TONE])
+                shapes = tones(estimator, residual)
             case Sought.LINE:
                 lines = load_lines(estimator, residual, load_deg)
                 result += [each for at in lines for each in kind.at_lines(at)]
@@ -220,13 +218,8 @@ def fast_residual(estimator: Estimator, fitted: Fitted) -> tuple[FloatArray, Flo
     return np.clip(residual, -40.0 * spread, 40.0 * spread), np.asarray(load)
 
 
-def tones(
-    estimator: Estimator, residual: FloatArray, present: Sequence[Effect] = ()
-) -> Iterator[tuple[float]]:
-    """Yields the frequencies (Hz) of the highest lines in time, outside the sidelobes of those ``present``.
-
-    A line whose amplitude varies between rest and motion has sidelobes, but is a single source.
-    """
+def tones(estimator: Estimator, residual: FloatArray) -> Iterator[tuple[float]]:
+    """Yields the frequencies (Hz) of the highest lines in time."""
     data = estimator.data
     time_s = data.full.time_s
     slot = np.round((time_s - time_s[0]) / data.period_s).astype(np.int64)
@@ -242,9 +235,6 @@ def tones(
     unbroken = min(length, int(np.max(np.bincount(data.full.zero))))
     power[frequency < max(LOWEST_HZ, 2.0 / (unbroken * data.period_s))] = 0.0
     lobe = max(4, size // length * 4)
-    for each in present:
-        own_hz = shape_value(each, each.shape[0].name)
-        power[np.abs(frequency - own_hz) < estimator.scales.foot_lines / (length * data.period_s)] = 0.0
     for at in _highest(power, lobe, 0.0):
         yield (float(frequency[at] + _off_centre(np.sqrt(power), at) * frequency[1]),)
 

@@ -170,7 +170,8 @@ def settled(estimator: Estimator, fitted: Fitted, found: Swing | None) -> Observ
     most = max(estimator.scales.floor_arcsec, float(np.quantile(unknown[data.full.usable], CALMEST)))
     usable = data.full.usable & (unknown <= most)
     _, turned = estimator.turned(effects, fitted.hypothesis.start)
-    sigma = np.sqrt(data.full.sigma_arcsec**2 + unknown**2 + turned**2)
+    errors = (data.full.sigma_arcsec, unknown, turned, estimator.first_branch(effects))
+    sigma = np.sqrt(sum(each**2 for each in errors))
     return data.having(replace(data.full, usable=usable, sigma_arcsec=sigma))
 
 

@@ -34,9 +34,6 @@ FEW = 50
 """Minimum number of points for a statement about a record."""
 TAIL = 3.0
 """Travel after a reversal, in widths of a loop, after which even a gradual memory has faded."""
-LESS = "does less than what is left unexplained"
-EPISODES = 30
-"""Number of stretches in which the residual is compared, to see if it is present everywhere."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -45,8 +42,6 @@ class Rest:
 
     arcsec: float
     """Root mean square beyond the noise, over short blocks."""
-    near_arcsec: float
-    """Root mean square near reversals, within the memory of a loop."""
     apart_arcsec: float
     """Root mean square in motion beyond the memory of a loop."""
     peak_arcsec: float
@@ -85,7 +80,6 @@ def rest(estimator: Estimator, fitted: Fitted) -> Rest:
     best = max((_View(0.0, "time", np.zeros(1)), *views), key=lambda each: each.gain)
     return Rest(
         beyond_noise(estimator, residual),
-        beyond_noise(estimator, residual, near),
         beyond_noise(estimator, residual, apart),
         max(_peak(estimator, residual), estimator.half_span(best.predicted_arcsec) if seen else 0.0),
         float(np.sqrt(max(float(np.mean(residual**2 - 1.0 / estimator.weight**2)), 0.0))),
@@ -134,51 +128,6 @@ def of_the_loop(estimator: Estimator, left: Rest) -> bool:
     counts = _angle_step_arcsec(estimator) / np.sqrt(12.0)
     most = np.linalg.norm((estimator.scales.floor_arcsec, counts, left.standing_arcsec))
     return not left.seen and bool(left.apart_arcsec <= most)
-
-
-def doubtful_loops(estimator: Estimator, findings: Sequence[Finding], left: Rest) -> list[Finding]:
-    """Returns changes of the loop's parameters that explain less near the reversals than remains there.
-
-    Returns none if the residual is the loop's too. Elsewhere, an effect of direction alone looks like a
-    changed loop.
-    """
-    if of_the_loop(estimator, left):
-        return []
-    return [
-        each
-        for each in findings
-        if each.within
-        and each.effect is not None
-        and each.effect.changes is Part.LOOP
-        and each.effect.part is not Part.LOOP
-        and each.taken_arcsec**2 < estimator.scales.shadow * left.near_arcsec**2
-    ]
-
-
-def does_more(estimator: Estimator, fitted: Fitted, place: int) -> float:
-    """Returns the squares that an effect explains where it acts, relative to those of the residual there.
-
-    It acts where it exceeds a share of its maximum. The tenth of the record with the largest residual is
-    ignored, because a residual in one episode (say, small swings of a motor that sticks at reversals) does
-    not cast doubt on an effect seen everywhere else. Without reversals an episode is a place, and all points
-    count.
-    """
-    effect, weight, scales = fitted.hypothesis.effects[place], estimator.weight, estimator.scales
-    residual = fitted.residual / weight
-    values = estimator.columns(effect, fitted.hypothesis.start) @ effect.coefficients()
-    values = np.abs(values - np.median(values))
-    rows = values > scales.acts * float(np.quantile(values, 1.0 - estimator.rare))
-    if estimator.data.reversals >= 2:
-        number = np.floor(EPISODES * np.arange(len(residual)) / len(residual)).astype(np.intp)
-        most = np.argsort(np.bincount(number, fitted.residual**2))[
-            -round(float(scales.episodes) * EPISODES) :
-        ]
-        apart = ~np.isin(number, most)
-        if np.any(rows & apart):
-            rows &= apart
-    without = estimator.fit(fitted.hypothesis.without(place)).residual[rows] / weight[rows]
-    does = float(np.mean(without**2) - np.mean(residual[rows] ** 2))
-    return does / max(beyond_noise(estimator, residual, rows) ** 2, 1e-12)
 
 
 def beyond_noise(estimator: Estimator, residual: FloatArray, rows: BoolArray | slice = slice(None)) -> float:

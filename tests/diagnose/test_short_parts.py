@@ -1,4 +1,4 @@
-"""A recording may have parts of hardly any sample: a task that was interrupted as it began."""
+"""Parts of hardly any sample, as of a task that was interrupted as it began; the motion before a record."""
 
 from __future__ import annotations
 
@@ -6,10 +6,13 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+import pytest
 
 from hdbridge.analysis.diagnosis import diagnose
+from hdbridge.axis.effects import USUAL_LOOP, Motion, Start, Synchronous
 from hdbridge.axis.model import TransmissionModel
 from hdbridge.records.record import Record, concatenate
+from hdbridge.units import ARCSEC_PER_DEG
 
 
 def test_a_part_of_one_sample_is_no_obstacle(
@@ -19,3 +22,17 @@ def test_a_part_of_one_sample_is_no_obstacle(
     record = concatenate([whole, whole.rows(0, 1)])
     result = diagnose(record, model, independent_zeros=True)
     assert result.noise_floor_arcsec > 0.0
+
+
+@pytest.mark.parametrize("back_deg", [3.0, 1.5])
+def test_the_motion_before_a_record_is_no_cause(back_deg: float) -> None:
+    effects = (Synchronous(orders=[{"order": 2, "amplitude_arcsec": 14.0, "phase_deg": 20.0}]), USUAL_LOOP)
+    time_s = 0.016 * np.arange(3000)
+    turns_s, speeds_deg_s = (0.5, 1.5, 12.0, 12.8, 30.0, 30.8), (0.0, -600.0, -600.0, 600.0, 600.0, -600.0)
+    motor = 0.016 * np.cumsum(np.interp(time_s, turns_s, speeds_deg_s))
+    angle = np.append((90.0 - back_deg, -back_deg), motor)
+    error = sum(each.predict(Motion(angle), Start.VIRGIN) for each in effects)[2:]
+    error += np.random.default_rng(7).normal(0.0, 0.3, len(error))
+    columns = {"time_s": time_s, "motor_position_deg": motor, "motor_target_deg": motor}
+    record = Record({**columns, "load_position_deg": motor / 50.0 + error / ARCSEC_PER_DEG})
+    assert not diagnose(record, TransmissionModel(50.0, effects)).findings
