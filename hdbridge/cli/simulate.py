@@ -7,7 +7,6 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated
 
-import can
 import typer
 
 from hdbridge.cli.interrupt import deferred_interrupt
@@ -25,6 +24,8 @@ from hdbridge.clock import Clock, MonotonicClock
 from hdbridge.errors import InputError
 
 if TYPE_CHECKING:
+    import can
+
     from hdbridge.axis import BusConfig
     from hdbridge.device.node import DriveNode
 

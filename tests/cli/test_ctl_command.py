@@ -135,8 +135,6 @@ def test_whoever_has_the_right_to_move_is_named_and_can_be_overruled(ctl, machin
         ("compensate joint-1 bth", 2, "did you mean both?"),
         ("model joint-1 newest", 2, "pending or active"),
         ("get joint-1 9999h", 2, "no such object"),
-        ("job joint-1 step --set count=60 --no-wait", 7, "run 'hdbridge step profiles/joint-1 --simulate'"),
-        ("job joint-1 stp", 2, "calibrate, step, improve"),
         ("status --at http://", 2, "expected"),
         ("status --at /nowhere/cell.sock", 7, "hdbridge run"),
     ],
