@@ -40,7 +40,9 @@ from hdbridge.analysis.search import (
 )
 from hdbridge.analysis.swing import ORDINARY_HZ, seen_swing, settled, without
 from hdbridge.analysis.unexplained import (
+    LESS,
     Rest,
+    does_more,
     is_unexplained,
     many_of_one,
     of_the_loop,
@@ -160,6 +162,7 @@ class _Judge:
         """Turns the result of the search into a diagnosis."""
         estimator, given = self.estimator, self.model.effects
         fitted = self.search.eliminated(fitted, self._stopped, self.considered)
+        fitted = self.search.eliminated(fitted, self._shadow, self.considered)
         fitted = with_measured(self.search, fitted)
         fitted = as_calibrated(estimator, fitted, given)
         judged = self._likely_only(fitted)
@@ -239,6 +242,23 @@ class _Judge:
             if reason := effect.implausible(data) or effect.unidentifiable(data):
                 return place, reason
         return None
+
+    def _shadow(self, fitted: Fitted) -> tuple[int, str] | None:
+        """Returns the cause with the least effect relative to the residual, if it may be an artefact."""
+        estimator, base = self.estimator, len(self.model.effects)
+        left = replace(rest(estimator, fitted), fast_arcsec=0.0)  # fast residuals cause no artefacts
+        if len(fitted.hypothesis.effects) == base or not is_unexplained(estimator, left):
+            return None
+        share = {
+            place: does_more(estimator, fitted, place)
+            for place, effect in enumerate(fitted.hypothesis.effects[base:], base)
+            # Exempt: spectral lines, which the residual does not resemble, and effects of any normal axis.
+            if not (effect.sought is not None and effect.sought.is_line) and not effect.ordinary_arcsec
+        }
+        place = min(share, key=lambda each: share[each], default=-1)
+        if place < 0 or share[place] > estimator.scales.shadow:
+            return None
+        return place, LESS
 
     def _likely_only(self, fitted: Fitted) -> _Judged:
         """Judges the findings and removes those that are improbable or normal for any axis.

@@ -83,6 +83,11 @@ class Scales:
     noisy: float = _scale(1.5, "times what a channel's noise costs", 0.0, "that cost is itself estimated")
     # Unexplained residual.
     plain_arcsec: float = _scale(1.0, "arcsec", math.inf, "twice the floor, for what has no name")
+    shadow: float = _scale(2.0, "times the square of what is left", 0.0, "a name does more than it misses")
+    episodes: float = _scale(
+        0.1, "share of a record", 0.0, "what is left in so little casts no shadow elsewhere"
+    )
+    acts: float = _scale(0.1, "share of an effect's peak", 0.0, "where it is a good part of itself")
     near: float = _scale(
         0.4,
         "share of the largest piece",
