@@ -15,7 +15,7 @@ import struct
 import threading
 import zlib
 from collections.abc import Callable, Iterable
-from typing import Any, Final, Generic, NamedTuple, TypeVar, cast
+from typing import Any, Final, Generic, NamedTuple, TypeVar
 
 from hdbridge.daemon.memory.layout import (
     COMMAND,
@@ -80,9 +80,8 @@ COMMANDS: Final[Format[Command]] = Format(
 )
 KNOTS: Final[Format[Knot]] = Format(KNOT, lambda knot: knot, lambda _, values: Knot(*values))
 FOLLOWED: Final[Format[OuterKnot]] = Format(
-    KNOT, lambda knot: knot, lambda _, values: cast("OuterKnot", values)
+    KNOT, lambda knot: knot, lambda _, values: OuterKnot._make(values)
 )
-"""Read as plain tuples, because the control loop takes one in each cycle."""
 
 
 class _Slots(Generic[T]):
@@ -224,13 +223,13 @@ class Queue(_Slots[T]):
         if sequence > self._head[0]:
             return None
         values = self._copy(sequence)
-        if values is not None:
-            return self._unpack(sequence, values)
-        # Not completely visible yet. If it stays so, it must not block the slots behind it.
-        self._misses += 1
-        if self._misses >= MISSES:
-            self.drop()
-        return None
+        if values is None:
+            # Not completely visible yet. If it stays so, it must not block the slots behind it.
+            self._misses += 1
+            if self._misses >= MISSES:
+                self.drop()
+            return None
+        return self._unpack(sequence, values)
 
     def drop(self) -> None:
         """Removes the item that `peek` returned."""
@@ -239,14 +238,10 @@ class Queue(_Slots[T]):
 
     def take(self) -> T | None:
         """Removes and returns the next item; None if there is none."""
-        sequence: int = self._tail[0] + 1
-        if sequence > self._head[0]:
-            return None
-        values = self._copy(sequence)
-        if values is None:
-            return self.peek()
-        self._misses, self._tail[0] = 0, sequence
-        return self._unpack(sequence, values)
+        item = self.peek()
+        if item is not None:
+            self.drop()
+        return item
 
     def clear(self) -> None:
         """Discards waiting items, at the consumer's end; they were meant for an earlier loop."""
