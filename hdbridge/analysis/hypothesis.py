@@ -230,10 +230,10 @@ class Estimator:
 
     def begun(self, effects: Sequence[Effect]) -> FloatArray:
         """Returns half of what the elastic state at the start of its part can change in each sample, (n,)."""
-        change = np.zeros(len(self.data.full))
-        for chain in self.data.full.chains:
+        change, loops = np.zeros(len(self.data.full)), with_memory(effects)
+        for chain in self.data.full.chains if loops else ():
             motion = self.data.full.along(chain)
-            for each in with_memory(effects):
+            for each in loops:
                 ends = [each.predict(motion, start) for start in (Start.FORWARD, Start.BACKWARD)]
                 change[chain.rows] += 0.5 * (ends[0] - ends[1])
         return change

@@ -596,6 +596,11 @@ def _points(response: Response) -> ComplexArray:
     return points
 
 
+def change_between(before: Response, after: Response) -> FloatArray:
+    """Returns the change at their common frequencies as a share of ``before``, shape (f,), lags excluded."""
+    return np.asarray(abs(_points(after) / _points(before) - 1.0))
+
+
 def _between(
     hertz: ArrayLike, points_hz: ArrayLike, values: ComplexArray, at_rest: float = 1.0
 ) -> ComplexArray:

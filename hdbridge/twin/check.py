@@ -32,8 +32,8 @@ from hdbridge.twin.fit import (
     intervals_of,
     legs_of_rows,
     over_legs,
+    softened,
     solve,
-    told,
 )
 from hdbridge.twin.misfit import (
     CHANNELS,
@@ -434,7 +434,7 @@ class _Search:
         drawn = self._replays(truths, range(1, DRAWS + 1))
         left = np.stack(
             [
-                told(shown, scale, self._rows) - here.jacobian @ (each - here.place)
+                softened(shown, scale, self._rows) - here.jacobian @ (each - here.place)
                 for each, shown in zip(places, drawn, strict=True)
             ]
         )
@@ -592,7 +592,7 @@ class _Search:
         ]
         truths = [self._twin, *(_shifted(self._twin, each, by) for each, by in moves)]
         scale = Scales(self._scales_of(best.apart))
-        lefts = (told(found, scale, self._rows) for found in self._replays(truths))
+        lefts = (softened(found, scale, self._rows) for found in self._replays(truths))
         here, *costs = (0.5 * float(left @ left) for left in lefts)
         nearest: dict[str, tuple[float, Truth]] = {}
         for (each, _), cost, there in zip(moves, costs, truths[1:], strict=True):
@@ -656,7 +656,7 @@ class _Search:
     def _matters(self, cause: str, found: _Place) -> bool:
         """Returns True if a cause explains more than the tolerated error of a twin."""
         back, scale = self._put_back(cause, found.truth), Scales(self._scales_of(found.apart))
-        with_it, without = (told(each, scale, self._rows) for each in self._replays([found.truth, back]))
+        with_it, without = (softened(each, scale, self._rows) for each in self._replays([found.truth, back]))
         return bool(np.any(self._squares(without) - self._squares(with_it) > TOLERATED))
 
     def _as(self, causes: tuple[str, ...]) -> _Place:

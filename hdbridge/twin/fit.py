@@ -491,7 +491,7 @@ class _Problem:
 
     def residuals(self, place: FloatArray) -> FloatArray:
         """Returns the softened scaled residuals, and the distances from the prior."""
-        left = told(self.found(place), self.scale, self._rows)
+        left = softened(self.found(place), self.scale, self._rows)
         return np.concatenate([left, (place - self._prior) / self.spread])
 
     def slopes(self, place: FloatArray, *, wide: bool = False) -> FloatArray:
@@ -589,7 +589,7 @@ def solve(
         after = problem.residuals(place)
         idle = idle + 1 if 0.5 * float(before @ before - after @ after) < WORTH else 0
         done += taken
-    left = told(found, problem.scale, rows)
+    left = softened(found, problem.scale, rows)
     slopes, covariance = problem.along, np.diag(problem.spread**2)
     if linear or slopes is None:
         problem.longer = 1.0
@@ -623,7 +623,7 @@ def legs_of_rows(data: Data, rows: NDArray[np.bool_]) -> FloatArray:
     return np.concatenate([data.leg] * len(CHANNELS))[rows]
 
 
-def told(found: dict[str, FloatArray], scale: Scales, rows: NDArray[np.bool_]) -> FloatArray:
+def softened(found: dict[str, FloatArray], scale: Scales, rows: NDArray[np.bool_]) -> FloatArray:
     """Returns the residuals of some rows, transformed by their likelihood and softened."""
     return counting(scale.scaled(found)[rows], scale, rows)[0]
 
@@ -644,7 +644,7 @@ def _tempered(known: Scales, found: dict[str, FloatArray], rows: NDArray[np.bool
     Far from the minimum, residuals are much larger than the noise, and the prior would have no weight. All
     channels share one factor, so the worst channel still dominates.
     """
-    left = told(found, known, rows)
+    left = softened(found, known, rows)
     factor = max(1.0, float(np.sqrt(np.mean(np.square(left)))))
     return replace(known, deviation={name: factor * each for name, each in known.deviation.items()})
 
@@ -1074,7 +1074,7 @@ def with_limit(replays: Replays, best: Fitted, usual: Truth, most: Scales | None
 def _cost(replays: Replays, truth: Truth, best: Fitted) -> float:
     """Returns half the sum of squares of a truth's residuals, by the scales of a fit."""
     (found,) = replays([truth])
-    left = told(found, best.scales, fitted_rows(replays.data))
+    left = softened(found, best.scales, fitted_rows(replays.data))
     return 0.5 * float(left @ left)
 
 

@@ -24,8 +24,8 @@ from hdbridge.twin.fit import (
     fitted_rows,
     legs_of_rows,
     over_legs,
+    softened,
     solve,
-    told,
 )
 from hdbridge.twin.misfit import Replays, judged_rows
 from hdbridge.twin.parameters import Parameter, at_coordinates, by_cause, coordinates, free_value
@@ -84,7 +84,7 @@ def without(
     kept = [coordinates(fitted.truth if each in moved else start, [each])[0] for each in others]
     begun = [led, at_coordinates(before, others, kept), as_late(before, fitted.truth, others)]
     rows = fitted_rows(replays.data)
-    costs = [float(np.sum(np.square(told(each, fitted.scales, rows)))) for each in replays(begun)]
+    costs = [float(np.sum(np.square(softened(each, fitted.scales, rows)))) for each in replays(begun)]
     near = replace(fitted, parameters=others, jacobian=slopes)
     prior, nearest = np.array(coordinates(start, others)), begun[int(np.argmin(costs))]
     return solve(replays, nearest, others, STEPS, prior, known=fitted.scales, near=near, linear=False).truth
@@ -170,7 +170,7 @@ def name_causes(
     legs = legs_of_rows(data, rows)
 
     def left_by(truths: Iterable[Truth]) -> list[FloatArray]:
-        return [told(shown, fitted.scales, rows) for shown in replays(truths)]
+        return [softened(shown, fitted.scales, rows) for shown in replays(truths)]
 
     (left,) = left_by([fitted.truth])
 

@@ -201,7 +201,10 @@ def direction_phase(effect: effects.DirectionPhase, draft: Draft) -> None:
     draft.gear["flank"] = {"shift_deg": effect.shift_deg, "travel_deg": FLANK_TRAVEL_DEG}
     draft.note(f"crosses within {FLANK_TRAVEL_DEG:g} motor deg, where the model jumps")
     if held:
-        draft.note(f"order {', '.join(held)}: shifted by too much to be told by its mean")
+        numbers = ", ".join(held)
+        draft.note(
+            f"order {numbers}: the shift is too large to find its amplitude from both directions' mean"
+        )
 
 
 def torque_modulation(effect: effects.TorqueModulation, draft: Draft) -> None:

@@ -14,6 +14,7 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
+from hdbridge.analysis.response import change_between
 from hdbridge.axis import AxisConfig
 from hdbridge.axis.channels import BY_KEY
 from hdbridge.axis.model import TransmissionModel
@@ -198,14 +199,11 @@ class Follower:
         )
 
     def _refined(self, used: Response | None) -> messages.RefinedResponse | None:
-        """Compares the response in use with the committed one, lags apart; None if they agree within 1 %."""
+        """Returns the change of the committed response by the one in use; None if they agree within 1 %."""
         committed = self.model.response
         if committed is None or used is None:
             return None
-        hertz = np.array(committed.frequency_hz)
-        later_deg = 0.36 * hertz * (used.following_lag_ms - committed.following_lag_ms)
-        turned = np.radians(np.subtract(used.phase_deg, committed.phase_deg) + later_deg)
-        change = abs(np.array(used.gain) / committed.gain * np.exp(1j * turned) - 1.0)
+        hertz, change = np.array(committed.frequency_hz), change_between(committed, used)
         largest = int(np.argmax(change))
         changed = hertz[change >= LEAST_CHANGE]
         if not len(changed):

@@ -48,10 +48,7 @@ _ADVICE: Final = {
     0x0800_0022: "not in this state: disable the drive first",
 }
 _LSS: Final = {
-    0x11: (
-        "node id",
-        "node ids are 1 to 127, or 255 for none",
-    ),
+    0x11: ("node id", "node ids are 1 to 127, or 255 for none"),
     0x13: ("bit timing", "the bit rate is that of the interface: 'bitrate_bps' in the machine file"),
     0x17: ("store configuration", "the node id that lasts is that of the machine file: change it there"),
 }
