@@ -26,12 +26,12 @@ class Scales:
         11.5, "chi square per parameter", 0.0, "Schwarz 1978: the logarithm of 100,000 points"
     )
     enter: float = _scale(
-        30.0, "chi square per cause", 0.0, "2 log of 3e6 places, shapes and kinds that are looked at"
+        30.0, "chi square per cause", 0.0, "2 log of the 3e6 places, shapes and kinds that are searched"
     )
-    floor_arcsec: float = _scale(0.5, "arcsec at its peak", 0.0, "smaller ones are of no use to an axis")
+    floor_arcsec: float = _scale(0.5, "arcsec at its peak", 0.0, "smaller ones do not matter to an axis")
     rare: float = _scale(
         20.0,
-        "samples of 10,000 or more in which an effect is larger than said",
+        "samples of 10,000 or more in which an effect exceeds its stated size",
         0.0,
         "a tooth is passed in hundreds, jumps and peaks of a channel are fewer",
     )
@@ -43,33 +43,44 @@ class Scales:
     )
 
     # Termination and revision of the search.
-    few: float = _scale(3.0, "causes", math.inf, "more mean something that is none of them")
+    few: float = _scale(3.0, "causes", math.inf, "more mean a cause that is not in the catalogue")
     large: float = _scale(4.0, "chi square per point", 1.0, "twice the noise")
     slow: float = _scale(
         0.8,
-        "share of a large rest that one more than few may leave",
+        "share of a large residual that one cause more than `few` may leave",
         math.inf,
         "the fourth partial of a sawtooth leaves 0.78 of what the first three leave",
     )
     leftover: float = _scale(2e-5, "share of the largest one's chi square", 0.0, "error of a linearisation")
     extrapolated: float = _scale(
         2.0,
-        "largest piece over what is seen",
+        "largest piece over the observed peak",
         math.inf,
-        "pieces that cancel, an order on an arc",
+        "beyond it pieces cancel, as of an order seen on a short arc",
     )
-    wave_share_left: float = _scale(0.03, "share of a wave's squares", 0.0, "the others explain the rest")
+    wave_share_left: float = _scale(
+        0.03,
+        "share of a wave's squares",
+        0.0,
+        "a wave that other causes explain to 97 % is not a cause of its own",
+    )
     bend: float = _scale(
-        0.6, "share by which a slope may differ along the way", math.inf, "a slope is one, or is none"
+        0.6,
+        "share by which a slope may differ along the path",
+        math.inf,
+        "a slope that bends is another effect",
     )
     alias: float = _scale(
         0.01, "share of the chi square of a cause", 0.0, "a real law differs from its formula by some 7 %"
     )
 
     # Loops of another shape, and changes of the model's own parts.
-    calibrated: float = _scale(0.04, "share of a coefficient", 0.04, "what kelvins and weeks change")
+    calibrated: float = _scale(0.04, "share of a coefficient", 0.04, "typical change by temperature and age")
     calibrated_shape: float = _scale(
-        0.06, "share of a width, of an exponent above one", 0.06, "as a coefficient, and it shows less"
+        0.06,
+        "share of a width, of an exponent above one",
+        0.06,
+        "typical change, and a shape is harder to see",
     )
     calibrated_arcsec: float = _scale(0.1, "arcsec at a coefficient's peak", 0.1, "reading of an encoder")
     calibrations: float = _scale(
@@ -82,12 +93,12 @@ class Scales:
     )
     noisy: float = _scale(1.5, "times what a channel's noise costs", 0.0, "that cost is itself estimated")
     # Unexplained residual.
-    plain_arcsec: float = _scale(1.0, "arcsec", math.inf, "twice the floor, for what has no name")
-    shadow: float = _scale(2.0, "times the square of what is left", 0.0, "a name does more than it misses")
+    plain_arcsec: float = _scale(1.0, "arcsec", math.inf, "twice the floor, for a residual without a name")
+    shadow: float = _scale(2.0, "times the square of the residual", 0.0, "a name does more than it misses")
     episodes: float = _scale(
-        0.1, "share of a record", 0.0, "what is left in so little casts no shadow elsewhere"
+        0.1, "share of a record", 0.0, "a residual in a shorter part does not count elsewhere"
     )
-    acts: float = _scale(0.1, "share of an effect's peak", 0.0, "where it is a good part of itself")
+    acts: float = _scale(0.1, "share of an effect's peak", 0.0, "samples where the effect counts as acting")
     near: float = _scale(
         0.4,
         "share of the largest piece",
@@ -99,17 +110,20 @@ class Scales:
     odds: float = _scale(-2.80, "log odds", 0.0, FITTED)
     odds_strength: float = _scale(1.88, "log odds per log of robust evidence over the needed", 0.0, FITTED)
     odds_rank: float = _scale(0.42, "log odds per decade of the largest one's chi square", 0.0, FITTED)
-    odds_size: float = _scale(1.22, "log odds per log of peak over what is left", 0.0, FITTED)
+    odds_size: float = _scale(1.22, "log odds per log of peak over residual", 0.0, FITTED)
     odds_excess: float = _scale(-1.19, "log odds per log of chi square per point", 0.0, FITTED)
     odds_unexplained: float = _scale(-1.30, "log odds", 0.0, FITTED)
     right: float = _scale(115 / 128, "share of the names that the formula is fitted to", 0.5, FITTED)
     strong: float = _scale(
-        12.0, "times the needed evidence", math.inf, "more says that something is there, not what it is"
+        12.0,
+        "times the needed evidence",
+        math.inf,
+        "stronger evidence shows that a cause is there, not which one",
     )
     surest: float = _scale(0.97, "probability", 1.0, "the rules were made on records that it is fitted to")
     named_from: float = _scale(0.3, "probability", 0.0, "of the names below it one in eleven was right")
     one_way: float = _scale(
-        0.6, "probability", 1.0, "without reversals place, speed, torque and time go together"
+        0.6, "probability", 1.0, "without reversals place, speed, torque and time are aliases"
     )
 
     def described(self) -> dict[str, dict[str, float | str]]:

@@ -134,7 +134,7 @@ def report(
     if result.further is not None:
         further = result.further
         console.print(
-            f"the axis could separate {', '.join(further.tells)} on its own (--auto), in "
+            f"the axis could separate {', '.join(further.separates)} on its own (--auto), in "
             f"{further.duration_s / 60:.0f} min: {further.plan.about}",
             soft_wrap=True,
         )

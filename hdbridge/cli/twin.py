@@ -253,7 +253,7 @@ def _beginning(files: Profile, axis: AxisConfig, truth: Path | None, *, afresh: 
     begun = translate(axis, model, Truth.load(plant) if plant is not None else None)
     if not (begun.truth.gear.hysteresis or begun.truth.gear.motor_orders):
         notes.print(
-            "no transmission error is simulated: neither a model nor the plant's file tells it. What it does "
+            "no transmission error is simulated: neither a model nor the plant's file has it. What it does "
             "to torque and following error may be taken for motor or loops; calibrate first "
             f"(hdbridge calibrate {files.folder})",
             markup=False,

@@ -65,7 +65,9 @@ def _refused(status: int, kind: str, content: bytes) -> HdbridgeError:
             return Problem.model_validate_json(content).error()
         except ValidationError:
             pass
-    return DaemonError(f"HTTP {status}, which is no answer of hdbridge: is another server at this address?")
+    return DaemonError(
+        f"HTTP {status}, which is not an answer of hdbridge: is another server at this address?"
+    )
 
 
 def given(request: type[M], /, **values: Any) -> M:

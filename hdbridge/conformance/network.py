@@ -102,7 +102,7 @@ def _(t: NodeTester) -> None:
 @check("nmt.reset-node.application", "Reset node restores application objects", _BOOT)
 def _(t: NodeTester) -> None:
     index, sub, bits = t.scratch()
-    t.need(index != 0x607A, "the object that can be written, 607Ah, is no parameter")
+    t.need(index != 0x607A, "the object that can be written, 607Ah, is not a parameter")
     t.reset(NMT_RESET_NODE)
     before = t.read(index, sub)
     t.write(index, sub, t.other_value(index, sub, bits), bits // 8)

@@ -106,7 +106,7 @@ def _left_because(axis: AxisConfig, od: ObjectDictionary, row: PlannedWrite) -> 
         return f"which {eds} lacks"
     kind = integer_type(variable)
     if kind is None:
-        return f"which is no integer in {eds}"
+        return f"which is not an integer in {eds}"
     found = held(variable)
     if not is_writable(variable):
         if found is None or row.holds(found):

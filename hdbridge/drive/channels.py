@@ -1,7 +1,7 @@
 """Optional channels of a running axis (load torque, temperature): scaling, range check, hold and loss. Pure.
 
 A channel matters less than the encoders. Without it the axis still holds its position, except for the part of
-the compensation that depends on it, so a missing or implausible reading is no reason to stop. The last good
+the compensation that depends on it, so it does not stop for a missing or implausible reading. The last good
 reading is held for the time given in the axis file. After that the channel is lost and has no value until
 readings return.
 """

@@ -129,7 +129,7 @@ def scaling_complaints(axis: AxisConfig, readings: Readings) -> list[Complaint]:
 
 
 def torque_notes(axis: AxisConfig, rated_mnm: int | None) -> list[str]:
-    """Returns a note if 6076h differs from the axis file, which is no reason to refuse the drive."""
+    """Returns a note if 6076h differs from the axis file, which is not a reason to refuse the drive."""
     if rated_mnm is None:
         return []
     drive_nm, file_nm = rated_mnm / 1000.0, axis.drive.rated_torque_nm

@@ -125,7 +125,7 @@ def _sections(summary: Summary, joint: Joint) -> Iterator[Section]:
     yield from _table(
         "Unlike their gear type",
         "The median over a joint's recordings is outside what 95 % of the joints of its type have, with a "
-        "false discovery rate of 5 %. That alone is no fault: a joint may be so from the beginning.",
+        "false discovery rate of 5 %. That alone is not a fault: a joint may be so from the beginning.",
         ["joint", "gear", "figure", *(Heading(each, "") for each in ("value", "normal from", "to"))],
         [
             [joint(each.joint), each.gear, _words(each.figure), each.value, each.normal.low, each.normal.high]

@@ -511,7 +511,7 @@ def _pairs(said: Said, where: str, what: str) -> dict[str, str]:
         if channel not in CHANNELS:
             close = nearest(channel, list(CHANNELS))
             raise _wrong(
-                f"{where}: '{channel}' is no channel of a record; expected {', '.join(CHANNELS)}"
+                f"{where}: '{channel}' is not a channel of a record; expected {', '.join(CHANNELS)}"
                 + (f" (did you mean {close}?)" if close else "")
             )
         if not equals or not value.strip():

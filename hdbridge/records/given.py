@@ -24,8 +24,8 @@ def by_name(given: Given) -> dict[Path, Recording]:
         for each in several:
             if not isinstance(each, Record | Recording):
                 raise InputError(
-                    f"{each!r} is no recording; expected a Record or a Recording: Recording.load(path) reads "
-                    "a folder or a CSV file"
+                    f"{each!r} is not a recording; expected a Record or Recording: Recording.load(path) "
+                    "reads a folder or a CSV file"
                 )
         recordings = [Recording(each) if isinstance(each, Record) else each for each in several]
         sources = [each.record.source for each in recordings]

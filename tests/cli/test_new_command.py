@@ -38,7 +38,7 @@ def test_a_copy_of_a_bundled_profile_is_an_axis_of_that_name(hdbridge, tmp_path,
 @pytest.mark.parametrize(
     ("arguments", "complaint"),
     [
-        (("a b",), "is no name of an axis"),
+        (("a b",), "is not a valid name of an axis"),
         (("mine", "--from", "scan"), "give --interface and --channel"),
         (("mine", "--interface", "socketcan"), "give --from scan with it"),
     ],

@@ -7,7 +7,7 @@ import pytest
 from hdbridge.analysis.findings import Finding
 from hdbridge.axis import AxisConfig
 from hdbridge.axis.model import TransmissionModel
-from hdbridge.commissioning.improvement import choose, untold
+from hdbridge.commissioning.improvement import choose, unseparated
 from hdbridge.commissioning.improvement.experiments import machine_for_unexplained, machine_plans
 from hdbridge.control.bench import axis_view
 from hdbridge.motion.procedures.plan import Plan
@@ -23,7 +23,7 @@ class Left:
 
 
 def choice_of(left, known, done=()):
-    return choose(left, untold(left, *known), *known, done)
+    return choose(left, unseparated(left, *known), *known, done)
 
 
 def found(cause, *aliases, lives_in=""):
@@ -39,7 +39,7 @@ def known(pytestconfig):
 def test_what_two_sweeps_of_a_load_turn_tell_is_told_by_them(known):
     choice = choice_of(Left((found("ratio_error", "load_order"),)), known)
     assert "load-turn" in choice.plan.name
-    assert choice.tells == ("ratio_error or load_order",)
+    assert choice.separates == ("ratio_error or load_order",)
     assert choice.duration_s > 60
 
 
@@ -84,6 +84,6 @@ def test_what_the_way_cannot_tell_is_not_told_however_well_it_fits(known):
         }
     )
     left = Left((found("ratio_error"),))
-    assert untold(left, *known) == {}
-    assert "load_order" in untold(left, *known, [short])["ratio_error"]
-    assert untold(left, *known, [short, machine_plans()["two-load-turns"]]) == {}
+    assert unseparated(left, *known) == {}
+    assert "load_order" in unseparated(left, *known, [short])["ratio_error"]
+    assert unseparated(left, *known, [short, machine_plans()["two-load-turns"]]) == {}

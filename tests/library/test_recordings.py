@@ -91,5 +91,5 @@ def test_a_recording_that_is_given_twice_is_refused(run, model):
 
 @pytest.mark.parametrize("given", ["one.csv", ["one.csv"], [np.zeros(3)]])
 def test_what_is_no_recording_is_refused_with_what_reads_one(given):
-    with pytest.raises(InputError, match=r"is no recording; expected .* Recording.load\(path\)"):
+    with pytest.raises(InputError, match=r"is not a recording; expected .* Recording.load\(path\)"):
         fit(given)

@@ -100,8 +100,8 @@ class VelocityWindup(Linear):
     def unidentifiable(self, observations: Observations) -> str:
         """Requires curvature, because a linear drag is indistinguishable from a delayed sample.
 
-        A small dry part is no evidence either: it can come from quantisation, because a command in whole
-        counts is followed with a fixed fraction of a count, with the sign of the direction.
+        A small dry part is not evidence either. A command in whole counts is followed with a fixed fraction
+        of a count, with the sign of the direction, and that looks the same.
         """
         speed = observations.motion.motor_speed_deg_s
         if speed is None or self.coulomb_arcsec > 0.5 * observations.motor_count_arcsec:

@@ -106,5 +106,7 @@ def _sections(lines: list[str]) -> dict[str, list[str]]:
 def _axis_name(folder: Path) -> str:
     name = folder.resolve().name
     if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]*", name):
-        raise InputError(f"{folder}: {name!r} is no name of an axis; expected letters, digits, '.', '_', '-'")
+        raise InputError(
+            f"{folder}: {name!r} is not a valid name of an axis; expected letters, digits, '.', '_', '-'"
+        )
     return name

@@ -191,7 +191,7 @@ def _ratio(axis: AxisConfig, wanted: float, tolerance: float) -> Accusation:
             return Accusation(RATIO, found, whole, 2.0 - less, "a usual ratio")
         return Accusation(RATIO, found, whole, 1.0 - less, "a whole number")
     return Accusation(
-        RATIO, found, float(f"{wanted:.5g}"), -2.0, "it would explain it, but is no whole number"
+        RATIO, found, float(f"{wanted:.5g}"), -2.0, "it would explain it, but is not a whole number"
     )
 
 

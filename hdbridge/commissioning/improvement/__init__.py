@@ -10,7 +10,7 @@ Drive and dates are passed in; nothing here depends on whether the drive is simu
 """
 
 from hdbridge.commissioning.improvement.extension import Extension, extension_of
-from hdbridge.commissioning.improvement.further import Choice, choose, untold
+from hdbridge.commissioning.improvement.further import Choice, choose, unseparated
 from hdbridge.commissioning.improvement.improve import Source, improve
 from hdbridge.commissioning.improvement.result import Improvement, Round
 from hdbridge.commissioning.improvement.trial import Trial, try_out
@@ -26,5 +26,5 @@ __all__ = [
     "extension_of",
     "improve",
     "try_out",
-    "untold",
+    "unseparated",
 ]

@@ -47,7 +47,7 @@ def extension_of(
     origin. Wear continues from the turns that the motor has run by the end of the record. Findings without a
     gain on held-out data, or that may be nothing (`Finding.refusal`), are left out.
 
-    ``rivals`` are the causes from which each has not been separated (`further.untold`). If one of them must
+    ``rivals`` are the causes from which each is not separated (`further.unseparated`). If one of them must
     not be compensated, the finding is left out too, because it may be that one.
     """
     known = {each.name for each in active.effects}

@@ -23,7 +23,7 @@ class Choice:
     plan: Plan
     duration_s: float
     """Duration on an ideal axis."""
-    tells: tuple[str, ...]
+    separates: tuple[str, ...]
     """Alternatives that it is predicted to separate, as text."""
 
     def as_dict(self) -> dict[str, Any]:
@@ -32,11 +32,11 @@ class Choice:
             "experiment": self.plan.name,
             "about": self.plan.about,
             "duration_s": self.duration_s,
-            "tells": list(self.tells),
+            "tells": list(self.separates),
         }
 
 
-def untold(
+def unseparated(
     diagnosis: Diagnosis, model: TransmissionModel, view: AxisView, plans: Sequence[Plan] = ()
 ) -> dict[str, tuple[str, ...]]:
     """Returns for each cause found the other causes from which it has not been separated.
@@ -88,7 +88,7 @@ def choose(
         told = dict.fromkeys(
             f"{one} or {other}" for one, other, peak in pairs if _separates(report, one, other, peak)
         )
-        if len(told) > (len(best.tells) if best else 0):
+        if len(told) > (len(best.separates) if best else 0):
             best = Choice(plan, duration_s, tuple(told))
         if len(told) == len(pairs):
             break

@@ -20,7 +20,7 @@ from hdbridge.commissioning.calibration.pipeline import ACTIVE_NAME, MODEL_NAME,
 from hdbridge.commissioning.calibration.result import Offer
 from hdbridge.commissioning.calibration.validation import floor_of
 from hdbridge.commissioning.improvement.extension import alternatives, extension_of, named
-from hdbridge.commissioning.improvement.further import advice, choose, untold
+from hdbridge.commissioning.improvement.further import advice, choose, unseparated
 from hdbridge.commissioning.improvement.result import Improvement, Round
 from hdbridge.commissioning.improvement.trial import Trial, try_out
 from hdbridge.control.bench import axis_view
@@ -81,22 +81,22 @@ def improve(
     diagnosis = diagnose(recordings, active, independent_zeros=apart)
     view = axis_view(drive.axis)
     plans = _plans_of(source, recordings.values())
-    rivals = untold(diagnosis, active, view, plans)
+    rivals = unseparated(diagnosis, active, view, plans)
     found: list[Round] = []
     while len(found) < rounds:
         folder = source.folder / f"round-{len(found) + 1}"
-        journal, tells = _journal(folder, bench, diagnosis, rivals, active, plans)
+        journal, pairs = _journal(folder, bench, diagnosis, rivals, active, plans)
         if journal is None:
             break
         tell(diagnosis.verdict())
-        tell(f"round {len(found) + 1}: {journal.plan.about}, to tell {', '.join(tells) or 'more'}")
+        tell(f"round {len(found) + 1}: {journal.plan.about}, to separate {', '.join(pairs) or 'the rest'}")
         apart = bench.run(journal) or apart or earlier
         recordings[folder] = journal.recording()
         diagnosis = diagnose(recordings, active, independent_zeros=apart)
         plans.append(journal.plan)
-        rivals = untold(diagnosis, active, view, plans)
+        rivals = unseparated(diagnosis, active, view, plans)
         left = tuple(map(alternatives, diagnosis.findings))
-        found.append(Round(journal.plan.name, journal.plan.about, str(folder), tells, left))
+        found.append(Round(journal.plan.name, journal.plan.about, str(folder), pairs, left))
     result = Improvement(
         axis=drive.axis.name,
         recordings=tuple(map(str, recordings)),
@@ -105,7 +105,7 @@ def improve(
         active=active,
         diagnosis=diagnosis,
         extension=extension_of(diagnosis, active, rivals),
-        untold=rivals,
+        unseparated=rivals,
         rounds=tuple(found),
         further=choose(diagnosis, rivals, active, view, [each.name for each in plans]),
         advice=advice(diagnosis),
@@ -182,7 +182,7 @@ def _journal(
     choice = choose(diagnosis, rivals, active, axis_view(axis), [each.name for each in plans])
     if choice is None:
         return None, ()
-    return start_journal(folder, axis, choice.plan, bench.date, bench.drive.identity), choice.tells
+    return start_journal(folder, axis, choice.plan, bench.date, bench.drive.identity), choice.separates
 
 
 def _concluded(

@@ -21,7 +21,7 @@ class Round:
     experiment: str
     about: str
     recording: str
-    tells: tuple[str, ...]
+    separates: tuple[str, ...]
     """Alternatives that it was predicted to separate; empty if it existed already."""
     found: tuple[str, ...]
     """Findings after it, each with its alternatives."""
@@ -32,7 +32,7 @@ class Round:
             "experiment": self.experiment,
             "about": self.about,
             "recording": self.recording,
-            "tells": list(self.tells),
+            "tells": list(self.separates),
             "found": list(self.found),
         }
 
@@ -49,7 +49,7 @@ class Improvement:
     active: TransmissionModel
     diagnosis: Diagnosis
     extension: Extension
-    untold: Mapping[str, tuple[str, ...]]
+    unseparated: Mapping[str, tuple[str, ...]]
     """For each cause found, the other causes from which it has not been separated."""
     rounds: tuple[Round, ...]
     further: Choice | None
@@ -77,7 +77,7 @@ class Improvement:
             "pending": str(self.offer.pending) if self.offer.pending else None,
             "compensated": [each.cause for each in self.extension.carried],
             "not_compensated": list(self.extension.left),
-            "not_told_from": {name: list(each) for name, each in self.untold.items()},
+            "not_told_from": {name: list(each) for name, each in self.unseparated.items()},
             "rounds": [each.as_dict() for each in self.rounds],
             "further": self.further.as_dict() if self.further else None,
             "advice": list(self.advice),

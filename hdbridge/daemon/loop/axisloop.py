@@ -227,7 +227,9 @@ class AxisLoop:
 
     def _seed(self, command: Command) -> None:
         if not 0 <= command.k <= 0xFFFF:
-            raise InputError(f"{self.config.name}: statusword {command.k} is none; expected 16 bits")
+            raise InputError(
+                f"{self.config.name}: statusword {command.k} is not a statusword; expected 16 bits"
+            )
         self.image.seed(command.i, command.j, command.k)
 
     def _silence(self, _: Command) -> None:

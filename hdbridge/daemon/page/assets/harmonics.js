@@ -4,7 +4,7 @@
 export const MOTOR_BINS = 72;
 export const LOAD_BINS = 36;
 export const ORDERS = 12;
-const NEEDED = 0.9; // share of the turn that must be covered: below that, orders cannot be told apart
+const NEEDED = 0.9; // share of the turn that must be covered: below that, orders are not separable
 const HALF_LIFE_S = 120; // so that the picture follows what changes
 
 const turn = (deg) => ((deg % 360) + 360) % 360;
