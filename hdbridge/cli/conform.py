@@ -17,7 +17,7 @@ from hdbridge.cli.options import (
     SeedOption,
     SimulateOption,
     TruthOption,
-    notes,
+    note,
     print_table,
     progress_bar,
     write_json,
@@ -29,12 +29,7 @@ if TYPE_CHECKING:
     from hdbridge.conformance import Check, Result
 
 
-def register(app: typer.Typer) -> None:
-    """Adds the command."""
-    app.command("conform")(conform)
-
-
-def conform(
+def command(
     profile: Annotated[
         str | None,
         typer.Argument(
@@ -246,6 +241,4 @@ def _print(results: Sequence[Result]) -> None:
         if each.verdict is Verdict.NOT_APPLICABLE:
             reasons[each.found] = reasons.get(each.found, 0) + 1
     for reason, count in reasons.items():
-        notes.print(
-            f"not applicable, {count} check{'s' * (count > 1)}: {reason}", markup=False, soft_wrap=True
-        )
+        note(f"not applicable, {count} check{'s' * (count > 1)}: {reason}")

@@ -18,12 +18,12 @@ from hdbridge.cli.options import (
     JsonOption,
     UnitsOption,
     UnwrapOption,
-    console,
     load_recordings,
     model_file,
     need_extra,
-    notes,
+    note,
     print_table,
+    say,
     write_json,
     write_result,
 )
@@ -39,12 +39,7 @@ WORTH_TELLING = 0.01
 """Minimum share of the difference for a coordinate to be printed."""
 
 
-def register(app: typer.Typer) -> None:
-    """Adds the command."""
-    app.command("diagnose")(run)
-
-
-def run(
+def command(
     records: Annotated[
         list[Path] | None,
         typer.Argument(
@@ -149,13 +144,13 @@ def run(
     if flown is not None:
         recordings[flights[0]] = flown
         for each in remarks(flown):
-            notes.print(each)
+            note(each)
     result = diagnose(
         recordings,
         known,
         independent_zeros=independent_zeros,
         prior=_prior(prior, group or []),
-        progress=lambda words: notes.print(f"{words} ..."),
+        progress=lambda words: note(f"{words} ..."),
     )
     recording = Recording.joined(list(recordings.values()))
     options = {"--columns": columns, "--units": units, "--unwrap": unwrap}
@@ -203,7 +198,7 @@ def _prior(path: Path | None, groups: Sequence[str]) -> Prior | None:
 
 def print_diagnosis(result: Diagnosis) -> None:
     """Prints verdict, findings, next experiments, and causes that were not named."""
-    _say(result.verdict())
+    say(result.verdict())
     if result.findings:
         table = Table("cause", "probability", "size, arcsec", "held out, arcsec rms")
         for each in result.findings:
@@ -216,9 +211,9 @@ def print_diagnosis(result: Diagnosis) -> None:
         print_table(table)
     for each in result.findings:
         for line in _details(each):
-            _say(line)
+            say(line)
     for remark in (*result.remarks, *(f"not named: {each}" for each in result.considered)):
-        notes.print(remark, markup=False, soft_wrap=True)
+        note(remark)
 
 
 def _details(finding: Finding) -> Iterator[str]:
@@ -242,11 +237,6 @@ def _details(finding: Finding) -> Iterator[str]:
 def _number(parameter: Parameter) -> str:
     low, high = f"{parameter.low:.4g}", f"{parameter.high:.4g}"
     return f"{parameter.value:.4g} ({low} to {high}) {parameter.unit}".rstrip()
-
-
-def _say(line: str) -> None:
-    """Prints a line unwrapped and without markup."""
-    console.print(line, markup=False, soft_wrap=True)
 
 
 def _print_figures(result: Diagnosis) -> None:
@@ -293,7 +283,7 @@ def _provenance(recording: Recording, records: Sequence[Path], model: Path) -> l
 
 
 def _print_plan(report: dict[str, Any]) -> None:
-    _say(report["record"]["sentence"].replace("record", "plan", 1))
+    say(report["record"]["sentence"].replace("record", "plan", 1))
     table = Table("cause", "detected from", "not distinguished from")
     for name, each in report["identifiability"].items():
         limit = each["detection_limit_arcsec"]
@@ -302,5 +292,5 @@ def _print_plan(report: dict[str, Any]) -> None:
         )
         table.add_row(name, words, ", ".join(each["aliases"]))
     print_table(table)
-    for note in report["notes"]:
-        notes.print(note, markup=False, soft_wrap=True)
+    for each in report["notes"]:
+        note(each)

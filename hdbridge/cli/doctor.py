@@ -7,12 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from hdbridge.cli.interrupt import deferred_interrupt
-from hdbridge.cli.options import (
-    JsonOption,
-    console,
-    notes,
-    write_json,
-)
+from hdbridge.cli.options import JsonOption, console, note, say, write_json
 from hdbridge.cli.session import Session, on_axis
 from hdbridge.commissioning.bringup import TORQUE_PERCENT
 from hdbridge.commissioning.bringup.checks import Outcome
@@ -40,12 +35,8 @@ DECLINED = "motion was not confirmed (on a terminal: answer y; in a script: --ye
 LEFT_OUT = "left out by --no-motion"
 
 
-def register(app: typer.Typer) -> None:
-    """Adds the command."""
-    app.command("doctor")(on_axis(doctor))
-
-
-def doctor(
+@on_axis
+def command(
     session: Session,
     torque_percent: Annotated[
         float,
@@ -122,21 +113,21 @@ def doctor(
         )
     if refused:
         raise DriveError(f"{files.axis}: {DECLINED}")
-    console.print("all right" if motion else "all right, as far as it can be checked without motion")
+    say("all right" if motion else "all right, as far as it can be checked without motion")
 
 
 def _confirm(torque_percent: float, servo: bool) -> bool:
     if servo:
-        notes.print(_FAST)
+        note(_FAST)
     try:
         return typer.confirm(_WARNING.format(torque=torque_percent), err=True)
     except typer.Abort:  # no terminal, or end of input
-        notes.print("")
+        note("")
         return False
 
 
 def _tell(row: Row[BringUpContext]) -> None:
     console.print(f"{_MARKS[row.verdict.outcome]}  {row.check.title:<25}", end=" ")
-    console.print(row.verdict.measured, markup=False, soft_wrap=True)
+    say(row.verdict.measured)
     for remedy in row.verdict.remedies:
-        console.print(f"              -> {remedy}", markup=False, soft_wrap=True)
+        say(f"              -> {remedy}")

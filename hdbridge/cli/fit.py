@@ -13,20 +13,15 @@ from hdbridge.cli.options import (
     JsonOption,
     UnitsOption,
     UnwrapOption,
-    console,
     load_recordings,
     model_file,
+    say,
     write_json,
     write_result,
 )
 from hdbridge.errors import InputError
 from hdbridge.files.outputs import Kind
 from hdbridge.files.profile import Profile
-
-
-def register(app: typer.Typer) -> None:
-    """Adds the command."""
-    app.command("fit")(command)
 
 
 def command(
@@ -98,7 +93,7 @@ def command(
         write_calibration_page(html_file, found)
     print_calibration(found)
     if out is not None and not refused:
-        console.print(f"model: {out}", soft_wrap=True)
+        say(f"model: {out}")
     if html_file is not None:
         print_page(html_file)
     if refused:

@@ -6,12 +6,7 @@ from typing import Annotated
 
 import typer
 
-from hdbridge.cli.options import (
-    JsonOption,
-    console,
-    notes,
-    write_json,
-)
+from hdbridge.cli.options import JsonOption, note, say, write_json
 from hdbridge.cli.session import Session, on_axis
 
 TOWARDS_SWITCH = 0.1
@@ -19,12 +14,8 @@ TOWARDS_SWITCH = 0.1
 TOWARDS_ZERO = 0.02
 
 
-def register(app: typer.Typer) -> None:
-    """Adds the command."""
-    app.command("home")(on_axis(home))
-
-
-def home(
+@on_axis
+def command(
     session: Session,
     method: Annotated[
         int,
@@ -77,7 +68,7 @@ def home(
         session.drive() as drive,
     ):
         drive.boot()
-        notes.print(f"booted node {axis.drive.node_id} over {drive.link.name}")
+        note(f"booted node {axis.drive.node_id} over {drive.link.name}")
         at = drive.home(*wanted)
     load_by_motor_deg = at.motor_deg / axis.gear.ratio
     write_json(
@@ -91,8 +82,7 @@ def home(
             "load_position_deg": at.load_deg,
         },
     )
-    console.print(
+    say(
         f"homed by method {method}: the load is at {load_by_motor_deg:.4f} deg by the motor encoder, "
-        f"{at.load_deg:.4f} deg by its own; power is off",
-        soft_wrap=True,
+        f"{at.load_deg:.4f} deg by its own; power is off"
     )

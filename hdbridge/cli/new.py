@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from hdbridge.cli.options import ChannelOption, InterfaceOption, JsonOption, console, notes, write_json
+from hdbridge.cli.options import ChannelOption, InterfaceOption, JsonOption, note, say, write_json
 from hdbridge.clock import MonotonicClock
 from hdbridge.errors import DriveError, InputError
 
@@ -24,12 +24,7 @@ class Source(Enum):
     SCAN = "scan"
 
 
-def register(app: typer.Typer) -> None:
-    """Adds the command."""
-    app.command("new")(new)
-
-
-def new(
+def command(
     name: Annotated[Path, typer.Argument(metavar="NAME", help="New folder; its name is the axis's.")],
     source: Annotated[
         Source,
@@ -66,12 +61,12 @@ def new(
         written = copy_bundled(source.value, name)
     write_json(json_file, {"schema": "hdbridge.new/1", "files": [str(each) for each in written]})
     for each in written:
-        console.print(f"wrote {each}", markup=False, soft_wrap=True)
+        say(f"wrote {each}")
     try:
         AxisConfig.load(name)
     except InputError as problem:
-        console.print(f"to be completed: {problem}", markup=False, soft_wrap=True)
-    console.print(f"next: hdbridge check {name}", markup=False, soft_wrap=True)
+        say(f"to be completed: {problem}")
+    say(f"next: hdbridge check {name}")
 
 
 def _scanned(
@@ -91,7 +86,7 @@ def _scanned(
         raise InputError("--from scan needs a bus: give --interface and --channel (socketcan, can0)")
     bus = BusConfig(interface=interface, channel=channel, bitrate_bps=bitrate_bps)
     with open_bus(bus) as opened:
-        notes.print("asking nodes ...")
+        note("asking nodes ...")
         link = Link(opened, MonotonicClock())
         found = scan_bus(link)
     return write_scanned(folder, bus, _chosen(link.name, found.nodes, node_id), eds)

@@ -201,7 +201,7 @@ def load_recordings(
     loaded = [Recording.load(each, columns=columns, units=units, unwrap=unwrap) for each in paths]
     for each in loaded:
         if each.record.origin is not None and each.record.origin.remark:
-            notes.print(each.record.origin.remark, markup=False, soft_wrap=True)
+            note(each.record.origin.remark)
     check_once(paths, [each.record for each in loaded])
     return dict(zip(paths, loaded, strict=True))
 
@@ -254,11 +254,9 @@ def note_clamped(limits: Any, **wanted: float | None) -> None:
         limit = getattr(limits, name)
         if value is not None and abs(value) > limit:
             kind, unit = ("velocity", "deg/s") if name == "velocity_deg_s" else ("acceleration", "deg/s2")
-            notes.print(
+            note(
                 f"{kind}: {abs(value):g} {unit} is above the axis's limit; {limit:g} {unit} is used "
-                f"(limits.{name})",
-                markup=False,
-                soft_wrap=True,
+                f"(limits.{name})"
             )
 
 
@@ -333,7 +331,17 @@ def print_object(name: str, value: object, type_name: str) -> None:
     """Prints an object of a drive: a natural number also in hexadecimal."""
     whole = isinstance(value, int) and not isinstance(value, bool) and value >= 0
     also = f" ({value:#x})" if whole else ""
-    console.print(f"{name}: {value}{also}  {type_name}", markup=False, soft_wrap=True)
+    say(f"{name}: {value}{also}  {type_name}")
+
+
+def say(line: str, style: str | None = None) -> None:
+    """Prints a line of the result, unwrapped and without markup."""
+    console.print(line, markup=False, soft_wrap=True, style=style)
+
+
+def note(line: str) -> None:
+    """Prints a remark, unwrapped and without markup."""
+    notes.print(line, markup=False, soft_wrap=True)
 
 
 def write_json(path: Path | None, result: dict[str, Any]) -> None:
@@ -347,4 +355,4 @@ def write_result(path: Path, text: str) -> None:
     with writing():
         write_atomically(path, text)
         if not is_stream(path):
-            notes.print(f"wrote {path}", soft_wrap=True)
+            note(f"wrote {path}")
