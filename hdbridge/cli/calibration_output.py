@@ -9,12 +9,13 @@ from typing import TYPE_CHECKING
 from rich.markup import escape
 from rich.table import Table
 
-from hdbridge.cli.options import print_table, say, write_result
+from hdbridge.cli.options import figures_table, print_table, say, write_result
 
 if TYPE_CHECKING:
     from hdbridge.cli.session import Session
     from hdbridge.commissioning.calibration import Calibration, Stepped, Validation
     from hdbridge.commissioning.calibration.result import Offer
+    from hdbridge.commissioning.evaluation.stepping import Scatter
 
 TAKEN_OFF = 0.95
 """Terms fitted in addition to the model (a delay, load orders) are reported if they reduce the residual to
@@ -119,8 +120,6 @@ def print_stepping(checked: Validation) -> None:
 
 def print_steps(title: str, tests: Iterable[Stepped]) -> None:
     """Prints scatter and mean of stepping tests, one line each."""
-    from hdbridge.cli.scattertable import print_scatter
-
     print_scatter(title, "with", ((each.model, (each.cw, each.ccw, each.pooled)) for each in tests))
 
 
@@ -135,15 +134,24 @@ def _print_accuracy(checked: Validation) -> None:
     rows = [(model, each) for model, each in found if each is not None]
     if not rows:
         return
-    table = Table(
-        title=f"Positioning test (ISO 230-2), arcsec: {rows[0][1].targets} targets, {rows[0][1].runs} "
+    table = figures_table(
+        f"Positioning test (ISO 230-2), arcsec: {rows[0][1].targets} targets, {rows[0][1].runs} "
         "approaches from each side",
-        title_justify="left",
+        "with",
+        *("accuracy\nA", "repeatability\nR", "reversal\nB", "systematic\nE", "range\nM"),
     )
-    table.add_column("with")
-    for name in ("accuracy\nA", "repeatability\nR", "reversal\nB", "systematic\nE", "range\nM"):
-        table.add_column(name, justify="right")
     for model, each in rows:
         figures = (each.accuracy, each.repeatability, each.reversal, each.systematic, each.range)
         table.add_row(model, *(f"{value:z.2f}" for value in figures))
+    print_table(table)
+
+
+def print_scatter(
+    title: str, first: str, rows: Iterable[tuple[str, tuple[Scatter, Scatter, Scatter]]]
+) -> None:
+    """Prints a line for each test: its name in the column ``first``, then its CW, CCW and pooled figures."""
+    table = figures_table(title, first, *("CW 3σ", "mean", "CCW 3σ", "mean", "pooled 3σ", "mean"))
+    for name, parts in rows:
+        figures = (value for part in parts for value in (part.three_sigma_arcsec, part.mean_arcsec))
+        table.add_row(name, *(f"{value:z.2f}" for value in figures))
     print_table(table)

@@ -10,6 +10,7 @@ import typer
 from rich.table import Table
 
 from hdbridge.cli.options import (
+    BitrateOption,
     BorrowOption,
     ForceOption,
     GatewayAxisOption,
@@ -45,10 +46,7 @@ def command(
     channel: Annotated[
         str | None, typer.Option("--channel", help="Channel of the bus, for example can0.")
     ] = None,
-    bitrate_bps: Annotated[
-        int | None,
-        typer.Option("--bitrate", min=10_000, max=1_000_000, help="Bit rate, if the interface sets it."),
-    ] = None,
+    bitrate_bps: BitrateOption = None,
     node_id: Annotated[
         int | None, typer.Option("--node", min=1, max=127, help="Node id; else the axis file's.")
     ] = None,

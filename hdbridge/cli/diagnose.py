@@ -15,9 +15,11 @@ from hdbridge.cli.flights import AxisOption, FromOption, ToOption, is_flight, re
 from hdbridge.cli.options import (
     ColumnsOption,
     HtmlOption,
+    IndependentZerosOption,
     JsonOption,
     UnitsOption,
     UnwrapOption,
+    figures_table,
     load_recordings,
     model_file,
     need_extra,
@@ -70,10 +72,7 @@ def command(
         typer.Option("--extend", metavar="NEW_MODEL.yaml", help="Write the extended model."),
         Kind.MODEL,
     ] = None,
-    independent_zeros: Annotated[
-        bool,
-        typer.Option("--independent-zeros", help="The encoders' zeros were lost between the records."),
-    ] = False,
+    independent_zeros: IndependentZerosOption = False,
     prior: Annotated[
         Path | None,
         typer.Option(
@@ -240,10 +239,8 @@ def _number(parameter: Parameter) -> str:
 
 
 def _print_figures(result: Diagnosis) -> None:
-    table = Table(title="model and measurement, arcsec", title_justify="left")
-    table.add_column("")
-    for name in ("as given, rms", "3σ", "extended, rms", "3σ"):
-        table.add_column(name, justify="right")
+    columns = ("as given, rms", "3σ", "extended, rms", "3σ")
+    table = figures_table("model and measurement, arcsec", "", *columns)
     rows = {"overall": (result.baseline, result.extended), **result.by_kind}
     for name, pair in rows.items():
         figures = [value for each in pair for value in (each.rms_arcsec, each.three_sigma_arcsec)]
@@ -253,10 +250,7 @@ def _print_figures(result: Diagnosis) -> None:
 
 def _print_shares(shares: dict[str, dict[str, float]]) -> None:
     ranked = sorted(shares.items(), key=lambda each: -each[1]["share_of_baseline"])
-    table = Table(title="share of the difference that goes with", title_justify="left")
-    table.add_column("")
-    for name in ("as given", "extended"):
-        table.add_column(name, justify="right")
+    table = figures_table("share of the difference that goes with", "", "as given", "extended")
     for name, each in ranked:
         if max(each.values()) >= WORTH_TELLING:
             table.add_row(name, *(f"{100.0 * value:.1f} %" for value in each.values()))

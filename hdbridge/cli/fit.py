@@ -10,6 +10,7 @@ import typer
 from hdbridge.cli.options import (
     ColumnsOption,
     HtmlOption,
+    IndependentZerosOption,
     JsonOption,
     UnitsOption,
     UnwrapOption,
@@ -48,9 +49,7 @@ def command(
     columns: ColumnsOption = None,
     units: UnitsOption = None,
     unwrap: UnwrapOption = None,
-    independent_zeros: Annotated[
-        bool, typer.Option("--independent-zeros", help="The encoders' zeros were lost between the records.")
-    ] = False,
+    independent_zeros: IndependentZerosOption = False,
     out: Annotated[
         Path | None, typer.Option("--out", metavar="MODEL.yaml", help="Write the model file."), Kind.MODEL
     ] = None,

@@ -13,6 +13,7 @@ from hdbridge.cli.measuring import PlanOption, out_option, resume_option
 from hdbridge.cli.options import (
     ColumnsOption,
     HtmlOption,
+    IndependentZerosOption,
     JsonOption,
     UnitsOption,
     UnwrapOption,
@@ -47,10 +48,7 @@ def command(
             help="Diagnose this and measure nothing; may be repeated, in order of time.",
         ),
     ] = None,
-    independent_zeros: Annotated[
-        bool,
-        typer.Option("--independent-zeros", help="The encoders' zeros were lost between the records."),
-    ] = False,
+    independent_zeros: IndependentZerosOption = False,
     columns: ColumnsOption = None,
     units: UnitsOption = None,
     unwrap: UnwrapOption = None,

@@ -9,12 +9,11 @@ from typing import Annotated, Any, Final
 
 import typer
 from rich.markup import escape
-from rich.table import Table
 
 from hdbridge.axis.model import TransmissionModel
 from hdbridge.axis.model.difference import Difference, diff
 from hdbridge.axis.model.store import ACTIVE, MODELS, PENDING, Store, Version
-from hdbridge.cli.options import JsonOption, ProfileArgument, print_table, say, write_json
+from hdbridge.cli.options import JsonOption, ProfileArgument, figures_table, print_table, say, write_json
 from hdbridge.errors import InputError
 from hdbridge.files.profile import Profile
 from hdbridge.files.yamlfile import read_yaml
@@ -148,10 +147,8 @@ def _now() -> datetime:
 def _print_diff(title: str, rows: Sequence[Difference]) -> None:
     """Prints the differences effect by effect; without the columns of a previous model if there was none."""
     compared = any(row.before is not None for row in rows if row.effect)
-    table = Table(title=title, title_justify="left")
-    table.add_column("parameter")
-    for name in ("before", "after", "change", "± 95 %") if compared else ("value", "± 95 %"):
-        table.add_column(name, justify="right")
+    columns = ("before", "after", "change", "± 95 %") if compared else ("value", "± 95 %")
+    table = figures_table(title, "parameter", *columns)
     effect = None
     for row in rows:
         if row.effect and row.effect != effect:

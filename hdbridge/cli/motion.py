@@ -13,6 +13,7 @@ from hdbridge.cli.options import (
     JsonOption,
     ModelOption,
     compensating_model,
+    figures_table,
     note,
     print_table,
     say,
@@ -128,10 +129,8 @@ def _paths(result: MotionTest) -> Table:
         "Error on a path, rms arcsec, with the wind-up in acceleration and corrected for it, and time until "
         "the load has settled, ms"
     )
-    table = Table(title=title, title_justify="left")
-    table.add_column("path")
-    for name in ("none", "static", "filtered", "wound up", "corrected", "settled", "static", "filtered"):
-        table.add_column(name, justify="right")
+    columns = ("none", "static", "filtered", "wound up", "corrected", "settled", "static", "filtered")
+    table = figures_table(title, "path", *columns)
     for each in result.paths:
         variants = (each.none, each.static, each.filtered)
         table.add_row(

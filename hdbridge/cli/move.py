@@ -11,8 +11,10 @@ import typer
 from rich.table import Table
 
 from hdbridge.cli.options import (
+    AnglesArgument,
     JsonOption,
     ModelOption,
+    VelocityOption,
     note,
     note_clamped,
     print_table,
@@ -36,16 +38,11 @@ KEPT_S = 60.0
 @on_axis
 def command(
     session: Session,
-    angles_deg: Annotated[
-        list[float], typer.Argument(metavar="ANGLE...", help="Load angles in degrees, one after the other.")
-    ],
+    angles_deg: AnglesArgument,
     relative: Annotated[
         bool, typer.Option("--relative", help="Each angle is relative to the previous position.")
     ] = False,
-    velocity_deg_s: Annotated[
-        float | None,
-        typer.Option("--velocity", min=1e-6, help="Speed of the load, deg/s; else the axis's limit."),
-    ] = None,
+    velocity_deg_s: VelocityOption = None,
     hold_s: Annotated[
         float | None,
         typer.Option(

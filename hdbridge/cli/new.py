@@ -8,7 +8,17 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from hdbridge.cli.options import ChannelOption, InterfaceOption, JsonOption, note, say, write_json
+from hdbridge.cli.options import (
+    BitrateOption,
+    ChannelOption,
+    EdsOption,
+    InterfaceOption,
+    JsonOption,
+    NodeOption,
+    note,
+    say,
+    write_json,
+)
 from hdbridge.clock import MonotonicClock
 from hdbridge.errors import DriveError, InputError
 
@@ -32,15 +42,9 @@ def command(
     ] = Source.DEMO,
     interface: InterfaceOption = None,
     channel: ChannelOption = None,
-    bitrate_bps: Annotated[
-        int | None,
-        typer.Option("--bitrate", min=10_000, max=1_000_000, help="Bit rate, if the interface sets it."),
-    ] = None,
-    node_id: Annotated[
-        int | None,
-        typer.Option("--node", min=1, max=127, help="Node id, if several drives answer."),
-    ] = None,
-    eds: Annotated[Path | None, typer.Option("--eds", metavar="FILE", help="The drive's EDS file.")] = None,
+    bitrate_bps: BitrateOption = None,
+    node_id: NodeOption = None,
+    eds: EdsOption = None,
     json_file: JsonOption = None,
 ) -> None:
     """Make the folder of an axis: a copy of a bundled profile, or from the data of a drive on the bus.

@@ -95,6 +95,51 @@ BorrowOption = Annotated[
         "command ends.",
     ),
 ]
+BitrateOption = Annotated[
+    int | None,
+    typer.Option("--bitrate", min=10_000, max=1_000_000, help="Bit rate, if the interface sets it."),
+]
+NodeOption = Annotated[
+    int | None, typer.Option("--node", min=1, max=127, help="Node id, if several drives answer.")
+]
+EdsOption = Annotated[Path | None, typer.Option("--eds", metavar="FILE", help="The drive's EDS file.")]
+VelocityOption = Annotated[
+    float | None,
+    typer.Option("--velocity", min=1e-6, help="Speed of the load, deg/s; else the axis's limit."),
+]
+AccelerationOption = Annotated[
+    float | None,
+    typer.Option("--acceleration", min=1e-6, help="Acceleration of the load, deg/s2; else the axis's limit."),
+]
+AnglesArgument = Annotated[
+    list[float], typer.Argument(metavar="ANGLE...", help="Load angles in degrees, one after the other.")
+]
+HomingMethodOption = Annotated[
+    int, typer.Option("--method", min=-128, max=127, help="Homing method, 6098h: see the drive's manual.")
+]
+SwitchVelocityOption = Annotated[
+    float | None,
+    typer.Option(
+        "--switch-velocity",
+        min=1e-6,
+        help="Speed towards the switch, deg/s of the load; else a tenth of the axis's limit.",
+    ),
+]
+ZeroVelocityOption = Annotated[
+    float | None,
+    typer.Option(
+        "--zero-velocity",
+        min=1e-6,
+        help="Speed towards the zero, deg/s of the load; else a fiftieth of the axis's limit.",
+    ),
+]
+OffsetOption = Annotated[float, typer.Option("--offset", help="Load angle of the home position (607Ch).")]
+HomingTimeoutOption = Annotated[
+    float, typer.Option("--timeout", min=0.1, max=3600.0, help="Longest time, s.")
+]
+IndependentZerosOption = Annotated[
+    bool, typer.Option("--independent-zeros", help="The encoders' zeros were lost between the records.")
+]
 ColumnsOption = Annotated[
     list[str] | None,
     typer.Option(
@@ -325,6 +370,15 @@ def _part(table: Table, columns: list[Column]) -> Table:
     for row, values in zip(table.rows, cells, strict=True):
         part.add_row(*values, end_section=row.end_section)
     return part
+
+
+def figures_table(title: str, first: str, *figures: str) -> Table:
+    """Returns an empty table with a title, a column of names, and right-aligned columns of figures."""
+    table = Table(title=title, title_justify="left")
+    table.add_column(first)
+    for name in figures:
+        table.add_column(name, justify="right")
+    return table
 
 
 def print_object(name: str, value: object, type_name: str) -> None:

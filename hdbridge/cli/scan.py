@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from hdbridge.cli.options import (
+    BitrateOption,
     BorrowOption,
     ChannelOption,
     ForceOption,
@@ -42,10 +43,7 @@ def command(
     channel: ChannelOption = None,
     force: ForceOption = False,
     borrow: BorrowOption = False,
-    bitrate_bps: Annotated[
-        int | None,
-        typer.Option("--bitrate", min=10_000, max=1_000_000, help="Bit rate, if the interface sets it."),
-    ] = None,
+    bitrate_bps: BitrateOption = None,
     listen_s: Annotated[
         float,
         typer.Option("--listen", min=0.0, max=3600.0, help="Seconds to listen before asking; at least 0.51."),

@@ -13,7 +13,16 @@ from typing import Annotated, Any, Final
 
 import typer
 
-from hdbridge.cli.options import ChannelOption, InterfaceOption, SeedOption, note, say
+from hdbridge.cli.options import (
+    BitrateOption,
+    ChannelOption,
+    EdsOption,
+    InterfaceOption,
+    NodeOption,
+    SeedOption,
+    note,
+    say,
+)
 from hdbridge.errors import BusError, DriveError, HdbridgeError, InputError
 from hdbridge.files.atomic import write_atomically
 
@@ -46,14 +55,9 @@ def command(
     ],
     interface: InterfaceOption = None,
     channel: ChannelOption = None,
-    bitrate_bps: Annotated[
-        int | None,
-        typer.Option("--bitrate", min=10_000, max=1_000_000, help="Bit rate, if the interface sets it."),
-    ] = None,
-    node_id: Annotated[
-        int | None, typer.Option("--node", min=1, max=127, help="Node id, if several drives answer.")
-    ] = None,
-    eds: Annotated[Path | None, typer.Option("--eds", metavar="FILE", help="The drive's EDS file.")] = None,
+    bitrate_bps: BitrateOption = None,
+    node_id: NodeOption = None,
+    eds: EdsOption = None,
     plan: Annotated[
         str, typer.Option("--plan", metavar="quick|full|FILE", help="Plan of the calibration.")
     ] = "quick",

@@ -185,7 +185,7 @@ def _told_when_stopped(
 
 def print_result(axis: AxisConfig, comparison: Comparison) -> None:
     """Prints the result."""
-    from hdbridge.cli.scattertable import print_scatter
+    from hdbridge.cli.calibration_output import print_scatter
 
     print_scatter(
         f"Load error at rest, arcsec: axis '{axis.name}'",

@@ -275,8 +275,8 @@ class Drive:
     def home(
         self,
         method: int,
-        switch_velocity_deg_s: float,
-        zero_velocity_deg_s: float,
+        switch_velocity_deg_s: float | None = None,
+        zero_velocity_deg_s: float | None = None,
         acceleration_deg_s2: float | None = None,
         offset_deg: float = 0.0,
         timeout_s: float = 60.0,
