@@ -79,7 +79,7 @@ class Backlash(Linear):
         return cls(gap_arcsec=gap_arcsec, crossing_deg=_crossing_deg(gap_arcsec, ratio, softness))
 
     @classmethod
-    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[Backlash]:  # noqa: ARG003
+    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[Backlash]:
         """Yields gaps from a hard contact to a soft one."""
         yield from (cls(gap_arcsec=1.0, crossing_deg=each) for each in (0.05, 0.15, 0.4, 1.0, 2.5, 6.0))
 
@@ -118,7 +118,7 @@ class Backlash(Linear):
         return self.gap_arcsec / self.crossing_deg
 
     @classmethod
-    def candidate(cls, ratio: float, base: Sequence[Effect] = ()) -> Self:  # noqa: ARG003
+    def candidate(cls, ratio: float, base: Sequence[Effect] = ()) -> Self:
         """Returns a gap of 10 arcsec."""
         return cls.of_gap(10.0, ratio)
 

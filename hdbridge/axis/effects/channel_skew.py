@@ -9,6 +9,7 @@ import numpy as np
 from pydantic import Field
 
 from hdbridge.axis.effects.base import (
+    Angleless,
     Cause,
     Channel,
     Compensable,
@@ -28,7 +29,7 @@ from hdbridge.axis.effects.load_order import Ratio
 from hdbridge.units import ARCSEC_PER_DEG
 
 
-class ChannelSkew(Linear):
+class ChannelSkew(Angleless, Linear):
     """delay omega_L + second alpha_L / 2: the load encoder, sampled later than the motor's, reads farther on.
 
     A pure delay has second = delay^2. It is a separate parameter because the speed is a difference over a
@@ -93,7 +94,7 @@ class ChannelSkew(Linear):
         return cls(ratio=ratio, delay_ms=delay_ms, second_order_ms2=delay_ms * delay_ms)
 
     @classmethod
-    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[ChannelSkew]:  # noqa: ARG003
+    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[ChannelSkew]:
         """Yields the single candidate."""
         yield cls(ratio=observations.ratio, delay_ms=1.0, second_order_ms2=1.0)
 
@@ -113,10 +114,6 @@ class ChannelSkew(Linear):
         speed = 1e-3 * abs(self.delay_ms) * self.limit_deg_s
         acceleration = 0.5e-6 * abs(self.second_order_ms2) * self.limit_deg_s2
         return ARCSEC_PER_DEG / self.ratio * (speed + acceleration)
-
-    def slope_bound_arcsec_per_deg(self) -> float:
-        """Zero, because the speed is the command's, independent of the angle."""
-        return 0.0
 
 
 class _Tracker(Memoryless):

@@ -11,6 +11,7 @@ from pydantic import Field
 
 from hdbridge.axis.effects import coordinate as over
 from hdbridge.axis.effects.base import (
+    Angleless,
     Cause,
     Channel,
     Coefficient,
@@ -45,7 +46,7 @@ class Relaxation(Strict):
     tau_s: Annotated[float, Field(gt=0, le=1e6, description="time constant at rest")]
 
 
-class Creep(Effect):
+class Creep(Angleless):
     """Sum of A_j y_j; y_j approaches the direction in motion, and zero at rest.
 
     In motion the time constant is ``build_up`` tau_j. A value of 1 is a linear viscoelastic element (short
@@ -92,7 +93,7 @@ class Creep(Effect):
     ] = 1.0
 
     @classmethod
-    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[Creep]:  # noqa: ARG003
+    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[Creep]:
         """Yields single exponentials; those found are combined afterwards."""
         for tau_s in (0.3, 1.0, 3.0, 10.0, 30.0, 100.0):
             for build_up in (0.03, 0.3, 1.0):
@@ -133,11 +134,6 @@ class Creep(Effect):
             for i in range(len(self.parts))
         )
 
-    def predict(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
-        """Returns the error in arcsec, shape (n,)."""
-        error: FloatArray = self.columns(motion, start) @ self.coefficients()
-        return error
-
     def tracker(self, start: Start = Start.VIRGIN) -> Tracker:
         """Returns an on-line tracker, fully relaxed at its first moment."""
         return _Tracker([(each.amplitude_arcsec, each.tau_s) for each in self.parts], self.build_up)
@@ -173,10 +169,6 @@ class Creep(Effect):
     def bound_arcsec(self) -> float:
         """Sum of the absolute amplitudes."""
         return sum(abs(each.amplitude_arcsec) for each in self.parts)
-
-    def slope_bound_arcsec_per_deg(self) -> float:
-        """Zero, because it depends on time and on the command's direction."""
-        return 0.0
 
 
 class _Tracker(Tracker):

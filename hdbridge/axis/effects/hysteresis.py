@@ -57,7 +57,7 @@ class Hysteresis(ElasticLoop):
     )
 
     @classmethod
-    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[Hysteresis]:  # noqa: ARG003
+    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[Hysteresis]:
         """Yields a narrow, a typical and a wide loop for a model without one."""
         if all(each.part is not Part.LOOP for each in base):
             for width in (3.0, 20.0, 60.0):

@@ -62,7 +62,7 @@ class HysteresisMemory(ElasticLoop):
         return _MemoryTracker(self.offset_arcsec, width_deg, self.exponent, start, steepest)
 
     @classmethod
-    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[HysteresisMemory]:  # noqa: ARG003
+    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[HysteresisMemory]:
         """Yields the model's plain loop under this law."""
         for each in base:
             if isinstance(each, Hysteresis):

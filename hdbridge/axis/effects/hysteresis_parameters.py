@@ -62,7 +62,7 @@ class HysteresisParameters(Effect):
     exponent: Annotated[float, Field(gt=1, le=6, description="new exponent")]
 
     @classmethod
-    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[HysteresisParameters]:  # noqa: ARG003
+    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[HysteresisParameters]:
         """Yields the model's loop with a larger width."""
         if any(each.part is Part.LOOP for each in base):
             loop = loop_of(base)

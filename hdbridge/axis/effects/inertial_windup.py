@@ -9,6 +9,7 @@ import numpy as np
 from pydantic import Field
 
 from hdbridge.axis.effects.base import (
+    Angleless,
     Cause,
     Channel,
     Compensable,
@@ -27,7 +28,7 @@ from hdbridge.axis.effects.load_order import Ratio
 from hdbridge.units import ARCSEC_PER_DEG
 
 
-class InertialWindup(Linear):
+class InertialWindup(Angleless, Linear):
     """-(J / K) alpha_L: the load lags while it is accelerated."""
 
     name: ClassVar[str] = "inertial_windup"
@@ -63,7 +64,7 @@ class InertialWindup(Linear):
     ] = 1e6
 
     @classmethod
-    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[InertialWindup]:  # noqa: ARG003
+    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[InertialWindup]:
         """Yields the single candidate."""
         yield cls(ratio=observations.ratio, inertia_over_stiffness_s2=1e-5)
 
@@ -93,10 +94,6 @@ class InertialWindup(Linear):
     def bound_arcsec(self) -> float:
         """Wind-up at the highest acceleration."""
         return ARCSEC_PER_DEG / self.ratio * abs(self.inertia_over_stiffness_s2) * self.limit_deg_s2
-
-    def slope_bound_arcsec_per_deg(self) -> float:
-        """Zero, because the acceleration is the command's, independent of the angle."""
-        return 0.0
 
 
 class _Tracker(Level):

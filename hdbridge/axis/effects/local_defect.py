@@ -83,7 +83,7 @@ class LocalDefect(Linear):
     ]
 
     @classmethod
-    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[LocalDefect]:  # noqa: ARG003
+    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[LocalDefect]:
         """Yields a tooth in the middle of the travel, as an example."""
         load = float(np.median(observations.motion.motor_deg)) / observations.ratio
         yield cls(

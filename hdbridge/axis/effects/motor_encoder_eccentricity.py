@@ -40,9 +40,7 @@ class MotorEncoderEccentricity(OrderSeries):
 
     @classmethod
     def proposals(
-        cls,
-        observations: Observations,  # noqa: ARG003
-        base: Sequence[Effect],  # noqa: ARG003
+        cls, observations: Observations, base: Sequence[Effect]
     ) -> Iterator[MotorEncoderEccentricity]:
         """Yields both orders, whether or not the model has them, because they come from one disc."""
         yield cls(orders=orders_from((1, 2)))

@@ -45,7 +45,7 @@ class MotorOrders(OrderSeries):
         return 1.0
 
     @classmethod
-    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[MotorOrders]:  # noqa: ARG003
+    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[MotorOrders]:
         """Yields single orders; those found are combined afterwards."""
         for number in missing_orders(cls(orders=orders_from(range(1, HIGHEST_MOTOR_ORDER + 1))), base):
             yield cls(orders=orders_from([number]))

@@ -67,7 +67,7 @@ class RatioError(Linear):
         return 1.0 / (1.0 / ratio + self.ramp_arcsec_per_turn / (DEG_PER_TURN * ARCSEC_PER_DEG))
 
     @classmethod
-    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[RatioError]:  # noqa: ARG003
+    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[RatioError]:
         """Yields the single candidate."""
         yield cls(ramp_arcsec_per_turn=1.0)
 

@@ -10,6 +10,7 @@ import numpy as np
 from pydantic import Field
 
 from hdbridge.axis.effects.base import (
+    Angleless,
     Cause,
     Channel,
     Coefficient,
@@ -30,7 +31,7 @@ from hdbridge.axis.effects.base import (
 from hdbridge.axis.effects.orders import cosines_and_sines
 
 
-class Vibration(Effect):
+class Vibration(Angleless):
     """amplitude cos(2 pi f t + phase)."""
 
     name: ClassVar[str] = "vibration"
@@ -74,7 +75,7 @@ class Vibration(Effect):
     ]
 
     @classmethod
-    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[Vibration]:  # noqa: ARG003
+    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[Vibration]:
         """Yields a fast vibration that the record can resolve, as an example."""
         fast_hz = 0.137 / max(observations.period_s, 1e-6)
         yield cls(frequency_hz=min(max(fast_hz, 0.3), 40.0), amplitude_arcsec=1.0, phase_deg=0.0)
@@ -120,10 +121,6 @@ class Vibration(Effect):
     def bound_arcsec(self) -> float:
         """The amplitude."""
         return self.amplitude_arcsec
-
-    def slope_bound_arcsec_per_deg(self) -> float:
-        """Zero, because it depends on time alone."""
-        return 0.0
 
     def _angle(self, motion: Motion) -> FloatArray:
         return (2.0 * math.pi * self.frequency_hz) * motion.channel(Channel.TIME, self.name)

@@ -76,7 +76,7 @@ class Wear(Linear):
     ] = 10_000.0
 
     @classmethod
-    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[Wear]:  # noqa: ARG003
+    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[Wear]:
         """Yields widths from that of a gap to that of the elastic loop."""
         yield from (cls(growth_arcsec_per_kiloturn=1.0, width_deg=each) for each in (0.5, 4.0, 20.0))
 
