@@ -11,8 +11,9 @@ import logging
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from itertools import groupby
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
+from hdbridge.axis import AxisConfig
 from hdbridge.drive import objects
 from hdbridge.drive.bootplan import plan
 from hdbridge.drive.dictionary import find, is_readable, is_writable
@@ -35,9 +36,6 @@ from hdbridge.drive.sdo import SdoAbortError, SdoClient
 from hdbridge.drive.states import State, decode
 from hdbridge.drive.writes import PlannedWrite
 from hdbridge.errors import DriveError, IdentityError, SdoError
-
-if TYPE_CHECKING:
-    from hdbridge.axis import AxisConfig
 
 _log = logging.getLogger(__name__)
 BOOT_UP_TIMEOUT_S: Final = 2.0

@@ -8,14 +8,9 @@ readings return.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
-from hdbridge.axis.channels import BY_KEY
+from hdbridge.axis.channels import BY_KEY, MeasuredChannel
 from hdbridge.drive.objects import IntegerType
 from hdbridge.drive.supervision import Fault
-
-if TYPE_CHECKING:
-    from hdbridge.axis.channels import MeasuredChannel
 
 
 class ChannelFollower:

@@ -10,20 +10,17 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from itertools import count
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
+from hdbridge.axis import AxisConfig
 from hdbridge.drive import objects
 from hdbridge.drive.commander import STEP_TIMEOUT_S, Commander
 from hdbridge.drive.image import HALT_BIT, ProcessImage
-from hdbridge.drive.sdo import ABSENT, SdoAbortError
+from hdbridge.drive.objects import Address
+from hdbridge.drive.sdo import ABSENT, SdoAbortError, SdoClient
 from hdbridge.drive.states import HOLD, State, decode
 from hdbridge.drive.writes import motor_rate
 from hdbridge.errors import DriveError, HdbridgeError, InputError
-
-if TYPE_CHECKING:
-    from hdbridge.axis import AxisConfig
-    from hdbridge.drive.objects import Address
-    from hdbridge.drive.sdo import SdoClient
 
 ENABLED: Final = HOLD[State.OPERATION_ENABLED]
 NEW_SET_POINT: Final = 0x0010

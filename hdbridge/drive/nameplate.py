@@ -8,14 +8,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from fractions import Fraction
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import Final, NamedTuple
 
+from hdbridge.axis import AxisConfig
 from hdbridge.drive import objects
 from hdbridge.drive.layout import cyclic_mode
 from hdbridge.drive.objects import Address
-
-if TYPE_CHECKING:
-    from hdbridge.axis import AxisConfig
 
 Readings = Mapping[Address, int]
 """Values read from the drive; objects that it lacks are missing."""

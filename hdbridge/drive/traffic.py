@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from hdbridge.drive.emergencies import HEARTBEAT_LOST, RPDO_TIMEOUT
+from hdbridge.drive.image import ProcessImage
+from hdbridge.drive.link import Frame
+from hdbridge.drive.monitor import NetworkMonitor
 from hdbridge.drive.objects import COB_EMCY, COB_HEARTBEAT, COB_NMT, COB_SDO_REQUEST, COB_SYNC, NmtState
 from hdbridge.drive.supervision import Fault
-
-if TYPE_CHECKING:
-    from hdbridge.drive.image import ProcessImage
-    from hdbridge.drive.link import Frame
-    from hdbridge.drive.monitor import NetworkMonitor
 
 _NODE_MASK: Final = 0x7F
 _MASTER_LOST: Final = (HEARTBEAT_LOST, RPDO_TIMEOUT)

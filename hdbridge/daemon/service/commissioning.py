@@ -10,19 +10,16 @@ from __future__ import annotations
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING
 
 from hdbridge.axis import AxisConfig, Identity
 from hdbridge.client import messages
 from hdbridge.daemon.service.core import Arguments, Core
 from hdbridge.daemon.service.relaybus import RelayBus
+from hdbridge.drive.bootup import BootReport
 from hdbridge.drive.drive import Drive, Positions
 from hdbridge.drive.states import State
 from hdbridge.drive.values import Object, Value, find_object
 from hdbridge.errors import InputError, RefusedError
-
-if TYPE_CHECKING:
-    from hdbridge.drive.bootup import BootReport
 
 BUSY_S = 3.0
 """Maximum wait for a drive that is busy with another request."""
