@@ -16,11 +16,6 @@ from hdbridge.drive.supervision import Fault
 class ChannelFollower:
     """One channel. `accept` takes its readings, `step` ends each cycle, ``value`` is the reading in force."""
 
-    __slots__ = (
-        "_age", "_at_zero", "_every", "_greatest", "_hold", "_least", "_overdue", "_per_count", "_unit",
-        "key", "lost", "value", "why",
-    )  # fmt: skip
-
     def __init__(self, key: str, channel: MeasuredChannel, cycle_ms: float) -> None:
         """``key`` is the channel's key in the axis file."""
         self.key = key

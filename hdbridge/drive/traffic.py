@@ -36,8 +36,6 @@ def bus_faults(heartbeat_id: int) -> dict[int, tuple[Fault, str]]:
 class Traffic:
     """Judges the frames of one axis's nodes that the control cycle does not wait for."""
 
-    __slots__ = ("_monitor", "_node_id", "_nodes", "_own", "heard_s", "identifiers")
-
     def __init__(self, image: ProcessImage, monitor: NetworkMonitor, now_s: float) -> None:
         self._monitor = monitor
         self._node_id = image.node_id

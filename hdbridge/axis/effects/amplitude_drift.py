@@ -185,8 +185,6 @@ class AmplitudeDrift(Linear, Warmed):
 
 
 class _Tracker(Tracker):
-    __slots__ = ("_friction", "_load", "_loop", "_orders", "_ripple", "_warmth")
-
     def __init__(self, effect: AmplitudeDrift, loop: Tracker) -> None:
         self._orders = OrderTracker(phasors(effect.orders))
         self._load = effect.under_load

@@ -129,8 +129,6 @@ def _crossing_deg(gap_arcsec: float, ratio: float, softness: float = _SOFTNESS) 
 
 
 class _Tracker(Tracker):
-    __slots__ = ("_height", "_stop")
-
     def __init__(self, height: float, play: Stop) -> None:
         self._height = height
         self._stop = play

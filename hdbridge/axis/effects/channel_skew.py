@@ -117,8 +117,6 @@ class ChannelSkew(Angleless, Linear):
 
 
 class _Tracker(Memoryless):
-    __slots__ = ("_first", "_limit", "_limit2", "_second")
-
     def __init__(self, effect: ChannelSkew) -> None:
         gain = ARCSEC_PER_DEG / effect.ratio
         self._first = 1e-3 * gain * effect.delay_ms

@@ -174,8 +174,6 @@ class Compliance(Angleless, Linear):
 
 
 class _Tracker(Memoryless):
-    __slots__ = ("_c", "_high", "_limit", "_low", "_sense", "_slot")
-
     def __init__(self, effect: Compliance) -> None:
         self._c = (effect.c1_arcsec_per_nm, effect.c2_arcsec_per_nm, effect.c3_arcsec_per_nm)
         self._low = effect.torque1_nm

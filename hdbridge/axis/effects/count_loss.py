@@ -151,8 +151,6 @@ class CountLoss(Angleless):
 
 
 class _Tracker(Memoryless):
-    __slots__ = ("_steps",)
-
     def __init__(self, steps: list[tuple[float, float]]) -> None:
         self._steps = steps
 

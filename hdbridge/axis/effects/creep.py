@@ -174,8 +174,6 @@ class Creep(Angleless):
 class _Tracker(Tracker):
     """State: y_j and the time they refer to."""
 
-    __slots__ = ("_amplitudes", "_build_up", "_rates", "_strains", "_time")
-
     def __init__(self, parts: list[tuple[float, float]], build_up: float) -> None:
         self._amplitudes = [amplitude for amplitude, _ in parts]
         self._rates = [1.0 / tau_s for _, tau_s in parts]

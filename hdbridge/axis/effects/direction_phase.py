@@ -123,8 +123,6 @@ class DirectionPhase(Linear):
 
 
 class _Tracker(Memoryless):
-    __slots__ = ("_phasors", "_start")
-
     def __init__(self, amplitudes: tuple[complex, ...], start: int) -> None:
         self._phasors = amplitudes
         self._start = start

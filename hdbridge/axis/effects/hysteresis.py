@@ -102,11 +102,6 @@ class _HysteresisTracker(Tracker):
     Values are those of a loop of unit offset.
     """
 
-    __slots__ = (
-        "_angle", "_branch_angle", "_branch_value", "_exponent", "_offset", "_sign", "_steepest", "_value",
-        "_virgin", "_width",
-    )  # fmt: skip
-
     def __init__(self, offset: float, width: float, exponent: float, start: Start, steepest: float) -> None:
         self._offset = offset
         self._width = width

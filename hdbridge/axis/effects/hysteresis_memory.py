@@ -135,8 +135,6 @@ class _Memory:
     is where the branch closes. If empty: on the virgin curve through ``_origin`` in direction ``_sign``.
     """
 
-    __slots__ = ("_exponent", "_origin", "_points", "_sign", "_steepest", "_width")
-
     def __init__(
         self, width: float, exponent: float, angle: float, start: int, steepest: float = math.inf
     ) -> None:
@@ -219,8 +217,6 @@ class _Memory:
 
 class _MemoryTracker(Tracker):
     """State: the remembered reversals, the last angle and the value there."""
-
-    __slots__ = ("_angle", "_exponent", "_memory", "_offset", "_start", "_steepest", "_value", "_width")
 
     def __init__(self, offset: float, width: float, exponent: float, start: Start, steepest: float) -> None:
         self._offset = offset

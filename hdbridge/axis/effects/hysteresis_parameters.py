@@ -128,8 +128,6 @@ class HysteresisParameters(Effect):
 
 
 class _Tracker(Tracker):
-    __slots__ = ("_new", "_old")
-
     def __init__(self, new: Tracker, old: Tracker) -> None:
         self._new = new
         self._old = old

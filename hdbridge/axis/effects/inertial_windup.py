@@ -97,8 +97,6 @@ class InertialWindup(Angleless, Linear):
 
 
 class _Tracker(Level):
-    __slots__ = ("_gain", "_limit")
-
     def __init__(self, gain: float, limit: float) -> None:
         self._gain = gain
         self._limit = limit

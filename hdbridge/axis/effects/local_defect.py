@@ -159,8 +159,6 @@ class LocalDefect(Linear):
 
 
 class _Tracker(Memoryless):
-    __slots__ = ("_centre", "_height", "_ratio", "_width")
-
     def __init__(self, effect: LocalDefect) -> None:
         self._height = effect.height_arcsec
         self._centre = effect.centre_deg

@@ -280,8 +280,6 @@ def compensated_orders(effects: Iterable[Effect]) -> list[MotorOrder]:
 class OrderTracker(Memoryless):
     """On-line tracker of a series of harmonics; ``scale`` is radians of order 1 per motor degree."""
 
-    __slots__ = ("_highest", "_lower", "_scale")
-
     def __init__(self, amplitudes: tuple[complex, ...], scale: float = RAD_PER_DEG) -> None:
         self._highest, *self._lower = amplitudes
         self._scale = scale

@@ -121,8 +121,6 @@ class RateDependence(Linear):
 
 
 class _Tracker(Tracker):
-    __slots__ = ("_gain", "_limit", "_loop", "_reference")
-
     def __init__(self, effect: RateDependence, loop: Tracker) -> None:
         self._loop = loop
         self._gain = 0.01 * effect.growth_percent / math.log(10.0)

@@ -117,8 +117,6 @@ class RatioError(Linear):
 
 
 class _Tracker(Memoryless):
-    __slots__ = ("_limit", "_slope")
-
     def __init__(self, slope: float, limit: float) -> None:
         self._slope = slope
         self._limit = limit

@@ -177,8 +177,6 @@ class SubdivisionalError(Angleless):
 
 
 class _Tracker(Memoryless):
-    __slots__ = ("_phasors", "_scale")
-
     def __init__(self, amplitudes: tuple[complex, ...], scale: float) -> None:
         self._phasors = amplitudes
         self._scale = scale

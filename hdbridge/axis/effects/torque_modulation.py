@@ -115,8 +115,6 @@ class TorqueModulation(TorqueGrowth, Linear):
 
 
 class _Tracker(Memoryless):
-    __slots__ = ("_gain", "_load_nm", "_orders")
-
     def __init__(self, effect: TorqueModulation) -> None:
         self._orders = OrderTracker(phasors(effect.orders))
         self._gain = 0.01 * effect.growth_percent_per_nm

@@ -134,8 +134,6 @@ class VelocityWindup(Angleless, Linear):
 
 
 class _Tracker(Level):
-    __slots__ = ("_coulomb", "_limit", "_shear", "_viscous")
-
     def __init__(self, effect: VelocityWindup) -> None:
         self._coulomb = effect.coulomb_arcsec
         self._viscous = effect.viscous_arcsec_s_per_deg

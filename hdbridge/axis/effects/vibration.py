@@ -127,8 +127,6 @@ class Vibration(Angleless):
 
 
 class _Tracker(Memoryless):
-    __slots__ = ("_amplitude", "_omega", "_phase")
-
     def __init__(self, effect: Vibration) -> None:
         self._amplitude = effect.amplitude_arcsec
         self._omega = 2.0 * math.pi * effect.frequency_hz

@@ -142,8 +142,6 @@ def _kiloturns(turns: float, exponent: float) -> float:
 class _Tracker(Tracker):
     """State: the stop operator's value, the distance run (degrees), the last angle."""
 
-    __slots__ = ("_angle", "_before", "_distance", "_fall", "_gain", "_half", "_limit", "_value")
-
     def __init__(self, effect: Wear, start: Start, fall_arcsec_per_deg: float) -> None:
         """``fall_arcsec_per_deg`` limits the slope of the crossing."""
         self._half = effect._half

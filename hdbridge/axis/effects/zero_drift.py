@@ -94,8 +94,6 @@ class ZeroDrift(Angleless, Linear, Warmed):
 
 
 class _Tracker(Tracker):
-    __slots__ = ("_drift", "_warmth")
-
     def __init__(self, drift: float, warmth: WarmthState) -> None:
         self._drift = drift
         self._warmth = warmth

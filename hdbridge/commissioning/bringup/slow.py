@@ -73,8 +73,6 @@ def plan_travel(axis: AxisConfig, here_deg: float) -> TravelPlan | None:
 class QuietLink(Link):
     """Link that withholds some identifiers, like a master that has died."""
 
-    __slots__ = ("muted", "sent_s", "unheard", "withheld")
-
     def __init__(self, bus: can.BusABC, clock: Clock) -> None:
         super().__init__(bus, clock)
         self.muted: set[int] = set()
