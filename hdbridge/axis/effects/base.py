@@ -377,7 +377,6 @@ class Linear(Effect):
         return np.array([getattr(self, each) for each in self.linear], dtype=np.float64)
 
     def named_coefficients(self) -> tuple[Coefficient, ...]:
-        """Returns the coefficients named by their parameters."""
         return tuple(Coefficient(each, (i,), (each,)) for i, each in enumerate(self.linear))
 
     def fitted(self, coefficients: FloatArray, shape: Mapping[str, float] | None = None) -> Self:
@@ -390,7 +389,6 @@ class Angleless(Effect):
     """Base class of effects that depend on the moment alone, not on the motor angle."""
 
     def slope_bound_arcsec_per_deg(self) -> float:
-        """Zero."""
         return 0.0
 
 

@@ -95,7 +95,6 @@ class ChannelSkew(Angleless, Linear):
 
     @classmethod
     def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[ChannelSkew]:
-        """Yields the single candidate."""
         yield cls(ratio=observations.ratio, delay_ms=1.0, second_order_ms2=1.0)
 
     def columns(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
@@ -106,11 +105,9 @@ class ChannelSkew(Angleless, Linear):
         return np.column_stack([1e-3 * gain * speed, 0.5e-6 * gain * acceleration])
 
     def tracker(self, start: Start = Start.VIRGIN) -> Tracker:
-        """Returns an on-line tracker; speed and acceleration come from the moment."""
         return _Tracker(self)
 
     def bound_arcsec(self) -> float:
-        """Bound at the highest speed and acceleration."""
         speed = 1e-3 * abs(self.delay_ms) * self.limit_deg_s
         acceleration = 0.5e-6 * abs(self.second_order_ms2) * self.limit_deg_s2
         return ARCSEC_PER_DEG / self.ratio * (speed + acceleration)

@@ -127,7 +127,6 @@ class Compliance(Angleless, Linear):
         return LoadOrders(ratio=ratio, orders=orders_from([1]))
 
     def needs(self) -> frozenset[Channel]:
-        """Returns the torque channel."""
         return frozenset({Channel(self.torque)})
 
     def columns(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
@@ -155,11 +154,9 @@ class Compliance(Angleless, Linear):
         return effect.model_copy(update={"sense": -self.sense}) if turned else effect
 
     def tracker(self, start: Start = Start.VIRGIN) -> Tracker:
-        """Returns a stateless on-line tracker."""
         return _Tracker(self)
 
     def bound_arcsec(self) -> float:
-        """Wind-up at the highest torque."""
         low, high, most = self.torque1_nm, self.torque2_nm, self.limit_nm
         return (
             abs(self.c1_arcsec_per_nm) * min(most, low)

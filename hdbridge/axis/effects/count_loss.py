@@ -104,25 +104,21 @@ class CountLoss(Angleless):
         return np.column_stack([number >= first - near, number >= first + near]).astype(np.float64)
 
     def pieces(self) -> tuple[Self, ...]:
-        """Returns one effect per step."""
         return tuple(self.model_copy(update={"steps": (each,)}) for each in self.steps)
 
     def joined(self, other: Effect) -> Self | None:
-        """Returns the effect with the steps of both."""
         if not isinstance(other, CountLoss):
             return None
         steps = tuple(sorted((*self.steps, *other.steps), key=lambda each: each.time_s))
         return self.model_copy(update={"steps": steps})
 
     def named_coefficients(self) -> tuple[Coefficient, ...]:
-        """Returns the names of the step sizes."""
         return tuple(
             Coefficient(f"step_{i + 1}_size_arcsec", (i,), ("steps", i, "size_arcsec"))
             for i in range(len(self.steps))
         )
 
     def tracker(self, start: Start = Start.VIRGIN) -> Tracker:
-        """Returns an on-line tracker; it depends only on the clock."""
         return _Tracker([(each.time_s, each.size_arcsec) for each in self.steps])
 
     def columns(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
@@ -131,7 +127,6 @@ class CountLoss(Angleless):
         return (time_s[:, np.newaxis] >= [each.time_s for each in self.steps]).astype(np.float64)
 
     def coefficients(self) -> FloatArray:
-        """Returns the step sizes, arcsec."""
         return np.array([each.size_arcsec for each in self.steps])
 
     def fitted(self, coefficients: FloatArray, shape: Mapping[str, float] | None = None) -> Self:
@@ -146,7 +141,6 @@ class CountLoss(Angleless):
         return self.model_copy(update={"steps": steps})
 
     def bound_arcsec(self) -> float:
-        """Sum of the absolute sizes."""
         return sum(abs(each.size_arcsec) for each in self.steps)
 
 

@@ -114,11 +114,9 @@ class Creep(Angleless):
         return over.since_change(motion)
 
     def pieces(self) -> tuple[Self, ...]:
-        """Returns one effect per exponential."""
         return tuple(self.model_copy(update={"parts": (each,)}) for each in self.parts)
 
     def joined(self, other: Effect) -> Self | None:
-        """Returns the effect with the exponentials of both."""
         if not isinstance(other, Creep):
             return None
         return self.model_copy(update={"parts": (*self.parts, *other.parts)})
@@ -128,14 +126,12 @@ class Creep(Angleless):
         return max(abs(each.amplitude_arcsec) for each in self.parts)
 
     def named_coefficients(self) -> tuple[Coefficient, ...]:
-        """Returns the names of the amplitudes."""
         return tuple(
             Coefficient(f"part_{i + 1}_amplitude_arcsec", (i,), ("parts", i, "amplitude_arcsec"))
             for i in range(len(self.parts))
         )
 
     def tracker(self, start: Start = Start.VIRGIN) -> Tracker:
-        """Returns an on-line tracker, fully relaxed at its first moment."""
         return _Tracker([(each.amplitude_arcsec, each.tau_s) for each in self.parts], self.build_up)
 
     def columns(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
@@ -151,7 +147,6 @@ class Creep(Angleless):
         return columns
 
     def coefficients(self) -> FloatArray:
-        """Returns the amplitudes, arcsec."""
         return np.array([each.amplitude_arcsec for each in self.parts])
 
     def fitted(self, coefficients: FloatArray, shape: Mapping[str, float] | None = None) -> Self:
@@ -167,7 +162,6 @@ class Creep(Angleless):
         return self.model_copy(update={"parts": parts, **given})
 
     def bound_arcsec(self) -> float:
-        """Sum of the absolute amplitudes."""
         return sum(abs(each.amplitude_arcsec) for each in self.parts)
 
 

@@ -84,7 +84,6 @@ class DirectionPhase(Linear):
         return math.cos(order * math.radians(self.shift_deg))
 
     def tracker(self, start: Start = Start.VIRGIN) -> Tracker:
-        """Returns an on-line tracker; the direction comes from the moment."""
         return _Tracker(tuple(self.shift_deg * each for each in self._odd()), start.value)
 
     def columns(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
@@ -95,11 +94,9 @@ class DirectionPhase(Linear):
         return error[:, np.newaxis]
 
     def bound_arcsec(self) -> float:
-        """Sum of A_k |tan(k shift)|."""
         return abs(self.shift_deg) * sum(map(abs, self._odd()))
 
     def slope_bound_arcsec_per_deg(self) -> float:
-        """Sum of k A_k |tan(k shift)|, per degree."""
         steepness = sum(k * abs(each) for k, each in enumerate(reversed(self._odd())))
         return RAD_PER_DEG * abs(self.shift_deg) * steepness
 

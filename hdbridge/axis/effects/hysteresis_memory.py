@@ -70,12 +70,10 @@ class HysteresisMemory(ElasticLoop):
 
     @classmethod
     def of_change(cls, before: Effect, now: Effect) -> HysteresisMemory | None:
-        """Returns this cause if a different hysteresis law explains the change."""
         return now if isinstance(now, cls) and not isinstance(before, cls) else None
 
     @classmethod
     def _carried(cls, base: Sequence[Effect]) -> dict[str, Any]:
-        """Returns the parameters of the model's plain law, else none."""
         for each in base:
             if isinstance(each, Hysteresis):
                 return each.parameters()

@@ -65,7 +65,6 @@ class InertialWindup(Angleless, Linear):
 
     @classmethod
     def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[InertialWindup]:
-        """Yields the single candidate."""
         yield cls(ratio=observations.ratio, inertia_over_stiffness_s2=1e-5)
 
     def columns(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
@@ -87,12 +86,10 @@ class InertialWindup(Angleless, Linear):
         return beyond[:, np.newaxis]
 
     def tracker(self, start: Start = Start.VIRGIN) -> Tracker:
-        """Returns an on-line tracker; acceleration comes from the moment."""
         gain = -ARCSEC_PER_DEG / self.ratio * self.inertia_over_stiffness_s2
         return _Tracker(gain, self.limit_deg_s2)
 
     def bound_arcsec(self) -> float:
-        """Wind-up at the highest acceleration."""
         return ARCSEC_PER_DEG / self.ratio * abs(self.inertia_over_stiffness_s2) * self.limit_deg_s2
 
 

@@ -47,7 +47,6 @@ class MotorEncoderEccentricity(OrderSeries):
 
     @classmethod
     def of_change(cls, before: Effect, now: Effect) -> MotorEncoderEccentricity | None:
-        """Returns this cause if orders 1 and 2 of the model have changed."""
         return cls._change(before, now)
 
     def turns_per_motor_turn(self) -> float:

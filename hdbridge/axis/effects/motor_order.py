@@ -52,12 +52,10 @@ class MotorOrders(OrderSeries):
 
     @classmethod
     def of_change(cls, before: Effect, now: Effect) -> MotorOrders | None:
-        """Returns this cause if the model's orders have changed."""
         return cls._change(before, now)
 
     @classmethod
     def _carried(cls, base: Sequence[Effect]) -> dict[str, Any]:
-        """Returns those of orders 1 to 12 that the model lacks."""
         present = {order.order for each in base if isinstance(each, OrderSeries)
                    if each.turns_per_motor_turn() == 1.0 for order in each.orders}  # fmt: skip
         return {"orders": orders_from(k for k in range(1, 13) if k not in present)}

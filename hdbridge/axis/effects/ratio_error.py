@@ -68,7 +68,6 @@ class RatioError(Linear):
 
     @classmethod
     def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[RatioError]:
-        """Yields the single candidate."""
         yield cls(ramp_arcsec_per_turn=1.0)
 
     def implausible(self, observations: Observations) -> str:
@@ -104,15 +103,12 @@ class RatioError(Linear):
         return (angle / DEG_PER_TURN)[:, np.newaxis]
 
     def tracker(self, start: Start = Start.VIRGIN) -> Tracker:
-        """Returns a stateless on-line tracker."""
         return _Tracker(self.ramp_arcsec_per_turn / DEG_PER_TURN, self.limit_deg)
 
     def bound_arcsec(self) -> float:
-        """Ramp at the limit."""
         return abs(self.ramp_arcsec_per_turn) / DEG_PER_TURN * self.limit_deg
 
     def slope_bound_arcsec_per_deg(self) -> float:
-        """Slope of the ramp, if it falls."""
         return max(-self.ramp_arcsec_per_turn, 0.0) / DEG_PER_TURN
 
 

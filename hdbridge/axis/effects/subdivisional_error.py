@@ -143,16 +143,13 @@ class SubdivisionalError(Angleless):
         return Coordinate(name, "arcsec", np.mod(load, line_deg) * ARCSEC_PER_DEG, bins=48)
 
     def named_coefficients(self) -> tuple[Coefficient, ...]:
-        """Returns the names of amplitude and phase of each order."""
         return named_orders(self.orders)
 
     def predict(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
-        """Returns the error in arcsec, shape (n,)."""
         error: FloatArray = horner(phasors(self.orders), turn_of(self._angle(motion))).real
         return error
 
     def tracker(self, start: Start = Start.VIRGIN) -> Tracker:
-        """Returns an on-line tracker; the load angle comes from the moment."""
         return _Tracker(phasors(self.orders), RAD_PER_DEG * self.lines_per_turn)
 
     def columns(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
@@ -169,7 +166,6 @@ class SubdivisionalError(Angleless):
         return self.model_copy(update=update)
 
     def bound_arcsec(self) -> float:
-        """Sum of the amplitudes."""
         return sum(each.amplitude_arcsec for each in self.orders)
 
     def _angle(self, motion: Motion) -> FloatArray:

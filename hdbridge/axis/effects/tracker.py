@@ -37,7 +37,6 @@ class Memoryless(Tracker):
     """Base class of trackers without state, for which `advance` equals `peek`."""
 
     def advance(self, motor_deg: float, moment: Moment) -> float:
-        """Returns the same as `peek`."""
         return self.peek(motor_deg, moment)
 
 

@@ -124,11 +124,9 @@ class VelocityWindup(Angleless, Linear):
         return (EXPONENT * self.viscous_arcsec_s_per_deg * speed * bent)[:, np.newaxis]
 
     def tracker(self, start: Start = Start.VIRGIN) -> Tracker:
-        """Returns an on-line tracker; speed comes from the moment."""
         return _Tracker(self)
 
     def bound_arcsec(self) -> float:
-        """Wind-up at the highest speed."""
         viscous = self.limit_deg_s / (1.0 + self.limit_deg_s / self.shear_deg_s)
         return abs(self.coulomb_arcsec) + abs(self.viscous_arcsec_s_per_deg) * viscous
 

@@ -81,22 +81,18 @@ class Vibration(Angleless):
         yield cls(frequency_hz=min(max(fast_hz, 0.3), 40.0), amplitude_arcsec=1.0, phase_deg=0.0)
 
     def coordinate(self, motion: Motion, ratio: float) -> Coordinate:
-        """Returns the time within a period."""
         period_s = 1.0 / self.frequency_hz
         within = 1e3 * np.mod(motion.channel(Channel.TIME, self.name), period_s)
         return Coordinate(f"time within a period of {1e3 * period_s:.4g} ms", "ms", within, bins=48)
 
     def named_coefficients(self) -> tuple[Coefficient, ...]:
-        """Returns the names of amplitude and phase."""
         return (Coefficient("", (0, 1), ()),)
 
     def predict(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
-        """Returns the error in arcsec, shape (n,)."""
         error: FloatArray = self.amplitude_arcsec * np.cos(self._angle(motion) + math.radians(self.phase_deg))
         return error
 
     def tracker(self, start: Start = Start.VIRGIN) -> Tracker:
-        """Returns an on-line tracker; it depends only on the clock."""
         return _Tracker(self)
 
     def columns(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
@@ -119,7 +115,6 @@ class Vibration(Angleless):
         return self.model_copy(update=update)
 
     def bound_arcsec(self) -> float:
-        """The amplitude."""
         return self.amplitude_arcsec
 
     def _angle(self, motion: Motion) -> FloatArray:

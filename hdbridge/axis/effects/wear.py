@@ -105,18 +105,15 @@ class Wear(Linear):
         return self.model_copy(update={"turns_before": self.turns_before + turns})
 
     def tracker(self, start: Start = Start.VIRGIN) -> Tracker:
-        """Returns an on-line tracker; its first `advance` only sets the motor position."""
         return _Tracker(self, start, math.inf)
 
     def gentle_tracker(self, start: Start, fall_arcsec_per_deg: float) -> Tracker | None:
-        """Returns a tracker whose crossing takes as much motor angle as the present height requires."""
         if self.growth_arcsec_per_kiloturn >= 0.0:
             return None
         crossing = fall_arcsec_per_deg - self._fastest_growth()
         return _Tracker(self, start, crossing) if crossing > 0.0 else None
 
     def bound_arcsec(self) -> float:
-        """Height at the limit."""
         return abs(self._half(self.turns_limit))
 
     def slope_bound_arcsec_per_deg(self) -> float:

@@ -85,11 +85,9 @@ class ZeroDrift(Angleless, Linear, Warmed):
         return self.warmth(motion)[:, np.newaxis]
 
     def tracker(self, start: Start = Start.VIRGIN) -> Tracker:
-        """Returns an on-line tracker, in equilibrium at its first moment."""
         return _Tracker(self.drift_arcsec_per_k, WarmthState(self))
 
     def bound_arcsec(self) -> float:
-        """Bound at the highest warmth."""
         return abs(self.drift_arcsec_per_k) * self.limit_k
 
 
