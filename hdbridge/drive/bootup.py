@@ -23,7 +23,6 @@ from hdbridge.drive.manners import heartbeat_of
 from hdbridge.drive.monitor import NetworkMonitor
 from hdbridge.drive.nameplate import (
     IDENTITY,
-    Complaint,
     device_type_complaints,
     identity_complaints,
     mode_complaints,
@@ -193,9 +192,9 @@ class BootUp:
 
     # -- verification -------------------------------------------------------------------------------------
 
-    def _refuse(self, complaints: list[Complaint]) -> None:
-        if complaints:
-            raise IdentityError(complaints[0].text)
+    def _refuse(self, complaints: Iterable[str]) -> None:
+        if first := next(iter(complaints), ""):
+            raise IdentityError(first)
 
     def _readings(self, addresses: Iterable[Address]) -> dict[Address, int]:
         """Reads those objects that the EDS lists."""
