@@ -10,11 +10,6 @@ import typer
 from hdbridge.cli.options import HtmlOption, JsonOption, write_json
 
 
-def register(app: typer.Typer) -> None:
-    """Adds the command."""
-    app.command("report")(command)
-
-
 def command(
     recording: Annotated[
         Path, typer.Argument(metavar="RECORDING", help="Folder of a calibration's recording.")

@@ -95,27 +95,6 @@ class Entry:
     that are ``is_known``. The default of an ``is_relative`` one contains the node id.
     """
 
-    __slots__ = (
-        "_bits",
-        "bound",
-        "codec",
-        "default",
-        "follower",
-        "guard",
-        "hidden",
-        "high",
-        "index",
-        "is_known",
-        "is_relative",
-        "low",
-        "mappable",
-        "name",
-        "readable",
-        "sub",
-        "value",
-        "writable",
-    )
-
     def __init__(self, variable: ODVariable, own: ODVariable | None = None) -> None:
         """``own`` is the same object in the bundled EDS: its default serves if the drive's EDS gives none."""
         self.index: Final[int] = variable.index

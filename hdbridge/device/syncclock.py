@@ -21,8 +21,6 @@ class SyncClock:
     It begins with a least-squares line through all SYNCs and ends with fixed gains.
     """
 
-    __slots__ = ("_agreeing", "_count", "_interval_s", "_received_s", "jitter_s", "period_s", "time_s")
-
     def __init__(self, period_s: float) -> None:
         self.period_s = period_s
         self.time_s = self._received_s = -float("inf")

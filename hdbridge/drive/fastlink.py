@@ -46,8 +46,6 @@ def fast_link(link: Link) -> Link:
 class _MessageLink(Link):
     """Link that sends messages that are cheap to copy."""
 
-    __slots__ = ()
-
     def send(self, can_id: int, data: bytes) -> None:
         if self._down is not None:
             raise BusError(self._down)
@@ -59,8 +57,6 @@ class _MessageLink(Link):
 
 class _SocketLink(Link):
     """Link that uses the socket of a python-can SocketCAN bus directly."""
-
-    __slots__ = ("_give", "_sockets", "_take")
 
     def __init__(self, link: Link) -> None:
         super().__init__(link.bus, link.clock)

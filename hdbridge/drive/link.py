@@ -99,11 +99,6 @@ class Link:
     open the bus again and make a new link.
     """
 
-    __slots__ = (
-        "_down", "_matches", "_raw_recv", "_recv", "_send", "bus", "clock", "dropped", "mark", "name", "now",
-        "private",
-    )  # fmt: skip
-
     def __init__(self, bus: can.BusABC, clock: Clock) -> None:
         self.bus = bus
         self.clock = clock

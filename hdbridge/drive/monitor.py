@@ -79,8 +79,6 @@ class NodeStatus:
 class NetworkMonitor:
     """Keeps a `NodeStatus` for each watched node."""
 
-    __slots__ = ("_emergency", "_heartbeat", "nodes")
-
     def __init__(self, *node_ids: int) -> None:
         self.nodes: dict[int, NodeStatus] = {}
         self._heartbeat: dict[int, NodeStatus] = {}

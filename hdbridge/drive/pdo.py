@@ -69,8 +69,6 @@ class PdoCodec:
     and no object occurs twice.
     """
 
-    __slots__ = ("_odd", "_struct", "_unpack", "entries", "length", "positions")
-
     def __init__(self, entries: Iterable[PdoEntry]) -> None:
         self.entries: tuple[PdoEntry, ...] = tuple(entries)
         self._struct = struct.Struct("<" + "".join(_FORMATS[entry.type] for entry in self.entries))

@@ -8,12 +8,10 @@ itself (6065h and 6066h).
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
+from hdbridge.axis import AxisConfig
 from hdbridge.units import ARCSEC_PER_DEG
-
-if TYPE_CHECKING:
-    from hdbridge.axis import AxisConfig
 
 OVERSPEED: Final = 1.5
 """Factor by which a quick stop, an overshoot or a resonance may exceed the axis's velocity limit."""

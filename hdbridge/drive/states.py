@@ -217,8 +217,6 @@ class PowerWalk:
     again, and a fault is reset only on request. A call that raises changes nothing.
     """
 
-    __slots__ = ("_aim", "_reset", "_state", "_was_enabled", "dropped")
-
     def __init__(self) -> None:
         self._state = State.UNKNOWN
         self._aim = State.SWITCH_ON_DISABLED

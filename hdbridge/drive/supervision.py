@@ -136,8 +136,6 @@ class Supervision:
     Memory is bounded: the newest `EVENTS_KEPT` events and a count of each fault are kept.
     """
 
-    __slots__ = ("_frozen", "_runs", "counts", "events", "gravest", "noted", "stop")
-
     def __init__(self) -> None:
         self._runs: dict[Fault, int] = {}
         self._frozen = False

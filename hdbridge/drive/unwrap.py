@@ -20,8 +20,6 @@ class Unwrap:
     the object, or an encoder's total range if it restarts earlier.
     """
 
-    __slots__ = ("_half", "_modulus", "_value")
-
     def __init__(self, modulus: int = INT32_RANGE) -> None:
         if modulus < 2:
             raise ValueError(f"the modulus of a counter is at least 2, not {modulus}")

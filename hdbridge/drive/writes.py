@@ -11,8 +11,11 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from decimal import Decimal
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
+from canopen.objectdictionary import ObjectDictionary, ODVariable
+
+from hdbridge.axis import AxisConfig
 from hdbridge.drive import objects
 from hdbridge.drive.dictionary import find, held, integer_type, is_writable
 from hdbridge.drive.image import position_limits_counts
@@ -20,11 +23,6 @@ from hdbridge.drive.layout import PDOS_PER_KIND, Layout, Layouts
 from hdbridge.drive.objects import PDO_INVALID, Address, IntegerType
 from hdbridge.errors import InputError
 from hdbridge.units import ARCSEC_PER_DEG
-
-if TYPE_CHECKING:
-    from canopen.objectdictionary import ObjectDictionary, ODVariable
-
-    from hdbridge.axis import AxisConfig
 
 SYNCHRONOUS: Final = 1
 """Transmission type: sent, or put into force, at every SYNC."""

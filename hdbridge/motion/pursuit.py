@@ -19,8 +19,6 @@ class Pursuit:
     for the knots of a stream.
     """
 
-    __slots__ = ("_acceleration", "_fastest", "_goal_deg", "_lower", "_period_s", "_upper", "state")
-
     def __init__(self, begin_deg: float, limits: MotionLimits, bounds: Bounds, period_s: float) -> None:
         self._acceleration, self._period_s = limits.acceleration_deg_s2, period_s
         self._fastest = limits.velocity_deg_s * (1.0 + _ROUNDING)

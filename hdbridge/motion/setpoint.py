@@ -30,12 +30,6 @@ class SetPoint:
     and move inwards.
     """
 
-    __slots__ = (
-        "_acceleration_deg_s2", "_aim", "_bounds", "_generator", "_left", "_limits", "_mode", "_path",
-        "_period_s", "_position_deg", "_pursuit", "_since_s", "_steps", "_stream", "_stream_timeout",
-        "_underrun", "_velocity_deg_s",
-    )  # fmt: skip
-
     def __init__(self, limits: MotionLimits, period_s: float) -> None:
         """``period_s`` is the time between two calls of `step`. The set-point is at zero until `reset`.
 

@@ -32,7 +32,6 @@ class Loop(Strict):
     memory: Annotated[bool, Field(description="with return-point memory (hysteresis_memory)")] = False
 
     def law(self) -> Hysteresis | HysteresisMemory:
-        """Returns the effect with these parameters."""
         kind = HysteresisMemory if self.memory else Hysteresis
         # During a fit it may be out of its range, like the effect it was copied from.
         return kind.model_construct(

@@ -50,5 +50,4 @@ class FlexsplineOrders(OrderSeries):
         return Coordinate("angle of the wave generator to the flexspline", "deg", angle)
 
     def turns_per_motor_turn(self) -> float:
-        """1 + 1 / N."""
         return 1.0 + 1.0 / self.ratio

@@ -57,7 +57,7 @@ class Hysteresis(ElasticLoop):
     )
 
     @classmethod
-    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[Hysteresis]:  # noqa: ARG003
+    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[Hysteresis]:
         """Yields a narrow, a typical and a wide loop for a model without one."""
         if all(each.part is not Part.LOOP for each in base):
             for width in (3.0, 20.0, 60.0):
@@ -101,11 +101,6 @@ class _HysteresisTracker(Tracker):
 
     Values are those of a loop of unit offset.
     """
-
-    __slots__ = (
-        "_angle", "_branch_angle", "_branch_value", "_exponent", "_offset", "_sign", "_steepest", "_value",
-        "_virgin", "_width",
-    )  # fmt: skip
 
     def __init__(self, offset: float, width: float, exponent: float, start: Start, steepest: float) -> None:
         self._offset = offset

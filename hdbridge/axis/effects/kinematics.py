@@ -76,8 +76,6 @@ class Observer:
     above.
     """
 
-    __slots__ = ("_angle", "_count", "_direction", "_speed", "_time")
-
     def __init__(self) -> None:
         self._count = 0
         self._angle = self._time = self._speed = 0.0

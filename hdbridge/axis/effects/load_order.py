@@ -75,11 +75,9 @@ class LoadOrders(OrderSeries):
             yield cls(ratio=ratio, orders=orders_from([number]))
 
     def coordinate(self, motion: Motion, ratio: float) -> Coordinate:
-        """Returns the load angle."""
         return replace(over.load_angle(motion, ratio), bins=120)
 
     def turns_per_motor_turn(self) -> float:
-        """1 / N."""
         return 1.0 / self.ratio
 
     def is_compensable(self) -> bool:

@@ -83,7 +83,7 @@ class LocalDefect(Linear):
     ]
 
     @classmethod
-    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[LocalDefect]:  # noqa: ARG003
+    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[LocalDefect]:
         """Yields a tooth in the middle of the travel, as an example."""
         load = float(np.median(observations.motion.motor_deg)) / observations.ratio
         yield cls(
@@ -125,7 +125,6 @@ class LocalDefect(Linear):
         return np.hstack([each.columns(motion) for each in beside])
 
     def coordinate(self, motion: Motion, ratio: float) -> Coordinate:
-        """Returns the load angle."""
         return replace(over.load_angle(motion, ratio), bins=120)
 
     def columns(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
@@ -146,11 +145,9 @@ class LocalDefect(Linear):
         return bump
 
     def tracker(self, start: Start = Start.VIRGIN) -> Tracker:
-        """Returns a stateless on-line tracker."""
         return _Tracker(self)
 
     def bound_arcsec(self) -> float:
-        """Absolute height."""
         return abs(self.height_arcsec)
 
     def slope_bound_arcsec_per_deg(self) -> float:
@@ -159,8 +156,6 @@ class LocalDefect(Linear):
 
 
 class _Tracker(Memoryless):
-    __slots__ = ("_centre", "_height", "_ratio", "_width")
-
     def __init__(self, effect: LocalDefect) -> None:
         self._height = effect.height_arcsec
         self._centre = effect.centre_deg

@@ -40,16 +40,13 @@ class MotorEncoderEccentricity(OrderSeries):
 
     @classmethod
     def proposals(
-        cls,
-        observations: Observations,  # noqa: ARG003
-        base: Sequence[Effect],  # noqa: ARG003
+        cls, observations: Observations, base: Sequence[Effect]
     ) -> Iterator[MotorEncoderEccentricity]:
         """Yields both orders, whether or not the model has them, because they come from one disc."""
         yield cls(orders=orders_from((1, 2)))
 
     @classmethod
     def of_change(cls, before: Effect, now: Effect) -> MotorEncoderEccentricity | None:
-        """Returns this cause if orders 1 and 2 of the model have changed."""
         return cls._change(before, now)
 
     def turns_per_motor_turn(self) -> float:

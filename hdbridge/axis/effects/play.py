@@ -34,8 +34,6 @@ def stop(motor_deg: FloatArray, width_deg: float, start: Start) -> FloatArray:
 class Stop:
     """On-line stop operator: `at` evaluates, `to` moves."""
 
-    __slots__ = ("_angle", "_gain", "_value")
-
     def __init__(self, width_deg: float, start: Start) -> None:
         self._gain = 2.0 / width_deg
         self._value = float(start.value)

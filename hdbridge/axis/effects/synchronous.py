@@ -41,7 +41,7 @@ class Synchronous(OrderSeries):
     """Teeth and the wave generator's bearing wear."""
 
     @classmethod
-    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[Synchronous]:  # noqa: ARG003
+    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[Synchronous]:
         """Yields none, because its orders are read from a spectrum."""
         return iter(())
 

@@ -14,8 +14,6 @@ class Tracker(ABC):
     `advance` changes the state.
     """
 
-    __slots__ = ()
-
     @property
     def memory_deg(self) -> float:
         """Motor angle that, run in one direction, makes the state independent of the start.
@@ -38,14 +36,9 @@ class Tracker(ABC):
 class Memoryless(Tracker):
     """Base class of trackers without state, for which `advance` equals `peek`."""
 
-    __slots__ = ()
-
     def advance(self, motor_deg: float, moment: Moment) -> float:
-        """Returns the same as `peek`."""
         return self.peek(motor_deg, moment)
 
 
 class Level(Memoryless):
     """Base class of trackers whose error is the same at every motor angle: the moment alone decides."""
-
-    __slots__ = ()

@@ -88,8 +88,6 @@ class Warmed(Effect):
 class WarmthState:
     """On-line warmth: `at` evaluates, `to` advances."""
 
-    __slots__ = ("_by_time", "_final", "_limit", "_reference", "_start", "_tau", "_temperature", "_time")
-
     def __init__(self, effect: Warmed) -> None:
         self._tau = effect.tau_s
         self._by_time = effect.driven_by == "time"

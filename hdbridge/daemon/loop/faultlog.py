@@ -32,8 +32,6 @@ class Tell(Protocol):
 class FaultLog:
     """Reports the faults of one axis without repeating those that persist."""
 
-    __slots__ = ("_axis", "_noted", "_over", "_seen", "_supervision", "_tell")
-
     def __init__(self, axis: int, supervision: Supervision, tell: Tell, period_s: float) -> None:
         self._axis, self._supervision, self._tell = axis, supervision, tell
         self._over = math.ceil(OVER_S / period_s)

@@ -46,12 +46,6 @@ class AxisSetup:
 class Follower:
     """Computes the target of one axis, turn by turn."""
 
-    __slots__ = (
-        "_axis", "_has_channels", "_image", "_issued", "_load_loop", "_load_loop_on", "_most",
-        "_needs", "_observer", "_ratio", "compensating", "correction", "loop_arcsec", "sensed",
-        "set_point", "target_deg",
-    )  # fmt: skip
-
     def __init__(self, setup: AxisSetup, image: ProcessImage) -> None:
         config = setup.config
         view = axis_view(config)

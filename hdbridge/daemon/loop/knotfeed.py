@@ -22,8 +22,6 @@ class KnotFeed:
     it begins, because they may be handed over shortly before the present one ends.
     """
 
-    __slots__ = ("_ending", "_following", "_knots", "_set_point", "_stream")
-
     def __init__(self, knots: Queue[Knot], set_point: SetPoint) -> None:
         self._knots, self._set_point = knots, set_point
         self._stream = 0

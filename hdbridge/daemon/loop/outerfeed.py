@@ -24,8 +24,6 @@ class OuterFeed:
     an interruption takes effect.
     """
 
-    __slots__ = ("_before", "_knots", "_last", "_patience_s", "_series", "received_s")
-
     def __init__(self, knots: Queue[OuterKnot]) -> None:
         self._knots = knots
         self._series = 0

@@ -18,7 +18,7 @@ from hdbridge.daemon.memory.layout import (
     sample_dtype,
 )
 from hdbridge.daemon.memory.memory import Memory
-from hdbridge.daemon.memory.samples import SampleArray, SampleReader, joined_samples
+from hdbridge.daemon.memory.samples import SampleArray, joined_samples
 from hdbridge.daemon.memory.status import Cell, OuterCells
 
 __all__ = [
@@ -42,7 +42,6 @@ __all__ = [
     "RingReader",
     "SampleArray",
     "SampleFlag",
-    "SampleReader",
     "joined_samples",
     "sample_dtype",
 ]

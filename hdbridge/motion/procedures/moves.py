@@ -100,8 +100,6 @@ class Procedure(Protocol[Outcome]):
 class _Timed:
     """A leg that ends with its path."""
 
-    __slots__ = ()
-
     def ended(self, samples: Sequence[Sample]) -> bool:
         """Returns True."""
         return True

@@ -18,7 +18,6 @@ from hdbridge.daemon.api.routes.parts import (
     stopped,
 )
 from hdbridge.daemon.service.bridge import ServiceBridge
-from hdbridge.daemon.service.commissioning import HomingRun
 from hdbridge.daemon.service.moves import WayPoint
 
 
@@ -82,7 +81,7 @@ def _add_motion(routes: APIRouter, bridge: ServiceBridge) -> None:
     ) -> messages.AxisState:
         """Home by a method of the drive, disabled before and after."""
         found = port(bridge, axis)
-        await kept(bridge, holder, request, found.home(holder, HomingRun(**home.model_dump())))
+        await kept(bridge, holder, request, found.home(holder, home))
         return found.state()
 
     @routes.post("/move", tags=["Move"], responses=refusals(MOVING))
