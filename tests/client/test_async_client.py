@@ -5,7 +5,7 @@ import asyncio
 from hdbridge import AsyncClient
 
 
-def test_a_task_that_is_cancelled_gives_the_lease_back(api):
+def test_a_cancelled_task_releases_the_lease(api):
     api.bridge.axes["joint-1"].moving_s = 30.0
 
     async def use() -> None:

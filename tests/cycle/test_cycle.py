@@ -46,7 +46,7 @@ def test_the_feedback_follows_the_target(moving) -> None:
     assert last.demand_counts == pytest.approx(last.motor_counts, abs=200)
 
 
-def test_a_command_of_none_holds_the_last_target(moving) -> None:
+def test_no_command_holds_the_last_target(moving) -> None:
     moving.move()
     moving.cycle.tick(None)
     moving.cycle.tick(lambda feedback: None)
@@ -54,7 +54,7 @@ def test_a_command_of_none_holds_the_last_target(moving) -> None:
     assert targets == [moving.target] * 3
 
 
-def test_before_the_drive_is_enabled_the_target_is_where_it_stands(idle) -> None:
+def test_the_target_is_the_actual_position_before_power(idle) -> None:
     for _ in range(10):
         feedback = idle.cycle.tick(123_456)
     assert idle.drive.image.power.state is not State.OPERATION_ENABLED
@@ -85,7 +85,7 @@ def test_an_overrun_skips_whole_periods_and_never_bursts(moving) -> None:
     assert moving.supervision.stop is None
 
 
-def test_late_but_less_than_half_a_period_is_only_recorded(moving) -> None:
+def test_less_than_half_a_period_late_is_only_recorded(moving) -> None:
     moving.move()
     moving.clock.sleep_until(moving.clock.now() + 0.0055)
     moving.move()
@@ -93,7 +93,7 @@ def test_late_but_less_than_half_a_period_is_only_recorded(moving) -> None:
     assert 1400 <= moving.cycle.histogram.maximum_us <= 1600
 
 
-def test_a_rest_is_not_judged_after_restart(moving) -> None:
+def test_a_pause_is_not_judged_after_a_restart(moving) -> None:
     moving.cycle.tick()
     number = moving.cycle.tick().cycle
     moving.drive.image.power.go(State.SWITCHED_ON)
@@ -108,7 +108,7 @@ def test_a_rest_is_not_judged_after_restart(moving) -> None:
     assert moving.cycle.skipped == 0
 
 
-def test_errors_of_the_command_pass_through(moving) -> None:
+def test_exceptions_of_the_command_propagate(moving) -> None:
     def broken(feedback: Feedback) -> int:
         raise ZeroDivisionError
 

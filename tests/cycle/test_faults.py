@@ -20,14 +20,14 @@ FREEZE, STOP, LATCH = Reaction.FREEZE, Reaction.QUICK_STOP, Reaction.LATCH
 # ------------------------------------------------------------------ TPDOs
 
 
-def test_a_tpdo_lost_in_turns_stops_too(moving) -> None:
+def test_alternately_lost_tpdos_stop_the_axis(moving) -> None:
     moving.node.faults.drop_tpdos = 1
     moving.move()
     moving.node.faults.hold_tpdos = 1
     moving.stopped_within(1, Fault.LOST_TPDO)
 
 
-def test_the_newest_of_one_identifier_wins(moving) -> None:
+def test_the_newest_frame_of_an_identifier_counts(moving) -> None:
     place = moving.move().motor_counts
     moving.node.faults.silent = True
     first, second = (struct.pack("<Hih", 0x1237, place + counts, 0) for counts in (10, 20))
@@ -36,7 +36,7 @@ def test_the_newest_of_one_identifier_wins(moving) -> None:
     assert moving.drive.image.motor_counts == place + 20
 
 
-def test_a_late_tpdo_is_thrown_away_and_not_taken_for_the_next_cycle(moving) -> None:
+def test_a_late_tpdo_is_discarded_not_used_in_the_next_cycle(moving) -> None:
     moving.node.faults.hold_tpdos = 1
     assert not moving.move().fresh
     after = moving.move(3)
@@ -84,13 +84,13 @@ def test_frames_of_other_nodes_are_ignored(moving) -> None:
 # ------------------------------------------------------------------ the drive
 
 
-def test_the_end_of_an_emergency_and_a_short_one_harm_nothing(moving) -> None:
+def test_error_reset_and_short_emergencies_are_harmless(moving) -> None:
     moving.interfere(0x081, bytes(8))
     moving.interfere(0x081, b"\x10")
     assert moving.move(3).fresh
 
 
-def test_a_fault_of_the_drive_stops_and_is_named(moving) -> None:
+def test_a_drive_fault_stops_the_axis_and_is_named(moving) -> None:
     moving.node.faults.raise_error(0x3210)
     text = moving.stopped_within(2, Fault.DRIVE_FAULT)
     assert "the drive sent EMCY 3210h (DC link over-voltage)" in text
@@ -100,7 +100,7 @@ def test_a_fault_of_the_drive_stops_and_is_named(moving) -> None:
 
 
 @pytest.mark.parametrize("stays", [False, True], ids=["leaves operational", "stays operational"])
-def test_a_hang_of_this_process_is_told_as_that(moving, stays: bool) -> None:
+def test_a_stall_of_the_control_process_is_reported_as_such(moving, stays: bool) -> None:
     """The drive gave its master up meanwhile: neither an NMT master nor an enable input has to do with it."""
     moving.node.faults.stay_operational = stays
     moving.move()
@@ -115,7 +115,7 @@ def test_a_hang_of_this_process_is_told_as_that(moving, stays: bool) -> None:
     moving.stands_still()
 
 
-def test_a_stall_stops_the_axis_whether_or_not_the_drive_has_noticed(moving) -> None:
+def test_a_stall_stops_the_axis_even_if_the_drive_ignores_it(moving) -> None:
     moving.node.faults.ignore_missing_set_points = True
     moving.move()
     moving.clock.sleep_until(moving.clock.now() + 0.03)
@@ -124,14 +124,14 @@ def test_a_stall_stops_the_axis_whether_or_not_the_drive_has_noticed(moving) -> 
     moving.stands_still()
 
 
-def test_a_stall_without_power_is_no_reason_to_stop(idle) -> None:
+def test_a_stall_without_power_does_not_latch_a_stop(idle) -> None:
     idle.cycle.tick()
     idle.clock.sleep_until(idle.clock.now() + 0.03)
     idle.cycle.tick()
     assert idle.supervision.stop is None
 
 
-def test_a_drive_that_leaves_operational_says_why(moving) -> None:
+def test_leaving_operational_is_reported_with_its_cause(moving) -> None:
     moving.interfere(0x081, struct.pack("<HB5x", 0x8130, 0x11))
     moving.interfere(0x701, b"\x7f")
     text = moving.stopped_within(1, Fault.MASTER_LOST)
@@ -143,7 +143,7 @@ def test_a_drive_that_leaves_operational_says_why(moving) -> None:
 # ------------------------------------------------------------------ plausibility
 
 
-def test_a_single_encoder_jump_is_not_believed(moving) -> None:
+def test_a_single_encoder_jump_is_ignored(moving) -> None:
     before = moving.move()
     moving.node.faults.load_jump_counts = 100_000
     moving.move()  # the jump is in the sample after the next SYNC

@@ -368,7 +368,7 @@ def test_a_vendor_object_as_load_encoder(
     assert drive.read_positions().load_counts == -3
 
 
-def test_a_load_encoder_that_is_a_node_of_its_own(
+def test_load_encoder_on_a_separate_node(
     bus: Any, clock: Any, tiny: Any, channel: str, build_axis: Callable[..., AxisConfig]
 ) -> None:
     source = {"index": 0x60E4, "subindex": 1, "type": "int32", "node": 2}

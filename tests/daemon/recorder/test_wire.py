@@ -46,7 +46,7 @@ def test_states_have_names():
     assert kind.DESCRIPTOR.fields_by_name["fault"].enum_type.values_by_number[255].name == "FAULT_NONE"
 
 
-def test_it_is_decoded_to_the_last_bit():
+def test_messages_are_decoded_exactly():
     made = samples(30)
     made["axes"]["issued_deg"][5] = np.nan
     made["axes"]["state"] = np.arange(30)[:, None] * 8 % 256
@@ -63,7 +63,7 @@ def test_messages_of_another_layout_are_refused():
 
 
 @pytest.mark.parametrize("message", [AXIS, MACHINE])
-def test_a_recording_from_before_the_last_fields_is_read_without_them(message):
+def test_recordings_without_the_newest_fields_are_read(message):
     made = samples(3)
     data = axis_messages(made, 0) if message is AXIS else machine_messages(made)
     offsets = [message.layout.fields[name][1] for name in message.layout.names]
@@ -78,5 +78,5 @@ def test_a_recording_from_before_the_last_fields_is_read_without_them(message):
                 assert not np.any(np.nan_to_num(column.astype(float)))
 
 
-def test_no_message_is_no_row():
+def test_no_messages_give_no_rows():
     assert len(AXIS.decode([])["cycle"]) == 0
