@@ -18,7 +18,7 @@ FORWARD = [True, True, False, False, True, True, False, False]
 S = 2.0**0.5
 
 
-def test_a_small_example_worked_by_hand():
+def test_matches_an_example_worked_by_hand():
     found = axis_accuracy(TARGET, DEVIATION, FORWARD)
     assert found.reversal == pytest.approx(5.0)
     assert found.mean_reversal == pytest.approx(5.0)

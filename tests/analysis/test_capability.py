@@ -78,7 +78,7 @@ def test_a_record_without_rests_shows_no_creep(speeds: list[float]) -> None:
 
 @FEW
 @given(st.lists(st.sampled_from([-60.0, -10.0, 0.0, 10.0, 60.0]), min_size=4, max_size=8).filter(any))
-def test_what_no_channel_was_recorded_for_is_not_seen(speeds: list[float]) -> None:
+def test_effects_of_a_missing_channel_are_not_visible(speeds: list[float]) -> None:
     motor = path(speeds, 40.0)
     rng = np.random.default_rng(2)
     without, measured = (
@@ -100,7 +100,7 @@ def test_slow_reversals_and_rests_show_the_loop() -> None:
 
 @FEW
 @given(legs, st.booleans())
-def test_every_subject_is_spoken_of_and_is_either_seen_or_not(speeds: list[float], back: bool) -> None:
+def test_every_subject_is_listed_as_visible_or_not(speeds: list[float], back: bool) -> None:
     motor = path([*speeds, *(-each for each in speeds)] if back else speeds, 40.0)
     details, found = examined(record(motor, 40.0, 0.3), MODEL)
     subjects = {CATALOGUE[name].about.subject or name.replace("_", " ") for name in causes()}
@@ -116,11 +116,11 @@ def test_every_subject_is_spoken_of_and_is_either_seen_or_not(speeds: list[float
 @pytest.mark.parametrize(
     ("probability", "word"), [(0.95, ""), (0.7, "probably "), (0.6, "perhaps "), (0.0, "perhaps ")]
 )
-def test_a_probability_has_one_word(probability: float, word: str) -> None:
+def test_each_probability_maps_to_one_word(probability: float, word: str) -> None:
     assert certainty(probability) == word
 
 
-def test_the_sentence_reads_as_it_should() -> None:
+def test_summary_sentence_is_grammatical() -> None:
     found = Capability(("no slow motion", "no reversals"), ("orders",), (), ("hysteresis", "backlash"), 0.97)
     assert found.sentence() == (
         "This record has no slow motion and no reversals: orders can be identified, hysteresis and backlash "

@@ -48,7 +48,7 @@ def spoilt(record: Record, row: int, **values: float) -> Record:
 
 @pytest.mark.parametrize("names", [["load"], ["motor"], ["load", "motor"]])
 @pytest.mark.parametrize("row", [0, 700, 701, -1])
-def test_a_reading_of_zero_is_left_out_and_told(names: list[str], row: int) -> None:
+def test_zero_readings_are_dropped_and_reported(names: list[str], row: int) -> None:
     record = sweeps(begin_deg=500.0)
     bad = spoilt(record, row, **{f"{each}_position_deg": 0.0 for each in names})
     seen = observed(bad, RATIO)
@@ -57,7 +57,7 @@ def test_a_reading_of_zero_is_left_out_and_told(names: list[str], row: int) -> N
     assert "misread" in seen.remarks[0]
 
 
-def test_one_reading_of_zero_takes_no_order_from_a_fit() -> None:
+def test_a_single_zero_reading_does_not_remove_an_order_from_the_fit() -> None:
     record = sweeps(begin_deg=500.0)
     clean = identify([Recording(record)], RATIO)
     found = identify([Recording(spoilt(record, 700, load_position_deg=0.0))], RATIO)
@@ -67,7 +67,7 @@ def test_one_reading_of_zero_takes_no_order_from_a_fit() -> None:
 
 
 @pytest.mark.parametrize("tick_s", [0.02, 0.025, 0.07])
-def test_samples_of_a_coarse_clock_are_spread_over_its_ticks_and_that_is_told(tick_s: float) -> None:
+def test_coarse_time_stamps_are_interpolated_and_reported(tick_s: float) -> None:
     record = sweeps()
     ticks = tick_s * np.floor(record.time_s / tick_s + 1e-9)
     seen = observed(Record({**record.columns, "time_s": ticks}), RATIO)
@@ -83,7 +83,7 @@ def test_samples_taken_twice_stay_as_they_are() -> None:
     assert observed(twice, RATIO).record is twice
 
 
-def test_an_axis_as_it_moves_is_neither_cut_nor_misread() -> None:
+def test_normal_motion_is_neither_cut_nor_dropped() -> None:
     record = sweeps()
     seen = observed(record, RATIO)
     assert seen.record is record
@@ -98,7 +98,7 @@ def test_an_axis_as_it_moves_is_neither_cut_nor_misread() -> None:
     assert observed(Record(columns), RATIO).remarks == ()
 
 
-def test_a_jump_that_no_motor_makes_is_a_cut_and_no_reversal() -> None:
+def test_an_impossible_jump_is_a_cut_not_a_reversal() -> None:
     """1,876 motor degrees in 10 ms: put together from two one-way moves."""
     parts = [sweeps(begin_deg=begin).rows(60, 560) for begin in (0.0, -876.0)]
     joined = concatenate(parts)
@@ -112,7 +112,7 @@ def test_a_jump_that_no_motor_makes_is_a_cut_and_no_reversal() -> None:
     assert all(each.probability <= 0.6 for each in found.findings if each.cause != "unexplained")
 
 
-def test_settling_summed_over_files_is_no_reversal() -> None:
+def test_settling_across_files_is_not_a_reversal() -> None:
     parts = []
     for begin in (0.0, 40.0, 80.0):
         part = sweeps(begin_deg=begin).rows(0, 600)
@@ -126,7 +126,7 @@ def test_settling_summed_over_files_is_no_reversal() -> None:
     assert all(each.probability <= 0.6 for each in found.findings if each.cause != "unexplained")
 
 
-def test_orders_of_motor_and_flexspline_are_aliases_until_they_have_parted() -> None:
+def test_motor_and_flexspline_orders_are_aliases_on_short_travel() -> None:
     model = TransmissionModel.from_text(
         "schema: hdbridge.model/1\nratio: 20\neffects:\n  - effect: synchronous\n    parameters:\n"
         "      orders: [{order: 1, amplitude_arcsec: 5, phase_deg: -120.3}, "
@@ -139,7 +139,7 @@ def test_orders_of_motor_and_flexspline_are_aliases_until_they_have_parted() -> 
         assert ("flexspline_order" in (order.cause, *order.aliases)) != apart
 
 
-def test_a_model_without_a_loop_is_to_be_fitted_first() -> None:
+def test_a_model_without_hysteresis_must_be_fitted_first() -> None:
     for offset in (30.0, -30.0):
         found = diagnose(sweeps(offset=offset, turns=2.0), TransmissionModel(RATIO, ()))
         said = next(each for each in found.remarks if "no elastic loop" in each)
@@ -149,7 +149,7 @@ def test_a_model_without_a_loop_is_to_be_fitted_first() -> None:
         assert all("fit a model first" in each.experiment for each in unknown)
 
 
-def test_torque_beyond_the_range_of_an_effect_is_told() -> None:
+def test_torque_beyond_the_range_of_an_effect_is_reported() -> None:
     model = TransmissionModel.from_text(
         "schema: hdbridge.model/1\nratio: 20\neffects:\n  - effect: compliance\n    parameters: "
         "{c1_arcsec_per_nm: 1, c2_arcsec_per_nm: 1, c3_arcsec_per_nm: 1, torque1_nm: 1, torque2_nm: 2, "
@@ -162,7 +162,7 @@ def test_torque_beyond_the_range_of_an_effect_is_told() -> None:
 
 
 @pytest.mark.parametrize("cut", [False, True])
-def test_the_command_makes_nothing_worse_where_a_record_ends_in_motion(cut: bool) -> None:
+def test_command_worsens_nothing_if_a_record_ends_in_motion(cut: bool) -> None:
     """A motor that follows its command with a lag, half a second of rest, then under way to the end."""
     time_s = 0.01 * np.arange(110)
     gone = np.maximum(time_s - 0.3, 0.0)

@@ -7,7 +7,7 @@ import numpy as np
 from hdbridge.analysis.linear import solve_symmetric
 
 
-def test_columns_of_nothing_beside_columns_that_are_alike_stay_at_zero() -> None:
+def test_zero_columns_next_to_collinear_columns_stay_at_zero() -> None:
     """The second spring constant of a record whose torque stays below the first break, and two orders that
     are one on a short arc.
     """

@@ -34,13 +34,13 @@ def words(path: Path) -> Iterator[str]:
                 yield from (word.strip(".,:;()'") for word in text.split())
 
 
-def test_there_is_something_to_look_at() -> None:
+def test_sources_are_found() -> None:
     assert len(FILES) > 20
     assert {"OrderSeries", "ElasticLoop", "Linear"} - CLASSES == {"Linear"}
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda each: f"{each.parent.name}/{each.stem}")
-def test_no_cause_and_no_class_of_one_is_named(path: Path) -> None:
+def test_shared_code_names_no_cause(path: Path) -> None:
     used = set(words(path))
     assert not used & CLASSES
     # "creep" and "wear" are words too: what gives a name of the catalogue away is that it stands alone.

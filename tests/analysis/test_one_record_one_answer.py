@@ -49,13 +49,13 @@ def seen(request: pytest.FixtureRequest) -> Seen:
     return Seen(calibration, prepared.gather(record, RATIO))
 
 
-def test_both_are_driven_by_the_same_angle_at_the_same_speed(seen: Seen) -> None:
+def test_both_use_the_same_driving_angle_and_speed(seen: Seen) -> None:
     motion = seen.diagnosis.full.motion
     assert np.array_equal(motion.motor_deg, seen.calibration.motor_deg)
     assert np.array_equal(motion.channel(Channel.SPEED, "both"), seen.calibration.speed_deg_s)
 
 
-def test_both_find_the_same_orders_and_loop_as_surely(seen: Seen) -> None:
+def test_both_find_the_same_orders_and_loop_with_the_same_uncertainty(seen: Seen) -> None:
     """The same white noise and blocks handed in: orders, loop and standard errors to 1e-6."""
     table = seen.calibration
     design = Design.of(table, make_blocks(table), [Start.VIRGIN])

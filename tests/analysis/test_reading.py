@@ -42,7 +42,7 @@ def turns(measured: np.ndarray, target: np.ndarray | None) -> int:
     noise=st.sampled_from([0.0, 0.5]),
     commanded=st.booleans(),
 )
-def test_the_number_of_reversals_does_not_depend_on_digits_counts_or_home(
+def test_reversal_count_is_independent_of_digits_counts_and_home(
     counts: int, digits: int, home_deg: float, noise: float, commanded: bool
 ) -> None:
     rng = np.random.default_rng(1)
@@ -54,7 +54,7 @@ def test_the_number_of_reversals_does_not_depend_on_digits_counts_or_home(
 
 @pytest.mark.parametrize("counts", COUNTS[:3])
 @pytest.mark.parametrize("digits", [9, 10, 12, 17])
-def test_a_count_is_seen_through_the_digits_of_a_file(counts: int, digits: int) -> None:
+def test_encoder_count_is_found_despite_rounded_digits(counts: int, digits: int) -> None:
     count = 360.0 / counts
     read = kept(np.round(bench(np.random.default_rng(2)) / count) * count + 4321.0, digits)
     if count > 6.0 * 10.0 ** (5 - digits):
@@ -62,7 +62,7 @@ def test_a_count_is_seen_through_the_digits_of_a_file(counts: int, digits: int) 
 
 
 @pytest.mark.parametrize("noise_deg", [0.0, 0.002, 0.05])
-def test_where_no_count_is_seen_the_jitter_says_how_fine_a_reading_is(noise_deg: float) -> None:
+def test_without_a_visible_count_jitter_gives_the_resolution(noise_deg: float) -> None:
     rng = np.random.default_rng(3)
     true = bench(rng)
     reading = reading_of(true + noise_deg * rng.normal(size=len(true)))
@@ -70,14 +70,14 @@ def test_where_no_count_is_seen_the_jitter_says_how_fine_a_reading_is(noise_deg:
     assert reading.jitter_deg == pytest.approx(noise_deg, rel=0.15, abs=1e-4)
 
 
-def test_what_settles_by_less_than_the_narrowest_loop_does_not_reverse() -> None:
+def test_settling_within_the_narrowest_loop_is_not_a_reversal() -> None:
     settles = np.concatenate([np.linspace(0.0, 360.0, 200), [360.07, 360.0, 360.05], np.full(20, 360.0)])
     assert reversals(settles, 0.0) == 0
     back = np.concatenate([settles, np.linspace(360.0, 359.0, 20)])
     assert reversals(back, 0.0) == 1
 
 
-def test_moves_that_bend_within_a_sample_are_no_jitter_of_a_counted_angle() -> None:
+def test_curved_motion_between_samples_is_not_jitter() -> None:
     """Fast moves at 14 Hz, with rests in which the reading flickers by a third of a count."""
     rng = np.random.default_rng(4)
     angle = np.repeat(np.cumsum(rng.choice([-90.0, 90.0], 120)), 8) + np.tile([-50.0, *[0.0] * 7], 120)

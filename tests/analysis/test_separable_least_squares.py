@@ -48,7 +48,7 @@ def terms(truth: tuple[Effect, ...], seed: int = 3) -> Terms:
     )
 
 
-def test_the_minimum_is_that_of_scipy_on_all_parameters_at_once() -> None:
+def test_minimum_equals_that_of_scipy() -> None:
     given = terms((RIPPLE, LOOP))
     found = Separable(given).fit((RIPPLE, LOOP.model_copy(update={"width_deg": 33.0, "exponent": 2.3})))
 
@@ -70,7 +70,7 @@ def test_the_minimum_is_that_of_scipy_on_all_parameters_at_once() -> None:
     assert np.diag(spread) == pytest.approx(np.diag(other), rel=0.02)
 
 
-def test_a_shape_ends_on_the_edge_of_its_range() -> None:
+def test_shape_parameters_stop_at_their_bounds() -> None:
     narrow = LOOP.model_copy(update={"exponent": 1.02})
     data = terms((narrow,))
     steep = replace(data, observed=data.observed + 15.0 * np.sign(np.diff(MOTION.motor_deg, prepend=0.0)))
@@ -78,7 +78,7 @@ def test_a_shape_ends_on_the_edge_of_its_range() -> None:
     assert (0, "exponent") in found.at_bound
 
 
-def test_what_is_known_beforehand_counts_as_so_many_observations() -> None:
+def test_a_prior_acts_like_observations() -> None:
     """A prior is a further row of the least squares."""
     data = terms((LOOP,))
     prior = {(0, "0"): Prior(30.0, 4.0), (0, "width_deg"): Prior(float(np.log(25.0)), 900.0)}
@@ -98,7 +98,7 @@ def test_what_is_known_beforehand_counts_as_so_many_observations() -> None:
     assert np.abs(slope) == pytest.approx(0.0, abs=0.02 * np.sqrt(np.max(np.diag(held.information))))
 
 
-def test_what_the_data_do_not_show_stays_where_it_was_known_to_be() -> None:
+def test_unobserved_parameters_stay_at_their_prior() -> None:
     unseen = Creep(parts=(Relaxation(amplitude_arcsec=1.0, tau_s=3.0),))
     data = terms((RIPPLE,))
     blind = replace(
@@ -119,7 +119,7 @@ def test_a_coefficient_of_the_wrong_sign_is_held_at_zero() -> None:
     assert found.free() == 1
 
 
-def test_what_an_effect_carries_of_another_one_is_exchanged_as_the_fit_goes_on() -> None:
+def test_nested_parameters_are_updated_during_the_fit() -> None:
     """The shift of the two directions is one of the orders as they are fitted, not as they were given."""
     phase = DirectionPhase(orders=RIPPLE.orders, shift_deg=4.0)
     data = replace(terms((RIPPLE, phase)), columns=lambda effect: effect.columns(MOTION, Start.FORWARD))

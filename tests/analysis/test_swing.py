@@ -55,7 +55,7 @@ def test_a_steady_acceleration_winds_the_load_up() -> None:
     assert found.does_arcsec[1500] == pytest.approx(-360_000.0 / (math.tau * 40.0) ** 2, rel=1e-3)
 
 
-def test_a_lag_that_changes_within_a_few_samples_is_no_noise_of_the_encoder() -> None:
+def test_a_quickly_changing_lag_is_not_encoder_noise() -> None:
     """The motor rings about its command in every move and never rests."""
     time_s = np.arange(600) * 0.006
     target = 200.0 * np.sin(math.tau * 1.5 * time_s)
@@ -66,7 +66,7 @@ def test_a_lag_that_changes_within_a_few_samples_is_no_noise_of_the_encoder() ->
     assert np.max(np.abs(driven.motor_deg - counted)[moving]) <= 0.501 * COUNT_DEG
 
 
-def test_fast_moves_of_a_healthy_axis_are_silent_and_its_swing_is_a_remark() -> None:
+def test_fast_moves_of_a_healthy_axis_yield_a_remark_only() -> None:
     """The record begins in the middle of a move, with the elastic state of what went before."""
     step_s, fine = 0.004, 8
     clock_s = np.arange(round(24.0 / step_s) * fine) * step_s / fine

@@ -83,7 +83,7 @@ def test_any_optional_objects_may_be_absent(
         assert record.columns["motor_target_deg"] == pytest.approx(usual.columns["motor_target_deg"], abs=0.1)
 
 
-def test_the_needed_objects_alone_will_do(tmp_path: Path, usual: Record) -> None:
+def test_mandatory_objects_alone_are_sufficient(tmp_path: Path, usual: Record) -> None:
     axis = profile_with(tmp_path, without(OWN, *(each for each in OPTIONAL if each != 0x607A)))
     _, record = stepped(axis)
     assert record.columns["load_position_deg"] == pytest.approx(usual.columns["load_position_deg"], abs=1e-9)
@@ -108,7 +108,7 @@ def test_fixed_mappings_in_another_order_on_other_pdos(tmp_path: Path, usual: Re
     assert record.columns["load_position_deg"] == pytest.approx(usual.columns["load_position_deg"], abs=1e-9)
 
 
-def test_a_fixed_mapping_that_the_eds_gets_wrong_is_refused(tmp_path: Path) -> None:
+def test_a_fixed_mapping_wrong_in_the_eds_is_refused(tmp_path: Path) -> None:
     axis = profile_with(tmp_path, mapped(OWN, 0x1801, 0x60E40120, 0x60640020))
     with (
         simulated_bench(tmp_path / "truth.yaml", bundled_folder("eds") / "hdbridge-402.eds") as (
@@ -136,7 +136,7 @@ def test_a_fixed_mapping_that_the_eds_gets_wrong_is_refused(tmp_path: Path) -> N
         ("60C2sub2", -4, 50, r"does not permit 50 ms"),
     ],
 )
-def test_a_period_of_which_a_part_is_fixed(
+def test_partly_fixed_interpolation_period(
     tmp_path: Path, name: str, value: int, cycle: float, refused: str | None
 ) -> None:
     edits = [("cycle_ms: 4 ", f"cycle_ms: {cycle} "), ("heartbeat_ms: 50", "heartbeat_ms: 200")]
@@ -206,7 +206,7 @@ def test_limits_of_a_part_of_a_value_are_not_those_of_the_value(tmp_path: Path) 
     assert [row.value for row in plan(axis) if row.index == 0x1016] == [127 << 16 | 50]
 
 
-def test_limits_that_leave_no_choice_mean_none(tmp_path: Path) -> None:
+def test_equal_limits_count_as_no_limits(tmp_path: Path) -> None:
     eds = stating(stating(OWN, "6007", LowLimit=0, HighLimit=0), "6072", LowLimit="", HighLimit="none")
     assert left_to_drive(profile_with(tmp_path, eds)) == []
 
@@ -236,7 +236,7 @@ def test_the_limits_of_6060h_count_if_6502h_gives_no_value(
             assert [each.index for each in left_to_drive(axis)] == [0x6502]
 
 
-def test_a_missing_mode_is_named_before_what_the_mode_would_need(tmp_path: Path) -> None:
+def test_a_missing_mode_is_reported_before_its_objects(tmp_path: Path) -> None:
     """A load encoder, or an EDS with 60C1h, does not help a drive that lacks the mode."""
     eds = stating(without(OWN, 0x60E4, 0x60C1), "6502", DefaultValue="0x25")
     for mode in ("csp", "ip"):
@@ -256,9 +256,7 @@ def test_a_missing_mode_is_named_before_what_the_mode_would_need(tmp_path: Path)
         ("0x00000003", "csp", r"this drive cannot be used: choose one with cyclic synchronous"),
     ],
 )
-def test_a_missing_mode_is_seen_at_the_desk(
-    tmp_path: Path, modes: str, mode: str, refused: str | None
-) -> None:
+def test_check_reports_a_missing_mode(tmp_path: Path, modes: str, mode: str, refused: str | None) -> None:
     axis = profile_with(tmp_path, stating(OWN, "6502", DefaultValue=modes), (MODE, f"{MODE}  mode: {mode}\n"))
     if refused:
         with pytest.raises(InputError, match=refused):
@@ -267,7 +265,7 @@ def test_a_missing_mode_is_seen_at_the_desk(
         stepped(axis)
 
 
-def test_the_mode_of_interpolation_on_a_drive_that_has_nothing_else(tmp_path: Path, usual: Record) -> None:
+def test_interpolated_position_mode_as_the_only_mode(tmp_path: Path, usual: Record) -> None:
     """As on several harmonic arms: no 607Ah in an RPDO, no option codes, 6502h with PP, VL and IP."""
     eds = without(
         OWN, 0x6007, 0x605A, 0x605B, 0x605C, 0x605D, 0x605E, 0x6066, 0x6072, 0x6080, 0x6085, 0x1029, 0x6099
@@ -288,7 +286,7 @@ def test_the_load_encoder_in_an_object_of_the_vendors(tmp_path: Path, usual: Rec
     assert offset_deg == pytest.approx(0x10000 * 360 / 2_880_000, abs=1e-9)  # it begins below zero
 
 
-def test_an_identity_that_only_the_device_info_gives(tmp_path: Path) -> None:
+def test_identity_from_the_device_info_section(tmp_path: Path) -> None:
     eds = OWN
     for sub in (1, 2, 3):
         eds = stating(eds, f"1018sub{sub}", DefaultValue=None)

@@ -54,7 +54,7 @@ def motor_deg(node, axis) -> float:
     return axis.motor_encoder.degrees(node.dictionary.value(0x6064))
 
 
-def test_with_both_parts_the_axis_points_to_within_the_floor(axis, model, bench_on):
+def test_extended_compensation_reaches_the_noise_floor(axis, model, bench_on):
     drive, _ = bench_on
     schemes = (Scheme.NONE, Scheme.SYNCHRONOUS, Scheme.HYSTERESIS, Scheme.BOTH)
     comparison = compare_schemes(drive, model, schemes, Stepping(count=33))
@@ -86,7 +86,7 @@ def test_power_is_on_only_while_a_procedure_runs_and_switching_moves_nothing(axi
     assert abs(motor_deg(node, axis)) < 0.01
 
 
-def test_there_is_time_between_two_procedures(axis, bench_on):
+def test_pauses_between_procedures_are_allowed(axis, bench_on):
     """A pause without heartbeats (files are written, say) is no fault while power is off."""
     drive, _ = bench_on
     bench = Bench(drive)
@@ -98,7 +98,7 @@ def test_there_is_time_between_two_procedures(axis, bench_on):
     assert not any(bench.supervision.counts.values())
 
 
-def test_the_record_has_what_was_commanded_and_measured(axis, bench_on):
+def test_record_contains_commands_and_measurements(axis, bench_on):
     drive, _ = bench_on
     bench = Bench(drive)
     run = bench.run(Moves(MoveTo(1.0), Dwell(0.2), MoveTo(0.0), Dwell(0.2)))

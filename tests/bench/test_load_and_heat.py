@@ -79,7 +79,7 @@ class Script:
         return False
 
 
-def test_with_the_load_torque_a_mass_on_the_axis_is_made_up_for():
+def test_a_mass_on_the_axis_is_compensated_with_load_torque():
     axis = axis_with()
     three_sigma, mean = {}, {}
     for model in (model_with(), model_with(compliance())):
@@ -100,7 +100,7 @@ def test_with_the_load_torque_a_mass_on_the_axis_is_made_up_for():
     assert abs(mean[3]) < 1
 
 
-def test_with_the_load_torque_a_ripple_that_grows_with_it_is_made_up_for():
+def test_load_dependent_ripple_is_compensated_with_load_torque():
     axis = axis_with()
     growth = TorqueModulation.candidate(50.0, model_with().effects).model_copy(
         update={"growth_percent_per_nm": 5.0, "limit_nm": 12.0}
@@ -116,7 +116,7 @@ def test_with_the_load_torque_a_ripple_that_grows_with_it_is_made_up_for():
     assert three_sigma[1] < 1.3 * floor
 
 
-def test_with_the_temperature_a_warm_gear_is_made_up_for():
+def test_a_warm_gear_is_compensated_with_temperature():
     axis = axis_with()
     drift = AmplitudeDrift.candidate(50.0, model_with().effects).model_copy(
         update={"ripple_percent_per_k": 1.0, "friction_percent_per_k": 0.0}
@@ -152,7 +152,7 @@ def test_an_axis_without_channels_records_none():
     assert "temperature_c" not in record.columns
 
 
-def test_a_torque_that_stays_away_is_held_then_faded_out_and_comes_back_without_a_jump():
+def test_a_missing_torque_is_held_then_faded_out_and_returns_without_a_jump():
     axis = axis_with()
     with loaded(axis) as (drive, node):
         # 60 degrees take 3.2 s; then the axis stands.
@@ -176,7 +176,7 @@ def test_a_torque_that_stays_away_is_held_then_faded_out_and_comes_back_without_
     assert np.abs(np.diff(at_rest)).max() <= 360 / axis.motor_encoder.counts_per_turn + 1e-9
 
 
-def test_a_torque_that_stays_away_in_motion_makes_no_jump():
+def test_a_torque_lost_in_motion_causes_no_jump():
     axis = axis_with()
     with loaded(axis) as (drive, node):
         # Up to the 750th cycle or so the axis moves at full speed.
@@ -189,7 +189,7 @@ def test_a_torque_that_stays_away_in_motion_makes_no_jump():
     assert np.abs(steps_deg - 4.0).max() < (8 + 3.24 + 1) / 72
 
 
-def test_a_reading_that_cannot_be_is_held_and_moves_nothing():
+def test_an_implausible_reading_is_held_and_moves_nothing():
     axis = axis_with()
     with loaded(axis) as (drive, node):
         wrong = []
@@ -219,7 +219,7 @@ def test_a_channel_that_never_comes_is_refused_before_the_axis_moves():
         assert node.firmware.statusword() & 0x6F == 0x40
 
 
-def test_a_model_that_needs_what_the_axis_has_not_is_refused_for_compensation():
+def test_a_model_with_missing_channels_is_refused_for_compensation():
     without = axis_with("")
     with pytest.raises(InputError, match=r"'compliance' needs load_torque_nm, .*add 'load_torque' to .*axis"):
         compensation_for(without, model_with(compliance()))

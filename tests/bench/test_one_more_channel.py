@@ -81,7 +81,7 @@ print("correction:", compensation.correction_arcsec)
 """
 
 
-def test_a_channel_more_is_one_row(tmp_path):
+def test_a_new_channel_needs_one_table_row(tmp_path):
     package = tmp_path / "hdbridge"
     shutil.copytree(ROOT / "hdbridge", package, ignore=shutil.ignore_patterns("__pycache__"))
     for folder in ("eds", "profiles"):

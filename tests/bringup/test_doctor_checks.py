@@ -39,7 +39,7 @@ def test_a_sound_axis_passes_every_check(case: Callable[..., Any]) -> None:
     assert abs(examined.node.firmware.motion.motor_counts) < 4000  # it came back, but for the last stop
 
 
-def test_the_axis_turns_to_the_side_that_has_room(case: Callable[..., Any]) -> None:
+def test_test_motion_turns_toward_the_side_with_room(case: Callable[..., Any]) -> None:
     verdicts = case(axis={"position_max_deg: 400": "position_max_deg: 0.5"}).run(until="turn")
     assert failures(verdicts) == []
     assert verdicts["turn"].figures["forward_motor_counts"] == pytest.approx(-8000, abs=1)
@@ -146,7 +146,7 @@ def _without(*keys: tuple[int, int]) -> Callable[[DriveNode], None]:
 
 
 @pytest.mark.parametrize(("name", "parts", "check", "text"), WRONG, ids=[row[0] for row in WRONG])
-def test_what_is_wrong_is_named(
+def test_each_fault_is_found_and_its_key_named(
     case: Callable[..., Any], name: str, parts: dict[str, Any], check: str, text: str
 ) -> None:
     verdicts = case(**parts).run(until=check)
@@ -180,9 +180,7 @@ DefaultValue=200
 }
 
 
-def test_gains_that_were_changed_since_the_response_was_measured(
-    case: Callable[..., Any], tmp_path: Path
-) -> None:
+def test_gains_changed_since_the_response_measurement(case: Callable[..., Any], tmp_path: Path) -> None:
     examined = case(eds=GAIN_EDS, drive_has_eds=True)
     response = Response(
         cycle_ms=4.0,
@@ -237,7 +235,7 @@ CHANNELS = {
 }
 
 
-def test_what_load_torque_and_temperature_tell(case: Callable[..., Any]) -> None:
+def test_load_torque_and_temperature_readings_are_shown(case: Callable[..., Any]) -> None:
     verdicts = case(axis=CHANNELS).run(until="rest")
     assert failures(verdicts) == []
     assert "; load torque 0 Nm; temperature 22 \N{DEGREE SIGN}C" in verdicts["rest"].measured
@@ -263,7 +261,7 @@ def test_a_torque_that_the_drive_does_not_have(case: Callable[..., Any]) -> None
     assert "2101h:00" in verdicts["files"].measured + " ".join(verdicts["files"].remedies)
 
 
-def test_the_eds_of_another_drive(case: Callable[..., Any]) -> None:
+def test_eds_of_another_drive(case: Callable[..., Any]) -> None:
     verdicts = case(spoil=_without((0x6085, 0), (0x6007, 0))).run(until="eds")
     assert failures(verdicts) == ["eds"]
     assert "axis.yaml:13:3: drive.eds: found hdbridge-402.eds" in verdicts["eds"].remedies[0]

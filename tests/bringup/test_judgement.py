@@ -76,7 +76,7 @@ def opposite(way: Turned) -> Turned:
     signs=st.tuples(st.sampled_from([1, -1]), st.sampled_from([1, -1])),
     backwards=st.booleans(),
 )
-def test_a_right_file_passes_whatever_it_says(
+def test_any_correct_file_passes(
     ratio: int, motor: int, load: int, signs: tuple[int, int], backwards: bool
 ) -> None:
     one = file(ratio, motor, load, *signs)
@@ -90,7 +90,7 @@ def test_a_right_file_passes_whatever_it_says(
     ratio=st.integers(30, 200),
     signs=st.tuples(st.sampled_from([1, -1]), st.sampled_from([1, -1])),
 )
-def test_a_wrong_direction_is_always_a_direction(ratio: int, signs: tuple[int, int]) -> None:
+def test_a_wrong_direction_is_always_reported_as_direction(ratio: int, signs: tuple[int, int]) -> None:
     said, true = file(ratio, 8000, 2880000, *signs), file(ratio, 8000, 2880000, signs[0], -signs[1])
     way = turned(true, said)
     verdict = judge_turn(said, way, opposite(way))
@@ -116,7 +116,7 @@ def test_a_wrong_direction_is_always_a_direction(ratio: int, signs: tuple[int, i
         ((50, 8000, 2_880_000), (50, 8000, 1 << 20), LOAD_COUNTS, 1 << 20, (MOTOR_COUNTS, RATIO)),
     ],
 )
-def test_the_likeliest_key_is_accused_first(
+def test_most_likely_key_is_reported_first(
     said: tuple[float, int, int],
     true: tuple[float, int, int],
     key: str,
@@ -135,7 +135,7 @@ def test_the_likeliest_key_is_accused_first(
 
 
 @given(factor=st.floats(0.05, 20.0))
-def test_every_accusation_would_explain_the_factor(factor: float) -> None:
+def test_each_suspected_key_explains_the_factor(factor: float) -> None:
     one, tolerance = file(50, 8000, 2_880_000), 0.007
     for each in accuse(one, factor, tolerance):
         ratio = each.expected / each.found
@@ -143,7 +143,7 @@ def test_every_accusation_would_explain_the_factor(factor: float) -> None:
         assert abs(explained / factor - 1.0) <= 2.0 * tolerance
 
 
-def test_a_slipping_load_encoder_is_no_wrong_key() -> None:
+def test_a_slipping_load_encoder_is_not_a_wrong_key() -> None:
     one = axis()
     verdict = judge_turn(one, Turned(8000, 57600 * 1.04), Turned(-8000, -57600 * 0.96))
     assert verdict.outcome is Outcome.FAIL
@@ -209,7 +209,7 @@ def test_a_travel_stays_within_the_limits(here: float, ratio: int) -> None:
         assert plan.span_deg % 360.0 == 0.0
 
 
-def test_checks_run_in_order_and_need_what_they_need() -> None:
+def test_checks_run_in_order_with_their_prerequisites() -> None:
     def broken(_: None) -> object:
         raise DriveError("no answer")
 

@@ -119,7 +119,7 @@ def test_a_node_that_another_client_talks_to_is_left_alone() -> None:
     assert not [each for each in seen if each.arbitration_id == 0x601 and each.data[0] == 0x80]
 
 
-def test_another_master_and_silent_nodes_are_told() -> None:
+def test_another_master_and_silent_nodes_are_reported() -> None:
     with bench((0x080, b""), (0x000, b"\x01\x00"), (0x714, b"\x04")) as (link, _, _):
         found = scan_bus(link, force=True)
     stopped = found.node(0x14)
@@ -130,7 +130,7 @@ def test_another_master_and_silent_nodes_are_told() -> None:
 
 
 @pytest.mark.parametrize("can_id", [0x080, 0x000, 0x77F, 0x201, 0x405], ids=hex)
-def test_nothing_is_asked_while_another_master_runs(can_id: int) -> None:
+def test_scan_sends_nothing_while_another_master_runs(can_id: int) -> None:
     with (
         bench((can_id, b"\x05\x00")) as (link, _, seen),
         pytest.raises(BusInUseError, match=rf"another master is on this bus.*\({can_id:03X}h\)"),
@@ -167,7 +167,7 @@ def test_the_drive_of_the_axis_file_is_recognised() -> None:
         ((Node(1, answers=True, device_type=401),), "input/output module"),
     ],
 )
-def test_why_the_drive_is_not_the_one_of_the_axis_file(nodes: tuple[Node, ...], text: str) -> None:
+def test_differences_from_the_axis_file_are_listed(nodes: tuple[Node, ...], text: str) -> None:
     matches, lines = compare(AXIS, Scan(nodes))
     assert not matches
     assert text in "\n".join(lines)

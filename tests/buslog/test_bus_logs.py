@@ -217,7 +217,7 @@ def test_an_mf4_log_without_its_reader_names_the_extra(tmp_path: Path) -> None:
         import_log(tmp_path / "bus.mf4", AXIS)
 
 
-def test_without_a_position_demand_the_target_that_was_sent_is_the_command(
+def test_without_6062h_the_target_is_the_command(
     tmp_path: Path, without_demand: Logged, logged: Logged
 ) -> None:
     """The same axis and seed: the drive reaches what was sent two cycles before."""
@@ -229,7 +229,7 @@ def test_without_a_position_demand_the_target_that_was_sent_is_the_command(
     np.testing.assert_allclose(target[known], demand, atol=1e-9)
 
 
-def test_targets_that_are_ends_of_moves_are_no_command(tmp_path: Path, without_demand: Logged) -> None:
+def test_profile_targets_are_not_a_command(tmp_path: Path, without_demand: Logged) -> None:
     """A drive in profile position mode plans the move itself."""
     constant = replace(without_demand)
     constant.messages = [
@@ -279,7 +279,7 @@ def test_without_sdo_traffic_the_mapping_is_that_of_the_axis_file(tmp_path: Path
     check_angles(Recording.load(tmp_path / "made"), logged)
 
 
-def test_another_order_than_that_of_the_axis_file_is_noticed(tmp_path: Path, logged: Logged) -> None:
+def test_a_mapping_different_from_the_axis_file_is_reported(tmp_path: Path, logged: Logged) -> None:
     path = in_order_of_axis_file(logged, swapped=True).write(tmp_path / "bus.log")
     with pytest.raises(InputError, match="the mapping is that of the axis file, the log may use another"):
         import_log(path, AXIS)
@@ -322,7 +322,7 @@ UNREADABLE = {
 
 
 @pytest.mark.parametrize(("name", "content"), UNREADABLE.items())
-def test_a_file_that_is_no_log_is_refused_in_one_line(tmp_path: Path, name: str, content: bytes) -> None:
+def test_a_file_that_is_not_a_log_is_refused_in_one_line(tmp_path: Path, name: str, content: bytes) -> None:
     (tmp_path / name).write_bytes(content)
     with pytest.raises(InputError) as caught:
         import_log(tmp_path / name, AXIS)
@@ -330,7 +330,7 @@ def test_a_file_that_is_no_log_is_refused_in_one_line(tmp_path: Path, name: str,
     assert "\n" not in str(caught.value)
 
 
-def test_a_log_that_was_cut_off_is_read_up_to_there(tmp_path: Path, logged: Logged) -> None:
+def test_a_truncated_log_is_read_to_its_end(tmp_path: Path, logged: Logged) -> None:
     """The logger was killed, or its disk was full."""
     text = logged.write(tmp_path / "whole.log").read_text()
     (tmp_path / "bus.log").write_text(text[: len(text) // 2])
@@ -432,7 +432,7 @@ def test_event_driven_pdos_are_read_if_one_carries_both_encoders(tmp_path: Path)
         import_log(write_frames(tmp_path / "apart.log", apart), AXIS)
 
 
-def test_a_load_encoder_that_is_a_node_of_its_own(tmp_path: Path) -> None:
+def test_load_encoder_on_a_separate_node(tmp_path: Path) -> None:
     """An absolute encoder of 16 bits whose count wraps, on node 5, with a mapping of its own."""
     text = (ARTICLE / "axis.yaml").read_text()
     source = "{index: 0x60E4, subindex: 1, type: int32, via: tpdo}"

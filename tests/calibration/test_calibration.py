@@ -15,7 +15,7 @@ def truth(cell):
     return yaml.safe_load((cell.axis / "truth.yaml").read_text())["gear"]
 
 
-def test_a_bare_axis_gets_a_model_that_waits_to_be_committed(calibrated_once):
+def test_a_new_axis_gets_a_pending_model(calibrated_once):
     cell, done = calibrated_once
     result = cell.json("result.json")
     assert result["schema"] == "hdbridge.calibration/1"
@@ -28,7 +28,7 @@ def test_a_bare_axis_gets_a_model_that_waits_to_be_committed(calibrated_once):
     assert "100 %" in done.stderr
 
 
-def test_the_model_is_the_gear_that_the_simulated_drive_has(calibrated_once):
+def test_model_matches_the_simulated_gear(calibrated_once):
     cell, _ = calibrated_once
     model = TransmissionModel.load(cell.axis / "pending.yaml")
     parts = {each.name: each.parameters() for each in model.effects}
@@ -42,7 +42,7 @@ def test_the_model_is_the_gear_that_the_simulated_drive_has(calibrated_once):
     assert parts["hysteresis"]["width_deg"] == pytest.approx(known["hysteresis"]["width_deg"], rel=0.2)
 
 
-def test_the_axis_points_better_with_it(calibrated_once):
+def test_model_improves_positioning(calibrated_once):
     stepping = calibrated_once[0].json("result.json")["stepping"]
     before, after = (stepping[name]["pooled"]["three_sigma_arcsec"] for name in ("before", "after"))
     assert before > 80
@@ -54,7 +54,7 @@ def test_the_axis_points_better_with_it(calibrated_once):
     assert accuracy["before"]["reversal_arcsec"] > 50
 
 
-def test_the_recording_is_kept_with_what_moved_how(calibrated_once):
+def test_recording_is_kept_with_its_segments(calibrated_once):
     cell, _ = calibrated_once
     recording = Recording.load(cell.folder / "rec")
     assert recording.axis == "demo"
@@ -69,7 +69,7 @@ def test_the_recording_is_kept_with_what_moved_how(calibrated_once):
     assert (cell.folder / "rec" / "stepping-after.csv.gz").exists()
 
 
-def test_measure_records_the_same_and_makes_nothing_of_it(calibrated_once, cell):
+def test_measure_records_the_same_without_fitting(calibrated_once, cell):
     done = cell.run("measure", "axis", "--simulate", "--plan", "short.yaml", "--out", "rec")
     assert "recording: rec, 5 tasks" in done.stdout
     assert "hdbridge twin axis rec" in done.stdout
@@ -80,7 +80,7 @@ def test_measure_records_the_same_and_makes_nothing_of_it(calibrated_once, cell)
     assert "0 tasks (5 tasks are there already)" in again.stderr
 
 
-def test_the_model_says_where_it_comes_from(calibrated_once):
+def test_model_states_its_provenance(calibrated_once):
     cell, _ = calibrated_once
     source = TransmissionModel.load(cell.axis / "pending.yaml").provenance
     assert source["recordings"] == ["rec"]
@@ -92,7 +92,7 @@ def test_the_model_says_where_it_comes_from(calibrated_once):
     assert "3 sigma" in source["reason"]
 
 
-def test_the_report_is_the_same_calibration_again_without_an_axis(calibrated):
+def test_report_reproduces_the_calibration_without_an_axis(calibrated):
     before = calibrated.json("result.json")
     done = calibrated.run("report", "rec", "--json", "again.json")
     again = calibrated.json("again.json")
@@ -102,13 +102,13 @@ def test_the_report_is_the_same_calibration_again_without_an_axis(calibrated):
     assert "hysteresis" in done.stdout
 
 
-def test_committed_it_is_what_step_uses(calibrated):
+def test_step_uses_the_committed_model(calibrated):
     calibrated.run("model", "commit", "axis")
     calibrated.run("step", "axis", "--simulate", "--count", 8, "--json", "step.json", "--scheme", "both")
     assert calibrated.json("step.json")["both"]["pooled"]["three_sigma_arcsec"] < 6.0
 
 
-def test_a_model_that_is_not_better_is_not_offered(calibrated):
+def test_a_model_without_improvement_is_not_proposed(calibrated):
     calibrated.run("model", "commit", "axis")
     active = (calibrated.axis / "model.yaml").read_bytes()
     done = calibrated.calibrate("--resume", "rec", "--json", "again.json")
@@ -122,7 +122,7 @@ def test_a_model_that_is_not_better_is_not_offered(calibrated):
     assert (calibrated.axis / "model.yaml").read_bytes() == active
 
 
-def test_a_model_of_another_drive_is_not_compared_with(calibrated):
+def test_models_of_other_drives_are_not_compared(calibrated):
     calibrated.run("model", "commit", "axis")
     path = calibrated.axis / "model.yaml"
     text = path.read_text()
@@ -142,20 +142,20 @@ def test_the_recording_of_another_axis_is_refused(calibrated):
     assert "other" in done.stderr
 
 
-def test_a_recording_is_not_written_over(calibrated):
+def test_recordings_are_never_overwritten(calibrated):
     before = (calibrated.folder / "rec" / "recording.yaml").read_bytes()
     done = calibrated.calibrate("--plan", "short.yaml", "--out", "rec", status=2)
     assert "--resume" in done.stderr
     assert (calibrated.folder / "rec" / "recording.yaml").read_bytes() == before
 
 
-def test_a_recording_that_was_changed_is_noticed(calibrated):
+def test_a_modified_recording_is_detected(calibrated):
     path = calibrated.folder / "rec" / "02-sweep.csv.gz"
     path.write_bytes(path.read_bytes()[:-1] + b"x")
     done = calibrated.calibrate("--resume", "rec", status=2)
     assert "changed since" in done.stderr
 
 
-def test_the_result_holds_no_figure_that_json_does_not_know(calibrated_once):
+def test_result_is_valid_json(calibrated_once):
     text = (calibrated_once[0].folder / "result.json").read_text()
     assert json.loads(text, parse_constant=pytest.fail)

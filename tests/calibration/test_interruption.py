@@ -57,7 +57,7 @@ def test_ctrl_c_keeps_the_record_and_resume_completes_it(cell):
     assert result["stepping"]["before"]["pooled"]["three_sigma_arcsec"] > 80
 
 
-def test_a_kill_keeps_every_task_that_was_done(cell):
+def test_a_kill_keeps_every_finished_task(cell):
     process = begun(cell)
     process.kill()
     process.communicate()

@@ -40,7 +40,7 @@ def measured(cell, silent_cycles):
     return {each["file"]: each["lost"] for each in about["notes"]["tasks"] if "lost" in each}, survived
 
 
-def test_a_channel_lost_on_the_way_is_told_and_kept_in_mind(cell):
+def test_a_channel_lost_during_calibration_is_reported_and_remembered(cell):
     lost_in, survived_in = measured(cell, silent_cycles=range(1700, 1760))
     lost, channels = lost_in.popitem()
     assert channels == ["load_torque"]

@@ -32,7 +32,7 @@ def beyond(entry):
 
 @pytest.mark.parametrize("name", ["quick", "full"])
 @pytest.mark.parametrize("ratio", [30.0, 50.0, 160.0])
-def test_the_bundled_plans_have_what_a_calibration_needs(name, ratio):
+def test_bundled_plans_suit_a_calibration(name, ratio):
     tasks = Plan.load(name).tasks(AxisView(ratio, WIDE))
     found = sweeps(tasks)
     assert max(each.high_deg - each.low_deg for each in found) == pytest.approx(720)
@@ -42,7 +42,7 @@ def test_the_bundled_plans_have_what_a_calibration_needs(name, ratio):
         assert procedure in words
 
 
-def test_the_quick_plan_shows_whether_the_gear_remembers_where_it_turned():
+def test_quick_plan_shows_return_point_memory():
     plan = Plan.load("quick")
     model = TransmissionModel(50.0, (Hysteresis(offset_arcsec=30, width_deg=20, exponent=1.6),))
     only = plan.model_copy(update={"procedures": tuple(each for each in plan.procedures if not beyond(each))})
@@ -52,7 +52,7 @@ def test_the_quick_plan_shows_whether_the_gear_remembers_where_it_turned():
     assert unseen["detectable"] is False
 
 
-def test_quick_takes_minutes_and_full_does_not():
+def test_quick_plan_takes_minutes_and_the_full_plan_longer():
     axis = AxisView(50.0, WIDE)
     quick, full = (
         sum(rehearse(each.procedure, axis).duration_s for each in Plan.load(name).tasks(axis).tasks)
@@ -68,7 +68,7 @@ def test_quick_takes_minutes_and_full_does_not():
     ratio=st.floats(30, 160),
     start=st.floats(0, 1),
 )
-def test_no_plan_leaves_the_limits_wherever_it_begins(low, travel, speed, ratio, start):
+def test_plans_stay_within_limits_from_any_start(low, travel, speed, ratio, start):
     axis = AxisView(ratio, MotionLimits(low, low + travel, speed, 200.0, 4000.0))
     plan = Plan.load("quick")
     try:
@@ -84,7 +84,7 @@ def test_no_plan_leaves_the_limits_wherever_it_begins(low, travel, speed, ratio,
         assert walked.highest_deg <= low + travel
 
 
-def test_what_is_shortened_is_said():
+def test_shortened_tasks_are_reported():
     tasks = Plan.load("quick").tasks(AxisView(50.0, MotionLimits(0.0, 100.0, 2.0, 200.0, 4000.0)))
     (sweep, _) = sweeps(tasks)
     assert 90 < sweep.high_deg - sweep.low_deg < 100
@@ -95,7 +95,7 @@ def test_what_is_shortened_is_said():
     assert "slowed" in notes
 
 
-def test_every_task_begins_at_the_same_pose_coming_the_same_way():
+def test_every_task_starts_from_the_same_pose_and_direction():
     axis = AxisView(50.0, WIDE)
     for task in Plan.load("quick").tasks(axis).tasks:
         moves = task.procedure.moves(axis)
@@ -119,14 +119,14 @@ def test_every_task_begins_at_the_same_pose_coming_the_same_way():
         ("  []", ("procedures",)),
     ],
 )
-def test_a_wrong_plan_is_refused_with_the_place(procedures, words):
+def test_a_wrong_plan_is_refused_with_its_location(procedures, words):
     with pytest.raises(InputError) as caught:
         plan_of(procedures)
     for word in words:
         assert word in str(caught.value)
 
 
-def test_a_plan_that_is_not_there_names_those_that_are():
+def test_an_unknown_plan_lists_the_known_ones():
     with pytest.raises(InputError, match=r"quik: no such plan; .*full, quick; did you mean 'quick'"):
         Plan.load("quik")
 
@@ -137,7 +137,7 @@ def test_a_plan_survives_being_written_into_a_recording():
 
 
 @pytest.mark.parametrize(("travel", "count"), [(80.0, 3), (170.0, 5), (360.0, 8)])
-def test_the_positioning_test_has_as_many_targets_as_the_standard_asks(travel, count):
+def test_positioning_test_has_the_number_of_targets_of_the_standard(travel, count):
     axis = AxisView(50.0, WIDE)
     plan = plan_of("  - {procedure: standstill}\n", f"validation: {{travel_deg: {travel}}}\n")
     places = plan.positioning(axis).targets_deg
@@ -169,7 +169,7 @@ def test_every_target_is_approached_from_either_side_five_times():
     assert all(each.error_arcsec == pytest.approx(1.0) for each in approaches)
 
 
-def test_a_move_whose_limits_and_distance_meet_in_a_point_is_found():
+def test_a_move_exactly_at_its_limits_is_planned():
     path = MoveTo(16.5).path(15.499999999999998, MotionLimits(0.0, 20.0, 10.0, 200.0, 4000.0))
     assert path.duration_s == pytest.approx(0.2, abs=1e-4)
     assert path.at(path.duration_s) == 16.5

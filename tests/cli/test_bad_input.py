@@ -42,7 +42,7 @@ COMPLIANCE = """\
 """
 
 
-def test_a_model_that_needs_what_the_axis_cannot_tell_is_refused_for_compensation(hdbridge, profile):
+def test_a_model_needing_unavailable_channels_is_refused_for_compensation(hdbridge, profile):
     folder = profile("# Made from printed tables", COMPLIANCE + "# Made from printed tables", "model.yaml")
     refused(hdbridge("check", folder), 2, "'compliance' needs load_torque_nm", "add 'load_torque' to")
     refused(hdbridge("step", folder, "--simulate"), 2, "'compliance' needs load_torque_nm", "axis.yaml")
@@ -72,7 +72,7 @@ def test_truth_without_simulation(hdbridge, profile):
     refused(hdbridge("step", "article", "--truth", profile.folder / "truth.yaml"), 2, "--simulate")
 
 
-def test_a_scheme_that_the_model_does_not_have(hdbridge):
+def test_a_scheme_not_in_the_model_is_refused(hdbridge):
     refused(hdbridge("step", "article", "--simulate", "--scheme", "extended"), 2, "extended")
 
 
@@ -105,7 +105,7 @@ def test_a_model_of_another_axis_is_refused_before_anything_is_connected(hdbridg
         assert "booted" not in done.stderr
 
 
-def test_a_cap_that_cuts_the_model_is_said_by_check_and_before_steps(hdbridge, profile):
+def test_a_cap_that_limits_the_model_is_reported_by_check_and_before_steps(hdbridge, profile):
     folder = profile("maximum_arcsec: ", "maximum_arcsec: 40 # not ")
     for command in (("check", folder), ("step", folder, "--simulate", "--count", 2, "--scheme", "both")):
         done = hdbridge(*command)

@@ -50,7 +50,7 @@ def write(path, motor_deg, columns=("time_s", "motor_position_deg", "load_positi
 BOTH_WAYS = (0, 1800, 0, 60, 50, 60, 0, 30, 0)
 
 
-def test_a_model_from_somebody_elses_csv(hdbridge, tmp_path):
+def test_a_model_from_a_foreign_csv_file(hdbridge, tmp_path):
     name = write(tmp_path / "theirs.csv", motor_path(*BOTH_WAYS))
     done = hdbridge("fit", name, "--ratio", 50, "--out", "model.yaml", "--json", "fit.json")
     assert done.returncode == 0, done.stderr
@@ -70,7 +70,7 @@ def test_a_model_from_somebody_elses_csv(hdbridge, tmp_path):
     assert result["recordings"] == [name]
 
 
-def test_a_record_without_reversals_says_what_it_cannot_tell(hdbridge, tmp_path):
+def test_a_record_without_reversals_reports_its_limits(hdbridge, tmp_path):
     name = write(tmp_path / "one-way.csv", motor_path(0, 3600))
     done = hdbridge("fit", name, "--ratio", 50, "--out", "model.yaml")
     assert done.returncode == 0, done.stderr
@@ -90,7 +90,7 @@ def test_a_second_fit_is_compared_with_the_active_model(hdbridge, tmp_path):
     assert {each["parameter"] for each in result["changes"]} >= {"offset_arcsec", "width_deg"}
 
 
-def test_a_reader_that_goes_away_gets_every_file(unread, tmp_path):
+def test_a_closed_output_pipe_still_yields_every_file(unread, tmp_path):
     name = write(tmp_path / "theirs.csv", motor_path(*BOTH_WAYS))
     files = ("--json", "out.json", "--html", "page.html")
     assert "Traceback" not in unread("fit", name, "--ratio", 50, "--out", "model.yaml", *files)
@@ -138,7 +138,7 @@ def test_plans_that_cannot_be_run_are_refused_before_anything_moves(hdbridge, pr
     assert not (tmp_path / "recordings").exists()
 
 
-def test_an_axis_that_may_hardly_move_cannot_be_calibrated(hdbridge, profile):
+def test_an_axis_with_too_little_travel_cannot_be_calibrated(hdbridge, profile):
     profile("position_min_deg: -400", "position_min_deg: -1")
     folder = profile("position_max_deg: 400", "position_max_deg: 1")
     done = hdbridge("calibrate", folder, "--simulate")

@@ -29,7 +29,7 @@ SOURCE = "source: {index: 0x60E4, subindex: 1, type: int32, via: tpdo}"
          [r"fixed mapping  201h: 6040h:00 uint16, 607Ah:00 int32, 60FEh:01 uint16", r"sent along  60FEh:01 = 3 in RPDO1"]),
     ],
 )  # fmt: skip
-def test_what_is_left_to_the_drive_is_listed_and_all_is_right(hdbridge, tmp_path, eds, lines):
+def test_values_left_to_the_drive_are_listed(hdbridge, tmp_path, eds, lines):
     profile_with(tmp_path / "axis", eds)
     done = hdbridge("check", "axis", "--json", "found.json")
     assert done.returncode == 0, done.stderr
@@ -60,7 +60,7 @@ def test_what_is_left_to_the_drive_is_listed_and_all_is_right(hdbridge, tmp_path
         (OWN.replace("[6064]\n", "[6064]\nDataType=zz\n"), None, r"drive\.eds:\d+: \[6064\] DataType: found 'zz'; expected a number"),
     ],
 )  # fmt: skip
-def test_what_cannot_be_is_refused_at_the_desk(hdbridge, tmp_path, eds, edit, complaint):
+def test_impossible_settings_are_refused_by_check(hdbridge, tmp_path, eds, edit, complaint):
     profile_with(tmp_path / "axis", eds, *([edit] if edit else []))
     for command in (("check", "axis"), ("step", "axis", "--simulate", "--scheme", "none", "--count", 2)):
         done = hdbridge(*command)

@@ -63,13 +63,13 @@ def ctl(hdbridge, machine):
         ("set joint-1 6041h 1", ("joint-1", "write", "6041h", "1")),
     ],
 )
-def test_a_command_asks_the_daemon_for_what_it_says(ctl, machine, line, asked):
+def test_each_command_sends_its_request(ctl, machine, line, asked):
     ctl(*line.split())
     assert machine.moved[0] == asked
     assert not machine.state().lease.held
 
 
-def test_status_is_a_table_for_people_and_the_state_for_machines(ctl, machine, tmp_path):
+def test_status_prints_a_table_or_json(ctl, machine, tmp_path):
     machine.axes["joint-2"].at = messages.ControlState.QUICK_STOPPED
     doubt = "the load encoder moved by 19.0 arcsec without the motor"
     machine.axes["joint-1"].load_loop = messages.LoadLoopState(configured=True, on=True, doubt=doubt)
@@ -91,14 +91,14 @@ def test_the_only_axis_needs_no_name(ctl, machine):
     assert machine.moved == [("joint-1", "disable"), ("joint-1", "home", 37)]
 
 
-def test_several_angles_are_moved_to_one_after_the_other(ctl, machine, tmp_path):
+def test_several_angles_are_reached_in_order(ctl, machine, tmp_path):
     ctl("move", "joint-1", 10, 20, "--json", "stands.json")
     assert json.loads((tmp_path / "stands.json").read_text())["load_target_deg"] == 20.0
     ctl("move", "joint-1", 5, -1, "--relative")
     assert [each[2] for each in machine.moved] == [10.0, 20.0, 25.0, 24.0]
 
 
-def test_stops_go_to_all_or_to_those_named_and_need_nobodys_leave(ctl, machine):
+def test_stops_go_to_all_or_named_axes_without_the_lease(ctl, machine):
     machine.lease.take("another")
     ctl("stop")
     ctl("stop", "joint-2")
@@ -109,7 +109,7 @@ def test_stops_go_to_all_or_to_those_named_and_need_nobodys_leave(ctl, machine):
     ]  # fmt: skip
 
 
-def test_whoever_has_the_right_to_move_is_named_and_can_be_overruled(ctl, machine):
+def test_the_lease_holder_is_named_and_can_be_overruled(ctl, machine):
     machine.lease.take("cell controller")
     assert "'cell controller' has the right to move" in ctl("lease")
     _, said = ctl("move", "joint-1", 1, status=7).splitlines()
@@ -139,7 +139,7 @@ def test_whoever_has_the_right_to_move_is_named_and_can_be_overruled(ctl, machin
         ("status --at /nowhere/cell.sock", 7, "hdbridge run"),
     ],
 )
-def test_what_is_refused_is_one_line_with_the_exit_status_of_its_kind(ctl, machine, line, status, words):
+def test_refusals_are_one_line_with_a_documented_exit_status(ctl, machine, line, status, words):
     *named, said = ctl(*line.split(), status=status).splitlines()
     assert words in said
     assert all(each.startswith("machine 'cell' at ") for each in named)
@@ -155,13 +155,13 @@ def test_events_and_marks_are_listed(ctl, tmp_path):
     assert [each["sequence"] for each in json.loads((tmp_path / "all.json").read_text())["events"]] == [1, 2]
 
 
-def test_watch_looks_again_and_again(ctl):
+def test_watch_refreshes_repeatedly(ctl):
     lines = ctl("watch", "--lines", "--count", 3, "--every", 0.05).splitlines()
     assert [messages.MachineState.model_validate_json(each).name for each in lines] == ["cell"] * 3
     assert "joint-2" in ctl("watch", "--count", 2, "--every", 0.05)
 
 
-def test_a_refusal_names_client_user_and_process_and_its_advice_works(ctl, machine, place):
+def test_a_refusal_names_client_user_and_process_with_working_advice(ctl, machine, place):
     user = pwd.getpwuid(os.getuid()).pw_name
     with Client(place.socket, name="cell controller") as other, other.lease():
         said = ctl("move", "joint-1", 1, status=7)
@@ -173,7 +173,7 @@ def test_a_refusal_names_client_user_and_process_and_its_advice_works(ctl, machi
 
 
 @pytest.mark.parametrize("line", ["enable joint-1", "stop", "get joint-1 6041h", "lease", "mark words"])
-def test_the_machine_is_named_if_it_was_not_given(hdbridge, machine, place, monkeypatch, line):
+def test_the_machine_is_named_if_not_given(hdbridge, machine, place, monkeypatch, line):
     done = hdbridge("ctl", *line.split())
     assert done.stderr == f"machine 'cell' at {place.socket} (from HDBRIDGE_SOCKET)\n"
     monkeypatch.delenv("HDBRIDGE_SOCKET")
@@ -189,7 +189,7 @@ def test_the_machine_is_named_if_it_was_not_given(hdbridge, machine, place, monk
 
 @pytest.mark.parametrize("width", [60, 120])
 @pytest.mark.parametrize("line", ["status", "watch --count 1"])
-def test_tables_are_whole_at_any_width(ctl, process, machine, monkeypatch, line, width):
+def test_tables_are_complete_at_any_width(ctl, process, machine, monkeypatch, line, width):
     shown = (
         machine.axes["joint-2"]
         .state()
@@ -231,7 +231,7 @@ def test_an_object_is_read(ctl):
 
 @pytest.mark.usefixtures("at_a_terminal")
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
-def test_a_signal_stops_the_axis_that_moves(machine, place, number):
+def test_a_signal_stops_the_moving_axis(machine, place, number):
     machine.axes["joint-1"].moving_s = 2 * PATIENCE_S
     command = [sys.executable, "-m", "hdbridge", "ctl", "move", "joint-1", "30"]
     environment = {**os.environ, "HDBRIDGE_SOCKET": str(place.socket)}

@@ -41,7 +41,7 @@ def test_doctor_on_a_real_bus_without_a_drive(hdbridge):
     assert "bus.interface: found virtual" in done.stdout
 
 
-def test_a_real_axis_moves_only_when_somebody_says_so(hdbridge, monkeypatch):
+def test_a_real_axis_moves_only_with_consent(hdbridge, monkeypatch):
     """The bus is simulated, but the command does not know it."""
     real = Session.connected
     monkeypatch.setattr(Session, "connected", lambda session: real(replace(session, simulate=True)))

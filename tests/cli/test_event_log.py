@@ -10,7 +10,7 @@ import pytest
 ENTRY = "import sys; sys.argv[0] = 'hdbridge'; from hdbridge.cli import main; main()"
 
 
-def test_the_log_tells_what_was_done_on_the_bus_but_nothing_of_single_cycles(hdbridge, tmp_path):
+def test_log_records_bus_actions_but_not_single_cycles(hdbridge, tmp_path):
     done = hdbridge("--log", "bus.jsonl", "move", "article", 1, "--simulate")
     assert done.returncode == 0, done.stderr
     events = [json.loads(each) for each in (tmp_path / "bus.jsonl").read_text().splitlines()]
@@ -41,7 +41,7 @@ def test_a_log_that_cannot_be_written_is_refused(hdbridge):
 
 
 @pytest.mark.parametrize("file", ["axis.yaml", "model.yaml", "notes.txt"])
-def test_a_log_is_appended_to_no_other_file(hdbridge, profile, file):
+def test_log_is_not_appended_to_another_kind_of_file(hdbridge, profile, file):
     place = profile.folder / file
     if not place.exists():
         place.write_text("mine\n")
@@ -51,14 +51,14 @@ def test_a_log_is_appended_to_no_other_file(hdbridge, profile, file):
     assert place.read_text() == before
 
 
-def test_a_log_whose_disk_is_full_ends_in_one_line_and_the_command_goes_on(hdbridge):
+def test_a_full_disk_ends_the_log_but_not_the_command(hdbridge):
     done = hdbridge("--log", "/dev/full", "check", "article")
     assert done.returncode == 6
     assert done.stderr == "hdbridge: /dev/full: cannot be written: No space left on device\n"
     assert "all right" in done.stdout
 
 
-def test_v_tells_on_standard_error_and_vv_tells_every_transfer(hdbridge):
+def test_v_logs_to_standard_error_and_vv_logs_every_transfer(hdbridge):
     quiet, more, most = (
         hdbridge(*v, "sdo", "get", "article", "6064h", "--simulate") for v in ((), ("-v",), ("-vv",))
     )

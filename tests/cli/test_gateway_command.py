@@ -75,7 +75,7 @@ def test_the_ideal_drive_answers_on_the_bus_of_the_gateway(tmp_path):
         ),
     ],
 )
-def test_a_gateway_that_cannot_work_is_refused_at_the_desk(tmp_path, replaced, by, words):
+def test_an_impossible_gateway_is_refused_by_check(tmp_path, replaced, by, words):
     done = run_here(tmp_path, "check", machine(tmp_path, MACHINE.replace(replaced, by)))
     assert done.returncode == 2
     assert words in done.stderr

@@ -39,7 +39,7 @@ def offset(folder) -> float:
     return effect.parameters()["offset_arcsec"]
 
 
-def test_commit_activate_roll_back_and_log(hdbridge, propose, tmp_path):
+def test_models_are_committed_activated_rolled_back_and_logged(hdbridge, propose, tmp_path):
     for each in (41.0, 42.0):
         folder = propose(each)
         assert hdbridge("model", "commit", folder).returncode == 0

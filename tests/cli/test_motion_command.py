@@ -11,7 +11,7 @@ def fast(tmp_path):
     return raised_profile(tmp_path / "fast")
 
 
-def test_it_measures_the_response_proposes_it_and_the_committed_model_uses_it(hdbridge, fast, tmp_path):
+def test_measures_and_proposes_the_response_and_the_committed_model_uses_it(hdbridge, fast, tmp_path):
     done = hdbridge("motion", "fast", "--simulate", "--propose", "--json", "out.json", "--html", "out.html")
     assert done.returncode == 0, done.stderr
     assert "pending" in done.stdout

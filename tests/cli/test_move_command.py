@@ -24,13 +24,13 @@ def test_way_points_are_reached_compensated(hdbridge, tmp_path):
     assert "model.yaml; power is off" in done.stdout
 
 
-def test_relative_angles_count_from_where_the_axis_stood(hdbridge, tmp_path):
+def test_relative_angles_start_from_the_present_position(hdbridge, tmp_path):
     done = hdbridge("move", "article", 1, 2, -0.5, "--relative", "--simulate", "--json", "out.json")
     assert done.returncode == 0, done.stderr
     assert [target for target, _ in stands(tmp_path / "out.json")] == pytest.approx([1.0, 3.0, 2.5])
 
 
-def test_without_compensation_the_gear_shows(hdbridge, tmp_path):
+def test_without_compensation_the_gear_error_is_visible(hdbridge, tmp_path):
     done = hdbridge("move", "article", -5, "--uncompensated", "--simulate", "--hold", 1, "--json", "out.json")
     assert done.returncode == 0, done.stderr
     assert "not compensated" in done.stdout
@@ -38,7 +38,7 @@ def test_without_compensation_the_gear_shows(hdbridge, tmp_path):
     assert json.loads((tmp_path / "out.json").read_text())["model"] is None
 
 
-def test_a_profile_without_a_model_moves_uncompensated_and_says_so(hdbridge):
+def test_a_profile_without_a_model_moves_uncompensated_with_a_notice(hdbridge):
     done = hdbridge("move", "demo", 1, "--simulate")
     assert done.returncode == 0, done.stderr
     assert "not compensated" in done.stdout
@@ -56,7 +56,7 @@ def test_a_profile_without_a_model_moves_uncompensated_and_says_so(hdbridge):
         ((1, "--velocity", 0), "--velocity: found '0'; expected a number of at least 1e-06"),
     ],
 )
-def test_what_cannot_be_moved_to_is_refused(hdbridge, arguments, complaint):
+def test_unreachable_targets_are_refused(hdbridge, arguments, complaint):
     done = hdbridge("move", "article", *arguments, "--simulate")
     assert done.returncode == 2
     assert complaint in done.stderr
@@ -64,7 +64,7 @@ def test_what_cannot_be_moved_to_is_refused(hdbridge, arguments, complaint):
 
 
 @pytest.mark.parametrize(("leg", "status"), [(Hold, 0), (Settle, 130)])
-def test_ctrl_c_ends_the_holding_in_good_order_and_stops_a_move(hdbridge, monkeypatch, leg, status):
+def test_ctrl_c_ends_holding_in_order_and_stops_a_move(hdbridge, monkeypatch, leg, status):
     ended = leg.ended
 
     def interrupted(self, samples):
@@ -80,7 +80,7 @@ def test_ctrl_c_ends_the_holding_in_good_order_and_stops_a_move(hdbridge, monkey
     assert "disabled  node=1" in done.stderr
 
 
-def test_homing_says_where_the_axis_is(hdbridge, tmp_path):
+def test_homing_reports_the_position(hdbridge, tmp_path):
     done = hdbridge("home", "article", "--method", 35, "--simulate", "--json", "out.json")
     assert done.returncode == 0, done.stderr
     assert "homed by method 35" in done.stdout
@@ -88,7 +88,7 @@ def test_homing_says_where_the_axis_is(hdbridge, tmp_path):
     assert found["load_position_by_motor_deg"] == pytest.approx(0.0, abs=0.01)
 
 
-def test_a_method_that_the_drive_lacks_is_its_refusal(hdbridge):
+def test_an_unsupported_homing_method_is_refused_by_the_drive(hdbridge):
     done = hdbridge("home", "article", "--method", 17, "--simulate")
     assert done.returncode == 4
     assert "6098h" in done.stderr

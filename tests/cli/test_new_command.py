@@ -22,7 +22,7 @@ def node():
 
 
 @pytest.mark.parametrize("source", ["demo", "article"])
-def test_a_copy_of_a_bundled_profile_is_an_axis_of_that_name(hdbridge, tmp_path, source):
+def test_copies_a_bundled_profile_under_a_new_name(hdbridge, tmp_path, source):
     done = hdbridge("new", "cells/my-axis", "--from", source)
     assert done.returncode == 0, done.stderr
     assert "next: hdbridge check cells/my-axis" in done.stdout
@@ -43,14 +43,14 @@ def test_a_copy_of_a_bundled_profile_is_an_axis_of_that_name(hdbridge, tmp_path,
         (("mine", "--interface", "socketcan"), "give --from scan with it"),
     ],
 )
-def test_what_makes_no_profile_is_refused_and_nothing_written(hdbridge, tmp_path, arguments, complaint):
+def test_an_impossible_profile_is_refused_and_nothing_written(hdbridge, tmp_path, arguments, complaint):
     done = hdbridge("new", *arguments)
     assert done.returncode == 2
     assert complaint in done.stderr
     assert list(tmp_path.iterdir()) == []
 
 
-def test_what_the_drive_says_of_itself_is_an_axis_file(node):
+def test_writes_an_axis_file_from_the_drives_objects(node):
     text = axis_text("found", BusConfig(interface="socketcan", channel="can0"), node, "hdbridge-402.eds")
     axis = AxisConfig.from_text(text)
     assert (axis.bus.interface, axis.bus.channel, axis.drive.node_id) == ("socketcan", "can0", 1)
@@ -58,7 +58,7 @@ def test_what_the_drive_says_of_itself_is_an_axis_file(node):
     assert axis.drive.identity.vendor_id == 0x4844
 
 
-def test_what_the_drive_does_not_say_is_left_to_be_filled_in(node):
+def test_values_unknown_to_the_drive_are_marked_to_be_filled_in(node):
     from dataclasses import replace
 
     silent = replace(node, values={})
@@ -68,7 +68,7 @@ def test_what_the_drive_does_not_say_is_left_to_be_filled_in(node):
         AxisConfig.from_text(text)
 
 
-def test_a_drive_with_interpolated_position_alone_gets_that_mode(node):
+def test_a_drive_with_interpolated_position_only_gets_that_mode(node):
     from dataclasses import replace
 
     bus = BusConfig(interface="socketcan", channel="can0")

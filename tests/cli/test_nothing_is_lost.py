@@ -29,7 +29,7 @@ def started(folder, *arguments):
 
 @pytest.mark.usefixtures("at_a_terminal")
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT])
-def test_a_signal_to_end_stops_in_order_keeps_what_runs_and_says_so(tmp_path, number):
+def test_a_termination_signal_stops_in_order_and_keeps_the_measurement(tmp_path, number):
     process = started(tmp_path, *LONG, "--record", "kept")
     time.sleep(1.0)
     process.send_signal(number)
@@ -42,7 +42,7 @@ def test_a_signal_to_end_stops_in_order_keeps_what_runs_and_says_so(tmp_path, nu
     assert len(Recording.load(kept).record)
 
 
-def test_without_a_folder_the_loss_is_said(tmp_path):
+def test_loss_of_data_without_a_folder_is_reported(tmp_path):
     process = started(tmp_path, *LONG)
     time.sleep(1.0)
     process.send_signal(signal.SIGINT)
@@ -51,7 +51,7 @@ def test_without_a_folder_the_loss_is_said(tmp_path):
     assert "not kept: it takes --record FOLDER" in errors
 
 
-def test_what_the_schemes_before_have_given_is_printed_and_written(tmp_path):
+def test_results_of_finished_schemes_are_printed_and_written(tmp_path):
     outputs = ("--record", "kept", "--json", "figures.json", "--html", "page.html")
     process = started(tmp_path, "step", "article", "--simulate", "--count", 40, *outputs)
     first = tmp_path / "kept" / "stepping-none.csv.gz"
@@ -69,7 +69,7 @@ def test_what_the_schemes_before_have_given_is_printed_and_written(tmp_path):
     assert (tmp_path / "page.html").exists()
 
 
-def test_what_nohup_ignores_stays_ignored(tmp_path):
+def test_signals_ignored_by_nohup_stay_ignored(tmp_path):
     process = subprocess.Popen(
         ["nohup", sys.executable, "-m", "hdbridge", "step", "article", "--simulate", "--count", "2"],
         cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
@@ -81,7 +81,7 @@ def test_what_nohup_ignores_stays_ignored(tmp_path):
     assert process.returncode == 0, errors
 
 
-def test_a_disk_that_fills_while_the_axis_moves_takes_no_figures_along(tmp_path):
+def test_a_full_disk_during_motion_loses_no_figures(tmp_path):
     done = subprocess.run(  # -B: bytecode cut off at 100 bytes would make every later process fail
         [sys.executable, "-B", "-m", "hdbridge", "step", "article", "--simulate", "--count", "2",
          "--scheme", "none", "--json", "out.json", "--html", "out.html", "--record", "kept"],
@@ -105,7 +105,7 @@ def test_one_measurement_of_an_axis_at_a_time(hdbridge, profile, tmp_path):
     assert not (tmp_path / "rec").exists()
 
 
-def test_two_calibrations_of_one_second_have_a_folder_each(monkeypatch, tmp_path):
+def test_calibrations_within_one_second_get_separate_folders(monkeypatch, tmp_path):
     from hdbridge.files.atomic import new_folder
 
     monkeypatch.chdir(tmp_path)
@@ -113,7 +113,7 @@ def test_two_calibrations_of_one_second_have_a_folder_each(monkeypatch, tmp_path
     assert made == [f"axis-20250101-000000{each}" for each in ("", "-2", "-3")]
 
 
-def test_a_small_file_is_read_in_little_memory(tmp_path):
+def test_a_small_file_needs_little_memory(tmp_path):
     (tmp_path / "one.csv").write_text(
         "time_s,motor_position_deg,load_position_deg\n" + "".join(f"{n},{n},{n / 50}\n" for n in range(9))
     )

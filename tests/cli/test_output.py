@@ -28,7 +28,7 @@ def test_no_figure_is_cut_in_a_narrow_terminal(tmp_path, profile):
     assert "orders[2].amplitude_arcsec" in shown.stdout
 
 
-def test_output_to_a_file_has_neither_colours_nor_control_characters(hdbridge):
+def test_output_to_a_file_has_no_colours_or_control_characters(hdbridge):
     done = hdbridge("step", "article", "--simulate", "--count", 2, "--scheme", "none")
     assert done.returncode == 0, done.stderr
     assert "\x1b" not in done.stdout + done.stderr
@@ -49,7 +49,7 @@ def test_the_version_and_the_short_help(hdbridge):
     ],
     ids=lambda each: each[0],
 )
-def test_a_reader_that_goes_away_is_no_error_and_the_result_is_whole(unread, tmp_path, arguments):
+def test_a_closed_output_pipe_is_not_an_error_and_results_are_complete(unread, tmp_path, arguments):
     errors = unread(*arguments, "--json", "out.json")
     assert "Traceback" not in errors
     assert "Exception" not in errors
@@ -57,11 +57,11 @@ def test_a_reader_that_goes_away_is_no_error_and_the_result_is_whole(unread, tmp
 
 
 @pytest.mark.parametrize("arguments", [("--help",), ("check", "--help"), ("check", "article", "--json", "-")])
-def test_a_reader_that_goes_away_from_help_and_json_is_no_error(unread, arguments):
+def test_a_closed_pipe_of_help_or_json_is_not_an_error(unread, arguments):
     assert unread(*arguments) == ""
 
 
-def test_a_closed_standard_output_is_no_error(tmp_path):
+def test_a_closed_standard_output_is_not_an_error(tmp_path):
     line = f'exec "{sys.executable}" -m hdbridge check article --json out.json >&-'
     done = subprocess.run(["sh", "-c", line], stderr=subprocess.PIPE, text=True, check=False, cwd=tmp_path)
     assert (done.returncode, done.stderr) == (0, "wrote out.json\n")
@@ -69,7 +69,7 @@ def test_a_closed_standard_output_is_no_error(tmp_path):
 
 
 @pytest.mark.parametrize(("slow", "arguments"), [("typer", ("--help",)), ("numpy", ("step", "--help"))])
-def test_ctrl_c_while_the_program_loads_gives_no_traceback(tmp_path, slow, arguments):
+def test_ctrl_c_during_start_up_prints_no_traceback(tmp_path, slow, arguments):
     """An import that never ends stands for a slow one."""
     (tmp_path / f"{slow}.py").write_text("import sys, time\nprint('loading', flush=True)\ntime.sleep(600)\n")
     with subprocess.Popen(
@@ -86,7 +86,7 @@ def test_ctrl_c_while_the_program_loads_gives_no_traceback(tmp_path, slow, argum
     assert errors == ""
 
 
-def test_a_terminal_that_lacks_a_character_gets_another(tmp_path):
+def test_characters_unknown_to_the_terminal_are_replaced(tmp_path):
     shown = command(
         *("step", "article", "--simulate", "--count", 2, "--scheme", "none"),
         env={**os.environ, "PYTHONIOENCODING": "ascii", "PYTHONUTF8": "0"},

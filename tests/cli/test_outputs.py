@@ -72,7 +72,7 @@ def bench(tmp_path, profile):
         ("demo --count 2 --out rec", "not empty"),
     ],
 )  # fmt: skip
-def test_what_would_destroy_something_is_refused_before_anything_is_read(hdbridge, bench, line, words):
+def test_destructive_outputs_are_refused_before_anything_is_read(hdbridge, bench, line, words):
     done = hdbridge(*line.split())
     assert done.returncode == 2, done.stderr
     assert words in done.stderr
@@ -80,7 +80,7 @@ def test_what_would_destroy_something_is_refused_before_anything_is_read(hdbridg
     assert bench()
 
 
-def test_a_second_result_takes_the_place_of_the_first(hdbridge, tmp_path):
+def test_a_second_result_replaces_the_first(hdbridge, tmp_path):
     for _ in range(2):
         assert hdbridge("check", "article", "--json", "out.json").returncode == 0
     (tmp_path / "empty").touch()  # as mktemp makes it
@@ -88,7 +88,7 @@ def test_a_second_result_takes_the_place_of_the_first(hdbridge, tmp_path):
     assert json.loads((tmp_path / "empty").read_text())["axis"] == "article"
 
 
-def test_a_model_may_wait_in_a_profile(tmp_path, bench):
+def test_a_pending_model_may_be_written_to_a_profile(tmp_path, bench):
     for name in ("pending.yaml", "first/model.yaml"):
         (tmp_path / "p" / "first").mkdir(exist_ok=True)
         shutil.copy(tmp_path / "p" / "axis.yaml", tmp_path / "p" / "first")
@@ -105,7 +105,7 @@ def test_stepping_twice_into_one_folder_keeps_the_first(hdbridge, tmp_path):
     assert (tmp_path / "kept" / "stepping-none.csv.gz").read_bytes() == first
 
 
-def test_a_minus_is_the_standard_output_and_tables_then_go_to_the_standard_error(process, tmp_path):
+def test_a_dash_means_standard_output_and_tables_go_to_standard_error(process, tmp_path):
     for place in ("-", "/dev/fd/1"):
         done = process("check", "article", "--json", place)
         assert json.loads(done.stdout if place == "-" else done.stdout.split("\n}\n")[0] + "}")
@@ -114,7 +114,7 @@ def test_a_minus_is_the_standard_output_and_tables_then_go_to_the_standard_error
     assert process("fit", "x.csv", "--json", "-", "--html", "/dev/stdout").returncode == 2
 
 
-def test_a_pipe_is_written_straight_through(hdbridge, tmp_path):
+def test_a_pipe_is_written_directly(hdbridge, tmp_path):
     pipe = tmp_path / "pipe"
     os.mkfifo(pipe)
     read = []
@@ -145,7 +145,7 @@ def test_a_device_is_never_replaced(hdbridge, tmp_path):
     assert stat.S_ISCHR(device.stat().st_mode)
 
 
-def test_a_socket_is_no_place_for_a_result(hdbridge, tmp_path, monkeypatch):
+def test_a_socket_is_refused_as_output(hdbridge, tmp_path, monkeypatch):
     import socket
 
     monkeypatch.chdir(tmp_path)
@@ -156,7 +156,7 @@ def test_a_socket_is_no_place_for_a_result(hdbridge, tmp_path, monkeypatch):
     assert "neither a file nor a pipe nor a character device" in done.stderr
 
 
-def test_a_file_that_the_shell_writes_to_already_is_refused(tmp_path):
+def test_a_file_already_open_in_the_shell_is_refused(tmp_path):
     with (tmp_path / "out").open("w") as out:
         done = subprocess.run(
             [sys.executable, "-m", "hdbridge", "check", "article", "--json", "out"],
@@ -166,7 +166,7 @@ def test_a_file_that_the_shell_writes_to_already_is_refused(tmp_path):
     assert "standard output goes there already" in done.stderr
 
 
-def test_names_that_lead_nowhere_are_one_line(hdbridge, tmp_path):
+def test_dangling_output_names_give_one_line(hdbridge, tmp_path):
     (tmp_path / "circle").symlink_to(tmp_path / "circle")
     for place, words in (("circle", "circle"), ("x" * 300, "too long"), ("one/two", "no folder")):
         done = hdbridge("check", "article", "--json", place)
@@ -201,7 +201,7 @@ def _is_seen_to_be_one(one: Path, other: Path) -> None:
 
 
 @given(st.tuples(*2 * [st.sampled_from(sorted(SPELLINGS))]))
-def test_a_file_is_known_by_any_name(tmp_path_factory, names):
+def test_aliases_of_a_file_are_recognised(tmp_path_factory, names):
     file = tmp_path_factory.mktemp("names") / "one.json"
     file.write_text('{"schema": "hdbridge.check/1"}')
     one, other = (SPELLINGS[each](file) for each in names)
@@ -211,13 +211,13 @@ def test_a_file_is_known_by_any_name(tmp_path_factory, names):
 
 
 @given(st.tuples(*2 * [st.sampled_from(OF_A_FILE_TO_BE)]))
-def test_a_file_that_is_not_there_yet_is_known_by_any_name(tmp_path_factory, names):
+def test_aliases_of_a_future_file_are_recognised(tmp_path_factory, names):
     file = tmp_path_factory.mktemp("names") / "one.json"
     more = {**SPELLINGS, "other case": lambda path: path.with_name("ONE.json")}
     _is_seen_to_be_one(*(more[each](file) for each in names))
 
 
-def test_every_option_that_writes_is_guarded():
+def test_every_output_option_is_guarded():
     """`--json` and `--html` everywhere; whatever else names what it writes, by the word in its help."""
     for name in (name for panel in PANELS.values() for name in panel):
         loaded = load(name)

@@ -150,7 +150,7 @@ def contents(folder):
 
 
 @pytest.mark.parametrize("command", COMMANDS, ids=" ".join)
-def test_what_cannot_be_right_is_refused_and_nothing_happens(command, place, monkeypatch):
+def test_invalid_arguments_are_refused_without_side_effects(command, place, monkeypatch):
     monkeypatch.delenv("HDBRIDGE_SOCKET", raising=False)
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(place))
     before, complaints = contents(place), []
@@ -203,7 +203,7 @@ def test_what_cannot_be_right_is_refused_and_nothing_happens(command, place, mon
         ("record mend /dev/null", "not a flight recording"),
     ],
 )
-def test_what_the_axis_cannot_do_is_refused_before_anything_is_connected(place, words, complaint):
+def test_requests_beyond_the_axis_are_refused_before_connecting(place, words, complaint):
     before = contents(place)
     done = run_here(place, *words.split())
     assert done.returncode == 2, done.stderr
@@ -214,7 +214,7 @@ def test_what_the_axis_cannot_do_is_refused_before_anything_is_connected(place, 
 
 
 @pytest.mark.parametrize("name", ["axis.yaml", "model.yaml", "truth.yaml"])
-def test_a_named_pipe_in_place_of_a_file_of_a_profile_is_not_waited_for(place, name):
+def test_a_named_pipe_in_a_profile_is_refused_at_once(place, name):
     (place / "axis" / name).unlink()
     os.mkfifo(place / "axis" / name)
     done = run_here(place, "step", "axis", "--simulate", "--count", 2)
@@ -222,13 +222,13 @@ def test_a_named_pipe_in_place_of_a_file_of_a_profile_is_not_waited_for(place, n
     assert f"axis/{name}: cannot be read: it is a named pipe; expected a file" in done.stderr
 
 
-def test_a_record_may_come_from_a_pipe_of_the_shell(place):
+def test_a_record_may_come_from_a_shell_pipe(place):
     with (place / "record.csv").open("rb") as file:
         done = run_here(place, "diagnose", f"/dev/fd/{file.fileno()}", "--model", "axis/model.yaml")
     assert "named pipe" not in done.stderr
 
 
-def test_check_knows_the_interfaces_of_python_can_and_those_of_this_computer(place):
+def test_check_knows_python_can_and_local_interfaces(place):
     file = place / "axis" / "axis.yaml"
     text = file.read_text()
     file.write_text(text.replace("interface: virtual", "interface: socketcna"))
@@ -256,7 +256,7 @@ def test_a_velocity_above_the_limit_is_reported(place):
 
 
 @pytest.mark.parametrize("name", ["mine", "cells/left/mine"])
-def test_a_new_profile_on_a_full_disk_leaves_nothing(tmp_path, name):
+def test_a_new_profile_on_a_full_disk_leaves_no_files(tmp_path, name):
     done = subprocess.run(
         [sys.executable, "-B", "-m", "hdbridge", "new", name],
         cwd=tmp_path, capture_output=True, text=True, check=False,
@@ -267,7 +267,7 @@ def test_a_new_profile_on_a_full_disk_leaves_nothing(tmp_path, name):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_port_that_is_taken_is_that_of_the_option(place, monkeypatch):
+def test_a_port_in_use_names_its_option(place, monkeypatch):
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(place))
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]

@@ -24,7 +24,7 @@ def faulty():
         yield drive, ("--interface", drive.interface, "--channel", drive.channel)
 
 
-def test_a_fault_is_reset_by_the_command_that_the_refusal_names(hdbridge, faulty, tmp_path):
+def test_the_suggested_command_resets_the_fault(hdbridge, faulty, tmp_path):
     drive, bus = faulty
     before_deg = drive.truth.load_deg
     refused = hdbridge("move", "article", 1, "--hold", 0, *bus)
@@ -58,7 +58,7 @@ def texts(tree: ast.Module) -> Iterator[str]:
             yield node.value
 
 
-def test_every_message_that_asks_for_a_reset_names_the_command():
+def test_every_message_asking_for_a_reset_names_the_command():
     asking = [
         (path.name, text)
         for path in sorted(PACKAGE.rglob("*.py"))

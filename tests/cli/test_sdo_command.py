@@ -46,7 +46,7 @@ def test_an_object_is_written_and_read_back(hdbridge, tmp_path):
         (("set", "6065h", "few"), "found 'few'; expected an integer"),
     ],
 )
-def test_what_the_eds_does_not_permit_is_refused_before_it_is_sent(hdbridge, arguments, complaint):
+def test_requests_forbidden_by_the_eds_are_not_sent(hdbridge, arguments, complaint):
     doing, *rest = arguments
     done = hdbridge("sdo", doing, "article", *rest, "--simulate")
     assert done.returncode == 2
@@ -83,6 +83,6 @@ def test_other_types_are_read_as_they_were_written(data_type, text, data, value)
 
 
 @pytest.mark.parametrize("data_type", [datatypes.REAL64, datatypes.BOOLEAN])
-def test_an_answer_of_another_length_is_no_value(data_type):
+def test_an_answer_of_the_wrong_length_is_rejected(data_type):
     with pytest.raises(InputError, match="check that drive"):
         Object(0x2000, 0, "", data_type, None).decode(b"\x01\x02\x03")

@@ -49,7 +49,7 @@ def steps(text: str) -> list[str]:
     ]
 
 
-def test_it_goes_from_nothing_to_a_compensated_axis(finished):
+def test_sets_up_a_compensated_axis_from_scratch(finished):
     folder, done = finished
     assert done.returncode == 0, done.stderr
     assert steps(done.stdout) == list(STEPS)
@@ -58,7 +58,7 @@ def test_it_goes_from_nothing_to_a_compensated_axis(finished):
     assert "hdbridge run arm --page --simulate" in done.stdout
 
 
-def test_the_commands_are_ordinary_ones(finished, tmp_path):
+def test_prints_ordinary_commands(finished, tmp_path):
     """Printed, they can be typed: the first three, in another folder, do the same."""
     _, done = finished
     for line in re.findall(r"^\$ hdbridge (.*)", done.stdout, re.M)[:3]:
@@ -67,14 +67,14 @@ def test_the_commands_are_ordinary_ones(finished, tmp_path):
     assert "all right" in again.stdout
 
 
-def test_what_is_done_is_not_done_again(finished):
+def test_finished_steps_are_not_repeated(finished):
     folder, _ = finished
     again = run_here(folder, "setup", "arm")
     assert again.returncode == 0, again.stderr
     assert steps(again.stdout) == ["check"]
 
 
-def test_a_changed_axis_file_is_examined_again(finished, tmp_path):
+def test_a_changed_axis_file_is_checked_again(finished, tmp_path):
     folder, _ = finished
     shutil.copytree(folder / "arm", tmp_path / "arm")
     path = tmp_path / "arm" / "axis.yaml"
@@ -85,7 +85,7 @@ def test_a_changed_axis_file_is_examined_again(finished, tmp_path):
     assert "resume: hdbridge setup arm" in again.stderr
 
 
-def test_it_resumes_with_the_steps_that_are_missing(finished, tmp_path):
+def test_resumes_with_the_missing_steps(finished, tmp_path):
     folder, _ = finished
     shutil.copytree(folder / "arm", tmp_path / "arm")
     path = tmp_path / "arm" / "setup.json"
@@ -97,7 +97,7 @@ def test_it_resumes_with_the_steps_that_are_missing(finished, tmp_path):
     assert steps(again.stdout) == ["check", "doctor", "move"]
 
 
-def test_a_calibration_that_is_interrupted_is_resumed(tmp_path):
+def test_an_interrupted_calibration_is_resumed(tmp_path):
     (tmp_path / "short.yaml").write_text(PLAN)
     command = ("setup", "arm", "--simulate", "--yes", "--plan", "short.yaml")
     process = subprocess.Popen(
@@ -126,7 +126,7 @@ def test_an_answer_changes_its_value_and_nothing_else(key, value):
     assert value_of(with_value(text, key, value_of(ARTICLE, key)[0]), key) == value_of(ARTICLE, key)
 
 
-def test_what_is_left_to_fill_in_is_marked():
+def test_values_to_fill_in_are_marked():
     text = ARTICLE.replace("  ratio: 50", "  ratio: 0         # fill in: motor turns per load turn")
     assert value_of(text, "gear.ratio") == ("0", True)
     assert "fill in" not in with_value(text, "gear.ratio", "50")
@@ -144,13 +144,13 @@ def test_what_is_left_to_fill_in_is_marked():
         (("arm", "--simulate"), 2, "Answer on a terminal, or give --yes"),
     ],
 )
-def test_what_it_needs_is_said(arguments, status, said, tmp_path):
+def test_missing_requirements_are_reported(arguments, status, said, tmp_path):
     done = run_here(tmp_path, "setup", *arguments)
     assert done.returncode == status
     assert said in done.stderr
 
 
-def test_nothing_moves_without_a_yes(tmp_path):
+def test_nothing_moves_without_consent(tmp_path):
     """On a terminal, with a no to the first question."""
     parent, child = pty.openpty()
     process = subprocess.Popen(

@@ -30,7 +30,7 @@ print("scipy" in sys.modules, status)
         (("check", "article"), 0),
     ],
 )
-def test_scipy_is_not_loaded_where_nothing_is_fitted(arguments, status, tmp_path):
+def test_scipy_is_not_loaded_unless_something_is_fitted(arguments, status, tmp_path):
     done = subprocess.run(
         [sys.executable, "-c", ASK, *arguments],
         capture_output=True,
@@ -46,7 +46,7 @@ def test_scipy_is_not_loaded_where_nothing_is_fitted(arguments, status, tmp_path
     [row for panel in PANELS.values() for row in panel.items()],
     ids=lambda each: each[:9],
 )
-def test_the_overview_says_what_the_command_says(name, summary):
+def test_overview_repeats_the_commands_own_summary(name, summary):
     loaded = load(name)
     said = [each.callback.__doc__ for each in loaded.registered_commands]
     said += [each.typer_instance.info.help for each in loaded.registered_groups]
@@ -54,7 +54,7 @@ def test_the_overview_says_what_the_command_says(name, summary):
     assert " ".join(inspect.cleandoc(words).split("\n\n")[0].split()) == summary
 
 
-def test_no_help_waits_for_what_computes_or_talks_to_a_bus():
+def test_help_loads_no_numeric_or_bus_modules():
     """All commands are imported as their help needs them; what they run with is not."""
     program = (
         "import sys\nfrom hdbridge.cli import PANELS, load\n"

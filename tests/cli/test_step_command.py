@@ -39,7 +39,7 @@ def test_the_same_seed_gives_the_same_record_bit_for_bit(hdbridge, tmp_path):
     assert a != c
 
 
-def test_demo_makes_everything_that_it_names(hdbridge, tmp_path):
+def test_demo_writes_every_file_it_names(hdbridge, tmp_path):
     done = hdbridge("demo", "--count", 4)
     assert done.returncode == 0, done.stderr
     page = (tmp_path / "demo-output" / "stepping.html").read_text()
@@ -48,20 +48,20 @@ def test_demo_makes_everything_that_it_names(hdbridge, tmp_path):
     assert json.loads((tmp_path / "demo-output" / "stepping.json").read_text())["both"]
 
 
-def test_check_says_what_the_files_mean(hdbridge):
+def test_check_explains_the_files(hdbridge):
     done = hdbridge("check", "article")
     assert done.returncode == 0, done.stderr
     for fact in ("ratio", "50", "3.24 arcsec", "synchronous, hysteresis", "all right"):
         assert fact in done.stdout
 
 
-def test_one_scheme_only(hdbridge, tmp_path):
+def test_a_single_scheme_is_run(hdbridge, tmp_path):
     done = hdbridge("step", "article", "--simulate", "--count", 3, "--scheme", "both", "--json", "out.json")
     assert done.returncode == 0, done.stderr
     assert "none" not in json.loads((tmp_path / "out.json").read_text())
 
 
-def test_a_profile_without_a_model_is_told_how_to_get_one(hdbridge):
+def test_a_profile_without_a_model_gets_advice(hdbridge):
     done = hdbridge("step", "demo", "--simulate")
     assert done.returncode == 2
     assert "hdbridge calibrate demo, or step without one: --scheme none" in done.stderr

@@ -25,7 +25,7 @@ import pytest
         (("step", "article", "--count", "1\n2"), r"--count: found '1\n2'"),
     ],
 )
-def test_one_line_says_what_was_given_and_what_is_expected(hdbridge, arguments, line):
+def test_errors_state_the_given_and_the_expected_value(hdbridge, arguments, line):
     done = hdbridge(*arguments)
     assert done.returncode == 2
     assert done.stdout == ""
@@ -35,7 +35,7 @@ def test_one_line_says_what_was_given_and_what_is_expected(hdbridge, arguments, 
 
 
 @pytest.mark.parametrize("arguments", [(), ("model",)])
-def test_without_a_command_it_shows_what_there_is(hdbridge, arguments):
+def test_without_a_command_the_overview_is_shown(hdbridge, arguments):
     done = hdbridge(*arguments)
     assert done.returncode == 2
     assert "Usage" in done.stdout

@@ -39,7 +39,7 @@ def test_the_motor_encoder_measures_the_response(hdbridge, blind: Path, tmp_path
 
 
 @pytest.mark.parametrize("command", ["step", "calibrate", "improve"])
-def test_what_needs_an_encoder_at_the_load_is_refused(hdbridge, blind: Path, command: str) -> None:
+def test_commands_needing_a_load_encoder_are_refused(hdbridge, blind: Path, command: str) -> None:
     done = hdbridge(command, blind, "--simulate")
     assert done.returncode == 2
     assert "axis.yaml:" in done.stderr

@@ -31,13 +31,13 @@ def machine(tmp_path, monkeypatch):
         yield listen
 
 
-def test_the_only_one_needs_no_address(machine):
+def test_a_single_daemon_needs_no_address(machine):
     path = machine("cell")
     assert find(environment=machine.environment) == Address(socket=path)
     assert find("cell", environment=machine.environment).socket == path
 
 
-def test_one_of_several_is_named(machine):
+def test_one_of_several_daemons_is_chosen_by_name(machine):
     machine("cell")
     other = machine("press", "system/press")
     with pytest.raises(DaemonError, match=r"2 daemons run: .*cell\.sock, .*press\.sock"):
@@ -47,7 +47,7 @@ def test_one_of_several_is_named(machine):
         find("mill", environment=machine.environment)
 
 
-def test_a_socket_that_nobody_listens_at_is_no_daemon(machine, tmp_path):
+def test_a_dead_socket_is_not_a_daemon(machine, tmp_path):
     path = machine("cell")
     dead = path.with_name("dead.sock")
     with socket.socket(socket.AF_UNIX) as listener:
@@ -55,7 +55,7 @@ def test_a_socket_that_nobody_listens_at_is_no_daemon(machine, tmp_path):
     assert find(environment=machine.environment).socket == path
 
 
-def test_a_daemon_that_ends_meanwhile_is_not_there(machine, tmp_path):
+def test_a_daemon_ending_during_the_search_is_not_found(machine, tmp_path):
     machine("cell", "system/cell")
     folder = tmp_path / "system" / "cell"
 
@@ -68,7 +68,7 @@ def test_a_daemon_that_ends_meanwhile_is_not_there(machine, tmp_path):
         find(environment=machine.environment)
 
 
-def test_a_folder_that_anybody_can_write_to_is_not_trusted(machine):
+def test_a_world_writable_folder_is_not_trusted(machine):
     """Below /tmp a stranger could put a socket where ours would be."""
     path = machine("cell")
     path.parent.chmod(0o777)
@@ -76,7 +76,7 @@ def test_a_folder_that_anybody_can_write_to_is_not_trusted(machine):
         find(environment=machine.environment)
 
 
-def test_what_is_given_comes_before_the_environment(machine, tmp_path):
+def test_an_argument_takes_precedence_over_the_environment(machine, tmp_path):
     machine("cell")
     given = {**machine.environment, "HDBRIDGE_SOCKET": str(tmp_path / "a.sock")}
     assert find(environment=given).socket == tmp_path / "a.sock"
@@ -90,6 +90,6 @@ def test_what_is_given_comes_before_the_environment(machine, tmp_path):
     "wrong",
     ["http://", "https://cell/api", "http://user:pass@cell", "http://cell?token=x", "cell one", "http://a b"],
 )
-def test_what_is_no_address_is_refused(machine, wrong):
+def test_an_invalid_address_is_refused(machine, wrong):
     with pytest.raises(InputError, match="expected"):
         find(wrong, environment=machine.environment)

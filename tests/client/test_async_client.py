@@ -1,15 +1,11 @@
 """The client for asyncio: the same names, awaited."""
 
 import asyncio
-import inspect
-
-import pytest
 
 from hdbridge import AsyncClient
-from hdbridge.client import aioaxis, axis, messages, sync
 
 
-def test_a_task_that_is_cancelled_gives_the_lease_back(api):
+def test_a_cancelled_task_releases_the_lease(api):
     api.bridge.axes["joint-1"].moving_s = 30.0
 
     async def use() -> None:
@@ -22,24 +18,3 @@ def test_a_task_that_is_cancelled_gives_the_lease_back(api):
             assert not (await client.lease_state()).held
 
     asyncio.run(use())
-
-
-def public(kind) -> dict[str, inspect.Signature]:
-    return {
-        name: [each.replace(annotation="") for each in inspect.signature(found).parameters.values()]
-        for name, found in vars(kind).items()
-        if inspect.isfunction(found) and not name.startswith("_")
-    }
-
-
-@pytest.mark.parametrize(
-    ("one", "other"), [(axis.Axis, aioaxis.AsyncAxis), (axis.Stream, aioaxis.AsyncStream)]
-)
-def test_both_clients_have_the_same_methods(one, other):
-    assert public(one) == public(other)
-
-
-def test_both_clients_themselves_have_the_same_methods():
-    mine = public(sync.Client)
-    assert {**mine, "axes": [*public(AsyncClient)["axes"]]} == public(AsyncClient)
-    assert messages.Move.__doc__

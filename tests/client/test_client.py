@@ -16,7 +16,7 @@ from hdbridge.client import messages
 USER = pwd.getpwuid(os.getuid()).pw_name
 
 
-def test_one_line_moves_an_axis_and_gives_the_right_to_move_back(api, monkeypatch):
+def test_one_line_moves_an_axis_and_releases_the_lease(api, monkeypatch):
     monkeypatch.setenv("HDBRIDGE_SOCKET", str(api.socket))
     assert Client().axis("joint-1").move(30).load_target_deg == 30.0
     assert api.bridge.moved == [("joint-1", "move", 30.0, None)]
@@ -31,7 +31,7 @@ def test_the_state_is_typed(client):
     assert client.axis("joint-2").state().state is messages.ControlState.DISABLED
 
 
-def test_a_coordinated_move_and_an_object_and_marks(client, api):
+def test_coordinated_moves_objects_and_marks(client, api):
     client.axis("joint-2").enable()
     client.coordinated({"joint-1": 1, "joint-2": 2}, speed=0.5)
     assert [each.load_target_deg for each in client.state().axes] == [1.0, 2.0]
@@ -40,7 +40,7 @@ def test_a_coordinated_move_and_an_object_and_marks(client, api):
     assert client.events(event.sequence).events == []
 
 
-def test_the_lease_is_held_in_the_block_and_renewed_meanwhile(api):
+def test_the_lease_is_held_and_renewed_within_the_block(api):
     api.bridge.lease = type(api.bridge.lease)(0.3, api.bridge.lease._now)
     with Client(api.socket, name="patience") as client:
         with client.lease() as grant:
@@ -53,7 +53,7 @@ def test_the_lease_is_held_in_the_block_and_renewed_meanwhile(api):
         assert not client.lease_state().held
 
 
-def test_another_client_waits_or_takes_it_by_force(api):
+def test_another_client_is_refused_or_takes_the_lease_by_force(api):
     with Client(api.socket, name="one") as one, Client(api.socket, name="two") as two:
         with one.lease():
             with pytest.raises(LeaseError, match="'one \\("):
@@ -96,14 +96,14 @@ def test_threads_share_the_lease_of_a_client(api):
         (lambda c: c.axis("joint-1").queue([1.0], wait=False), LeaseError, "client.lease"),
     ],
 )
-def test_what_is_refused_is_the_error_that_it_is_in_the_library(client, api, call, error, words):
+def test_refusals_raise_the_library_errors(client, api, call, error, words):
     with pytest.raises(error, match=words):
         call(client)
     assert api.bridge.moved == []
     assert not api.bridge.state().lease.held
 
 
-def test_a_jog_of_some_time_is_repeated_and_ends_in_a_stop(client, api):
+def test_a_timed_jog_is_renewed_and_ends_in_a_stop(client, api):
     client.axis("joint-1").jog(5.0, duration_s=0.4)
     assert len(api.bridge.moved) >= 2
     assert api.bridge.stopped == [("joint-1", "stop")]
@@ -122,7 +122,7 @@ def once_queued(axis, act):
     return thread
 
 
-def test_a_queue_is_waited_for_until_nothing_waits(client, api):
+def test_queue_waits_until_it_is_empty(client, api):
     axis = api.bridge.axes["joint-1"]
     reached = once_queued(axis, axis.queued.clear)
     client.axis("joint-1").queue([1.0, 2.0])
@@ -130,7 +130,7 @@ def test_a_queue_is_waited_for_until_nothing_waits(client, api):
     assert axis.queued == []
 
 
-def test_a_stop_ends_the_waiting_with_its_reason(client, api):
+def test_a_stop_ends_the_wait_with_its_reason(client, api):
     axis = api.bridge.axes["joint-1"]
     stopping = once_queued(axis, lambda: setattr(axis, "at", messages.ControlState.QUICK_STOPPED))
     with pytest.raises(SafetyStop, match="a TPDO is missing; check the cable"):
@@ -138,7 +138,7 @@ def test_a_stop_ends_the_waiting_with_its_reason(client, api):
     stopping.join()
 
 
-def test_a_path_is_streamed_and_the_lease_given_back(client, api):
+def test_a_path_is_streamed_and_the_lease_released(client, api):
     with client.axis("joint-1").stream(timeout_s=0.2) as stream:
         stream.put([(0.0, 0.0), (0.1, 0.5, 5.0)])
         stream.put(messages.StreamPoint(time_s=0.2 + 0.01 * n, position_deg=1.0) for n in range(450))
@@ -148,7 +148,7 @@ def test_a_path_is_streamed_and_the_lease_given_back(client, api):
     assert not api.bridge.state().lease.held
 
 
-def test_a_refused_point_and_an_error_of_ones_own_leave_the_stream(client, api):
+def test_a_refused_point_or_an_error_ends_the_stream(client, api):
     with (
         pytest.raises(InputError, match="-180 to 180"),
         client.axis("joint-1").stream() as stream,
@@ -161,7 +161,7 @@ def test_a_refused_point_and_an_error_of_ones_own_leave_the_stream(client, api):
     assert not api.bridge.state().lease.held
 
 
-def test_samples_are_read_as_they_come(client):
+def test_samples_are_received_live(client):
     cycles: list[int] = []
     for samples in client.live(every=5, axes=["joint-2"]):
         if set(samples.axes) == {"joint-2"}:  # as asked for, once that has arrived
@@ -181,7 +181,7 @@ def test_without_a_daemon_it_says_how_to_start_one(tmp_path, monkeypatch):
         client.state()
 
 
-def test_a_wrong_token_is_said(api):
+def test_a_wrong_token_is_reported(api):
     with (
         Client(f"http://127.0.0.1:{api.port}", token="not-the-token-at-all") as client,
         pytest.raises(DaemonError, match="token"),
@@ -213,7 +213,7 @@ def test_neither_client_nor_messages_import_the_daemon():
 
 
 @pytest.mark.parametrize("missing", ["httpx", "websockets"])
-def test_without_the_extra_it_says_what_to_install(missing):
+def test_missing_extra_is_named(missing):
     program = (
         f"import sys\nsys.modules[{missing!r}] = None\nimport hdbridge\n"
         "try:\n    hdbridge.Client\nexcept hdbridge.InputError as error:\n    print(error)"

@@ -12,7 +12,7 @@ EXAMPLES = re.findall(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), 
 
 
 @pytest.mark.parametrize("number", range(len(EXAMPLES)))
-def test_an_example_runs(number, api, monkeypatch, capsys):
+def test_documented_example_runs(number, api, monkeypatch, capsys):
     api.bridge.__init__("arm", "base")
     api.bridge.axes["arm"].at = ControlState.ENABLED
     monkeypatch.setenv("HDBRIDGE_SOCKET", str(api.socket))
@@ -22,5 +22,5 @@ def test_an_example_runs(number, api, monkeypatch, capsys):
     assert bool(told) == ("print(" in EXAMPLES[number])
 
 
-def test_there_are_examples():
+def test_the_page_has_examples():
     assert len(EXAMPLES) >= 4

@@ -33,7 +33,7 @@ EXAMPLES = {
 
 @pytest.mark.parametrize("request_", EXAMPLES, ids=lambda each: each.__name__)
 @pytest.mark.parametrize("wrong", [math.nan, math.inf, -math.inf, 1e300, "30", True, None, [1.0]])
-def test_a_number_of_a_request_is_finite_bounded_and_a_number(request_, wrong):
+def test_request_numbers_are_finite_and_bounded(request_, wrong):
     right = EXAMPLES[request_]
     assert request_.model_validate(right)
     name = next(iter(right))
@@ -44,13 +44,13 @@ def test_a_number_of_a_request_is_finite_bounded_and_a_number(request_, wrong):
 
 
 @pytest.mark.parametrize("request_", REQUESTS, ids=lambda each: each.__name__)
-def test_a_request_refuses_a_key_that_it_does_not_know(request_):
+def test_requests_refuse_unknown_keys(request_):
     with pytest.raises(ValidationError, match="taget_deg"):
         request_.model_validate({**EXAMPLES.get(request_, {}), "taget_deg": 1.0})
 
 
 @pytest.mark.parametrize("request_", REQUESTS, ids=lambda each: each.__name__)
-def test_every_field_that_takes_much_is_bounded(request_):
+def test_every_variable_size_field_is_bounded(request_):
     """A list, a text or a mapping without an upper limit would let one request fill the memory."""
 
     def unbounded(schema, path):
@@ -76,25 +76,25 @@ def test_every_field_that_takes_much_is_bounded(request_):
 
 
 @pytest.mark.parametrize("wrong", ["a\nb", "\x1b[2J", "\x9b2J", "\u202egnitirw", "\u2028", "x" * 401, 3])
-def test_a_text_of_a_client_is_one_line_that_moves_no_cursor(wrong):
+def test_client_texts_are_one_line_without_control_characters(wrong):
     """Others are shown it, and it goes into the log."""
     with pytest.raises(ValidationError, match="client"):
         messages.LeaseRequest(client=wrong)
     assert messages.LeaseRequest(client="Zelle 3, Prüfstand \u2192 Süd").client
 
 
-def test_a_report_ignores_what_a_newer_daemon_adds():
+def test_reports_ignore_unknown_keys():
     state = messages.LeaseState.model_validate({"held": False, "timeout_s": 5.0, "colour": "red"})
     assert not state.held
 
 
-def test_closed_sets_are_those_of_the_drive_and_the_evaluation():
+def test_enumerations_match_those_of_drive_and_evaluation():
     assert [each.value for each in messages.PowerState] == [each.value for each in State]
     assert [each.value for each in messages.Scheme] == [each.value for each in Scheme]
 
 
 @pytest.mark.parametrize("kind", RAISED, ids=lambda each: each.__name__)
-def test_an_error_comes_back_as_what_it_was(kind):
+def test_errors_survive_the_round_trip(kind):
     problem = messages.Problem.of(kind("node 3: no answer; check its power"), axis="joint-3")
     assert problem.hint == "check its power"
     assert problem.axis == "joint-3"
@@ -104,7 +104,7 @@ def test_an_error_comes_back_as_what_it_was(kind):
     assert back.exit_status == kind.exit_status
 
 
-def test_an_error_of_a_narrower_kind_comes_back_as_the_kind_that_clients_know():
+def test_a_subclass_of_an_error_arrives_as_its_public_base_class():
     class AbortError(errors.SdoError):
         pass
 
@@ -113,7 +113,7 @@ def test_an_error_of_a_narrower_kind_comes_back_as_the_kind_that_clients_know():
     assert back.exit_status == 4
 
 
-def test_the_narrowest_row_of_an_error_counts():
+def test_subclasses_precede_their_base_classes_in_the_table():
     """A kind that stands behind one that it is derived from would never be told."""
     kinds = list(STATUS)
     assert [
@@ -125,12 +125,12 @@ def test_the_narrowest_row_of_an_error_counts():
 
 
 @given(st.text(max_size=60), st.text(max_size=60))
-def test_a_problem_of_another_server_is_still_an_error_of_hdbridge(kind, detail):
+def test_problems_of_other_servers_become_hdbridge_errors(kind, detail):
     back = messages.Problem(type=kind, title="?", status=418, detail=detail).error()
     assert isinstance(back, errors.HdbridgeError)
 
 
-def test_a_number_that_is_not_one_never_gets_into_json():
+def test_nan_becomes_null_in_json():
     columns = {name: [math.nan] for name in messages.AxisColumns.model_fields}
     columns["state"] = ["enabled"]
     batch = messages.Samples(
@@ -146,7 +146,7 @@ def test_a_number_that_is_not_one_never_gets_into_json():
 
 
 @pytest.mark.parametrize("name", messages.__all__)
-def test_every_message_says_what_it_is(name):
+def test_every_message_is_documented(name):
     found = getattr(messages, name)
     assert found.__doc__
     if isinstance(found, type) and issubclass(found, BaseModel):

@@ -51,7 +51,7 @@ def moments(loads):
 
 
 @pytest.mark.parametrize("name", CATALOGUE)
-def test_every_effect_that_may_be_compensated_is_inverted_with_its_channels(name):
+def test_every_compensable_effect_is_inverted_with_its_channels(name):
     effect = CATALOGUE[name].candidate(50.0, BASE)
     model = run_with(effect)
     if not compensable((effect,)):
@@ -72,7 +72,7 @@ def test_every_effect_that_may_be_compensated_is_inverted_with_its_channels(name
         assert abs(3600 * (motor / 50 - load) + gear.advance(motor, moment)) <= 1e-6
 
 
-def test_what_an_inverse_needs_is_said():
+def test_missing_channels_of_an_inverse_are_named():
     assert Inverse(TransmissionModel(50.0, BASE)).needs == frozenset()
     assert Compensation(LOADED, CompensationLimits(), PERIOD).needs == {Channel.LOAD_TORQUE}
 
@@ -89,7 +89,7 @@ def engaged(torque_nm: float) -> tuple[Compensation, Moment]:
     return compensation, moment
 
 
-def test_without_its_channel_an_effect_is_faded_out_and_with_it_in_again():
+def test_an_effect_fades_out_without_its_channel_and_in_again_with_it():
     compensation, moment = engaged(5.0)
     gear = LOADED.tracker(Start.FORWARD)  # five degrees forward are many times the loop's width
     gear.advance(compensation.command(5.0, moment), moment)
@@ -112,7 +112,7 @@ def test_without_its_channel_an_effect_is_faded_out_and_with_it_in_again():
     assert abs(error) < 1e-6
 
 
-def test_to_lose_a_channel_that_nothing_needs_changes_nothing():
+def test_losing_an_unused_channel_changes_nothing():
     compensation, moment = engaged(5.0)
     before = compensation.correction_arcsec
     compensation.know(LOSABLE - {Channel.TEMPERATURE})
@@ -121,7 +121,7 @@ def test_to_lose_a_channel_that_nothing_needs_changes_nothing():
     assert compensation.correction_arcsec == before
 
 
-def test_a_compensation_that_begins_without_the_channel_begins_without_the_effect():
+def test_without_a_channel_at_the_start_its_effect_starts_faded_out():
     compensation = Compensation(LOADED, CompensationLimits(ramp_s=0.5), PERIOD)
     compensation.know(frozenset())
     compensation.reset(0.0)

@@ -55,7 +55,7 @@ load_paths = st.lists(
 
 @settings(deadline=None)
 @given(model=models(), path=load_paths, start=st.sampled_from(list(Start)))
-def test_the_inverse_inverts(model, path, start):
+def test_inverse_is_exact(model, path, start):
     inverse, gear = Inverse(model, start), model.tracker(start)
     inverse.advance(0.0)
     gear.advance(0.0, NOW)
@@ -69,7 +69,7 @@ def test_the_inverse_inverts(model, path, start):
         assert abs(reached - load_deg) * 3600 <= max(1e-6, 2 * bits)
 
 
-def test_the_inverse_inverts_the_article_to_a_millionth_of_an_arcsecond():
+def test_inverse_of_the_article_model_is_exact_to_a_millionth_of_an_arcsecond():
     article = model()
     inverse, gear = Inverse(article), article.tracker()
     inverse.advance(0.0)
@@ -83,7 +83,7 @@ def test_the_inverse_inverts_the_article_to_a_millionth_of_an_arcsecond():
         assert abs(3600 * (motor / 50 - load) + gear.advance(motor, NOW)) <= 1e-6
 
 
-def test_solving_changes_nothing_and_rest_stays_rest():
+def test_solving_has_no_side_effects():
     inverse = Inverse(model())
     inverse.advance(0.0)
     motor = inverse.solve(0.3)
@@ -93,7 +93,7 @@ def test_solving_changes_nothing_and_rest_stays_rest():
     assert [inverse.solve(0.3) for _ in range(5)] == [motor] * 5
 
 
-def test_weight_zero_is_the_plain_gear():
+def test_weight_zero_gives_the_plain_gear():
     inverse = Inverse(model())
     inverse.advance(0.0)
     assert inverse.solve(1.5, weight=0.0) == pytest.approx(75.0, abs=1e-9)
@@ -118,7 +118,7 @@ PLAY = {
 
 
 @pytest.mark.parametrize("play", PLAY.values(), ids=PLAY)
-def test_past_the_crossing_play_is_made_up_for_though_it_has_no_inverse(play):
+def test_backlash_is_compensated_past_the_crossing(play):
     bare = model()
     worn = TransmissionModel(bare.ratio, (*bare.effects, *play))
     inverse, gear = Inverse(worn, Start.FORWARD), worn.tracker(Start.FORWARD)
@@ -141,7 +141,7 @@ lagging = st.builds(
 
 @settings(deadline=None)
 @given(model=lagging, path=load_paths, start=st.sampled_from(list(Start)))
-def test_the_inverse_of_a_load_that_lags_lets_it_stand_still_and_never_run_back(model, path, start):
+def test_inverse_of_a_lagging_load_never_reverses(model, path, start):
     """The inverse limits a law that is steeper than the gear to the steepest possible slope."""
     (loop,) = model.effects
     steepest = 0.9 * 3600.0 / model.ratio
@@ -162,7 +162,7 @@ def test_the_inverse_of_a_load_that_lags_lets_it_stand_still_and_never_run_back(
         last_deg, last_load_deg = motor_deg, load_deg
 
 
-def test_past_the_crossing_a_load_that_lags_arrives_on_its_target():
+def test_a_lagging_load_reaches_its_target_past_the_crossing():
     lags = model(offset=-30.0, width=10.0)
     inverse, gear = Inverse(lags, Start.FORWARD), lags.tracker(Start.FORWARD)
     inverse.advance(0.0)
@@ -173,7 +173,7 @@ def test_past_the_crossing_a_load_that_lags_arrives_on_its_target():
         assert motor_deg / 50.0 + gear.advance(motor_deg, NOW) / 3600 == pytest.approx(load_deg, abs=1e-8)
 
 
-def test_within_the_crossing_of_play_the_motor_runs_ahead_but_never_back():
+def test_within_the_backlash_the_motor_never_reverses():
     inverse = Inverse(TransmissionModel(50.0, PLAY["growing"]), Start.FORWARD)
     inverse.advance(0.0)
     path = [inverse.solve(0.1)]
@@ -192,14 +192,14 @@ def travel(seconds: float, speed_deg_s: float = 10.0) -> list[float]:
     return [speed_deg_s * PERIOD * i for i in range(round(seconds / PERIOD))]
 
 
-def test_disengaged_it_is_the_plain_gear():
+def test_disengaged_compensation_gives_the_plain_gear():
     compensation = Compensation(model(), CompensationLimits(), PERIOD)
     compensation.reset(0.0)
     for load in travel(1.0):
         assert compensation.command(load) == pytest.approx(50 * load, abs=1e-9)
 
 
-def test_engaged_it_puts_the_load_on_target():
+def test_engaged_compensation_puts_the_load_on_target():
     gear_model = model()
     compensation = Compensation(gear_model, CompensationLimits(), PERIOD)
     gear = gear_model.tracker()
@@ -236,7 +236,7 @@ def test_switching_at_rest_moves_the_axis_only_along_the_ramp(on):
     )
 
 
-def test_the_cap_holds():
+def test_size_limit_holds():
     compensation = Compensation(model(), CompensationLimits(maximum_arcsec=15.0), PERIOD)
     compensation.reset(0.0)
     compensation.engage()
@@ -260,7 +260,7 @@ def test_the_slew_limit_holds_through_a_reversal():
     assert compensation.limited > 0
 
 
-def test_hold_freezes_the_correction():
+def test_holding_freezes_the_correction():
     compensation = Compensation(model(), CompensationLimits(), PERIOD)
     compensation.reset(0.0)
     compensation.engage()

@@ -46,7 +46,7 @@ def test_a_foreign_model_compensates_nothing(what):
         compensation_for(AXIS, model)
 
 
-def test_what_the_drive_answers_counts_and_a_compensation_of_ones_own_making_is_no_way_round():
+def test_drive_identity_is_checked_even_for_custom_compensations():
     truth = Truth.load(PROFILE / "truth.yaml")
     with booted(AXIS, truth) as (drive, _):
         assert drive.identity.serial not in {None, 7}
@@ -60,7 +60,7 @@ def test_what_the_drive_answers_counts_and_a_compensation_of_ones_own_making_is_
             assert Bench(drive, compensation_for(AXIS, model)).run(Stepping(count=2)).segments
 
 
-def test_a_cap_that_cuts_the_model_is_said():
+def test_a_cap_that_limits_the_model_is_reported():
     assert cap_remark(AXIS, MODEL) is None
     orders = {"orders": [{"order": 2, "amplitude_arcsec": 400, "phase_deg": 0}]}
     large = replace(MODEL, effects=(Synchronous.model_validate(orders),))

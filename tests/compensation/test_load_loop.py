@@ -72,7 +72,7 @@ class Plant:
         st.tuples(numbers, st.none() | numbers, numbers, st.booleans(), st.integers(1, 200)), max_size=20
     )
 )
-def test_the_value_is_bounded_and_never_steps_for_any_input(inputs):
+def test_value_is_bounded_and_continuous_for_any_input(inputs):
     its = loop(gain=5.0)
     value = 0.0
     for target, load, motor, moving, periods in inputs:
@@ -85,13 +85,13 @@ def test_the_value_is_bounded_and_never_steps_for_any_input(inputs):
 
 
 @given(lags, st.floats(0.2, 5.0))
-def test_at_rest_the_mean_error_is_taken_away(lag, gain):
+def test_mean_error_at_rest_is_removed(lag, gain):
     plant = Plant(loop(gain), lag)
     assert abs(plant.rest(1.0 + 10.0 / gain)) <= 1e-3 * abs(lag) + 1e-9
     assert not plant.its.doubt
 
 
-def test_in_motion_the_value_is_held():
+def test_value_is_held_in_motion():
     plant = Plant(loop(), 20.0)
     plant.rest(3.0)
     held = plant.its.value_arcsec
@@ -99,7 +99,7 @@ def test_in_motion_the_value_is_held():
 
 
 @given(lags)
-def test_without_a_reading_it_fades_out_and_comes_back(lag):
+def test_value_fades_out_without_a_reading_and_returns(lag):
     plant = Plant(loop(), lag)
     plant.rest(3.0)
     for _ in range(round(MAXIMUM / SLEW / PERIOD_S) + 1):
@@ -109,7 +109,7 @@ def test_without_a_reading_it_fades_out_and_comes_back(lag):
 
 
 @given(st.floats(41, 79), signs)
-def test_at_its_bound_it_does_not_wind_up(lag, sign):
+def test_no_wind_up_at_the_bound(lag, sign):
     plant = Plant(loop(gain=5.0), sign * lag)
     plant.rest(5.0)
     assert plant.its.value_arcsec == sign * MAXIMUM
@@ -136,7 +136,7 @@ def test_a_reset_continues_from_its_value(value):
     moves=st.lists(st.tuples(st.floats(-500, 500), st.floats(-3, 3)), max_size=6),
     seed=st.integers(0, 1000),
 )
-def test_motor_counts_noise_and_reversals_are_never_taken_for_a_fault(lag, noise, count, moves, seed):
+def test_motor_counts_noise_and_reversals_are_not_faults(lag, noise, count, moves, seed):
     its = loop(gain=0.5, counts=count + 0.1, maximum=20.0, slew=20.0)
     plant = Plant(its, lag, noise, count, random=Random(seed))
     plant.rest(4.0)
@@ -148,7 +148,7 @@ def test_motor_counts_noise_and_reversals_are_never_taken_for_a_fault(lag, noise
 
 
 @given(st.floats(-20, 20), st.floats(2.0, 1000), signs)
-def test_an_encoder_that_moves_at_rest_is_not_followed_until_it_moves_back(lag, size, sign):
+def test_an_encoder_moving_at_rest_is_ignored_until_it_returns(lag, size, sign):
     plant = Plant(loop(), lag)
     plant.rest(2.0)
     before = plant.its.value_arcsec
@@ -164,7 +164,7 @@ def test_an_encoder_that_moves_at_rest_is_not_followed_until_it_moves_back(lag, 
 
 
 @given(st.floats(0.1, 3.0), st.integers(0, 1000), signs)
-def test_with_noise_a_jump_is_found_and_the_doubt_ends_with_it(noise, seed, sign):
+def test_a_jump_is_detected_in_noise_and_the_doubt_ends_with_it(noise, seed, sign):
     plant = Plant(loop(), 10.0, noise, random=Random(seed))
     plant.rest(4.0)
     plant.jump = sign * 30.0 * noise
@@ -175,7 +175,7 @@ def test_with_noise_a_jump_is_found_and_the_doubt_ends_with_it(noise, seed, sign
     assert plant.its.doubt == ""
 
 
-def test_each_further_doubt_doubles_the_time_that_the_encoder_is_observed():
+def test_each_further_doubt_doubles_the_observation_time():
     plant = Plant(loop(), 10.0)
     plant.rest(2.0)
     waits = []
@@ -197,7 +197,7 @@ SMALL = TransmissionModel(100.0, (Hysteresis(offset_arcsec=1.0, width_deg=3.0, e
 
 
 @given(st.floats(6, 20), signs)
-def test_an_encoder_that_stands_still_is_found_by_the_motion_of_the_motor(shown, sign):
+def test_a_frozen_encoder_is_detected_by_motor_motion(shown, sign):
     its = loop(gain=2.0)
     its.use_models(SMALL, TransmissionModel(100.0))
     plant = Plant(its, sign * shown)
@@ -208,7 +208,7 @@ def test_an_encoder_that_stands_still_is_found_by_the_motion_of_the_motor(shown,
     assert its.value_arcsec == 0.0
 
 
-def test_an_encoder_that_stood_still_is_believed_again_after_motion_in_both_directions():
+def test_a_recovered_encoder_is_trusted_after_motion_in_both_directions():
     plant = Plant(loop(gain=2.0, maximum=20.0), 10.0)
     plant.its.use_models(SMALL, SMALL)
     plant.frozen = -10.0
@@ -225,7 +225,7 @@ def test_an_encoder_that_stood_still_is_believed_again_after_motion_in_both_dire
     assert plant.its.doubt == ""
 
 
-def test_an_error_that_is_too_large_is_left_alone_and_reported():
+def test_an_excessive_error_is_not_corrected_but_reported():
     plant = Plant(loop(), 20.0)
     plant.rest(3.0)
     plant.lag = 85.0
@@ -247,7 +247,7 @@ def test_a_slow_drift_is_followed():
     assert abs(plant.lag - plant.its.value_arcsec) < 1.0
 
 
-def test_switching_it_on_again_ends_a_doubt():
+def test_switching_on_again_ends_a_doubt():
     plant = Plant(loop(), 10.0)
     plant.rest(2.0)
     plant.jump = 5.0
@@ -278,7 +278,7 @@ def test_the_width_of_a_loop_is_twice_its_offset(law):
         ((6.0, 1.0, 1.0, 1.0, 1.0), "at most 5"),
     ],
 )
-def test_numbers_that_make_no_loop_are_refused(numbers, message):
+def test_invalid_settings_are_refused(numbers, message):
     *first, counts = numbers
     with pytest.raises(InputError, match=message):
         LoadLoop(*first, counts_arcsec=counts)
@@ -286,7 +286,7 @@ def test_numbers_that_make_no_loop_are_refused(numbers, message):
         loop().reset(math.nan)
 
 
-def test_a_reset_begins_at_zero_without_a_doubt():
+def test_a_reset_starts_at_zero_without_doubt():
     its = loop()
     plant = Plant(its, lag=20.0)
     for _ in range(2000):

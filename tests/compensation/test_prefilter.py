@@ -64,7 +64,7 @@ def smooth_move(far_deg: float, time_s: float) -> np.ndarray:
 
 @settings(deadline=None, max_examples=30)
 @given(measured=filters, moves=st.lists(st.floats(-10.0, 10.0), min_size=1, max_size=4))
-def test_at_rest_it_is_the_static_correction_to_the_last_bit(measured, moves):
+def test_correction_at_rest_equals_the_static_one_bit_for_bit(measured, moves):
     filtered, static = begun(model(measured)), begun(model())
     place = 0.0
     for far in moves:
@@ -120,7 +120,7 @@ def test_size_and_slew_limits_hold_for_the_filtered_correction(measured, targets
         before = correction
 
 
-def test_its_state_follows_the_unfiltered_path():
+def test_filter_state_follows_the_unfiltered_path():
     """A filter that overshoots must not make the hysteresis reverse."""
     sharp = response([3.0, -2.0, *[0.0] * 7], lead=4)
     filtered, static = begun(model(sharp)), begun(model())
@@ -130,7 +130,7 @@ def test_its_state_follows_the_unfiltered_path():
         assert filtered.predicted_arcsec == pytest.approx(static.predicted_arcsec, abs=1e-6)
 
 
-def test_a_change_of_the_response_in_motion_makes_no_step():
+def test_changing_the_response_in_motion_causes_no_step():
     first = begun(model())
     correction = Correction(first)
     targets = 20.0 * PERIOD * np.arange(1, 800)
@@ -152,7 +152,7 @@ def test_a_response_of_another_cycle_is_refused():
         Compensation(model(response([1.0], lead=0, per_cycle=1, cycle_ms=2.0)), WIDE, PERIOD)
 
 
-def test_the_model_file_keeps_it(tmp_path):
+def test_model_file_keeps_the_response(tmp_path):
     given = model(response([0.5, 0.25, 0.25]))
     given.save(tmp_path / "model.yaml")
     assert TransmissionModel.load(tmp_path / "model.yaml") == given
@@ -162,7 +162,7 @@ def test_the_model_file_keeps_it(tmp_path):
 
 @settings(deadline=None, max_examples=20)
 @given(measured=filters, far_deg=st.floats(0.3, 10.0))
-def test_no_filter_makes_the_motor_turn_back_at_the_end_of_a_move(measured, far_deg):
+def test_no_filter_reverses_the_motor_at_the_end_of_a_move(measured, far_deg):
     """The load would stay on the wrong side of its hysteresis."""
     filtered = begun(model(measured))
     targets = [*smooth_move(far_deg, math.sqrt(far_deg / 8.0)), *[far_deg] * 60]

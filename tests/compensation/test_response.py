@@ -117,7 +117,7 @@ def test_a_run_that_explores_extends_the_known_range():
     assert second.known_to_hz > 80.0
 
 
-def test_an_order_that_would_exceed_the_slew_limit_is_corrected_in_part():
+def test_an_order_exceeding_the_slew_limit_is_partly_corrected():
     answer = flat
     wide, narrow = measured(answer), measured(answer, slew_arcsec_s=6000.0)
     hertz = np.array([10.0, 60.0])

@@ -65,7 +65,7 @@ def places(stretches, start: float = 0.0) -> list[float]:
 
 
 @given(models, models, speeds, speeds, st.integers(0, 40))
-def test_a_change_never_steps_and_ends_where_the_new_model_alone_would_be(old, new, before, after, held):
+def test_a_change_is_continuous_and_ends_at_the_new_model(old, new, before, after, held):
     correction, alone = Correction(made(old)), made(new)
     way = places(before)
     for load in way:
@@ -93,7 +93,7 @@ def test_a_change_never_steps_and_ends_where_the_new_model_alone_would_be(old, n
 
 
 @given(models, speeds)
-def test_the_new_model_begins_in_the_state_that_the_path_gave_it(its, way):
+def test_the_new_model_starts_in_the_state_given_by_the_path(its, way):
     """At rest from the beginning of the change on: nothing but the path before can tell it."""
     correction, alone = Correction(made(its)), made(its)
     load = 0.0
@@ -110,7 +110,7 @@ def test_the_new_model_begins_in_the_state_that_the_path_gave_it(its, way):
 
 
 @given(st.lists(st.sampled_from(list(Scheme)[:4]), min_size=1, max_size=4), speeds)
-def test_schemes_are_changed_alike(schemes, way):
+def test_schemes_are_changed_the_same_way(schemes, way):
     whole = model()
     correction = Correction(made(Scheme.BOTH.of(whole)))
     load = last = 0.0
@@ -126,7 +126,7 @@ def test_schemes_are_changed_alike(schemes, way):
         assert correction.correction_arcsec == pytest.approx(0.0, abs=1e-9)
 
 
-def test_while_nothing_changes_it_is_the_compensation_itself():
+def test_without_a_change_it_equals_the_compensation():
     compensation = made(model())
     correction = Correction(compensation)
     assert correction.command == compensation.command
@@ -169,7 +169,7 @@ def test_a_smaller_cap_is_reached_within_the_slew():
     assert last == pytest.approx(5.0)
 
 
-def test_it_fades_out_and_in_during_a_change():
+def test_weight_fades_during_a_change():
     correction = Correction(made(model()))
     way = places([(2.0, 200)])
     for load in way[:100]:
@@ -202,14 +202,14 @@ def test_a_reset_ends_a_change_and_forgets_the_path():
     assert correction.weight > 0.0
 
 
-def test_a_model_that_remembers_no_path_is_known_at_once():
+def test_a_model_without_memory_is_known_at_once():
     its = Compensation(Scheme.SYNCHRONOUS.of(model()), LIMITS, PERIOD)
     its.reset(0.0)
     assert its.memory_known
     assert not made(model()).memory_known
 
 
-def test_a_new_model_with_memory_of_time_begins_now():
+def test_a_new_model_with_memory_of_time_starts_now():
     """Creep counts from its first moment; the replayed path must not make it older."""
     creep = Creep(parts=(Relaxation(amplitude_arcsec=20.0, tau_s=1.0),))
     observer = Observer()
@@ -233,7 +233,7 @@ def test_a_new_model_with_memory_of_time_begins_now():
     assert -20.0 * 0.2 < correction.correction_arcsec < -20.0 * 0.1
 
 
-def test_the_prediction_is_the_models_error_whatever_the_weight():
+def test_prediction_is_independent_of_the_weight():
     its = model(amplitude=0.0)
     off = Compensation(its, LIMITS, PERIOD)
     off.reset(0.0)
@@ -243,7 +243,7 @@ def test_the_prediction_is_the_models_error_whatever_the_weight():
     assert off.predicted_arcsec == pytest.approx(30.0)
 
 
-def test_play_that_is_crossed_gently_is_remembered_as_long():
+def test_gently_crossed_backlash_keeps_its_memory():
     gap = Backlash(gap_arcsec=20.0, crossing_deg=0.01)
     its = Compensation(TransmissionModel(RATIO, (gap,)), LIMITS, PERIOD)
     its.reset(0.0)
@@ -260,7 +260,7 @@ def bundled() -> list[Path]:
 
 
 @pytest.mark.parametrize("folder", bundled(), ids=lambda each: each.name)
-def test_a_compensation_goes_through_a_pickle(folder):
+def test_compensation_can_be_pickled(folder):
     """The service makes it, the loop takes it."""
     axis = AxisConfig.load(folder / "axis.yaml")
     whole = TransmissionModel.load(folder / "model.yaml")
@@ -275,5 +275,5 @@ def test_a_compensation_goes_through_a_pickle(folder):
         assert (sent.needs, sent.model.ratio) == (compensation.needs, compensation.model.ratio)
 
 
-def test_there_are_bundled_models():
+def test_bundled_models_are_found():
     assert len(bundled()) >= 2

@@ -703,7 +703,7 @@ FAULTS: tuple[Fault, ...] = (
 )  # fmt: skip
 
 
-def test_there_are_many_faults_and_their_checks_exist():
+def test_every_seeded_fault_names_an_existing_check():
     assert len(FAULTS) >= 100
     assert {check for check, _, _ in FAULTS} <= set(CHECKS)
 

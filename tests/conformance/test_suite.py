@@ -124,7 +124,7 @@ def test_an_absent_node_is_one_clear_error():
             run(absent, EVERY)
 
 
-def test_a_run_that_is_ended_in_a_move_stops_the_axis_and_changes_everything_back():
+def test_an_interrupted_move_is_stopped_and_everything_restored():
     moving = [each for each in EVERY if each.id == "402.pp.velocity"] * 2
     with simulated_drive(stopped=lambda: motor.powered and motor.velocity_counts_s != 0.0) as (
         tester,
@@ -139,7 +139,7 @@ def test_a_run_that_is_ended_in_a_move_stops_the_axis_and_changes_everything_bac
 
 
 @pytest.mark.parametrize("name", ["lss.node-id.used", "lss.fast-scan"])
-def test_a_run_that_is_ended_gives_the_node_its_node_id_again(name):
+def test_an_interrupted_run_restores_the_node_id(name):
     renumbered = [each for each in EVERY if each.id == name]
     with simulated_drive(stopped=lambda: node.node_id != 1) as (tester, node, _):
         run(tester, renumbered)

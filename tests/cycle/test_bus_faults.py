@@ -44,7 +44,7 @@ def broken(feedback: object) -> int:
     raise ZeroDivisionError("1 / 0")
 
 
-def test_a_command_that_breaks_stops_its_axis_alone(pair: TwoAxes) -> None:
+def test_an_exception_in_a_command_stops_only_its_axis(pair: TwoAxes) -> None:
     pair.moving[0] = False
     pair.axes[0].command = broken
     pair.turn()
@@ -66,7 +66,7 @@ def test_the_quick_stop_is_driven_and_confirmed_while_the_other_axis_moves(pair:
     assert pair.axes[0].image.power.state is State.SWITCH_ON_DISABLED
 
 
-def test_a_stop_that_is_not_confirmed_says_so_and_delays_nobody_for_ever(pair: TwoAxes) -> None:
+def test_an_unconfirmed_stop_is_reported_and_delays_no_axis_forever(pair: TwoAxes) -> None:
     pair.nodes[0].faults.silent = True
     pair.turn(2)
     pair.turn(270)
@@ -113,7 +113,7 @@ def test_a_stopped_axis_is_reset_and_moves_again_while_the_other_never_stopped(p
     assert pair.follows(1)
 
 
-def test_a_stopped_axis_is_told_nothing_and_not_asked(pair: TwoAxes) -> None:
+def test_a_stopped_axis_gets_no_commands(pair: TwoAxes) -> None:
     pair.interfere(0x601, bytes(8))
     pair.turn()
     asked: list[object] = []
@@ -125,7 +125,7 @@ def test_a_stopped_axis_is_told_nothing_and_not_asked(pair: TwoAxes) -> None:
     assert pair.axes[0].image.power.state is not State.OPERATION_ENABLED
 
 
-def test_after_the_interface_was_opened_anew_verified_axes_move_again(pair: TwoAxes) -> None:
+def test_verified_axes_move_again_after_the_interface_is_reopened(pair: TwoAxes) -> None:
     pair.bus.recv_error = DOWN
     pair.turn()
     assert pair.cycle.down is not None

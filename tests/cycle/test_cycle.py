@@ -25,15 +25,6 @@ def test_sync_comes_first_and_the_rpdo_after_the_feedback(moving) -> None:
     assert [can_id for _, can_id, _ in moving.bus.sent][:2] == [0x080, 0x201]
 
 
-def test_syncs_come_on_absolute_deadlines(moving) -> None:
-    moving.move(100)
-    times = [time_s for time_s, _ in moving.frames(0x080)]
-    assert len(times) == 100
-    for count, time_s in enumerate(times):
-        assert time_s == pytest.approx(times[0] + 0.004 * count, abs=1e-9)
-    assert moving.cycle.histogram.maximum_us == 0
-
-
 def test_work_between_ticks_does_not_shift_the_deadlines(moving) -> None:
     for _ in range(20):
         moving.clock.sleep_until(moving.clock.now() + 0.0015)
@@ -55,7 +46,7 @@ def test_the_feedback_follows_the_target(moving) -> None:
     assert last.demand_counts == pytest.approx(last.motor_counts, abs=200)
 
 
-def test_a_command_of_none_holds_the_last_target(moving) -> None:
+def test_no_command_holds_the_last_target(moving) -> None:
     moving.move()
     moving.cycle.tick(None)
     moving.cycle.tick(lambda feedback: None)
@@ -63,21 +54,12 @@ def test_a_command_of_none_holds_the_last_target(moving) -> None:
     assert targets == [moving.target] * 3
 
 
-def test_before_the_drive_is_enabled_the_target_is_where_it_stands(idle) -> None:
+def test_the_target_is_the_actual_position_before_power(idle) -> None:
     for _ in range(10):
         feedback = idle.cycle.tick(123_456)
     assert idle.drive.image.power.state is not State.OPERATION_ENABLED
     for _, data in idle.frames(0x201):
         assert struct.unpack("<Hi", data)[1] == feedback.motor_counts
-
-
-def test_the_master_sends_its_heartbeat_at_its_period(moving) -> None:
-    moving.move(250)
-    times = [time_s for time_s, _ in moving.frames(0x77F)]
-    gaps = [b - a for a, b in pairwise(times)]
-    assert max(gaps) <= 0.025 + 0.004 + 1e-9
-    assert len(times) == pytest.approx(40, abs=4)
-    assert all(data == b"\x05" for _, data in moving.frames(0x77F))
 
 
 def test_the_first_cycle_after_a_rest_sends_the_heartbeat(idle) -> None:
@@ -103,7 +85,7 @@ def test_an_overrun_skips_whole_periods_and_never_bursts(moving) -> None:
     assert moving.supervision.stop is None
 
 
-def test_late_but_less_than_half_a_period_is_only_recorded(moving) -> None:
+def test_less_than_half_a_period_late_is_only_recorded(moving) -> None:
     moving.move()
     moving.clock.sleep_until(moving.clock.now() + 0.0055)
     moving.move()
@@ -111,7 +93,7 @@ def test_late_but_less_than_half_a_period_is_only_recorded(moving) -> None:
     assert 1400 <= moving.cycle.histogram.maximum_us <= 1600
 
 
-def test_a_rest_is_not_judged_after_restart(moving) -> None:
+def test_a_pause_is_not_judged_after_a_restart(moving) -> None:
     moving.cycle.tick()
     number = moving.cycle.tick().cycle
     moving.drive.image.power.go(State.SWITCHED_ON)
@@ -126,15 +108,9 @@ def test_a_rest_is_not_judged_after_restart(moving) -> None:
     assert moving.cycle.skipped == 0
 
 
-def test_errors_of_the_command_pass_through(moving) -> None:
+def test_exceptions_of_the_command_propagate(moving) -> None:
     def broken(feedback: Feedback) -> int:
         raise ZeroDivisionError
 
     with pytest.raises(ZeroDivisionError):
         moving.cycle.tick(broken)
-
-
-def test_the_cycle_keeps_a_bounded_amount_of_memory(moving) -> None:
-    moving.move(300)
-    assert moving.cycle.stopping == []
-    assert len(moving.supervision.events) == 0

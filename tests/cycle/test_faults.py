@@ -11,39 +11,23 @@ import can
 import pytest
 
 from hdbridge.drive.plausibility import Plausibility
-from hdbridge.drive.states import State
 from hdbridge.drive.supervision import Fault, Reaction
 from hdbridge.errors import SafetyStop
 
 FREEZE, STOP, LATCH = Reaction.FREEZE, Reaction.QUICK_STOP, Reaction.LATCH
 
 
-def quick_stop_was_sent(rig) -> bool:
-    return 0x02 in [struct.unpack("<Hi", data)[0] for _, data in rig.frames(0x201)]
-
-
 # ------------------------------------------------------------------ TPDOs
 
 
-def test_one_lost_tpdo_freezes_and_is_counted(moving) -> None:
-    before = moving.move()
-    moving.node.faults.drop_tpdos = 1
-    lost = moving.move()
-    assert not lost.fresh
-    assert lost[2:7] == before[2:7]
-    assert moving.events(Fault.LOST_TPDO) == [FREEZE]
-    assert moving.move(20).fresh
-    assert moving.supervision.stop is None
-
-
-def test_a_tpdo_lost_in_turns_stops_too(moving) -> None:
+def test_alternately_lost_tpdos_stop_the_axis(moving) -> None:
     moving.node.faults.drop_tpdos = 1
     moving.move()
     moving.node.faults.hold_tpdos = 1
     moving.stopped_within(1, Fault.LOST_TPDO)
 
 
-def test_the_newest_of_one_identifier_wins(moving) -> None:
+def test_the_newest_frame_of_an_identifier_counts(moving) -> None:
     place = moving.move().motor_counts
     moving.node.faults.silent = True
     first, second = (struct.pack("<Hih", 0x1237, place + counts, 0) for counts in (10, 20))
@@ -52,7 +36,7 @@ def test_the_newest_of_one_identifier_wins(moving) -> None:
     assert moving.drive.image.motor_counts == place + 20
 
 
-def test_a_late_tpdo_is_thrown_away_and_not_taken_for_the_next_cycle(moving) -> None:
+def test_a_late_tpdo_is_discarded_not_used_in_the_next_cycle(moving) -> None:
     moving.node.faults.hold_tpdos = 1
     assert not moving.move().fresh
     after = moving.move(3)
@@ -90,14 +74,6 @@ def test_a_tpdo_of_the_wrong_length_beside_a_good_one_is_only_counted(moving) ->
     assert moving.events(Fault.DISCARDED_FRAME) == [Reaction.GO]
 
 
-@pytest.mark.parametrize("kind", ["is_remote_frame", "is_extended_id", "is_error_frame"])
-def test_remote_extended_and_error_frames_are_discarded(moving, kind: str) -> None:
-    moving.interfere(0x181, b"" if kind == "is_remote_frame" else bytes(8), **{kind: True})
-    assert moving.move().fresh
-    assert moving.events(Fault.DISCARDED_FRAME) == [Reaction.GO]
-    assert moving.move(5).fresh
-
-
 def test_frames_of_other_nodes_are_ignored(moving) -> None:
     for can_id in (0x182, 0x382, 0x702, 0x082, 0x585, 0x7E5):
         moving.interfere(can_id, b"\x05")
@@ -108,45 +84,13 @@ def test_frames_of_other_nodes_are_ignored(moving) -> None:
 # ------------------------------------------------------------------ the drive
 
 
-def test_a_boot_up_message_stops_the_rpdos_at_once(moving) -> None:
-    moving.move()
-    moving.node.faults.boot_up()
-    moving.node.poll(moving.clock.now())
-    sent = len(moving.frames(0x201))
-    moving.stopped_within(1, Fault.BOOT_UP)
-    assert moving.supervision.reaction is LATCH
-    assert len(moving.frames(0x201)) == sent
-    moving.stands_still()
-
-
-def test_after_a_latch_the_drive_is_booted_and_verified_again(moving) -> None:
-    moving.interfere(0x701, b"\x00")
-    moving.stopped_within(1, Fault.BOOT_UP)
-    moving.clock.sleep_until(moving.clock.now() + 1.0)
-    with pytest.raises(SafetyStop):
-        moving.cycle.tick()
-    moving.drive.boot()
-    moving.supervision.reset(verified=True)
-    moving.enable()
-    assert moving.move(50).fresh
-
-
-def test_an_emergency_is_noted_and_the_statusword_decides(moving) -> None:
-    for code in range(0x3110, 0x3130):
-        moving.interfere(0x081, struct.pack("<HB5x", code, 1))
-    assert moving.move().fresh
-    assert moving.events(Fault.EMERGENCY) == [Reaction.GO]
-    assert moving.drive.monitor.nodes[1].emergency_count == 32
-    assert moving.move(5).fresh
-
-
-def test_the_end_of_an_emergency_and_a_short_one_harm_nothing(moving) -> None:
+def test_error_reset_and_short_emergencies_are_harmless(moving) -> None:
     moving.interfere(0x081, bytes(8))
     moving.interfere(0x081, b"\x10")
     assert moving.move(3).fresh
 
 
-def test_a_fault_of_the_drive_stops_and_is_named(moving) -> None:
+def test_a_drive_fault_stops_the_axis_and_is_named(moving) -> None:
     moving.node.faults.raise_error(0x3210)
     text = moving.stopped_within(2, Fault.DRIVE_FAULT)
     assert "the drive sent EMCY 3210h (DC link over-voltage)" in text
@@ -156,7 +100,7 @@ def test_a_fault_of_the_drive_stops_and_is_named(moving) -> None:
 
 
 @pytest.mark.parametrize("stays", [False, True], ids=["leaves operational", "stays operational"])
-def test_a_hang_of_this_process_is_told_as_that(moving, stays: bool) -> None:
+def test_a_stall_of_the_control_process_is_reported_as_such(moving, stays: bool) -> None:
     """The drive gave its master up meanwhile: neither an NMT master nor an enable input has to do with it."""
     moving.node.faults.stay_operational = stays
     moving.move()
@@ -171,7 +115,7 @@ def test_a_hang_of_this_process_is_told_as_that(moving, stays: bool) -> None:
     moving.stands_still()
 
 
-def test_a_stall_stops_the_axis_whether_or_not_the_drive_has_noticed(moving) -> None:
+def test_a_stall_stops_the_axis_even_if_the_drive_ignores_it(moving) -> None:
     moving.node.faults.ignore_missing_set_points = True
     moving.move()
     moving.clock.sleep_until(moving.clock.now() + 0.03)
@@ -180,14 +124,14 @@ def test_a_stall_stops_the_axis_whether_or_not_the_drive_has_noticed(moving) -> 
     moving.stands_still()
 
 
-def test_a_stall_without_power_is_no_reason_to_stop(idle) -> None:
+def test_a_stall_without_power_does_not_latch_a_stop(idle) -> None:
     idle.cycle.tick()
     idle.clock.sleep_until(idle.clock.now() + 0.03)
     idle.cycle.tick()
     assert idle.supervision.stop is None
 
 
-def test_a_drive_that_leaves_operational_says_why(moving) -> None:
+def test_leaving_operational_is_reported_with_its_cause(moving) -> None:
     moving.interfere(0x081, struct.pack("<HB5x", 0x8130, 0x11))
     moving.interfere(0x701, b"\x7f")
     text = moving.stopped_within(1, Fault.MASTER_LOST)
@@ -196,13 +140,10 @@ def test_a_drive_that_leaves_operational_says_why(moving) -> None:
     assert "NMT master" not in text
 
 
-# ------------------------------------------------------------------ others on the bus
-
-
 # ------------------------------------------------------------------ plausibility
 
 
-def test_a_single_encoder_jump_is_not_believed(moving) -> None:
+def test_a_single_encoder_jump_is_ignored(moving) -> None:
     before = moving.move()
     moving.node.faults.load_jump_counts = 100_000
     moving.move()  # the jump is in the sample after the next SYNC
@@ -265,13 +206,6 @@ def test_a_full_transmit_queue_stops_without_a_retry(moving) -> None:
     moving.stands_still()
 
 
-def test_a_queue_that_is_full_for_one_frame_ends_in_a_confirmed_stop(moving) -> None:
-    moving.bus.no_room_for = 0x201
-    text = moving.stopped_within(1, Fault.TRANSMIT_FULL)
-    assert "did not confirm" not in text
-    assert moving.drive.image.power.state is State.SWITCH_ON_DISABLED
-
-
 # ------------------------------------------------------------------ the latch, the stop
 
 
@@ -285,14 +219,3 @@ def test_a_stop_is_latched_until_reset_and_then_the_axis_runs_again(moving) -> N
     moving.supervision.reset()
     moving.enable()
     assert moving.move(50).fresh
-
-
-def test_the_quick_stop_is_driven_until_the_motor_stands(moving) -> None:
-    place = moving.move().motor_counts
-    moving.interfere(0x080)
-    moving.stopped_within(1, Fault.FOREIGN_SYNC)
-    assert quick_stop_was_sent(moving)
-    last = moving.cycle.stopping[-1]
-    assert abs(last.motor_counts - moving.cycle.stopping[-3].motor_counts) <= 2
-    assert abs(last.motor_counts - place) < 4000
-    moving.stands_still()

@@ -62,11 +62,11 @@ def test_merging_is_recording_both(first: list[int], second: list[int]) -> None:
     assert merged.as_dict() == histogram_of(first + second).as_dict()
 
 
-def test_the_late_ones_can_be_counted() -> None:
+def test_late_wake_ups_are_counted() -> None:
     assert histogram_of([10, 1900, 2500, 9000]).later_than_us(2000) == 2
 
 
-def test_early_and_absurdly_late_wake_ups_have_a_place() -> None:
+def test_early_and_extremely_late_wake_ups_are_recorded() -> None:
     histogram = Histogram()
     histogram.record(-0.001)
     histogram.record(1e6)
@@ -75,12 +75,12 @@ def test_early_and_absurdly_late_wake_ups_have_a_place() -> None:
     assert histogram.maximum_us == 10**12
 
 
-def test_an_empty_histogram_carries_nothing() -> None:
+def test_an_empty_histogram_sustains_no_cycle() -> None:
     assert not carries(Histogram(), 0.01)
     assert Histogram().octaves() == []
 
 
-def test_the_rule_counts_the_share_and_the_worst() -> None:
+def test_the_rule_uses_the_share_and_the_maximum() -> None:
     punctual = histogram_of([100] * 20_000)
     assert carries(punctual, 0.001)
     assert not carries(punctual, 0.0004)
@@ -97,14 +97,14 @@ def test_lateness_does_not_add_up() -> None:
     assert measurement.histogram.maximum_us in (999, 1000)
 
 
-def test_missed_periods_are_skipped_and_counted_not_made_up_for() -> None:
+def test_missed_periods_are_skipped_and_counted() -> None:
     measurement = wake_ups(0.004, 0.4, LateClock([0.0] * 9 + [0.0105]))
     assert measurement.skipped == 2 * 8
     assert measurement.histogram.total == 100 - measurement.skipped
     assert not measurement.carried
 
 
-def test_the_report_names_the_shortest_cycle_that_is_carried() -> None:
+def test_report_names_the_shortest_sustained_cycle() -> None:
     report = measure(LateClock([0.0003]), 0.2, (0.004, 0.001, 0.002))
     assert [each.period_s for each in report.measurements] == [0.001, 0.002, 0.004]
     assert [each.carried for each in report.measurements] == [False, True, True]
@@ -113,7 +113,7 @@ def test_the_report_names_the_shortest_cycle_that_is_carried() -> None:
     assert report.as_dict()["carried_cycle_ms"] == 2.0
 
 
-def test_a_short_measurement_says_that_it_is_short() -> None:
+def test_a_short_measurement_is_flagged() -> None:
     assert "only 50 wake-ups" in measure(LateClock([0.0]), 0.2, (0.004,)).verdict
 
 
@@ -125,7 +125,7 @@ def test_a_cycle_below_one_that_failed_is_not_recommended() -> None:
     assert report.carried_s == 0.004
 
 
-def test_a_machine_that_carries_nothing_is_told_so() -> None:
+def test_a_computer_sustaining_no_cycle_is_reported() -> None:
     report = measure(LateClock([0.009]), 0.2, (0.001, 0.01))
     assert report.carried_s is None
     assert "none of these" in report.table()

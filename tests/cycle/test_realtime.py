@@ -20,7 +20,7 @@ def state() -> tuple[int, int, bool, int, set[int]]:
     )
 
 
-def test_it_reports_what_it_got_and_puts_everything_back() -> None:
+def test_reports_the_settings_and_restores_them() -> None:
     before = state()
     with prepare_realtime(priority=1) as realtime:
         assert not gc.isenabled()
@@ -30,14 +30,14 @@ def test_it_reports_what_it_got_and_puts_everything_back() -> None:
     assert state() == before
 
 
-def test_it_puts_everything_back_after_an_error() -> None:
+def test_restores_everything_after_an_error() -> None:
     before = state()
     with pytest.raises(RuntimeError), prepare_realtime(priority=1):
         raise RuntimeError
     assert state() == before
 
 
-def test_what_is_not_permitted_is_reported_and_not_insisted_on(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_denied_permissions_are_reported_not_fatal(monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(pid: int, policy: int, parameter: os.sched_param) -> None:
         raise PermissionError(1, "Operation not permitted")
 
@@ -47,7 +47,7 @@ def test_what_is_not_permitted_is_reported_and_not_insisted_on(monkeypatch: pyte
         assert "no real-time priority" in str(realtime)
 
 
-def test_it_runs_on_the_processors_that_were_asked_for() -> None:
+def test_runs_on_the_requested_processors() -> None:
     before = state()
     first = min(os.sched_getaffinity(0))
     with prepare_realtime(priority=0, cpus=[first]) as realtime:
@@ -58,7 +58,7 @@ def test_it_runs_on_the_processors_that_were_asked_for() -> None:
     assert state() == before
 
 
-def test_a_processor_that_is_not_there_is_reported() -> None:
+def test_a_missing_processor_is_reported() -> None:
     before = state()
     with prepare_realtime(priority=0, cpus=[0, 4095]) as realtime:
         assert "not on processor 0, 4095 (there is no processor 4095" in str(realtime)
@@ -66,7 +66,7 @@ def test_a_processor_that_is_not_there_is_reported() -> None:
     assert state() == before
 
 
-def test_a_fit_leaves_the_block_and_a_motion_within_it_goes_back():
+def test_a_fit_runs_without_priority_and_motion_within_it_with():
     with left_realtime(), resumed_realtime():
         assert gc.isenabled()  # nothing was prepared, nothing to leave
     with prepare_realtime(priority=0):

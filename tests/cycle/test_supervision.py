@@ -61,12 +61,12 @@ def test_reactions_to_cycles_in_a_row(fault: Fault) -> None:
 @pytest.mark.parametrize(
     "row", [row for row in TABLE if row.first < row.then], ids=lambda row: row.fault.name
 )
-def test_a_good_cycle_in_between_begins_the_count_anew(row: Row) -> None:
+def test_a_good_cycle_resets_the_count(row: Row) -> None:
     reactions = run(Supervision(), [{row.fault}, set()] * 10)
     assert reactions == [row.first, GO] * 10
 
 
-def test_two_cycles_without_feedback_stop_whatever_spoilt_them() -> None:
+def test_two_cycles_without_feedback_stop_for_any_cause() -> None:
     assert run(Supervision(), [{Fault.ENCODER_JUMP}, {Fault.LOST_TPDO}]) == [FREEZE, STOP]
 
 
@@ -110,7 +110,7 @@ def test_a_fault_while_answering_counts_in_the_same_cycle() -> None:
     assert [event.cycle for event in supervision.events] == [7, 7]
 
 
-def test_what_was_seen_is_kept_with_its_cycle_within_bounds() -> None:
+def test_a_bounded_number_of_events_is_kept_with_cycle_numbers() -> None:
     supervision = Supervision()
     run(supervision, [{Fault.DUPLICATE_TPDO}] * (EVENTS_KEPT + 5))
     assert len(supervision.events) == EVENTS_KEPT
@@ -118,7 +118,7 @@ def test_what_was_seen_is_kept_with_its_cycle_within_bounds() -> None:
     assert supervision.counts[Fault.DUPLICATE_TPDO] == EVENTS_KEPT + 5
 
 
-def test_the_error_says_when_what_and_what_to_do() -> None:
+def test_error_states_cycle_fault_and_remedy() -> None:
     supervision = Supervision()
     supervision.judge(119, [(Fault.LOST_TPDO, "281h")])
     supervision.judge(120, [(Fault.LOST_TPDO, "281h")])
@@ -129,9 +129,7 @@ def test_the_error_says_when_what_and_what_to_do() -> None:
 
 
 @given(cycles, cycles)
-def test_after_a_stop_nothing_but_a_reset_leads_back(
-    before: list[set[Fault]], after: list[set[Fault]]
-) -> None:
+def test_only_a_reset_ends_a_stop(before: list[set[Fault]], after: list[set[Fault]]) -> None:
     supervision = Supervision()
     run(supervision, [*before, {Fault.DRIVE_FAULT}])
     assert all(reaction >= STOP for reaction in run(supervision, after))
@@ -154,7 +152,7 @@ def test_two_lost_tpdos_in_a_row_always_stop(before: list[set[Fault]]) -> None:
 
 
 @given(cycles)
-def test_the_quiet_way_past_the_judge_changes_nothing(sequence: list[set[Fault]]) -> None:
+def test_the_fast_path_equals_the_full_judgement(sequence: list[set[Fault]]) -> None:
     asked, spared = Supervision(), Supervision()
     for cycle, faults in enumerate(sequence):
         named = [(fault, "") for fault in sorted(faults, key=lambda each: each.name)]

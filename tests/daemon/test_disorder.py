@@ -357,7 +357,7 @@ def run(size: settings) -> None:
     run_state_machine_as_test(Disorder, settings=size)
 
 
-def test_in_no_order_is_a_law_broken() -> None:
+def test_no_order_of_events_breaks_a_law() -> None:
     run(SMALL)
     assert Disorder.events > 100
     assert Disorder.enabled > 100, "the drives were hardly ever enabled: nothing was tested"
@@ -365,7 +365,7 @@ def test_in_no_order_is_a_law_broken() -> None:
 
 @pytest.mark.slow
 @pytest.mark.timeout(0)
-def test_in_no_order_is_a_law_broken_in_a_hundred_thousand_events() -> None:
+def test_no_law_is_broken_in_a_hundred_thousand_events() -> None:
     run(LARGE)
     print(f"{Disorder.events} events, {Disorder.enabled} targets to enabled drives")
     assert Disorder.events >= 100_000

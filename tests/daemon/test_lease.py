@@ -31,7 +31,7 @@ def lease(time: Time) -> Lease:
     return Lease(10.0, time.now)
 
 
-def test_tokens_are_not_to_be_guessed(time: Time) -> None:
+def test_tokens_cannot_be_guessed(time: Time) -> None:
     lease = Lease(10.0, time.now)
     tokens = set()
     for _ in range(100):
@@ -40,7 +40,7 @@ def test_tokens_are_not_to_be_guessed(time: Time) -> None:
     assert min(map(len, tokens)) >= 20
 
 
-def test_a_second_client_is_told_who_holds_it_and_for_how_long(lease: Lease, time: Time) -> None:
+def test_a_second_client_learns_the_holder_and_the_remaining_time(lease: Lease, time: Time) -> None:
     lease.take("page")
     time.s = 4.0
     with pytest.raises(LeaseError, match=r"'page' holds the right to move; it runs out in 6\.0 s"):
@@ -50,7 +50,7 @@ def test_a_second_client_is_told_who_holds_it_and_for_how_long(lease: Lease, tim
         lease.take("script")
 
 
-def test_it_runs_out_and_says_so_once(lease: Lease, time: Time) -> None:
+def test_an_expired_lease_is_reported_once(lease: Lease, time: Time) -> None:
     token = lease.take("page")
     time.s = 9.99
     lease.check(token)

@@ -86,7 +86,7 @@ def test_keys_of_an_axis_and_of_the_whole_machine(folder: Path) -> None:
     assert machine.on_bus(channel="vcan0").axes[1].config.bus.channel == "vcan0"
 
 
-def test_another_process_gets_it_whole(folder: Path) -> None:
+def test_machine_can_be_pickled(folder: Path) -> None:
     machine = load(folder)
     again = pickle.loads(pickle.dumps(machine))
     assert again == machine
@@ -122,7 +122,7 @@ def test_another_process_gets_it_whole(folder: Path) -> None:
         ),
     ],
 )  # fmt: skip
-def test_what_is_wrong_is_said_with_its_place(folder: Path, wanted: str, given: str, expected: str) -> None:
+def test_errors_state_their_location(folder: Path, wanted: str, given: str, expected: str) -> None:
     assert expected in refused(folder, GOOD.replace(wanted, given, 1))
 
 
@@ -135,7 +135,7 @@ def test_what_is_wrong_is_said_with_its_place(folder: Path, wanted: str, given: 
         ({"channel: hdbridge": "channel: other"}, "bus: differs from that of 'one'"),
     ],
 )
-def test_axes_that_do_not_go_together(folder: Path, changes: dict[str, str], expected: str) -> None:
+def test_incompatible_axes_are_refused(folder: Path, changes: dict[str, str], expected: str) -> None:
     text = (folder / "two" / "axis.yaml").read_text(encoding="utf-8")
     for wanted, given in changes.items():
         text = (
@@ -148,7 +148,7 @@ def test_axes_that_do_not_go_together(folder: Path, changes: dict[str, str], exp
     assert str(folder / "two" / "axis.yaml") + ":" in complaint
 
 
-def test_a_bus_with_too_much_on_it(folder: Path) -> None:
+def test_an_overloaded_bus_is_refused(folder: Path) -> None:
     text = GOOD + "bus: {interface: socketcan, channel: can0, bitrate_bps: 125000}\n"
     assert "axes: the cycle of one and two takes" in refused(folder, text)
     assert load(folder, text.replace("125000", "1000000")).bus.bitrate_bps == 1_000_000
@@ -162,7 +162,7 @@ def test_a_model_of_another_axis(folder: Path) -> None:
     assert [each.name for each in load(folder).axis("two").model().effects] == ["synchronous", "hysteresis"]
 
 
-def test_the_token_is_nobody_elses_to_read(folder: Path) -> None:
+def test_the_token_file_must_be_private(folder: Path) -> None:
     text = GOOD + "api: {tcp: {token_file: token}}\n"
     token = folder / "token"
     token.write_text("0123456789abcdef\n", encoding="ascii")
@@ -176,14 +176,14 @@ def test_the_token_is_nobody_elses_to_read(folder: Path) -> None:
     assert "expected a token of 16 to 200" in refused(folder, text)
 
 
-def test_tcp_is_for_this_machine_alone(folder: Path) -> None:
+def test_tcp_listens_on_this_machine_only(folder: Path) -> None:
     text = GOOD + "api: {tcp: {host: 0.0.0.0, token_file: token}}\n"
     assert "machine.yaml:6:13: api.tcp.host: unknown key; expected port, names, token_file" in refused(
         folder, text
     )
 
 
-def test_what_a_person_may_call_a_machine(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_machine_is_found_by_folder_file_or_name(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     load(folder)
     monkeypatch.chdir(folder)
     for text in (".", "machine.yaml", str(folder)):
@@ -195,7 +195,7 @@ def test_what_a_person_may_call_a_machine(folder: Path, monkeypatch: pytest.Monk
         Machine.find("nowhere")
 
 
-def test_the_machine_that_comes_with_hdbridge_is_right() -> None:
+def test_the_bundled_machine_is_valid() -> None:
     machine = Machine.find("cell")
     assert machine.path == bundled_folder("profiles") / "cell" / "machine.yaml"
     assert all(axis.profile.truth.is_file() for axis in machine.axes)

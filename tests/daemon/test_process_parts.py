@@ -32,7 +32,7 @@ def test_the_service_manager_s_folder_comes_first(tmp_path: Path) -> None:
     assert runtime_folder(session) == folder
 
 
-def test_a_folder_that_others_could_use_is_refused(tmp_path: Path) -> None:
+def test_a_folder_open_to_others_is_refused(tmp_path: Path) -> None:
     session = {"XDG_RUNTIME_DIR": str(tmp_path)}
     runtime_folder(session).chmod(0o755)
     with pytest.raises(InputError, match="not a folder of this user alone"):
@@ -43,7 +43,7 @@ def test_a_folder_that_others_could_use_is_refused(tmp_path: Path) -> None:
         runtime_folder(session)
 
 
-def test_a_child_reads_what_it_was_told() -> None:
+def test_a_child_reads_its_start_data() -> None:
     start = Start(Machine.find("article"), memory_fd=7, keeper=os.getpid())
     fd = start.hand_over(restarts=2, api_fds=(8, 9))
     told = Start.inherited([str(fd)])
@@ -94,7 +94,7 @@ def test_without_a_service_manager_nobody_is_told(tmp_path: Path) -> None:
         notifier.alive()
 
 
-def test_a_budget_is_for_a_window_of_time() -> None:
+def test_a_budget_covers_a_sliding_window() -> None:
     budget = Budget(2, 60.0)
     assert [budget.spend(at) for at in (0.0, 10.0, 59.0, 60.0, 65.0, 70.0)] == [
         True, True, False, True, False, True,
@@ -102,7 +102,7 @@ def test_a_budget_is_for_a_window_of_time() -> None:
     assert not Budget(0, 60.0).spend(0.0)
 
 
-def test_delays_double_until_something_has_lived() -> None:
+def test_delays_double_until_a_process_stays_alive() -> None:
     back_off = BackOff(0.5, 3.0, 60.0)
     assert [back_off.delay_s(lived) for lived in (0.1, 0.1, 0.1, 0.1, 61.0, 0.1)] == [0.5, 1, 2, 3, 0.5, 1]
 
@@ -120,7 +120,7 @@ def log() -> Iterator[logging.Logger]:
     root.propagate = before[2]
 
 
-def test_the_log_is_json_where_nobody_looks(
+def test_the_log_is_json_without_a_terminal(
     log: logging.Logger, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     begin_log(LogSettings(file=tmp_path / "log"))
@@ -141,7 +141,7 @@ def test_the_control_process_logs_once(log: logging.Logger, capsys: pytest.Captu
     assert json.loads(line)["conditions"] == "none"
 
 
-def test_the_journal_is_told_the_priority(
+def test_the_journal_gets_the_priority(
     log: logging.Logger, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setenv("JOURNAL_STREAM", "8:1")
@@ -150,7 +150,7 @@ def test_the_journal_is_told_the_priority(
     assert capsys.readouterr().err.startswith('<4>{"date": ')
 
 
-def test_an_event_that_comes_too_often_is_counted(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_too_frequent_events_are_counted(monkeypatch: pytest.MonkeyPatch) -> None:
     now_s = 0.0
     monkeypatch.setattr("hdbridge.daemon.logs.time.monotonic", lambda: now_s)
     limit = RateLimit(burst=2, window_s=10.0)

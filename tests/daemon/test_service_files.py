@@ -59,7 +59,7 @@ def test_the_unit_of_the_system(folder: Path) -> None:
     assert options(network)["CAN"] == {"BitRate": "500000", "RestartSec": "100ms"}
 
 
-def test_who_it_runs_as(folder: Path) -> None:
+def test_the_service_account(folder: Path) -> None:
     machine = Machine.load(folder)
     (folder / "machine.yaml").chmod(0o644)
     unit = service_files(machine)[0]
@@ -97,7 +97,7 @@ def test_a_tcp_port_and_a_serial_adapter_are_let_through(folder: Path) -> None:
 
 
 @pytest.mark.parametrize("user", [False, True])
-def test_systemd_takes_the_unit(folder: Path, tmp_path: Path, user: bool) -> None:
+def test_systemd_accepts_the_unit(folder: Path, tmp_path: Path, user: bool) -> None:
     if shutil.which("systemd-analyze") is None:
         pytest.skip("needs systemd-analyze")
     unit = service_files(Machine.load(folder), user=user, account=None if user else "daemon")[0]
@@ -110,7 +110,7 @@ def test_systemd_takes_the_unit(folder: Path, tmp_path: Path, user: bool) -> Non
     assert (done.returncode, done.stderr) == (0, "")
 
 
-def test_the_command_shows_writes_and_removes(
+def test_the_unit_is_shown_written_and_removed(
     folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path / "config"))
@@ -139,7 +139,7 @@ def test_the_command_shows_writes_and_removes(
     assert unit.read_text(encoding="utf-8") == "[Service]\n"
 
 
-def test_no_service_for_a_bus_that_reaches_nothing(tmp_path: Path) -> None:
+def test_a_virtual_bus_gets_no_service(tmp_path: Path) -> None:
     refused = run_here(tmp_path, "install-service", "article")
     assert refused.returncode == 2
     assert "the bus 'virtual' reaches no drive" in refused.stderr

@@ -7,23 +7,6 @@ import struct
 import pytest
 
 
-@pytest.mark.parametrize(
-    ("words", "status"),
-    [
-        ((), 0x0250),
-        ((0x06,), 0x0231),
-        ((0x06, 0x07), 0x0233),
-        ((0x06, 0x07, 0x0F), 0x0237),
-        ((0x06, 0x07, 0x0F, 0x02), 0x0617),
-    ],
-)
-def test_the_statusword_of_each_state(master, words, status):
-    master.put(0x605A, 0, 6, 2)
-    for word in words:
-        master.control(word)
-    assert master.statusword == status
-
-
 def test_a_repeated_controlword_does_not_enable_again(master):
     """A target stream that goes on, with a stale 'enable', must not undo a stop."""
     master.put(0x6007, 0, 3, 2)

@@ -86,13 +86,6 @@ def test_sdo_numbers_and_strings(remote):
     assert remote.sdo[0x60E4][1].raw == 0
 
 
-@pytest.mark.parametrize(("index", "code"), [(0x5FFF, 0x06020000), (0x6041, 0x06010002)])
-def test_sdo_aborts(remote, index, code):
-    with pytest.raises(canopen.SdoAbortedError) as caught:
-        remote.sdo.download(index, 0, b"\0\0")
-    assert caught.value.code == code
-
-
 def test_emergencies_arrive(remote, drive):
     codes = []
     remote.emcy.add_callback(lambda error: codes.append(error.code))
@@ -116,19 +109,6 @@ def test_pdo_configuration_by_canopen(network, remote):
     remote.nmt.state = "OPERATIONAL"
     until(lambda: network.sync.transmit() or bool(received))
     assert received[0] == b"\x50\x02" + bytes(4)
-
-
-def test_a_profile_move_in_real_time(remote, motor):
-    for index, value in ((0x6081, 100_000), (0x6083, 1_000_000), (0x6084, 1_000_000)):
-        remote.sdo[index].raw = value
-    remote.sdo[0x6060].raw = 1
-    for word in (0x06, 0x07, 0x0F):
-        remote.sdo[0x6040].raw = word
-    remote.sdo[0x607A].raw = 4000
-    remote.sdo[0x6040].raw = 0x1F
-    until(lambda: remote.sdo[0x6041].raw & 0x1400 == 0x1400)
-    assert remote.sdo[0x6064].raw == motor.motor_counts == 4000
-    remote.sdo[0x6040].raw = 0x00
 
 
 class BrokenBus(can.BusABC):

@@ -62,13 +62,6 @@ def test_the_plan_maps_them_and_says_which_key_decides(build_axis: Build) -> Non
     assert (rows[0x1802, 1].value, rows[0x1803, 1].value) == (0x381, 0x481)
 
 
-def test_without_them_nothing_is_mapped(build_axis: Build) -> None:
-    od = load_eds(bundled_folder("eds") / "hdbridge-402.eds", 1)
-    rows = {(row.index, row.sub): row for row in plan(build_axis(), od)}
-    assert rows[0x1802, 1].value == 0x8000_0000
-    assert (0x1A02, 1) not in rows
-
-
 @pytest.mark.parametrize(
     ("source", "complaint"),
     [

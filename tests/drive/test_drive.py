@@ -212,16 +212,6 @@ def test_quick_stop_and_the_way_out_of_it(drive: Drive, tiny: Any) -> None:
     assert tiny.state == 0x40
 
 
-def test_a_reversed_motor_encoder(
-    bus: Any, clock: Any, tiny: Any, build_axis: Callable[..., AxisConfig]
-) -> None:
-    with Drive(bus, build_axis(motor_encoder__direction=-1), clock, tiny.od) as drive:
-        drive.boot()
-        positions = drive.move_to(2.0)
-    assert positions.motor_counts == -round(2.0 * 50 * 8000 / 360)
-    assert positions.motor_deg == pytest.approx(100.0, abs=0.03)
-
-
 def test_leaving_disables_and_ends_operation(bus: Any, clock: Any, tiny: Any, axis: AxisConfig) -> None:
     with Drive(bus, axis, clock, tiny.od) as drive:
         drive.boot()

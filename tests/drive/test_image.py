@@ -30,21 +30,6 @@ def sent(frames: Frames) -> tuple[int, ...]:
     return struct.unpack("<Hi", data)
 
 
-def test_layout_of_the_cycle(axis: AxisConfig) -> None:
-    image = ProcessImage(axis)
-    assert image.tpdo_ids == (0x181, 0x281)
-    assert [(layout.number, layout.can_id) for layout in image.rpdos] == [(1, 0x201)]
-    assert image.heartbeat_id == 0x77F
-    assert [str(entry) for layout in image.tpdos for entry in layout.codec.entries] == [
-        "6041h:00 uint16",
-        "6064h:00 int32",
-        "6077h:00 int16",
-        "60E4h:01 int32",
-        "6062h:00 int32",
-    ]
-    assert image.heartbeat_period_s < axis.drive.heartbeat_ms / 1000 < image.heartbeat_timeout_s
-
-
 def test_frames_become_values(axis: AxisConfig) -> None:
     image = ProcessImage(axis)
     assert image.statusword is None
@@ -78,14 +63,6 @@ def test_a_second_node_may_carry_the_load_encoder(build_axis: Callable[..., Axis
     assert image.load_counts == 1004
     image.accept(0x281, struct.pack("<i", -5))
     assert image.demand_counts == -5
-
-
-def test_a_vendor_object_may_carry_it_too(build_axis: Callable[..., AxisConfig]) -> None:
-    source = {"index": 0x2030, "subindex": 7, "type": "uint16"}
-    image = ProcessImage(build_axis(load_encoder__source=source))
-    image.accept(0x281, struct.pack("<Hi", 65535, 1))
-    image.accept(0x281, struct.pack("<Hi", 1, 1))
-    assert image.load_counts == 65537
 
 
 @pytest.mark.parametrize("direction", [1, -1])

@@ -16,7 +16,6 @@ from support.foreign_slaves import NODE_ID, DurandDrive
 
 from hdbridge.axis import AxisConfig
 from hdbridge.drive import Drive, Mode, State, load_eds
-from hdbridge.errors import IdentityError, SdoError
 
 
 @pytest.fixture
@@ -93,18 +92,3 @@ def test_leaving_disables_it(drive: Drive, peer: DurandDrive) -> None:
     assert drive.close() == []
     assert peer.state == 0x40
     assert peer.node.nmt.state == 127
-
-
-def test_a_refusal_by_another_stack_is_understood(drive: Drive, peer: DurandDrive) -> None:
-    with pytest.raises(SdoError, match=r"6041h:00.*read-only"):
-        drive.sdo.write(0x6041, 0, 1)
-    with pytest.raises(SdoError, match="does not have the object"):
-        drive.sdo.write(0x6091, 1, 1)
-    peer.od.write(0x1018, 1, 7)
-    with pytest.raises(IdentityError, match="vendor_id"):
-        drive.boot()
-
-
-def test_long_texts_come_in_segments(drive: Drive, peer: DurandDrive) -> None:
-    peer.od.write(0x1008, 0, b"a durand node with a long name")
-    assert drive.boot().names["device"] == "a durand node with a long name"

@@ -55,27 +55,6 @@ def link_to(closing: deque[can.BusABC], bus: FakeBus) -> Link:
     return Link(bus, MonotonicClock())
 
 
-def test_frames_pass_both_ways() -> None:
-    with (
-        can.Bus(interface="virtual", channel="link", ignore_config=True) as near,
-        can.Bus(interface="virtual", channel="link", ignore_config=True) as far,
-    ):
-        link = Link(near, MonotonicClock())
-        link.send(0x201, b"\x0f\x00\x01")
-        received = far.recv(1)
-        assert received is not None
-        assert (received.arbitration_id, bytes(received.data), received.is_extended_id) == (
-            0x201,
-            b"\x0f\x00\x01",
-            False,
-        )
-        far.send(message(0x181, b"\x37"))
-        frame = link.recv(link.now() + 1)
-        assert frame is not None
-        assert frame[:2] == (0x181, b"\x37")
-        assert link.recv(link.now()) is None
-
-
 def test_what_canopen_does_not_use_is_dropped_and_counted(closing: deque[can.BusABC]) -> None:
     link = link_to(
         closing,
@@ -132,14 +111,6 @@ def test_bus_off_is_the_end_of_the_link(closing: deque[can.BusABC]) -> None:
         link.send(1, b"")
 
 
-def test_an_error_frame_that_only_warns_is_counted(closing: deque[can.BusABC]) -> None:
-    link = link_to(closing, FakeBus(message(0x04, is_error_frame=True), message(0x181)))
-    frame = link.recv(0.0)
-    assert frame is not None
-    assert frame.can_id == 0x181
-    assert link.dropped.error == 1
-
-
 def test_a_wall_clock_that_is_set_back_does_not_hold_the_wait(
     closing: deque[can.BusABC], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -162,15 +133,6 @@ def test_opening_an_unknown_interface() -> None:
     with (
         pytest.raises(InputError, match=r"no interface 'nonsense'.*socketcan") as caught,
         open_bus(BusConfig(interface="nonsense", channel="x")),
-    ):
-        pass
-    assert "\n" not in str(caught.value)
-
-
-def test_opening_an_absent_channel() -> None:
-    with (
-        pytest.raises(BusError, match="socketcan:absent0: cannot open it") as caught,
-        open_bus(BusConfig(interface="socketcan", channel="absent0")),
     ):
         pass
     assert "\n" not in str(caught.value)

@@ -91,15 +91,6 @@ def test_other_pdos_are_disabled_and_absent_objects_left_out(axis: AxisConfig, t
     assert (1, 0x607D, 1) in written
 
 
-def test_a_separate_encoder_gets_its_pdo_and_heartbeat(build_axis: Callable[..., AxisConfig]) -> None:
-    source = {"index": 0x6004, "subindex": 0, "type": "uint32", "node": 2}
-    written = values(build_axis(load_encoder__source=source))
-    assert written[2, 0x1A00, 1] == 0x60040020
-    assert written[2, 0x1800, 1] == 0x182
-    assert written[2, 0x1017, 0] == 50
-    assert written[1, 0x1A01, 0] == 1
-
-
 def test_a_row_reads_like_a_sentence(axis: AxisConfig) -> None:
     rows = [str(row) for row in plan(axis)]
     assert "605Ah:00 = 2 (2h): what a quick stop does [drive.quick_stop_option]" in rows
@@ -117,8 +108,3 @@ def test_a_value_that_its_object_cannot_hold(build_axis: Callable[..., AxisConfi
     axis = build_axis(limits__acceleration_deg_s2=1e7, motor_encoder__counts_per_turn=8_000_000)
     with pytest.raises(InputError, match=r"limits\.acceleration_deg_s2 gives .* 6085h:00"):
         plan(axis)
-
-
-def test_the_bundled_eds_is_read_without_a_word(tiny: Any, caplog: pytest.LogCaptureFixture) -> None:
-    assert 0x60E4 in tiny.od
-    assert caplog.records == []

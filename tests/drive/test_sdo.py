@@ -8,7 +8,7 @@ from typing import Any
 import can
 import pytest
 
-from hdbridge.drive import IntegerType, Link, NetworkMonitor, SdoAbortError, SdoClient, load_eds
+from hdbridge.drive import IntegerType, Link, NetworkMonitor, SdoAbortError, SdoClient
 from hdbridge.errors import InputError, SdoError
 
 
@@ -233,17 +233,6 @@ def test_types_without_an_eds(bus: Any, clock: Any, tiny: Any) -> None:
 def test_an_object_that_is_no_integer(client: SdoClient) -> None:
     with pytest.raises(SdoError, match="not an integer by the EDS"):
         client.read(0x1008)
-
-
-def test_an_unreadable_eds(tmp_path: Any) -> None:
-    for name, content in (("garbage.eds", "\0\1\2 not an ini file"), ("empty.eds", "[1000]\nObjectType=x\n")):
-        path = tmp_path / name
-        path.write_text(content)
-        with pytest.raises(InputError, match=name) as caught:
-            load_eds(path, 1)
-        assert "\n" not in str(caught.value)
-    with pytest.raises(InputError, match="absent"):
-        load_eds(tmp_path / "absent.eds", 1)
 
 
 def test_a_foreign_answer_does_not_help(client: SdoClient, tiny: Any, peer_bus: can.BusABC) -> None:

@@ -153,14 +153,6 @@ def after_an_excursion(law: Law, back_deg: float) -> float:
     return along_from(law, 52.0, 47.0)
 
 
-def test_maxwell_slip_remembers_the_return_point() -> None:
-    law = maxwell()
-    along_from(law, 0.0, 60.0)
-    left = along_from(law, 60.0, 52.0)
-    along_from(law, 52.0, 54.0)
-    assert along_from(law, 54.0, 52.0) == pytest.approx(left, abs=1e-9)
-
-
 @pytest.mark.parametrize("back_deg", [0.5, 2.0, 5.0])
 def test_maxwell_slip_goes_on_as_if_the_excursion_had_not_been(back_deg: float) -> None:
     assert after_an_excursion(maxwell(), back_deg) == pytest.approx(

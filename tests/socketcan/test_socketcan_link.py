@@ -45,7 +45,9 @@ def test_frames_go_out_and_come_in_as_they_are(pair, data: bytes) -> None:
 def test_its_own_frames_do_not_come_back(pair) -> None:
     link, _ = pair
     link.send(0x123, b"")
-    assert link.recv(link.now() + 0.05) is None
+    deadline = link.now() + 0.05
+    assert link.recv(deadline) is None
+    assert link.now() >= deadline
 
 
 def test_a_deadline_that_has_passed_polls_once(pair) -> None:
@@ -54,13 +56,6 @@ def test_a_deadline_that_has_passed_polls_once(pair) -> None:
     other.send(can.Message(arbitration_id=0x55, is_extended_id=False))
     time.sleep(0.05)
     assert link.recv(0.0) is not None
-
-
-def test_waiting_ends_at_the_deadline(pair) -> None:
-    link, _ = pair
-    deadline = link.now() + 0.05
-    assert link.recv(deadline) is None
-    assert link.now() >= deadline
 
 
 def test_remote_and_extended_frames_are_dropped_and_counted(pair) -> None:
@@ -81,13 +76,6 @@ def test_an_interface_that_goes_down_is_gone_for_good(pair, may_configure, inter
     with pytest.raises(BusError):
         link.send(0x80, b"")
     assert link.down is not None
-
-
-def test_sending_finds_a_deleted_interface(pair, may_configure, interface: str) -> None:
-    link, _ = pair
-    may_configure("link", "delete", interface)
-    with pytest.raises(BusError):
-        link.send(0x80, b"")
 
 
 @pytest.fixture

@@ -18,11 +18,13 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final, Protocol
 
+import pytest
+
 from hdbridge.device.behaviour import Controlword
 from hdbridge.device.node import DriveNode
 from hdbridge.drive.supervision import Event, Fault, Reaction, Supervision
 from hdbridge.errors import SafetyStop
-from tests.support.characters import FRIENDLY, Character
+from tests.support.characters import CHARACTERS, FRIENDLY, Character
 
 RECORD: Final = "HDBRIDGE_RELIABILITY"
 """Environment variable: file to which a line of JSON is added for each row that was tried."""
@@ -271,9 +273,24 @@ def read_record(path: Path) -> list[Seen]:
     return [Seen(**json.loads(line)) for line in path.read_text(encoding="utf-8").splitlines()]
 
 
+ABOUT_POWER: Final = frozenset(
+    {_F.HANG, _F.MASTER_LOST, _F.DROPPED_OUT, _F.HEARTBEAT_LOST, _F.TRANSMIT_FULL, _F.BOOT_UP, _F.BUS_DOWN}
+)
+"""Faults after which a drive may resume without a request, if its firmware allows it."""
+
+
 def rows_of(place: str) -> list[Row]:
     """Returns the rows that can be tried at a place."""
     return [row for row in ROWS if place in row.places]
+
+
+def cases_on(place: str, in_every_run: Callable[[Character, Row], bool]) -> list[Any]:
+    """Returns every character with every row as pytest parameters, the others marked slow."""
+    return [
+        pytest.param(character, row, marks=() if in_every_run(character, row) else pytest.mark.slow,
+                     id=f"{character}-{row.name}")
+        for character in CHARACTERS for row in ROWS if place in row.places
+    ]  # fmt: skip
 
 
 def try_out(

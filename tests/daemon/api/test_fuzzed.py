@@ -50,14 +50,14 @@ def machine(case) -> str:
 
 @schema.include(method="GET").parametrize()
 @few
-def test_by_looking_nothing_moves_and_nothing_fails(case):
+def test_read_requests_move_nothing_and_never_fail(case):
     case.call_and_validate(headers={"X-Lease": machine(case)}, checks=checks)
     assert BRIDGE.moved == BRIDGE.stopped == []
 
 
 @schema.exclude(method="GET").parametrize()
 @fewer
-def test_without_the_lease_nothing_moves_and_nothing_fails(case):
+def test_requests_without_the_lease_move_nothing_and_never_fail(case):
     machine(case)
     case.headers.pop("X-Lease", None)
     case.call_and_validate(checks=checks)
@@ -66,7 +66,7 @@ def test_without_the_lease_nothing_moves_and_nothing_fails(case):
 
 @schema.exclude(method="GET").parametrize()
 @few
-def test_with_the_lease_nothing_fails_and_no_target_is_outside_the_limits(case):
+def test_requests_with_the_lease_never_fail_nor_leave_the_limits(case):
     answer = case.call_and_validate(headers={"X-Lease": machine(case)}, checks=checks)
     if answer.status_code >= 400:
         assert BRIDGE.moved == []

@@ -26,7 +26,7 @@ def figure(found, name, **labels) -> float:
     return found[f"hdbridge_{name}", frozenset(labels.items())]
 
 
-def test_lateness_is_counted_in_buckets_that_add_up():
+def test_lateness_buckets_are_cumulative():
     bridge, metrics = FakeBridge(), Metrics()
     samples = bridge.samples(range(1, 5))
     samples["late_us"] = [5.0, 15.0, 2e6, np.nan]
@@ -61,7 +61,7 @@ def test_faults_are_counted_by_axis_and_name():
     assert sum(value for (name, _), value in found.items() if name == "hdbridge_faults_total") == 3
 
 
-def test_an_axis_is_in_one_state_and_its_figures_are_there():
+def test_each_axis_has_one_state_and_its_figures():
     bridge = FakeBridge()
     bridge.axes["joint-1"].at = ControlState.ENABLED
     bridge.axes["joint-1"].target_deg = 30.0
@@ -82,7 +82,7 @@ def test_an_axis_is_in_one_state_and_its_figures_are_there():
     assert ("hdbridge_model_age_seconds", frozenset({("axis", "joint-1")})) not in found
 
 
-def test_a_client_cannot_make_the_page_grow(api):
+def test_clients_cannot_grow_the_page(api):
     """Counts requests with methods, paths or names that the client made up."""
     with api.over_socket() as client:
         url = "http://hdbridge/metrics"

@@ -43,7 +43,7 @@ def with_client(service: Service, use: Callable[[Client], None]) -> None:
     play(story())
 
 
-def test_a_client_lives_a_day(service):
+def test_a_typical_client_session(service):
     def day(client: Client) -> None:
         axis = client.axis("axis1")
         assert axis.state().state is messages.ControlState.DISABLED

@@ -87,7 +87,7 @@ OF_AN_AXIS = {
 }
 
 
-def test_these_are_all_calls_that_there_are() -> None:
+def test_every_client_call_is_listed() -> None:
     for kind, calls in ((Client, OF_THE_MACHINE), (Axis, OF_AN_AXIS)):
         assert set(calls) == {name for name in vars(kind) if not name.startswith("_")}
 
@@ -172,7 +172,7 @@ def call_everything(machine: Machine, folder: Path) -> list[str]:
     return complaints
 
 
-def test_every_optional_key_may_be_left_out(tmp_path: Path) -> None:
+def test_every_call_works_without_optional_keys(tmp_path: Path) -> None:
     """Together with others: of each two keys, each is left out once where the other is there."""
     whole = files(tmp_path)
     tried = {content(machine_of(tmp_path, *whole))}
@@ -201,7 +201,7 @@ def test_every_optional_key_may_be_left_out(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf")])
-def test_an_object_that_is_no_number_is_read(value: float) -> None:
+def test_non_numeric_objects_are_read(value: float) -> None:
     from hdbridge.client.messages import SdoValue
 
     told = SdoValue(index=0x2000, subindex=0, name="x", type="real32", value=value).model_dump_json()

@@ -30,7 +30,7 @@ def said(place, sent: bytes) -> bytes:
     return received
 
 
-def test_who_says_nothing_or_half_a_request_is_closed(hasty):
+def test_silent_and_half_finished_requests_are_closed(hasty):
     assert said(hasty, b"") == b""
     assert said(hasty, b"GET /healthz HTTP/1.1\r\nHost: local") == b""
 
@@ -41,7 +41,7 @@ def test_half_a_second_request_is_closed_after_the_first_was_answered(hasty):
     assert answer.count(b"HTTP/1.1 200") == 1
 
 
-def test_a_body_that_does_not_come_is_told(hasty):
+def test_a_missing_body_is_reported(hasty):
     head = b"POST /api/v1/mark HTTP/1.1\r\nHost: localhost\r\nContent-Length: 9\r\n\r\n"
     assert b"HTTP/1.1 408" in said(hasty, head + b"{")
 
@@ -57,7 +57,7 @@ def test_a_body_that_does_not_come_is_told(hasty):
     ],
     ids=["tls", "long head", "two lengths", "two hosts", "half an upgrade"],
 )
-def test_what_is_no_request_is_refused_and_the_next_one_served(hasty, sent):
+def test_an_invalid_request_is_refused_and_the_next_served(hasty, sent):
     assert said(hasty, sent)[:12] in {b"HTTP/1.1 400", b"HTTP/1.1 421", b"HTTP/1.1 426"}
     assert hasty.bridge.stopped == []
     with hasty.over_socket() as client:

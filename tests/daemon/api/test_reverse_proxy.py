@@ -168,7 +168,7 @@ def api(place: Served) -> Served:
     return place
 
 
-def test_a_client_asks_moves_streams_watches_and_stops(url, api, certificate, monkeypatch):
+def test_clients_work_through_the_proxy(url, api, certificate, monkeypatch):
     monkeypatch.setenv("SSL_CERT_FILE", str(certificate / "cell.pem"))
     with Client(url, token=TOKEN, name="elsewhere") as client:
         axis = client.axis("joint-1")
@@ -230,7 +230,7 @@ def test_the_threads_of_a_client_call_openssl_one_at_a_time(url, api, certificat
     assert Watched.overlaps == 0
 
 
-def test_a_certificate_that_is_not_trusted_ends_it_before_the_token_is_sent(url):
+def test_no_token_is_sent_over_an_untrusted_certificate(url):
     with Client(url, token=TOKEN) as client, pytest.raises(DaemonError, match="certificate"):
         client.state()
 
@@ -240,7 +240,7 @@ def over(url: str, certificate: Path, **headers: str) -> httpx.Client:
     return httpx.Client(base_url=url, verify=context, headers=headers, trust_env=False)
 
 
-def test_without_the_token_nothing_is_shown_or_done(url, api, certificate):
+def test_every_request_needs_the_token(url, api, certificate):
     with over(url, certificate) as client:
         assert client.get("/").status_code == 200  # the page without data
         assert client.get("/api/v1/state").status_code == 401
@@ -259,7 +259,7 @@ def test_without_the_token_nothing_is_shown_or_done(url, api, certificate):
         ("evil.example", "https://evil.example", 421),
     ],
 )
-def test_the_page_of_the_proxys_name_may_ask_and_no_other(url, api, certificate, host, origin, status):
+def test_only_the_proxys_origin_may_send_requests(url, api, certificate, host, origin, status):
     headers = {"Host": host, "Authorization": f"Bearer {TOKEN}"}
     if origin is not None:
         headers["Origin"] = origin

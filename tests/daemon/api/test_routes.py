@@ -7,14 +7,14 @@ import pytest
 from hdbridge.client import messages
 
 
-def test_the_state_is_the_machine_as_it_stands(leased):
+def test_state_describes_the_machine(leased):
     state = messages.MachineState.model_validate_json(leased.get("/state").content)
     assert [each.name for each in state.axes] == ["joint-1", "joint-2"]
     assert state.axes[0].state is messages.ControlState.ENABLED
     assert state.lease.client == "the tests"
 
 
-def test_a_move_waits_and_tells_where_the_axis_is(leased, api):
+def test_a_move_waits_and_returns_the_position(leased, api):
     answer = leased.post("/axes/joint-1/move", json={"target_deg": 30, "velocity_deg_s": 20.0})
     state = messages.AxisState.model_validate_json(answer.content)
     assert state.load_target_deg == 30.0
@@ -39,9 +39,7 @@ def test_a_move_waits_and_tells_where_the_axis_is(leased, api):
         ("PUT", "objects/6041h", {"value": "1"}, ("write", "6041h", "1")),
     ],
 )
-def test_what_moves_reaches_the_machine_with_the_lease_and_never_without(
-    api, leased, method, path, body, asked
-):
+def test_motion_requests_need_the_lease(api, leased, method, path, body, asked):
     """The same request: with the lease it is done once; without, or with another token, nothing is."""
     url = f"/axes/joint-1/{path}"
     with api.over_socket() as stranger:
@@ -66,13 +64,13 @@ def test_what_moves_reaches_the_machine_with_the_lease_and_never_without(
         ("/quick-stop", [("joint-1", "quick-stop"), ("joint-2", "quick-stop")]),
     ],
 )
-def test_everybody_may_stop(api, leased, path, stopped):
+def test_anyone_may_stop(api, leased, path, stopped):
     with api.over_socket() as stranger:
         assert stranger.post(path).status_code == 200
     assert api.bridge.stopped == stopped
 
 
-def test_a_coordinated_move_takes_every_axis_or_none(api, leased):
+def test_a_coordinated_move_starts_every_axis_or_none(api, leased):
     targets = {"joint-1": 10.0, "joint-2": 20.0}
     refused = leased.post("/coordinated", json={"targets_deg": targets})
     assert refused.status_code == 409
@@ -106,7 +104,7 @@ def test_the_lease_is_taken_renewed_and_given_back(api):
         assert taken.json()["token"] != grant.token
 
 
-def test_a_lease_that_ran_out_moves_nothing(api):
+def test_an_expired_lease_moves_nothing(api):
     bridge = api.bridge
     bridge.now_s = 0.0
     token = bridge.lease.take("sleeper")
@@ -116,12 +114,12 @@ def test_a_lease_that_ran_out_moves_nothing(api):
     assert bridge.moved == []
 
 
-def test_the_kernel_says_who_takes_the_lease_without_a_name(api):
+def test_a_lease_without_a_name_gets_the_peer_process(api):
     with api.over_socket() as client:
         assert "process" in client.post("/lease", json={}).json()["client"]
 
 
-def test_a_move_that_is_waited_for_keeps_the_lease(api):
+def test_waiting_for_a_move_renews_the_lease(api):
     """The lease would run out before the axis arrives."""
     bridge = api.bridge
     bridge.lease = type(bridge.lease)(1.5, bridge.lease._now)
@@ -140,7 +138,7 @@ def test_an_object_is_read_without_a_lease(api):
         assert client.get("/axes/joint-1/objects/9999h").status_code == 422
 
 
-def test_a_mark_is_an_event_and_events_are_told_since_one(api):
+def test_marks_are_events_and_events_are_listed_since_a_number(api):
     with api.over_socket() as client:
         for text in ("first", "second"):
             told = client.post("/mark", json={"text": text}).json()
@@ -149,7 +147,7 @@ def test_a_mark_is_an_event_and_events_are_told_since_one(api):
         assert client.get("/events", params={"since": 2}).json()["events"] == []
 
 
-def test_an_axis_that_there_is_not_is_named_with_those_that_there_are(leased):
+def test_an_unknown_axis_lists_the_known_ones(leased):
     answer = leased.get("/axes/joint-9")
     assert answer.status_code == 404
     assert "joint-1, joint-2" in answer.json()["detail"]
@@ -174,7 +172,7 @@ def test_an_axis_that_there_is_not_is_named_with_those_that_there_are(leased):
         (b'{"target_deg": 30}' + b" " * (256 << 10), 413, "KiB"),
     ],
 )
-def test_a_body_that_is_wrong_moves_nothing_and_is_told_why(api, leased, content, status, words):
+def test_an_invalid_body_moves_nothing_and_is_explained(api, leased, content, status, words):
     answer = leased.post("/axes/joint-1/move", content=content, headers={"Content-Type": "application/json"})
     assert answer.status_code == status, answer.text
     assert answer.headers["content-type"] == "application/problem+json"
@@ -183,7 +181,7 @@ def test_a_body_that_is_wrong_moves_nothing_and_is_told_why(api, leased, content
     assert api.bridge.moved == []
 
 
-def test_an_error_in_hdbridge_is_a_problem_without_its_insides(api, leased, monkeypatch):
+def test_internal_errors_reveal_no_internals(api, leased, monkeypatch):
     def broken() -> None:
         raise ZeroDivisionError("secret")
 
@@ -194,7 +192,7 @@ def test_an_error_in_hdbridge_is_a_problem_without_its_insides(api, leased, monk
     assert answer.headers["content-type"] == "application/problem+json"
 
 
-def test_health_is_that_of_the_loop(api):
+def test_health_reflects_the_loop(api):
     with api.over_tcp(token=None) as client:
         url = str(client.base_url).replace("api/v1/", "healthz")
         assert client.get(url).status_code == 200
@@ -207,7 +205,7 @@ def test_every_operation_is_described(leased):
     assert all(each["description"] for methods in schema["paths"].values() for each in methods.values())
 
 
-def test_every_operation_says_what_it_refuses_as_a_problem(leased):
+def test_every_operation_documents_its_problems(leased):
     schema = leased.get("/openapi.json").json()
     kinds = {
         kind

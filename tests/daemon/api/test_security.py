@@ -19,7 +19,7 @@ from hdbridge.errors import DaemonError, InputError
 
 
 @pytest.mark.parametrize("umask", [0o000, 0o022, 0o077])
-def test_the_socket_is_open_to_owner_and_group_and_to_nobody_else(tmp_path, umask):
+def test_the_socket_is_open_to_owner_and_group_only(tmp_path, umask):
     before = os.umask(umask)
     try:
         with unix_socket(tmp_path / "cell.sock"):
@@ -28,7 +28,7 @@ def test_the_socket_is_open_to_owner_and_group_and_to_nobody_else(tmp_path, umas
         os.umask(before)
 
 
-def test_a_socket_that_nobody_listens_at_is_replaced_and_another_is_not(tmp_path):
+def test_only_a_dead_socket_is_replaced(tmp_path):
     path = tmp_path / "cell.sock"
     with unix_socket(path), pytest.raises(DaemonError, match="another daemon"):
         unix_socket(path)
@@ -45,12 +45,12 @@ def test_a_socket_that_nobody_listens_at_is_replaced_and_another_is_not(tmp_path
 @pytest.mark.parametrize(
     ("path", "words"), [("x" * 120, "longer than"), ("absent/cell.sock", "folder must exist")]
 )
-def test_a_path_that_no_socket_can_have_is_refused_in_one_line(tmp_path, path, words):
+def test_an_impossible_socket_path_is_refused_in_one_line(tmp_path, path, words):
     with pytest.raises(InputError, match=words):
         unix_socket(tmp_path / path)
 
 
-def test_a_group_that_there_is_not_is_refused_and_one_that_there_is_owns_it(tmp_path):
+def test_an_unknown_group_is_refused_and_a_known_one_owns_the_socket(tmp_path):
     path = tmp_path / "cell.sock"
     with pytest.raises(InputError, match="no group 'nobodys'"):
         unix_socket(path, group="nobodys")
@@ -59,7 +59,7 @@ def test_a_group_that_there_is_not_is_refused_and_one_that_there_is_owns_it(tmp_
         assert path.stat().st_gid == own.gr_gid
 
 
-def test_a_port_that_is_taken_is_said(api):
+def test_a_port_in_use_is_reported(api):
     with pytest.raises(DaemonError, match="another process"):
         tcp_socket(api.port)
 
@@ -67,7 +67,7 @@ def test_a_port_that_is_taken_is_said(api):
 @pytest.mark.parametrize(
     "token", ["", "short", "with spaces in the middle", "x" * 201, "line\nbreak-long-enough"]
 )
-def test_a_token_that_can_be_guessed_or_cannot_be_sent_is_refused(token):
+def test_a_weak_or_unsendable_token_is_refused(token):
     with pytest.raises(InputError, match="token of the API"):
         Policy(token=token)
 
@@ -76,7 +76,7 @@ def test_a_token_that_can_be_guessed_or_cannot_be_sent_is_refused(token):
     "authorization",
     [None, "", "Bearer", "Bearer wrong", f"Basic {TOKEN}", TOKEN, f"Bearer {TOKEN}x", f"Bearer {TOKEN[:-1]}"],
 )
-def test_over_tcp_nothing_is_shown_or_done_without_the_token(api, authorization):
+def test_tcp_requests_need_the_token(api, authorization):
     headers = {} if authorization is None else {"Authorization": authorization}
     with api.over_tcp(token=None, **headers) as client:
         paths = {
@@ -97,7 +97,7 @@ def client_schema(api):
         return client.get("/openapi.json").json()
 
 
-def test_with_the_token_and_the_lease_it_moves_and_with_the_token_alone_it_does_not(api):
+def test_motion_needs_token_and_lease(api):
     with api.over_tcp() as client:
         assert client.get("/state").status_code == 200
         assert client.post("/axes/joint-1/enable").status_code == 423
@@ -111,7 +111,7 @@ def test_with_the_token_and_the_lease_it_moves_and_with_the_token_alone_it_does_
      "127.0.0.1, evil.example", "[::1", "hdbridge:x"],
 )  # fmt: skip
 @pytest.mark.parametrize("over", ["over_tcp", "over_socket"])
-def test_a_name_that_is_not_this_machines_is_refused(api, host, over):
+def test_a_foreign_host_name_is_refused(api, host, over):
     """A page whose name was pointed at this machine asks with that name."""
     with getattr(api, over)(Host=host) as client:
         assert client.post("/stop").status_code == 421
@@ -119,7 +119,7 @@ def test_a_name_that_is_not_this_machines_is_refused(api, host, over):
 
 
 @pytest.mark.parametrize("host", ["localhost", "127.0.0.1:8402", "[::1]:8402", "192.168.1.5", "hdbridge"])
-def test_an_address_and_a_name_of_this_machine_are_known(host):
+def test_local_addresses_and_names_are_accepted(host):
     assert Policy().knows_host(host)
     assert Policy(names=frozenset({"cell.example"})).knows_host("Cell.Example:8402")
 
@@ -138,7 +138,7 @@ def test_an_address_and_a_name_of_this_machine_are_known(host):
         ("null", False),
     ],
 )
-def test_a_page_that_was_loaded_through_the_reverse_proxy_is_known_by_its_name(origin, known):
+def test_a_page_from_the_reverse_proxy_is_accepted_by_name(origin, known):
     policy = Policy(names=frozenset({"cell.example"}))
     assert policy.knows_origin(origin, "127.0.0.1:8402", "http") is known
     assert Policy().knows_origin("https://cell.example", "127.0.0.1:8402", "http") is False
@@ -147,7 +147,7 @@ def test_a_page_that_was_loaded_through_the_reverse_proxy_is_known_by_its_name(o
 @pytest.mark.parametrize(
     "origin", ["https://evil.example", "http://localhost:1", "null", "http://127.0.0.1", "", "file://"]
 )
-def test_a_page_from_elsewhere_can_do_nothing(api, origin):
+def test_a_page_of_another_origin_is_refused(api, origin):
     lease = api.bridge.lease.take("page")
     with api.over_tcp(Origin=origin, **{"X-Lease": lease}) as client:
         assert client.post("/axes/joint-1/enable").status_code == 403
@@ -156,13 +156,13 @@ def test_a_page_from_elsewhere_can_do_nothing(api, origin):
     assert api.bridge.moved == []
 
 
-def test_the_daemons_own_page_may_ask(api):
+def test_the_daemons_own_page_is_accepted(api):
     with api.over_tcp(Origin=f"http://127.0.0.1:{api.port}") as client:
         assert client.get("/state").status_code == 200
         assert "access-control-allow-origin" not in client.get("/state").headers
 
 
-def test_a_form_of_another_page_is_not_taken_for_json(api):
+def test_a_foreign_form_is_not_parsed_as_json(api):
     """Without an Origin, as an old browser sends it: the type alone gives it away."""
     lease = api.bridge.lease.take("form")
     with api.over_socket(**{"X-Lease": lease}) as client:
@@ -175,7 +175,7 @@ def test_a_form_of_another_page_is_not_taken_for_json(api):
     assert api.bridge.moved == [("joint-1", "enable")]
 
 
-def test_neither_token_nor_lease_gets_into_the_log(api, caplog, capfd):
+def test_neither_token_nor_lease_is_logged(api, caplog, capfd):
     caplog.set_level(logging.DEBUG)
     with api.over_tcp() as client:
         lease = client.post("/lease", json={"client": "quiet"}).json()["token"]
@@ -192,7 +192,7 @@ def test_neither_token_nor_lease_gets_into_the_log(api, caplog, capfd):
     assert TOKEN not in logged
 
 
-def test_who_asks_over_the_unix_socket_is_logged(api, caplog):
+def test_peers_on_the_unix_socket_are_logged(api, caplog):
     caplog.set_level(logging.INFO)
     with api.over_socket() as client:
         client.post("/stop")
@@ -202,7 +202,7 @@ def test_who_asks_over_the_unix_socket_is_logged(api, caplog):
     assert about["status"] == 200
 
 
-def test_a_length_that_is_none_and_a_body_that_does_not_end_are_refused(api):
+def test_an_invalid_length_and_an_endless_body_are_refused(api):
     def chunks():
         for _ in range(40):
             yield b" " * 16384
@@ -213,12 +213,12 @@ def test_a_length_that_is_none_and_a_body_that_does_not_end_are_refused(api):
 
 
 @given(st.integers(min_value=1, max_value=60), st.sampled_from([b"[", b'{"a":', b'{"]":[', b'["[[[",']))
-def test_depth_is_counted_outside_of_texts_only(depth, opening):
+def test_nesting_is_counted_outside_strings(depth, opening):
     levels = depth * {b"[": 1, b'{"a":': 1, b'{"]":[': 2, b'["[[[",': 1}[opening]
     assert too_deep(opening * depth) == (levels > DEPTH_MAXIMUM)
 
 
-def test_a_client_that_goes_away_in_its_request_costs_nothing(api):
+def test_an_aborted_request_is_harmless(api):
     """Reset in the middle of a body; the next one is served."""
     with socket.create_connection(("127.0.0.1", api.port)) as raw:
         raw.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))

@@ -40,7 +40,7 @@ def held(api, over: str, sent: str) -> Iterator[None]:
 
 @pytest.mark.parametrize("over", ["tcp", "socket"])
 @pytest.mark.parametrize("sent", SENT.values(), ids=SENT)
-def test_a_stop_gets_through_whatever_others_hold(api, over, sent):
+def test_a_stop_gets_through_despite_other_connections(api, over, sent):
     with held(api, over, sent):
         for client in (api.over_tcp(), api.over_socket()):
             with client:
@@ -82,7 +82,7 @@ def test_a_stop_gets_through_a_flood_of_new_connections(api):
     assert len(api.bridge.stopped) == 10
 
 
-def test_too_many_requests_under_way_leave_room_for_a_stop(api):
+def test_too_many_pending_requests_leave_room_for_a_stop(api):
     api.server.traffic.open["http"] += 64
     try:
         with api.over_socket() as client:
@@ -93,7 +93,7 @@ def test_too_many_requests_under_way_leave_room_for_a_stop(api):
 
 
 @pytest.mark.parametrize("length", ["9", "300000", "99999999999"])
-def test_the_body_of_a_stop_is_not_waited_for(api, length):
+def test_a_stop_does_not_wait_for_its_body(api, length):
     with connected(api, "socket") as raw:
         raw.sendall(f"POST /api/v1/stop HTTP/1.1\r\n{HEAD}Content-Length: {length}\r\n\r\n{{".encode())
         answer = raw.recv(65536)

@@ -37,7 +37,7 @@ def read_on(connection) -> None:
         connection.recv()
 
 
-def test_samples_come_in_columns_and_what_is_not_a_number_is_null(api):
+def test_samples_come_in_columns_with_null_for_nan(api):
     with live(api) as connection:
         samples = batch(connection)
     assert len(samples.time_s) == len(samples.cycle) == len(samples.axes["joint-2"].weight)
@@ -56,7 +56,7 @@ def test_a_client_chooses_axes_and_how_many_samples(api):
     assert all(each % 10 == 0 for each in cycles)
 
 
-def test_events_come_with_the_samples_but_not_those_of_before(api):
+def test_only_new_events_come_with_the_samples(api):
     api.bridge.mark("before")
     with live(api) as connection:
         batch(connection)
@@ -69,7 +69,7 @@ def test_events_come_with_the_samples_but_not_those_of_before(api):
 @pytest.mark.parametrize(
     "wrong", ["{", "[]", '{"every": 0}', '{"every": NaN}', '{"axes": ["joint-9"]}', '{"evry": 3}', b"bytes"]
 )
-def test_what_is_no_wish_ends_the_connection_and_says_why(api, wrong):
+def test_an_invalid_request_ends_the_connection_with_a_reason(api, wrong):
     with live(api) as connection:
         connection.send(wrong)
         with pytest.raises(ConnectionClosed) as closed:
@@ -78,7 +78,7 @@ def test_what_is_no_wish_ends_the_connection_and_says_why(api, wrong):
     assert closed.value.rcvd.reason
 
 
-def test_a_client_that_does_not_read_loses_samples_and_nobody_else_does(api):
+def test_a_slow_client_loses_only_its_own_samples(api):
     """A client that reads nothing for thousands of cycles gets the newest samples, and a count of others."""
     api.bridge.rows = 40
     with socket.socket(socket.AF_UNIX) as raw:
@@ -106,7 +106,7 @@ def test_a_client_that_does_not_read_loses_samples_and_nobody_else_does(api):
     assert lost_by_reader < lost
 
 
-def test_only_so_many_may_watch_and_the_next_is_told(api):
+def test_the_number_of_watchers_is_limited(api):
     with ExitStack() as open_now:
         for _ in range(32):
             open_now.enter_context(live(api))
@@ -122,7 +122,7 @@ def over_tcp(api, **options):
 @pytest.mark.parametrize(
     "subprotocols", [None, ["hdbridge.v1"], ["hdbridge.v1", "bearer.wrong-token-of-old"]]
 )
-def test_over_tcp_nobody_watches_without_the_token(api, subprotocols):
+def test_watching_over_tcp_needs_the_token(api, subprotocols):
     with pytest.raises(InvalidStatus) as refused, over_tcp(api, subprotocols=subprotocols):
         pass
     assert refused.value.response.status_code == 401
@@ -136,7 +136,7 @@ def test_over_tcp_nobody_watches_without_the_token(api, subprotocols):
         {"additional_headers": {"Authorization": f"Bearer {TOKEN}"}},
     ],
 )
-def test_a_browser_shows_the_token_as_a_subprotocol_which_is_not_sent_back(api, shown, caplog):
+def test_the_token_subprotocol_of_a_browser_is_not_echoed(api, shown, caplog):
     caplog.set_level(logging.DEBUG)
     with over_tcp(api, origin=f"http://127.0.0.1:{api.port}", **shown) as connection:
         assert batch(connection).cycle
@@ -146,7 +146,7 @@ def test_a_browser_shows_the_token_as_a_subprotocol_which_is_not_sent_back(api, 
     assert TOKEN not in "\n".join(f"{each.getMessage()} {each.args}" for each in server)
 
 
-def test_a_page_from_elsewhere_does_not_watch(api):
+def test_a_page_of_another_origin_cannot_watch(api):
     shown = {"Authorization": f"Bearer {TOKEN}"}
     with (
         pytest.raises(InvalidStatus) as refused,
@@ -178,7 +178,7 @@ def points(*positions_deg: float, end: bool = False) -> str:
     ).model_dump_json()
 
 
-def test_points_of_a_stream_are_taken_and_answered(api, lease):
+def test_stream_points_are_accepted_and_acknowledged(api, lease):
     with stream(api) as connection:
         begin(connection, lease)
         assert told(connection).accepted == 0
@@ -199,7 +199,7 @@ def test_points_of_a_stream_are_taken_and_answered(api, lease):
     "first",
     ['{"lease": "mZ3s"}', '{"lease": ""}', "{}", "{", '{"lease": "mZ3s", "timeout_s": 60}', '{"points": []}'],
 )
-def test_nobody_streams_without_the_lease(api, lease, first):
+def test_streaming_needs_the_lease(api, lease, first):
     with stream(api) as connection:
         connection.send(first)
         answer = told(connection)
@@ -211,7 +211,7 @@ def test_nobody_streams_without_the_lease(api, lease, first):
     assert api.bridge.moved == []
 
 
-def test_an_axis_that_is_not_enabled_or_not_there_is_told(api, lease):
+def test_a_disabled_or_unknown_axis_is_reported(api, lease):
     for axis, words in (("joint-2", "enable it first"), ("joint-9", "joint-1, joint-2")):
         with stream(api, axis) as connection:
             begin(connection, lease)
@@ -227,7 +227,7 @@ def test_an_axis_that_is_not_enabled_or_not_there_is_told(api, lease):
         '{"points": 3}',
     ],
 )
-def test_a_wrong_point_ends_the_stream_and_says_why(api, lease, wrong):
+def test_an_invalid_point_ends_the_stream_with_a_reason(api, lease, wrong):
     with stream(api) as connection:
         begin(connection, lease)
         told(connection)
@@ -240,7 +240,7 @@ def test_a_wrong_point_ends_the_stream_and_says_why(api, lease, wrong):
     assert given.points == []
 
 
-def test_the_lease_that_another_client_took_ends_the_stream(api, lease):
+def test_losing_the_lease_ends_the_stream(api, lease):
     with stream(api) as connection:
         begin(connection, lease)
         told(connection)
@@ -249,7 +249,7 @@ def test_the_lease_that_another_client_took_ends_the_stream(api, lease):
         assert "another" in told(connection).problem.detail
 
 
-def test_a_streaming_client_that_dies_ends_its_stream(api, lease):
+def test_the_stream_ends_with_its_client(api, lease):
     with stream(api) as connection:
         begin(connection, lease)
         told(connection)

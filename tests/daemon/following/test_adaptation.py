@@ -103,7 +103,7 @@ def test_a_gear_that_has_not_changed_is_left_alone():
     assert axis.waiting is None
 
 
-def test_observing_changes_nothing_and_says_what_it_would():
+def test_observe_mode_changes_nothing_and_reports_the_proposal():
     axis = Axis(mode="observe")
     for seed in range(4):
         axis.works(worn(4.0), seed=seed)
@@ -134,7 +134,7 @@ def test_at_rest_nothing_moves():
     assert state_of(axis) == before
 
 
-def test_without_reversals_the_loop_is_neither_learnt_nor_forgotten():
+def test_without_reversals_the_hysteresis_estimate_is_unchanged():
     axis = Axis()
     axis.works(stands=80)
     one_way = axis.path[-1] + 97.0 * np.arange(1, 241)
@@ -147,7 +147,7 @@ def test_without_reversals_the_loop_is_neither_learnt_nor_forgotten():
     assert axis.adaptation.covariance[OFFSET, OFFSET] == pytest.approx(before[1][OFFSET, OFFSET], rel=1e-9)
 
 
-def test_a_zero_that_moves_is_told_and_changes_nothing_else():
+def test_a_zero_shift_is_reported_and_changes_nothing_else():
     axis = Axis()
     for seed in range(3):
         axis.works(seed=seed)
@@ -161,7 +161,7 @@ def test_a_zero_that_moves_is_told_and_changes_nothing_else():
     assert axis.adaptation.used_arcsec == pytest.approx(quiet, abs=0.3)
 
 
-def test_an_eccentric_disc_of_the_load_encoder_is_not_learnt():
+def test_load_encoder_eccentricity_is_not_learnt():
     axis = Axis(interval_s=5.0)
     for seed in range(6):
         times, samples = axis.measures(MODEL, wandering(60, seed, 9000.0), seed=seed)
@@ -172,7 +172,7 @@ def test_an_eccentric_disc_of_the_load_encoder_is_not_learnt():
     assert np.max(np.abs(axis.adaptation.used_arcsec)) < 0.4
 
 
-def test_a_load_that_is_off_all_at_once_freezes_until_the_zero_is_taken_again():
+def test_a_sudden_load_offset_freezes_until_the_zero_is_reset():
     axis = Axis()
     axis.works(stands=100)
     before = state_of(axis)
@@ -188,7 +188,7 @@ def test_a_load_that_is_off_all_at_once_freezes_until_the_zero_is_taken_again():
     assert axis.events() == ["frozen", "thawed"]
 
 
-def test_a_zero_that_has_moved_too_far_is_a_fault():
+def test_an_excessive_zero_shift_is_a_fault():
     axis = Axis(zero_bound_arcsec=1.0)
     axis.works(stands=100)
     times, samples = axis.measures(MODEL, wandering(700, 7))
@@ -198,7 +198,7 @@ def test_a_zero_that_has_moved_too_far_is_a_fault():
     assert "at most 1" in axis.frozen
 
 
-def test_a_command_ends_a_doubt_that_lasts():
+def test_a_command_ends_a_lasting_doubt():
     axis = Axis()
     axis.works(stands=100)
     axis.works(stands=100, zero_arcsec=40.0)
@@ -209,7 +209,7 @@ def test_a_command_ends_a_doubt_that_lasts():
     assert np.max(np.abs(axis.adaptation.used_arcsec)) < 0.6
 
 
-def test_a_doubt_that_passes_thaws_after_some_plausible_windows():
+def test_a_passing_doubt_ends_after_some_plausible_windows():
     axis = Axis()
     axis.works(stands=60)
     axis.works(stands=20, fault="load encoder noisy: it says so")
@@ -223,7 +223,7 @@ def test_a_doubt_that_passes_thaws_after_some_plausible_windows():
     assert axis.events() == ["frozen", "thawed"]
 
 
-def test_what_the_windows_before_a_fault_taught_is_forgotten():
+def test_estimates_from_windows_before_a_fault_are_discarded():
     axis = Axis()
     axis.works(stands=200)
     learnt = [axis.adaptation.estimate_arcsec]
@@ -236,7 +236,7 @@ def test_what_the_windows_before_a_fault_taught_is_forgotten():
 
 
 @pytest.mark.parametrize("flag", [SampleFlag.FRESH, SampleFlag.MEMORY_KNOWN])
-def test_samples_that_are_not_sure_are_not_used(flag):
+def test_uncertain_samples_are_not_used(flag):
     axis = Axis()
     times, samples = work(worn(5.0), wandering(100))
     samples["flags"] &= ~np.uint16(flag)
@@ -253,7 +253,7 @@ def test_a_stopped_axis_freezes():
     assert axis.frozen
 
 
-def test_after_power_was_off_the_path_has_to_be_known_again():
+def test_the_path_must_be_known_again_after_power_off():
     axis = Axis()
     axis.works(stands=60)
     times, samples = axis.measures(MODEL, axis.path[-1:])

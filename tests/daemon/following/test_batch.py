@@ -27,7 +27,7 @@ def run():
         return Bench(drive, MODEL).run(Stepping(count=40, settle=Settle(minimum_s=0.3)))
 
 
-def test_recursion_equals_the_least_squares_of_the_identification(run):
+def test_recursion_equals_batch_least_squares(run):
     drift = DriftModel(MODEL)
     samples = Sampler(AXIS, MODEL).samples(run.record)
     measuring = Measuring(drift, 0.5)
@@ -57,5 +57,5 @@ def test_recursion_equals_the_least_squares_of_the_identification(run):
         assert order.amplitude_arcsec == pytest.approx(theirs.value, abs=max(theirs.half_width, 0.3))
 
 
-def test_the_axis_says_how_finely_it_is_measured():
+def test_measurement_resolution_comes_from_the_axis():
     assert observation_sigma_arcsec(AxisConfig.load(AXIS.path)) == pytest.approx(0.944, abs=0.001)

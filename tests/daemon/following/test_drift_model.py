@@ -10,7 +10,7 @@ from hdbridge.errors import InputError
 
 
 @pytest.mark.parametrize("name", [name for name, kind in CATALOGUE.items() if kind.drifting])
-def test_what_drifts_is_spoken_for_by_columns_of_the_motor_angle_alone(name):
+def test_drift_columns_depend_on_the_motor_angle_only(name):
     effect = CATALOGUE[name].candidate(50.0)
     assert set(effect.drifting) <= set(type(effect).model_fields)
     assert not effect.needs()
@@ -18,11 +18,11 @@ def test_what_drifts_is_spoken_for_by_columns_of_the_motor_angle_alone(name):
     assert effect.is_compensable()
 
 
-def test_what_a_load_encoder_may_do_by_itself_does_not_drift():
+def test_load_encoder_errors_are_not_part_of_the_drift():
     assert not any(CATALOGUE[name].drifting for name in ("load_order", "zero_drift", "count_loss"))
 
 
-def test_columns_on_line_are_those_of_a_record():
+def test_on_line_columns_equal_those_of_a_record():
     drift = DriftModel(MODEL)
     columns = DriftColumns(drift)
     _, samples = work(MODEL, [0.0, *wandering(20, seed=3)])
@@ -54,7 +54,7 @@ def test_a_changed_model_differs_by_the_columns():
     assert difference == pytest.approx(columns @ change, abs=1e-9)
 
 
-def test_only_what_is_asked_for_is_followed():
+def test_only_requested_parameters_are_followed():
     assert [each.effect.name for each in DriftModel(MODEL, ["hysteresis.offset_arcsec"]).terms] == [
         "hysteresis"
     ]

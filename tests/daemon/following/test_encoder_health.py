@@ -83,7 +83,7 @@ def faulty(change, **options):
         (EncoderFault.DRIFTING, lambda load, time_s: load + 6.0 / 60.0 * time_s / 3600.0, 180.0),
     ],
 )
-def test_a_fault_is_named_with_figures_and_not_before_it_is_there(fault, change, within_s):
+def test_faults_are_named_with_figures_and_not_too_early(fault, change, within_s):
     seen = judged(faulty(change)[: FAULT + int((within_s + 1.0) / PERIOD_S)])
     assert [each.fault for _, each in seen][:2] == [None, fault]
     at_s, status = seen[1]
@@ -94,16 +94,16 @@ def test_a_fault_is_named_with_figures_and_not_before_it_is_there(fault, change,
 
 @pytest.mark.parametrize("seed", range(2))
 @pytest.mark.parametrize("speed_deg_s", [2.0, 20.0])
-def test_a_healthy_encoder_stays_believed(seed, speed_deg_s):
+def test_a_healthy_encoder_stays_trusted(seed, speed_deg_s):
     assert [each.fault for _, each in judged(working(seed=seed, speed_deg_s=speed_deg_s))] == [None]
 
 
 @pytest.mark.parametrize("truth", [model_of(offset=38.0), model_of(second=17.0), model_of(phase=150.0)])
-def test_a_gear_that_has_changed_is_no_fault_of_the_encoder(truth):
+def test_a_changed_gear_is_not_an_encoder_fault(truth):
     assert [each.fault for _, each in judged(working(truth))] == [None]
 
 
-def test_wear_in_the_course_of_time_is_no_fault_of_the_encoder():
+def test_gradual_wear_is_not_an_encoder_fault():
     """The loop grows by a fifth within minutes, which no gear's does."""
     path = moves_and_rests(360.0, PERIOD_S, 5)
     before, after = (
@@ -115,13 +115,13 @@ def test_wear_in_the_course_of_time_is_no_fault_of_the_encoder():
     assert [each.fault for _, each in judged(before)] == [None]
 
 
-def test_one_misread_sample_is_no_fault():
+def test_one_misread_sample_is_not_a_fault():
     samples = working(duration_s=60.0)
     samples["axes"]["load_position_deg"][3000] += 0.5
     assert [each.fault for _, each in judged(samples)] == [None]
 
 
-def test_an_encoder_that_follows_again_is_believed_again():
+def test_a_recovered_encoder_is_trusted_again():
     def for_a_while(load, time_s):
         return np.where(time_s < 10.0, load[0], load)
 
@@ -130,7 +130,7 @@ def test_an_encoder_that_follows_again_is_believed_again():
     assert seen[2][0] >= FAULT_S + 15.0
 
 
-def test_a_jump_stays_until_the_drive_was_verified_again():
+def test_a_jump_persists_until_the_drive_is_verified_again():
     samples = faulty(lambda load, _: load + 100.0 / 3600.0)
     health = EncoderHealth(AXIS, MODEL)
     judged(samples, health)
@@ -141,7 +141,7 @@ def test_a_jump_stays_until_the_drive_was_verified_again():
     assert judged(again, health)[-1][1].fault is None
 
 
-def test_it_does_not_depend_on_how_the_samples_come():
+def test_verdicts_are_independent_of_batching():
     samples = faulty(lambda load, _: load + 100.0 / 3600.0, duration_s=165.0)
     before, after = samples[: FAULT - 500], samples[FAULT - 500 :]
     at_s = []
@@ -158,14 +158,14 @@ def test_it_does_not_depend_on_how_the_samples_come():
     assert max(at_s) - min(at_s) <= 1.1
 
 
-def test_while_the_memory_is_not_known_the_model_blames_nobody():
+def test_no_fault_is_reported_while_the_hysteresis_state_is_unknown():
     samples = working()
     samples["axes"]["flags"] &= ~np.uint16(8)
     samples["axes"]["predicted_arcsec"] += np.where(samples["cycle"] % 1000 < 500, 40.0, 0.0)[:, None]
     assert [each.fault for _, each in judged(samples)] == [None]
 
 
-def test_an_axis_that_is_not_calibrated_yet_is_not_blamed_for_its_gear():
+def test_an_uncalibrated_gear_is_not_an_encoder_fault():
     """A loop of 160 arcsec that no model predicts does all that an encoder does that has faults."""
     nothing = TransmissionModel(AXIS.gear.ratio)
     maker = SampleMaker(AXIS, nothing, model_of(offset=160.0, second=30.0), 3, compensated=False)

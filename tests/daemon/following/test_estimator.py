@@ -27,7 +27,7 @@ def data(count: int, rows: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 @given(seed=seeds, cuts=st.lists(st.integers(1, 39), max_size=6))
-def test_in_any_batches_without_forgetting_it_is_least_squares_with_the_prior(seed, cuts):
+def test_without_forgetting_it_equals_least_squares_with_a_prior(seed, cuts):
     columns, observed = data(5, 40, seed)
     estimator = fresh(5, seed)
     prior = np.linalg.inv(estimator.covariance)
@@ -40,7 +40,7 @@ def test_in_any_batches_without_forgetting_it_is_least_squares_with_the_prior(se
 
 
 @given(seed=seeds, keep=st.floats(0.3, 1.0), correlated=st.booleans())
-def test_what_is_not_shown_is_not_forgotten_nor_learnt_but_by_what_was_known(seed, keep, correlated):
+def test_unexcited_parameters_are_neither_learnt_nor_forgotten(seed, keep, correlated):
     estimator = fresh(6, seed)
     hidden, shown = slice(0, 4), slice(4, 6)
     if not correlated:
@@ -57,7 +57,7 @@ def test_what_is_not_shown_is_not_forgotten_nor_learnt_but_by_what_was_known(see
 
 
 @given(seed=seeds, keep=st.floats(0.3, 1.0))
-def test_nothing_shown_changes_nothing(seed, keep):
+def test_without_excitation_nothing_changes(seed, keep):
     estimator = fresh(4, seed)
     estimate, covariance = estimator.estimate.copy(), estimator.covariance.copy()
     assert estimator.update(np.zeros((8, 4)), np.ones(8), SIGMA, retention=keep) == 0
@@ -66,7 +66,7 @@ def test_nothing_shown_changes_nothing(seed, keep):
 
 
 @given(seed=seeds, keep=st.floats(0.3, 1.0))
-def test_what_is_held_keeps_its_value_and_its_variance(seed, keep):
+def test_held_parameters_keep_value_and_variance(seed, keep):
     estimator = fresh(5, seed)
     before = estimator.covariance.copy()
     columns, observed = data(5, 30, seed)
@@ -79,7 +79,7 @@ def test_what_is_held_keeps_its_value_and_its_variance(seed, keep):
 
 @settings(max_examples=20)
 @given(seed=seeds, keep=st.floats(0.05, 0.99), shown=st.integers(1, 5))
-def test_forgetting_for_ever_winds_no_variance_up(seed, keep, shown):
+def test_endless_forgetting_does_not_inflate_the_variance(seed, keep, shown):
     estimator = fresh(5, seed)
     first = estimator.covariance.copy()
     rng = np.random.default_rng(seed)
@@ -96,7 +96,7 @@ def test_forgetting_for_ever_winds_no_variance_up(seed, keep, shown):
     assert float(np.linalg.eigvalsh(scaled)[-1]) <= 2.0 * most
 
 
-def test_forgetting_follows_what_changes():
+def test_forgetting_tracks_changes():
     rng = np.random.default_rng(0)
     estimator = fresh(3)
     truth = np.zeros(3)

@@ -104,9 +104,7 @@ def without_lag(response: Response) -> np.ndarray:
 
 
 @pytest.mark.parametrize(("mode", "stuck"), [("off", False), ("on", True), ("observe", False)])
-def test_nothing_is_refined_without_a_believed_encoder_and_permission(
-    profile: Path, mode: Mode, stuck: bool
-) -> None:
+def test_refinement_needs_a_trusted_encoder_and_permission(profile: Path, mode: Mode, stuck: bool) -> None:
     found = seen(profile, mode, stuck, position_gain_per_s=130.0)
     assert Verdict.RETUNED in found.verdicts
     assert not any(each.apply for each in found.proposals)
@@ -121,7 +119,7 @@ def test_nothing_is_refined_without_a_believed_encoder_and_permission(
     gain=st.floats(0.3, 3.0),
     phase_deg=st.floats(-90.0, 90.0),
 )
-def test_gain_and_phase_are_seen_in_both_directions_and_a_delay_alone_is_none(
+def test_gain_and_phase_changes_are_detected_but_a_pure_delay_is_not(
     speed: float, later_ms: float, gain: float, phase_deg: float
 ) -> None:
     """The motor answers its set-points with a gain, a phase, and its lag."""

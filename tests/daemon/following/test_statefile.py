@@ -53,7 +53,7 @@ def history(folder: Path) -> list[dict]:
     return [json.loads(line) for line in (folder / "article.log.jsonl").read_text().splitlines()]
 
 
-def test_every_change_is_in_the_history_and_what_was_learnt_survives_a_restart(tmp_path):
+def test_every_change_is_logged_and_the_state_survives_a_restart(tmp_path):
     machine = Machine(on(tmp_path))
     for seed in range(3):
         machine.works(worn(4.0), seed=seed)
@@ -71,7 +71,7 @@ def test_every_change_is_in_the_history_and_what_was_learnt_survives_a_restart(t
     assert history(tmp_path)[-1]["event"] == "restored"
 
 
-def test_another_committed_model_begins_anew(tmp_path):
+def test_a_newly_committed_model_resets_the_state(tmp_path):
     machine = Machine(on(tmp_path))
     machine.works(worn(4.0), stands=120)
     machine.follower.save()
@@ -88,7 +88,7 @@ def test_another_committed_model_begins_anew(tmp_path):
 
 
 @pytest.mark.parametrize("content", ["", "{", '{"schema": "hdbridge.adaptation/1"}', "[1]", "\0" * 100])
-def test_a_broken_state_file_is_told_and_begun_anew(tmp_path, content):
+def test_a_broken_state_file_is_reported_and_replaced(tmp_path, content):
     (tmp_path / "article.json").write_text(content)
     assert on(tmp_path).adaptation.model == MODEL
     last = history(tmp_path)[-1]
@@ -96,7 +96,7 @@ def test_a_broken_state_file_is_told_and_begun_anew(tmp_path, content):
     assert "article.json cannot be read" in last["reason"]
 
 
-def test_back_is_one_call_and_survives_a_restart(tmp_path):
+def test_reverting_takes_one_call_and_survives_a_restart(tmp_path):
     machine = Machine(on(tmp_path))
     for seed in range(3):
         machine.works(worn(4.0), seed=seed)
@@ -106,7 +106,7 @@ def test_back_is_one_call_and_survives_a_restart(tmp_path):
     assert history(tmp_path)[-2]["event"] == "back"
 
 
-def test_clients_are_told_what_it_does(tmp_path):
+def test_state_is_reported_to_clients(tmp_path):
     machine = Machine(on(tmp_path))
     assert machine.follower.state().frozen == "the axis has not yet turned past its loop"
     for seed in range(3):
@@ -123,7 +123,7 @@ def test_clients_are_told_what_it_does(tmp_path):
     assert machine.follower.state().frozen is None
 
 
-def test_lost_samples_are_a_lost_path(tmp_path):
+def test_lost_samples_lose_the_path(tmp_path):
     machine = Machine(on(tmp_path))
     machine.works()
     assert machine.follower.state().frozen is None
@@ -133,7 +133,7 @@ def test_lost_samples_are_a_lost_path(tmp_path):
     assert machine.follower.state().frozen is None
 
 
-def test_a_disk_that_is_full_costs_the_history_and_nothing_else(tmp_path, monkeypatch):
+def test_a_full_disk_loses_only_the_history(tmp_path, monkeypatch):
     machine = Machine(on(tmp_path))
 
     def full(*_: object) -> None:

@@ -61,13 +61,13 @@ def raised_over(follower, samples, batch):
     return [each for batch in batches for each in follower.take(batch).raised]
 
 
-def test_at_work_nothing_is_raised():
+def test_normal_work_raises_nothing():
     quiet(0, 1500.0)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(8))
-def test_for_hours_at_work_nothing_is_raised(seed):
+def test_hours_of_normal_work_raise_nothing(seed):
     quiet(seed, 3600.0)
 
 
@@ -88,7 +88,7 @@ def quiet(seed, duration_s):
         (model_of(orders=second(4.0)), "synchronous.orders[2].amplitude_arcsec 13.7 to 1"),
     ],
 )
-def test_wear_asks_for_a_calibration_and_says_what_has_moved(truth, named):
+def test_wear_requests_a_calibration_and_names_the_change(truth, named):
     watch, raised = watched(truth)
     assert [each.verdict for each in raised] == [Verdict.RECALIBRATE]
     assert named in raised[0].evidence
@@ -98,12 +98,12 @@ def test_wear_asks_for_a_calibration_and_says_what_has_moved(truth, named):
 
 
 @pytest.mark.parametrize("truth", [with_order(5, 5.0), model_of(offset=31.6 * 1.8)])
-def test_what_wear_does_not_do_is_something_else(truth):
+def test_changes_unlike_wear_are_reported_as_such(truth):
     _, raised = watched(truth)
     assert [each.verdict for each in raised] == [Verdict.SOMETHING_CHANGED]
 
 
-def test_a_zero_that_moves_asks_for_a_calibration():
+def test_a_zero_shift_requests_a_calibration():
     def warm(samples):
         minutes = PERIOD_S / 60.0 * np.arange(len(samples))
         samples["axes"]["load_position_deg"][:, 0] += np.minimum(minutes, 15.0) * 1.0 / 3600.0
@@ -113,7 +113,7 @@ def test_a_zero_that_moves_asks_for_a_calibration():
     assert "zero: by +" in raised[0].evidence
 
 
-def test_a_load_encoder_that_is_not_believed_is_all_that_is_said():
+def test_an_untrusted_load_encoder_is_the_only_report():
     def jump(samples):
         samples["axes"]["load_position_deg"][20_000:] += 50.0 / 3600.0
 
@@ -133,19 +133,19 @@ def test_one_bad_minute_raises_nothing():
     assert raised == []
 
 
-def test_an_axis_without_a_model_has_not_changed():
+def test_without_a_model_no_change_is_reported():
     watch, raised = watched(MODEL, model=TransmissionModel(50.0))
     assert raised == []
     assert watch.verdict is Verdict.HOLDS
 
 
-def test_a_model_without_intervals_is_taken_for_a_usual_calibration():
+def test_a_model_without_intervals_gets_typical_ones():
     bare = replace(MODEL, uncertainty={})
     _, raised = watched(model_of(offset=31.6 * 1.3), model=bare)
     assert [each.verdict for each in raised] == [Verdict.RECALIBRATE]
 
 
-def test_an_axis_that_rests_says_nothing():
+def test_a_resting_axis_raises_nothing():
     watch, raised = watched(model_of(offset=60.0), path=np.zeros(10_000))
     assert raised == []
     assert watch.evidence is None
@@ -163,7 +163,7 @@ def test_lost_cycles_leave_the_path_unknown_until_it_is_known_again():
     assert follower.watch.evidence is not None
 
 
-def test_a_verdict_lasts_before_it_is_raised_and_longer_before_it_is_withdrawn():
+def test_verdicts_are_debounced():
     steady = Debounced()
     assert not any(steady.take(Verdict.RECALIBRATE, 10.0) for _ in range(5))
     assert not steady.take(Verdict.HOLDS, 10.0)

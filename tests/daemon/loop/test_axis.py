@@ -54,7 +54,7 @@ def test_nothing_is_sent_to_a_drive_that_is_not_verified(daemon: SteppedDaemon) 
     assert sent == []
 
 
-def test_a_verified_axis_is_idle_with_its_place_as_target(daemon: SteppedDaemon) -> None:
+def test_a_verified_axis_is_idle_at_its_position(daemon: SteppedDaemon) -> None:
     daemon.verify()
     sent = rpdos(daemon)
     daemon.run(0.2)
@@ -85,7 +85,7 @@ def test_enabling_moves_nothing_and_a_move_arrives(daemon: SteppedDaemon) -> Non
     assert end.code == MotionMode.GOTO
 
 
-def test_the_sample_says_what_was_sent_and_what_the_model_says(enabled: SteppedDaemon) -> None:
+def test_samples_hold_the_sent_target_and_the_model_error(enabled: SteppedDaemon) -> None:
     enabled.run(1.0)
     sent = rpdos(enabled)
     record(enabled)
@@ -105,7 +105,7 @@ def test_the_sample_says_what_was_sent_and_what_the_model_says(enabled: SteppedD
     assert np.isnan(axis["reading0"]).all()
 
 
-def test_a_jog_runs_out_when_nobody_renews_it(enabled: SteppedDaemon) -> None:
+def test_an_unrenewed_jog_runs_out(enabled: SteppedDaemon) -> None:
     enabled.done(K.JOG, a=5.0, b=0.2)
     enabled.run(0.15)
     enabled.done(K.JOG, a=5.0, b=0.2)
@@ -141,7 +141,7 @@ def test_disabling_in_motion_brakes_first(enabled: SteppedDaemon) -> None:
         ({"a": 1.0, "c": math.inf}, "finite"),
     ],
 )
-def test_a_move_that_makes_no_sense_is_refused_and_moves_nothing(
+def test_an_invalid_move_is_refused_and_moves_nothing(
     enabled: SteppedDaemon, fields: dict[str, float], words: str
 ) -> None:
     enabled.run(1.0)
@@ -169,7 +169,7 @@ def test_enabling_outside_the_limits_is_refused(daemon: SteppedDaemon) -> None:
     assert "not an integer within" in answer.text
 
 
-def test_a_drive_that_does_not_come_to_power_is_given_up(daemon: SteppedDaemon) -> None:
+def test_a_drive_that_does_not_enable_is_given_up(daemon: SteppedDaemon) -> None:
     daemon.verify()
     fields = daemon.prepare()
     node = daemon.nodes[0]
@@ -231,14 +231,14 @@ def quintic(duration_s: float, travel_deg: float, step_s: float = 0.02) -> list[
     return [(float(t), float(p), float(v)) for t, p, v in zip(times, place, speed, strict=True)]
 
 
-def test_a_stream_that_is_ended_by_its_client_ends_at_once_when_it_rests(enabled: SteppedDaemon) -> None:
+def test_a_stream_ended_at_rest_ends_at_once(enabled: SteppedDaemon) -> None:
     begin = enabled.axes[0].set_point.position_deg
     enabled.stream({0: [(t, begin + p, v) for t, p, v in quintic(0.4, 1.0)]}, timeout_s=30.0)
     enabled.done(K.STREAM_END)
     enabled.until(lambda: bool(enabled.told(E.MOTION_ENDED)), 1.0)
 
 
-def test_knots_of_an_earlier_stream_are_thrown_away(enabled: SteppedDaemon) -> None:
+def test_knots_of_an_earlier_stream_are_discarded(enabled: SteppedDaemon) -> None:
     begin = enabled.axes[0].set_point.position_deg
     enabled.memory.knots[0].put([Knot(0, 0.0, 300.0, 0.0)] * 200)
     enabled.stream({0: [(t, begin + p, v) for t, p, v in quintic(0.4, 1.0)]}, timeout_s=0.1)
@@ -247,7 +247,7 @@ def test_knots_of_an_earlier_stream_are_thrown_away(enabled: SteppedDaemon) -> N
     assert enabled.axes[0].set_point.position_deg == pytest.approx(begin + 1.0)
 
 
-def test_knots_that_come_before_the_stream_before_them_is_over_are_kept(enabled: SteppedDaemon) -> None:
+def test_early_knots_of_the_next_stream_are_kept(enabled: SteppedDaemon) -> None:
     """A leg's end is told, and the next one is handed over within the same period."""
     begin = enabled.axes[0].set_point.position_deg
     enabled.stream({0: [(t, begin + p, v) for t, p, v in quintic(0.4, 1.0)]}, timeout_s=10.0)
@@ -293,7 +293,7 @@ def test_axes_stream_together_or_not_at_all(pair: SteppedDaemon) -> None:
     assert np.allclose(2 * (both[moving, 0] - begins[0]), both[moving, 1] - begins[1], atol=1e-9)
 
 
-def test_a_fault_of_one_axis_stops_those_that_move_with_it_in_order(pair: SteppedDaemon) -> None:
+def test_a_fault_stops_coordinated_axes_in_order(pair: SteppedDaemon) -> None:
     begins = [axis.set_point.position_deg for axis in pair.axes]
     pair.stream({
         index: [(t, begins[index] + p, v) for t, p, v in quintic(3.0, 20.0)] for index in (0, 1)
@@ -341,7 +341,7 @@ def test_a_full_mailbox_is_emptied_eight_a_turn(enabled: SteppedDaemon) -> None:
     assert [each.id for each in enabled.told(E.DONE) if each.id >= ids[0]] == ids
 
 
-def test_a_loop_that_begins_anew_does_not_carry_out_what_was_posted_before(enabled: SteppedDaemon) -> None:
+def test_a_new_loop_ignores_earlier_commands(enabled: SteppedDaemon) -> None:
     from hdbridge.daemon.loop.controller import Controller
 
     enabled.post(K.ENABLE)
@@ -365,7 +365,7 @@ def with_load_loop(made: AxisSetup) -> AxisSetup:
     return replace(made, load_loop=LoadLoopSettings(gain_1_s=2.0, maximum_arcsec=40.0, slew_arcsec_s=40.0))
 
 
-def test_the_load_loop_takes_away_what_the_model_leaves_and_fades_when_switched_off() -> None:
+def test_the_load_loop_removes_the_remaining_error_and_fades_out() -> None:
     without = TransmissionModel(50.0)
     with stepped_daemon(model=without, setup=lambda _, made: with_load_loop(made)) as daemon:
         daemon.verify()
@@ -412,7 +412,7 @@ def test_the_load_loop_takes_away_what_the_model_leaves_and_fades_when_switched_
         pytest.param(Scheme.SYNCHRONOUS, 60.0, id="it has all of the hysteresis to take away"),
     ],
 )
-def test_a_sound_load_encoder_is_never_in_doubt(scheme: Scheme, maximum_arcsec: float) -> None:
+def test_a_sound_load_encoder_raises_no_doubt(scheme: Scheme, maximum_arcsec: float) -> None:
     """Reversals at rest, by one motor count and by more, and in motion."""
     settings = LoadLoopSettings(gain_1_s=0.5, maximum_arcsec=maximum_arcsec)
     with stepped_daemon(setup=lambda _, made: replace(made, load_loop=settings)) as daemon:

@@ -34,7 +34,7 @@ def test_all_axes_brake_in_order_and_lose_power(pair: SteppedDaemon) -> None:
     assert len(pair.told(E.ENDING)) == 1
 
 
-def test_nothing_is_begun_any_more_while_it_ends(pair: SteppedDaemon) -> None:
+def test_nothing_starts_during_shutdown(pair: SteppedDaemon) -> None:
     pair.move(100.0)
     pair.run(1.0)
     pair.controller.end()
@@ -87,7 +87,7 @@ def test_from_every_state(daemon: SteppedDaemon, state: str) -> None:
         assert daemon.axes[0].image.power.state in (State.SWITCH_ON_DISABLED, State.UNKNOWN)
 
 
-def test_a_drive_that_does_not_answer_is_not_waited_for_for_ever(pair: SteppedDaemon) -> None:
+def test_shutdown_does_not_wait_forever_for_a_silent_drive(pair: SteppedDaemon) -> None:
     pair.move(100.0)
     pair.run(1.0)
     pair.nodes[0].faults.silent = True

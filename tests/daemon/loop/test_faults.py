@@ -106,7 +106,7 @@ def test_a_fault_is_one_event_and_not_one_per_cycle(
     assert again[len(told) :] == reactions
 
 
-def test_emergencies_with_different_codes_are_all_told(enabled: SteppedDaemon) -> None:
+def test_emergencies_with_different_codes_are_all_reported(enabled: SteppedDaemon) -> None:
     for number in range(200):
         enabled.interfere(0x081, struct.pack("<HBB4x", (0x3110, 0x4210, 0x8110)[number % 3], 1, number))
         enabled.turn()
@@ -115,7 +115,7 @@ def test_emergencies_with_different_codes_are_all_told(enabled: SteppedDaemon) -
     assert enabled.states == [S.ENABLED]
 
 
-def test_a_drive_fault_is_reset_by_command_after_the_stop_was(enabled: SteppedDaemon) -> None:
+def test_a_drive_fault_is_reset_after_the_stop(enabled: SteppedDaemon) -> None:
     moving(enabled)
     drive_fault(enabled)
     enabled.until(lambda: bool(enabled.told(E.STOPPED)))

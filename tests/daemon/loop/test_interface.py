@@ -46,7 +46,7 @@ class Talker:
         (0x203, None),
     ],
 )
-def test_a_bus_that_somebody_masters_is_left_alone(can_id: int, words: str | None) -> None:
+def test_a_bus_with_another_master_is_left_alone(can_id: int, words: str | None) -> None:
     clock = VirtualClock()
     channel = str(uuid4())
     with (
@@ -65,14 +65,14 @@ def test_a_bus_that_somebody_masters_is_left_alone(can_id: int, words: str | Non
     assert clock.now() >= 0.5
 
 
-def test_an_interface_that_is_not_there_is_said_at_the_start_and_tried_again_later() -> None:
+def test_a_missing_interface_is_reported_at_start_and_retried() -> None:
     with Interface(BusConfig(interface="socketcan", channel="nosuchcan7"), MonotonicClock()) as gone:
         with pytest.raises(BusError, match="nosuchcan7"):
             gone.open()
         assert gone.reopen() is None
 
 
-def test_it_is_opened_anew_and_the_old_one_is_left() -> None:
+def test_the_interface_is_reopened_and_the_old_one_closed() -> None:
     settings = BusConfig(interface="virtual", channel=str(uuid4()))
     with Interface(settings, MonotonicClock()) as there:
         first = there.open()
@@ -84,7 +84,7 @@ def test_it_is_opened_anew_and_the_old_one_is_left() -> None:
             first.send(0x080, b"")
 
 
-def test_one_that_can_be_opened_but_is_down_is_not_taken(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_interface_that_is_down_is_not_used(monkeypatch: pytest.MonkeyPatch) -> None:
     class Down(Link):
         def recv(self, deadline_s: float) -> None:
             raise BusError(f"Network is down ({errno.ENETDOWN})")

@@ -40,7 +40,7 @@ def corrections(daemon, cycles: int) -> list[float]:
 
 
 @pytest.mark.parametrize("end", [CommandKind.STOP, CommandKind.MOVE])
-def test_a_stop_and_a_new_target_make_no_jump_and_end_at_the_correction_of_rest(end):
+def test_stops_and_new_targets_cause_no_jump_and_end_at_the_static_correction(end):
     slew_arcsec = AXIS.compensation.slew_arcsec_s * AXIS.drive.cycle_s
     ends = []
     for model in (with_response(), TransmissionModel.load(PROFILE / "model.yaml")):

@@ -25,7 +25,7 @@ def ended(machine: Machine, simulation: Simulation | None, **changes: object) ->
         return done.returncode, done.stderr, memory.status.loop_count
 
 
-def test_a_bus_that_is_not_there_is_said_in_a_line() -> None:
+def test_a_missing_bus_is_reported_in_one_line() -> None:
     status, said, _ = ended(
         Machine.of_profile("article").on_bus(interface="socketcan", channel="nosuchcan7"), None
     )
@@ -34,13 +34,13 @@ def test_a_bus_that_is_not_there_is_said_in_a_line() -> None:
     assert said.count("\n") == 1
 
 
-def test_by_hand_it_is_refused() -> None:
+def test_starting_by_hand_is_refused() -> None:
     done = subprocess.run(CONTROL, capture_output=True, text=True, check=False)
     assert done.returncode == 2
     assert "use 'hdbridge run'" in done.stderr
 
 
-def test_it_does_not_outlive_its_keeper() -> None:
+def test_the_control_process_ends_with_its_keeper() -> None:
     machine = Machine.of_profile("article")
     simulation = Simulation(tuple(axis.profile.truth for axis in machine.axes))
     status, _, turns = ended(machine, simulation, keeper=1)

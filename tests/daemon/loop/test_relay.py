@@ -15,7 +15,7 @@ WRITES = [DOWNLOAD, bytes(8), bytes([0xC0, *bytes(7)]), bytes([0xE0, *bytes(7)])
 
 
 @pytest.mark.parametrize("state", list(AxisState))
-def test_reading_is_always_possible_writing_only_where_nothing_moves(state: AxisState) -> None:
+def test_reads_are_always_allowed_and_writes_only_without_motion(state: AxisState) -> None:
     for data in READS:
         assert why_refused(0x601, data, {1: state}) is None
     for data in WRITES:
@@ -40,12 +40,12 @@ def test_reading_is_always_possible_writing_only_where_nothing_moves(state: Axis
         (0x7E5, bytes(8)),
     ],
 )
-def test_what_is_not_the_services_business_is_refused(can_id: int, data: bytes) -> None:
+def test_other_requests_of_the_service_are_refused(can_id: int, data: bytes) -> None:
     states = {1: AxisState.UNVERIFIED, 2: AxisState.DISABLED}
     assert why_refused(can_id, data, states) is not None
 
 
-def test_one_axis_moving_does_not_keep_others_from_being_written() -> None:
+def test_a_moving_axis_does_not_block_writes_to_others() -> None:
     states = {1: AxisState.ENABLED, 2: AxisState.DISABLED}
     assert why_refused(0x602, DOWNLOAD, states) is None
     assert why_refused(0x601, DOWNLOAD, states) == (
@@ -53,7 +53,7 @@ def test_one_axis_moving_does_not_keep_others_from_being_written() -> None:
     )
 
 
-def test_what_comes_in_is_answers_emergencies_and_everybodys_heartbeats() -> None:
+def test_answers_emergencies_and_heartbeats_are_forwarded() -> None:
     wanted = incoming_ids([1, 5])
     assert {0x581, 0x585, 0x081, 0x085, 0x701, 0x705, 0x742} <= wanted
     assert not {0x080, 0x181, 0x201, 0x582, 0x000, 0x700, 0x780} & wanted
@@ -71,7 +71,7 @@ def test_objects_can_be_read_in_motion_and_cost_no_cycle(enabled: SteppedDaemon)
     assert not enabled.ended(id_)
 
 
-def test_at_most_one_frame_a_turn(daemon: SteppedDaemon) -> None:
+def test_at_most_one_frame_per_turn(daemon: SteppedDaemon) -> None:
     sent: list[int] = []
     daemon.bus.spy = lambda can_id, _: sent.append(can_id)
     for _ in range(10):

@@ -55,14 +55,14 @@ def turns_until(bench: DaemonBench, state: AxisState, most: int = 1000) -> int:
 # ---------------------------------------------------------------- the bus and the drive
 
 
-def test_the_order_of_tpdos_is_nothing(moving: DaemonBench) -> None:
+def test_tpdo_order_has_no_effect(moving: DaemonBench) -> None:
     moving.node.faults.reverse_tpdos = 50
     assert moving.moves_on(0)
     assert not faults(moving)
     further("TPDOs come in another order").show(0)
 
 
-def test_a_position_that_wraps_is_nothing(bench: DaemonBench) -> None:
+def test_a_wrapping_position_has_no_effect(bench: DaemonBench) -> None:
     end = bench.node.firmware.motion.machine.load_counts + 150_000  # 19 degrees on
 
     def wrapped(counts: int) -> int:
@@ -100,7 +100,7 @@ def test_a_motor_that_does_not_follow(bench: DaemonBench) -> None:
     further("the motor does not follow").show(beyond)
 
 
-def test_a_drive_that_is_another_is_never_spoken_to(bench: DaemonBench) -> None:
+def test_a_different_drive_gets_no_set_points(bench: DaemonBench) -> None:
     daemon = bench.daemon
     sent: list[int] = []
     daemon.bus.spy = lambda can_id, data: sent.append(can_id) if can_id == RPDO + 1 else None
@@ -120,7 +120,7 @@ def test_a_drive_that_is_another_is_never_spoken_to(bench: DaemonBench) -> None:
     further("another drive identity, encoder or gear").show(0)
 
 
-def test_the_service_verifies_a_bus_that_comes_back(bench: DaemonBench) -> None:
+def test_the_service_verifies_drives_when_the_bus_returns(bench: DaemonBench) -> None:
     bench.set_off()
     daemon = bench.daemon
     daemon.bus.down = errno.ENODEV
@@ -159,7 +159,7 @@ def test_a_step_beyond_the_limits_is_not_sent(moving: DaemonBench) -> None:
     moving.leads_back()
 
 
-def test_a_target_that_makes_no_sense_is_refused(moving: DaemonBench) -> None:
+def test_invalid_targets_are_refused(moving: DaemonBench) -> None:
     daemon = moving.daemon
     for bad in (math.nan, math.inf, -math.inf, 400.1, -1e300):
         before = daemon.axes[0].set_point.velocity_deg_s
@@ -174,7 +174,7 @@ def test_a_target_that_makes_no_sense_is_refused(moving: DaemonBench) -> None:
     further("a client's target is not a number, infinite or outside the limits").show(1)
 
 
-def test_a_stream_with_a_number_that_is_none_brakes(bench: DaemonBench) -> None:
+def test_nan_in_a_stream_brakes(bench: DaemonBench) -> None:
     daemon = bench.daemon
     daemon.verify()
     daemon.enable()
@@ -191,7 +191,7 @@ def test_a_stream_with_a_number_that_is_none_brakes(bench: DaemonBench) -> None:
     further("a client streams a set-point that is not a number").show(1)
 
 
-def test_a_mailbox_of_nonsense_is_refused_and_nothing_else(moving: DaemonBench) -> None:
+def test_a_mailbox_full_of_nonsense_is_refused(moving: DaemonBench) -> None:
     daemon = moving.daemon
     posted = 0
     with suppress(MailboxFullError):
@@ -226,7 +226,7 @@ def test_the_service_cannot_write_restart_or_command_a_moving_drive(moving: Daem
     further("an SDO write, an NMT reset, a set-point from the service in motion").show(len(passed))
 
 
-def test_a_stale_place_at_enable_moves_nothing(bench: DaemonBench) -> None:
+def test_a_stale_position_at_enable_moves_nothing(bench: DaemonBench) -> None:
     daemon = bench.daemon
     daemon.verify()
     seeds = daemon.prepare()
@@ -248,7 +248,7 @@ def test_a_stale_place_at_enable_moves_nothing(bench: DaemonBench) -> None:
 # ---------------------------------------------------------------- processes
 
 
-def test_a_killed_control_process(bench: DaemonBench) -> None:
+def test_drives_stop_when_the_control_process_is_killed(bench: DaemonBench) -> None:
     bench.set_off()
     daemon = bench.daemon
     cycles = 0
@@ -274,7 +274,7 @@ def test_a_killed_control_process(bench: DaemonBench) -> None:
     further("the control process is killed in motion").show(cycles)
 
 
-def test_a_jog_whose_service_dies_runs_out(moving: DaemonBench) -> None:
+def test_a_jog_runs_out_when_the_service_dies(moving: DaemonBench) -> None:
     daemon = moving.daemon
     axis = daemon.axes[0]
     direction = math.copysign(1.0, axis.set_point.velocity_deg_s)
@@ -288,7 +288,7 @@ def test_a_jog_whose_service_dies_runs_out(moving: DaemonBench) -> None:
     further("the service dies during a jog").show(turns)
 
 
-def test_a_full_disk_costs_the_loop_nothing(moving: DaemonBench, tmp_path: Path) -> None:
+def test_a_full_disk_does_not_disturb_the_loop(moving: DaemonBench, tmp_path: Path) -> None:
     told: list[str] = []
     recorder = FlightRecorder(tmp_path / "flights", about(2), tell=told.append, free=lambda _: 0)
 

@@ -140,7 +140,7 @@ class Watch:
 @pytest.mark.parametrize("character", CHARACTERS, ids=str)
 @settings(max_examples=12)
 @given(st.lists(st.tuples(EVENTS, st.integers(1, 60)), min_size=4, max_size=16))
-def test_the_set_point_does_not_jump(character: Character, events: list[tuple[Event, int]]) -> None:
+def test_set_point_never_jumps(character: Character, events: list[tuple[Event, int]]) -> None:
     model = TransmissionModel(AXIS.gear.ratio)
     text = (
         (PROFILE / "truth.yaml")

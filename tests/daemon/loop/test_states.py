@@ -20,7 +20,7 @@ from hdbridge.daemon.memory import CommandKind
 S = AxisState
 
 
-def test_a_row_is_there_once() -> None:
+def test_every_row_is_unique() -> None:
     assert len({(row.source, row.cause) for row in TRANSITIONS}) == len(TRANSITIONS)
 
 
@@ -31,14 +31,14 @@ def test_only_an_enable_command_leads_towards_power() -> None:
     assert [(row.source, row.cause) for row in ways] == [(S.ENABLING, Happening.POWERED)]
 
 
-def test_out_of_a_latch_leads_a_reset_alone() -> None:
+def test_only_a_reset_leaves_the_latch() -> None:
     for latched in (S.QUICK_STOPPED, S.LATCHED):
         causes = {row.cause for row in TRANSITIONS if row.source is latched and row.target is not latched}
         assert causes - {Happening.VERIFICATION_LOST} == {CommandKind.RESET}
 
 
 @pytest.mark.parametrize("state", list(AxisState))
-def test_to_stop_is_never_refused(state: AxisState) -> None:
+def test_stopping_is_never_refused(state: AxisState) -> None:
     for kind in (CommandKind.STOP, CommandKind.QUICK_STOP):
         target = target_of(state, kind)
         assert target is not None
@@ -46,7 +46,7 @@ def test_to_stop_is_never_refused(state: AxisState) -> None:
 
 
 @pytest.mark.parametrize("state", [S.DISABLED, S.ENABLING, S.ENABLED, S.STOPPING, S.LENT, S.QUICK_STOPPED])
-def test_a_lost_drive_latches_wherever_it_was_known(state: AxisState) -> None:
+def test_a_lost_drive_latches_from_every_known_state(state: AxisState) -> None:
     assert target_of(state, Happening.VERIFICATION_LOST) is S.LATCHED
 
 
@@ -61,20 +61,20 @@ def test_motion_is_possible_only_while_enabled() -> None:
         assert [state for state in AxisState if target_of(state, kind) is not None] == [S.ENABLED]
 
 
-def test_a_refusal_says_what_to_do() -> None:
+def test_refusals_state_the_remedy() -> None:
     assert refusal(S.QUICK_STOPPED, CommandKind.ENABLE) == (
         "enable is not possible while the axis is quick stopped: remove the cause, then reset it: "
         "hdbridge ctl reset AXIS"
     )
 
 
-def test_the_diagram_names_every_state_and_the_way_to_power() -> None:
+def test_diagram_shows_every_state_and_the_path_to_power() -> None:
     text = mermaid()
     assert all(state.name in text for state in AxisState)
     assert "DISABLED --> ENABLING: ENABLE" in text
 
 
-def test_the_page_has_what_the_table_says() -> None:
+def test_documentation_matches_the_table() -> None:
     page = Path(__file__).resolve().parents[3] / "docs" / "architecture.md"
     text = page.read_text(encoding="utf-8")
     assert mermaid() in text

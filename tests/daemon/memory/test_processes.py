@@ -44,7 +44,7 @@ def start(script: str, memory: Memory) -> subprocess.Popen[bytes]:
 
 
 @pytest.mark.parametrize("checked", [False, True])
-def test_no_sample_is_torn_however_fast_the_writer_is(checked: bool) -> None:
+def test_samples_are_never_torn(checked: bool) -> None:
     with Memory.create(1, 0.001, checked=checked) as memory:
         samples_of, events_of = memory.reader(), memory.event_reader()
         process = start(HAMMER, memory)
@@ -79,7 +79,7 @@ def test_no_sample_is_torn_however_fast_the_writer_is(checked: bool) -> None:
             process.wait()
 
 
-def test_what_a_service_posted_before_it_was_killed_is_whole_and_a_new_one_goes_on() -> None:
+def test_commands_of_a_killed_service_are_whole_and_a_new_one_continues() -> None:
     with Memory.create(1, 0.001) as memory:
         process = start(OTHER_END, memory)
         assert process.wait() == -signal.SIGKILL
@@ -98,7 +98,7 @@ def test_what_a_service_posted_before_it_was_killed_is_whole_and_a_new_one_goes_
         assert command.kind == CommandKind.STOP
 
 
-def test_a_loop_that_takes_the_place_of_a_killed_one_goes_on_with_the_numbers() -> None:
+def test_a_replacement_loop_continues_the_numbering() -> None:
     with Memory.create(1, 0.001) as memory:
         reader, events = memory.reader(), memory.event_reader()
         process = start(HAMMER, memory)
@@ -120,7 +120,7 @@ def test_a_loop_that_takes_the_place_of_a_killed_one_goes_on_with_the_numbers() 
         assert (event.kind, lost) == (EventKind.BUS_UP, 0)
 
 
-def test_status_cells_are_seen_by_the_other_side(memory: Memory) -> None:
+def test_status_cells_are_shared(memory: Memory) -> None:
     with Memory.attach(os.dup(memory.fd)) as other:
         assert other.axes == 2
         assert other.period_s == 0.004
@@ -160,26 +160,26 @@ def header(version: int = VERSION, axes: int = 1, size: int | None = None) -> by
         (header(), Layout.of(1).total, "another release"),
     ],
 )
-def test_memory_of_somebody_else_is_refused_in_words(data: bytes, size: int, words: str) -> None:
+def test_foreign_memory_is_refused(data: bytes, size: int, words: str) -> None:
     fd = foreign(data, size)
     with pytest.raises(InputError, match=words):
         Memory.attach(fd)
     os.close(fd)
 
 
-def test_a_descriptor_that_is_closed_is_refused_in_words() -> None:
+def test_a_closed_descriptor_is_refused() -> None:
     fd = foreign(b"", 0)
     os.close(fd)
     with pytest.raises(InputError, match="cannot be read as shared memory"):
         Memory.attach(fd)
 
 
-def test_the_memory_cannot_be_shrunk_under_those_who_use_it(memory: Memory) -> None:
+def test_the_memory_cannot_be_shrunk(memory: Memory) -> None:
     with pytest.raises(PermissionError):
         os.ftruncate(memory.fd, 0)
 
 
 @pytest.mark.parametrize(("axes", "period_s"), [(0, 0.004), (65, 0.004), (1, 0.0)])
-def test_senseless_sizes_are_refused(axes: int, period_s: float) -> None:
+def test_invalid_sizes_are_refused(axes: int, period_s: float) -> None:
     with pytest.raises(InputError, match="expected 1 to 64 axes"):
         Memory.create(axes, period_s)

@@ -28,7 +28,7 @@ def test_a_command_arrives_with_its_id_and_its_numbers(memory: Memory) -> None:
     assert memory.commands.take() is None
 
 
-def test_an_event_arrives_with_its_words(memory: Memory) -> None:
+def test_an_event_arrives_with_its_text(memory: Memory) -> None:
     reader = memory.event_reader()
     memory.events.append(Event(0, 7, 28_000_000, 1, EventKind.REFUSED, 99, 3, "outside -400 .. 400°"))
     (event,), lost = reader.read()
@@ -45,7 +45,7 @@ def test_a_long_text_is_cut_between_two_characters(memory: Memory, before: str) 
     assert event.text == before + "°" * ((400 - len(before)) // 2)
 
 
-def test_events_that_nobody_read_are_counted(memory: Memory) -> None:
+def test_unread_events_are_counted(memory: Memory) -> None:
     reader = memory.event_reader()
     for cycle in range(EVENTS_KEPT + 10):
         memory.events.append(Event(0, cycle, 0, -1, EventKind.DONE))
@@ -91,7 +91,7 @@ def test_knots_of_two_axes_do_not_mix_and_are_bounded(memory: Memory) -> None:
     assert first.peek() is None
 
 
-def test_a_slot_gives_only_the_setting_of_that_number(memory: Memory) -> None:
+def test_a_slot_returns_only_the_setting_of_its_number(memory: Memory) -> None:
     slot, other = memory.settings[:2]
     with pytest.raises(InputError, match="not in the slot"):
         slot.get(slot.number)

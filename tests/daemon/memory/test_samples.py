@@ -37,7 +37,7 @@ def test_a_sample_arrives_as_it_was_written(memory: Memory) -> None:
     assert reader.read()[0].size == 0
 
 
-def test_readers_are_independent_and_begin_when_they_are_made(memory: Memory) -> None:
+def test_readers_are_independent_and_start_at_creation(memory: Memory) -> None:
     write(memory, 0)
     first = memory.reader()
     write(memory, 1)
@@ -47,7 +47,7 @@ def test_readers_are_independent_and_begin_when_they_are_made(memory: Memory) ->
     assert second.read()[0]["cycle"].tolist() == [2]
 
 
-def test_a_reader_that_was_too_slow_gets_the_newest_and_the_number_of_the_lost(memory: Memory) -> None:
+def test_a_slow_reader_gets_the_newest_samples_and_the_number_lost(memory: Memory) -> None:
     reader = memory.reader()
     total = SAMPLES_KEPT + 500
     for cycle in range(total):
@@ -59,7 +59,7 @@ def test_a_reader_that_was_too_slow_gets_the_newest_and_the_number_of_the_lost(m
     assert len(samples) == SAMPLES_KEPT - 1
 
 
-def test_what_was_read_stays_as_it_is(memory: Memory) -> None:
+def test_samples_read_are_copies(memory: Memory) -> None:
     reader = memory.reader()
     write(memory, 1)
     samples, _ = reader.read()
@@ -68,7 +68,7 @@ def test_what_was_read_stays_as_it_is(memory: Memory) -> None:
     assert samples["cycle"].tolist() == [1]
 
 
-def test_nan_says_that_there_is_no_value(memory: Memory) -> None:
+def test_nan_marks_missing_values(memory: Memory) -> None:
     reader = memory.reader()
     values = [*axis(1.0)._replace(reading0=math.nan), *axis(2.0)]
     memory.samples.write(0, 0, 0.0, 0.0, 0.0, 0, values)
@@ -97,7 +97,7 @@ def test_every_sample_is_read_once_or_counted_as_lost(bursts: list[int]) -> None
 
 
 @pytest.mark.parametrize("field", ["sequence", "last"])
-def test_a_slot_under_way_is_not_read(memory: Memory, field: str) -> None:
+def test_a_slot_being_written_is_not_read(memory: Memory, field: str) -> None:
     reader = memory.reader()
     for cycle in range(3):
         write(memory, cycle)
@@ -107,7 +107,7 @@ def test_a_slot_under_way_is_not_read(memory: Memory, field: str) -> None:
     assert lost == 1
 
 
-def test_where_order_is_weak_a_checksum_finds_what_the_numbers_do_not() -> None:
+def test_a_checksum_detects_reordered_writes() -> None:
     with Memory.create(1, 0.001, checked=True) as memory:
         reader = memory.reader()
         memory.samples.write(5, 0, 0.0, 0.0, 0.0, 0, axis(0.0))

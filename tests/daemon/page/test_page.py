@@ -64,7 +64,7 @@ def take_control(page):
     page.until("!document.querySelector('#controls').disabled")
 
 
-def test_the_page_shows_the_axis_live_and_loads_nothing_from_elsewhere(place, page):
+def test_the_page_shows_the_axis_live_without_external_resources(place, page):
     page.until("document.querySelector('#load').innerText === '0.0003'")
     assert page.text("#machine") == "cell"
     assert page.text("#bus-load") == "31"
@@ -77,7 +77,7 @@ def test_the_page_shows_the_axis_live_and_loads_nothing_from_elsewhere(place, pa
     assert page.complaints == []
 
 
-def test_nothing_moves_before_control_was_taken(bridge, page):
+def test_nothing_moves_before_control_is_taken(bridge, page):
     assert page.evaluate("document.querySelector('#controls').disabled")
     page.press("ArrowRight", hold_s=0.2)
     for button in ("#enable", "#move", "#jog-up"):
@@ -94,7 +94,7 @@ def test_nothing_moves_before_control_was_taken(bridge, page):
     assert bridge.lease.holder is None
 
 
-def test_a_refusal_is_told_in_the_daemons_own_words(bridge, page):
+def test_refusals_show_the_daemons_text(bridge, page):
     take_control(page)
     page.evaluate("document.querySelector('#move-to').value = '10'")
     page.click("#move")
@@ -103,7 +103,7 @@ def test_a_refusal_is_told_in_the_daemons_own_words(bridge, page):
     assert asked(bridge, "move") == []
 
 
-def test_a_jog_lasts_as_long_as_the_key_is_pressed_and_ends_in_a_stop(bridge, page):
+def test_a_jog_lasts_while_the_key_is_pressed_and_ends_in_a_stop(bridge, page):
     take_control(page)
     page.click("#enable")
     page.until("document.querySelector('#state').innerText === 'enabled'")
@@ -114,7 +114,7 @@ def test_a_jog_lasts_as_long_as_the_key_is_pressed_and_ends_in_a_stop(bridge, pa
     assert {(each[2], each[3]) for each in jogs} == {(-5.0, 0.4)}
 
 
-def test_anybody_may_stop_and_the_fault_says_what_to_do(bridge, page):
+def test_anyone_may_stop_and_the_fault_shows_the_remedy(bridge, page):
     page.press("Escape")
     page.until("!document.querySelector('#fault').hidden")
     eventually(lambda: ("joint-2", "quick-stop") in bridge.stopped)
@@ -127,7 +127,7 @@ def test_anybody_may_stop_and_the_fault_says_what_to_do(bridge, page):
     assert eventually(lambda: asked(bridge, "reset")) == [("joint-1", "reset")]
 
 
-def test_the_page_offers_the_commands_of_procedures_to_copy(bridge, page):
+def test_the_page_offers_procedure_commands_to_copy(bridge, page):
     lines = page.text("#commands").splitlines()
     assert lines[0] == "hdbridge calibrate profiles/joint-1 --simulate"
     assert lines[-1] == "hdbridge ctl model joint-1 pending"
@@ -171,7 +171,7 @@ def test_the_other_axis_is_one_key_away(bridge, page):
     assert asked(bridge, "enable") == [("joint-2", "enable")]
 
 
-def test_events_that_were_and_that_come_are_listed(place, bridge, chromium):
+def test_past_and_new_events_are_listed(place, bridge, chromium):
     bridge.told.append(event(1, "the first"))
     show(chromium, place)
     chromium.until("document.querySelector('#events').innerText.includes('the first')")
@@ -184,7 +184,7 @@ def event(number, text):
     return Event(sequence=number, kind=EventKind.NOTE, date=NOON, text=text)
 
 
-def test_what_chromium_drops_while_a_page_goes_away_is_asked_again(place, chromium):
+def test_requests_dropped_during_navigation_are_repeated(place, chromium):
     for _ in range(20):
         chromium.evaluate("void setTimeout(() => location.reload(), 5)")
         assert chromium.until("new Promise(done => setTimeout(() => done(true), 20))") is True
@@ -201,7 +201,7 @@ def test_without_its_token_the_page_asks_for_it(place, bridge, chromium):
     chromium.until("document.querySelector('#connection').className === 'live'")
 
 
-def test_it_shows_the_axis_as_the_other_master_sees_it(place, bridge, page):
+def test_the_page_shows_the_axis_as_the_other_master_sees_it(place, bridge, page):
     outer = {"node_id": 5, "nmt": 5, "statusword": 0x1237}
     axis = next(iter(bridge.axes.values()))
     axis.outer = messages.OuterState(
@@ -217,7 +217,7 @@ def test_it_shows_the_axis_as_the_other_master_sees_it(place, bridge, page):
 
 
 @pytest.mark.parametrize("dark", [False, True])
-def test_a_telephone_shows_it_whole_with_the_stop_in_reach(place, bridge, chromium, dark):
+def test_the_page_fits_a_phone_with_the_stop_in_reach(place, bridge, chromium, dark):
     show(chromium, place, width=360, height=740, dark=dark)
     assert chromium.evaluate("document.documentElement.scrollWidth") <= 360
     button = chromium.evaluate(
@@ -228,7 +228,7 @@ def test_a_telephone_shows_it_whole_with_the_stop_in_reach(place, bridge, chromi
     assert ground == ("rgb(20, 24, 28)" if dark else "rgb(255, 255, 255)")
 
 
-def test_orders_are_found_where_the_turn_was_covered_and_not_claimed_where_not(page):
+def test_orders_are_shown_only_for_covered_turns(page):
     wave = [
         8 * math.cos(math.radians(2 * each + 20)) + 3 * math.sin(math.radians(5 * each))
         for each in range(3600)

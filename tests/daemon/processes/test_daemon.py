@@ -19,7 +19,7 @@ TRUTH = Path(__file__).parents[3] / "profiles" / "article" / "truth.yaml"
 
 
 @pytest.mark.usefixtures("at_a_terminal")
-def test_a_day_in_short(tmp_path: Path) -> None:
+def test_a_whole_daemon_session(tmp_path: Path) -> None:
     """Started, moved, its service killed, its control process killed, ended by a terminal that is closed."""
     arguments = ("article", "--simulate", "--speed", 4, "--page", "--port", 0)
     with running(tmp_path, *arguments, name="article") as daemon:
@@ -90,7 +90,7 @@ def test_a_day_in_short(tmp_path: Path) -> None:
         assert all(gone(pid) for pid in (*daemon.pids("control"), *daemon.pids("service")))
 
 
-def test_without_room_on_the_disk_and_then_without_its_keeper(tmp_path: Path) -> None:
+def test_full_disk_then_killed_keeper(tmp_path: Path) -> None:
     """The daemon reports that nothing is recorded, and works; then it stops the axes and ends."""
     (tmp_path / "machine.yaml").write_text(
         "schema: hdbridge.machine/1\nname: full\naxes: [{profile: article}]\nrecorder: {free_mb: 1e7}\n",
@@ -123,7 +123,7 @@ def test_without_room_on_the_disk_and_then_without_its_keeper(tmp_path: Path) ->
         (("article", "--interface", "socketcan", "--channel", "can99"), 3, "can99"),
     ],
 )
-def test_what_it_refuses(
+def test_invalid_arguments_are_refused(
     tmp_path: Path, arguments: tuple[str, ...], status: int, said: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     if status == 2:  # before it begins any process, and so in this one

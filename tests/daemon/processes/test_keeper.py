@@ -105,7 +105,7 @@ def keeper(tmp_path: Path) -> Iterator[Callable[..., Kept]]:
         each.process.stderr.close()
 
 
-def test_it_says_when_it_is_ready_and_ends_in_order(keeper: Callable[..., Kept]) -> None:
+def test_reports_readiness_and_ends_in_order(keeper: Callable[..., Kept]) -> None:
     kept = keeper()
     kept.until_told("READY=1")
     kept.process.send_signal(signal.SIGTERM)
@@ -115,7 +115,7 @@ def test_it_says_when_it_is_ready_and_ends_in_order(keeper: Callable[..., Kept])
     assert [name for name in kept.names() if name in {"ready", "stopping"}] == ["ready", "stopping"]
 
 
-def test_who_dies_or_hangs_is_replaced_and_the_other_goes_on(keeper: Callable[..., Kept]) -> None:
+def test_a_dead_or_hanging_process_is_replaced_and_the_other_continues(keeper: Callable[..., Kept]) -> None:
     kept = keeper()
     kept.until_told("READY=1")
     kept.until_told("WATCHDOG=1")
@@ -148,7 +148,7 @@ with InterfaceLock("socketcan", "can0", Path(sys.argv[1])):
 """
 
 
-def test_a_lent_bus_comes_back_however_its_borrower_ends(keeper: Callable[..., Kept], tmp_path: Path) -> None:
+def test_a_lent_bus_returns_however_its_borrower_ends(keeper: Callable[..., Kept], tmp_path: Path) -> None:
     """The borrower is killed; the service is killed meanwhile, too. Nothing runs on the bus beside it."""
     kept = keeper()
     kept.until_told("READY=1")
@@ -170,7 +170,7 @@ def test_a_lent_bus_comes_back_however_its_borrower_ends(keeper: Callable[..., K
     assert kept.until_ended() == 0
 
 
-def test_a_lent_bus_that_nobody_opens_comes_back_and_a_daemon_may_end_meanwhile(
+def test_an_unused_lent_bus_returns_and_the_daemon_may_end_meanwhile(
     keeper: Callable[..., Kept],
 ) -> None:
     kept = keeper()
@@ -187,7 +187,7 @@ def test_a_lent_bus_that_nobody_opens_comes_back_and_a_daemon_may_end_meanwhile(
     assert kept.until_ended() == 0
 
 
-def test_a_gateway_that_dies_or_hangs_is_replaced_and_the_others_go_on(keeper: Callable[..., Kept]) -> None:
+def test_a_dead_or_hanging_gateway_is_replaced(keeper: Callable[..., Kept]) -> None:
     kept = keeper(HDBRIDGE_TEST_WITH_GATEWAY="1")
     kept.until_told("READY=1")
     for times, number in ((1, signal.SIGKILL), (2, signal.SIGSTOP)):
@@ -203,7 +203,7 @@ def test_a_gateway_that_dies_or_hangs_is_replaced_and_the_others_go_on(keeper: C
 @pytest.mark.parametrize(
     ("number", "how"), [(signal.SIGKILL, "ended by SIGKILL"), (signal.SIGTERM, "exit status 0")]
 )
-def test_a_control_process_that_dies_again_and_again_ends_all(
+def test_a_repeatedly_dying_control_process_ends_the_daemon(
     keeper: Callable[..., Kept], number: signal.Signals, how: str
 ) -> None:
     """SIGTERM to it alone is a death like any other: only the keeper ends the daemon."""
@@ -220,7 +220,9 @@ def test_a_control_process_that_dies_again_and_again_ends_all(
 
 
 @pytest.mark.parametrize(("kind", "status"), [("CONTROL", 3), ("SERVICE", 2), ("SERVICE", 1)])
-def test_a_child_that_cannot_begin_ends_all(keeper: Callable[..., Kept], kind: str, status: int) -> None:
+def test_a_child_that_cannot_start_ends_the_daemon(
+    keeper: Callable[..., Kept], kind: str, status: int
+) -> None:
     kept = keeper(**{f"HDBRIDGE_TEST_{kind}": str(status)})
     assert kept.until_ended() == status
     assert "ready" not in kept.names()

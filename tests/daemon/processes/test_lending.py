@@ -91,7 +91,7 @@ def until_borrowed(daemon: Daemon, pid: int) -> None:
     until(lambda: InterfaceLock(bus["interface"], bus["channel"]).holder == pid, lambda: str(daemon.state()))
 
 
-def test_a_command_borrows_the_bus_and_the_axis_comes_back_disabled(daemon: Daemon) -> None:
+def test_a_command_borrows_the_bus_and_the_axis_returns_disabled(daemon: Daemon) -> None:
     folder, loops = daemon.folder, len(daemon.pids("control"))
     with started(folder, "sdo", "get", folder, "1000h", "--json", "-") as refused:
         _, error = refused.communicate()
@@ -106,7 +106,7 @@ def test_a_command_borrows_the_bus_and_the_axis_comes_back_disabled(daemon: Daem
     assert (daemon.state() or {})["bus"]["lent_to"] is None
 
 
-def test_others_see_who_has_the_bus_and_can_stop_it(daemon: Daemon) -> None:
+def test_clients_see_the_borrower_and_can_stop_it(daemon: Daemon) -> None:
     folder, loops = daemon.folder, len(daemon.pids("control"))
     with started(folder, *LISTENING, folder) as borrower:
         until_borrowed(daemon, borrower.pid)

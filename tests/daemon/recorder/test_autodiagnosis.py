@@ -40,7 +40,7 @@ def recorded(tmp_path_factory):
     log.close()
 
 
-def test_the_last_minutes_are_diagnosed_and_the_result_is_next_to_the_recording(recorded):
+def test_the_last_minutes_are_diagnosed_next_to_the_recording(recorded):
     folder, now_ns = recorded
     told = []
     diagnosis = AutoDiagnosis(folder, lambda: now_ns)
@@ -59,7 +59,7 @@ def test_the_last_minutes_are_diagnosed_and_the_result_is_next_to_the_recording(
     shutil.rmtree(folder / "diagnoses")
 
 
-def test_what_cannot_be_diagnosed_says_why(recorded):
+def test_a_failed_diagnosis_is_explained(recorded):
     folder, now_ns = recorded
     told = []
     diagnosis = AutoDiagnosis(folder, lambda: now_ns)
@@ -69,7 +69,7 @@ def test_what_cannot_be_diagnosed_says_why(recorded):
     assert "no axis 'nose'" in words
 
 
-def test_it_ends_when_the_service_does(recorded):
+def test_diagnosis_ends_with_the_service(recorded):
     folder, now_ns = recorded
     told = []
     diagnosis = AutoDiagnosis(folder, lambda: now_ns)
@@ -79,6 +79,6 @@ def test_it_ends_when_the_service_does(recorded):
     assert diagnosis.start("demo", MODEL.dump(), 10.0, "", told.append) is None
 
 
-def test_a_diagnosis_that_names_nothing_says_so():
+def test_a_diagnosis_without_findings_is_reported():
     found = {"findings": [], "baseline": {"rms_arcsec": 2.0}, "noise_floor_arcsec": 1.0}
     assert summary(found).startswith("diagnosis: nothing that it could name; the model is 2.00 arcsec")

@@ -40,7 +40,7 @@ def flown(folder, *batches, axes=1, model=None, **limits):
     return [read(each) for each in flight_files([folder])]
 
 
-def test_every_column_of_a_record_is_there_to_the_last_bit(tmp_path):
+def test_every_column_is_exported_bit_for_bit(tmp_path):
     made = samples(500, axes=2)
     recording = exported(flown(tmp_path, made[:250], made[250:], axes=2), "tilt")
     record = recording.record
@@ -62,7 +62,7 @@ def test_two_files_of_one_run_are_one_part(tmp_path):
 
 
 @pytest.mark.parametrize(("gap", "parts"), [(0, 1), (5, 1), (6, 2), (400, 2)])
-def test_a_gap_is_a_new_part_and_a_few_cycles_are_counted(tmp_path, gap, parts):
+def test_gaps_start_a_new_part_and_few_missing_cycles_are_counted(tmp_path, gap, parts):
     flights = flown(tmp_path, samples(250), samples(250, 251 + gap))
     recording = exported(flights)
     assert len(recording.record.parts()) == recording.notes["parts"] == parts
@@ -70,7 +70,7 @@ def test_a_gap_is_a_new_part_and_a_few_cycles_are_counted(tmp_path, gap, parts):
     assert len(recording.record) == 500
 
 
-def test_parts_survive_the_folder(tmp_path):
+def test_parts_survive_saving(tmp_path):
     recording = exported(flown(tmp_path, samples(250), samples(250, 1251)))
     recording.save(tmp_path / "out")
     again = Recording.load(tmp_path / "out")
@@ -78,7 +78,7 @@ def test_parts_survive_the_folder(tmp_path):
     assert again.record.starts == recording.record.starts == (0, 250)
 
 
-def test_where_the_axis_was_not_enabled_is_left_out_unless_asked_for(tmp_path):
+def test_disabled_stretches_are_omitted_by_default(tmp_path):
     made = samples(750)
     made["axes"]["state"][200:400] = 1
     flights = flown(tmp_path, made)
@@ -86,7 +86,7 @@ def test_where_the_axis_was_not_enabled_is_left_out_unless_asked_for(tmp_path):
     assert [len(each) for each in exported(flights, all_states=True).record.parts()] == [750]
 
 
-def test_a_cycle_without_fresh_feedback_is_no_measurement(tmp_path):
+def test_cycles_without_fresh_feedback_are_omitted(tmp_path):
     made = samples(500)
     made["axes"]["flags"][100:103] = 8
     record = exported(flown(tmp_path, made)).record
@@ -94,7 +94,7 @@ def test_a_cycle_without_fresh_feedback_is_no_measurement(tmp_path):
     assert not np.any(np.isin(record.time_s, made["cycle"][100:103] * 0.004))
 
 
-def test_a_loop_that_began_anew_is_another_part_and_its_zeros_may_be_others(tmp_path):
+def test_a_restarted_loop_starts_a_part_with_possibly_new_zeros(tmp_path):
     again = samples(300)
     again["time_ns"] += 4_000_000_000
     again["axes"]["state"][:50] = 0
@@ -103,7 +103,7 @@ def test_a_loop_that_began_anew_is_another_part_and_its_zeros_may_be_others(tmp_
     assert recording.notes["zeros_may_differ"]
 
 
-def test_a_channel_is_there_where_it_was_known(tmp_path):
+def test_known_channels_are_exported(tmp_path):
     made = samples(300)
     made["axes"]["flags"] |= 256
     flights = flown(tmp_path, made)
@@ -115,7 +115,7 @@ def test_a_channel_is_there_where_it_was_known(tmp_path):
     assert "temperature_c" not in columns
 
 
-def test_a_time_can_be_chosen(tmp_path):
+def test_a_time_span_can_be_chosen(tmp_path):
     flights = flown(tmp_path, *(samples(250, 1 + 250 * each) for each in range(4)))
     begin = flights[0].first_ns + 10**9
     record = exported(flights, start_ns=begin, end_ns=begin + 10**9).record
@@ -126,20 +126,20 @@ def test_a_time_can_be_chosen(tmp_path):
     ("axis", "complaint"),
     [("nose", "no axis 'nose'; expected --axis with one of: demo, tilt"), (None, "which axis?")],
 )
-def test_an_axis_that_is_not_there_is_refused(tmp_path, axis, complaint):
+def test_an_unknown_axis_is_refused(tmp_path, axis, complaint):
     with pytest.raises(InputError, match="expected --axis") as error:
         exported(flown(tmp_path, samples(250, axes=2), axes=2), axis)
     assert complaint in str(error.value)
 
 
-def test_nothing_enabled_is_said(tmp_path):
+def test_an_export_without_enabled_samples_is_refused(tmp_path):
     made = samples(250)
     made["axes"]["state"] = 1
     with pytest.raises(InputError, match="nothing of axis 'demo' to export while it was enabled"):
         exported(flown(tmp_path, made))
 
 
-def test_the_model_in_use_comes_along(tmp_path):
+def test_the_model_in_use_is_exported(tmp_path):
     flights = flown(tmp_path, samples(250), model="the text")
     assert last_model(flights, "demo").text == "the text"
     assert last_model(flights, "tilt") is None
@@ -166,7 +166,7 @@ def worked(tmp_path_factory):
     return folder
 
 
-def test_the_command_makes_a_record_that_diagnose_names_the_change_in(worked, tmp_path):
+def test_diagnose_finds_the_change_in_an_exported_record(worked, tmp_path):
     out, model, result = tmp_path / "rec", tmp_path / "model.yaml", tmp_path / "result.json"
     done = command("record", "export", str(worked), "--out", str(out), "--model-out", str(model))
     assert done.returncode == 0, done.stderr
@@ -178,7 +178,7 @@ def test_the_command_makes_a_record_that_diagnose_names_the_change_in(worked, tm
     ]
 
 
-def test_diagnose_takes_flight_recordings_with_the_model_in_use_and_a_time(worked, tmp_path):
+def test_diagnose_reads_flight_recordings_with_model_and_time_span(worked, tmp_path):
     result = tmp_path / "result.json"
     for paths, limits in (
         ([str(worked)], []),
@@ -198,7 +198,7 @@ def test_diagnose_refuses_options_of_flight_recordings_for_other_records(tmp_pat
     assert "--to is for flight recordings" in done.stderr
 
 
-def test_the_command_lists_and_tells(worked, tmp_path):
+def test_recordings_are_listed_and_described(worked, tmp_path):
     done = command("record", "list", str(worked))
     assert done.returncode == 0
     assert "the axis was stopped" in done.stdout
@@ -238,7 +238,7 @@ def test_bad_input_is_one_line_and_status_2(worked, tmp_path):
         assert not (tmp_path / "x").exists()
 
 
-def test_without_the_extra_it_says_what_to_install(worked, tmp_path, monkeypatch):
+def test_missing_extra_is_named(worked, tmp_path, monkeypatch):
     monkeypatch.setattr("hdbridge.cli.flights._EXTRA", ("mcap", "no_such_package"))
     done = command("record", "list", str(worked))
     assert done.returncode == 2

@@ -26,7 +26,7 @@ def names(folder):
     return sorted(each.name for each in folder.glob("*.mcap*"))
 
 
-def test_what_was_put_in_comes_out(tmp_path):
+def test_recordings_read_back_unchanged(tmp_path):
     log, clock = flight_log(tmp_path, axes=2)
     log.put(ModelUse("tilt", "7", "schema: hdbridge.model/1\n"))
     run(log, clock, 3, axes=2, events={1: [event(1.5)]})
@@ -51,7 +51,7 @@ def test_what_was_put_in_comes_out(tmp_path):
     assert log.counts.recorded == 3 * SECOND
 
 
-def test_any_mcap_reader_understands_it(tmp_path):
+def test_recordings_are_standard_mcap(tmp_path):
     log, clock = flight_log(tmp_path)
     run(log, clock, 2, events={0: [event(0.5)]})
     log.close()
@@ -73,7 +73,7 @@ def test_any_mcap_reader_understands_it(tmp_path):
     assert abs(content["timestamp"]["sec"] - START_NS // 10**9) <= 1
 
 
-def test_each_file_says_which_model_is_in_use(tmp_path):
+def test_each_file_holds_the_model_in_use(tmp_path):
     log, clock = flight_log(tmp_path, file_s=5.0)
     log.put(ModelUse("demo", "1", "one"))
     run(log, clock, 13)
@@ -83,7 +83,7 @@ def test_each_file_says_which_model_is_in_use(tmp_path):
     assert all([each.text for each in read(path).models] == ["one"] for path in files)
 
 
-def test_files_are_cut_by_size(tmp_path):
+def test_files_are_split_by_size(tmp_path):
     log, clock = flight_log(tmp_path, file_mb=0.2)
     run(log, clock, 12)
     log.close()
@@ -93,7 +93,7 @@ def test_files_are_cut_by_size(tmp_path):
 
 
 @pytest.mark.parametrize("file_mb", [0.1, 0.6])
-def test_the_ring_keeps_to_its_size_at_all_times_and_the_oldest_goes(tmp_path, file_mb):
+def test_the_ring_stays_within_its_size_and_drops_the_oldest(tmp_path, file_mb):
     log, clock = flight_log(tmp_path, file_mb=file_mb, size_mb=1.0)
     for second in range(40):
         run(log, clock, 1, first=second)
@@ -103,7 +103,7 @@ def test_the_ring_keeps_to_its_size_at_all_times_and_the_oldest_goes(tmp_path, f
     assert newest.machine["cycle"][-1] == 40 * SECOND
 
 
-def test_the_ring_keeps_to_its_age(tmp_path):
+def test_the_ring_drops_files_by_age(tmp_path):
     log, clock = flight_log(tmp_path, file_s=5.0, age_days=1.0)
     run(log, clock, 6)
     (old,) = tmp_path.glob("*.mcap")
@@ -113,7 +113,7 @@ def test_the_ring_keeps_to_its_age(tmp_path):
     assert not old.exists()
 
 
-def test_the_time_about_a_fault_is_kept_when_the_ring_turns(tmp_path):
+def test_samples_around_a_fault_are_kept(tmp_path):
     log, clock = flight_log(tmp_path, file_s=5.0, size_mb=1.0, before_s=8.0, after_s=4.0)
     run(log, clock, 90, events={22: [event(22.5)]})
     log.close()
@@ -127,7 +127,7 @@ def test_the_time_about_a_fault_is_kept_when_the_ring_turns(tmp_path):
     assert time_s[-1] < 40.0
 
 
-def test_a_mark_keeps_as_a_fault_does(tmp_path):
+def test_a_mark_keeps_samples_like_a_fault(tmp_path):
     log, clock = flight_log(tmp_path, file_s=5.0, before_s=2.0, after_s=1.0)
     run(log, clock, 7)
     log.put(Note(MARK, "it squeaks"))
@@ -138,7 +138,7 @@ def test_a_mark_keeps_as_a_fault_does(tmp_path):
     assert kept[0].machine["cycle"][0] * 0.004 <= 5.0
 
 
-def test_what_is_kept_has_a_limit_too_and_says_what_goes(tmp_path):
+def test_kept_files_are_limited_and_removals_reported(tmp_path):
     told = []
     log, clock = flight_log(tmp_path, told, file_s=5.0, before_s=1.0, after_s=1.0, kept_mb=1.0)
     run(log, clock, 100, events={each: [event(each + 0.5)] for each in range(5, 100, 10)})
@@ -146,7 +146,7 @@ def test_what_is_kept_has_a_limit_too_and_says_what_goes(tmp_path):
     assert any("over 1 MB; removed: " in each for each in told)
 
 
-def test_lost_cycles_are_written_down(tmp_path):
+def test_lost_cycles_are_recorded(tmp_path):
     log, _ = flight_log(tmp_path)
     log.put(Batch(samples(10), (), 33))
     log.close()
@@ -155,7 +155,7 @@ def test_lost_cycles_are_written_down(tmp_path):
     assert log.counts.lost == 33
 
 
-def test_two_files_of_one_second_have_two_names(tmp_path):
+def test_files_of_the_same_second_get_different_names(tmp_path):
     log, _ = flight_log(tmp_path, file_mb=0.1)
     for each in range(4):
         log.put(Batch(samples(5 * SECOND, 1 + each * 5 * SECOND)))

@@ -36,7 +36,7 @@ print(*told, sep="\\n")
 """
 
 
-def test_free_space_is_asked_before_and_what_is_missing_is_counted(tmp_path):
+def test_free_space_is_checked_and_dropped_cycles_are_counted(tmp_path):
     told, free = [], [10**9]
     log, clock = flight_log(tmp_path, told, free=lambda _: free[0], free_mb=100.0)
     for second in range(6):
@@ -57,7 +57,7 @@ def test_free_space_is_asked_before_and_what_is_missing_is_counted(tmp_path):
     assert [each.kind for each in flight.events] == ["REFUSED_BY_DISK"]
 
 
-def test_a_write_that_fails_leaves_a_whole_file_and_is_made_up_for(tmp_path):
+def test_a_failed_write_leaves_a_whole_file_and_is_repeated(tmp_path):
     done = subprocess.run(
         [sys.executable, "-B", "-c", SCRIPT, str(tmp_path)], capture_output=True, text=True, check=True
     )
@@ -71,7 +71,7 @@ def test_a_write_that_fails_leaves_a_whole_file_and_is_made_up_for(tmp_path):
     assert list(flight.machine["cycle"][[0, 249, 250, 499, 500]]) == [1, 250, 251, 500, 1001]
 
 
-def test_a_folder_that_takes_no_file_leaves_no_crumbs(tmp_path):
+def test_an_unwritable_folder_is_left_clean(tmp_path):
     told = []
     log, _ = flight_log(tmp_path / "inside", told)
     (tmp_path / "inside").rmdir()

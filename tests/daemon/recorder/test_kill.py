@@ -55,7 +55,7 @@ def copied(killed, tmp_path):
     return confirmed
 
 
-def test_all_that_was_confirmed_is_there_and_mended_it_is_a_file_like_any_other(killed, tmp_path):
+def test_confirmed_samples_survive_a_kill_and_mending_finishes_the_file(killed, tmp_path):
     confirmed = copied(killed, tmp_path)
     (part,) = tmp_path.iterdir()
     assert part.name.endswith(".mcap.part")
@@ -74,7 +74,7 @@ def test_all_that_was_confirmed_is_there_and_mended_it_is_a_file_like_any_other(
     assert len(after.events) == len(cycles) // 250
 
 
-def test_a_file_cut_anywhere_gives_whole_seconds(killed, tmp_path):
+def test_a_truncated_file_yields_whole_seconds(killed, tmp_path):
     copied(killed, tmp_path)
     (part,) = tmp_path.iterdir()
     data = part.read_bytes()
@@ -86,7 +86,7 @@ def test_a_file_cut_anywhere_gives_whole_seconds(killed, tmp_path):
     assert all(each % 250 == 0 and each for each in lengths)
 
 
-def test_a_file_with_nothing_whole_in_it_goes(killed, tmp_path):
+def test_a_file_without_whole_chunks_is_removed(killed, tmp_path):
     copied(killed, tmp_path)
     (part,) = tmp_path.iterdir()
     for data in (b"", part.read_bytes()[:20]):
@@ -96,7 +96,7 @@ def test_a_file_with_nothing_whole_in_it_goes(killed, tmp_path):
         part.touch()
 
 
-def test_a_torn_tail_of_zeros_is_not_read(killed, tmp_path):
+def test_a_tail_of_zeros_is_ignored(killed, tmp_path):
     copied(killed, tmp_path)
     (part,) = tmp_path.iterdir()
     whole = len(read(part).machine["cycle"])
@@ -105,7 +105,7 @@ def test_a_torn_tail_of_zeros_is_not_read(killed, tmp_path):
     assert len(read(part).machine["cycle"]) == whole
 
 
-def test_one_that_is_being_written_is_left_alone(tmp_path):
+def test_a_file_being_written_is_left_alone(tmp_path):
     log, _ = flight_log(tmp_path)
     log.put(Batch(samples(250)))
     log.flush()
@@ -119,7 +119,7 @@ def test_one_that_is_being_written_is_left_alone(tmp_path):
     assert read(next(tmp_path.glob("*.mcap"))).finished
 
 
-def test_a_finished_file_stays_as_it_is(tmp_path):
+def test_a_finished_file_is_unchanged(tmp_path):
     log, _ = flight_log(tmp_path)
     log.put(Batch(samples(250)))
     log.close()
@@ -129,7 +129,7 @@ def test_a_finished_file_stays_as_it_is(tmp_path):
     assert path.read_bytes() == before
 
 
-def test_the_next_start_mends_and_keeps_what_a_fault_is_in(killed, tmp_path):
+def test_the_next_start_mends_files_and_keeps_those_with_faults(killed, tmp_path):
     copied(killed, tmp_path)
     said = []
     recorder = FlightRecorder(tmp_path, about(), tell=said.append)
@@ -144,7 +144,7 @@ def test_the_next_start_mends_and_keeps_what_a_fault_is_in(killed, tmp_path):
     assert recorder.counts.recorded == 100
 
 
-def test_the_recorder_never_blocks_who_hands_it_samples(tmp_path, monkeypatch):
+def test_the_recorder_never_blocks_its_caller(tmp_path, monkeypatch):
     """Its queue is full at once here: what does not fit is dropped and counted."""
     monkeypatch.setattr("hdbridge.daemon.recorder.recorder.QUEUE_BATCHES", 1)
     monkeypatch.setattr(FlightRecorder, "_run", lambda self: None)

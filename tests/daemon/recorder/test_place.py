@@ -15,21 +15,21 @@ def profile(tmp_path):
     return folder
 
 
-def test_next_to_the_profile_without_a_service_manager(profile):
+def test_folder_next_to_the_profile_without_a_service_manager(profile):
     assert Machine.find(str(profile)).recorder_folder({}) == profile / "recordings" / "daemon"
 
 
-def test_in_the_state_folder_of_the_service(profile):
+def test_folder_in_the_state_directory_of_the_service(profile):
     folder = Machine.find(str(profile)).recorder_folder({"STATE_DIRECTORY": "/var/lib/hdbridge:/other"})
     assert folder == Path("/var/lib/hdbridge/recordings")
 
 
-def test_never_among_the_bundled_profiles(tmp_path):
+def test_folder_never_among_the_bundled_profiles(tmp_path):
     folder = Machine.find("demo").recorder_folder({"XDG_STATE_HOME": str(tmp_path)})
     assert folder == tmp_path / "hdbridge" / "demo" / "recordings"
 
 
-def test_where_the_machine_file_says_it_counts_from_the_file(profile):
+def test_folder_of_the_machine_file_is_relative_to_it(profile):
     file = profile / "machine.yaml"
     head = "schema: hdbridge.machine/1\nname: cell\n"
     file.write_text(f"{head}axes: [{{profile: {profile}}}]\nrecorder: {{folder: here}}\n")

@@ -54,7 +54,7 @@ def renames(folder: Path, names: list[str]) -> Callable[[str, Path], None]:
 
 
 @pytest.mark.parametrize("which", [0, 1, 2])
-def test_a_recording_that_is_renamed_meanwhile_is_listed_and_exported(folder: Path, which: int) -> None:
+def test_a_recording_renamed_meanwhile_is_listed_and_exported(folder: Path, which: int) -> None:
     files = flight_files([folder])
     with before_each(renames(folder, [files[which].name])):
         listed = run_here(folder.parent, "record", "list", folder, "--json", "listed.json")
@@ -68,7 +68,7 @@ def test_a_recording_that_is_renamed_meanwhile_is_listed_and_exported(folder: Pa
     assert "750 samples" in done.stdout
 
 
-def test_a_recording_that_was_named_is_found_under_its_new_name(folder: Path) -> None:
+def test_a_renamed_recording_is_found_by_its_old_name(folder: Path) -> None:
     (part,) = folder.glob("*.part")
     part.rename(part.with_name(part.name.removesuffix(".part")))
     done = run_here(folder.parent, "record", "info", part)
@@ -78,9 +78,7 @@ def test_a_recording_that_was_named_is_found_under_its_new_name(folder: Path) ->
 
 @pytest.mark.parametrize("command", [("list",), ("export", "--all-states", "--out", "out"), ("mend",)])
 @pytest.mark.parametrize("which", [0, 1, 2])
-def test_a_recording_that_is_removed_meanwhile_is_left_out(
-    folder: Path, command: tuple[str, ...], which: int
-) -> None:
+def test_a_recording_removed_meanwhile_is_omitted(folder: Path, command: tuple[str, ...], which: int) -> None:
     gone = flight_files([folder])[which]
 
     def hook(event: str, path: Path) -> None:
@@ -102,7 +100,7 @@ def test_a_recording_that_is_removed_meanwhile_is_left_out(
 
 
 @pytest.mark.parametrize("moment", [1, 2, 3, 4])
-def test_no_recording_is_listed_twice_or_missing_when_one_is_renamed_during_the_listing(
+def test_renaming_during_the_listing_neither_duplicates_nor_drops_recordings(
     folder: Path, moment: int
 ) -> None:
     looks = 0

@@ -46,7 +46,7 @@ def test_states_have_names():
     assert kind.DESCRIPTOR.fields_by_name["fault"].enum_type.values_by_number[255].name == "FAULT_NONE"
 
 
-def test_it_is_decoded_to_the_last_bit():
+def test_messages_are_decoded_exactly():
     made = samples(30)
     made["axes"]["issued_deg"][5] = np.nan
     made["axes"]["state"] = np.arange(30)[:, None] * 8 % 256
@@ -62,5 +62,5 @@ def test_messages_of_another_layout_are_refused():
             AXIS.decode([data[1], wrong])
 
 
-def test_no_message_is_no_row():
+def test_no_messages_give_no_rows():
     assert len(AXIS.decode([])["cycle"]) == 0

@@ -79,7 +79,7 @@ def offset_arcsec(bridge: ServiceBridge) -> float:
     return next(each.offset_arcsec for each in effects if isinstance(each, Hysteresis))
 
 
-async def test_the_model_in_the_loop_follows_and_goes_back(service: Service) -> None:
+async def test_the_model_in_the_loop_is_adapted_and_reverted(service: Service) -> None:
     async with adapting(service) as (bridge, token, _):
         reader = service.daemon.memory.reader()
         await work(bridge, token, 70)
@@ -103,7 +103,7 @@ async def test_the_model_in_the_loop_follows_and_goes_back(service: Service) -> 
         assert bridge.axis_state("axis1").adaptation.mode == messages.AdaptationMode.OBSERVE
 
 
-async def test_a_service_that_begins_anew_goes_on_with_what_was_learnt(service: Service) -> None:
+async def test_a_restarted_service_keeps_the_adaptation(service: Service) -> None:
     async with adapting(service) as (bridge, token, _):
         await work(bridge, token, 50)
         learnt = offset_arcsec(bridge)
@@ -120,7 +120,7 @@ async def test_a_service_that_begins_anew_goes_on_with_what_was_learnt(service: 
         made.close()
 
 
-async def test_a_load_encoder_that_stands_still_freezes_it(service: Service) -> None:
+async def test_a_frozen_load_encoder_freezes_the_adaptation(service: Service) -> None:
     async with adapting(service) as (bridge, token, _):
         await work(bridge, token, 6)
         stuck = service.daemon.nodes[0].firmware.motion.load_counts
@@ -131,7 +131,7 @@ async def test_a_load_encoder_that_stands_still_freezes_it(service: Service) -> 
         assert frozen.startswith("load encoder frozen: it reads")
 
 
-async def test_what_was_adapted_stays_with_another_part_of_the_model_and_a_new_loop(service: Service) -> None:
+async def test_the_adaptation_survives_another_scheme_and_a_new_loop(service: Service) -> None:
     async with adapting(service) as (bridge, token, made):
         await work(bridge, token, 50)
         axis = bridge.axes["axis1"]
@@ -146,7 +146,7 @@ async def test_what_was_adapted_stays_with_another_part_of_the_model_and_a_new_l
         assert offset_arcsec(bridge) == learnt
 
 
-def test_an_axis_works_without_an_adaptation_that_cannot_be(service: Service) -> None:
+def test_an_impossible_adaptation_does_not_block_the_axis(service: Service) -> None:
     settings = QUICK.model_copy(update={"parameters": ("backlash.gap_arcsec",)})
     axes = tuple(replace(each, adaptation=settings) for each in service.machine.axes)
     service.machine = replace(service.machine, axes=axes)

@@ -27,7 +27,7 @@ async def test_nothing_moves_without_the_lease(service: Service) -> None:
         assert axis.state().load_target_deg == before
 
 
-async def test_what_cannot_be_is_refused_in_the_loops_words(service: Service) -> None:
+async def test_impossible_requests_are_refused_with_the_loops_text(service: Service) -> None:
     async with service.ready() as bridge:
         axis = bridge.axes["axis1"]
         token = bridge.lease.take("test")

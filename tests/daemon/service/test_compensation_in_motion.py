@@ -67,7 +67,7 @@ async def ripple(
 
 
 @pytest.mark.parametrize("motion", [jog, stream, coordinated])
-def test_it_removes_the_ripple(motion, profile: Path, tmp_path: Path) -> None:
+def test_every_kind_of_motion_removes_the_ripple(motion, profile: Path, tmp_path: Path) -> None:
     async def story(service: Service) -> tuple[float, float]:
         async with service.enabled() as (bridge, token):
             left = await ripple(service, bridge, token, motion)
@@ -80,7 +80,7 @@ def test_it_removes_the_ripple(motion, profile: Path, tmp_path: Path) -> None:
     assert left < 0.1 * none, (none, left)
 
 
-def test_the_ripple_of_a_retuned_servo_comes_back(profile: Path, tmp_path: Path) -> None:
+def test_adaptation_removes_the_ripple_of_a_retuned_servo(profile: Path, tmp_path: Path) -> None:
     async def story(service: Service) -> tuple[float, float]:
         async with service.enabled() as (bridge, token):
             axis = bridge.axes["axis1"]

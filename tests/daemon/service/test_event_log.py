@@ -25,7 +25,7 @@ def event(kind: EventKind, code: int = 0, text: str = "") -> Event:
     return Event(sequence=1, cycle=1, time_ns=1, axis=0, kind=kind, id=7, code=code, text=text)
 
 
-def test_routine_does_not_push_out_what_stopped_an_axis() -> None:
+def test_routine_events_do_not_displace_stops() -> None:
     reader = Told()
     log = EventLog(reader)
     reader.events = [event(EventKind.STOPPED, text="cycle 1: lost")]
@@ -41,7 +41,7 @@ def test_routine_does_not_push_out_what_stopped_an_axis() -> None:
     assert log.answer(7) is not None
 
 
-async def test_of_many_the_newest_are_told_and_the_others_counted(service: Service) -> None:
+async def test_the_newest_events_are_returned_and_the_others_counted(service: Service) -> None:
     async with service.ready() as bridge:
         before = bridge.events(0).newest
         for number in range(EVENTS_TOLD + 5):

@@ -42,7 +42,7 @@ def changes(bridge: ServiceBridge) -> int:
     return sum(each.event is not None and each.event.kind is EventKind.CHANGED for each in entries)
 
 
-def test_an_adaptation_that_is_off_learns_and_writes_nothing(tmp_path: Path) -> None:
+def test_a_disabled_adaptation_learns_and_writes_nothing(tmp_path: Path) -> None:
     folder = tmp_path / "adaptation"
     with stepped_service(tmp_path) as service:
 
@@ -63,7 +63,7 @@ def test_an_adaptation_that_is_off_learns_and_writes_nothing(tmp_path: Path) -> 
         play(story())
 
 
-def test_without_a_model_it_says_what_to_do(tmp_path: Path) -> None:
+def test_without_a_model_a_calibration_is_requested(tmp_path: Path) -> None:
     with stepped_service(tmp_path) as service:
         service.machine.axes[0].profile.model.unlink()
 
@@ -77,7 +77,7 @@ def test_without_a_model_it_says_what_to_do(tmp_path: Path) -> None:
         play(story())
 
 
-def test_without_a_place_to_write_it_says_so_and_the_axis_works(tmp_path: Path) -> None:
+def test_an_unwritable_folder_is_reported_and_the_axis_works(tmp_path: Path) -> None:
     folder = tmp_path / "adaptation"
     folder.write_text("not a folder")
     with stepped_service(tmp_path) as service:
@@ -91,7 +91,7 @@ def test_without_a_place_to_write_it_says_so_and_the_axis_works(tmp_path: Path) 
         play(story())
 
 
-def test_each_axis_is_watched_in_a_thread_of_its_own_that_ends(
+def test_each_axis_is_watched_in_its_own_thread_that_ends(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     with stepped_service(tmp_path, axes=2) as service, caplog.at_level(logging.ERROR):
@@ -112,7 +112,7 @@ def test_each_axis_is_watched_in_a_thread_of_its_own_that_ends(
     assert not [each for each in threading.enumerate() if each.name.startswith("following")]
 
 
-def test_a_verdict_is_advice_a_note_and_a_diagnosis_until_another_model_is_committed(tmp_path: Path) -> None:
+def test_a_verdict_gives_advice_note_and_diagnosis_until_a_new_model(tmp_path: Path) -> None:
     config = AxisConfig.from_text(DEMO.read_text().replace("cycle_ms: 4", "cycle_ms: 20"), DEMO)
     model = TransmissionModel.load("profiles/article/model.yaml")
     loop = next(each for each in model.effects if isinstance(each, Hysteresis))

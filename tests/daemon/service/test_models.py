@@ -47,7 +47,7 @@ def steps(samples: np.ndarray) -> np.ndarray:
     return np.abs(np.diff(samples["axes"][:, 0]["correction_arcsec"]))
 
 
-async def test_schemes_are_faded_over_in_motion(service: Service) -> None:
+async def test_schemes_are_cross_faded_in_motion(service: Service) -> None:
     async with service.enabled() as (bridge, token):
         axis = bridge.axes["axis1"]
         assert axis.state().scheme == "extended"
@@ -69,7 +69,7 @@ async def test_schemes_are_faded_over_in_motion(service: Service) -> None:
         assert not service.daemon.axes[0].supervision.stop
 
 
-async def test_another_model_is_committed_and_used_in_motion(service: Service) -> None:
+async def test_a_new_model_is_committed_and_used_in_motion(service: Service) -> None:
     async with service.enabled() as (bridge, token):
         axis = bridge.axes["axis1"]
         first = axis.state().model
@@ -92,7 +92,7 @@ async def test_another_model_is_committed_and_used_in_motion(service: Service) -
         assert store.find(folder, "active").number == in_use.version - 1
 
 
-async def test_a_model_that_is_not_there_or_not_of_this_axis_changes_nothing(service: Service) -> None:
+async def test_a_missing_or_foreign_model_changes_nothing(service: Service) -> None:
     async with service.enabled() as (bridge, token):
         axis = bridge.axes["axis1"]
         before = axis.state().model
@@ -176,7 +176,7 @@ async def choose(bridge: ServiceBridge, token: str) -> None:
         await bridge.axes[name].compensate(token, Scheme(scheme))
 
 
-async def test_each_axis_gets_its_own_compensation_back_after_each_restart_of_the_control_process(
+async def test_each_axis_keeps_its_compensation_over_restarts_of_the_control_process(
     pair: Service,
 ) -> None:
     async with pair.enabled() as (bridge, token):
@@ -193,7 +193,7 @@ async def test_each_axis_gets_its_own_compensation_back_after_each_restart_of_th
         assert "the control process was started again: every axis is disabled" in told
 
 
-async def test_an_axis_is_not_enabled_with_another_compensation_than_the_chosen_one(pair: Service) -> None:
+async def test_an_axis_is_enabled_with_its_chosen_compensation_only(pair: Service) -> None:
     async with pair.ready() as bridge:
         token = bridge.lease.take("test")
         await choose(bridge, token)
@@ -203,7 +203,7 @@ async def test_an_axis_is_not_enabled_with_another_compensation_than_the_chosen_
 
 
 @pytest.mark.parametrize("lost", range(1, 4))
-async def test_a_setting_that_is_lost_is_sent_again(pair: Service, lost: int) -> None:
+async def test_lost_settings_are_sent_again(pair: Service, lost: int) -> None:
     async with pair.ready() as bridge:
         token = bridge.lease.take("test")
         await choose(bridge, token)
@@ -216,7 +216,7 @@ async def test_a_setting_that_is_lost_is_sent_again(pair: Service, lost: int) ->
         assert used(pair) == [["synchronous"], ["hysteresis"]]
 
 
-async def test_a_new_service_finds_what_the_control_process_uses(pair: Service) -> None:
+async def test_a_new_service_reads_the_settings_in_use(pair: Service) -> None:
     async with pair.enabled() as (bridge, token):
         await choose(bridge, token)
         await bridge.axes["axis2"].switch_load_loop(token, on=False)
@@ -236,7 +236,7 @@ async def test_a_new_service_finds_what_the_control_process_uses(pair: Service) 
         assert used(pair) == [["synchronous"], ["hysteresis"]]
 
 
-async def test_a_service_that_died_while_it_wrote_a_setting_starts_with_the_machine_file(
+async def test_a_half_written_setting_falls_back_to_the_machine_file(
     pair: Service,
 ) -> None:
     async with pair.enabled() as (bridge, token):
@@ -249,7 +249,7 @@ async def test_a_service_that_died_while_it_wrote_a_setting_starts_with_the_mach
         assert used(pair) == [["synchronous", "hysteresis"], ["hysteresis"]]
 
 
-async def test_a_refused_setting_is_never_reported_and_does_not_come_back(pair: Service) -> None:
+async def test_refused_settings_are_never_reported_or_repeated(pair: Service) -> None:
     async with pair.enabled() as (bridge, token):
         await choose(bridge, token)
         axis = bridge.axes["axis1"]
@@ -263,7 +263,7 @@ async def test_a_refused_setting_is_never_reported_and_does_not_come_back(pair: 
         assert [axis.state().scheme for axis in bridge.axes.values()] == [*SCHEMES.values()]
 
 
-async def test_an_answer_that_comes_too_late_changes_nothing_that_is_reported(pair: Service) -> None:
+async def test_late_answers_change_no_report(pair: Service) -> None:
     async with pair.enabled() as (bridge, token):
         await choose(bridge, token)
         daemon = pair.daemon
@@ -295,7 +295,7 @@ def test_a_setting_reads_back_exactly(data: st.DataObject) -> None:
     assert CompensationSetting.from_json(setting.to_json()) == setting
 
 
-def test_a_load_loop_that_does_not_act_says_why_in_state_and_events(tmp_path: Path) -> None:
+def test_an_inactive_load_loop_reports_its_reason(tmp_path: Path) -> None:
     loop = LoadLoopSettings(gain_1_s=0.5, maximum_arcsec=20.0)
     with stepped_service(tmp_path, setup=lambda _, made: replace(made, load_loop=loop)) as made:
         made.machine = replace(made.machine, axes=(replace(made.machine.axes[0], load_loop=loop),))

@@ -13,7 +13,7 @@ from hdbridge.daemon.service.streams import StreamPoint
 from hdbridge.errors import InputError, LeaseError, RefusedError
 
 
-async def test_way_points_are_stood_at_one_after_the_other(service: Service) -> None:
+async def test_way_points_are_visited_in_order(service: Service) -> None:
     async with service.enabled() as (bridge, token):
         axis = bridge.axes["axis1"]
         reader = service.daemon.memory.reader()
@@ -29,7 +29,7 @@ async def test_way_points_are_stood_at_one_after_the_other(service: Service) -> 
         assert np.count_nonzero(np.isclose(standing, 2.0)) * service.daemon.period_s >= 0.3
 
 
-async def test_a_move_takes_the_place_of_the_queue(service: Service) -> None:
+async def test_a_move_replaces_the_queue(service: Service) -> None:
     async with service.enabled() as (bridge, token):
         axis = bridge.axes["axis1"]
         await axis.queue(token, [WayPoint(20.0), WayPoint(-20.0)])
@@ -40,7 +40,7 @@ async def test_a_move_takes_the_place_of_the_queue(service: Service) -> None:
         assert axis.state().load_target_deg == pytest.approx(1.0)
 
 
-async def test_a_bad_way_point_takes_none(service: Service) -> None:
+async def test_an_invalid_way_point_rejects_all(service: Service) -> None:
     async with service.enabled() as (bridge, token):
         axis = bridge.axes["axis1"]
         for bad in (
@@ -56,7 +56,7 @@ async def test_a_bad_way_point_takes_none(service: Service) -> None:
 
 
 @pytest.mark.parametrize("steps", range(3))
-async def test_a_queue_may_be_forgotten_while_its_move_begins(service: Service, steps: int) -> None:
+async def test_a_queue_may_be_cleared_while_its_move_starts(service: Service, steps: int) -> None:
     async with service.enabled() as (bridge, token):
         axis = bridge.axes["axis1"]
         await axis.queue(token, [WayPoint(4.0)])
@@ -69,7 +69,7 @@ async def test_a_queue_may_be_forgotten_while_its_move_begins(service: Service, 
         assert state.at_rest
 
 
-async def test_a_forgotten_queue_ends_after_the_present_move(service: Service) -> None:
+async def test_a_cleared_queue_ends_after_the_present_move(service: Service) -> None:
     async with service.enabled() as (bridge, token):
         axis = bridge.axes["axis1"]
         await axis.queue(token, [WayPoint(4.0), WayPoint(-20.0), WayPoint(20.0)])
@@ -148,7 +148,7 @@ async def test_a_stream_follows_its_set_points(service: Service) -> None:
             await stream.put([StreamPoint(9.0, 0.0)])
 
 
-async def test_a_stream_that_dries_up_brakes_and_says_so(service: Service) -> None:
+async def test_a_starved_stream_brakes_and_reports_it(service: Service) -> None:
     async with service.enabled() as (bridge, token):
         axis = bridge.axes["axis1"]
         await axis.move(token, 0.0)
@@ -196,7 +196,7 @@ async def test_set_points_beyond_the_limits_end_the_stream_braking(service: Serv
         assert axis.state().load_target_deg < 10.0
 
 
-def test_two_axes_arrive_together(tmp_path: Path) -> None:
+def test_coordinated_axes_arrive_together(tmp_path: Path) -> None:
     async def story(service: Service) -> None:
         async with service.enabled() as (bridge, token):
             reader = service.daemon.memory.reader()

@@ -39,7 +39,7 @@ def test_a_new_service_finds_the_axis_where_it_is(service: Service) -> None:
     play(second())
 
 
-def test_nothing_is_asked_of_an_axis_before_its_state_is_known(service: Service) -> None:
+def test_no_request_is_made_before_the_axis_state_is_known(service: Service) -> None:
     """A drive that still holds its axis after a quick stop is not booted because the service is young."""
     daemon = service.daemon
     daemon.verify()
@@ -77,7 +77,7 @@ async def test_without_a_control_process_nothing_is_sent(service: Service) -> No
         await axis.enable(token)
 
 
-async def test_what_was_lent_is_taken_back(service: Service) -> None:
+async def test_a_lent_axis_is_taken_back(service: Service) -> None:
     async with service.ready() as bridge:
         await bridge.axes["axis1"].link.do(CommandKind.LEND)
     async with service.bridge() as bridge:

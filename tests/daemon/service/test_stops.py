@@ -116,7 +116,7 @@ async def test_a_drive_that_restarts_is_verified_again_and_stays_disabled(
         await axis.move(token, axis.state().load_target_deg + 1.0)
 
 
-async def test_an_interface_that_comes_back_is_found_again(service: Service) -> None:
+async def test_a_returning_interface_is_used_again(service: Service) -> None:
     async with service.enabled() as (bridge, token):
         axis = bridge.axes["axis1"]
         await axis.move(token, 100.0, wait=False)
@@ -136,7 +136,7 @@ async def test_an_interface_that_comes_back_is_found_again(service: Service) -> 
         await axis.move(token, axis.state().load_target_deg + 1.0)
 
 
-async def test_a_drive_that_is_not_there_yet_is_waited_for(service: Service) -> None:
+async def test_an_absent_drive_is_awaited(service: Service) -> None:
     service.daemon.nodes[0].faults.silent = True
     async with service.bridge() as bridge:
         axis = bridge.axes["axis1"]
@@ -146,7 +146,7 @@ async def test_a_drive_that_is_not_there_yet_is_waited_for(service: Service) -> 
         await until(bridge, lambda: axis.state().state == "disabled", 60.0)
 
 
-async def test_a_jog_that_has_run_out_costs_the_next_client_nothing(service: Service) -> None:
+async def test_an_expired_jog_does_not_affect_the_next_client(service: Service) -> None:
     async with service.ready() as bridge:
         axis = bridge.axes["axis1"]
         token = bridge.lease.take("first")

@@ -47,7 +47,7 @@ def at_work(blind: Path, folder: Path, **servo: float) -> tuple[messages.AxisSta
         return play(story(service))
 
 
-def test_what_needs_a_load_encoder_is_reported_as_not_available(blind: Path, tmp_path: Path) -> None:
+def test_features_needing_a_load_encoder_are_reported_as_unavailable(blind: Path, tmp_path: Path) -> None:
     state, noted = at_work(blind, tmp_path)
     assert state.load_position_deg is None
     assert state.error_arcsec is None
