@@ -56,6 +56,27 @@ def test_held_out_data_speak_for_the_new_model_against_none(standard):
     assert standard.held_out.gain.after_arcsec == pytest.approx(0.5, rel=0.1)
 
 
+def test_sines_without_names_are_divided_between_the_folds(bench):
+    end = 360.0 * 50.0
+    rest = np.zeros(50)
+    legs = [rest, bench.ramp(0.0, end, 617.3), end + rest, bench.ramp(end, 0.0, 617.3), rest]
+    for amplitude in (5.0, 15.0, 40.0, 120.0):
+        legs += [amplitude * np.sin(0.2 * np.pi * np.arange(1000) / bench.rate_hz), rest]
+    motor = np.concatenate(legs)
+    loop = np.full(len(motor), -1.0)
+    for at, step in enumerate(np.diff(motor), 1):  # exponential approach, which the model's law lacks
+        loop[at] = (
+            np.sign(step) - (np.sign(step) - loop[at - 1]) * np.exp(-abs(step) / 8.0)
+            if step
+            else loop[at - 1]
+        )
+    noise = np.random.default_rng(1).normal(0.0, 0.4, len(motor))
+    error = 14.0 * np.cos(np.deg2rad(2.0 * motor)) + 30.0 * loop + noise
+    leg = Leg(np.arange(len(motor)) / bench.rate_hz, motor, motor / 50.0 + error / 3600.0)
+    result = fit([leg], 50.0)
+    assert result.held_out.improves, result.held_out.text
+
+
 def test_against_the_true_model_nothing_improves(bench):
     axis = bench.axis()
     orders = tuple(
