@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 import struct
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,6 +13,9 @@ from support.gateway import COUNTS_PER_DEG, NODE, GatewayBench, gateway_bench, s
 from support.raised import without_load_encoder
 from support.service import play
 
+from hdbridge.axis import AxisConfig
+from hdbridge.axis.model import TransmissionModel
+from hdbridge.daemon.gateway.objects import rest_deg
 from hdbridge.daemon.loop.states import AxisState
 from hdbridge.daemon.memory import CommandKind
 from hdbridge.motion import MotionMode
@@ -290,6 +294,43 @@ def test_a_target_before_its_mode_and_a_mode_while_enabled_do_not_move_it(tmp_pa
         assert bench.gateway.nodes["axis1"].firmware.statusword() & 0x1400 == 0x1400
 
     scene(tmp_path, scenario)
+
+
+def test_target_reached_means_that_the_load_rests_there(tmp_path):
+    """The window is what the axis can do, so the load is no farther away from then on."""
+
+    async def scenario(bench):
+        plc = bench.plc
+        await bench.write(0x6060, 0, 1, 1)
+        await bench.enable()
+        await bench.wait(0.6)
+        plc.sends_targets = False
+        goal = plc.target + 200_000
+        await bench.write(0x607A, 0, goal, 4)
+        await bench.write(0x6040, 0, 0x1F, 2)
+        await bench.until(lambda: not plc.statusword & 0x400, 1.0)
+        await bench.until(lambda: plc.statusword & 0x400 != 0)
+        window = await bench.read(0x6067)
+        axis = bench.service.machine.axes[0].config
+        count = abs(axis.motor_encoder.degrees(1)) / axis.gear.ratio * COUNTS_PER_DEG
+        assert count < window < 2.0 * count  # an exact model: the motor's count and the rounding
+        for _ in range(50):
+            assert abs(bench.load_deg * COUNTS_PER_DEG - goal) < window + 0.5 * count
+            assert plc.statusword & 0x400
+            await bench.wait(0.01)
+
+    scene(tmp_path, scenario)
+
+
+@pytest.mark.parametrize(
+    ("held_out", "arcsec"),
+    [({"after_arcsec": 4.0}, 3.24 + 12.32), ("too short", 3.24 + 2.83), (None, 3.24 + 300.0)],
+)
+def test_the_position_window_grows_with_the_residual_of_the_model(held_out, arcsec):
+    axis = AxisConfig.load(PROFILE)
+    model = TransmissionModel.load(PROFILE / "model.yaml")
+    model = replace(model, provenance={"held_out": held_out}) if held_out else model.only(())
+    assert 3600.0 * rest_deg(axis, model) == pytest.approx(arcsec, abs=0.01)
 
 
 def test_homing_makes_the_present_position_zero(tmp_path):

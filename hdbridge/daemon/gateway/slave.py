@@ -28,6 +28,7 @@ from hdbridge.units import ARCSEC_PER_DEG
 
 if TYPE_CHECKING:
     from hdbridge.axis import AxisConfig
+    from hdbridge.axis.model import TransmissionModel
     from hdbridge.daemon.machinefile import GatewaySettings
 
 BEHAVIOUR: Final = Behaviour.model_validate(
@@ -269,7 +270,7 @@ class Gateway:
     def __init__(
         self,
         bus: can.BusABC,
-        axes: Sequence[AxisConfig],
+        axes: Sequence[tuple[AxisConfig, TransmissionModel]],
         settings: GatewaySettings,
         memory: Memory,
         clock: Clock,
@@ -286,7 +287,7 @@ class Gateway:
         self._looked_s = -math.inf
         self.axes: dict[str, LoadAxis] = {}
         self.nodes: dict[str, DriveNode] = {}
-        for index, axis in enumerate(axes):
+        for index, (axis, model) in enumerate(axes):
             node_id = settings.nodes.get(axis.name)
             if node_id is None:
                 continue
@@ -294,7 +295,7 @@ class Gateway:
             node = DriveNode(
                 bus,
                 load,
-                write_eds(folder, axis, settings),
+                write_eds(folder, axis, settings, model),
                 node_id,
                 clock,
                 nameplate(axis, settings),
