@@ -41,10 +41,9 @@ from hdbridge.twin.replay import (
     commands_of,
     continuous,
     demand_deg,
-    held_rows,
     legs_of,
     run,
-    stands,
+    standing,
     stretches,
     unknown_rows,
 )
@@ -327,18 +326,13 @@ def _piece(
     elastic = unknown | (np.cumsum(travelled) < (UNKNOWN_DEG if remembers(base) else 0.0))
     # Between two parts the drive's loops may have been restarted.
     loops = elastic | (np.cumsum(np.where(judged, travelled, 0.0)) <= UNKNOWN_DEG)
-    count_deg = 360.0 / axis.motor_encoder.counts_per_turn
-    still = stands(moved > 0.0, part.motor_position_deg, STANDS_COUNTS * count_deg)
+    still, held = standing(part, axis)
     rests = stuck & still
     torque = part.columns.get("motor_torque_nm")
     if torque is not None:
         # The holding torque at rest is the value of the integral.
-        held = held_rows(part, moved > 0.0, still)
         known = held[0] if len(held) else len(loops)
         loops[known:] = unknown[known:]
-        cycles = commands.lead + 1 + np.floor(commands.row_cycles[held]).astype(int)
-        told = tuple(zip(cycles.tolist(), torque[held].tolist(), strict=True))
-        commands = replace(commands, held=(*commands.held, *told))
     measured = {
         FOLLOWING: target - part.motor_position_deg,
         TORQUE: torque if torque is not None else np.zeros(len(part)),

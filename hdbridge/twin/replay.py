@@ -121,17 +121,22 @@ def stands(moved: NDArray[np.bool_], motor_deg: FloatArray, within_deg: float) -
     return given
 
 
-def held_rows(part: Record, moved: NDArray[np.bool_], still: NDArray[np.bool_]) -> NDArray[np.intp]:
-    """Returns the rows that show the holding torque of a motor at rest: every `HELD_S`, and the last.
+def standing(part: Record, axis: AxisConfig) -> tuple[NDArray[np.bool_], NDArray[np.intp]]:
+    """Returns the mask of the rows at which the motor stands, and the rows that show its holding torque.
 
-    The last one alone would not do, because the integral may have moved until the motor broke away.
+    These are every `HELD_S`, and the last: the last one alone would not do, because the integral may have
+    moved until the motor broke away.
     """
+    target, count_deg = part.motor_target_deg, 360.0 / axis.motor_encoder.counts_per_turn
+    assert target is not None  # commands_of has refused it
+    moved = np.diff(target, prepend=target[0]) != 0.0
+    still = stands(moved, part.motor_position_deg, STANDS_COUNTS * count_deg)
     rested_s = part.time_s - np.maximum.accumulate(np.where(moved, part.time_s, part.time_s[0]))
     times = np.floor(rested_s / HELD_S)
     told = still & (times >= 1.0)
     told[1:-1] &= (times[1:-1] > times[:-2]) | moved[2:]
     told[-1:] = False
-    return np.flatnonzero(told)
+    return still, np.flatnonzero(told)
 
 
 def begins_in_motion(part: Record) -> bool:
@@ -267,11 +272,24 @@ def commands_of(part: Record, axis: AxisConfig, truth: Truth) -> Commands:
         off.insert(0, slice(lead - math.ceil(0.5 * STANDING_S / cycle_s), lead - ON_BEFORE))
     off = [each for each in off if each.stop > each.start]
     torque_nm = part.columns.get(Channel.MOTOR_TORQUE.value)
-    held = () if torque_nm is None or not holds else ((lead, float(torque_nm[0])),)
+    held: list[tuple[int, float]] = []
+    if torque_nm is not None:
+        held += [(lead, float(torque_nm[0]))] if holds else []
+        _, rows = standing(part, axis)
+        known = lead + 1 + np.floor(cycles[rows]).astype(np.intp)
+        held += zip(known.tolist(), torque_nm[rows].tolist(), strict=True)
     warmth_c = part.columns.get(Channel.TEMPERATURE.value)
     start_c = None if warmth_c is None else float(warmth_c[0])
     return Commands(
-        (*map(float, approach), *recorded), lead, cycles, time_s, cycle_s, told_nm, tuple(off), held, start_c
+        (*map(float, approach), *recorded),
+        lead,
+        cycles,
+        time_s,
+        cycle_s,
+        told_nm,
+        tuple(off),
+        tuple(held),
+        start_c,
     )
 
 
