@@ -351,7 +351,7 @@ def moved_twice(creeps_deg: float) -> tuple[Record, np.ndarray]:
 def test_a_standing_motor_tells_its_torque_again_and_again_and_at_last(creeps_deg: float, count: int) -> None:
     """The integral goes on meanwhile: what it comes to at the end may be after the motor broke away."""
     record, moved = moved_twice(creeps_deg)
-    still, held = standing(record, AXIS)
+    _, still, held = standing(record, COUNT_DEG)
     assert still[held].all()
     assert held[-1] == 99, "the last row of the rest"
     assert np.all(np.abs(np.diff(record.time_s[held[:-1]]) - HELD_S) < 1.5 * CYCLE_S)
@@ -369,7 +369,7 @@ def test_a_standing_motor_is_held_by_its_recorded_torque_in_the_replay_that_judg
     )
     soft = TRUTH.model_copy(update={"servo": servo})
     again = replay(Recording(rests, axis="demo", ratio=50.0), AXIS, soft)
-    _, held = standing(rests, AXIS)
+    *_, held = standing(rests, COUNT_DEG)
     off_nm = (again.columns["motor_torque_nm"] - rests.columns["motor_torque_nm"])[held]
     assert len(held) > 5
     assert np.max(np.abs(off_nm)) < 0.1 * TRUTH.motor.coulomb_nm
