@@ -37,10 +37,9 @@ from hdbridge.twin.replay import (
     continuous,
     counted_cycles,
     doubts,
-    held_rows,
     legs_of,
     replay,
-    stands,
+    standing,
     stretches,
     unknown_rows,
 )
@@ -352,11 +351,28 @@ def moved_twice(creeps_deg: float) -> tuple[Record, np.ndarray]:
 def test_a_standing_motor_tells_its_torque_again_and_again_and_at_last(creeps_deg: float, count: int) -> None:
     """The integral goes on meanwhile: what it comes to at the end may be after the motor broke away."""
     record, moved = moved_twice(creeps_deg)
-    held = held_rows(record, moved, stands(moved, record.motor_position_deg, 1.5 * COUNT_DEG))
+    _, still, held = standing(record, COUNT_DEG)
+    assert still[held].all()
     assert held[-1] == 99, "the last row of the rest"
     assert np.all(np.abs(np.diff(record.time_s[held[:-1]]) - HELD_S) < 1.5 * CYCLE_S)
     assert len(held) == count
     assert not moved[held].any()
+
+
+def test_a_standing_motor_is_held_by_its_recorded_torque_in_the_replay_that_judges_a_twin() -> None:
+    """Soft loops that have not settled would wind up, and begin the next motion with another torque."""
+    rests = record_of(
+        TRUTH, lambda bench: [bench.move(40.0, 300.0, 3000.0), bench.hold(1.0), bench.move(9.0, 90.0, 900.0)]
+    )
+    servo = TRUTH.servo.model_copy(
+        update={"position_gain_per_s": 8.0, "integral_of": "position", "integral_time_ms": 45.0}
+    )
+    soft = TRUTH.model_copy(update={"servo": servo})
+    again = replay(Recording(rests, axis="demo", ratio=50.0), AXIS, soft)
+    *_, held = standing(rests, COUNT_DEG)
+    off_nm = (again.columns["motor_torque_nm"] - rests.columns["motor_torque_nm"])[held]
+    assert len(held) > 5
+    assert np.max(np.abs(off_nm)) < 0.1 * TRUTH.motor.coulomb_nm
 
 
 def ended_in_motion(first_s: float, then_s: float) -> Record:
