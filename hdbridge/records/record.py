@@ -89,9 +89,8 @@ class Record:
         found, origin = read(file, said)
         record = cls(found, str(path), origin=origin)
         if len(record) < minimum_samples:
-            raise InputError(
-                f"{path}: {len(record)} samples are too few; expected at least {minimum_samples}"
-            )
+            count = f"{len(record)} sample{'s' * (len(record) != 1)}"
+            raise InputError(f"{path}: {count}; expected at least {minimum_samples}")
         backwards = np.flatnonzero(np.diff(record.time_s) < 0.0)
         if len(backwards):
             row = int(backwards[0]) + 1

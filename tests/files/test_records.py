@@ -50,9 +50,11 @@ def record(samples: int = 101, ratio: float = 50.0, travel_deg: float = 400.0, *
         (f"{HEAD}\n0,1,2\n1,1\n".encode(), ":3: 2 values; expected 3, one for each column"),
         (f"{HEAD}\n0,1,2\n1,1,2,3\n".encode(), ":3: 4 values; expected 3, one for each column"),
         (f"{HEAD}\n0,1,2,3\n1,1,2,3\n".encode(), ":2: 4 values; expected 3, one for each column"),
-        (f"{HEAD}\n0,1,2\n".encode(), ": 1 samples are too few; expected at least 2"),
-        (f"{HEAD}\n".encode(), ": 0 samples are too few; expected at least 2"),
+        (f"{HEAD}\n0,1,2\n".encode(), ": 1 sample; expected at least 2"),
+        (f"{HEAD}\n".encode(), ": 0 samples; expected at least 2"),
         (f"{HEAD},note\n0,1,2,\x81\n".encode("latin-1"), ":2: neither UTF-8 nor Windows-1252 text; expected CSV in UTF-8"),
+        (b"PK\x03\x04\x14\x00\x06\x00\x08\x90", ": a ZIP archive, such as an Excel workbook; expected CSV: export the samples as CSV"),
+        (b"PAR1\x15\x04\x15\x00\x90", ": a Parquet file; expected CSV: export the samples as CSV"),
         (gzip.compress(f"{HEAD}\n0,1,2\n".encode(), mtime=0)[:-9], ": gzip data are damaged or cut off (Compressed file ended before the end-of-stream marker was reached)"),
     ],
 )  # fmt: skip

@@ -68,12 +68,13 @@ def check_pages(folder):
         (["run", ".", "--out", "out", "--memory", "1MB"], "at least 200MB"),
         (["run", ".", "--out", "out", "--scheduler", "tcp://a:1", "--workers", "2"], "--workers"),
         (["run", ".", "--out", "."], "not written by hdbridge fleet"),
+        (["run", "--manifest", "mine.csv", "--out", "out"], "mine.csv: no row"),
         (["report", "."], "no recordings in this folder"),
         (["simulate", "."], "is not empty"),
     ],
 )
 def test_what_is_wrong_is_refused_before_anything_is_written(tmp_path, arguments, complaint):
-    (tmp_path / "mine.csv").write_text("mine")
+    (tmp_path / "mine.csv").write_text("path,joint\n")
     done = run_here(tmp_path, "fleet", *arguments)
     assert done.returncode == 2
     assert complaint in done.stderr
