@@ -504,5 +504,5 @@ def _lead(response: Response, period_s: float) -> LeadFilter:
         return response.filter
     raise InputError(
         f"the model's response was measured with a cycle of {response.cycle_ms:g} ms, but this axis has "
-        f"{1000.0 * period_s:g} ms: calibrate the axis again, or delete 'response' from the model file"
+        f"{1000.0 * period_s:g} ms: measure it again with 'hdbridge motion AXIS --propose', then commit"
     )

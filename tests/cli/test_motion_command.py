@@ -1,9 +1,25 @@
 """`hdbridge motion` on the simulated drive."""
 
 import json
+import re
+from dataclasses import replace
 
 import pytest
 from support.raised import raised_profile
+
+from hdbridge import Drive
+from hdbridge.axis import AxisConfig
+from hdbridge.axis.model import TransmissionModel
+from hdbridge.axis.model.response import LeadFilter, Response
+from hdbridge.commissioning.calibration.motion import motion_test
+from hdbridge.errors import InputError
+from hdbridge.sim.lockstep import simulated_bench
+
+OF_ANOTHER_CYCLE = Response(
+    cycle_ms=3.0, following_lag_ms=5.0, known_to_hz=10.0,
+    frequency_hz=(10.0,), gain=(1.0,), phase_deg=(0.0,), uncertainty=(0.1,),
+    filter=LeadFilter(lead_cycles=0, per_cycle=1, full_speed_deg_s=1.0, weights=(1.0,)),
+)  # fmt: skip
 
 
 @pytest.fixture
@@ -12,7 +28,11 @@ def fast(tmp_path):
 
 
 def test_measures_and_proposes_the_response_and_the_committed_model_uses_it(hdbridge, fast, tmp_path):
-    done = hdbridge("motion", "fast", "--simulate", "--propose", "--json", "out.json", "--html", "out.html")
+    model = TransmissionModel.load(fast / "model.yaml")
+    replace(model, response=OF_ANOTHER_CYCLE).save(fast / "model.yaml")
+    advice = re.search("hdbridge (motion AXIS --propose)", hdbridge("check", "fast").stderr)
+    command = advice[1].replace("AXIS", "fast").split()
+    done = hdbridge(*command, "--simulate", "--json", "out.json", "--html", "out.html")
     assert done.returncode == 0, done.stderr
     assert "pending" in done.stdout
     result = json.loads((tmp_path / "out.json").read_text())
@@ -70,3 +90,17 @@ def test_a_model_without_orders_and_a_proposal_without_a_measurement_are_refused
     done = hdbridge("motion", "article", "--simulate", "--no-measure", "--propose")
     assert done.returncode == 2
     assert "--no-measure" in done.stderr
+
+
+def test_a_response_of_another_cycle_is_refused_before_anything_moves(fast):
+    axis = AxisConfig.load(fast)
+    model = replace(TransmissionModel.load(fast / "model.yaml"), response=OF_ANOTHER_CYCLE)
+    with (
+        simulated_bench(fast / "truth.yaml", axis.eds_path) as (bus, clock, _),
+        Drive(bus, axis, clock) as drive,
+    ):
+        drive.boot()
+        booted_s = clock.now()
+        with pytest.raises(InputError, match="measured with a cycle of 3 ms"):
+            motion_test(drive, model, measure=False)
+        assert clock.now() == booted_s

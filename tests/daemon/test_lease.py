@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
 
 from hdbridge.daemon.service.lease import Lease
+from hdbridge.daemon.service.reports import lease_state
 from hdbridge.errors import InputError, LeaseError
 
 CLIENTS = ("page", "script", "pendant")
@@ -46,8 +47,19 @@ def test_a_second_client_learns_the_holder_and_the_remaining_time(lease: Lease, 
     with pytest.raises(LeaseError, match=r"'page' holds the right to move; it runs out in 6\.0 s"):
         lease.take("script")
     lease.doing = lambda: "axis 'a' is in motion (jog)"
-    with pytest.raises(LeaseError, match=r"renewed; axis 'a' is in motion \(jog\); wait, or take it with"):
+    with pytest.raises(LeaseError, match=r"renewed; axis 'a' is in motion \(jog\); wait, or repeat"):
         lease.take("script")
+
+
+def test_the_lease_of_the_gateway_lasts_until_it_is_taken_by_force(lease: Lease, time: Time) -> None:
+    lease.take("gateway", lasts=True)
+    time.s = 1e6
+    assert lease_state(lease, time.s).remaining_s is None
+    with pytest.raises(LeaseError, match=r"as long as the gateway runs; to stop .*repeat .* with --force$"):
+        lease.take("script")
+    lease.take("script", force=True)
+    time.s += 10.0
+    assert lease.holder is None
 
 
 def test_an_expired_lease_is_reported_once(lease: Lease, time: Time) -> None:

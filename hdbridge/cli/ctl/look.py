@@ -142,7 +142,7 @@ def _outer(outer: OuterState) -> str:
 def _lease(state: LeaseState) -> str:
     if not state.held:
         return "nobody has the right to move"
-    left = "" if state.remaining_s is None else f", for another {state.remaining_s:.1f} s unless it is used"
+    left = "" if state.remaining_s is None else f", for another {state.remaining_s:.1f} s; use extends it"
     return f"'{state.client}' has the right to move{left}"
 
 

@@ -33,6 +33,6 @@ class LeaseState(Report):
     client: str | None = Field(None, description="who holds it", examples=["cell controller"])
     since: datetime | None = Field(None, description="time at which it was taken")
     remaining_s: float | None = Field(
-        None, description="time until it expires unless it is used", examples=[4.2]
+        None, description="time until it expires; each use extends it", examples=[4.2]
     )
     timeout_s: float = Field(description="it ends when it was not used for so long", examples=[5.0])

@@ -234,10 +234,13 @@ def motion_test(
 
     With ``measure`` the response is measured, otherwise the model's own is tested. A filter is kept only if
     at every speed it leaves no more ripple than no correction, and no larger path error. InputError if no
-    motor order of the model is large enough to measure, or if the travel is too short. Without an encoder at
+    motor order of the model is large enough to measure, if the travel is too short, or if a response to be
+    tested was measured at another cycle. Without an encoder at
     the load, the ripple is that of the load angle predicted from the motor encoder, and no path is run.
     """
     runner = _Runner(drive, model, progress, interrupted)
+    if not measure:
+        compensation_for(drive.axis, model)  # refuses a response of another cycle before anything moves
     gains = read_gains(drive.sdo) if isinstance(drive, Drive) else {}
     found = _ripple_test(runner, model, measure)
     if found.response is not None and measure:

@@ -55,7 +55,7 @@ def calibrate(
     tell("fitting")
     recording = journal.recording()
     result = conclude({journal.folder: recording}, axis.gear.ratio, active, axis=axis)
-    if active and active.response and active.response.fits_cycle(axis.drive.cycle_s):
+    if active and active.response:
         # This calibration measured the gear again, but neither the servo nor the load's inertia.
         kept = MotionTest(
             (), active.response, wind_up=wind_up_of(active) if not wind_up_of(result.model) else None
@@ -192,6 +192,9 @@ def active_model(
     except InputError as problem:
         tell(f"not compared with the active model: {problem}")
         return None
+    if model.response and not model.response.fits_cycle(axis.drive.cycle_s):
+        tell("the response in motion of the active model is not used: it was measured at another cycle")
+        return replace(model, response=None)
     return model
 
 

@@ -7,6 +7,7 @@ machine. Reading, stopping and quick-stopping require no lease.
 
 from __future__ import annotations
 
+import math
 import secrets
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -28,7 +29,7 @@ class Holder:
     taken_s: float
     """Time at which it was taken; lease's clock."""
     expires_s: float
-    """Time at which it expires unless the holder makes a request before."""
+    """Time at which it expires unless the holder makes a request before; infinite for the gateway."""
 
 
 class Lease:
@@ -49,6 +50,7 @@ class Lease:
         self._token: str | None = None
         self._client = ""
         self._taken_s = self._heard_s = 0.0
+        self._lasts = False
         self._ended: list[str] = []
         self.doing: Callable[[], str] = lambda: ""
         """Returns what the machine does at present and how to end it, in words, for refusals."""
@@ -59,10 +61,13 @@ class Lease:
         self._expire()
         if self._token is None:
             return None
-        return Holder(self._client, self._taken_s, self._heard_s + self.timeout_s)
+        return Holder(
+            self._client, self._taken_s, math.inf if self._lasts else self._heard_s + self.timeout_s
+        )
 
-    def take(self, client: str, *, force: bool = False) -> str:
-        """Takes the lease and returns its token. ``force`` takes it from another holder.
+    def take(self, client: str, *, force: bool = False, lasts: bool = False) -> str:
+        """Takes the lease and returns its token. ``force`` takes it from another holder. One that ``lasts``
+        does not expire.
 
         Raises LeaseError if another client holds it, InputError if the client's name is empty or too long.
         """
@@ -74,13 +79,16 @@ class Lease:
         holder = self.holder
         if holder is not None and not force:
             left_s = holder.expires_s - self._now()
+            until, advice = f"; it runs out in {left_s:.1f} s unless it is renewed", "wait, or repeat"
+            if self._lasts:
+                until, advice = " as long as the gateway runs", "to stop its axes and take it, repeat"
             raise LeaseError(
-                f"'{holder.client}' holds the right to move; it runs out in {left_s:.1f} s unless it is "
-                f"renewed{self._doing()}; wait, or take it with 'hdbridge ctl lease --force'"
+                f"'{holder.client}' holds the right to move{until}{self._doing()}; {advice} the command with "
+                "--force"
             )
         if holder is not None:
             self._end()
-        self._token, self._client = self._new_token(), client
+        self._token, self._client, self._lasts = self._new_token(), client, lasts
         self._taken_s = self._heard_s = self._now()
         return self._token
 
@@ -121,7 +129,7 @@ class Lease:
         return ended
 
     def _expire(self) -> None:
-        if self._token is not None and self._now() - self._heard_s >= self.timeout_s:
+        if self._token is not None and not self._lasts and self._now() - self._heard_s >= self.timeout_s:
             self._end()
 
     def _doing(self) -> str:

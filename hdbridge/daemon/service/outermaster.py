@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Sequence
-from contextlib import suppress
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -19,7 +18,7 @@ from hdbridge.daemon.loop.states import AxisState
 from hdbridge.daemon.memory import CommandKind, Event, OuterCell, OuterCells, SampleArray
 from hdbridge.daemon.service.timing import POLL_S
 from hdbridge.drive.states import State
-from hdbridge.errors import HdbridgeError, LeaseError
+from hdbridge.errors import HdbridgeError
 from hdbridge.motion import MotionMode
 
 if TYPE_CHECKING:
@@ -76,13 +75,11 @@ class OuterMaster:
         self._token = ""
 
     async def keep(self) -> None:
-        """Takes the lease whenever it is free, and renews it, until cancelled."""
+        """Takes the lease whenever it is free, until cancelled."""
         lease = self._core.lease
         while True:
             if lease.holder is None:
-                self._token = lease.take(self._name)
-            with suppress(LeaseError):
-                lease.renew(self._token)
+                self._token = lease.take(self._name, lasts=True)
             await self._core.timing.sleep(POLL_S)
 
     async def serve(self, axis: ServiceAxis) -> None:

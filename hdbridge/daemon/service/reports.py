@@ -103,7 +103,7 @@ def lease_state(lease: Lease, now_s: float) -> messages.LeaseState:
         held=True,
         client=holder.client,
         since=since,
-        remaining_s=max(holder.expires_s - now_s, 0.0),
+        remaining_s=max(holder.expires_s - now_s, 0.0) if math.isfinite(holder.expires_s) else None,
         timeout_s=lease.timeout_s,
     )
 
