@@ -125,7 +125,7 @@ class BrokenBus(can.BusABC):
         raise can.CanOperationError("network is down")
 
 
-def test_a_drive_whose_bus_is_gone_runs_on_and_gives_up_in_the_end(motor):
+def test_a_drive_without_its_bus_runs_on_and_finally_gives_up(motor):
     clock = VirtualClock()
     with BrokenBus() as bus:
         node = DriveNode(bus, motor, EDS, 1, clock)
