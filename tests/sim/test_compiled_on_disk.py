@@ -55,7 +55,7 @@ def said(program: str, *arguments: object, **environment: str) -> list[str]:
     return done.stdout.splitlines()
 
 
-def test_a_layout_has_the_same_name_in_each_process_and_no_other_has_it(
+def test_layout_names_are_unique_and_stable_between_processes(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(sys, "argv", ["", "16", "32"])

@@ -159,7 +159,7 @@ def check(bench: VcanBench, row: Row, character: Character) -> None:
 
 
 @pytest.mark.parametrize("command", ["step", "run"])
-def test_a_bus_that_another_master_has_is_left_alone(
+def test_a_bus_of_another_master_is_left_alone(
     command: str,
     interface: str,
     profile: Path,
