@@ -1,4 +1,4 @@
-"""A scan finds the nodes of a bus, and leaves everything as it was."""
+"""A scan finds the nodes of a bus and changes nothing."""
 
 from __future__ import annotations
 

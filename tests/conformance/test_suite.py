@@ -1,4 +1,4 @@
-"""The conformance suite: its verdicts are right, it restores what it changes, and power stays off."""
+"""The conformance suite: correct verdicts, restored settings, power off."""
 
 from __future__ import annotations
 

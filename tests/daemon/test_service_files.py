@@ -1,4 +1,4 @@
-"""The files with which systemd runs the daemon: what they say, and that systemd takes them."""
+"""The systemd unit files: content, and acceptance by systemd."""
 
 from __future__ import annotations
 

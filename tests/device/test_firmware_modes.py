@@ -1,4 +1,4 @@
-"""Operating modes: CSP, PP and HM as a master sees them, and what holds for all of them."""
+"""Operating modes CSP, IP, PP and HM as a master sees them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The lockstep bus and the virtual clock: time passes only in waiting, and always the same way."""
+"""The lockstep bus and the virtual clock: deterministic time that passes only while waiting."""
 
 from __future__ import annotations
 

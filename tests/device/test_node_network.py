@@ -1,4 +1,4 @@
-"""NMT, heartbeats, boot-up and what the node ignores."""
+"""NMT, heartbeats, boot-up, and time with and without SYNC."""
 
 from __future__ import annotations
 

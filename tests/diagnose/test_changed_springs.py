@@ -1,4 +1,4 @@
-"""A known spring that has changed is found as such, or told as what else it may be."""
+"""Changed springs are found, or reported with their aliases."""
 
 from __future__ import annotations
 

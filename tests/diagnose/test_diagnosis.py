@@ -1,4 +1,4 @@
-"""Hidden effects are found by their names, and nothing is found where nothing is."""
+"""Hidden effects are named, and a healthy axis yields no finding."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Fast effects are not noise: the floor beside them, their frequency, and decay soon after a stop."""
+"""Fast effects are separated from noise: floor, frequency, and decay after a stop."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A gain is what a hold-out gave; without one there is none, and what does not gain is not offered."""
+"""Gains are validated on held-out data; findings without a gain are not offered."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Causes that cannot be, or cannot be separated, whatever fits: teeth are whole, one speed is one clock."""
+"""Physically impossible or inseparable causes are not named, however well they fit."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The 95 % intervals of parameters hold the truth as often as they say, and are no wider than needed."""
+"""95 % intervals of parameters have their nominal coverage and a reasonable width."""
 
 from __future__ import annotations
 

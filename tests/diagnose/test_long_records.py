@@ -1,4 +1,4 @@
-"""A long record is averaged, and what is fitted to it alike: its figures are those of its samples."""
+"""Averaging a long record keeps the figures of its samples."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A wrong ratio has the same slope over the whole travel; what has it in a part of it only is none."""
+"""A wrong ratio has the same slope over the whole travel."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Seeing: what a residual goes with, and what it does not."""
+"""Views of the residual: its correlation with each coordinate."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""Parts of hardly any sample, as of a task that was interrupted as it began; the motion before a record."""
+"""Parts of few samples, and the motion before a record."""
 
 from __future__ import annotations
 

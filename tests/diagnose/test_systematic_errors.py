@@ -1,4 +1,4 @@
-"""Intervals hold what leaves nothing in a residual: a law of another form, a look-alike that hides beside."""
+"""Intervals include systematic errors: another law, or a hidden look-alike."""
 
 from __future__ import annotations
 

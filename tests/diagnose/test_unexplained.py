@@ -1,4 +1,4 @@
-"""Causes that the catalogue lacks: the smallest visible size, and what must not count as one."""
+"""Causes outside the catalogue: smallest detectable size, and exclusions."""
 
 from __future__ import annotations
 

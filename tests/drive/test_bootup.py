@@ -1,4 +1,4 @@
-"""Booting a drive: what is checked, in which order it is written, and every way it is refused."""
+"""Booting a drive: checks, order of writes, and every refusal."""
 
 from __future__ import annotations
 

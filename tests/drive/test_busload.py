@@ -1,4 +1,4 @@
-"""The load of the bus: bits of a frame by its very worst case, and what a cycle's axes make of it."""
+"""Bus load: worst-case bits of a frame and of a cycle."""
 
 from __future__ import annotations
 

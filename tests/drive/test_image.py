@@ -1,4 +1,4 @@
-"""The process image: layout, scaling with direction, limits, and what reaches the bus."""
+"""The process image: scaling, limits and packed frames."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which PDO carries what, on drives with free, fixed, few and small PDOs."""
+"""PDO layout on drives with free, fixed, few and small PDOs."""
 
 from __future__ import annotations
 

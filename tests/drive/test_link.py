@@ -1,4 +1,4 @@
-"""The link: what it drops, what it raises, and that it never waits for ever."""
+"""The link: dropped frames, errors, bounded waits."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The PDO codec: what goes in comes out, and what does not fit never gets as far as a frame."""
+"""The PDO codec: round trip and rejected values."""
 
 from __future__ import annotations
 

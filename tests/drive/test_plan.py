@@ -1,4 +1,4 @@
-"""The list of what a boot-up writes: values, units, order, and what is refused."""
+"""The boot plan: values, units, order and refusals."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Unwrapping a counter: a wrap has no effect, whatever the path and the width."""
+"""Unwrapping a counter of any width along any path."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Effects combine in a model, and the compensation corrects what it should."""
+"""Effects combined in a model, and their compensation."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""Return-point memory: its figures, and the same law made in another way, of stop operators."""
+"""Return-point memory: its figures, and the equivalent sum of stop operators."""
 
 from itertools import pairwise
 

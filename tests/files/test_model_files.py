@@ -1,4 +1,4 @@
-"""The model file: exact round trip, one exact line for what is wrong, and the binding to its drive."""
+"""The model file: exact round trip, one exact line for errors, binding to its drive."""
 
 # ruff: noqa: E501  (the table of complaints shows each on one line)
 

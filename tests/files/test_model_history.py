@@ -261,7 +261,7 @@ for offset in range(first, 3600):
 
 def test_a_kill_at_any_moment_leaves_a_usable_profile(profile):
     make(profile, 1, 2)
-    for attempt in range(6):
+    for attempt in range(4):
         worker = subprocess.Popen(
             [sys.executable, "-c", WORKER, str(profile), str(3 + 100 * attempt)], stdout=subprocess.PIPE
         )

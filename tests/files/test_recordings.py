@@ -1,4 +1,4 @@
-"""Recording folders: what comes back, what is refused."""
+"""Recording folders: round trip and refusals."""
 
 import numpy as np
 import pytest

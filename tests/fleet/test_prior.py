@@ -1,4 +1,4 @@
-"""The fleet as a prior of one joint: it weighs names that the record supports, and makes none."""
+"""The fleet as a prior of one joint: it weighs supported causes and adds none."""
 
 import json
 import math

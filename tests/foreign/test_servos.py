@@ -12,7 +12,7 @@ from foreign.response import motor_response
 from foreign.servos import INTERPOLATIONS, STRUCTURES, Piv, StateFeedback
 
 FINE = Encoders(1 << 20, 64, 0.0, 1 << 23, 0.0)
-AXES = [(seed, structure) for seed in (1, 2) for structure in STRUCTURES]
+AXES = [(1, structure) for structure in STRUCTURES]
 
 
 @pytest.fixture(params=AXES, ids=[f"{structure}-{seed}" for seed, structure in AXES])
@@ -163,9 +163,9 @@ def test_limits_hold_and_integrators_recover(axis):
 
 @pytest.mark.parametrize("structure", STRUCTURES)
 def test_a_seed_draws_one_axis_within_the_ranges(structure):
-    axes = [draw(seed, structure) for seed in range(8)]
+    axes = [draw(seed, structure) for seed in range(4)]
     assert axes[3] == draw(3, structure)
-    assert len({axis.mechanics for axis in axes}) == 8
+    assert len({axis.mechanics for axis in axes}) == 4
     for axis in axes:
         m, servo = axis.mechanics, axis.servo
         assert 15.0 <= m.held_hz <= 80.0

@@ -1,4 +1,4 @@
-"""A PLC-like master on the outer bus: it gets the load where it asks, and only when it asks."""
+"""A PLC-like master on the outer bus moves the load to its targets, and only on request."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ async def reset(bench):
 
 @pytest.mark.parametrize(
     ("period_ms", "drift_ppm"),
-    [(1, 200), (2, -200), (4, 0), (4, 200), (4, -200), (5, 200), (10, 0), (20, -200)],
+    [(1, 200), (2, -200), (4, 0), (5, 200), (20, -200)],
 )
 def test_the_set_point_is_that_of_a_drive_one_cycle_later(tmp_path, period_ms, drift_ppm):
     """No set-point is lost, at any outer cycle and with 200 ppm of drift."""

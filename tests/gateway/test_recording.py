@@ -1,4 +1,4 @@
-"""A flight recording of a gateway: what the other master asked for on its bus, and what it saw."""
+"""A flight recording of a gateway: requests and statuswords of the other master."""
 
 from __future__ import annotations
 

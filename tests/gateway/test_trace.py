@@ -1,4 +1,4 @@
-"""The doctor of the outer side: what a master configures and gets wrong, from the frames on its bus."""
+"""The doctor of the outer side: configuration and mistakes of a master, from its frames."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Records of made-up axes, written from the formulas: nothing here is shared with what is tested."""
+"""Records of synthetic axes from the formulas, independent of the tested code."""
 
 from __future__ import annotations
 

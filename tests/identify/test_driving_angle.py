@@ -1,4 +1,4 @@
-"""The angle that the hysteresis sees: without chatter, turned round only where the motor turned."""
+"""Driving angle of the hysteresis: without chatter, reversing only with the motor."""
 
 from itertools import accumulate
 

@@ -1,4 +1,4 @@
-"""Fast sweeps of which nothing is said: what they cannot show is left out, and nothing is made up."""
+"""Fast sweeps without segment information: undetermined terms are left out."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""A fit finds what a made-up axis has, and says how well."""
+"""Fits recover the parameters of synthetic axes and their uncertainty."""
 
 from dataclasses import replace
 

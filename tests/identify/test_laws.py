@@ -1,4 +1,4 @@
-"""The law of the loop is the one that predicts what was left out of the fit."""
+"""The hysteresis law is chosen by prediction of held-out data."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Spectra by least squares at the true angles, and which orders a record can tell apart."""
+"""Least-squares spectra at the true angles, and the separability of orders."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Limits of a record: the fit reports what cannot be determined, and does not invent it."""
+"""Limits of a record: undetermined terms are reported, not invented."""
 
 from dataclasses import replace
 

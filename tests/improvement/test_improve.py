@@ -1,4 +1,4 @@
-"""`hdbridge improve` on the simulated drive: what is hidden is named, and the axis points better."""
+"""`hdbridge improve` on the simulated drive: the hidden cause is named and positioning improves."""
 
 import json
 

@@ -1,4 +1,4 @@
-"""Pursuit of positions that somebody else gives: exact if the limits allow it, within them in any case."""
+"""Pursuit of external positions: exact within the limits, limited otherwise."""
 
 from __future__ import annotations
 

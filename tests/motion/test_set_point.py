@@ -1,4 +1,4 @@
-"""Laws of the set-point: whatever is asked of it, in any order."""
+"""Laws of the set-point for any order of requests."""
 
 import math
 

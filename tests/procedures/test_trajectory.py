@@ -1,4 +1,4 @@
-"""An own trajectory: what it is refused for before anything moves, and where it leads."""
+"""User trajectories: refusals before any motion, and execution."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""A fleet of two measured joints: what it says, and what it refuses to say.
+"""A fleet of two measured joints: supported and refused statements.
 
 Four one-way moves of a second each, all within minutes: nothing can have changed, so nobody is to be listed.
 """

@@ -1,4 +1,4 @@
-"""`hdbridge fit` on short records of other benches: refused, or fitted with what is not known said once."""
+"""`hdbridge fit` on short foreign records: refused, or fitted with its limits reported once."""
 
 from __future__ import annotations
 

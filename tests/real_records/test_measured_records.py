@@ -1,4 +1,4 @@
-"""Records that other people measured: is what is in them named, and does it hold on what was left out?
+"""Published measurements: causes are named and hold on held-out data.
 
 The records are not part of the project (licences; docs/real-records.md names the sources). They are looked
 for in the folder that HDBRIDGE_REAL_RECORDS names, else beside the repository; without them these tests are

@@ -1,4 +1,4 @@
-"""A short move one way is never given a confident name: place, time, speed and torque go together in it."""
+"""A short one-way move yields no confident cause: place, time, speed and torque coincide."""
 
 from __future__ import annotations
 

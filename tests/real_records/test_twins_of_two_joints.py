@@ -1,4 +1,4 @@
-"""Agreement of a simulated drive with two robot joints that somebody else measured.
+"""Agreement of a simulated drive with two published robot joints.
 
 The records are looked for as in `test_measured_records.py`; without them these tests are skipped.
 """

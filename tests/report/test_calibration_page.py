@@ -1,4 +1,4 @@
-"""The page of a calibration shows what was found, and what could not be."""
+"""The calibration page shows the result and its limits."""
 
 import dataclasses
 import json

@@ -1,4 +1,4 @@
-"""Charts are enlarged by keyboard, touch and buttons. Asked of a real browser where there is one."""
+"""Charts are zoomed by keyboard, touch and buttons, in a real browser."""
 
 import json
 import re

@@ -1,4 +1,4 @@
-"""The page of a diagnosis says what was found, shows it where it lives, and tells what to do."""
+"""The diagnosis page shows findings, their charts and the remedy."""
 
 import dataclasses
 import html

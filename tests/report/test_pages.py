@@ -1,4 +1,4 @@
-"""Pages open without a network, hold what they were given, and cannot be broken out of by it."""
+"""Pages work offline, keep their data and escape it."""
 
 import hashlib
 import json

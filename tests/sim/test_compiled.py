@@ -1,4 +1,4 @@
-"""The compiled axis says what the one in Python says, bit for bit, whatever the truth file says."""
+"""The compiled axis equals the Python one bit for bit for any truth file."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Truth files: what the simulated axis is, read strictly."""
+"""Truth files, read strictly."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The cycle's link on a real socket: what vcan, vxcan and slcan do to it."""
+"""The cycle's link on real sockets: vcan, vxcan and slcan."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Every fault that `drive.fault` knows, by what a program on the bus then sees."""
+"""Every fault of `drive.fault`, by its effect on the bus."""
 
 from __future__ import annotations
 
@@ -373,7 +373,7 @@ def test_a_fault_impossible_on_the_bus_is_refused(name):
         drive.fault(name, after_s=0.1)
 
 
-# ------------------------------------------------------------------ when
+# ------------------------------------------------------------------ time and angle of a fault
 
 
 def test_a_fault_starts_and_ends_at_its_time(drive, program):

@@ -1,4 +1,4 @@
-"""A twin is fitted to what an axis does, states its certainty, and says what has changed since."""
+"""A twin is fitted to an axis, states its uncertainty, and detects changes."""
 
 from __future__ import annotations
 

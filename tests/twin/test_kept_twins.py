@@ -1,4 +1,4 @@
-"""Twins of a profile: pending until committed, kept, undone; and used wherever an axis is simulated."""
+"""Twins of a profile: pending, committed, rolled back, and used by the simulated axis."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The table of what a twin may change."""
+"""The table of a twin's adjustable parameters."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Thermal constants are learned from a warm-up, and stay as they were where nothing shows them."""
+"""Thermal constants are learned from a warm-up and otherwise unchanged."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Models as truth files: the simulated drive then errs as the model says."""
+"""Models as truth files: the simulated drive errs like the model."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""WebSocket clients that die, break off or talk nonsense: no traceback in the log, and the server goes on."""
+"""WebSocket clients that die or send garbage cause no traceback and do not stop the server."""
 
 from __future__ import annotations
 

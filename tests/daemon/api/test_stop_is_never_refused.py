@@ -1,4 +1,4 @@
-"""Stopping has room of its own: whatever other clients hold open, half send or never read."""
+"""Stop requests get through despite other connections, half requests and unread answers."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Recovery from a fault, its reports, and the axes that go on. `test_reliability` has each fault itself."""
+"""Recovery from faults, their reports, and the unaffected axes. `test_reliability` has each fault."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The control process itself: it begins, and ends in order for whoever asks."""
+"""The control process: start and orderly end."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Every fault of the reliability table on the daemon, two axes in motion: who stops, how soon, for good."""
+"""Every fault of the reliability table on the daemon with two axes in motion."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The table of states by itself: what it promises whatever the rows are."""
+"""Properties of the state table."""
 
 from __future__ import annotations
 

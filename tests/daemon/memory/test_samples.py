@@ -1,4 +1,4 @@
-"""The ring of samples: what is written is read, once, whole, in order, and what is lost is counted."""
+"""The sample ring: samples are read once, whole and in order; lost ones are counted."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A keeper whose children stand in for the real ones."""
+"""A keeper with stand-ins for its children."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The whole daemon on simulated drives: started, asked, and what becomes of its processes."""
+"""The whole daemon on simulated drives: start, requests, killed processes, end."""
 
 from __future__ import annotations
 

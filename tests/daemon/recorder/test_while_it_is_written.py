@@ -1,4 +1,4 @@
-"""Whoever reads a folder in which the recorder is at work: files are renamed and removed at any moment."""
+"""Reading a folder while the recorder renames and removes its files."""
 
 from __future__ import annotations
 

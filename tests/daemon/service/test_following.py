@@ -1,4 +1,4 @@
-"""Watch and adaptation behind the service: what is adapted, the control process compensates by."""
+"""Watch and adaptation behind the service."""
 
 from __future__ import annotations
 
