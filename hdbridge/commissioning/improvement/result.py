@@ -1,7 +1,5 @@
 """Result of an improvement as plain values; `Improvement.as_dict` is the JSON document."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
