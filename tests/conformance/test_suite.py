@@ -1,7 +1,5 @@
 """The conformance suite: its verdicts are right, it restores what it changes, and power stays off."""
 
-from __future__ import annotations
-
 import json
 import logging
 

@@ -1,7 +1,5 @@
 """The files with which systemd runs the daemon: what they say, and that systemd takes them."""
 
-from __future__ import annotations
-
 import configparser
 import shutil
 import subprocess

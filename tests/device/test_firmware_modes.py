@@ -1,7 +1,5 @@
 """Operating modes: CSP, PP and HM as a master sees them, and what holds for all of them."""
 
-from __future__ import annotations
-
 import struct
 
 import pytest

@@ -1,7 +1,5 @@
 """The lockstep bus and the virtual clock: time passes only in waiting, and always the same way."""
 
-from __future__ import annotations
-
 import struct
 from pathlib import Path
 

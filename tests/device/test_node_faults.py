@@ -1,7 +1,5 @@
 """The hooks with which a test makes the drive misbehave."""
 
-from __future__ import annotations
-
 import struct
 
 import pytest

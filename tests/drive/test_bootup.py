@@ -1,7 +1,5 @@
 """Booting a drive: what is checked, in which order it is written, and every way it is refused."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The load of the bus: bits of a frame by its very worst case, and what a cycle's axes make of it."""
 
-from __future__ import annotations
-
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st

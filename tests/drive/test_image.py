@@ -1,7 +1,5 @@
 """The process image: layout, scaling with direction, limits, and what reaches the bus."""
 
-from __future__ import annotations
-
 import math
 import struct
 from collections.abc import Callable

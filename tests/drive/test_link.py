@@ -1,7 +1,5 @@
 """The link: what it drops, what it raises, and that it never waits for ever."""
 
-from __future__ import annotations
-
 import errno
 import sys
 import time

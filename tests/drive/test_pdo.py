@@ -1,7 +1,5 @@
 """The PDO codec: what goes in comes out, and what does not fit never gets as far as a frame."""
 
-from __future__ import annotations
-
 import math
 import struct
 

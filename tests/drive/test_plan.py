@@ -1,7 +1,5 @@
 """The list of what a boot-up writes: values, units, order, and what is refused."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Unwrapping a counter: a wrap has no effect, whatever the path and the width."""
 
-from __future__ import annotations
-
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st

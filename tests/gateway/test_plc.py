@@ -1,7 +1,5 @@
 """A PLC-like master on the outer bus: it gets the load where it asks, and only when it asks."""
 
-from __future__ import annotations
-
 import shutil
 import struct
 

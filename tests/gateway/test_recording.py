@@ -1,7 +1,5 @@
 """A flight recording of a gateway: what the other master asked for on its bus, and what it saw."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from support.gateway import COUNTS_PER_DEG, gateway_bench, swing

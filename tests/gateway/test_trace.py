@@ -1,7 +1,5 @@
 """The doctor of the outer side: what a master configures and gets wrong, from the frames on its bus."""
 
-from __future__ import annotations
-
 import struct
 
 import can

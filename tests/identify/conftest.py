@@ -1,7 +1,5 @@
 """Records of made-up axes, written from the formulas: nothing here is shared with what is tested."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The law of the loop is the one that predicts what was left out of the fit."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Pursuit of positions that somebody else gives: exact if the limits allow it, within them in any case."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

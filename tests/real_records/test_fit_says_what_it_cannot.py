@@ -1,7 +1,5 @@
 """`hdbridge fit` on short records of other benches: refused, or fitted with what is not known said once."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """A short move one way is never given a confident name: place, time, speed and torque go together in it."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

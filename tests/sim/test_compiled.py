@@ -1,7 +1,5 @@
 """The compiled axis says what the one in Python says, bit for bit, whatever the truth file says."""
 
-from __future__ import annotations
-
 import random
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """The cycle's link on a real socket: what vcan, vxcan and slcan do to it."""
 
-from __future__ import annotations
-
 import os
 import select
 import subprocess

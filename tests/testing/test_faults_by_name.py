@@ -1,7 +1,5 @@
 """Every fault that `drive.fault` knows, by what a program on the bus then sees."""
 
-from __future__ import annotations
-
 import struct
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The blind suites: what is made, what it is judged by, and what is printed."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import sys

@@ -1,7 +1,5 @@
 """WebSocket clients that die, break off or talk nonsense: no traceback in the log, and the server goes on."""
 
-from __future__ import annotations
-
 import base64
 import logging
 import os

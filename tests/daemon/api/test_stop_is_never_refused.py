@@ -1,7 +1,5 @@
 """Stopping has room of its own: whatever other clients hold open, half send or never read."""
 
-from __future__ import annotations
-
 import socket
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """The end: every axis at rest without power, whatever it was doing, and nobody is waited for for ever."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

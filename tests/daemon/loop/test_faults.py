@@ -1,7 +1,5 @@
 """Recovery from a fault, its reports, and the axes that go on. `test_reliability` has each fault itself."""
 
-from __future__ import annotations
-
 import errno
 import struct
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """The control process itself: it begins, and ends in order for whoever asks."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """Every fault of the reliability table on the daemon, two axes in motion: who stops, how soon, for good."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import pytest

@@ -1,7 +1,5 @@
 """The table of states by itself: what it promises whatever the rows are."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

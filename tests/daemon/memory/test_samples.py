@@ -1,7 +1,5 @@
 """The ring of samples: what is written is read, once, whole, in order, and what is lost is counted."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

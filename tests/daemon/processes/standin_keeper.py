@@ -1,7 +1,5 @@
 """A keeper whose children stand in for the real ones."""
 
-from __future__ import annotations
-
 import os
 import sys
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The whole daemon on simulated drives: started, asked, and what becomes of its processes."""
 
-from __future__ import annotations
-
 import os
 import signal
 import stat

@@ -1,7 +1,5 @@
 """The keeper with children that stand in for the real ones: who dies, hangs or is told to end."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal

@@ -1,7 +1,5 @@
 """Whoever reads a folder in which the recorder is at work: files are renamed and removed at any moment."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from pathlib import Path
