@@ -6,12 +6,11 @@ are printed); 7 the daemon cannot be reached, or refuses this client now; 130 Ct
 the record kept).
 """
 
-from __future__ import annotations
-
 import errno
 import io
 import os
 import sys
+from collections.abc import Callable
 from functools import cache
 from importlib import import_module
 from pathlib import Path
@@ -83,20 +82,32 @@ PANELS: Final = {
 }
 """Every command under its heading in `hdbridge --help`, with its summary there.
 
-The command is the file of that name in this folder, with the same summary. It is imported only for its own
-help or to be run, and it imports what it computes with when it runs.
+A command is the file of that name in this folder: the function ``command``, with the same summary, or the
+functions in ``COMMANDS``. It is imported only for its own help or to be run, and it imports what it computes
+with when it runs.
 """
+SIGNED: Final = {"move", "sdo set", "ctl move", "ctl jog", "ctl queue", "ctl set"}
+"""Commands with a number that may be negative and would otherwise be taken for an option."""
 
 
 def load(name: str) -> typer.Typer:
     """Imports a command; returns an app with only that command, which checks its outputs before it runs."""
+    module = import_module(f"{__name__}.{name.replace('-', '_')}")
     guarded = import_module(f"{__name__}.outputs").guarded
     loaded = typer.Typer(rich_markup_mode="markdown")
-    import_module(f"{__name__}.{name.replace('-', '_')}").register(loaded)
-    groups = (each.typer_instance for each in loaded.registered_groups)
-    for each in (loaded, *(group for group in groups if group is not None)):
-        for command in each.registered_commands:
-            command.callback = guarded(command.callback)
+
+    def add(group: typer.Typer, called: str, path: str, function: Callable[..., None]) -> None:
+        settings = {"ignore_unknown_options": True} if path in SIGNED else None
+        group.command(called, context_settings=settings)(guarded(function))
+
+    if hasattr(module, "command"):
+        add(loaded, name, name, module.command)
+        return loaded
+    summary = next(commands[name] for commands in PANELS.values() if name in commands)
+    group = typer.Typer(help=summary, no_args_is_help=True, rich_markup_mode="markdown")
+    for each, function in module.COMMANDS.items():
+        add(group, each, f"{name} {each}", function)
+    loaded.add_typer(group, name=name)
     return loaded
 
 

@@ -6,17 +6,8 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import typer
-from rich.markup import escape
-
 from hdbridge.cli.measuring import PlanOption, out_option, resume_option
-from hdbridge.cli.options import (
-    HtmlOption,
-    JsonOption,
-    console,
-    notes,
-    write_json,
-)
+from hdbridge.cli.options import HtmlOption, JsonOption, note, say, write_json
 from hdbridge.cli.session import Session, on_axis
 from hdbridge.errors import InputError
 from hdbridge.files.outputs import Kind
@@ -25,11 +16,7 @@ if TYPE_CHECKING:
     from hdbridge.commissioning.calibration import Calibration
 
 
-def register(app: typer.Typer) -> None:
-    """Adds the command."""
-    app.command("calibrate")(on_axis(command))
-
-
+@on_axis
 def command(
     session: Session,
     plan: PlanOption = "quick",
@@ -65,7 +52,7 @@ def command(
                 work.date,
                 progress=progress,
                 interrupted=interrupted,
-                tell=lambda line: notes.print(escape(line)),
+                tell=note,
             )
     report(result, work.folder, session, json_file, html_file)
 
@@ -85,6 +72,6 @@ def report(
     write_json(json_file, result.as_dict())
     write_calibration_page(page, result)
     print_calibration(result)
-    console.print(f"\nrecording: {folder}", soft_wrap=True)
+    say(f"\nrecording: {folder}")
     print_page(page)
     print_next(result.offer, session)

@@ -9,12 +9,13 @@ from typing import TYPE_CHECKING
 from rich.markup import escape
 from rich.table import Table
 
-from hdbridge.cli.options import console, print_table, write_result
+from hdbridge.cli.options import figures_table, print_table, say, write_result
 
 if TYPE_CHECKING:
     from hdbridge.cli.session import Session
     from hdbridge.commissioning.calibration import Calibration, Stepped, Validation
     from hdbridge.commissioning.calibration.result import Offer
+    from hdbridge.commissioning.evaluation.stepping import Scatter
 
 TAKEN_OFF = 0.95
 """Terms fitted in addition to the model (a delay, load orders) are reported if they reduce the residual to
@@ -56,21 +57,16 @@ def print_calibration(result: Calibration) -> None:
     apart = ""
     if noise.fitted_arcsec < TAKEN_OFF * noise.residual_arcsec:
         apart = f"; {noise.fitted_arcsec:.2f} with what was fitted in addition to the model taken off"
-    console.print(
-        f"noise at rest {standing}, residual {noise.residual_arcsec:.2f} arcsec rms{apart}", soft_wrap=True
-    )
-    console.print(f"held out: {escape(fit.held_out.text)}", soft_wrap=True)
+    say(f"noise at rest {standing}, residual {noise.residual_arcsec:.2f} arcsec rms{apart}")
+    say(f"held out: {fit.held_out.text}")
     if len(result.drift) > 1:
         errors = [error for _, error in result.drift]
-        console.print(
-            f"reference pose: {max(errors) - min(errors):.2f} arcsec of drift over {len(errors)} visits",
-            soft_wrap=True,
-        )
+        say(f"reference pose: {max(errors) - min(errors):.2f} arcsec of drift over {len(errors)} visits")
     for test in fit.residual_tests:
         if not test.passed:
-            console.print(f"residual: {escape(test.text)}", soft_wrap=True)
+            say(f"residual: {test.text}")
     for warning in fit.warnings:
-        console.print(f"note: {escape(warning)}", soft_wrap=True)
+        say(f"note: {warning}")
     if result.validation:
         print_stepping(result.validation)
     if result.motion:
@@ -78,9 +74,7 @@ def print_calibration(result: Calibration) -> None:
 
         print_motion(result.motion)
     if result.offer:
-        console.print(
-            escape(result.offer.reason), style=None if result.offer.made else "bold", soft_wrap=True
-        )
+        say(result.offer.reason, style=None if result.offer.made else "bold")
 
 
 def write_calibration_page(path: Path, result: Calibration) -> None:
@@ -93,7 +87,7 @@ def write_calibration_page(path: Path, result: Calibration) -> None:
 
 def print_page(path: Path) -> None:
     """Prints the path of the page."""
-    console.print(f"report: {path}", soft_wrap=True)
+    say(f"report: {path}")
 
 
 def print_next(offer: Offer | None, session: Session) -> None:
@@ -102,10 +96,7 @@ def print_next(offer: Offer | None, session: Session) -> None:
         folder = session.files.axis.parent
         daemon = f"hdbridge ctl model {session.axis.name} pending"
         use = daemon if session.borrow else f"hdbridge model commit {folder}"
-        console.print(
-            f"pending: {offer.pending}\nreview it: hdbridge model diff {folder}\nuse it: {use}",
-            soft_wrap=True,
-        )
+        say(f"pending: {offer.pending}\nreview it: hdbridge model diff {folder}\nuse it: {use}")
 
 
 def _title(result: Calibration) -> str:
@@ -119,26 +110,23 @@ def print_stepping(checked: Validation) -> None:
     print_worse("stepping", checked.worse)
     _print_accuracy(checked)
     for line in checked.survived:
-        console.print(f"note: {escape(line)}", soft_wrap=True)
+        say(f"note: {line}")
     floor = checked.floor
-    console.print(
+    say(
         f"best possible on this axis: {floor.three_sigma_arcsec:.2f} arcsec; new model: "
-        f"{checked.after.pooled.three_sigma_arcsec / floor.three_sigma_arcsec:.2f} times that",
-        soft_wrap=True,
+        f"{checked.after.pooled.three_sigma_arcsec / floor.three_sigma_arcsec:.2f} times that"
     )
 
 
 def print_steps(title: str, tests: Iterable[Stepped]) -> None:
     """Prints scatter and mean of stepping tests, one line each."""
-    from hdbridge.cli.scattertable import print_scatter
-
     print_scatter(title, "with", ((each.model, (each.cw, each.ccw, each.pooled)) for each in tests))
 
 
 def print_worse(test: str, ways: Iterable[str]) -> None:
     """Prints what got worse in one direction."""
     for each in ways:
-        console.print(f"{test}: {each}", style="bold", soft_wrap=True)
+        say(f"{test}: {each}", style="bold")
 
 
 def _print_accuracy(checked: Validation) -> None:
@@ -146,15 +134,24 @@ def _print_accuracy(checked: Validation) -> None:
     rows = [(model, each) for model, each in found if each is not None]
     if not rows:
         return
-    table = Table(
-        title=f"Positioning test (ISO 230-2), arcsec: {rows[0][1].targets} targets, {rows[0][1].runs} "
+    table = figures_table(
+        f"Positioning test (ISO 230-2), arcsec: {rows[0][1].targets} targets, {rows[0][1].runs} "
         "approaches from each side",
-        title_justify="left",
+        "with",
+        *("accuracy\nA", "repeatability\nR", "reversal\nB", "systematic\nE", "range\nM"),
     )
-    table.add_column("with")
-    for name in ("accuracy\nA", "repeatability\nR", "reversal\nB", "systematic\nE", "range\nM"):
-        table.add_column(name, justify="right")
     for model, each in rows:
         figures = (each.accuracy, each.repeatability, each.reversal, each.systematic, each.range)
         table.add_row(model, *(f"{value:z.2f}" for value in figures))
+    print_table(table)
+
+
+def print_scatter(
+    title: str, first: str, rows: Iterable[tuple[str, tuple[Scatter, Scatter, Scatter]]]
+) -> None:
+    """Prints a line for each test: its name in the column ``first``, then its CW, CCW and pooled figures."""
+    table = figures_table(title, first, *("CW 3σ", "mean", "CCW 3σ", "mean", "pooled 3σ", "mean"))
+    for name, parts in rows:
+        figures = (value for part in parts for value in (part.three_sigma_arcsec, part.mean_arcsec))
+        table.add_row(name, *(f"{value:z.2f}" for value in figures))
     print_table(table)

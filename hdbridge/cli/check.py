@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from hdbridge.cli.options import JsonOption, ModelOption, console, notes, write_json
+from hdbridge.cli.options import JsonOption, ModelOption, note, say, write_json
 from hdbridge.errors import InputError
 from hdbridge.files.profile import Profile
 
@@ -25,12 +25,7 @@ CheckedArgument = Annotated[
 ]
 
 
-def register(app: typer.Typer) -> None:
-    """Adds the command."""
-    app.command("check")(check)
-
-
-def check(profile: CheckedArgument, model: ModelOption = None, json_file: JsonOption = None) -> None:
+def command(profile: CheckedArgument, model: ModelOption = None, json_file: JsonOption = None) -> None:
     """Check the files of an axis or of a machine; report what they mean, or what is wrong and where."""
     from hdbridge.axis import AxisConfig
     from hdbridge.daemon.machine import Machine, machine_file
@@ -56,7 +51,7 @@ def check(profile: CheckedArgument, model: ModelOption = None, json_file: JsonOp
     write_json(json_file, document)
     for report in reports:
         report.print()
-    console.print("all right")
+    say("all right")
 
 
 def _check_bus(bus: BusConfig, where: str) -> None:
@@ -65,7 +60,7 @@ def _check_bus(bus: BusConfig, where: str) -> None:
 
     check_interface(bus.interface, f"{where}.interface")
     if absent := absent_interface(bus):
-        notes.print(f"note: {where}.channel: {absent}", markup=False, soft_wrap=True)
+        note(f"note: {where}.channel: {absent}")
 
 
 def _existing(path: Path) -> Path | None:
@@ -93,7 +88,7 @@ def _of_machine(machine: Machine) -> dict[str, str]:
 
 def _print(facts: dict[str, str]) -> None:
     for name, value in facts.items():
-        console.print(f"{name:>20}  {value}")
+        say(f"{name:>20}  {value}")
 
 
 class _Report:
@@ -153,6 +148,6 @@ class _Report:
         _print(self.facts)
         for name, rows in self.rows.items():
             for row in rows:
-                console.print(f"{name:>20}  {row}", markup=False, soft_wrap=True)
+                say(f"{name:>20}  {row}")
         if self.remark:
-            notes.print(self.remark, markup=False, soft_wrap=True)
+            note(self.remark)

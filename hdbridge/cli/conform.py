@@ -10,6 +10,7 @@ import typer
 from rich.table import Table
 
 from hdbridge.cli.options import (
+    BitrateOption,
     BorrowOption,
     ForceOption,
     GatewayAxisOption,
@@ -17,7 +18,7 @@ from hdbridge.cli.options import (
     SeedOption,
     SimulateOption,
     TruthOption,
-    notes,
+    note,
     print_table,
     progress_bar,
     write_json,
@@ -29,12 +30,7 @@ if TYPE_CHECKING:
     from hdbridge.conformance import Check, Result
 
 
-def register(app: typer.Typer) -> None:
-    """Adds the command."""
-    app.command("conform")(conform)
-
-
-def conform(
+def command(
     profile: Annotated[
         str | None,
         typer.Argument(
@@ -50,10 +46,7 @@ def conform(
     channel: Annotated[
         str | None, typer.Option("--channel", help="Channel of the bus, for example can0.")
     ] = None,
-    bitrate_bps: Annotated[
-        int | None,
-        typer.Option("--bitrate", min=10_000, max=1_000_000, help="Bit rate, if the interface sets it."),
-    ] = None,
+    bitrate_bps: BitrateOption = None,
     node_id: Annotated[
         int | None, typer.Option("--node", min=1, max=127, help="Node id; else the axis file's.")
     ] = None,
@@ -246,6 +239,4 @@ def _print(results: Sequence[Result]) -> None:
         if each.verdict is Verdict.NOT_APPLICABLE:
             reasons[each.found] = reasons.get(each.found, 0) + 1
     for reason, count in reasons.items():
-        notes.print(
-            f"not applicable, {count} check{'s' * (count > 1)}: {reason}", markup=False, soft_wrap=True
-        )
+        note(f"not applicable, {count} check{'s' * (count > 1)}: {reason}")

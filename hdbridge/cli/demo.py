@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from hdbridge.cli.options import console, write_json
+from hdbridge.cli.options import say, write_json
 from hdbridge.cli.session import Session
 from hdbridge.files.atomic import make_folder, new_folder
 from hdbridge.files.outputs import Kind
@@ -16,12 +16,7 @@ if TYPE_CHECKING:
     from hdbridge.commissioning.evaluation.comparison import Comparison
 
 
-def register(app: typer.Typer) -> None:
-    """Adds the command."""
-    app.command("demo")(demo)
-
-
-def demo(
+def command(
     out: Annotated[
         Path | None,
         typer.Option("--out", metavar="FOLDER", help="Where the results go; else demo-output, numbered."),
@@ -57,7 +52,4 @@ def demo(
         record=folder,
         tell=tell,
     )
-    console.print(
-        f"\nopen {folder / 'stepping.html'} in a browser for the picture; next: docs/tutorial.md",
-        soft_wrap=True,
-    )
+    say(f"\nopen {folder / 'stepping.html'} in a browser for the picture; next: docs/tutorial.md")

@@ -15,15 +15,17 @@ from hdbridge.cli.flights import AxisOption, FromOption, ToOption, is_flight, re
 from hdbridge.cli.options import (
     ColumnsOption,
     HtmlOption,
+    IndependentZerosOption,
     JsonOption,
     UnitsOption,
     UnwrapOption,
-    console,
+    figures_table,
     load_recordings,
     model_file,
     need_extra,
-    notes,
+    note,
     print_table,
+    say,
     write_json,
     write_result,
 )
@@ -39,12 +41,7 @@ WORTH_TELLING = 0.01
 """Minimum share of the difference for a coordinate to be printed."""
 
 
-def register(app: typer.Typer) -> None:
-    """Adds the command."""
-    app.command("diagnose")(run)
-
-
-def run(
+def command(
     records: Annotated[
         list[Path] | None,
         typer.Argument(
@@ -75,10 +72,7 @@ def run(
         typer.Option("--extend", metavar="NEW_MODEL.yaml", help="Write the extended model."),
         Kind.MODEL,
     ] = None,
-    independent_zeros: Annotated[
-        bool,
-        typer.Option("--independent-zeros", help="The encoders' zeros were lost between the records."),
-    ] = False,
+    independent_zeros: IndependentZerosOption = False,
     prior: Annotated[
         Path | None,
         typer.Option(
@@ -149,13 +143,13 @@ def run(
     if flown is not None:
         recordings[flights[0]] = flown
         for each in remarks(flown):
-            notes.print(each)
+            note(each)
     result = diagnose(
         recordings,
         known,
         independent_zeros=independent_zeros,
         prior=_prior(prior, group or []),
-        progress=lambda words: notes.print(f"{words} ..."),
+        progress=lambda words: note(f"{words} ..."),
     )
     recording = Recording.joined(list(recordings.values()))
     options = {"--columns": columns, "--units": units, "--unwrap": unwrap}
@@ -203,7 +197,7 @@ def _prior(path: Path | None, groups: Sequence[str]) -> Prior | None:
 
 def print_diagnosis(result: Diagnosis) -> None:
     """Prints verdict, findings, next experiments, and causes that were not named."""
-    _say(result.verdict())
+    say(result.verdict())
     if result.findings:
         table = Table("cause", "probability", "size, arcsec", "held out, arcsec rms")
         for each in result.findings:
@@ -216,9 +210,9 @@ def print_diagnosis(result: Diagnosis) -> None:
         print_table(table)
     for each in result.findings:
         for line in _details(each):
-            _say(line)
+            say(line)
     for remark in (*result.remarks, *(f"not named: {each}" for each in result.considered)):
-        notes.print(remark, markup=False, soft_wrap=True)
+        note(remark)
 
 
 def _details(finding: Finding) -> Iterator[str]:
@@ -244,16 +238,9 @@ def _number(parameter: Parameter) -> str:
     return f"{parameter.value:.4g} ({low} to {high}) {parameter.unit}".rstrip()
 
 
-def _say(line: str) -> None:
-    """Prints a line unwrapped and without markup."""
-    console.print(line, markup=False, soft_wrap=True)
-
-
 def _print_figures(result: Diagnosis) -> None:
-    table = Table(title="model and measurement, arcsec", title_justify="left")
-    table.add_column("")
-    for name in ("as given, rms", "3σ", "extended, rms", "3σ"):
-        table.add_column(name, justify="right")
+    columns = ("as given, rms", "3σ", "extended, rms", "3σ")
+    table = figures_table("model and measurement, arcsec", "", *columns)
     rows = {"overall": (result.baseline, result.extended), **result.by_kind}
     for name, pair in rows.items():
         figures = [value for each in pair for value in (each.rms_arcsec, each.three_sigma_arcsec)]
@@ -263,10 +250,7 @@ def _print_figures(result: Diagnosis) -> None:
 
 def _print_shares(shares: dict[str, dict[str, float]]) -> None:
     ranked = sorted(shares.items(), key=lambda each: -each[1]["share_of_baseline"])
-    table = Table(title="share of the difference that goes with", title_justify="left")
-    table.add_column("")
-    for name in ("as given", "extended"):
-        table.add_column(name, justify="right")
+    table = figures_table("share of the difference that goes with", "", "as given", "extended")
     for name, each in ranked:
         if max(each.values()) >= WORTH_TELLING:
             table.add_row(name, *(f"{100.0 * value:.1f} %" for value in each.values()))
@@ -293,7 +277,7 @@ def _provenance(recording: Recording, records: Sequence[Path], model: Path) -> l
 
 
 def _print_plan(report: dict[str, Any]) -> None:
-    _say(report["record"]["sentence"].replace("record", "plan", 1))
+    say(report["record"]["sentence"].replace("record", "plan", 1))
     table = Table("cause", "detected from", "not distinguished from")
     for name, each in report["identifiability"].items():
         limit = each["detection_limit_arcsec"]
@@ -302,5 +286,5 @@ def _print_plan(report: dict[str, Any]) -> None:
         )
         table.add_row(name, words, ", ".join(each["aliases"]))
     print_table(table)
-    for note in report["notes"]:
-        notes.print(note, markup=False, soft_wrap=True)
+    for each in report["notes"]:
+        note(each)

@@ -2,20 +2,15 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
 
 from hdbridge.cli.interrupt import deferred_interrupt
-from hdbridge.cli.options import (
-    JsonOption,
-    console,
-    notes,
-    write_json,
-)
+from hdbridge.cli.options import JsonOption, console, note, say, write_json
 from hdbridge.cli.session import Session, on_axis
 from hdbridge.commissioning.bringup import TORQUE_PERCENT
-from hdbridge.commissioning.bringup.checks import Outcome
+from hdbridge.commissioning.bringup.checks import Check, Outcome, Verdict, failed, not_possible, passed
 from hdbridge.errors import DriveError
 
 if TYPE_CHECKING:
@@ -40,12 +35,8 @@ DECLINED = "motion was not confirmed (on a terminal: answer y; in a script: --ye
 LEFT_OUT = "left out by --no-motion"
 
 
-def register(app: typer.Typer) -> None:
-    """Adds the command."""
-    app.command("doctor")(on_axis(doctor))
-
-
-def doctor(
+@on_axis
+def command(
     session: Session,
     torque_percent: Annotated[
         float,
@@ -78,7 +69,6 @@ def doctor(
     Exit status 0 if all checks passed, 4 if one failed or motion was not confirmed, 2 if the first failure
     is a file, 3 if it is the bus. This is not a safety function: the emergency stop must be in hardware.
     """
-    from hdbridge.cli.servo import SERVO
     from hdbridge.commissioning.bringup.checks import run_checks
     from hdbridge.commissioning.bringup.context import BringUpContext
     from hdbridge.commissioning.bringup.doctor import CHECKS
@@ -122,21 +112,56 @@ def doctor(
         )
     if refused:
         raise DriveError(f"{files.axis}: {DECLINED}")
-    console.print("all right" if motion else "all right, as far as it can be checked without motion")
+    say("all right" if motion else "all right, as far as it can be checked without motion")
 
 
 def _confirm(torque_percent: float, servo: bool) -> bool:
     if servo:
-        notes.print(_FAST)
+        note(_FAST)
     try:
         return typer.confirm(_WARNING.format(torque=torque_percent), err=True)
     except typer.Abort:  # no terminal, or end of input
-        notes.print("")
+        note("")
         return False
 
 
 def _tell(row: Row[BringUpContext]) -> None:
     console.print(f"{_MARKS[row.verdict.outcome]}  {row.check.title:<25}", end=" ")
-    console.print(row.verdict.measured, markup=False, soft_wrap=True)
+    say(row.verdict.measured)
     for remedy in row.verdict.remedies:
-        console.print(f"              -> {remedy}", markup=False, soft_wrap=True)
+        say(f"              -> {remedy}")
+
+
+def _servo_as_measured(context: BringUpContext) -> Verdict:
+    """Runs the axis at constant speeds without and with its correction, and compares the response.
+
+    The response in motion is the one that the model holds.
+    """
+    from hdbridge.axis.model import TransmissionModel
+    from hdbridge.commissioning.calibration.motion import servo_check
+
+    path = context.axis.path.with_name("model.yaml")
+    model = TransmissionModel.load(path) if path.exists() else None
+    if model is None or model.response is None:
+        return not_possible("there is no model with a response in motion: hdbridge motion --propose")
+    with context.interruptible() as interrupted:
+        found = servo_check(context.boot(), model, interrupted)
+    text = (
+        f"following lag {found.lag_ms:.1f} ms, {found.stored_lag_ms:.1f} when it was measured; "
+        f"responses differ by {100.0 * found.difference:.0f} %"
+    )
+    figures = {
+        "following_lag_ms": found.lag_ms,
+        "stored_following_lag_ms": found.stored_lag_ms,
+        "difference": found.difference,
+    }
+    if found.agrees:
+        return passed(text, **figures)
+    return failed(
+        text, "restore the gains of the servo, or measure it again: hdbridge motion --propose", **figures
+    )
+
+
+SERVO: Final[Check[Any]] = Check(
+    "servo", "servo as measured", _servo_as_measured, ("turn", "quick_stop", "off"), moves=True
+)

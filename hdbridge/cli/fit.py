@@ -1,7 +1,5 @@
 """``hdbridge fit``: a model from recordings alone, hdbridge's own or any CSV files."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
 
@@ -10,23 +8,19 @@ import typer
 from hdbridge.cli.options import (
     ColumnsOption,
     HtmlOption,
+    IndependentZerosOption,
     JsonOption,
     UnitsOption,
     UnwrapOption,
-    console,
     load_recordings,
     model_file,
+    say,
     write_json,
     write_result,
 )
 from hdbridge.errors import InputError
 from hdbridge.files.outputs import Kind
 from hdbridge.files.profile import Profile
-
-
-def register(app: typer.Typer) -> None:
-    """Adds the command."""
-    app.command("fit")(command)
 
 
 def command(
@@ -53,9 +47,7 @@ def command(
     columns: ColumnsOption = None,
     units: UnitsOption = None,
     unwrap: UnwrapOption = None,
-    independent_zeros: Annotated[
-        bool, typer.Option("--independent-zeros", help="The encoders' zeros were lost between the records.")
-    ] = False,
+    independent_zeros: IndependentZerosOption = False,
     out: Annotated[
         Path | None, typer.Option("--out", metavar="MODEL.yaml", help="Write the model file."), Kind.MODEL
     ] = None,
@@ -98,7 +90,7 @@ def command(
         write_calibration_page(html_file, found)
     print_calibration(found)
     if out is not None and not refused:
-        console.print(f"model: {out}", soft_wrap=True)
+        say(f"model: {out}")
     if html_file is not None:
         print_page(html_file)
     if refused:

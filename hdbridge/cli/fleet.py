@@ -7,18 +7,18 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
 from hdbridge.cli.interrupt import deferred_interrupt
 from hdbridge.cli.options import (
     JsonOption,
-    console,
     need_extra,
-    notes,
+    note,
     print_table,
     progress_bar,
+    say,
     taking,
     write_json,
     write_result,
@@ -86,20 +86,6 @@ TimeoutOption = Annotated[
     ),
 ]
 MemoryOption = Annotated[str, typer.Option("--memory", metavar="SIZE", help="Memory limit of each process.")]
-
-
-def register(app: typer.Typer) -> None:
-    """Add the commands."""
-    group = typer.Typer(
-        help="Diagnose recordings of many joints on Dask; report which joints to look at first.",
-        no_args_is_help=True,
-        rich_markup_mode="markdown",
-    )
-    group.command()(taking(Fleet)(run))
-    group.command()(taking(Fleet)(watch))
-    group.command()(report)
-    group.command()(simulate)
-    app.add_typer(group, name="fleet")
 
 
 @dataclass(frozen=True)
@@ -171,7 +157,7 @@ class Fleet:
         from hdbridge.fleet.engine import RETRIED, Cluster, Progress
         from hdbridge.fleet.engine import run as run_fleet
 
-        _note(f"{len(found)} sources, {len({each.joint for each in found} - {None})} joints")
+        note(f"{len(found)} sources, {len({each.joint for each in found} - {None})} joints")
         with progress_bar() as bar:
             task = bar.add_task("diagnosing", total=len(found))
 
@@ -191,7 +177,7 @@ class Fleet:
             )
         memory = f"; largest memory of a worker {end.memory_mb:.0f} MB" if end.memory_mb else ""
         counts = f"{end.done} recordings, {end.known} of them known already, {end.failed} newly failed"
-        _say(f"{self.dataset.folder}: {counts}{memory}")
+        say(f"{self.dataset.folder}: {counts}{memory}")
 
     def summarise(self) -> Summary:
         """Prints, writes and returns the summary of the data set."""
@@ -199,9 +185,10 @@ class Fleet:
 
     def say_interrupted(self) -> None:
         """Reports that the finished part is kept."""
-        _note(f"interrupted; {self.dataset.folder} keeps what is done, and the same command continues")
+        note(f"interrupted; {self.dataset.folder} keeps what is done, and the same command continues")
 
 
+@taking(Fleet)
 def run(fleet: Fleet) -> None:
     """Diagnose every recording that is not in FOLDER yet, and write Parquet and a page there.
 
@@ -224,6 +211,7 @@ def run(fleet: Fleet) -> None:
         raise InputError(f"none of {summary.recordings} recordings has a diagnosis; the first: {reason}")
 
 
+@taking(Fleet)
 def watch(
     fleet: Fleet,
     interval_s: Annotated[
@@ -252,7 +240,7 @@ def watch(
         try:
             watch_fleet(
                 partial(fleet.find, may_be_empty=True), fleet.dataset, interval_s, diagnose,
-                once=once, report=_note, interrupted=interrupted,
+                once=once, report=note, interrupted=interrupted,
             )  # fmt: skip
         except KeyboardInterrupt:
             fleet.say_interrupted()
@@ -302,7 +290,7 @@ def simulate(
     with progress_bar() as bar:
         task = bar.add_task("simulating", total=1.0)
         make(folder, joints, recordings, seed, lambda share: bar.update(task, completed=share))
-    _say(f"{folder}: {joints} joints with {recordings} recordings each")
+    say(f"{folder}: {joints} joints with {recordings} recordings each")
 
 
 def _summarise(
@@ -348,9 +336,9 @@ def _summarise(
     if summary.first:
         print_table(table)
     else:
-        _say("No joint stands out." if latest else "No recording has a diagnosis.")
+        say("No joint stands out." if latest else "No recording has a diagnosis.")
     for line in summary.lines():
-        _say(line)
+        say(line)
     target = page or dataset.folder / PAGE_NAME
     beside = target.resolve().parent == dataset.folder.resolve()
     if not beside:  # pages are in OUT
@@ -371,7 +359,7 @@ def _with_pages(folder: Path, latest: Mapping[str, Row], wanted: Collection[str]
                 try:
                     write_page(folder, latest[each])
                 except InputError as problem:  # for example a removed recording
-                    _note(f"no page of {each}: {problem}")
+                    note(f"no page of {each}: {problem}")
         there = links(folder, latest)
     return there
 
@@ -389,9 +377,4 @@ def _check_memory(text: str) -> None:
         )
 
 
-def _note(line: str) -> None:
-    notes.print(line, markup=False, soft_wrap=True)
-
-
-def _say(line: str) -> None:
-    console.print(line, markup=False, soft_wrap=True)
+COMMANDS: Final = {"run": run, "watch": watch, "report": report, "simulate": simulate}

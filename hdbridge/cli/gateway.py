@@ -6,11 +6,11 @@ from collections.abc import Iterator
 from itertools import chain, islice
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
 
-from hdbridge.cli.options import GatewayAxisOption, JsonOption, MachineArgument, console, notes, write_json
+from hdbridge.cli.options import GatewayAxisOption, JsonOption, MachineArgument, note, say, write_json
 from hdbridge.errors import DriveError, InputError
 
 if TYPE_CHECKING:
@@ -19,18 +19,6 @@ if TYPE_CHECKING:
     from hdbridge.axis import AxisConfig
     from hdbridge.daemon.machinefile import GatewaySettings
     from hdbridge.drive.link import Frame
-
-
-def register(app: typer.Typer) -> None:
-    """Add the commands."""
-    group = typer.Typer(
-        help="The axes of a machine as drives of another master.",
-        no_args_is_help=True,
-        rich_markup_mode="markdown",
-    )
-    group.command("eds")(eds)
-    group.command("doctor")(doctor)
-    app.add_typer(group, name="gateway")
 
 
 def eds(machine: MachineArgument, axis: GatewayAxisOption = None) -> None:
@@ -78,12 +66,12 @@ def doctor(
         for line in trace.take(frame):
             at_s = line.time_s - begun_s
             rows.append({"time_s": round(at_s, 6), "text": line.text, "advice": line.advice})
-            console.print(f"{at_s:10.4f}  {line.text}", markup=False, soft_wrap=True)
+            say(f"{at_s:10.4f}  {line.text}")
             if line.advice:
-                console.print(f"{'':10}  > {line.advice}", style="bold", markup=False, soft_wrap=True)
+                say(f"{'':10}  > {line.advice}", style="bold")
     configured = trace.configured()
     for text in configured:
-        console.print(f"configured  {text}", markup=False, soft_wrap=True)
+        say(f"configured  {text}")
     write_json(
         json_file,
         {"schema": "hdbridge.gateway-doctor/1", "node_id": node_id, "configured": configured, "trace": rows},
@@ -116,7 +104,7 @@ def _heard(settings: GatewaySettings, duration_s: float) -> Iterator[Frame]:
 
     with deferred_interrupt() as interrupted, open_bus(settings.bus, shared=True) as bus:
         link = Link(bus, MonotonicClock())
-        notes.print(f"listening on {link.name} for {duration_s:g} s")
+        note(f"listening on {link.name} for {duration_s:g} s")
         end_s = link.now() + duration_s
         while not interrupted() and (now_s := link.now()) < end_s:
             if (frame := link.recv(min(end_s, now_s + 0.2))) is not None:
@@ -137,7 +125,7 @@ def _logged(path: Path) -> Iterator[Frame]:
     for message in messages(path, cut_off):
         yield Frame(message.arbitration_id, bytes(message.data), message.timestamp)
     for problem in cut_off:
-        notes.print(f"{path}: {problem}", markup=False, soft_wrap=True)
+        note(f"{path}: {problem}")
 
 
 def gateway_axis(machine: str, name: str | None) -> tuple[AxisConfig, GatewaySettings]:
@@ -157,3 +145,6 @@ def gateway_axis(machine: str, name: str | None) -> tuple[AxisConfig, GatewaySet
     if name is not None and name not in names:
         raise InputError(f"--axis {name}: is not in the gateway; expected one of: {', '.join(names)}")
     return found.axis(name or names[0]).config, found.gateway
+
+
+COMMANDS: Final = {"eds": eds, "doctor": doctor}

@@ -8,18 +8,18 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich.markup import escape
 
 from hdbridge.cli.measuring import PlanOption, out_option, resume_option
 from hdbridge.cli.options import (
     ColumnsOption,
     HtmlOption,
+    IndependentZerosOption,
     JsonOption,
     UnitsOption,
     UnwrapOption,
-    console,
     load_recordings,
-    notes,
+    note,
+    say,
     write_json,
     write_result,
 )
@@ -36,11 +36,7 @@ LEFT_OF_FLOOR = 1.5
 """Ratio of a stepping test to its floor above which a further cause is suspected."""
 
 
-def register(app: typer.Typer) -> None:
-    """Adds the command."""
-    app.command("improve")(on_axis(command))
-
-
+@on_axis
 def command(
     session: Session,
     plan: PlanOption = "quick",
@@ -52,10 +48,7 @@ def command(
             help="Diagnose this and measure nothing; may be repeated, in order of time.",
         ),
     ] = None,
-    independent_zeros: Annotated[
-        bool,
-        typer.Option("--independent-zeros", help="The encoders' zeros were lost between the records."),
-    ] = False,
+    independent_zeros: IndependentZerosOption = False,
     columns: ColumnsOption = None,
     units: UnitsOption = None,
     unwrap: UnwrapOption = None,
@@ -88,7 +81,7 @@ def command(
     work = Measurement.asked(axis, plan, out, resume)
     trial = f"{trial_s(work.plan, axis, active) / 60:.1f} min to step with both models, if something is found"
     if recordings:
-        notes.print(f"nothing is measured first; {trial}", soft_wrap=True)
+        note(f"nothing is measured first; {trial}")
     else:
         work.announce(trial)
     with work.booted(session) as (drive, interrupted):
@@ -103,7 +96,7 @@ def command(
                 rounds=rounds if auto else 0,
                 progress=progress,
                 interrupted=interrupted,
-                tell=lambda line: notes.print(escape(line), soft_wrap=True),
+                tell=note,
             )
     report(result, work.folder, session, json_file, html_file)
 
@@ -128,28 +121,26 @@ def report(
         write_page(page, result)
     print_diagnosis(result.diagnosis)
     for line in result.extension.left:
-        console.print(escape(line), soft_wrap=True)
+        say(line)
     for line in result.survived:
-        console.print(f"note: {escape(line)}", soft_wrap=True)
+        say(f"note: {line}")
     if result.further is not None:
         further = result.further
-        console.print(
+        say(
             f"the axis could separate {', '.join(further.tells)} on its own (--auto), in "
-            f"{further.duration_s / 60:.0f} min: {further.plan.about}",
-            soft_wrap=True,
+            f"{further.duration_s / 60:.0f} min: {further.plan.about}"
         )
     if result.trial is not None:
         print_stepping(result.trial.stepping)
         print_steps("Small steps, within the hysteresis: load error at rest, arcsec", result.trial.small)
         print_worse("small steps", worse_ways(*result.trial.small))
         if result.trial.of_floor > LEFT_OF_FLOOR:
-            console.print(
+            say(
                 f"stepping is still {result.trial.of_floor:.1f} times the floor: something is left that "
-                "these data do not show; --auto, or a plan with two load turns, shows more",
-                soft_wrap=True,
+                "these data do not show; --auto, or a plan with two load turns, shows more"
             )
-    console.print(escape(result.offer.reason), style=None if result.offer.made else "bold", soft_wrap=True)
-    console.print(f"\nrecordings: {', '.join(result.recordings)}", soft_wrap=True)
+    say(result.offer.reason, style=None if result.offer.made else "bold")
+    say(f"\nrecordings: {', '.join(result.recordings)}")
     if page is not None:
         print_page(page)
     print_next(result.offer, session)

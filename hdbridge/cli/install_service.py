@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from hdbridge.cli.options import MachineArgument, console
+from hdbridge.cli.options import MachineArgument, say
 from hdbridge.errors import InputError
 
 if TYPE_CHECKING:
@@ -14,12 +14,7 @@ if TYPE_CHECKING:
     from hdbridge.daemon.systemd import ServiceFile
 
 
-def register(app: typer.Typer) -> None:
-    """Adds the command."""
-    app.command("install-service")(install_service)
-
-
-def install_service(
+def command(
     machine: MachineArgument,
     yes: Annotated[bool, typer.Option("--yes", help="Write the files; else they are only shown.")] = False,
     remove: Annotated[bool, typer.Option("--remove", help="Remove the files.")] = False,
@@ -57,9 +52,9 @@ def install_service(
         _tell_what_next(held, files, user=user)
     else:
         for file in files:
-            console.print(f"# {file.path}", markup=False, soft_wrap=True)
-            console.print(file.text, markup=False, soft_wrap=True)
-        console.print("nothing was written: --yes writes this")
+            say(f"# {file.path}")
+            say(file.text)
+        say("nothing was written: --yes writes this")
 
 
 def _write(files: list[ServiceFile]) -> None:
@@ -72,19 +67,19 @@ def _write(files: list[ServiceFile]) -> None:
             raise InputError(_refused(file, problem)) from None
         write_atomically(file.path, file.text)
         file.path.chmod(0o644)
-        console.print(f"wrote {file.path}", soft_wrap=True)
+        say(f"wrote {file.path}")
 
 
 def _remove(files: list[ServiceFile]) -> None:
     for file in files:
         if not file.path.exists():
-            console.print(f"{file.path} is not there", soft_wrap=True)
+            say(f"{file.path} is not there")
             continue
         try:
             file.path.unlink()
         except OSError as problem:
             raise InputError(_refused(file, problem)) from None
-        console.print(f"removed {file.path}", soft_wrap=True)
+        say(f"removed {file.path}")
 
 
 def _refused(file: ServiceFile, problem: OSError) -> str:
@@ -94,10 +89,10 @@ def _refused(file: ServiceFile, problem: OSError) -> str:
 def _tell_what_next(machine: Machine, files: list[ServiceFile], *, user: bool) -> None:
     control = "systemctl --user" if user else "systemctl"
     unit = files[0].path.name
-    console.print("next:")
+    say("next:")
     if len(files) > 1:
-        console.print("  networkctl reload")
-    console.print(f"  {control} daemon-reload")
-    console.print(f"  {control} enable --now {unit}")
+        say("  networkctl reload")
+    say(f"  {control} daemon-reload")
+    say(f"  {control} enable --now {unit}")
     if user and machine.bus.interface == "socketcan":
-        console.print("the CAN interface is set up by root: see docs/daemon.md")
+        say("the CAN interface is set up by root: see docs/daemon.md")

@@ -7,19 +7,14 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from hdbridge.cli.options import JsonOption, console, notes, write_json
+from hdbridge.cli.options import JsonOption, note, say, write_json
 from hdbridge.clock import MonotonicClock
 
 if TYPE_CHECKING:
     from hdbridge.control.latency import Measurement
 
 
-def register(app: typer.Typer) -> None:
-    """Adds the command."""
-    app.command("latency")(latency)
-
-
-def latency(
+def command(
     duration_s: Annotated[
         float, typer.Option("--duration", min=0.1, max=86_400, help="Seconds for each cycle time.")
     ] = 10.0,
@@ -42,9 +37,9 @@ def latency(
     periods = tuple(each / 1000.0 for each in cycle_ms) if cycle_ms else CANDIDATES_S
 
     def tell(done: Measurement) -> None:
-        notes.print(f"measured {1e3 * done.period_s:g} ms")
+        note(f"measured {1e3 * done.period_s:g} ms")
 
     with prepare_realtime() if realtime else nullcontext("ordinary priority") as conditions:
         report = measure(MonotonicClock(), duration_s, periods, conditions=str(conditions), progress=tell)
     write_json(json_file, report.as_dict())
-    console.print(report.table())
+    say(report.table())

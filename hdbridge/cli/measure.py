@@ -1,26 +1,17 @@
 """``hdbridge measure``: a recording of an axis by a plan, without a fit."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.markup import escape
 
 from hdbridge.cli.measuring import out_option, resume_option
-from hdbridge.cli.options import (
-    console,
-)
+from hdbridge.cli.options import say
 from hdbridge.cli.session import Session, on_axis
 from hdbridge.files.outputs import Kind
 
 
-def register(app: typer.Typer) -> None:
-    """Adds the command."""
-    app.command("measure")(on_axis(command))
-
-
+@on_axis
 def command(
     session: Session,
     plan: Annotated[
@@ -49,10 +40,7 @@ def command(
         with phases() as progress:
             measure(drive, journal, progress=progress, interrupted=interrupted)
     recording = journal.recording()
-    name, folder = escape(session.profile), escape(str(work.folder))
-    lines = [f"recording: {folder}, {len(journal.done)} tasks, {len(recording.record)} samples"]
+    say(f"recording: {work.folder}, {len(journal.done)} tasks, {len(recording.record)} samples")
     if files.model.exists():
-        lines.append(f"what the model lacks: hdbridge diagnose {folder} --model {escape(str(files.model))}")
-    lines.append(f"what the simulated drive gets wrong: hdbridge twin {name} {folder}")
-    for line in lines:
-        console.print(line, soft_wrap=True)
+        say(f"what the model lacks: hdbridge diagnose {work.folder} --model {files.model}")
+    say(f"what the simulated drive gets wrong: hdbridge twin {session.profile} {work.folder}")

@@ -10,9 +10,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Self
 
 import typer
-from rich.markup import escape
 
-from hdbridge.cli.options import notes, progress_bar
+from hdbridge.cli.options import note, progress_bar
 from hdbridge.errors import InputError
 from hdbridge.files.atomic import make_folder, new_folder
 
@@ -80,12 +79,11 @@ class Measurement:
         done = self.journal.done if self.journal else ()
         left = outlook(self.plan, self.axis, done)
         for each in left.notes:
-            notes.print(escape(f"plan '{self.plan.name}': {each}"), soft_wrap=True)
+            note(f"plan '{self.plan.name}': {each}")
         there = f" ({len(done)} tasks are there already)" if self.journal else ""
-        notes.print(
+        note(
             f"plan '{self.plan.name}': {len(left.tasks)} tasks{there}, {left.duration_s / 60:.1f} min of the "
-            f"axis{f', and {after}' if after else ''}",
-            soft_wrap=True,
+            f"axis{f', and {after}' if after else ''}"
         )
 
     def begun(self, drive: Drive, simulated_seed: int | None) -> Journal:
@@ -113,7 +111,7 @@ def _kept_in(folder: Path) -> Iterator[None]:
         yield
     except BaseException:
         if (folder / "recording.yaml").exists():
-            notes.print(f"what was measured is kept; go on with --resume {folder}", soft_wrap=True)
+            note(f"what was measured is kept; go on with --resume {folder}")
         raise
     finally:
         with suppress(OSError):

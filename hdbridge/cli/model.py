@@ -1,20 +1,17 @@
 """``hdbridge model``: the history of an axis's model or twin: look, compare, commit, go back."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from datetime import datetime
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Final
 
 import typer
 from rich.markup import escape
-from rich.table import Table
 
 from hdbridge.axis.model import TransmissionModel
 from hdbridge.axis.model.difference import Difference, diff
 from hdbridge.axis.model.store import ACTIVE, MODELS, PENDING, Store, Version
-from hdbridge.cli.options import JsonOption, ProfileArgument, console, print_table, write_json
+from hdbridge.cli.options import JsonOption, ProfileArgument, figures_table, print_table, say, write_json
 from hdbridge.errors import InputError
 from hdbridge.files.profile import Profile
 from hdbridge.files.yamlfile import read_yaml
@@ -22,19 +19,6 @@ from hdbridge.units import figure, with_interval
 
 ReasonOption = Annotated[str, typer.Option("--reason", help="Why, for the log.")]
 TwinOption = Annotated[bool, typer.Option("--twin", help="The twins of the axis instead of its models.")]
-
-
-def register(app: typer.Typer) -> None:
-    """Adds the commands."""
-    group = typer.Typer(
-        help="Manage the models of an axis: the active one, a pending one, and all earlier ones.",
-        no_args_is_help=True,
-        rich_markup_mode="markdown",
-    )
-    for command in (log, commit, activate, rollback, discard):
-        group.command()(command)
-    group.command("diff")(compare)
-    app.add_typer(group, name="model")
 
 
 def log(profile: ProfileArgument, twin: TwinOption = False, json_file: JsonOption = None) -> None:
@@ -46,15 +30,13 @@ def log(profile: ProfileArgument, twin: TwinOption = False, json_file: JsonOptio
         {"schema": f"hdbridge.{store.noun}-log/1", f"{store.noun}s": [_version(each) for each in versions]},
     )
     if not versions:
-        console.print(f"no {store.noun} yet: {store.first}")
+        say(f"no {store.noun} yet: {store.first}")
     for each in versions:
         mark = "active" if each.active else "pending" if each.number is None else ""
         name = f"{each.number:4d}" if each.number else "   -"
-        console.print(f"{name}  {mark:<8}{each.date}  {escape(each.reason)}", soft_wrap=True)
+        say(f"{name}  {mark:<8}{each.date}  {each.reason}")
         for step in each.activations:
-            console.print(
-                f"                {step.date}  {step.action}  {escape(step.reason)}", soft_wrap=True
-            )
+            say(f"                {step.date}  {step.action}  {step.reason}")
 
 
 def compare(
@@ -99,7 +81,7 @@ def commit(profile: ProfileArgument, twin: TwinOption = False) -> None:
     """Make the pending model the active one; the one before stays in the history."""
     store = _store(twin)
     number = store.commit(_folder(profile), _now())
-    console.print(f"{store.noun} {number} is active")
+    say(f"{store.noun} {number} is active")
 
 
 def activate(
@@ -111,21 +93,21 @@ def activate(
     """Make a model of the history the active one."""
     store = _store(twin)
     number = store.activate(_folder(profile), version, reason, _now())
-    console.print(f"{store.noun} {number} is active")
+    say(f"{store.noun} {number} is active")
 
 
 def rollback(profile: ProfileArgument, reason: ReasonOption = "", twin: TwinOption = False) -> None:
     """Undo the last activation: the model before it is active again."""
     store = _store(twin)
     number = store.rollback(_folder(profile), reason, _now())
-    console.print(f"{store.noun} {number} is active again")
+    say(f"{store.noun} {number} is active again")
 
 
 def discard(profile: ProfileArgument, twin: TwinOption = False) -> None:
     """Throw the pending model away; the recording that it came from stays."""
     store = _store(twin)
     store.discard(_folder(profile))
-    console.print(f"the pending {store.noun} is gone; its recording is kept")
+    say(f"the pending {store.noun} is gone; its recording is kept")
 
 
 def _store(twin: bool) -> Store[Any]:
@@ -163,10 +145,8 @@ def _now() -> datetime:
 def _print_diff(title: str, rows: Sequence[Difference]) -> None:
     """Prints the differences effect by effect; without the columns of a previous model if there was none."""
     compared = any(row.before is not None for row in rows if row.effect)
-    table = Table(title=title, title_justify="left")
-    table.add_column("parameter")
-    for name in ("before", "after", "change", "± 95 %") if compared else ("value", "± 95 %"):
-        table.add_column(name, justify="right")
+    columns = ("before", "after", "change", "± 95 %") if compared else ("value", "± 95 %")
+    table = figures_table(title, "parameter", *columns)
     effect = None
     for row in rows:
         if row.effect and row.effect != effect:
@@ -211,3 +191,13 @@ def _version(each: Version[Any]) -> dict[str, Any]:
         "file": str(each.path),
         "activations": [step.model_dump() for step in each.activations],
     }
+
+
+COMMANDS: Final = {
+    "log": log,
+    "commit": commit,
+    "activate": activate,
+    "rollback": rollback,
+    "discard": discard,
+    "diff": compare,
+}

@@ -13,9 +13,10 @@ from hdbridge.cli.options import (
     JsonOption,
     ModelOption,
     compensating_model,
-    console,
-    notes,
+    figures_table,
+    note,
     print_table,
+    say,
     write_json,
     write_result,
 )
@@ -26,12 +27,8 @@ if TYPE_CHECKING:
     from hdbridge.commissioning.calibration.motion import MotionTest
 
 
-def register(app: typer.Typer) -> None:
-    """Adds the command."""
-    app.command("motion")(on_axis(motion))
-
-
-def motion(
+@on_axis
+def command(
     session: Session,
     model: ModelOption = None,
     measure: Annotated[
@@ -63,7 +60,7 @@ def motion(
         raise InputError("--propose needs a measured response: leave --no-measure out")
     used = TransmissionModel.load(chosen)
     used.check_bound_to(axis)
-    notes.print(f"motion test: {motion_test_s(axis) / 60.0:.1f} min at most")
+    note(f"motion test: {motion_test_s(axis) / 60.0:.1f} min at most")
     with (
         session.booted() as (drive, interrupted),
         phases() as progress,
@@ -85,9 +82,7 @@ def motion(
             datetime.now().astimezone(),
             identity,
         )
-        console.print(
-            f"pending: {pending}; commit it with: hdbridge model commit {session.profile}", soft_wrap=True
-        )
+        say(f"pending: {pending}; commit it with: hdbridge model commit {session.profile}")
 
 
 def print_motion(result: MotionTest) -> None:
@@ -117,20 +112,16 @@ def print_motion(result: MotionTest) -> None:
     if result.paths:
         print_table(_paths(result))
     if result.response is not None:
-        console.print(
+        say(
             f"response known up to {result.response.known_to_hz:.0f} Hz, "
-            f"following lag {result.response.following_lag_ms:.2f} ms",
-            soft_wrap=True,
+            f"following lag {result.response.following_lag_ms:.2f} ms"
         )
     if result.wind_up is not None:
-        console.print(
-            f"wind-up J / K {result.wind_up.inertia_over_stiffness_s2:.3g} s2: compensated in acceleration",
-            soft_wrap=True,
-        )
+        say(f"wind-up J / K {result.wind_up.inertia_over_stiffness_s2:.3g} s2: compensated in acceleration")
     if (reached := result.helps_to_deg_s) is not None:
-        console.print(f"the compensation removes half of the ripple or more up to {reached:g} deg/s")
+        say(f"the compensation removes half of the ripple or more up to {reached:g} deg/s")
     for line in result.remarks:
-        console.print(f"note: {line}", markup=False, soft_wrap=True)
+        say(f"note: {line}")
 
 
 def _paths(result: MotionTest) -> Table:
@@ -138,10 +129,8 @@ def _paths(result: MotionTest) -> Table:
         "Error on a path, rms arcsec, with the wind-up in acceleration and corrected for it, and time until "
         "the load has settled, ms"
     )
-    table = Table(title=title, title_justify="left")
-    table.add_column("path")
-    for name in ("none", "static", "filtered", "wound up", "corrected", "settled", "static", "filtered"):
-        table.add_column(name, justify="right")
+    columns = ("none", "static", "filtered", "wound up", "corrected", "settled", "static", "filtered")
+    table = figures_table(title, "path", *columns)
     for each in result.paths:
         variants = (each.none, each.static, each.filtered)
         table.add_row(

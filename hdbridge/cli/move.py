@@ -11,13 +11,15 @@ import typer
 from rich.table import Table
 
 from hdbridge.cli.options import (
+    AnglesArgument,
     JsonOption,
     ModelOption,
-    console,
+    VelocityOption,
+    note,
     note_clamped,
-    notes,
     print_table,
     progress_bar,
+    say,
     write_json,
 )
 from hdbridge.cli.session import Session, on_axis
@@ -33,23 +35,14 @@ KEPT_S = 60.0
 """Duration of the samples kept while the axis holds; s."""
 
 
-def register(app: typer.Typer) -> None:
-    """Adds the command."""
-    app.command("move", context_settings={"ignore_unknown_options": True})(on_axis(move))
-
-
-def move(
+@on_axis
+def command(
     session: Session,
-    angles_deg: Annotated[
-        list[float], typer.Argument(metavar="ANGLE...", help="Load angles in degrees, one after the other.")
-    ],
+    angles_deg: AnglesArgument,
     relative: Annotated[
         bool, typer.Option("--relative", help="Each angle is relative to the previous position.")
     ] = False,
-    velocity_deg_s: Annotated[
-        float | None,
-        typer.Option("--velocity", min=1e-6, help="Speed of the load, deg/s; else the axis's limit."),
-    ] = None,
+    velocity_deg_s: VelocityOption = None,
     hold_s: Annotated[
         float | None,
         typer.Option(
@@ -113,7 +106,7 @@ def _tell_where_it_stands(drive: Drive) -> None:
     """Prints the position after a stop on the way; nothing if the drive does not answer any more."""
     with suppress(HdbridgeError):
         stands_deg = drive.read_positions().motor_deg / drive.axis.gear.ratio
-        notes.print(f"stopped on the way, at {stands_deg:.4f} deg by the motor encoder; power is off")
+        note(f"stopped on the way, at {stands_deg:.4f} deg by the motor encoder; power is off")
 
 
 def _model(files: Profile, given: Path | None, ratio: float, *, compensated: bool) -> TransmissionModel:
@@ -125,7 +118,7 @@ def _model(files: Profile, given: Path | None, ratio: float, *, compensated: boo
             raise InputError("--uncompensated uses no model: leave out --model")
         return TransmissionModel(ratio)
     if given is None and not files.model.exists():
-        notes.print(f"not compensated: {files.model} does not exist", markup=False, soft_wrap=True)
+        note(f"not compensated: {files.model} does not exist")
         return TransmissionModel(ratio)
     return TransmissionModel.load(given or files.model)
 
@@ -168,4 +161,4 @@ def _print(axis: str, model: TransmissionModel, stands: tuple[Standing, ...]) ->
         )
     print_table(table)
     how = f"compensated by {model.path}" if model.effects else "not compensated"
-    console.print(f"{how}; power is off", markup=False, soft_wrap=True)
+    say(f"{how}; power is off")

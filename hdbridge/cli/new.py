@@ -8,7 +8,17 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from hdbridge.cli.options import ChannelOption, InterfaceOption, JsonOption, console, notes, write_json
+from hdbridge.cli.options import (
+    BitrateOption,
+    ChannelOption,
+    EdsOption,
+    InterfaceOption,
+    JsonOption,
+    NodeOption,
+    note,
+    say,
+    write_json,
+)
 from hdbridge.clock import MonotonicClock
 from hdbridge.errors import DriveError, InputError
 
@@ -24,12 +34,7 @@ class Source(Enum):
     SCAN = "scan"
 
 
-def register(app: typer.Typer) -> None:
-    """Adds the command."""
-    app.command("new")(new)
-
-
-def new(
+def command(
     name: Annotated[Path, typer.Argument(metavar="NAME", help="New folder; its name is the axis's.")],
     source: Annotated[
         Source,
@@ -37,15 +42,9 @@ def new(
     ] = Source.DEMO,
     interface: InterfaceOption = None,
     channel: ChannelOption = None,
-    bitrate_bps: Annotated[
-        int | None,
-        typer.Option("--bitrate", min=10_000, max=1_000_000, help="Bit rate, if the interface sets it."),
-    ] = None,
-    node_id: Annotated[
-        int | None,
-        typer.Option("--node", min=1, max=127, help="Node id, if several drives answer."),
-    ] = None,
-    eds: Annotated[Path | None, typer.Option("--eds", metavar="FILE", help="The drive's EDS file.")] = None,
+    bitrate_bps: BitrateOption = None,
+    node_id: NodeOption = None,
+    eds: EdsOption = None,
     json_file: JsonOption = None,
 ) -> None:
     """Make the folder of an axis: a copy of a bundled profile, or from the data of a drive on the bus.
@@ -66,12 +65,12 @@ def new(
         written = copy_bundled(source.value, name)
     write_json(json_file, {"schema": "hdbridge.new/1", "files": [str(each) for each in written]})
     for each in written:
-        console.print(f"wrote {each}", markup=False, soft_wrap=True)
+        say(f"wrote {each}")
     try:
         AxisConfig.load(name)
     except InputError as problem:
-        console.print(f"to be completed: {problem}", markup=False, soft_wrap=True)
-    console.print(f"next: hdbridge check {name}", markup=False, soft_wrap=True)
+        say(f"to be completed: {problem}")
+    say(f"next: hdbridge check {name}")
 
 
 def _scanned(
@@ -91,7 +90,7 @@ def _scanned(
         raise InputError("--from scan needs a bus: give --interface and --channel (socketcan, can0)")
     bus = BusConfig(interface=interface, channel=channel, bitrate_bps=bitrate_bps)
     with open_bus(bus) as opened:
-        notes.print("asking nodes ...")
+        note("asking nodes ...")
         link = Link(opened, MonotonicClock())
         found = scan_bus(link)
     return write_scanned(folder, bus, _chosen(link.name, found.nodes, node_id), eds)

@@ -95,6 +95,51 @@ BorrowOption = Annotated[
         "command ends.",
     ),
 ]
+BitrateOption = Annotated[
+    int | None,
+    typer.Option("--bitrate", min=10_000, max=1_000_000, help="Bit rate, if the interface sets it."),
+]
+NodeOption = Annotated[
+    int | None, typer.Option("--node", min=1, max=127, help="Node id, if several drives answer.")
+]
+EdsOption = Annotated[Path | None, typer.Option("--eds", metavar="FILE", help="The drive's EDS file.")]
+VelocityOption = Annotated[
+    float | None,
+    typer.Option("--velocity", min=1e-6, help="Speed of the load, deg/s; else the axis's limit."),
+]
+AccelerationOption = Annotated[
+    float | None,
+    typer.Option("--acceleration", min=1e-6, help="Acceleration of the load, deg/s2; else the axis's limit."),
+]
+AnglesArgument = Annotated[
+    list[float], typer.Argument(metavar="ANGLE...", help="Load angles in degrees, one after the other.")
+]
+HomingMethodOption = Annotated[
+    int, typer.Option("--method", min=-128, max=127, help="Homing method, 6098h: see the drive's manual.")
+]
+SwitchVelocityOption = Annotated[
+    float | None,
+    typer.Option(
+        "--switch-velocity",
+        min=1e-6,
+        help="Speed towards the switch, deg/s of the load; else a tenth of the axis's limit.",
+    ),
+]
+ZeroVelocityOption = Annotated[
+    float | None,
+    typer.Option(
+        "--zero-velocity",
+        min=1e-6,
+        help="Speed towards the zero, deg/s of the load; else a fiftieth of the axis's limit.",
+    ),
+]
+OffsetOption = Annotated[float, typer.Option("--offset", help="Load angle of the home position (607Ch).")]
+HomingTimeoutOption = Annotated[
+    float, typer.Option("--timeout", min=0.1, max=3600.0, help="Longest time, s.")
+]
+IndependentZerosOption = Annotated[
+    bool, typer.Option("--independent-zeros", help="The encoders' zeros were lost between the records.")
+]
 ColumnsOption = Annotated[
     list[str] | None,
     typer.Option(
@@ -201,7 +246,7 @@ def load_recordings(
     loaded = [Recording.load(each, columns=columns, units=units, unwrap=unwrap) for each in paths]
     for each in loaded:
         if each.record.origin is not None and each.record.origin.remark:
-            notes.print(each.record.origin.remark, markup=False, soft_wrap=True)
+            note(each.record.origin.remark)
     check_once(paths, [each.record for each in loaded])
     return dict(zip(paths, loaded, strict=True))
 
@@ -254,11 +299,9 @@ def note_clamped(limits: Any, **wanted: float | None) -> None:
         limit = getattr(limits, name)
         if value is not None and abs(value) > limit:
             kind, unit = ("velocity", "deg/s") if name == "velocity_deg_s" else ("acceleration", "deg/s2")
-            notes.print(
+            note(
                 f"{kind}: {abs(value):g} {unit} is above the axis's limit; {limit:g} {unit} is used "
-                f"(limits.{name})",
-                markup=False,
-                soft_wrap=True,
+                f"(limits.{name})"
             )
 
 
@@ -329,11 +372,30 @@ def _part(table: Table, columns: list[Column]) -> Table:
     return part
 
 
+def figures_table(title: str, first: str, *figures: str) -> Table:
+    """Returns an empty table with a title, a column of names, and right-aligned columns of figures."""
+    table = Table(title=title, title_justify="left")
+    table.add_column(first)
+    for name in figures:
+        table.add_column(name, justify="right")
+    return table
+
+
 def print_object(name: str, value: object, type_name: str) -> None:
     """Prints an object of a drive: a natural number also in hexadecimal."""
     whole = isinstance(value, int) and not isinstance(value, bool) and value >= 0
     also = f" ({value:#x})" if whole else ""
-    console.print(f"{name}: {value}{also}  {type_name}", markup=False, soft_wrap=True)
+    say(f"{name}: {value}{also}  {type_name}")
+
+
+def say(line: str, style: str | None = None) -> None:
+    """Prints a line of the result, unwrapped and without markup."""
+    console.print(line, markup=False, soft_wrap=True, style=style)
+
+
+def note(line: str) -> None:
+    """Prints a remark, unwrapped and without markup."""
+    notes.print(line, markup=False, soft_wrap=True)
 
 
 def write_json(path: Path | None, result: dict[str, Any]) -> None:
@@ -347,4 +409,4 @@ def write_result(path: Path, text: str) -> None:
     with writing():
         write_atomically(path, text)
         if not is_stream(path):
-            notes.print(f"wrote {path}", soft_wrap=True)
+            note(f"wrote {path}")

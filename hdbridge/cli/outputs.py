@@ -4,8 +4,6 @@ An option that writes carries its `Kind` in its annotation, `Annotated[Path | No
 Kind.JSON]`. Every other file or folder that a command is given counts as an input.
 """
 
-from __future__ import annotations
-
 import functools
 import inspect
 import typing
@@ -16,7 +14,7 @@ from typing import Any
 
 from typer.models import OptionInfo
 
-from hdbridge.cli.options import console, notes
+from hdbridge.cli.options import console, note
 from hdbridge.errors import InputError
 from hdbridge.files.outputs import Kind, Output, check_outputs, failures_deferred
 
@@ -53,12 +51,12 @@ def guarded(command: Callable[..., Any]) -> Callable[..., Any]:
                         done = command(**values)
                 except BaseException:
                     for each in failed:
-                        notes.print(str(each), markup=False, soft_wrap=True)
+                        note(str(each))
                     raise
         finally:
             console.stderr = before
         for each in failed[1:]:
-            notes.print(str(each), markup=False, soft_wrap=True)
+            note(str(each))
         if failed:
             raise failed[0]
         return done

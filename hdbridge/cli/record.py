@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
 from rich.markup import escape
 from rich.table import Table
 
 from hdbridge.cli.flights import AxisOption, FromOption, ToOption, need_reader, read_flights, remarks
-from hdbridge.cli.options import JsonOption, console, notes, print_table, write_json, write_result
+from hdbridge.cli.options import JsonOption, note, print_table, say, write_json, write_result
 from hdbridge.errors import InputError
 from hdbridge.files.atomic import check_writable
 from hdbridge.files.outputs import Kind
@@ -38,21 +38,6 @@ OutOption = Annotated[
 AllStatesOption = Annotated[
     bool, typer.Option("--all-states", help="Include samples in which the axis was not enabled.")
 ]
-
-
-def register(app: typer.Typer) -> None:
-    """Adds the commands."""
-    group = typer.Typer(
-        help="Flight recordings and bus logs: list, mend, and make records for fit and diagnose.",
-        no_args_is_help=True,
-        rich_markup_mode="markdown",
-    )
-    group.command("list")(overviews)
-    group.command()(info)
-    group.command()(mend)
-    group.command()(export)
-    group.command("import")(import_)
-    app.add_typer(group, name="record")
 
 
 def overviews(flights: FlightsArgument, json_file: JsonOption = None) -> None:
@@ -131,23 +116,23 @@ def info(
         "events": [_event(each) for each in found.events],
     }
     write_json(json_file, document)
-    _say(f"machine '{about.machine}', {document['from']} to {document['to']}")
-    _say(
+    say(f"machine '{about.machine}', {document['from']} to {document['to']}")
+    say(
         f"{document['cycles']} cycles of {1e3 * about.period_s:g} ms, {missing} missing, "
         f"{document['restarts']} restarts of the loop"
         + ("" if found.finished else "; not finished: hdbridge record mend")
     )
     for each in document["axes"]:
         models = f"; models {', '.join(each['models'])}" if any(each["models"]) else ""
-        _say(f"axis '{each['name']}', ratio {each['ratio']:g}, enabled for {each['enabled_s']:.1f} s{models}")
+        say(f"axis '{each['name']}', ratio {each['ratio']:g}, enabled for {each['enabled_s']:.1f} s{models}")
         if (outer := each["outer"]) is not None:
             errors = f"; errors {', '.join(outer['errors'])}" if outer["errors"] else ""
-            _say(
+            say(
                 f"  another master: connected for {outer['connected_s']:.1f} s, 'operation enabled' for "
                 f"{outer['enabled_s']:.1f} s{errors}"
             )
     for told in found.events:
-        _say(f"{_date(told.time_ns):%H:%M:%S.%f}  {told.name}  {told.kind.lower()}  {told.text}")
+        say(f"{_date(told.time_ns):%H:%M:%S.%f}  {told.name}  {told.kind.lower()}  {told.text}")
 
 
 def mend(flights: FlightsArgument) -> None:
@@ -163,7 +148,7 @@ def mend(flights: FlightsArgument) -> None:
         if path.name.endswith(".mcap") and overview(path).finished:
             return
         done = mending.mend(path)
-        _say(f"{done}: finished" if done is not None else f"{path}: it held no complete data; removed")
+        say(f"{done}: finished" if done is not None else f"{path}: it held no complete data; removed")
 
     for _ in each_flight(flights, mended):
         pass
@@ -224,11 +209,11 @@ def import_(
     axis = AxisConfig.load(Profile.find(profile).axis)
     recording = import_log(log, axis, channel=channel, all_states=all_states)
     _write(recording, out)
-    notes.print(f"PDO mapping {recording.notes['mapping']}", markup=False, soft_wrap=True)
+    note(f"PDO mapping {recording.notes['mapping']}")
     if cut_off := recording.notes.get("cut_off"):
-        notes.print(f"{log}: {cut_off}; what comes before is imported", markup=False, soft_wrap=True)
+        note(f"{log}: {cut_off}; what comes before is imported")
     if recording.record.motor_target_deg is None:
-        notes.print("no command in each cycle: the record has no motor_target_deg")
+        note("no command in each cycle: the record has no motor_target_deg")
     _print_export(recording, out)
 
 
@@ -248,12 +233,12 @@ def _write(recording: Recording, out: Path) -> None:
 def _print_export(recording: Recording, out: Path) -> None:
     record, parts = recording.record, recording.notes["parts"]
     lengths = [float(each.time_s[-1] - each.time_s[0]) for each in record.parts()]
-    _say(
+    say(
         f"{out}: axis '{recording.axis}', {len(record)} samples in {parts} "
         f"part{'s' * (parts != 1)}, {sum(lengths):.1f} s"
     )
     for each in remarks(recording):
-        notes.print(each)
+        note(each)
 
 
 def _checked_out(out: Path | None) -> Path:
@@ -299,5 +284,4 @@ def _event(event: Any) -> dict[str, Any]:
     }
 
 
-def _say(line: str) -> None:
-    console.print(line, markup=False, soft_wrap=True)
+COMMANDS: Final = {"list": overviews, "info": info, "mend": mend, "export": export, "import": import_}

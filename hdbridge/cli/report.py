@@ -1,18 +1,11 @@
 """``hdbridge report``: the report of a calibration, again from its recording."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from hdbridge.cli.options import HtmlOption, JsonOption, write_json
-
-
-def register(app: typer.Typer) -> None:
-    """Adds the command."""
-    app.command("report")(command)
 
 
 def command(

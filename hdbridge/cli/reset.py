@@ -1,23 +1,11 @@
 """``hdbridge reset``: resets a fault of the drive."""
 
-from __future__ import annotations
-
-import typer
-
-from hdbridge.cli.options import (
-    JsonOption,
-    console,
-    write_json,
-)
+from hdbridge.cli.options import JsonOption, say, write_json
 from hdbridge.cli.session import Session, on_axis
 
 
-def register(app: typer.Typer) -> None:
-    """Adds the command."""
-    app.command("reset")(on_axis(reset))
-
-
-def reset(
+@on_axis
+def command(
     session: Session,
     json_file: JsonOption = None,
 ) -> None:
@@ -41,4 +29,4 @@ def reset(
         {"schema": "hdbridge.reset/1", "axis": axis.name, "fault": fault, "state": state.value},
     )
     done = f"the fault is reset ({fault})" if faulty else "there is no fault to reset"
-    console.print(f"{done}: the drive is in '{state.value}'", markup=False, soft_wrap=True)
+    say(f"{done}: the drive is in '{state.value}'")

@@ -27,12 +27,7 @@ _EXTRA = ("fastapi", "uvicorn", "websockets", "mcap", "prometheus_client")
 """Packages of the extra ``daemon``."""
 
 
-def register(app: typer.Typer) -> None:
-    """Adds the command."""
-    app.command("run")(run)
-
-
-def run(
+def command(
     machine: MachineArgument,
     simulate: Annotated[
         bool, typer.Option("--simulate", help="Hold simulated drives in place of the bus.")

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from hdbridge.cli.options import (
+    BitrateOption,
     BorrowOption,
     ChannelOption,
     ForceOption,
@@ -15,9 +16,9 @@ from hdbridge.cli.options import (
     SeedOption,
     SimulateOption,
     TruthOption,
-    console,
-    notes,
+    note,
     progress_bar,
+    say,
     write_json,
 )
 from hdbridge.cli.session import Session, bare_bus
@@ -29,12 +30,7 @@ if TYPE_CHECKING:
     from hdbridge.commissioning.bringup.scan import Node, Scan
 
 
-def register(app: typer.Typer) -> None:
-    """Adds the command."""
-    app.command("scan")(scan)
-
-
-def scan(
+def command(
     profile: Annotated[
         str | None,
         typer.Argument(
@@ -47,10 +43,7 @@ def scan(
     channel: ChannelOption = None,
     force: ForceOption = False,
     borrow: BorrowOption = False,
-    bitrate_bps: Annotated[
-        int | None,
-        typer.Option("--bitrate", min=10_000, max=1_000_000, help="Bit rate, if the interface sets it."),
-    ] = None,
+    bitrate_bps: BitrateOption = None,
     listen_s: Annotated[
         float,
         typer.Option("--listen", min=0.0, max=3600.0, help="Seconds to listen before asking; at least 0.51."),
@@ -110,17 +103,17 @@ def _print(name: str, found: Scan) -> None:
     from hdbridge.commissioning.bringup.match import axis_lines
 
     count = len(found.nodes)
-    console.print(f"{name}: {count} node{'' if count == 1 else 's'}", soft_wrap=True)
+    say(f"{name}: {count} node{'' if count == 1 else 's'}")
     for node in found.nodes:
-        console.print(f"\nnode {node.node_id}: {node.kind}", style="bold")
+        say(f"\nnode {node.node_id}: {node.kind}", style="bold")
         for label, value in _facts(node).items():
-            console.print(f"{label:>12}  {value}", markup=False)
+            say(f"{label:>12}  {value}")
         if node.usable or node.profile == 406:
-            console.print("  for the axis file:")
+            say("  for the axis file:")
             for line in axis_lines(node):
-                console.print(f"    {line}", markup=False, soft_wrap=True)
+                say(f"    {line}")
     for remark in found.remarks:
-        notes.print(f"note: {remark}", markup=False, soft_wrap=True)
+        note(f"note: {remark}")
 
 
 def _facts(node: Node) -> dict[str, str]:
@@ -139,11 +132,9 @@ def _facts(node: Node) -> dict[str, str]:
 
 def _print_match(axis: AxisConfig, matches: bool, lines: list[str]) -> None:
     if matches:
-        console.print(
-            f"\nnode {axis.drive.node_id} is the drive of {axis.path}", markup=False, soft_wrap=True
-        )
+        say(f"\nnode {axis.drive.node_id} is the drive of {axis.path}")
     for line in lines:
-        console.print(line, markup=False, soft_wrap=True)
+        say(line)
 
 
 def _judge(name: str, found: Scan, axis: AxisConfig | None, matches: bool) -> None:

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
-import typer
+from typing import TYPE_CHECKING, Final
 
 from hdbridge.cli.options import (
     JsonOption,
@@ -20,18 +18,7 @@ if TYPE_CHECKING:
     from hdbridge.drive.values import Object, Value
 
 
-def register(app: typer.Typer) -> None:
-    """Adds the commands."""
-    group = typer.Typer(
-        help="Read or write an object of the drive by SDO, typed by its EDS.",
-        no_args_is_help=True,
-        rich_markup_mode="markdown",
-    )
-    group.command()(on_axis(get))
-    group.command("set", context_settings={"ignore_unknown_options": True})(on_axis(put))
-    app.add_typer(group, name="sdo")
-
-
+@on_axis
 def get(
     session: Session,
     object_: ObjectArgument,
@@ -50,6 +37,7 @@ def get(
     print_object(str(wanted), value, wanted.type_name)
 
 
+@on_axis
 def put(
     session: Session,
     object_: ObjectArgument,
@@ -86,3 +74,6 @@ def _document(wanted: Object, value: Value) -> dict[str, object]:
         "type": wanted.type_name,
         "value": value,
     }
+
+
+COMMANDS: Final = {"get": get, "set": put}

@@ -19,7 +19,7 @@ from hdbridge.cli.options import (
     SeedOption,
     SimulateOption,
     TruthOption,
-    notes,
+    note,
     taking,
 )
 from hdbridge.clock import Clock, MonotonicClock
@@ -107,7 +107,7 @@ class Session:
             _borrow(axis.bus)
         wanted, bus_of = axis.realtime, open_bus(axis.bus, shared=self.force)
         with prepare_realtime(wanted.priority, wanted.cpus) as conditions, bus_of as bus:
-            notes.print(f"this process: {conditions}")
+            note(f"this process: {conditions}")
             yield bus, MonotonicClock()
 
     @contextmanager
@@ -123,9 +123,9 @@ class Session:
         """Yields the booted drive, and a function that reports a request to end. Ctrl-C stops the axis."""
         with deferred_interrupt() as interrupted, self.drive() as drive:
             report = drive.boot()
-            notes.print(f"booted node {self.axis.drive.node_id} over {drive.link.name}")
-            for note in report.notes:
-                notes.print(note, markup=False, soft_wrap=True)
+            note(f"booted node {self.axis.drive.node_id} over {drive.link.name}")
+            for each in report.notes:
+                note(each)
             yield drive, interrupted
 
 
@@ -163,11 +163,9 @@ def _borrow(bus: BusConfig) -> None:
     names = ", ".join(each.name for each in machine.axes)
     with Client(address.socket, name="hdbridge --borrow") as client:
         client.lend_bus()
-    notes.print(
+    note(
         f"the daemon of machine '{machine.name}' has stopped its axes ({names}) and lends the bus to this "
-        "command; they come back disabled",
-        markup=False,
-        soft_wrap=True,
+        "command; they come back disabled"
     )
 
 
@@ -175,7 +173,7 @@ def simulated_by(files: Profile, truth: Path | None) -> Path:
     """Returns the file that describes the simulated axis; prints a note if it is the axis's twin."""
     plant = truth or files.simulated
     if plant == files.twin:
-        notes.print(f"simulated by the axis's twin, {plant}", markup=False, soft_wrap=True)
+        note(f"simulated by the axis's twin, {plant}")
     return plant
 
 

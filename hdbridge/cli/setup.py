@@ -1,7 +1,5 @@
 """``hdbridge setup``: from a wired drive to a compensated axis, by a sequence of ordinary commands."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import re
@@ -13,7 +11,16 @@ from typing import Annotated, Any, Final
 
 import typer
 
-from hdbridge.cli.options import ChannelOption, InterfaceOption, SeedOption, console, notes
+from hdbridge.cli.options import (
+    BitrateOption,
+    ChannelOption,
+    EdsOption,
+    InterfaceOption,
+    NodeOption,
+    SeedOption,
+    note,
+    say,
+)
 from hdbridge.errors import BusError, DriveError, HdbridgeError, InputError
 from hdbridge.files.atomic import write_atomically
 
@@ -40,25 +47,15 @@ _UP: Final = 1
 _REMEDY: Final = re.compile(r"axis\.yaml:\d+:\d+: ([a-z_.]+): found (\S+), expected (-?[\d.]+)\b")
 
 
-def register(app: typer.Typer) -> None:
-    """Adds the command."""
-    app.command("setup")(setup)
-
-
-def setup(
+def command(
     folder: Annotated[
         Path, typer.Argument(metavar="NAME", help="Folder of the axis, new or from an earlier set-up.")
     ],
     interface: InterfaceOption = None,
     channel: ChannelOption = None,
-    bitrate_bps: Annotated[
-        int | None,
-        typer.Option("--bitrate", min=10_000, max=1_000_000, help="Bit rate, if the interface sets it."),
-    ] = None,
-    node_id: Annotated[
-        int | None, typer.Option("--node", min=1, max=127, help="Node id, if several drives answer.")
-    ] = None,
-    eds: Annotated[Path | None, typer.Option("--eds", metavar="FILE", help="The drive's EDS file.")] = None,
+    bitrate_bps: BitrateOption = None,
+    node_id: NodeOption = None,
+    eds: EdsOption = None,
     plan: Annotated[
         str, typer.Option("--plan", metavar="quick|full|FILE", help="Plan of the calibration.")
     ] = "quick",
@@ -85,7 +82,7 @@ def setup(
         work.commit()
         work.move()
     except (HdbridgeError, KeyboardInterrupt, typer.Abort, typer.Exit):
-        notes.print(f"resume: hdbridge setup {shlex.quote(str(folder))}", markup=False, soft_wrap=True)
+        note(f"resume: hdbridge setup {shlex.quote(str(folder))}")
         raise
     work.tell_next()
 
@@ -228,12 +225,10 @@ class _Setup:
     def tell_next(self) -> None:
         """Prints the page of the calibration and the commands for daily use."""
         how = " --simulate" if self._state.simulated else ""
-        console.print(
+        say(
             f"\nthe axis is set up. Its page: {self._folder / RECORDING / 'report.html'}\n"
             f"every day: hdbridge run {self._folder} --page{how}\n"
-            f"by hand:   hdbridge move {self._folder} ANGLE{how}",
-            markup=False,
-            soft_wrap=True,
+            f"by hand:   hdbridge move {self._folder} ANGLE{how}"
         )
 
     # ---------------------------------------------------------------- parts of them
@@ -247,7 +242,7 @@ class _Setup:
         from hdbridge.cli import app
 
         words = [str(each) for each in arguments]
-        console.print(f"\n$ hdbridge {shlex.join(words)}", style="bold", markup=False, soft_wrap=True)
+        say(f"\n$ hdbridge {shlex.join(words)}", style="bold")
         status = app(words, prog_name="hdbridge", standalone_mode=False)
         if status:
             raise typer.Exit(status)

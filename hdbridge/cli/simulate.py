@@ -17,7 +17,7 @@ from hdbridge.cli.options import (
     ProfileArgument,
     SeedOption,
     TruthOption,
-    notes,
+    note,
 )
 from hdbridge.cli.session import Session, simulated_by
 from hdbridge.clock import Clock, MonotonicClock
@@ -32,12 +32,7 @@ if TYPE_CHECKING:
     Maker = Callable[[can.BusABC, Clock, Path], DriveNode]
 
 
-def register(app: typer.Typer) -> None:
-    """Adds the command."""
-    app.command("simulate")(simulate)
-
-
-def simulate(
+def command(
     profile: ProfileArgument,
     truth: TruthOption = None,
     seed: SeedOption = 0,
@@ -86,7 +81,7 @@ def simulate(
         TemporaryDirectory(prefix="hdbridge-gateway-") as folder,
     ):
         node = make(bus, clock, Path(folder))
-        notes.print(f"{name} drive: node {node.node_id} on {bus.channel_info}; Ctrl-C ends it")
+        note(f"{name} drive: node {node.node_id} on {bus.channel_info}; Ctrl-C ends it")
         end = float("inf") if duration_s is None else clock.now() + duration_s
         run(bus, node, clock, lambda: interrupted() or clock.now() >= end)
 

@@ -15,9 +15,9 @@ from hdbridge.cli.options import (
     JsonOption,
     ModelOption,
     compensating_model,
-    console,
-    notes,
+    note,
     progress_bar,
+    say,
     write_json,
     write_result,
 )
@@ -36,12 +36,8 @@ if TYPE_CHECKING:
     from hdbridge.records.record import Record
 
 
-def register(app: typer.Typer) -> None:
-    """Adds the command."""
-    app.command("step")(on_axis(step))
-
-
-def step(
+@on_axis
+def command(
     session: Session,
     model: ModelOption = None,
     scheme: Annotated[
@@ -123,7 +119,7 @@ def run_comparison(
     for each in wanted:
         compensation_for(axis, each.of(model))  # refused before anything is connected
     if remark := cap_remark(axis, model):
-        notes.print(remark, markup=False, soft_wrap=True)
+        note(remark)
 
     done: dict[Scheme, Run[SteppingOutcome]] = {}
 
@@ -140,7 +136,7 @@ def run_comparison(
                 measured.write_csv(path)
         kept = f"kept in {path}" if path else "not kept: it takes --record FOLDER"
         seconds = float(measured.time_s[-1] - measured.time_s[0])
-        notes.print(f"stopped in '{scheme.value}' after {seconds:.1f} s, {kept}", soft_wrap=True)
+        note(f"stopped in '{scheme.value}' after {seconds:.1f} s, {kept}")
 
     with (
         _told_when_stopped(axis, done, tell),
@@ -189,7 +185,7 @@ def _told_when_stopped(
 
 def print_result(axis: AxisConfig, comparison: Comparison) -> None:
     """Prints the result."""
-    from hdbridge.cli.scattertable import print_scatter
+    from hdbridge.cli.calibration_output import print_scatter
 
     print_scatter(
         f"Load error at rest, arcsec: axis '{axis.name}'",
@@ -197,13 +193,12 @@ def print_result(axis: AxisConfig, comparison: Comparison) -> None:
         ((scheme.value, (each.cw, each.ccw, each.pooled)) for scheme, each in comparison.results.items()),
     )
     for line in comparison.survived:
-        console.print(f"note: {line}", markup=False, soft_wrap=True)
+        say(f"note: {line}")
     best, result = min(comparison.results.items(), key=lambda item: item[1].pooled.three_sigma_arcsec)
     floor = comparison.quantisation_floor_arcsec
-    console.print(
+    say(
         f"quantisation floor (3 sigma of one motor count): {floor:.2f}; "
-        f"'{best.value}' is at {result.pooled.three_sigma_arcsec / floor:.2f} times that",
-        soft_wrap=True,
+        f"'{best.value}' is at {result.pooled.three_sigma_arcsec / floor:.2f} times that"
     )
 
 

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from rich.markup import escape
 from rich.table import Table
 
 from hdbridge.cli.options import (
@@ -18,11 +17,11 @@ from hdbridge.cli.options import (
     TruthOption,
     UnitsOption,
     UnwrapOption,
-    console,
     load_recordings,
-    notes,
+    note,
     print_table,
     progress_bar,
+    say,
     write_json,
     write_result,
 )
@@ -36,11 +35,6 @@ if TYPE_CHECKING:
     from hdbridge.report.twin import Learned, TwinReport
     from hdbridge.sim.truth import Truth
     from hdbridge.twin.translate import Translation
-
-
-def register(app: typer.Typer) -> None:
-    """Adds the command."""
-    app.command("twin")(command)
 
 
 def command(
@@ -84,7 +78,7 @@ def command(
     axis = AxisConfig.load(files.axis)
     recording = _joined(axis, load_recordings(recordings, columns, units, unwrap))
     for doubt in doubts(recording, axis):
-        notes.print(f"look at the recording: {doubt}", markup=False, soft_wrap=True)
+        note(f"look at the recording: {doubt}")
     if check:
         _check(files, axis, recording, json_file, html_file)
         return
@@ -115,7 +109,7 @@ def _compared(
     from hdbridge.twin.compare import compare
     from hdbridge.twin.replay import legs_of, replay
 
-    notes.print("the recording's commands run through the simulated drive ...")
+    note("the recording's commands run through the simulated drive ...")
     simulated = replay(recording, axis, begun.truth)
     found = compare(recording.record, simulated, legs_of(recording), axis.gear.ratio)
     return TwinReport(axis.name, found, translated=begun.rows, facts=facts)
@@ -212,7 +206,7 @@ def _check(
             "unseen": list(found.unseen),
         },
     )
-    console.print(found.sentence, markup=False, soft_wrap=True)
+    say(found.sentence)
 
 
 def _joined(axis: AxisConfig, recordings: dict[Path, Recording]) -> Recording:
@@ -252,12 +246,10 @@ def _beginning(files: Profile, axis: AxisConfig, truth: Path | None, *, afresh: 
         model.check_bound_to(axis)
     begun = translate(axis, model, Truth.load(plant) if plant is not None else None)
     if not (begun.truth.gear.hysteresis or begun.truth.gear.motor_orders):
-        notes.print(
+        note(
             "no transmission error is simulated: neither a model nor the plant's file tells it. What it does "
             "to torque and following error may be taken for motor or loops; calibrate first "
-            f"(hdbridge calibrate {files.folder})",
-            markup=False,
-            soft_wrap=True,
+            f"(hdbridge calibrate {files.folder})"
         )
     return begun
 
@@ -316,10 +308,10 @@ def print_report(report: TwinReport) -> None:
 
     for effect in report.translated:
         if effect.counterpart is None:
-            notes.print(f"{effect.effect} is not simulated: {effect.note}", markup=False, soft_wrap=True)
+            note(f"{effect.effect} is not simulated: {effect.note}")
     if report.verdict:
-        console.print(sentence(report.verdict), markup=False, soft_wrap=True, style="bold")
-    console.print(escape(verdict(report)), soft_wrap=True)
+        say(sentence(report.verdict), style="bold")
+    say(verdict(report))
     table = Table("")
     differences = ["difference before", "difference"] if report.after else ["difference"]
     for name in ("measured", "simulated", *differences, "of the noise"):
@@ -335,9 +327,9 @@ def print_report(report: TwinReport) -> None:
         table.add_row(title_of(row), *cells, figure(row.difference), figure(row.in_noise, 3), row.unit)
     print_table(table)
     for named in report.named:
-        console.print(f"{named.cause}: {named.text}", markup=False, soft_wrap=True)
+        say(f"{named.cause}: {named.text}")
     for estimate in report.learned if report.values == Values.AXIS else ():
         if estimate.before is None:
-            console.print(estimate.text, markup=False, soft_wrap=True)
+            say(estimate.text)
     for each in report.commands:
-        console.print(f"  {each.line}   # {each.purpose}", markup=False, soft_wrap=True)
+        say(f"  {each.line}   # {each.purpose}")

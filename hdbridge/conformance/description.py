@@ -1,7 +1,5 @@
 """Checks of the EDS against the node: objects, types, access, limits, defaults, PDO mapping."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from typing import Final
 
@@ -39,7 +37,7 @@ def _name(each: ODVariable) -> str:
 
 
 def _entries(t: NodeTester) -> list[ODVariable]:
-    t.need(t.od is not None, "no EDS is given")
+    t.eds  # noqa: B018 - needed
     return [each for each in t.variables() if each.index >= 0x1000]
 
 
@@ -148,12 +146,8 @@ def _limit(name: str, attribute: str, step: int) -> None:
             if limit is None or len(each) > 32 or not t.has(each.index, each.subindex):
                 continue
             beyond, size = limit + step, len(each) // 8
-            low, high = (
-                (-(1 << len(each) - 1), (1 << len(each) - 1) - 1)
-                if is_signed(each)
-                else (0, (1 << len(each)) - 1)
-            )
-            if not low <= beyond <= high:
+            low = -(1 << len(each) - 1) if is_signed(each) else 0
+            if not low <= beyond < low + (1 << len(each)):
                 continue
             tried += 1
             before = t.upload(each.index, each.subindex)
@@ -260,21 +254,17 @@ _mapped(
 
 @check("eds.undeclared", "Optional objects that the EDS does not name do not exist", _EDS)
 def _(t: NodeTester) -> None:
-    t.need(t.od is not None, "no EDS is given")
-    assert t.od is not None
     optional = (*range(0x1000, 0x1030), *range(0x1200, 0x1204), *range(0x6040, 0x6100), 0x6502, 0x6503)
-    wrong = [f"{index:04X}h" for index in optional if index not in t.od and t.has(index)]
+    wrong = [f"{index:04X}h" for index in optional if index not in t.eds and t.has(index)]
     _report(wrong, "abort 06020000h")
 
 
 def _count(kind: str, first: int, attribute: str) -> None:
     @check(f"eds.pdos.{kind}", f"The EDS names as many {kind}s as it says", _EDS)
     def _(t: NodeTester) -> None:
-        t.need(t.od is not None, "no EDS is given")
-        assert t.od is not None
-        expected = getattr(t.od.device_information, f"nr_of_{attribute}")
+        expected = getattr(t.eds.device_information, f"nr_of_{attribute}")
         t.need(expected is not None, f"the EDS does not say how many {kind}s there are")
-        found = sum(t.has(index, 1) for index in range(first, first + 0x200) if index in t.od)
+        found = sum(t.has(index, 1) for index in range(first, first + 0x200) if index in t.eds)
         t.equal(found, expected, f"number of {kind}s")
 
 

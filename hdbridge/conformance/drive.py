@@ -1,7 +1,5 @@
 """Checks of CiA 402 that need no power: objects, units, modes, and the states up to *ready to switch on*."""
 
-from __future__ import annotations
-
 import struct
 from typing import Final
 
@@ -13,13 +11,14 @@ from hdbridge.conformance.tester import (
     READY_TO_SWITCH_ON,
     SWITCH_ON_DISABLED,
     NodeTester,
+    NotApplicableError,
     Table,
     expedited,
     pack,
     power_state,
 )
 
-CHECKS: Final = Table()
+CHECKS: Final = Table(drives=True)
 check: Final = CHECKS.check
 _PROFILE: Final = "CiA 402-2"
 _STATES: Final = "CiA 402-2, finite state automaton"
@@ -41,7 +40,6 @@ MODES: Final = {
 
 @check("402.type", "1000h has the profile number 402 and a drive's type", _PROFILE)
 def _(t: NodeTester) -> None:
-    t.need_402()
     kind = t.read(0x1000) >> 16 & 0xFF
     t.true(
         kind & 0x07, f"type {kind:02X}h", "frequency converter, servo drive or stepper motor (bits 0 to 2)"
@@ -55,7 +53,6 @@ def _mandatory(index: int, size: int, name: str, *, writable: bool) -> None:
         _PROFILE,
     )
     def _(t: NodeTester) -> None:
-        t.need_402()
         data = t.upload(index)
         t.equal(len(data), size, "bytes")
         if not writable:
@@ -71,7 +68,6 @@ _mandatory(0x6502, 4, "supported drive modes", writable=False)
 
 @check("402.modes", "6502h names at least one mode", _MODES)
 def _(t: NodeTester) -> None:
-    t.need_402()
     t.true(t.read(0x6502) & 0x3FF, f"6502h = {t.read(0x6502):08X}h", "a bit from 0 to 9")
 
 
@@ -80,7 +76,6 @@ def _mode(number: int, name: str) -> None:
         f"402.mode.{number}", f"Mode {number}, {name}, is accepted if 6502h names it, else refused", _MODES
     )
     def _(t: NodeTester) -> None:
-        t.need_402()
         if t.read(0x6502) >> number - 1 & 1:
             t.write(0x6060, 0, number, 1)
             t.wait(0.05)
@@ -99,7 +94,6 @@ for _number, _name in MODES.items():
 
 @check("402.mode.reserved", "A reserved mode, 5, is refused or not displayed", _MODES)
 def _(t: NodeTester) -> None:
-    t.need_402()
     t.write(0x6060, 0, t.read(0x6060, signed=True), 1)
     t.ask(expedited(0x6060, 0, b"\x05"))
     t.wait(0.05)
@@ -111,7 +105,6 @@ def _(t: NodeTester) -> None:
 
 @check("402.state.reset", "After the NMT command reset node the drive reaches switch on disabled", _STATES)
 def _(t: NodeTester) -> None:
-    t.need_402()
     t.reset(NMT_RESET_NODE)
     t.reaches(SWITCH_ON_DISABLED)
 
@@ -123,7 +116,6 @@ def _(t: NodeTester) -> None:
 
 def ready(t: NodeTester) -> None:
     """Leads to READY TO SWITCH ON."""
-    t.need_402()
     t.disable()
     t.control(0x06)
     t.reaches(READY_TO_SWITCH_ON)
@@ -144,7 +136,6 @@ _back("quick-stop", 0x02, "Quick stop")
 def _no_effect(name: str, word: int, text: str) -> None:
     @check(f"402.state.disabled.{name}", f"{text} changes nothing in switch on disabled", _STATES)
     def _(t: NodeTester) -> None:
-        t.need_402()
         t.disable()
         t.control(word)
         t.stays(SWITCH_ON_DISABLED)
@@ -164,7 +155,6 @@ def _(t: NodeTester) -> None:
 
 @check("402.state.mode-bits", "Bits 4 to 6 and 8 of the controlword do not disturb shutdown", _STATES)
 def _(t: NodeTester) -> None:
-    t.need_402()
     t.disable()
     t.control(0x176)
     t.reaches(READY_TO_SWITCH_ON)
@@ -184,7 +174,6 @@ def _(t: NodeTester) -> None:
 
 @check("402.status.fault", "Bit 3 of the statusword is 0 without a fault", _STATES)
 def _(t: NodeTester) -> None:
-    t.need_402()
     t.disable()
     t.equal(t.read(0x6041) & 0x08, 0, "bit 3")
 
@@ -197,15 +186,12 @@ def _(t: NodeTester) -> None:
 
 @check("402.status.limit", "Bit 11 of the statusword, internal limit, is 0 at rest without power", _STATES)
 def _(t: NodeTester) -> None:
-    t.need_402()
     t.disable()
     t.equal(t.read(0x6041) >> 11 & 1, 0, "bit 11")
 
 
-@check("402.error-code", "603Fh is 0 without a fault", "CiA 402-2, object 603Fh")
+@check("402.error-code", "603Fh is 0 without a fault", "CiA 402-2, object 603Fh", 0x603F)
 def _(t: NodeTester) -> None:
-    t.need_402()
-    t.require(0x603F)
     t.disable()
     t.equal(t.read(0x603F), 0, "603Fh")
 
@@ -218,7 +204,6 @@ def _(t: NodeTester) -> None:
 
 @check("402.controlword.pdo", "The controlword is obeyed as an RPDO", _STATES)
 def _(t: NodeTester) -> None:
-    t.need_402()
     t.disable()
     can_id = t.map_pdo(0x1400, ((0x6040, 0, 16),), 255)
     t.nmt(NMT_START)
@@ -230,7 +215,6 @@ def _(t: NodeTester) -> None:
 
 @check("402.controlword.pdo.sync", "A synchronous controlword is obeyed at SYNC, not before", _STATES)
 def _(t: NodeTester) -> None:
-    t.need_402()
     t.disable()
     can_id = t.map_pdo(0x1400, ((0x6040, 0, 16),), 1)
     t.nmt(NMT_START)
@@ -247,9 +231,7 @@ def _(t: NodeTester) -> None:
     t.nmt(NMT_START)
     since = t.mark()
     t.sync()
-    frame = t.hears(can_id, since=since)
-    t.true(frame, "no TPDO", "the statusword")
-    assert frame is not None
+    frame = t.true(t.hears(can_id, since=since), "no TPDO", "the statusword")
     t.equal(power_state(struct.unpack("<H", frame.data)[0]), READY_TO_SWITCH_ON, "state in the TPDO")
 
 
@@ -279,14 +261,11 @@ def _option(index: int, name: str, reserved: int) -> None:
         _OPTIONS,
     )
     def _(t: NodeTester) -> None:
-        t.need_402()
         t.require(index)
         t.refuses_value(index, 0, pack(reserved, 2), RANGE)
 
-    @check(f"402.option.{index:04X}", f"{index:04X}h, {name}, holds a defined value", _OPTIONS)
+    @check(f"402.option.{index:04X}", f"{index:04X}h, {name}, holds a defined value", _OPTIONS, index)
     def _(t: NodeTester) -> None:
-        t.need_402()
-        t.require(index)
         data = t.upload(index)
         t.equal(len(data), 2, "bytes")
         value = int.from_bytes(data, "little", signed=True)
@@ -313,10 +292,8 @@ _option(0x605E, "fault reaction", 5)
 
 
 def _ratio(index: int, name: str, words: str) -> None:
-    @check(f"402.units.{name}", f"{index:04X}h: {words} are not 0", _UNITS)
+    @check(f"402.units.{name}", f"{index:04X}h: {words} are not 0", _UNITS, (index, 1))
     def _(t: NodeTester) -> None:
-        t.need_402()
-        t.require(index, 1)
         found = [t.read(index, sub) for sub in (1, 2)]
         t.true(all(found), f"{index:04X}h = {found}", "both above 0")
 
@@ -328,7 +305,6 @@ _ratio(0x6092, "feed", "feed and driving shaft revolutions")
 
 @check("402.units.position", "6064h is 6063h · 6092h / (608Fh · 6091h) apart from a home offset", _UNITS)
 def _(t: NodeTester) -> None:
-    t.need_402()
     for index, sub in ((0x6063, 0), (0x608F, 1), (0x6091, 1), (0x6092, 1)):
         t.require(index, sub)
     increments, turns = t.read(0x608F, 1), t.read(0x608F, 2)
@@ -348,7 +324,6 @@ def _(t: NodeTester) -> None:
     "402.limits.position", "607Dh: the lower position limit is below the upper one", "CiA 402-2, object 607Dh"
 )
 def _(t: NodeTester) -> None:
-    t.need_402()
     t.require(0x607D, 1)
     low, high = (t.read(0x607D, sub, signed=True) for sub in (1, 2))
     t.true(low < high or low == high == 0, f"607Dh = {low}, {high}", "lower below upper")
@@ -357,7 +332,6 @@ def _(t: NodeTester) -> None:
 def _positive(index: int, name: str) -> None:
     @check(f"402.limits.{index:04X}", f"{index:04X}h, {name}, is above 0", f"CiA 402-2, object {index:04X}h")
     def _(t: NodeTester) -> None:
-        t.need_402()
         t.require(index)
         t.true(t.read(index), f"{index:04X}h = 0", "a value above 0")
 
@@ -371,26 +345,21 @@ _positive(0x6085, "quick stop deceleration")
 _positive(0x6076, "motor rated torque")
 
 
-@check("402.period", "60C2h is a period from 0.1 ms to 1 s", "CiA 402-2, object 60C2h")
+@check("402.period", "60C2h is a period from 0.1 ms to 1 s", "CiA 402-2, object 60C2h", (0x60C2, 1))
 def _(t: NodeTester) -> None:
-    t.need_402()
-    t.require(0x60C2, 1)
     period_s = t.read(0x60C2, 1) * 10.0 ** t.read(0x60C2, 2, signed=True)
     t.true(1e-4 <= period_s <= 1.0, f"{period_s:g} s", "0.1 ms to 1 s")
 
 
 @check("402.homing.methods", "Every method in 60E3h is accepted by 6098h", "CiA 402-2, objects 6098h, 60E3h")
 def _(t: NodeTester) -> None:
-    t.need_402()
     t.require(0x60E3)
     for sub in range(1, t.read(0x60E3) + 1):
         t.write(0x6098, 0, t.read(0x60E3, sub, signed=True), 1)
 
 
-@check("402.homing.reserved", "A reserved homing method, 38, is refused", "CiA 402-2, object 6098h")
+@check("402.homing.reserved", "A reserved homing method, 38, is refused", "CiA 402-2, object 6098h", 0x6098)
 def _(t: NodeTester) -> None:
-    t.need_402()
-    t.require(0x6098)
     t.refuses_value(0x6098, 0, b"\x26", RANGE)
 
 
@@ -400,16 +369,12 @@ def _(t: NodeTester) -> None:
     "CiA 402-2, object 6086h",
 )
 def _(t: NodeTester) -> None:
-    t.need_402()
     t.require(0x6086)
     t.refuses_value(0x6086, 0, b"\x05\0", RANGE)
 
 
-@check("402.following-error", "60F4h is 6062h minus 6064h", "CiA 402-2, object 60F4h")
+@check("402.following-error", "60F4h is 6062h minus 6064h", "CiA 402-2, object 60F4h", 0x60F4, 0x6062)
 def _(t: NodeTester) -> None:
-    t.need_402()
-    for index in (0x60F4, 0x6062):
-        t.require(index)
     error = t.read(0x60F4, signed=True)
     found = t.read(0x6062, signed=True) - t.read(0x6064, signed=True)
     noise = max(2, t.travel // 10)
@@ -418,8 +383,7 @@ def _(t: NodeTester) -> None:
 
 @check("402.still", "The axis has not moved during the checks without power", _PROFILE)
 def _(t: NodeTester) -> None:
-    t.need_402()
-    t.need(t.start_position is not None, "the position at the start is not known")
-    assert t.start_position is not None
+    if t.start_position is None:
+        raise NotApplicableError("the position at the start is not known")
     moved = t.read(0x6064, signed=True) - t.start_position
     t.true(abs(moved) <= t.travel, f"moved by {moved}", f"at most {t.travel}")

@@ -1,7 +1,5 @@
 """Checks of EMCY, the error objects, stored parameters and identity."""
 
-from __future__ import annotations
-
 import struct
 from typing import Final
 
@@ -52,9 +50,8 @@ def _(t: NodeTester) -> None:
     t.aborts(expedited(0x1001, 0, b"\0"), READ_ONLY, "download to 1001h")
 
 
-@check("emcy.identifier", "1014h is 80h + node id by default", _EMCY)
+@check("emcy.identifier", "1014h is 80h + node id by default", _EMCY, 0x1014)
 def _(t: NodeTester) -> None:
-    t.require(0x1014)
     t.reset()
     t.equal(f"{t.read(0x1014) & 0x7FF:03X}h", f"{0x80 + t.node_id:03X}h", "identifier")
 
@@ -78,9 +75,8 @@ def _(t: NodeTester) -> None:
     t.equal(t.emergencies(0).count(0x8130), 1, "number of EMCY messages")
 
 
-@check("emcy.disabled", "1014h with bit 31 set sends no EMCY", _EMCY)
+@check("emcy.disabled", "1014h with bit 31 set sends no EMCY", _EMCY, 0x1014)
 def _(t: NodeTester) -> None:
-    t.require(0x1014)
     lose_heartbeat(t)
     t.send(0x77E, b"\x05")
     t.wait(0.02)
@@ -90,9 +86,8 @@ def _(t: NodeTester) -> None:
     t.equal(t.emergencies(since), [], "EMCY codes")
 
 
-@check("emcy.identifier.other", "EMCY is sent with the identifier in 1014h", _EMCY)
+@check("emcy.identifier.other", "EMCY is sent with the identifier in 1014h", _EMCY, 0x1014)
 def _(t: NodeTester) -> None:
-    t.require(0x1014)
     other = 0x80 + (t.node_id ^ 1 or 2)
     t.write(0x1014, 0, t.read(0x1014) | PDO_INVALID, 4)
     t.write(0x1014, 0, other, 4)
@@ -104,38 +99,33 @@ def _(t: NodeTester) -> None:
     t.true(t.heard(other, since), "no EMCY with the new identifier", "EMCY 8130h")
 
 
-@check("emcy.history", "An error is the first entry of 1003h", _HISTORY)
+@check("emcy.history", "An error is the first entry of 1003h", _HISTORY, 0x1003)
 def _(t: NodeTester) -> None:
-    t.require(0x1003)
     lose_heartbeat(t)
     t.equal(f"{t.read(0x1003, 1) & 0xFFFF:04X}h", "8130h", "1003h:01")
 
 
-@check("emcy.history.count", "1003h:00 counts the errors", _HISTORY)
+@check("emcy.history.count", "1003h:00 counts the errors", _HISTORY, 0x1003)
 def _(t: NodeTester) -> None:
-    t.require(0x1003)
     t.put(0x1003, 0, 0, 1)
     lose_heartbeat(t)
     t.equal(t.read(0x1003, 0), 1, "1003h:00")
 
 
-@check("emcy.history.clear", "Writing 0 to 1003h:00 clears the history", _HISTORY)
+@check("emcy.history.clear", "Writing 0 to 1003h:00 clears the history", _HISTORY, 0x1003)
 def _(t: NodeTester) -> None:
-    t.require(0x1003)
     lose_heartbeat(t)
     t.put(0x1003, 0, 0, 1)
     t.equal(t.read(0x1003, 0), 0, "1003h:00")
 
 
-@check("emcy.history.write", "Writing anything else to 1003h:00 is abort 06090030h", _HISTORY)
+@check("emcy.history.write", "Writing anything else to 1003h:00 is abort 06090030h", _HISTORY, 0x1003)
 def _(t: NodeTester) -> None:
-    t.require(0x1003)
     t.aborts(expedited(0x1003, 0, b"\x01"), RANGE, "1003h:00 = 1")
 
 
-@check("emcy.history.order", "The newest error is in 1003h:01", _HISTORY)
+@check("emcy.history.order", "The newest error is in 1003h:01", _HISTORY, 0x1003)
 def _(t: NodeTester) -> None:
-    t.require(0x1003)
     index, sub, bits = t.scratch()
     can_id = t.map_pdo(0x1400, ((index, sub, bits),), 255)
     lose_heartbeat(t)
@@ -183,10 +173,7 @@ def _identity(sub: int, key: str, name: str) -> None:
         "CiA 306, [DeviceInfo]",
     )
     def _(t: NodeTester) -> None:
-        t.need(t.od is not None, "no EDS is given")
-        assert t.od is not None
-        expected = getattr(t.od.device_information, key)
-        t.need(expected, f"the EDS has no {name}")
+        expected = t.need(getattr(t.eds.device_information, key), f"the EDS has no {name}")
         t.require(0x1018, sub)
         t.equal(f"{t.read(0x1018, sub):08X}h", f"{expected:08X}h", name)
 
@@ -205,14 +192,12 @@ def _storage(index: int, verb: str) -> None:
         t.require(index, 1)
         t.true(t.read(index, 1) & 3, f"{index:04X}h:01 = {t.read(index, 1)}", "bit 0 or bit 1")
 
-    @check(f"store.{index:04X}.signature", f"{index:04X}h:01 refuses a wrong signature", _STORE)
+    @check(f"store.{index:04X}.signature", f"{index:04X}h:01 refuses a wrong signature", _STORE, (index, 1))
     def _(t: NodeTester) -> None:
-        t.require(index, 1)
         t.aborts(expedited(index, 1, b"evil"), _NO_STORAGE, "signature 'evil'")
 
-    @check(f"store.{index:04X}.entries", f"{index:04X}h:00 is 1 to 127", _STORE)
+    @check(f"store.{index:04X}.entries", f"{index:04X}h:00 is 1 to 127", _STORE, (index, 1))
     def _(t: NodeTester) -> None:
-        t.require(index, 1)
         t.true(1 <= t.read(index, 0) <= 127, f"{index:04X}h:00 = {t.read(index, 0)}", "1 to 127")
 
 
@@ -269,9 +254,8 @@ def _(t: NodeTester) -> None:
     t.equal(t.read(0x1017), before, "1017h")
 
 
-@check("store.evil", "A wrong signature saves nothing", _STORE, stores=True)
+@check("store.evil", "A wrong signature saves nothing", _STORE, (0x1010, 1), stores=True)
 def _(t: NodeTester) -> None:
-    t.require(0x1010, 1)
     before = t.read(0x1017)
     t.put(0x1017, 0, before + 300, 2)
     t.ask(expedited(0x1010, 1, pack(struct.unpack("<I", b"evas")[0], 4)))

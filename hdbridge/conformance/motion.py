@@ -1,13 +1,12 @@
 """Checks of CiA 402 with power: states, options, moves, cyclic targets, homing; the axis moves a little."""
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Callable
 from typing import Final
 
 from hdbridge.conformance.drive import MODES
 from hdbridge.conformance.tester import (
+    ENABLING,
     FAULT,
     NMT_PRE_OPERATIONAL,
     NMT_RESET_NODE,
@@ -20,12 +19,14 @@ from hdbridge.conformance.tester import (
     SWITCH_ON_DISABLED,
     SWITCHED_ON,
     NodeTester,
+    NotApplicableError,
     Table,
     pack,
     power_state,
 )
 
-CHECKS: Final = Table()
+CHECKS: Final = Table(drives=True, moves=True)
+check: Final = CHECKS.check
 _STATES: Final = "CiA 402-2, finite state automaton"
 _OPTIONS: Final = "CiA 402-2, objects 605Ah to 605Eh, 6007h"
 _PP: Final = "CiA 402-2, profile position mode"
@@ -39,15 +40,6 @@ _MASTER: Final = 126
 _CYCLE_S: Final = 0.01
 _STOP_S: Final = 0.5
 """Longest time from a stop command to standstill."""
-
-
-def check(
-    name: str,
-    text: str,
-    clause: str,
-) -> Callable[[Callable[[NodeTester], None]], Callable[[NodeTester], None]]:
-    """Decorates a check that may switch power on."""
-    return CHECKS.check(name, text, clause, moves=True)
 
 
 # ---------------------------------------------------------------- on the way
@@ -66,8 +58,13 @@ def _stands(t: NodeTester, duration_s: float = 0.1, within: float = 0.1) -> None
         t.true(moved <= max(2.0, within * t.travel), f"the axis moves: {moved} units", "standstill")
 
 
+def _moved_at_most(t: NodeTester, before: int, most: float, now: int | None = None) -> None:
+    """Fails if the axis is farther from ``before`` than this; ``now`` is its position, read by default."""
+    moved = abs((_position(t) if now is None else now) - before)
+    t.true(moved <= most, f"the axis moved by {moved}", "standstill")
+
+
 def _select(t: NodeTester, mode: int) -> None:
-    t.need_402()
     t.need(t.read(0x6502) >> mode - 1 & 1, f"the drive has no {MODES[mode]} mode (6502h)")
     t.write(0x6060, 0, mode, 1)
     end_s = t.now + t.timing.power_s
@@ -77,17 +74,11 @@ def _select(t: NodeTester, mode: int) -> None:
 
 
 def _some_mode(t: NodeTester) -> int:
-    t.need_402()
     has = t.read(0x6502)
     for mode in (1, 8, 7, 6):
         if has >> mode - 1 & 1:
             return mode
-    t.need(False, "the drive has no position mode (6502h)")
-    raise AssertionError
-
-
-def _enable(t: NodeTester, mode: int | None = None) -> None:
-    _bring(t, OPERATION_ENABLED, mode)
+    raise NotApplicableError("the drive has no position mode (6502h)")
 
 
 def _bring(t: NodeTester, state: int, mode: int | None = None) -> None:
@@ -101,12 +92,7 @@ def _bring(t: NodeTester, state: int, mode: int | None = None) -> None:
     if state == FAULT:
         _fault(t)
         return
-    words = (
-        (READY_TO_SWITCH_ON, 0x06),
-        (SWITCHED_ON, 0x07),
-        (OPERATION_ENABLED, 0x0F),
-        (QUICK_STOP_ACTIVE, 0x02),
-    )
+    words = (*ENABLING, (QUICK_STOP_ACTIVE, 0x02))
     for reached, word in words if state != SWITCH_ON_DISABLED else ():
         t.control(word)
         t.reaches(reached)
@@ -119,14 +105,10 @@ def _fault(t: NodeTester) -> None:
     t.require(0x6007)
     t.require(0x1016, 1)
     t.write(0x6007, 0, 1, 2)
-    _lose_master(t)
-    t.reaches(FAULT)
-
-
-def _lose_master(t: NodeTester) -> None:
     _guarded(t)
     _enable_after_select(t)
     t.wait(0.35)
+    t.reaches(FAULT)
 
 
 def _guarded(t: NodeTester) -> None:
@@ -135,9 +117,7 @@ def _guarded(t: NodeTester) -> None:
 
 
 def _enable_after_select(t: NodeTester) -> None:
-    for reached, word in ((READY_TO_SWITCH_ON, 0x06), (SWITCHED_ON, 0x07), (OPERATION_ENABLED, 0x0F)):
-        t.control(word)
-        t.reaches(reached)
+    t.walk()
     t.send(0x700 + _MASTER, b"\x05")
 
 
@@ -153,8 +133,7 @@ def _transition(number: str, state: int, word: int, command: str, then: int) -> 
         before = _position(t)
         t.control(word)
         t.reaches(then)
-        moved = abs(_position(t) - before)
-        t.true(moved <= t.travel, f"the axis moved by {moved}", "standstill")
+        _moved_at_most(t, before, t.travel)
 
 
 _transition("2", SWITCH_ON_DISABLED, 0x06, "Shutdown", READY_TO_SWITCH_ON)
@@ -198,15 +177,11 @@ def _(t: NodeTester) -> None:
     _bring(t, FAULT)
     t.control(0x80)
     t.reaches(SWITCH_ON_DISABLED)
-    _lose_master_again(t)
-    t.control(0x8F)
-    t.reaches(SWITCH_ON_DISABLED)
-
-
-def _lose_master_again(t: NodeTester) -> None:
     _enable_after_select(t)
     t.wait(0.35)
     t.reaches(FAULT)
+    t.control(0x8F)
+    t.reaches(SWITCH_ON_DISABLED)
 
 
 @check(
@@ -246,16 +221,14 @@ def _(t: NodeTester) -> None:
     t.stays(SWITCH_ON_DISABLED, 0.1)
 
 
-@check("402.fault.code", "603Fh is the code of the fault", "CiA 402-2, object 603Fh")
+@check("402.fault.code", "603Fh is the code of the fault", "CiA 402-2, object 603Fh", 0x603F)
 def _(t: NodeTester) -> None:
-    t.require(0x603F)
     _bring(t, FAULT)
     t.equal(f"{t.read(0x603F):04X}h", "8130h", "603Fh")
 
 
-@check("402.fault.code.reset", "603Fh is 0 after the fault reset", "CiA 402-2, object 603Fh")
+@check("402.fault.code.reset", "603Fh is 0 after the fault reset", "CiA 402-2, object 603Fh", 0x603F)
 def _(t: NodeTester) -> None:
-    t.require(0x603F)
     _bring(t, FAULT)
     t.control(0x80)
     t.reaches(SWITCH_ON_DISABLED)
@@ -292,30 +265,20 @@ def _(t: NodeTester) -> None:
 
 
 def _lost_master(code: int, states: tuple[int, ...], text: str) -> None:
-    @check(f"402.option.6007.{code}", f"6007h = {code}: a lost heartbeat {text}", _OPTIONS)
+    @check(f"402.option.6007.{code}", f"6007h = {code}: a lost heartbeat {text}", _OPTIONS, 0x6007)
     def _(t: NodeTester) -> None:
-        t.require(0x6007)
         mode = _some_mode(t)
         t.disable()
         _select(t, mode)
         t.write(0x6007, 0, code, 2)
         t.write(0x1029, 1, 1, 1) if t.has(0x1029, 1) else None
-        _lose_master(t)
+        _guarded(t)
+        _enable_after_select(t)
+        t.wait(0.35)
         if code:
-            _settles(t, states)
+            t.reaches(*states)
         else:
             t.stays(OPERATION_ENABLED, 0.1)
-
-
-def _settles(t: NodeTester, states: tuple[int, ...]) -> None:
-    """Waits until one of the states is reached."""
-    end_s = t.now + t.timing.power_s
-    while (found := t.power_state()) not in states:
-        if t.now > end_s:
-            t.fail(
-                POWER_STATES.get(found, f"{found:02X}h"), " or ".join(POWER_STATES[each] for each in states)
-            )
-        t.wait(0.01)
 
 
 _lost_master(0, (OPERATION_ENABLED,), "changes nothing")
@@ -391,7 +354,6 @@ for _code in (0, 1, 2):
 
 def _select_slowly(t: NodeTester) -> None:
     """Selects profile position at one test distance in 0.2 s."""
-    t.need_402()
     t.disable()
     _select(t, 1)
     t.require(0x6081)
@@ -400,9 +362,7 @@ def _select_slowly(t: NodeTester) -> None:
 
 def _enable_slowly(t: NodeTester) -> None:
     _select_slowly(t)
-    for reached, word in ((READY_TO_SWITCH_ON, 0x06), (SWITCHED_ON, 0x07), (OPERATION_ENABLED, 0x0F)):
-        t.control(word)
-        t.reaches(reached)
+    t.walk()
 
 
 def _direction(t: NodeTester, distances: int) -> int:
@@ -451,10 +411,9 @@ def _(t: NodeTester) -> None:
     mode = _some_mode(t)
     t.disable()
     before = _position(t)
-    _enable(t, mode)
+    _bring(t, OPERATION_ENABLED, mode)
     _stands(t, 0.3)
-    moved = abs(_position(t) - before)
-    t.true(moved <= 0.5 * t.travel, f"the axis moved by {moved}", "standstill")
+    _moved_at_most(t, before, 0.5 * t.travel)
 
 
 @check("402.pp.move", "A new set-point is reached", _PP)
@@ -510,9 +469,7 @@ def _(t: NodeTester) -> None:
 def _(t: NodeTester) -> None:
     _select_slowly(t)
     t.put(0x607A, 0, _position(t) + _direction(t, 3) * 3 * t.travel, 4)
-    for reached, word in ((READY_TO_SWITCH_ON, 0x06), (SWITCHED_ON, 0x07), (OPERATION_ENABLED, 0x0F)):
-        t.control(word)
-        t.reaches(reached)
+    t.walk()
     _stands(t, 0.3)
 
 
@@ -601,9 +558,8 @@ def _(t: NodeTester) -> None:
     _arrives(t, target)
 
 
-@check("402.pp.limit", "A set-point beyond 607Dh leads at most to the limit", _PP)
+@check("402.pp.limit", "A set-point beyond 607Dh leads at most to the limit", _PP, (0x607D, 1))
 def _(t: NodeTester) -> None:
-    t.require(0x607D, 1)
     _select_slowly(t)
     start = _position(t)
     side = _direction(t, 3)
@@ -611,9 +567,7 @@ def _(t: NodeTester) -> None:
     low, high = sorted((start - side * 3 * t.travel, edge))
     t.write(0x607D, 1, low, 4)
     t.write(0x607D, 2, high, 4)
-    for reached, word in ((READY_TO_SWITCH_ON, 0x06), (SWITCHED_ON, 0x07), (OPERATION_ENABLED, 0x0F)):
-        t.control(word)
-        t.reaches(reached)
+    t.walk()
     _set_point(t, start + side * 3 * t.travel)
     for _ in range(100):
         beyond = side * (_position(t) - edge)
@@ -654,7 +608,6 @@ class _Stream:
 
     def __init__(self, t: NodeTester) -> None:
         self.t = t
-        t.need_402()
         t.disable()
         _select(t, 8)
         if t.has(0x60C2, 1):
@@ -683,7 +636,7 @@ class _Stream:
     def enable(self) -> None:
         """Walks to OPERATION ENABLED with the target at the actual position."""
         self.t.powered = True
-        for word, state in ((0x06, READY_TO_SWITCH_ON), (0x07, SWITCHED_ON), (0x0F, OPERATION_ENABLED)):
+        for state, word in ENABLING:
             self.word = word
             end_s = self.t.now + self.t.timing.power_s
             while power_state(self.status) != state:
@@ -708,8 +661,7 @@ def _(t: NodeTester) -> None:
     before = stream.position
     stream.enable()
     stream.cycle(20)
-    moved = abs(stream.position - before)
-    t.true(moved <= 0.5 * t.travel, f"the axis moved by {moved}", "standstill")
+    _moved_at_most(t, before, 0.5 * t.travel, stream.position)
 
 
 @check("402.csp.follow", "The position follows the target of every SYNC", _CSP)
@@ -746,13 +698,11 @@ def _(t: NodeTester) -> None:
     stream.cycle(20, step)
     before = stream.position
     stream.cycle(30, step)
-    moved = abs(stream.position - before)
-    t.true(moved <= 0.1 * t.travel + 2, f"the axis moved by {moved}", "standstill")
+    _moved_at_most(t, before, 0.1 * t.travel + 2, stream.position)
 
 
-@check("402.csp.limit", "A target beyond 607Dh leads at most to the limit", _CSP)
+@check("402.csp.limit", "A target beyond 607Dh leads at most to the limit", _CSP, (0x607D, 1))
 def _(t: NodeTester) -> None:
-    t.require(0x607D, 1)
     stream = _Stream(t)
     side = _direction(t, 3)
     edge = stream.position + side * t.travel // 2
@@ -786,7 +736,7 @@ def _(t: NodeTester) -> None:
     stream.enable()
     t.send(0x700 + _MASTER, b"\x05")
     stream.cycle(50, 0.02 * t.travel * _direction(t, 3))
-    _settles(t, (FAULT,))
+    t.reaches(FAULT)
     _stands(t)
 
 
@@ -806,14 +756,12 @@ def _(t: NodeTester) -> None:
     stream.target = before + _direction(t, 2) * t.travel
     stream.cycle(20)
     t.true(power_state(stream.status) != OPERATION_ENABLED, "operation enabled", "any other state")
-    moved = abs(stream.position - before)
-    t.true(moved <= 0.1 * t.travel + 2, f"the axis moved by {moved}", "standstill")
+    _moved_at_most(t, before, 0.1 * t.travel + 2, stream.position)
 
 
 def _leaves(name: str, command: int, text: str) -> None:
-    @check(f"402.csp.nmt.{name}", f"{text} stops an axis that follows targets", _CSP)
+    @check(f"402.csp.nmt.{name}", f"{text} stops an axis that follows targets", _CSP, 0x6007)
     def _(t: NodeTester) -> None:
-        t.require(0x6007)
         stream = _Stream(t)
         t.write(0x6007, 0, 1, 2)
         stream.enable()
@@ -851,7 +799,6 @@ def _homing(method: int) -> None:
         _HM,
     )
     def _(t: NodeTester) -> None:
-        t.need_402()
         t.require(0x607C)
         _enable_for_homing(t, method)
         before, offset = _position(t), t.read(0x607C, signed=True)
@@ -886,9 +833,8 @@ _homing(35)
 _homing(37)
 
 
-@check("402.homing.start", "Homing needs the rising edge of bit 4", _HM)
+@check("402.homing.start", "Homing needs the rising edge of bit 4", _HM, 0x607C)
 def _(t: NodeTester) -> None:
-    t.require(0x607C)
     _enable_for_homing(t, 37)
     before = _position(t)
     t.write(0x607C, 0, before + 3 * t.travel, 4)
@@ -909,9 +855,7 @@ def _(t: NodeTester) -> None:
     _select_slowly(t)
     t.write(0x6065, 0, 1, 4)
     t.write(0x6066, 0, 0, 2)
-    for reached, word in ((READY_TO_SWITCH_ON, 0x06), (SWITCHED_ON, 0x07), (OPERATION_ENABLED, 0x0F)):
-        t.control(word)
-        t.reaches(reached)
+    t.walk()
     target = _position(t) + _direction(t, 4) * 4 * t.travel
     _set_point(t, target)
     exceeded = 0

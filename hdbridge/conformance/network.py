@@ -1,7 +1,6 @@
 """Checks of network management: NMT, boot-up, heartbeat, node guarding."""
 
-from __future__ import annotations
-
+from collections.abc import Callable
 from itertools import pairwise
 from statistics import median
 from typing import Final
@@ -80,9 +79,8 @@ def _(t: NodeTester) -> None:
     t.equal(len(boots), 1, "number of boot-up messages")
 
 
-@check("nmt.reset-communication.parameters", "Reset communication restores 1000h to 1FFFh", _BOOT)
+@check("nmt.reset-communication.parameters", "Reset communication restores 1000h to 1FFFh", _BOOT, 0x1017)
 def _(t: NodeTester) -> None:
-    t.require(0x1017)
     t.reset()
     before = t.read(0x1017)
     t.put(0x1017, 0, before + 500, 2)
@@ -150,11 +148,10 @@ def _(t: NodeTester) -> None:
     t.equal(t.state(), OPERATIONAL, "NMT state")
 
 
-def _ignored(name: str, what: str, send: object) -> None:
+def _ignored(name: str, what: str, send: Callable[[NodeTester], None]) -> None:
     @check(f"nmt.ignores.{name}", f"The node ignores {what}", _NMT)
     def _(t: NodeTester) -> None:
         t.watch_state()
-        assert callable(send)
         send(t)
         t.equal(t.state(), PRE_OPERATIONAL, "NMT state")
 
@@ -223,9 +220,8 @@ def _(t: NodeTester) -> None:
     _period(t, 100)
 
 
-@check("heartbeat.period.other", "A new value of 1017h changes the period", _HEARTBEAT)
+@check("heartbeat.period.other", "A new value of 1017h changes the period", _HEARTBEAT, 0x1017)
 def _(t: NodeTester) -> None:
-    t.require(0x1017)
     t.write(0x1017, 0, 100, 2)
     t.wait(0.25)
     _period(t, 250)
@@ -255,9 +251,8 @@ def _(t: NodeTester) -> None:
 
 
 def _heartbeat_state(command: int, state: str, value: int) -> None:
-    @check(f"heartbeat.{state.lower()}", f"The heartbeat in {state} is {value:02X}h", _HEARTBEAT)
+    @check(f"heartbeat.{state.lower()}", f"The heartbeat in {state} is {value:02X}h", _HEARTBEAT, 0x1017)
     def _(t: NodeTester) -> None:
-        t.require(0x1017)
         t.write(0x1017, 0, 50, 2)
         t.nmt(command)
         since = t.mark()
@@ -310,9 +305,7 @@ def _(t: NodeTester) -> None:
     _beat(t, 3)
     begun_s = t.now
     t.send(0x700 + _MASTER, b"\x05")
-    frame = t.hears(0x080 + t.node_id, 0.4 + t.timing.jitter_s)
-    t.true(frame, "no EMCY", "EMCY 8130h after 200 ms")
-    assert frame is not None
+    frame = t.true(t.hears(0x080 + t.node_id, 0.4 + t.timing.jitter_s), "no EMCY", "EMCY 8130h after 200 ms")
     t.near(frame.time_s - begun_s, 0.2, "time to the EMCY")
 
 
@@ -382,9 +375,7 @@ def _guard(t: NodeTester) -> bytes:
     since = t.mark()
     t.send_special(0x700 + t.node_id, remote=True)
     frame = t.hears(0x700 + t.node_id, since=since)
-    t.true(frame, "no answer to the remote frame", "the NMT state")
-    assert frame is not None
-    return frame.data
+    return t.true(frame, "no answer to the remote frame", "the NMT state").data
 
 
 def _need_guarding(t: NodeTester) -> None:

@@ -1,7 +1,5 @@
 """Checks of PDOs and SYNC: communication and mapping parameters, transmission types, timers, reception."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from itertools import pairwise
 from statistics import median
@@ -370,9 +368,8 @@ _event(254)
 _event(255)
 
 
-@check("tpdo.event-timer", "The event timer repeats a TPDO", _PDO)
+@check("tpdo.event-timer", "The event timer repeats a TPDO", _PDO, (_TPDO, 5))
 def _(t: NodeTester) -> None:
-    t.require(_TPDO, 5)
     can_id = _sent(t, (_REGISTER,), 255, timers={5: 50})
     since = t.mark()
     t.wait(0.4)
@@ -382,9 +379,8 @@ def _(t: NodeTester) -> None:
     t.near(median(intervals), 0.05, "period")
 
 
-@check("tpdo.event-timer.off", "Event timer 0 repeats nothing", _PDO)
+@check("tpdo.event-timer.off", "Event timer 0 repeats nothing", _PDO, (_TPDO, 5))
 def _(t: NodeTester) -> None:
-    t.require(_TPDO, 5)
     can_id = _sent(t, (_REGISTER,), 255, timers={5: 0})
     t.wait(0.05)
     since = t.mark()
@@ -607,16 +603,14 @@ def _maps_dummy(t: NodeTester) -> bool:
 # ---------------------------------------------------------------- SYNC
 
 
-@check("sync.identifier", "1005h is 80h by default", _SYNC)
+@check("sync.identifier", "1005h is 80h by default", _SYNC, 0x1005)
 def _(t: NodeTester) -> None:
-    t.require(0x1005)
     t.reset()
     t.equal(t.read(0x1005) & 0x7FF, 0x80, "identifier")
 
 
-@check("sync.identifier.other", "SYNC is received with the identifier in 1005h", _SYNC)
+@check("sync.identifier.other", "SYNC is received with the identifier in 1005h", _SYNC, 0x1005)
 def _(t: NodeTester) -> None:
-    t.require(0x1005)
     can_id = t.map_pdo(_TPDO, (_REGISTER,), 1)
     t.write(0x1005, 0, _SPARE_ID, 4)
     _start(t)
@@ -627,15 +621,13 @@ def _(t: NodeTester) -> None:
     t.equal(_syncs(t, can_id, 2), [0, 0], "TPDOs at the old SYNC")
 
 
-@check("sync.identifier.zero", "1005h: identifier 0, which is NMT, is refused", _SYNC)
+@check("sync.identifier.zero", "1005h: identifier 0, which is NMT, is refused", _SYNC, 0x1005)
 def _(t: NodeTester) -> None:
-    t.require(0x1005)
     t.refuses_value(0x1005, 0, bytes(4), RANGE)
 
 
-@check("sync.counter", "SYNC with a counter triggers TPDOs", _COUNTER)
+@check("sync.counter", "SYNC with a counter triggers TPDOs", _COUNTER, 0x1019)
 def _(t: NodeTester) -> None:
-    t.require(0x1019)
     t.write(0x1019, 0, 10, 1)
     can_id = _sent(t, (_REGISTER,), 1)
     t.equal(_syncs(t, can_id, 3, 1), [1, 1, 1], "TPDOs")
@@ -653,9 +645,8 @@ def _(t: NodeTester) -> None:
 def _overflow(value: int, *, allowed: bool) -> None:
     verb = "accepted" if allowed else "refused"
 
-    @check(f"sync.overflow.{value}", f"Overflow value {value} in 1019h is {verb}", _COUNTER)
+    @check(f"sync.overflow.{value}", f"Overflow value {value} in 1019h is {verb}", _COUNTER, 0x1019)
     def _(t: NodeTester) -> None:
-        t.require(0x1019)
         if allowed:
             t.write(0x1019, 0, value, 1)
         else:

@@ -9,7 +9,7 @@ import struct
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from enum import Enum
-from typing import Final, NoReturn
+from typing import Final, NoReturn, TypeVar
 
 import can
 from canopen.objectdictionary import ObjectDictionary, ODVariable, datatypes
@@ -52,8 +52,11 @@ POWER_STATES: Final = {
     FAULT_REACTION_ACTIVE: "fault reaction active",
     FAULT: "fault",
 }
+ENABLING: Final = ((READY_TO_SWITCH_ON, 0x06), (SWITCHED_ON, 0x07), (OPERATION_ENABLED, 0x0F))
+"""Power states on the way to OPERATION ENABLED, each with the controlword that leads there."""
 _SIGNED: Final = frozenset(datatypes.SIGNED_TYPES)
 _HEARTBEAT_MS: Final = 40
+_Found = TypeVar("_Found")
 _EXCLUDED_FROM_RPDO: Final = (0x6040, 0x6060)
 
 
@@ -119,19 +122,25 @@ class Result:
 class Table(list[Check]):
     """The checks of one subject; `check` adds a function to it."""
 
+    def __init__(self, *, drives: bool = False, moves: bool = False) -> None:
+        """``drives``: the checks are for drives of CiA 402; ``moves``: each may switch power on."""
+        super().__init__()
+        self._drives, self._moves = drives, moves
+
     def check(
-        self,
-        name: str,
-        text: str,
-        clause: str,
-        *,
-        moves: bool = False,
-        stores: bool = False,
+        self, name: str, text: str, clause: str, *needs: int | tuple[int, int], stores: bool = False
     ) -> Callable[[Callable[[NodeTester], None]], Callable[[NodeTester], None]]:
-        """Decorates the function of a check."""
+        """Decorates the function of a check, which applies only to a node with the objects ``needs``."""
 
         def add(function: Callable[[NodeTester], None]) -> Callable[[NodeTester], None]:
-            self.append(Check(name, text, clause, function, moves, stores))
+            def run(t: NodeTester) -> None:
+                if self._drives:
+                    t.need_402()
+                for each in needs:
+                    t.require(*((each,) if isinstance(each, int) else each))
+                function(t)
+
+            self.append(Check(name, text, clause, run, self._moves, stores))
             return function
 
         return add
@@ -256,16 +265,23 @@ class NodeTester:
             raise FailedError(f"{prefix}{_text(found)}", f"{prefix}{_text(expected)}")
 
     @staticmethod
-    def true(condition: object, found: object, expected: object) -> None:
-        """Fails unless the condition holds."""
+    def true(condition: _Found | None, found: object, expected: object) -> _Found:
+        """Fails unless the condition holds; returns it."""
         if not condition:
             raise FailedError(str(found), str(expected))
+        return condition
 
     @staticmethod
-    def need(condition: object, reason: str) -> None:
-        """Ends the check as not applicable unless the condition holds."""
+    def need(condition: _Found | None, reason: str) -> _Found:
+        """Ends the check as not applicable unless the condition holds; returns it."""
         if not condition:
             raise NotApplicableError(reason)
+        return condition
+
+    @property
+    def eds(self) -> ObjectDictionary:
+        """The EDS; ends the check as not applicable if none is given."""
+        return self.need(self.od, "no EDS is given")
 
     def near(self, found_s: float, expected_s: float, what: str) -> None:
         """Fails unless a period or delay is right within the tolerance."""
@@ -319,9 +335,10 @@ class NodeTester:
         since = self.mark()
         if not self._state_watched:
             self.send_special(can_id, remote=True)
-        frame = self.hears(can_id, 4e-3 * _HEARTBEAT_MS + self.timing.answer_s, since)
-        self.need(frame, "the node has neither a heartbeat (1017h) nor node guarding")
-        assert frame is not None
+        frame = self.need(
+            self.hears(can_id, 4e-3 * _HEARTBEAT_MS + self.timing.answer_s, since),
+            "the node has neither a heartbeat (1017h) nor node guarding",
+        )
         value = frame.data[0] & 0x7F if frame.data else -1
         return STATES.get(value, f"{value:02X}h")
 
@@ -525,15 +542,20 @@ class NodeTester:
         """Returns the power state, as the bits of the statusword that define it."""
         return power_state(self.read(0x6041))
 
-    def reaches(
-        self, state: int, timeout_s: float | None = None, pace: Callable[[], None] | None = None
-    ) -> None:
-        """Waits for a power state; fails if it does not come in time."""
-        deadline_s = self.now + (self.timing.power_s if timeout_s is None else timeout_s)
-        while (found := self.power_state()) != state:
+    def reaches(self, *states: int) -> None:
+        """Waits for one of these power states; fails if none comes in time."""
+        deadline_s = self.now + self.timing.power_s
+        while (found := self.power_state()) not in states:
             if self.now > deadline_s:
-                self.fail(POWER_STATES.get(found, f"{found:02X}h"), POWER_STATES[state])
+                expected = " or ".join(POWER_STATES[each] for each in states)
+                self.fail(POWER_STATES.get(found, f"{found:02X}h"), expected)
             self.wait(0.005)
+
+    def walk(self) -> None:
+        """Leads from SWITCH ON DISABLED to OPERATION ENABLED."""
+        for state, word in ENABLING:
+            self.control(word)
+            self.reaches(state)
 
     def stays(self, state: int, duration_s: float = 0.05) -> None:
         """Fails if the power state is, or becomes, another one."""

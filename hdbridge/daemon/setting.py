@@ -1,20 +1,16 @@
 """Compensation setting of an axis, as sent by the service to the control process."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Self
+from typing import Self
 
+from hdbridge.axis import AxisConfig
 from hdbridge.axis.model import TransmissionModel
 from hdbridge.commissioning.evaluation.stepping import Scheme
 from hdbridge.control.bench import compensation_for
 from hdbridge.control.compensation import Compensation
 from hdbridge.errors import InputError
-
-if TYPE_CHECKING:
-    from hdbridge.axis import AxisConfig
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,8 +6,6 @@ PDO mappings are compiled from entries once (``pdo.py``), so the cyclic path onl
 calls bound functions.
 """
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Callable, Iterator
 from enum import IntEnum
@@ -94,27 +92,6 @@ class Entry:
     stored. The firmware uses a ``hidden`` entry, but the bus does not see it. The firmware uses only entries
     that are ``is_known``. The default of an ``is_relative`` one contains the node id.
     """
-
-    __slots__ = (
-        "_bits",
-        "bound",
-        "codec",
-        "default",
-        "follower",
-        "guard",
-        "hidden",
-        "high",
-        "index",
-        "is_known",
-        "is_relative",
-        "low",
-        "mappable",
-        "name",
-        "readable",
-        "sub",
-        "value",
-        "writable",
-    )
 
     def __init__(self, variable: ODVariable, own: ODVariable | None = None) -> None:
         """``own`` is the same object in the bundled EDS: its default serves if the drive's EDS gives none."""

@@ -1,7 +1,5 @@
 """Time and period of SYNC without its reception jitter."""
 
-from __future__ import annotations
-
 from typing import Final
 
 LONGEST_PERIOD_S: Final = 1.0
@@ -20,8 +18,6 @@ class SyncClock:
 
     It begins with a least-squares line through all SYNCs and ends with fixed gains.
     """
-
-    __slots__ = ("_agreeing", "_count", "_interval_s", "_received_s", "jitter_s", "period_s", "time_s")
 
     def __init__(self, period_s: float) -> None:
         self.period_s = period_s

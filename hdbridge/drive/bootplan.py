@@ -1,11 +1,11 @@
 """Fits the boot-up's writes to a drive: objects that its EDS lacks or fixes are left to the drive. Pure."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
+from canopen.objectdictionary import ObjectDictionary
+
+from hdbridge.axis import AxisConfig
 from hdbridge.drive import objects
 from hdbridge.drive.dictionary import dictionary_of, find, held, integer_type, is_writable
 from hdbridge.drive.layout import cyclic_mode, layouts
@@ -13,11 +13,6 @@ from hdbridge.drive.nameplate import mode_advice
 from hdbridge.drive.objects import Mode
 from hdbridge.drive.writes import PlannedWrite, permitted, rows
 from hdbridge.errors import InputError
-
-if TYPE_CHECKING:
-    from canopen.objectdictionary import ObjectDictionary
-
-    from hdbridge.axis import AxisConfig
 
 
 @dataclass(frozen=True, slots=True)

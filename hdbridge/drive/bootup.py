@@ -5,14 +5,13 @@ written and read back afterwards. The first mismatch ends the boot-up with an er
 unless the object may be left to the drive.
 """
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from itertools import groupby
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
+from hdbridge.axis import AxisConfig
 from hdbridge.drive import objects
 from hdbridge.drive.bootplan import plan
 from hdbridge.drive.dictionary import find, is_readable, is_writable
@@ -22,7 +21,6 @@ from hdbridge.drive.manners import heartbeat_of
 from hdbridge.drive.monitor import NetworkMonitor
 from hdbridge.drive.nameplate import (
     IDENTITY,
-    Complaint,
     device_type_complaints,
     identity_complaints,
     mode_complaints,
@@ -35,9 +33,6 @@ from hdbridge.drive.sdo import SdoAbortError, SdoClient
 from hdbridge.drive.states import State, decode
 from hdbridge.drive.writes import PlannedWrite
 from hdbridge.errors import DriveError, IdentityError, SdoError
-
-if TYPE_CHECKING:
-    from hdbridge.axis import AxisConfig
 
 _log = logging.getLogger(__name__)
 BOOT_UP_TIMEOUT_S: Final = 2.0
@@ -195,9 +190,9 @@ class BootUp:
 
     # -- verification -------------------------------------------------------------------------------------
 
-    def _refuse(self, complaints: list[Complaint]) -> None:
-        if complaints:
-            raise IdentityError(complaints[0].text)
+    def _refuse(self, complaints: Iterable[str]) -> None:
+        if first := next(iter(complaints), ""):
+            raise IdentityError(first)
 
     def _readings(self, addresses: Iterable[Address]) -> dict[Address, int]:
         """Reads those objects that the EDS lists."""

@@ -10,17 +10,13 @@ Refuted, revisited and revised. Real-Time Systems 35 (2007) 239-272). g counts t
 the checksum that are subject to stuffing; the other 13 are not.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
+from hdbridge.axis import AxisConfig
 from hdbridge.drive.image import HEARTBEATS_PER_TIMEOUT
 from hdbridge.drive.layout import layouts
 from hdbridge.errors import InputError
-
-if TYPE_CHECKING:
-    from hdbridge.axis import AxisConfig
 
 MAXIMUM_LOAD: Final = 0.8
 """Maximum share of the cycle taken by its frames. The rest is for retransmissions and other nodes."""

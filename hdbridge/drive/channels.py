@@ -6,25 +6,13 @@ reading is held for the time given in the axis file. After that the channel is l
 readings return.
 """
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
-
-from hdbridge.axis.channels import BY_KEY
+from hdbridge.axis.channels import BY_KEY, MeasuredChannel
 from hdbridge.drive.objects import IntegerType
 from hdbridge.drive.supervision import Fault
-
-if TYPE_CHECKING:
-    from hdbridge.axis.channels import MeasuredChannel
 
 
 class ChannelFollower:
     """One channel. `accept` takes its readings, `step` ends each cycle, ``value`` is the reading in force."""
-
-    __slots__ = (
-        "_age", "_at_zero", "_every", "_greatest", "_hold", "_least", "_overdue", "_per_count", "_unit",
-        "key", "lost", "value", "why",
-    )  # fmt: skip
 
     def __init__(self, key: str, channel: MeasuredChannel, cycle_ms: float) -> None:
         """``key`` is the channel's key in the axis file."""

@@ -1,18 +1,13 @@
 """The drive's object dictionary according to its EDS: objects, types and values."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING, Final
+from pathlib import Path
+from typing import Final
 
 from canopen.objectdictionary import ObjectDictionary, ODVariable, datatypes
 
+from hdbridge.axis import AxisConfig
 from hdbridge.drive.objects import IntegerType
 from hdbridge.files.edsfile import read_eds, shared_eds
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from hdbridge.axis import AxisConfig
 
 INTEGER_TYPES: Final = {
     datatypes.INTEGER8: IntegerType.INT8,

@@ -9,14 +9,15 @@ For the control cycle, `enable()` prepares everything and hands over to ``image.
 the states by PDO, while SYNC and set-points are already running.
 """
 
-from __future__ import annotations
-
 import logging
 from contextlib import suppress
 from types import TracebackType
-from typing import TYPE_CHECKING, Final, NamedTuple, Self
+from typing import Final, NamedTuple, Self
 
-from hdbridge.axis import Identity
+import can
+from canopen.objectdictionary import ObjectDictionary
+
+from hdbridge.axis import AxisConfig, Identity
 from hdbridge.clock import Clock, MonotonicClock
 from hdbridge.drive import modes, objects
 from hdbridge.drive.bootup import BootReport, BootUp
@@ -32,12 +33,6 @@ from hdbridge.drive.states import Command, State, decode, row_for
 from hdbridge.drive.writes import master_heartbeat
 from hdbridge.errors import DriveError, HdbridgeError, InputError, TransitionError
 from hdbridge.files.edsfile import shared_eds
-
-if TYPE_CHECKING:
-    import can
-    from canopen.objectdictionary import ObjectDictionary
-
-    from hdbridge.axis import AxisConfig
 
 _log = logging.getLogger(__name__)
 _CLOSING_TIMEOUT_S: Final = 0.2
@@ -275,8 +270,8 @@ class Drive:
     def home(
         self,
         method: int,
-        switch_velocity_deg_s: float,
-        zero_velocity_deg_s: float,
+        switch_velocity_deg_s: float | None = None,
+        zero_velocity_deg_s: float | None = None,
         acceleration_deg_s2: float | None = None,
         offset_deg: float = 0.0,
         timeout_s: float = 60.0,

@@ -6,8 +6,6 @@ messages are copied by their constructor instead of the general deep copy that p
 for each receiver.
 """
 
-from __future__ import annotations
-
 import select
 import socket
 import struct
@@ -46,8 +44,6 @@ def fast_link(link: Link) -> Link:
 class _MessageLink(Link):
     """Link that sends messages that are cheap to copy."""
 
-    __slots__ = ()
-
     def send(self, can_id: int, data: bytes) -> None:
         if self._down is not None:
             raise BusError(self._down)
@@ -59,8 +55,6 @@ class _MessageLink(Link):
 
 class _SocketLink(Link):
     """Link that uses the socket of a python-can SocketCAN bus directly."""
-
-    __slots__ = ("_give", "_sockets", "_take")
 
     def __init__(self, link: Link) -> None:
         super().__init__(link.bus, link.clock)

@@ -4,12 +4,13 @@
 cycle packs and unpacks with it.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterable, Sequence
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
+from canopen.objectdictionary import ObjectDictionary
+
+from hdbridge.axis import AxisConfig
 from hdbridge.drive import objects
 from hdbridge.drive.channels import ChannelFollower
 from hdbridge.drive.dictionary import dictionary_of, find, held
@@ -21,11 +22,6 @@ from hdbridge.drive.supervision import Fault
 from hdbridge.drive.unwrap import INT32_RANGE, Unwrap, wrap_int32
 from hdbridge.errors import InputError
 from hdbridge.units import ARCSEC_PER_DEG
-
-if TYPE_CHECKING:
-    from canopen.objectdictionary import ObjectDictionary
-
-    from hdbridge.axis import AxisConfig
 
 Frames = tuple[tuple[int, bytes], ...]
 """Frames to send: identifier and data of each."""

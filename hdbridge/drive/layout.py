@@ -13,22 +13,18 @@ PDOs. Position demand and torque are left out if the drive cannot send them. A l
 id sends its TPDO1.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator, Sequence
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import Final, NamedTuple
 
+from canopen.objectdictionary import ObjectDictionary, ODVariable
+
+from hdbridge.axis import AxisConfig, Source
+from hdbridge.axis.channels import ChannelSource
 from hdbridge.drive import objects
 from hdbridge.drive.dictionary import dictionary_of, find, held, integer_type, is_writable
 from hdbridge.drive.objects import PDO_INVALID, Address, CyclicMode, IntegerType
 from hdbridge.drive.pdo import MAX_BYTES, PdoCodec, PdoEntry
 from hdbridge.errors import InputError
-
-if TYPE_CHECKING:
-    from canopen.objectdictionary import ObjectDictionary, ODVariable
-
-    from hdbridge.axis import AxisConfig, Source
-    from hdbridge.axis.channels import ChannelSource
 
 PDOS_PER_KIND: Final = 512
 _PREDEFINED: Final = 4

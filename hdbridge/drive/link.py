@@ -5,8 +5,6 @@ becomes a `BusError` that names it, frames that CANopen does not use are dropped
 deadline is on the monotonic clock that was passed in.
 """
 
-from __future__ import annotations
-
 import errno
 import logging
 import os
@@ -98,11 +96,6 @@ class Link:
     socket reports the loss only *once* and then stays silent, which would look like a quiet bus. To continue,
     open the bus again and make a new link.
     """
-
-    __slots__ = (
-        "_down", "_matches", "_raw_recv", "_recv", "_send", "bus", "clock", "dropped", "mark", "name", "now",
-        "private",
-    )  # fmt: skip
 
     def __init__(self, bus: can.BusABC, clock: Clock) -> None:
         self.bus = bus

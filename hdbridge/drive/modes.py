@@ -4,26 +4,21 @@ Each is a handshake of controlword and statusword bits defined in CiA 402-2. A m
 long ends with a quick stop.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from itertools import count
-from typing import TYPE_CHECKING, Final
+from typing import Final, Self
 
+from hdbridge.axis import AxisConfig
 from hdbridge.drive import objects
 from hdbridge.drive.commander import STEP_TIMEOUT_S, Commander
 from hdbridge.drive.image import HALT_BIT, ProcessImage
-from hdbridge.drive.sdo import ABSENT, SdoAbortError
+from hdbridge.drive.objects import Address
+from hdbridge.drive.sdo import ABSENT, SdoAbortError, SdoClient
 from hdbridge.drive.states import HOLD, State, decode
 from hdbridge.drive.writes import motor_rate
 from hdbridge.errors import DriveError, HdbridgeError, InputError
-
-if TYPE_CHECKING:
-    from hdbridge.axis import AxisConfig
-    from hdbridge.drive.objects import Address
-    from hdbridge.drive.sdo import SdoClient
 
 ENABLED: Final = HOLD[State.OPERATION_ENABLED]
 NEW_SET_POINT: Final = 0x0010
@@ -37,6 +32,9 @@ FAILED: Final = 0x2000
 HOMED: Final = ACKNOWLEDGED | TARGET_REACHED
 STALE_READINGS: Final = 50
 """Statusword readings, at least `POLL_S` apart, after which bits from before a command have been cleared."""
+TOWARDS_SWITCH: Final = 0.1
+"""Default speed of a homing run towards the switch, as a share of the axis's velocity limit."""
+TOWARDS_ZERO: Final = 0.02
 _OFFSET_COUNTS: Final = 2**31
 _TIME_MARGIN: Final = 1.5
 _TIME_EXTRA_S: Final = 2.0
@@ -71,7 +69,7 @@ class ProfileMove:
         velocity_deg_s: float | None,
         acceleration_deg_s2: float | None,
         timeout_s: float | None,
-    ) -> ProfileMove:
+    ) -> Self:
         """Builds a move; angles, speeds and accelerations are at the load and default to the axis's limits.
 
         Raises `InputError` if a value is not finite or outside the limits. Without ``timeout_s`` the time-out
@@ -118,14 +116,19 @@ class Homing:
         cls,
         axis: AxisConfig,
         method: int,
-        switch_velocity_deg_s: float,
-        zero_velocity_deg_s: float,
+        switch_velocity_deg_s: float | None,
+        zero_velocity_deg_s: float | None,
         acceleration_deg_s2: float | None,
         offset_deg: float,
         timeout_s: float,
-    ) -> Homing:
-        """Builds a homing run; raises `InputError` if a value is not finite or beyond the axis's limits."""
+    ) -> Self:
+        """Builds a homing run, with defaults from the axis's limits.
+
+        Raises `InputError` if a value is not finite or beyond the limits.
+        """
         limits = axis.limits
+        towards_switch = switch_velocity_deg_s or TOWARDS_SWITCH * limits.velocity_deg_s
+        towards_zero = zero_velocity_deg_s or TOWARDS_ZERO * limits.velocity_deg_s
         highest_deg = abs(axis.motor_encoder.degrees(_OFFSET_COUNTS) / axis.gear.ratio)
         if not abs(offset_deg) < highest_deg:  # also false for NaN
             raise InputError(
@@ -134,8 +137,8 @@ class Homing:
             )
         return cls(
             method,
-            _at_most(switch_velocity_deg_s, limits.velocity_deg_s, "velocity_deg_s", "switch_"),
-            _at_most(zero_velocity_deg_s, limits.velocity_deg_s, "velocity_deg_s", "zero_"),
+            _at_most(towards_switch, limits.velocity_deg_s, "velocity_deg_s", "switch_"),
+            _at_most(towards_zero, limits.velocity_deg_s, "velocity_deg_s", "zero_"),
             _at_most(acceleration_deg_s2, limits.acceleration_deg_s2, "acceleration_deg_s2"),
             offset_deg,
             timeout_s,

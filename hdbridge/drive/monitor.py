@@ -4,8 +4,6 @@ Bookkeeping only; nothing is decided here. Every receiver passes its frames on t
 heartbeat that arrives during an SDO transfer is not lost.
 """
 
-from __future__ import annotations
-
 from collections import deque
 from dataclasses import dataclass, field
 from typing import Final, NamedTuple
@@ -78,8 +76,6 @@ class NodeStatus:
 
 class NetworkMonitor:
     """Keeps a `NodeStatus` for each watched node."""
-
-    __slots__ = ("_emergency", "_heartbeat", "nodes")
 
     def __init__(self, *node_ids: int) -> None:
         self.nodes: dict[int, NodeStatus] = {}

@@ -1,21 +1,17 @@
 """Comparison of a drive's identification and scaling with the axis file. Pure: it judges readings.
 
-Every difference is a one-line `Complaint`: the key of the axis file, its value, and the drive's value. The
-boot-up refuses the drive with the first one; the bring-up shows them all.
+Every difference is a line of text: the key of the axis file, its value, and the drive's value. The boot-up
+refuses the drive with the first one; the bring-up shows them all.
 """
 
-from __future__ import annotations
-
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from fractions import Fraction
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import Final
 
+from hdbridge.axis import AxisConfig
 from hdbridge.drive import objects
 from hdbridge.drive.layout import cyclic_mode
 from hdbridge.drive.objects import Address
-
-if TYPE_CHECKING:
-    from hdbridge.axis import AxisConfig
 
 Readings = Mapping[Address, int]
 """Values read from the drive; objects that it lacks are missing."""
@@ -28,15 +24,6 @@ IDENTITY: Final[tuple[tuple[Address, str], ...]] = (
 )
 """Identity objects, and their keys under ``drive.identity``."""
 _RATED_TORQUE_TOLERANCE: Final = 0.01
-
-
-class Complaint(NamedTuple):
-    """One difference between the drive and the axis file."""
-
-    key: str
-    """Key of the axis file."""
-    text: str
-    """One line: what is wrong, where, and what to do."""
 
 
 def scaling_addresses(axis: AxisConfig) -> tuple[Address, ...]:
@@ -55,50 +42,33 @@ def scaling_addresses(axis: AxisConfig) -> tuple[Address, ...]:
     )
 
 
-def device_type_complaints(axis: AxisConfig, device_type: int) -> list[Complaint]:
+def device_type_complaints(axis: AxisConfig, device_type: int) -> Iterator[str]:
     """Checks that 1000h reports a CiA-402 drive."""
-    if device_type & 0xFFFF == objects.DEVICE_PROFILE_402:
-        return []
-    key = "drive.node_id"
-    return [
-        Complaint(
-            key,
+    if device_type & 0xFFFF != objects.DEVICE_PROFILE_402:
+        yield (
             f"{_at(axis, objects.DEVICE_TYPE)} is {device_type:08X}h, device profile {device_type & 0xFFFF}; "
-            f"expected 402 (drives and motion control); check {axis.where(key)}",
+            f"expected 402 (drives and motion control); check {axis.where('drive.node_id')}"
         )
-    ]
 
 
-def identity_complaints(axis: AxisConfig, found: Mapping[str, int]) -> list[Complaint]:
-    """Lists the identity values (keys of ``drive.identity``) that differ from the axis file."""
-    complaints = []
+def identity_complaints(axis: AxisConfig, found: Mapping[str, int]) -> Iterator[str]:
+    """Yields the identity values (keys of ``drive.identity``) that differ from the axis file."""
     for address, name in IDENTITY:
         wanted = getattr(axis.drive.identity, name)
-        if wanted is None or found.get(name) == wanted:
-            continue
-        key = f"drive.identity.{name}"
-        complaints.append(
-            Complaint(
-                key,
-                f"{_at(axis, address)} is {found[name]:X}h, but {axis.where(key)} is {wanted:X}h; connect "
-                "the right drive or correct the file",
+        if wanted is not None and found.get(name) != wanted:
+            yield (
+                f"{_at(axis, address)} is {found[name]:X}h, but {axis.where(f'drive.identity.{name}')} is "
+                f"{wanted:X}h; connect the right drive or correct the file"
             )
-        )
-    return complaints
 
 
-def mode_complaints(axis: AxisConfig, modes: int) -> list[Complaint]:
+def mode_complaints(axis: AxisConfig, modes: int) -> Iterator[str]:
     """Checks that 6502h contains the mode of the control cycle; a value of 0 is accepted as unknown."""
-    if not modes or modes & cyclic_mode(axis).mode.supported_bit:
-        return []
-    key = "drive.mode"
-    return [
-        Complaint(
-            key,
+    if modes and not modes & cyclic_mode(axis).mode.supported_bit:
+        yield (
             f"{_at(axis, objects.SUPPORTED_MODES)} is {modes:08X}h, without the mode {axis.drive.mode} of "
-            f"{axis.where(key)}; {mode_advice(modes)}",
+            f"{axis.where('drive.mode')}; {mode_advice(modes)}"
         )
-    ]
 
 
 def mode_advice(modes: int) -> str:
@@ -112,121 +82,95 @@ def mode_advice(modes: int) -> str:
     )
 
 
-def scaling_complaints(axis: AxisConfig, readings: Readings) -> list[Complaint]:
-    """Lists the contradictions between the axis file and every object that defines the drive's scaling."""
+def scaling_complaints(axis: AxisConfig, readings: Readings) -> Iterator[str]:
+    """Yields the contradictions between the axis file and every object that defines the drive's scaling."""
     try:
         increments = _ratio(axis, readings, objects.ENCODER_INCREMENTS, objects.ENCODER_REVOLUTIONS)
         feed = _ratio(axis, readings, objects.FEED, objects.FEED_SHAFT) if axis.drive.feed_scales else None
         gear = _ratio(axis, readings, objects.GEAR_MOTOR, objects.GEAR_SHAFT) or Fraction(1)
     except _NotARatioError as problem:
-        return [Complaint(problem.key, str(problem))]
-    return [
-        *_gear(axis, gear, feed),
-        *_motor_counts(axis, increments, None if feed is None else feed / gear),
-        *_polarity(axis, readings),
-        *_load_counts(axis, readings),
-    ]
+        yield str(problem)
+        return
+    yield from _gear(axis, gear, feed)
+    yield from _motor_counts(axis, increments, None if feed is None else feed / gear)
+    yield from _polarity(axis, readings)
+    yield from _load_counts(axis, readings)
 
 
-def torque_notes(axis: AxisConfig, rated_mnm: int | None) -> list[str]:
-    """Returns a note if 6076h differs from the axis file, which is no reason to refuse the drive."""
+def torque_notes(axis: AxisConfig, rated_mnm: int | None) -> Iterator[str]:
+    """Yields a note if 6076h differs from the axis file, which is no reason to refuse the drive."""
     if rated_mnm is None:
-        return []
+        return
     drive_nm, file_nm = rated_mnm / 1000.0, axis.drive.rated_torque_nm
-    if abs(drive_nm - file_nm) <= _RATED_TORQUE_TOLERANCE * file_nm:
-        return []
-    return [
-        f"{_at(axis, objects.RATED_TORQUE)}: the drive says {drive_nm:g} Nm, "
-        f"{axis.where('drive.rated_torque_nm')} is {file_nm:g}; torques are reported with the latter"
-    ]
+    if abs(drive_nm - file_nm) > _RATED_TORQUE_TOLERANCE * file_nm:
+        yield (
+            f"{_at(axis, objects.RATED_TORQUE)}: the drive says {drive_nm:g} Nm, "
+            f"{axis.where('drive.rated_torque_nm')} is {file_nm:g}; torques are reported with the latter"
+        )
 
 
-def _gear(axis: AxisConfig, gear: Fraction, feed: Fraction | None) -> list[Complaint]:
-    key, ratio = "gear.ratio", axis.gear.ratio
+def _gear(axis: AxisConfig, gear: Fraction, feed: Fraction | None) -> Iterator[str]:
+    where, ratio = axis.where("gear.ratio"), axis.gear.ratio
     if gear not in (1, Fraction(ratio)):
-        return [
-            Complaint(
-                key,
-                f"{_at(axis, objects.GEAR_MOTOR)}: the drive knows a gear of {float(gear):g}, but "
-                f"{axis.where(key)} is {ratio:g}; correct the one that is wrong",
-            )
-        ]
-    if feed is None and gear != 1 and axis.drive.feed_scales:
-        return [
-            Complaint(
-                key,
-                f"{_at(axis, objects.GEAR_MOTOR)}: the drive divides positions by a gear ratio of "
-                f"{float(gear):g}; set 6091h to 1:1, {axis.where(key)} is the only one",
-            )
-        ]
-    return []
+        yield (
+            f"{_at(axis, objects.GEAR_MOTOR)}: the drive knows a gear of {float(gear):g}, but "
+            f"{where} is {ratio:g}; correct the one that is wrong"
+        )
+    elif feed is None and gear != 1 and axis.drive.feed_scales:
+        yield (
+            f"{_at(axis, objects.GEAR_MOTOR)}: the drive divides positions by a gear ratio of "
+            f"{float(gear):g}; set 6091h to 1:1, {where} is the only one"
+        )
 
 
-def _motor_counts(
-    axis: AxisConfig, increments: Fraction | None, per_turn: Fraction | None
-) -> list[Complaint]:
-    key, counts = "motor_encoder.counts_per_turn", axis.motor_encoder.counts_per_turn
+def _motor_counts(axis: AxisConfig, increments: Fraction | None, per_turn: Fraction | None) -> Iterator[str]:
+    counts = axis.motor_encoder.counts_per_turn
     informative = (
         f"; on a drive that counts encoder counts whatever 6092h says: 'feed_scales: false' under "
         f"{axis.where('drive')}"
     )
-    return [
-        Complaint(
-            key,
-            f"node {axis.drive.node_id}, {used}: the drive counts {float(value):g} per motor turn, but "
-            f"{axis.where(key)} is {counts}; set the drive's scaling to plain encoder counts, or correct the "
-            f"file{hint}",
-        )
-        for value, used, hint in (
-            (increments, "608Fh:01 / 608Fh:02 (encoder resolution)", ""),
-            (per_turn, "6092h (feed) over 6091h (gear ratio)", informative),
-        )
-        if value is not None and value != counts
-    ]
+    for value, used, hint in (
+        (increments, "608Fh:01 / 608Fh:02 (encoder resolution)", ""),
+        (per_turn, "6092h (feed) over 6091h (gear ratio)", informative),
+    ):
+        if value is not None and value != counts:
+            yield (
+                f"node {axis.drive.node_id}, {used}: the drive counts {float(value):g} per motor turn, but "
+                f"{axis.where('motor_encoder.counts_per_turn')} is {counts}; set the drive's scaling to "
+                f"plain encoder counts, or correct the file{hint}"
+            )
 
 
-def _polarity(axis: AxisConfig, readings: Readings) -> list[Complaint]:
+def _polarity(axis: AxisConfig, readings: Readings) -> Iterator[str]:
     polarity = readings.get(objects.POLARITY, 0)
-    if not polarity & 0x80:
-        return []
-    key = "motor_encoder.direction"
-    return [
-        Complaint(
-            key,
+    if polarity & 0x80:
+        yield (
             f"{_at(axis, objects.POLARITY)} is {polarity:02X}h, the drive reverses positions itself; set it "
-            f"to 0 and use {axis.where(key)}",
+            f"to 0 and use {axis.where('motor_encoder.direction')}"
         )
-    ]
 
 
-def _load_counts(axis: AxisConfig, readings: Readings) -> list[Complaint]:
+def _load_counts(axis: AxisConfig, readings: Readings) -> Iterator[str]:
     """Compares 60E6h and 60EBh, for an encoder at 60E4h, with the axis file; per turn of load or motor."""
     source, counts = axis.load_encoder.source, axis.load_encoder.counts_per_turn
     if source.node is not None or source.index != objects.ADDITIONAL_POSITIONS:
-        return []
-    key, sub = "load_encoder.counts_per_turn", source.subindex
+        return
+    sub = source.subindex
     try:
         found = _ratio(axis, readings, *objects.additional_resolution(sub))
     except _NotARatioError as problem:
-        return [Complaint(key, str(problem))]
-    if found is None or found in (counts, Fraction(counts) / Fraction(axis.gear.ratio)):
-        return []
-    return [
-        Complaint(
-            key,
+        yield str(problem)
+        return
+    if found not in (None, counts, Fraction(counts) / Fraction(axis.gear.ratio)):
+        yield (
             f"node {axis.drive.node_id}, 60E6h:{sub:02X} / 60EBh:{sub:02X} (additional encoder resolution): "
-            f"the drive counts {float(found):g} per turn, but {axis.where(key)} is {counts}; correct the one "
-            "that is wrong",
+            f"the drive counts {float(found):g} per turn, but {axis.where('load_encoder.counts_per_turn')} "
+            f"is {counts}; correct the one that is wrong"
         )
-    ]
 
 
 class _NotARatioError(Exception):
     """One of the two objects of a ratio is 0."""
-
-    def __init__(self, key: str, text: str) -> None:
-        super().__init__(text)
-        self.key = key
 
 
 def _ratio(axis: AxisConfig, readings: Readings, above: Address, below: Address) -> Fraction | None:
@@ -235,11 +179,9 @@ def _ratio(axis: AxisConfig, readings: Readings, above: Address, below: Address)
         return None
     numerator, denominator = readings[above], readings.get(below, 1)
     if numerator == 0 or denominator == 0:
-        key = "gear.ratio" if above is objects.GEAR_MOTOR else "motor_encoder.counts_per_turn"
         raise _NotARatioError(
-            key,
             f"{_at(axis, above)} is {numerator}, over {denominator}: not a ratio; set the drive's "
-            "scaling first",
+            "scaling first"
         )
     return Fraction(numerator, denominator)
 

@@ -10,8 +10,6 @@ path, because each must be requested explicitly: leaving a fault (15), resuming 
 course a fault (13).
 """
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Iterator
 from enum import Enum
@@ -216,8 +214,6 @@ class PowerWalk:
     It only pursues the aim it was given: a drive that leaves 'operation enabled' on its own is not enabled
     again, and a fault is reset only on request. A call that raises changes nothing.
     """
-
-    __slots__ = ("_aim", "_reset", "_state", "_was_enabled", "dropped")
 
     def __init__(self) -> None:
         self._state = State.UNKNOWN

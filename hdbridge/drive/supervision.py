@@ -5,8 +5,6 @@ The cycle reports the faults it saw, and the table gives the reaction. A stop is
 again. The table is data. A fault with another reaction is another row, not an `if`.
 """
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Iterable
 from enum import Enum, IntEnum
@@ -135,8 +133,6 @@ class Supervision:
 
     Memory is bounded: the newest `EVENTS_KEPT` events and a count of each fault are kept.
     """
-
-    __slots__ = ("_frozen", "_runs", "counts", "events", "gravest", "noted", "stop")
 
     def __init__(self) -> None:
         self._runs: dict[Fault, int] = {}

@@ -1,18 +1,14 @@
 """Frames that are not PDOs of the cycle: node status, and signs of another master on the bus."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from hdbridge.drive.emergencies import HEARTBEAT_LOST, RPDO_TIMEOUT
+from hdbridge.drive.image import ProcessImage
+from hdbridge.drive.link import Frame
+from hdbridge.drive.monitor import NetworkMonitor
 from hdbridge.drive.objects import COB_EMCY, COB_HEARTBEAT, COB_NMT, COB_SDO_REQUEST, COB_SYNC, NmtState
 from hdbridge.drive.supervision import Fault
-
-if TYPE_CHECKING:
-    from hdbridge.drive.image import ProcessImage
-    from hdbridge.drive.link import Frame
-    from hdbridge.drive.monitor import NetworkMonitor
 
 _NODE_MASK: Final = 0x7F
 _MASTER_LOST: Final = (HEARTBEAT_LOST, RPDO_TIMEOUT)
@@ -37,8 +33,6 @@ def bus_faults(heartbeat_id: int) -> dict[int, tuple[Fault, str]]:
 
 class Traffic:
     """Judges the frames of one axis's nodes that the control cycle does not wait for."""
-
-    __slots__ = ("_monitor", "_node_id", "_nodes", "_own", "heard_s", "identifiers")
 
     def __init__(self, image: ProcessImage, monitor: NetworkMonitor, now_s: float) -> None:
         self._monitor = monitor

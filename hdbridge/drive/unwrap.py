@@ -1,7 +1,5 @@
 """Unwraps a wrapping counter into a continuous position. Pure."""
 
-from __future__ import annotations
-
 from typing import Final
 
 INT32_RANGE: Final = 1 << 32
@@ -19,8 +17,6 @@ class Unwrap:
     than half the modulus between two readings. The first reading is taken as it is. ``modulus`` is 2**bits of
     the object, or an encoder's total range if it restarts earlier.
     """
-
-    __slots__ = ("_half", "_modulus", "_value")
 
     def __init__(self, modulus: int = INT32_RANGE) -> None:
         if modulus < 2:

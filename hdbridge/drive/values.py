@@ -1,22 +1,17 @@
 """Conversion of object values between bytes and text, by the type given in the EDS."""
 
-from __future__ import annotations
-
 import math
 import re
 import struct
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from canopen.objectdictionary import datatypes
+from canopen.objectdictionary import ObjectDictionary, ODVariable, datatypes
 
 from hdbridge.drive.dictionary import INTEGER_TYPES, is_readable, is_writable
 from hdbridge.drive.objects import STANDARD, IntegerType
 from hdbridge.errors import InputError
 from hdbridge.files.expectation import nearest
-
-if TYPE_CHECKING:
-    from canopen.objectdictionary import ObjectDictionary, ODVariable
 
 Value = int | float | bool | str
 _REALS = {datatypes.REAL32: ("<f", "real32"), datatypes.REAL64: ("<d", "real64")}

@@ -5,14 +5,15 @@ boot-up reads each object first, writes those that hold another value, in this o
 `hdbridge.drive.bootplan` leaves objects that are optional in CiA 402 to a drive that lacks them.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from decimal import Decimal
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
+from canopen.objectdictionary import ObjectDictionary, ODVariable
+
+from hdbridge.axis import AxisConfig
 from hdbridge.drive import objects
 from hdbridge.drive.dictionary import find, held, integer_type, is_writable
 from hdbridge.drive.image import position_limits_counts
@@ -20,11 +21,6 @@ from hdbridge.drive.layout import PDOS_PER_KIND, Layout, Layouts
 from hdbridge.drive.objects import PDO_INVALID, Address, IntegerType
 from hdbridge.errors import InputError
 from hdbridge.units import ARCSEC_PER_DEG
-
-if TYPE_CHECKING:
-    from canopen.objectdictionary import ObjectDictionary, ODVariable
-
-    from hdbridge.axis import AxisConfig
 
 SYNCHRONOUS: Final = 1
 """Transmission type: sent, or put into force, at every SYNC."""

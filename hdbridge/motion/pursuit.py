@@ -1,7 +1,5 @@
 """Pursuit of a position that somebody else gives in each period, within the limits of the axis."""
 
-from __future__ import annotations
-
 import math
 
 from hdbridge.motion.generator import Bounds, Kinematics
@@ -18,8 +16,6 @@ class Pursuit:
     from one set-point to the next. A goal outside the bounds is pursued to the bound. Jerk is not limited, as
     for the knots of a stream.
     """
-
-    __slots__ = ("_acceleration", "_fastest", "_goal_deg", "_lower", "_period_s", "_upper", "state")
 
     def __init__(self, begin_deg: float, limits: MotionLimits, bounds: Bounds, period_s: float) -> None:
         self._acceleration, self._period_s = limits.acceleration_deg_s2, period_s

@@ -8,8 +8,6 @@ The set-point always stays within the position limits. A plan is accepted only i
 them, and braking has a fallback that always exists (`SetPoint._brake`). Rounding errors are clipped.
 """
 
-from __future__ import annotations
-
 import math
 
 from hdbridge.errors import InputError
@@ -29,12 +27,6 @@ class SetPoint:
     Pure: time is counted in calls of `step`. An axis that stands outside its position limits may hold there
     and move inwards.
     """
-
-    __slots__ = (
-        "_acceleration_deg_s2", "_aim", "_bounds", "_generator", "_left", "_limits", "_mode", "_path",
-        "_period_s", "_position_deg", "_pursuit", "_since_s", "_steps", "_stream", "_stream_timeout",
-        "_underrun", "_velocity_deg_s",
-    )  # fmt: skip
 
     def __init__(self, limits: MotionLimits, period_s: float) -> None:
         """``period_s`` is the time between two calls of `step`. The set-point is at zero until `reset`.

@@ -3,8 +3,6 @@
 Each piece is evaluated once per substep, in order of time, so those with a state advance by one substep.
 """
 
-from __future__ import annotations
-
 import math
 import random
 from typing import ClassVar, Final
@@ -269,7 +267,6 @@ class Seat:
     """Bearing ring that is carried along by the motion and slips back at random angles."""
 
     BY_MOTOR_ONLY: ClassVar[bool] = True
-    __slots__ = ("_carried", "_last_deg", "_per_deg", "_random", "_slip", "_slips_at")
 
     def __init__(self, truth: TrueSeat) -> None:
         self._random = random.Random(f"seat {truth.seed}")

@@ -1,7 +1,5 @@
 """A scan finds the nodes of a bus and changes nothing."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import contextmanager
 from uuid import uuid4

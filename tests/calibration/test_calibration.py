@@ -102,17 +102,6 @@ def test_report_reproduces_the_calibration_without_an_axis(calibrated):
     assert "hysteresis" in done.stdout
 
 
-def test_a_calibration_without_accuracy_figures_is_still_reported(calibrated):
-    path = calibrated.folder / "rec" / "calibration.json"
-    data = json.loads(path.read_text())
-    del data["stepping"]["accuracy"]
-    path.write_text(json.dumps(data))
-    calibrated.run("report", "rec", "--json", "again.json")
-    again = calibrated.json("again.json")["stepping"]
-    assert again["accuracy"] == {"before": None, "after": None}
-    assert again["after"] == data["stepping"]["after"]
-
-
 def test_step_uses_the_committed_model(calibrated):
     calibrated.run("model", "commit", "axis")
     calibrated.run("step", "axis", "--simulate", "--count", 8, "--json", "step.json", "--scheme", "both")

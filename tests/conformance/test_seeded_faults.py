@@ -3,8 +3,6 @@
 A fault changes the frames between the node and the bus, or substitutes one behaviour.
 """
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Callable
 from operator import attrgetter
@@ -116,7 +114,7 @@ def described(check: str, text: str, index: int, **changes: Any) -> Fault:
 def replace_entry(node: DriveNode, index: int, **changes: Any) -> None:
     old = node.dictionary[index, 0]
     new = object.__new__(type(old))
-    for name in type(old).__slots__:
+    for name in vars(old):
         object.__setattr__(new, name, changes.get(name, getattr(old, name)))
     node.dictionary._entries[index, 0] = new
 

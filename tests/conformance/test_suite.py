@@ -1,7 +1,5 @@
 """The conformance suite: correct verdicts, restored settings, power off."""
 
-from __future__ import annotations
-
 import json
 import logging
 

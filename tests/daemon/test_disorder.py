@@ -6,8 +6,6 @@ ENABLE command since it was last taken away; nothing to an axis that is not veri
 once.
 """
 
-from __future__ import annotations
-
 import math
 import struct
 from contextlib import ExitStack, suppress

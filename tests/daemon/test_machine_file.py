@@ -2,8 +2,6 @@
 
 # ruff: noqa: E501  (the table of complaints shows each on one line)
 
-from __future__ import annotations
-
 import pickle
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The systemd unit files: content, and acceptance by systemd."""
 
-from __future__ import annotations
-
 import configparser
 import shutil
 import subprocess

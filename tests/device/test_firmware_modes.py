@@ -1,7 +1,5 @@
 """Operating modes CSP, IP, PP and HM as a master sees them."""
 
-from __future__ import annotations
-
 import pytest
 
 from hdbridge.device.behaviour import Behaviour, Controlword

@@ -1,7 +1,5 @@
 """Power states, stops and faults of the drive, by SDO and PDO. Every state and word: test_state_machine."""
 
-from __future__ import annotations
-
 import struct
 
 import pytest

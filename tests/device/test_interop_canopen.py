@@ -3,8 +3,6 @@
 Nothing here asserts how long anything takes: events are waited for, generously.
 """
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Iterator
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The lockstep bus and the virtual clock: deterministic time that passes only while waiting."""
 
-from __future__ import annotations
-
 import struct
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """LSS: python-canopen's master finds, selects and numbers a drive; nothing that it sends disturbs an axis."""
 
-from __future__ import annotations
-
 import struct
 
 import canopen.lss

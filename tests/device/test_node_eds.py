@@ -1,7 +1,5 @@
 """The EDS: read without a complaint, complete in itself, and true of the node."""
 
-from __future__ import annotations
-
 import logging
 import re
 import struct

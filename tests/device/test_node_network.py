@@ -1,7 +1,5 @@
 """NMT, heartbeats, boot-up, and time with and without SYNC."""
 
-from __future__ import annotations
-
 import pytest
 
 PRE_OPERATIONAL, OPERATIONAL, STOPPED = 0x7F, 0x05, 0x04

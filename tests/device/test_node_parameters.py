@@ -1,7 +1,5 @@
 """Stored parameters: they outlive a reset and, with a file, the process."""
 
-from __future__ import annotations
-
 import struct
 from contextlib import contextmanager
 

@@ -1,7 +1,5 @@
 """PDOs: mapping over SDO, transmission types, SYNC semantics, deadlines, lengths."""
 
-from __future__ import annotations
-
 import struct
 
 import pytest

@@ -1,7 +1,5 @@
 """The SDO server: transfers, abort codes, and requests that make no sense."""
 
-from __future__ import annotations
-
 import struct
 
 import pytest

@@ -1,7 +1,5 @@
 """Random events on the slave: no demand outside the limits, and no motion without a request."""
 
-from __future__ import annotations
-
 import pytest
 from support.slave_events import play_events
 

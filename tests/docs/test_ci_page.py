@@ -1,7 +1,5 @@
 """The example of docs/ci.md, in docs/ci-example: on every bus that is here, by real runs of pytest."""
 
-from __future__ import annotations
-
 import os
 import re
 import subprocess

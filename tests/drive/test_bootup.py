@@ -1,7 +1,5 @@
 """Booting a drive: checks, order of writes, and every refusal."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Bus load: worst-case bits of a frame and of a cycle."""
 
-from __future__ import annotations
-
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st

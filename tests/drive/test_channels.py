@@ -1,7 +1,5 @@
 """Load torque and temperature: mapped, read back, scaled, checked, held and given up."""
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Callable
 from typing import Any

@@ -1,7 +1,5 @@
 """Enabling, moving, homing, faults, and that a drive is never left enabled."""
 
-from __future__ import annotations
-
 import math
 import struct
 from collections.abc import Callable, Iterator

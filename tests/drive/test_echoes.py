@@ -1,7 +1,5 @@
 """Back ends that give a master its own frames back: the echo is dropped, a second master is not."""
 
-from __future__ import annotations
-
 import socket
 from collections.abc import Iterator
 from contextlib import ExitStack

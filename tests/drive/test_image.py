@@ -1,7 +1,5 @@
 """The process image: scaling, limits and packed frames."""
 
-from __future__ import annotations
-
 import math
 import struct
 from collections.abc import Callable

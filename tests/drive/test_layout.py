@@ -1,7 +1,5 @@
 """PDO layout on drives with free, fixed, few and small PDOs."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from itertools import pairwise
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The link: dropped frames, errors, bounded waits."""
 
-from __future__ import annotations
-
 import errno
 import sys
 import time

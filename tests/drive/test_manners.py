@@ -1,7 +1,5 @@
 """A master listens before it speaks, and holds a lock on its interface while it does."""
 
-from __future__ import annotations
-
 import os
 import pwd
 import re

@@ -1,7 +1,5 @@
 """Heartbeats, boot-up messages and emergencies."""
 
-from __future__ import annotations
-
 import math
 
 from hdbridge.drive import Frame, NetworkMonitor, NmtState

@@ -1,7 +1,5 @@
 """The PDO codec: round trip and rejected values."""
 
-from __future__ import annotations
-
 import math
 import struct
 

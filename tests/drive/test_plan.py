@@ -1,7 +1,5 @@
 """The boot plan: values, units, order and refusals."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

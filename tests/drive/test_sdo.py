@@ -1,7 +1,5 @@
 """The SDO client against nodes that answer late, wrongly, too much, or not at all."""
 
-from __future__ import annotations
-
 import struct
 from typing import Any
 

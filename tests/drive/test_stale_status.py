@@ -1,7 +1,5 @@
 """A status from before a command is not taken for its answer, on drives that show it for a while."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The CiA-402 state table: decoding, every legal and every illegal transition, ways, the diagram."""
 
-from __future__ import annotations
-
 from itertools import pairwise, product
 from pathlib import Path
 

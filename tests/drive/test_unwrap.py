@@ -1,7 +1,5 @@
 """Unwrapping a counter of any width along any path."""
 
-from __future__ import annotations
-
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st

@@ -1,7 +1,5 @@
 """The effect of docs/add-an-effect.md, taken from the page: found, drawn, written, compensated, forecast."""
 
-from __future__ import annotations
-
 import html
 import importlib.util
 import re

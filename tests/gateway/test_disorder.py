@@ -1,7 +1,5 @@
 """Anything in any order on both buses: no set-point outside the limits, and no motion unasked."""
 
-from __future__ import annotations
-
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.disorder import draw, play_story

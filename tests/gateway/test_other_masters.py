@@ -12,8 +12,6 @@ A line is a frame that is sent (>), one that must come next with its identifier 
 writes and reads (w, r), or SYNCs with an RPDO before each, until a frame matches (sync). A dot is any digit.
 """
 
-from __future__ import annotations
-
 import re
 from contextlib import contextmanager
 

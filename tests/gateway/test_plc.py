@@ -1,7 +1,5 @@
 """A PLC-like master on the outer bus moves the load to its targets, and only on request."""
 
-from __future__ import annotations
-
 import shutil
 import struct
 

@@ -1,7 +1,5 @@
 """A flight recording of a gateway: requests and statuswords of the other master."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from support.gateway import COUNTS_PER_DEG, gateway_bench, swing

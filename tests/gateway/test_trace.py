@@ -1,7 +1,5 @@
 """The doctor of the outer side: configuration and mistakes of a master, from its frames."""
 
-from __future__ import annotations
-
 import struct
 
 import can

@@ -5,8 +5,6 @@ that are not in the catalogue. Sizes are 5 arcsec at the load (an interpolation 
 0.3 arcsec of noise. Each plan is what an engineer would run who suspects the cause.
 """
 
-from __future__ import annotations
-
 import json
 import os
 from collections.abc import Iterator

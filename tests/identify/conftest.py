@@ -1,7 +1,5 @@
 """Records of synthetic axes from the formulas, independent of the tested code."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 
 import numpy as np

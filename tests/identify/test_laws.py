@@ -1,7 +1,5 @@
 """The hysteresis law is chosen by prediction of held-out data."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

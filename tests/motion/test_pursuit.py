@@ -1,7 +1,5 @@
 """Pursuit of external positions: exact within the limits, limited otherwise."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

@@ -3,8 +3,6 @@
 Four one-way moves of a second each, all within minutes: nothing can have changed, so nobody is to be listed.
 """
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """`hdbridge fit` on short foreign records: refused, or fitted with its limits reported once."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

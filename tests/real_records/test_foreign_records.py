@@ -1,7 +1,5 @@
 """CSV files of other benches: dialects, columns, units and wrapped counters; one line for each error."""
 
-from __future__ import annotations
-
 import gzip
 import math
 from collections.abc import Callable

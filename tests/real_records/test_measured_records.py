@@ -5,8 +5,6 @@ for in the folder that HDBRIDGE_REAL_RECORDS names, else beside the repository; 
 skipped.
 """
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """A short one-way move yields no confident cause: place, time, speed and torque coincide."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Inference from four rows of scatter and mean to the runs behind them, tried on known runs."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 from typing import Any

@@ -3,8 +3,6 @@
 The records are looked for as in `test_measured_records.py`; without them these tests are skipped.
 """
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 

@@ -25,7 +25,6 @@ from hdbridge.axis.effects import Hysteresis, MotorOrder, Synchronous
 from hdbridge.axis.model import TransmissionModel
 from hdbridge.commissioning.calibration import Calibration, Offer
 from hdbridge.commissioning.calibration.validation import Floor, Stepped, Validation
-from hdbridge.commissioning.evaluation.stepping import Scatter
 from hdbridge.report.calibration import calibration_page
 from hdbridge.report.page import render
 
@@ -191,8 +190,8 @@ def test_phase_changes_are_wrapped():
 def test_before_and_after_share_a_scale():
     errors = ((30.0, 32.0), (-30.0, -28.0))
     targets = ((1.0, 2.0), (2.0, 1.0))
-    before = Stepped("no compensation", *[Scatter(90.0, 1.0)] * 3, errors, targets)
-    after = Stepped("the new model", *[Scatter(5.68, 0.1)] * 3, ((1.0, -1.0), (0.5, 0.0)), targets)
+    before = Stepped("no compensation", errors, targets)
+    after = Stepped("the new model", ((5.68 / 3.0, -5.68 / 3.0), (5.68 / 3.0, -5.68 / 3.0)), targets)
     checked = Validation(before, after, Floor(2.84, 0.0))
     text, charts = read(
         result(axis="demo", validation=checked, offer=Offer(True, "stepping 3 sigma 90 to 5.68 arcsec"))

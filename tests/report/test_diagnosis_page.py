@@ -31,7 +31,6 @@ from hdbridge.axis.effects import (
 from hdbridge.axis.model import TransmissionModel
 from hdbridge.commissioning.calibration.result import Offer
 from hdbridge.commissioning.calibration.validation import Floor, Stepped, Validation
-from hdbridge.commissioning.evaluation.stepping import Scatter
 from hdbridge.report.diagnosis import diagnosis_page
 from hdbridge.report.page import render
 
@@ -315,9 +314,9 @@ def test_simulation_is_shown_next_to_measurement(plain):
 
 
 def test_the_stepping_test_shows_the_gain_on_the_axis():
-    targets, errors = ((1.0, 2.0), (2.0, 1.0)), ((3.0, 1.0), (-1.0, -3.0))
-    before = Stepped("the active model", *[Scatter(12.0, 1.0)] * 3, errors, targets)
-    after = Stepped("the extended model", *[Scatter(3.2, 0.1)] * 3, errors, targets)
+    targets = ((1.0, 2.0), (2.0, 1.0))
+    before = Stepped("the active model", ((4.0, -4.0), (4.0, -4.0)), targets)
+    after = Stepped("the extended model", ((3.2 / 3.0, -3.2 / 3.0), (3.2 / 3.0, -3.2 / 3.0)), targets)
     offer = Offer(True, "offered for commit: stepping 12 to 3.2 arcsec", Path("my-axis/pending.yaml"))
     text = page(finding(), stepping=Validation(before, after, Floor(2.84, 0.0)), offer=offer)
     said = words(text)

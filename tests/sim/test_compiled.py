@@ -1,7 +1,5 @@
 """The compiled axis equals the Python one bit for bit for any truth file."""
 
-from __future__ import annotations
-
 import random
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Code that several processes have compiled and kept on disk runs together in one."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

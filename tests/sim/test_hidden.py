@@ -1,7 +1,5 @@
 """Causes that are hidden in the simulated axis: each really has the size that its description states."""
 
-from __future__ import annotations
-
 import random
 from collections.abc import Callable
 from functools import cache

@@ -1,7 +1,5 @@
 """The causes in the simulated axis, each by its physics; the sizes are tested in test_hidden."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The hysteresis laws of the simulated gear."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections.abc import Callable, Iterable

@@ -1,7 +1,5 @@
 """The mechanics of the simulated axis alone: spring, inertias, friction, coupling."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """The simulated axis in motion and at rest: loops, friction, encoders, heat."""
 
-from __future__ import annotations
-
 import math
 import statistics
 from pathlib import Path

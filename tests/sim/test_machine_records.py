@@ -1,7 +1,5 @@
 """Records of the plant with every cause off: they stay as they have always been, bit for bit."""
 
-from __future__ import annotations
-
 import hashlib
 import math
 import struct

@@ -1,7 +1,5 @@
 """Virtual time at the pace of real time: never ahead of it, and late without a rush."""
 
-from __future__ import annotations
-
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st

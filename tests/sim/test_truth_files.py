@@ -1,7 +1,5 @@
 """Truth files, read strictly."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 from typing import Any, get_args

@@ -1,7 +1,5 @@
 """The whole daemon on a real Linux CAN stack: its bus spoilt or taken away, its processes killed."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

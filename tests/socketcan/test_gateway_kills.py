@@ -3,8 +3,6 @@
 That master keeps sending *enable operation* and targets. None of it may move the axis.
 """
 
-from __future__ import annotations
-
 import os
 import signal
 import struct

@@ -1,7 +1,5 @@
 """Every fault of the reliability table on a real Linux CAN stack, and the manners of the commands there."""
 
-from __future__ import annotations
-
 import re
 import shutil
 import subprocess

@@ -1,7 +1,5 @@
 """The control cycle and the simulated drive, two processes on a real Linux CAN stack."""
 
-from __future__ import annotations
-
 import re
 import subprocess
 import sys

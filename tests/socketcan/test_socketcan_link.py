@@ -1,7 +1,5 @@
 """The cycle's link on real sockets: vcan, vxcan and slcan."""
 
-from __future__ import annotations
-
 import os
 import select
 import subprocess

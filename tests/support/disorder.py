@@ -3,8 +3,6 @@
 The laws look at the control loop's samples and at what the outer master has sent, not at the gateway.
 """
 
-from __future__ import annotations
-
 import errno
 import struct
 from collections.abc import Sequence

@@ -17,7 +17,6 @@ import numpy as np
 from hdbridge.client import messages
 from hdbridge.commissioning.evaluation.stepping import Scheme
 from hdbridge.daemon.memory import sample_dtype
-from hdbridge.daemon.service.commissioning import HomingRun
 from hdbridge.daemon.service.lease import Lease
 from hdbridge.daemon.service.moves import WayPoint
 from hdbridge.daemon.service.observer import Batch
@@ -105,7 +104,7 @@ class FakeAxis:
         self._moved(holder, "reset")
         self.at = messages.ControlState.DISABLED
 
-    async def home(self, holder: str, run: HomingRun) -> float:
+    async def home(self, holder: str, run: messages.Home) -> float:
         self._moved(holder, "home", run.method)
         return 0.0
 

@@ -4,8 +4,6 @@ The laws look at the motor's demand and at the frames that the master has sent, 
 outside the limits, no motion without a request in the present life of the drive and the master.
 """
 
-from __future__ import annotations
-
 import struct
 from random import Random
 from typing import Any

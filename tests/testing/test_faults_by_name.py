@@ -1,7 +1,5 @@
 """Every fault of `drive.fault`, by its effect on the bus."""
 
-from __future__ import annotations
-
 import struct
 from pathlib import Path
 

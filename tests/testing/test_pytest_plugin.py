@@ -1,7 +1,5 @@
 """The fixture `hdbridge_drive` as a user's pytest has it."""
 
-from __future__ import annotations
-
 import shutil
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """`hdbridge.testing.simulated_drive`: the drive on its buses, its time and its history."""
 
-from __future__ import annotations
-
 import threading
 import time
 from collections import deque

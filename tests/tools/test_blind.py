@@ -1,7 +1,5 @@
 """The blind suites: generation, judgement and tables."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import sys

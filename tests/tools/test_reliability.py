@@ -1,7 +1,5 @@
 """The diagram of probabilities counts each name once, in the bin of its probability."""
 
-from __future__ import annotations
-
 import re
 
 import pytest

@@ -1,10 +1,8 @@
 """Temperature dependence of ripple and friction."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any, ClassVar, Self
 
 import numpy as np
 from pydantic import Field
@@ -81,7 +79,7 @@ class AmplitudeDrift(Linear, Warmed):
     ]
 
     @classmethod
-    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[AmplitudeDrift]:
+    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[Self]:
         """Yields effects driven by temperature if it changes, else by time."""
         if has_orders(base) and has_loop(base):
             for driven_by, tau_s in cls.lags(observations):
@@ -116,7 +114,7 @@ class AmplitudeDrift(Linear, Warmed):
             each._counted(told) if isinstance(each, AmplitudeDrift) else told.counted(each) for each in now
         )
 
-    def _counted(self, told: Told) -> AmplitudeDrift:
+    def _counted(self, told: Told) -> Self:
         return self.model_copy(
             update={
                 "ripple_percent_per_k": self.ripple_percent_per_k * told.per_ripple,
@@ -140,7 +138,6 @@ class AmplitudeDrift(Linear, Warmed):
         return columns
 
     def tracker(self, start: Start = Start.VIRGIN) -> Tracker:
-        """Returns an on-line tracker, in thermal equilibrium at its first moment."""
         return _Tracker(self, self.loop.law().tracker(start))
 
     def gentle_tracker(self, start: Start, fall_arcsec_per_deg: float) -> Tracker | None:
@@ -154,7 +151,6 @@ class AmplitudeDrift(Linear, Warmed):
         return None if loop is None else _Tracker(self, loop)
 
     def bound_arcsec(self) -> float:
-        """Bound at the highest warmth."""
         ripple = abs(self.ripple_percent_per_k) * sum(each.amplitude_arcsec for each in self.orders)
         ripple *= self._most()
         return 0.01 * self.limit_k * (ripple + abs(self.friction_percent_per_k * self.loop.offset_arcsec))
@@ -185,8 +181,6 @@ class AmplitudeDrift(Linear, Warmed):
 
 
 class _Tracker(Tracker):
-    __slots__ = ("_friction", "_load", "_loop", "_orders", "_ripple", "_warmth")
-
     def __init__(self, effect: AmplitudeDrift, loop: Tracker) -> None:
         self._orders = OrderTracker(phasors(effect.orders))
         self._load = effect.under_load
@@ -197,7 +191,6 @@ class _Tracker(Tracker):
 
     @property
     def memory_deg(self) -> float:
-        """Memory of the loop."""
         return self._loop.memory_deg
 
     def peek(self, motor_deg: float, moment: Moment) -> float:

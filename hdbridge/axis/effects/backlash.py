@@ -1,7 +1,5 @@
 """Dead zone behind the gear: a loose key, a worn coupling, a gear stage on the output."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from typing import Annotated, ClassVar, Self
 
@@ -79,7 +77,7 @@ class Backlash(Linear):
         return cls(gap_arcsec=gap_arcsec, crossing_deg=_crossing_deg(gap_arcsec, ratio, softness))
 
     @classmethod
-    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[Backlash]:  # noqa: ARG003
+    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[Self]:
         """Yields gaps from a hard contact to a soft one."""
         yield from (cls(gap_arcsec=1.0, crossing_deg=each) for each in (0.05, 0.15, 0.4, 1.0, 2.5, 6.0))
 
@@ -101,25 +99,20 @@ class Backlash(Linear):
         return (-0.5 * stop(motion.motor_deg, self.crossing_deg, start))[:, np.newaxis]
 
     def tracker(self, start: Start = Start.VIRGIN) -> Tracker:
-        """Returns an on-line tracker; its first `advance` only sets the motor position."""
         return _Tracker(-0.5 * self.gap_arcsec, Stop(self.crossing_deg, start))
 
     def gentle_tracker(self, start: Start, fall_arcsec_per_deg: float) -> Tracker | None:
-        """Returns the tracker of a gap that takes a larger motor angle to cross."""
         crossing = max(self.crossing_deg, self.gap_arcsec / fall_arcsec_per_deg)
         return _Tracker(-0.5 * self.gap_arcsec, Stop(crossing, start))
 
     def bound_arcsec(self) -> float:
-        """Half the gap."""
         return 0.5 * self.gap_arcsec
 
     def slope_bound_arcsec_per_deg(self) -> float:
-        """Gap divided by its crossing angle."""
         return self.gap_arcsec / self.crossing_deg
 
     @classmethod
-    def candidate(cls, ratio: float, base: Sequence[Effect] = ()) -> Self:  # noqa: ARG003
-        """Returns a gap of 10 arcsec."""
+    def candidate(cls, ratio: float, base: Sequence[Effect] = ()) -> Self:
         return cls.of_gap(10.0, ratio)
 
 
@@ -129,15 +122,12 @@ def _crossing_deg(gap_arcsec: float, ratio: float, softness: float = _SOFTNESS) 
 
 
 class _Tracker(Tracker):
-    __slots__ = ("_height", "_stop")
-
     def __init__(self, height: float, play: Stop) -> None:
         self._height = height
         self._stop = play
 
     @property
     def memory_deg(self) -> float:
-        """Motor angle that crosses the gap."""
         return self._stop.memory_deg
 
     def peek(self, motor_deg: float, moment: Moment) -> float:

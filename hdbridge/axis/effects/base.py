@@ -40,16 +40,12 @@ from hdbridge.axis.effects.motion import (
     AT_REST,
     MEASURED,
     SLOT,
-    BoolArray,
     Channel,
     FloatArray,
-    IntArray,
     Moment,
     Motion,
     Start,
-    measured_by_all,
     missing_error,
-    readings,
 )
 from hdbridge.axis.effects.observations import Observations
 from hdbridge.axis.effects.tracker import Level, Memoryless, Tracker
@@ -59,7 +55,7 @@ __all__ = [
     "AT_REST",
     "MEASURED",
     "SLOT",
-    "BoolArray",
+    "Angleless",
     "Cause",
     "Channel",
     "Coefficient",
@@ -68,7 +64,6 @@ __all__ = [
     "Effect",
     "Experiment",
     "FloatArray",
-    "IntArray",
     "Level",
     "Linear",
     "Memoryless",
@@ -82,9 +77,7 @@ __all__ = [
     "Start",
     "Stretch",
     "Tracker",
-    "measured_by_all",
     "missing_error",
-    "readings",
     "unmet",
 ]
 
@@ -141,9 +134,10 @@ class Effect(Strict, ABC):
     Either all parameters that `columns` covers, or none.
     """
 
-    @abstractmethod
     def predict(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
         """Returns the error at the load for each sample, arcsec, shape (n,)."""
+        error: FloatArray = self.columns(motion, start) @ self.coefficients()
+        return error
 
     @abstractmethod
     def tracker(self, start: Start = Start.VIRGIN) -> Tracker:
@@ -196,7 +190,7 @@ class Effect(Strict, ABC):
         return cls(**values)
 
     @classmethod
-    def _carried(cls, base: Sequence[Effect]) -> dict[str, Any]:  # noqa: ARG003
+    def _carried(cls, base: Sequence[Effect]) -> dict[str, Any]:
         """Returns the parameters that are copies of parts of a model."""
         return {}
 
@@ -220,7 +214,7 @@ class Effect(Strict, ABC):
             yield typical.fitted(typical.coefficients(), shape)
 
     @classmethod
-    def at_lines(cls, periods_per_turn: int) -> Iterator[Self]:  # noqa: ARG003
+    def at_lines(cls, periods_per_turn: int) -> Iterator[Self]:
         """Yields the effects that can appear as a spectral line at this many periods per load turn, for
         `Sought.LINE`.
         """
@@ -300,14 +294,14 @@ class Effect(Strict, ABC):
         )
 
     @classmethod
-    def of_change(cls, before: Effect, now: Effect) -> Self | None:  # noqa: ARG003
+    def of_change(cls, before: Effect, now: Effect) -> Self | None:
         """Returns this cause if it can explain a change of ``before`` into ``now``, else None;
         see `changes`.
         """
         return None
 
     @classmethod
-    def unmeasured(cls, ratio: float) -> Effect | None:  # noqa: ARG003
+    def unmeasured(cls, ratio: float) -> Effect | None:
         """Returns its appearance if its channel was not measured; None if there is no characteristic one."""
         return None
 
@@ -372,23 +366,24 @@ class Linear(Effect):
     linear: ClassVar[tuple[str, ...]]
     """Parameters that the error is linear in, in the order of the columns."""
 
-    def predict(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
-        """Returns the error in arcsec, shape (n,)."""
-        error: FloatArray = self.columns(motion, start) @ self.coefficients()
-        return error
-
     def coefficients(self) -> FloatArray:
         """Returns the linear parameters in their units."""
         return np.array([getattr(self, each) for each in self.linear], dtype=np.float64)
 
     def named_coefficients(self) -> tuple[Coefficient, ...]:
-        """Returns the coefficients named by their parameters."""
         return tuple(Coefficient(each, (i,), (each,)) for i, each in enumerate(self.linear))
 
     def fitted(self, coefficients: FloatArray, shape: Mapping[str, float] | None = None) -> Self:
         """Returns the effect with other linear parameters and, if given, other shape parameters."""
         values = dict(zip(self.linear, map(float, coefficients), strict=True))
         return self.model_copy(update={**values, **dict(shape or {})})
+
+
+class Angleless(Effect):
+    """Base class of effects that depend on the moment alone, not on the motor angle."""
+
+    def slope_bound_arcsec_per_deg(self) -> float:
+        return 0.0
 
 
 def unmet(effects: Iterable[Effect], available: frozenset[Channel]) -> dict[str, frozenset[Channel]]:

@@ -5,8 +5,6 @@ tracked and read on its own, it carries a copy of the part that it modulates, ta
 created; `combine.refreshed` keeps the copy up to date.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from typing import Annotated
 
@@ -32,7 +30,6 @@ class Loop(Strict):
     memory: Annotated[bool, Field(description="with return-point memory (hysteresis_memory)")] = False
 
     def law(self) -> Hysteresis | HysteresisMemory:
-        """Returns the effect with these parameters."""
         kind = HysteresisMemory if self.memory else Hysteresis
         # During a fit it may be out of its range, like the effect it was copied from.
         return kind.model_construct(

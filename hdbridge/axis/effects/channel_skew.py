@@ -1,7 +1,5 @@
 """Time skew between the samples of the two encoders."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Annotated, Any, ClassVar, Self
 
@@ -9,6 +7,7 @@ import numpy as np
 from pydantic import Field
 
 from hdbridge.axis.effects.base import (
+    Angleless,
     Cause,
     Channel,
     Compensable,
@@ -28,7 +27,7 @@ from hdbridge.axis.effects.load_order import Ratio
 from hdbridge.units import ARCSEC_PER_DEG
 
 
-class ChannelSkew(Linear):
+class ChannelSkew(Angleless, Linear):
     """delay omega_L + second alpha_L / 2: the load encoder, sampled later than the motor's, reads farther on.
 
     A pure delay has second = delay^2. It is a separate parameter because the speed is a difference over a
@@ -93,8 +92,7 @@ class ChannelSkew(Linear):
         return cls(ratio=ratio, delay_ms=delay_ms, second_order_ms2=delay_ms * delay_ms)
 
     @classmethod
-    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[ChannelSkew]:  # noqa: ARG003
-        """Yields the single candidate."""
+    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[Self]:
         yield cls(ratio=observations.ratio, delay_ms=1.0, second_order_ms2=1.0)
 
     def columns(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
@@ -105,23 +103,15 @@ class ChannelSkew(Linear):
         return np.column_stack([1e-3 * gain * speed, 0.5e-6 * gain * acceleration])
 
     def tracker(self, start: Start = Start.VIRGIN) -> Tracker:
-        """Returns an on-line tracker; speed and acceleration come from the moment."""
         return _Tracker(self)
 
     def bound_arcsec(self) -> float:
-        """Bound at the highest speed and acceleration."""
         speed = 1e-3 * abs(self.delay_ms) * self.limit_deg_s
         acceleration = 0.5e-6 * abs(self.second_order_ms2) * self.limit_deg_s2
         return ARCSEC_PER_DEG / self.ratio * (speed + acceleration)
 
-    def slope_bound_arcsec_per_deg(self) -> float:
-        """Zero, because the speed is the command's, independent of the angle."""
-        return 0.0
-
 
 class _Tracker(Memoryless):
-    __slots__ = ("_first", "_limit", "_limit2", "_second")
-
     def __init__(self, effect: ChannelSkew) -> None:
         gain = ARCSEC_PER_DEG / effect.ratio
         self._first = 1e-3 * gain * effect.delay_ms

@@ -1,7 +1,5 @@
 """Wind-up of the gear by the load torque: a spring that stiffens at two torques."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import pairwise
 from typing import Annotated, Any, ClassVar, Literal, Self
@@ -11,6 +9,7 @@ from pydantic import Field, model_validator
 
 from hdbridge.axis.effects.base import (
     SLOT,
+    Angleless,
     Cause,
     Channel,
     Compensable,
@@ -39,7 +38,7 @@ SOFTER = 1.05
 _Softness = Annotated[float, Field(ge=0, le=1000)]
 
 
-class Compliance(Linear):
+class Compliance(Angleless, Linear):
     """sense * (c1, c2, c3 per Nm in the zones up to T1, up to T2, beyond); c = 206265 / K.
 
     Written in compliances, because the error is linear in them: c1 = 206265 / K1 arcsec/Nm with K1 in Nm/rad.
@@ -100,7 +99,7 @@ class Compliance(Linear):
         return self
 
     @classmethod
-    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[Compliance]:  # noqa: ARG003
+    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[Self]:
         """Yields a linear spring, and springs that stiffen once or twice within the torques of the record."""
         largest = top(observations.motion, Channel.LOAD_TORQUE)
         if largest:
@@ -126,7 +125,6 @@ class Compliance(Linear):
         return LoadOrders(ratio=ratio, orders=orders_from([1]))
 
     def needs(self) -> frozenset[Channel]:
-        """Returns the torque channel."""
         return frozenset({Channel(self.torque)})
 
     def columns(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
@@ -154,21 +152,15 @@ class Compliance(Linear):
         return effect.model_copy(update={"sense": -self.sense}) if turned else effect
 
     def tracker(self, start: Start = Start.VIRGIN) -> Tracker:
-        """Returns a stateless on-line tracker."""
         return _Tracker(self)
 
     def bound_arcsec(self) -> float:
-        """Wind-up at the highest torque."""
         low, high, most = self.torque1_nm, self.torque2_nm, self.limit_nm
         return (
             abs(self.c1_arcsec_per_nm) * min(most, low)
             + abs(self.c2_arcsec_per_nm) * min(max(most - low, 0.0), high - low)
             + abs(self.c3_arcsec_per_nm) * max(most - high, 0.0)
         )
-
-    def slope_bound_arcsec_per_deg(self) -> float:
-        """Zero, because it depends on the torque, not on the motor angle."""
-        return 0.0
 
     def stiffness_nm_per_rad(self) -> tuple[float, float, float]:
         """Returns K1, K2, K3 as in catalogues; infinite for a compliance of zero."""
@@ -177,8 +169,6 @@ class Compliance(Linear):
 
 
 class _Tracker(Memoryless):
-    __slots__ = ("_c", "_high", "_limit", "_low", "_sense", "_slot")
-
     def __init__(self, effect: Compliance) -> None:
         self._c = (effect.c1_arcsec_per_nm, effect.c2_arcsec_per_nm, effect.c3_arcsec_per_nm)
         self._low = effect.torque1_nm

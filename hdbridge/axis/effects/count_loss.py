@@ -1,7 +1,5 @@
 """Counts lost by an encoder, or a tooth jumped: a persistent step at one time."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Annotated, Any, ClassVar, Self
 
@@ -9,6 +7,7 @@ import numpy as np
 from pydantic import Field
 
 from hdbridge.axis.effects.base import (
+    Angleless,
     Cause,
     Channel,
     Coefficient,
@@ -40,7 +39,7 @@ class Step(Strict):
     size_arcsec: Annotated[float, Field(ge=-1e6, le=1e6, description="the step, at the load")]
 
 
-class CountLoss(Effect):
+class CountLoss(Angleless):
     """Sum of size_j for all steps with time_j <= t."""
 
     name: ClassVar[str] = "count_loss"
@@ -76,7 +75,7 @@ class CountLoss(Effect):
     ]
 
     @classmethod
-    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[CountLoss]:  # noqa: ARG003
+    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[Self]:
         """Yields one step in the middle of the record, as an example."""
         if observations.motion.time_s is not None:
             middle = float(np.quantile(observations.motion.time_s, 0.5))
@@ -103,30 +102,21 @@ class CountLoss(Effect):
         return np.column_stack([number >= first - near, number >= first + near]).astype(np.float64)
 
     def pieces(self) -> tuple[Self, ...]:
-        """Returns one effect per step."""
         return tuple(self.model_copy(update={"steps": (each,)}) for each in self.steps)
 
     def joined(self, other: Effect) -> Self | None:
-        """Returns the effect with the steps of both."""
         if not isinstance(other, CountLoss):
             return None
         steps = tuple(sorted((*self.steps, *other.steps), key=lambda each: each.time_s))
         return self.model_copy(update={"steps": steps})
 
     def named_coefficients(self) -> tuple[Coefficient, ...]:
-        """Returns the names of the step sizes."""
         return tuple(
             Coefficient(f"step_{i + 1}_size_arcsec", (i,), ("steps", i, "size_arcsec"))
             for i in range(len(self.steps))
         )
 
-    def predict(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
-        """Returns the error in arcsec, shape (n,)."""
-        error: FloatArray = self.columns(motion, start) @ self.coefficients()
-        return error
-
     def tracker(self, start: Start = Start.VIRGIN) -> Tracker:
-        """Returns an on-line tracker; it depends only on the clock."""
         return _Tracker([(each.time_s, each.size_arcsec) for each in self.steps])
 
     def columns(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
@@ -135,7 +125,6 @@ class CountLoss(Effect):
         return (time_s[:, np.newaxis] >= [each.time_s for each in self.steps]).astype(np.float64)
 
     def coefficients(self) -> FloatArray:
-        """Returns the step sizes, arcsec."""
         return np.array([each.size_arcsec for each in self.steps])
 
     def fitted(self, coefficients: FloatArray, shape: Mapping[str, float] | None = None) -> Self:
@@ -150,17 +139,10 @@ class CountLoss(Effect):
         return self.model_copy(update={"steps": steps})
 
     def bound_arcsec(self) -> float:
-        """Sum of the absolute sizes."""
         return sum(abs(each.size_arcsec) for each in self.steps)
-
-    def slope_bound_arcsec_per_deg(self) -> float:
-        """Zero, because it depends on time alone."""
-        return 0.0
 
 
 class _Tracker(Memoryless):
-    __slots__ = ("_steps",)
-
     def __init__(self, steps: list[tuple[float, float]]) -> None:
         self._steps = steps
 

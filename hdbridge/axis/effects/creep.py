@@ -1,7 +1,5 @@
 """Creep: slow relaxation of strain after a stop."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Annotated, Any, ClassVar, Self
@@ -11,6 +9,7 @@ from pydantic import Field
 
 from hdbridge.axis.effects import coordinate as over
 from hdbridge.axis.effects.base import (
+    Angleless,
     Cause,
     Channel,
     Coefficient,
@@ -45,7 +44,7 @@ class Relaxation(Strict):
     tau_s: Annotated[float, Field(gt=0, le=1e6, description="time constant at rest")]
 
 
-class Creep(Effect):
+class Creep(Angleless):
     """Sum of A_j y_j; y_j approaches the direction in motion, and zero at rest.
 
     In motion the time constant is ``build_up`` tau_j. A value of 1 is a linear viscoelastic element (short
@@ -92,7 +91,7 @@ class Creep(Effect):
     ] = 1.0
 
     @classmethod
-    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[Creep]:  # noqa: ARG003
+    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[Self]:
         """Yields single exponentials; those found are combined afterwards."""
         for tau_s in (0.3, 1.0, 3.0, 10.0, 30.0, 100.0):
             for build_up in (0.03, 0.3, 1.0):
@@ -113,11 +112,9 @@ class Creep(Effect):
         return over.since_change(motion)
 
     def pieces(self) -> tuple[Self, ...]:
-        """Returns one effect per exponential."""
         return tuple(self.model_copy(update={"parts": (each,)}) for each in self.parts)
 
     def joined(self, other: Effect) -> Self | None:
-        """Returns the effect with the exponentials of both."""
         if not isinstance(other, Creep):
             return None
         return self.model_copy(update={"parts": (*self.parts, *other.parts)})
@@ -127,19 +124,12 @@ class Creep(Effect):
         return max(abs(each.amplitude_arcsec) for each in self.parts)
 
     def named_coefficients(self) -> tuple[Coefficient, ...]:
-        """Returns the names of the amplitudes."""
         return tuple(
             Coefficient(f"part_{i + 1}_amplitude_arcsec", (i,), ("parts", i, "amplitude_arcsec"))
             for i in range(len(self.parts))
         )
 
-    def predict(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
-        """Returns the error in arcsec, shape (n,)."""
-        error: FloatArray = self.columns(motion, start) @ self.coefficients()
-        return error
-
     def tracker(self, start: Start = Start.VIRGIN) -> Tracker:
-        """Returns an on-line tracker, fully relaxed at its first moment."""
         return _Tracker([(each.amplitude_arcsec, each.tau_s) for each in self.parts], self.build_up)
 
     def columns(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
@@ -155,7 +145,6 @@ class Creep(Effect):
         return columns
 
     def coefficients(self) -> FloatArray:
-        """Returns the amplitudes, arcsec."""
         return np.array([each.amplitude_arcsec for each in self.parts])
 
     def fitted(self, coefficients: FloatArray, shape: Mapping[str, float] | None = None) -> Self:
@@ -171,18 +160,11 @@ class Creep(Effect):
         return self.model_copy(update={"parts": parts, **given})
 
     def bound_arcsec(self) -> float:
-        """Sum of the absolute amplitudes."""
         return sum(abs(each.amplitude_arcsec) for each in self.parts)
-
-    def slope_bound_arcsec_per_deg(self) -> float:
-        """Zero, because it depends on time and on the command's direction."""
-        return 0.0
 
 
 class _Tracker(Tracker):
     """State: y_j and the time they refer to."""
-
-    __slots__ = ("_amplitudes", "_build_up", "_rates", "_strains", "_time")
 
     def __init__(self, parts: list[tuple[float, float]], build_up: float) -> None:
         self._amplitudes = [amplitude for amplitude, _ in parts]

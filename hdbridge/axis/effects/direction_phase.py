@@ -1,7 +1,5 @@
 """Shift of the synchronous part with the direction of travel, because other tooth flanks carry."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Annotated, Any, ClassVar, Self
@@ -12,10 +10,10 @@ from pydantic import Field
 from hdbridge.axis.effects.base import (
     Cause,
     Channel,
-    Coefficient,
     Compensable,
     Effect,
     FloatArray,
+    Linear,
     Memoryless,
     Moment,
     Motion,
@@ -34,7 +32,7 @@ of the order.
 """
 
 
-class DirectionPhase(Effect):
+class DirectionPhase(Linear):
     """Direction-odd part of a tooth error T(theta_M + d shift), S being the mean over both flanks.
 
     An order A_k of the tooth error appears as A_k cos(k shift) in the mean, which is the model's synchronous
@@ -63,6 +61,7 @@ class DirectionPhase(Effect):
     )
     carries: ClassVar[Mapping[Part, str]] = {Part.ORDERS: "orders"}
     curved: ClassVar[bool] = True
+    linear: ClassVar[tuple[str, ...]] = ("shift_deg",)
     typical: ClassVar[Mapping[str, Any]] = {"shift_deg": 1.0}
     """A shift of 1 degree of the base's orders."""
 
@@ -73,7 +72,7 @@ class DirectionPhase(Effect):
     ]
 
     @classmethod
-    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[DirectionPhase]:  # noqa: ARG003
+    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[Self]:
         """Yields a start at zero shift."""
         if has_orders(base):
             yield cls(orders=orders_of(base), shift_deg=0.0)
@@ -82,16 +81,7 @@ class DirectionPhase(Effect):
         """Returns the cosine of the shift, because the mean of two shifted flanks is smaller than either."""
         return math.cos(order * math.radians(self.shift_deg))
 
-    def named_coefficients(self) -> tuple[Coefficient, ...]:
-        """Returns the name of the shift."""
-        return (Coefficient("shift_deg", (0,), ("shift_deg",)),)
-
-    def predict(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
-        """Returns the error in arcsec, shape (n,)."""
-        return self.columns(motion, start)[:, 0] * self.shift_deg
-
     def tracker(self, start: Start = Start.VIRGIN) -> Tracker:
-        """Returns an on-line tracker; the direction comes from the moment."""
         return _Tracker(tuple(self.shift_deg * each for each in self._odd()), start.value)
 
     def columns(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
@@ -101,20 +91,10 @@ class DirectionPhase(Effect):
         error: FloatArray = direction_of(motion, start) * ripple(motion.motor_deg, self._odd())
         return error[:, np.newaxis]
 
-    def coefficients(self) -> FloatArray:
-        """Returns the shift, motor degrees."""
-        return np.array([self.shift_deg])
-
-    def fitted(self, coefficients: FloatArray, shape: Mapping[str, float] | None = None) -> Self:
-        """Returns the effect with another shift."""
-        return self.model_copy(update={"shift_deg": float(coefficients[0])})
-
     def bound_arcsec(self) -> float:
-        """Sum of A_k |tan(k shift)|."""
         return abs(self.shift_deg) * sum(map(abs, self._odd()))
 
     def slope_bound_arcsec_per_deg(self) -> float:
-        """Sum of k A_k |tan(k shift)|, per degree."""
         steepness = sum(k * abs(each) for k, each in enumerate(reversed(self._odd())))
         return RAD_PER_DEG * abs(self.shift_deg) * steepness
 
@@ -138,8 +118,6 @@ class DirectionPhase(Effect):
 
 
 class _Tracker(Memoryless):
-    __slots__ = ("_phasors", "_start")
-
     def __init__(self, amplitudes: tuple[complex, ...], start: int) -> None:
         self._phasors = amplitudes
         self._start = start

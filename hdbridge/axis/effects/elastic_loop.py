@@ -9,8 +9,6 @@ gear's own slope, 3600 / N arcsec per motor degree. Just after a reversal the fo
 inverse uses a slope that it can invert (`gentle_tracker`).
 """
 
-from __future__ import annotations
-
 import math
 from abc import abstractmethod
 from collections.abc import Mapping
@@ -91,19 +89,15 @@ class ElasticLoop(Effect):
     exponent: Annotated[float, Field(gt=1, le=6, description="shape n of the branch")]
 
     def predict(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
-        """Returns the error in arcsec, shape (n,)."""
         return self.offset_arcsec * self._loop(motion.motor_deg, start)
 
     def columns(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
-        """Returns the loop of unit offset, shape (n, 1)."""
         return self._loop(motion.motor_deg, start)[:, np.newaxis]
 
     def coefficients(self) -> FloatArray:
-        """Returns the offset, arcsec, shape (1,)."""
         return np.array([self.offset_arcsec])
 
     def named_coefficients(self) -> tuple[Coefficient, ...]:
-        """Returns the name of the offset."""
         return (Coefficient("offset_arcsec", (0,), ("offset_arcsec",)),)
 
     def fitted(self, coefficients: FloatArray, shape: Mapping[str, float] | None = None) -> Self:
@@ -111,11 +105,9 @@ class ElasticLoop(Effect):
         return self.model_copy(update={"offset_arcsec": float(coefficients[0]), **dict(shape or {})})
 
     def bound_arcsec(self) -> float:
-        """Absolute offset."""
         return abs(self.offset_arcsec)
 
     def tracker(self, start: Start = Start.VIRGIN) -> Tracker:
-        """Returns an on-line tracker; its first `advance` only sets the motor position."""
         return self._tracker(start, self.width_deg, math.inf)
 
     def slope_bound_arcsec_per_deg(self) -> float:

@@ -17,12 +17,10 @@ width.
 infinitely steeply where the plain law rises, and would have to repeat the plain law's parameters.
 """
 
-from __future__ import annotations
-
 import math
 from bisect import bisect_left
 from collections.abc import Iterator, Sequence
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple, Self
 
 import numpy as np
 
@@ -62,20 +60,18 @@ class HysteresisMemory(ElasticLoop):
         return _MemoryTracker(self.offset_arcsec, width_deg, self.exponent, start, steepest)
 
     @classmethod
-    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[HysteresisMemory]:  # noqa: ARG003
+    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[Self]:
         """Yields the model's plain loop under this law."""
         for each in base:
             if isinstance(each, Hysteresis):
                 yield cls(**each.parameters())
 
     @classmethod
-    def of_change(cls, before: Effect, now: Effect) -> HysteresisMemory | None:
-        """Returns this cause if a different hysteresis law explains the change."""
+    def of_change(cls, before: Effect, now: Effect) -> Self | None:
         return now if isinstance(now, cls) and not isinstance(before, cls) else None
 
     @classmethod
     def _carried(cls, base: Sequence[Effect]) -> dict[str, Any]:
-        """Returns the parameters of the model's plain law, else none."""
         for each in base:
             if isinstance(each, Hysteresis):
                 return each.parameters()
@@ -134,8 +130,6 @@ class _Memory:
     ``_points`` holds pairs of angle and value; the last is the start of the present branch, the one before it
     is where the branch closes. If empty: on the virgin curve through ``_origin`` in direction ``_sign``.
     """
-
-    __slots__ = ("_exponent", "_origin", "_points", "_sign", "_steepest", "_width")
 
     def __init__(
         self, width: float, exponent: float, angle: float, start: int, steepest: float = math.inf
@@ -219,8 +213,6 @@ class _Memory:
 
 class _MemoryTracker(Tracker):
     """State: the remembered reversals, the last angle and the value there."""
-
-    __slots__ = ("_angle", "_exponent", "_memory", "_offset", "_start", "_steepest", "_value", "_width")
 
     def __init__(self, offset: float, width: float, exponent: float, start: Start, steepest: float) -> None:
         self._offset = offset

@@ -1,7 +1,5 @@
 """Changed elastic loop: another offset, width or exponent than in the model."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Annotated, Any, ClassVar, Self
@@ -62,7 +60,7 @@ class HysteresisParameters(Effect):
     exponent: Annotated[float, Field(gt=1, le=6, description="new exponent")]
 
     @classmethod
-    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[HysteresisParameters]:  # noqa: ARG003
+    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[Self]:
         """Yields the model's loop with a larger width."""
         if any(each.part is Part.LOOP for each in base):
             loop = loop_of(base)
@@ -70,8 +68,7 @@ class HysteresisParameters(Effect):
             yield cls(base=loop, **now)
 
     @classmethod
-    def of_change(cls, before: Effect, now: Effect) -> HysteresisParameters | None:
-        """Returns this cause if the parameters of one law have changed."""
+    def of_change(cls, before: Effect, now: Effect) -> Self | None:
         if before.part is not Part.LOOP or not isinstance(now, type(before)):
             return None
         return cls(base=loop_of([before]), **loop_of([now]).model_dump(exclude={"memory"}))
@@ -87,11 +84,9 @@ class HysteresisParameters(Effect):
         )
 
     def predict(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
-        """Returns the error in arcsec, shape (n,)."""
         return self.changed().law().predict(motion, start) - self.base.law().predict(motion, start)
 
     def tracker(self, start: Start = Start.VIRGIN) -> Tracker:
-        """Returns an on-line tracker of the difference."""
         return _Tracker(self.changed().law().tracker(start), self.base.law().tracker(start))
 
     def columns(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
@@ -110,7 +105,6 @@ class HysteresisParameters(Effect):
         return self.model_copy(update=update)
 
     def bound_arcsec(self) -> float:
-        """Sum of the absolute offsets."""
         return abs(self.offset_arcsec) + abs(self.base.offset_arcsec)
 
     def slope_bound_arcsec_per_deg(self) -> float:
@@ -121,15 +115,12 @@ class HysteresisParameters(Effect):
 
     @classmethod
     def _carried(cls, base: Sequence[Effect]) -> dict[str, Any]:
-        """Returns an offset increased by 20 %."""
         loop = loop_of(base)
         changed = {**loop.model_dump(exclude={"memory"}), "offset_arcsec": 1.2 * loop.offset_arcsec}
         return {"base": loop, **changed}
 
 
 class _Tracker(Tracker):
-    __slots__ = ("_new", "_old")
-
     def __init__(self, new: Tracker, old: Tracker) -> None:
         self._new = new
         self._old = old

@@ -1,14 +1,13 @@
 """Wind-up of the gear by the load's own inertia during acceleration."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any, ClassVar, Self
 
 import numpy as np
 from pydantic import Field
 
 from hdbridge.axis.effects.base import (
+    Angleless,
     Cause,
     Channel,
     Compensable,
@@ -27,7 +26,7 @@ from hdbridge.axis.effects.load_order import Ratio
 from hdbridge.units import ARCSEC_PER_DEG
 
 
-class InertialWindup(Linear):
+class InertialWindup(Angleless, Linear):
     """-(J / K) alpha_L: the load lags while it is accelerated."""
 
     name: ClassVar[str] = "inertial_windup"
@@ -63,8 +62,7 @@ class InertialWindup(Linear):
     ] = 1e6
 
     @classmethod
-    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[InertialWindup]:  # noqa: ARG003
-        """Yields the single candidate."""
+    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[Self]:
         yield cls(ratio=observations.ratio, inertia_over_stiffness_s2=1e-5)
 
     def columns(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
@@ -86,22 +84,14 @@ class InertialWindup(Linear):
         return beyond[:, np.newaxis]
 
     def tracker(self, start: Start = Start.VIRGIN) -> Tracker:
-        """Returns an on-line tracker; acceleration comes from the moment."""
         gain = -ARCSEC_PER_DEG / self.ratio * self.inertia_over_stiffness_s2
         return _Tracker(gain, self.limit_deg_s2)
 
     def bound_arcsec(self) -> float:
-        """Wind-up at the highest acceleration."""
         return ARCSEC_PER_DEG / self.ratio * abs(self.inertia_over_stiffness_s2) * self.limit_deg_s2
-
-    def slope_bound_arcsec_per_deg(self) -> float:
-        """Zero, because the acceleration is the command's, independent of the angle."""
-        return 0.0
 
 
 class _Tracker(Level):
-    __slots__ = ("_gain", "_limit")
-
     def __init__(self, gain: float, limit: float) -> None:
         self._gain = gain
         self._limit = limit

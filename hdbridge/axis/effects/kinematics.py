@@ -12,8 +12,6 @@ correction into the next. If a record has a better speed (from the procedure, or
 encoder), `Motion` holds it and it is used directly.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import numpy as np
@@ -75,8 +73,6 @@ class Observer:
     """Builds the `Moment` of each control cycle from the command: the on-line counterpart of the functions
     above.
     """
-
-    __slots__ = ("_angle", "_count", "_direction", "_speed", "_time")
 
     def __init__(self) -> None:
         self._count = 0

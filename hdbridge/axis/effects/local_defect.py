@@ -1,11 +1,9 @@
 """Bump at one load angle: a damaged tooth."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any, ClassVar, Self
 
 import numpy as np
 from pydantic import Field
@@ -83,7 +81,7 @@ class LocalDefect(Linear):
     ]
 
     @classmethod
-    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[LocalDefect]:  # noqa: ARG003
+    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[Self]:
         """Yields a tooth in the middle of the travel, as an example."""
         load = float(np.median(observations.motion.motor_deg)) / observations.ratio
         yield cls(
@@ -125,7 +123,6 @@ class LocalDefect(Linear):
         return np.hstack([each.columns(motion) for each in beside])
 
     def coordinate(self, motion: Motion, ratio: float) -> Coordinate:
-        """Returns the load angle."""
         return replace(over.load_angle(motion, ratio), bins=120)
 
     def columns(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
@@ -146,11 +143,9 @@ class LocalDefect(Linear):
         return bump
 
     def tracker(self, start: Start = Start.VIRGIN) -> Tracker:
-        """Returns a stateless on-line tracker."""
         return _Tracker(self)
 
     def bound_arcsec(self) -> float:
-        """Absolute height."""
         return abs(self.height_arcsec)
 
     def slope_bound_arcsec_per_deg(self) -> float:
@@ -159,8 +154,6 @@ class LocalDefect(Linear):
 
 
 class _Tracker(Memoryless):
-    __slots__ = ("_centre", "_height", "_ratio", "_width")
-
     def __init__(self, effect: LocalDefect) -> None:
         self._height = effect.height_arcsec
         self._centre = effect.centre_deg

@@ -1,7 +1,5 @@
 """Harmonic series over an angle that turns with the motor: common base of all order effects."""
 
-from __future__ import annotations
-
 import cmath
 import math
 from abc import abstractmethod
@@ -73,12 +71,10 @@ class OrderSeries(Effect):
         """Returns c, the periods of order 1 per motor turn."""
 
     def predict(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
-        """Returns the error in arcsec, shape (n,)."""
         error: FloatArray = horner(phasors(self.orders), turn_of(self._scale() * motion.motor_deg)).real
         return error
 
     def tracker(self, start: Start = Start.VIRGIN) -> Tracker:
-        """Returns a stateless on-line tracker."""
         return OrderTracker(phasors(self.orders), self._scale())
 
     def columns(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
@@ -94,11 +90,9 @@ class OrderSeries(Effect):
         return self.model_copy(update={"orders": orders_fitted(self.orders, coefficients)})
 
     def bound_arcsec(self) -> float:
-        """Sum of the amplitudes."""
         return sum(each.amplitude_arcsec for each in self.orders)
 
     def slope_bound_arcsec_per_deg(self) -> float:
-        """Sum of order times amplitude, per degree."""
         return self._scale() * sum(each.order * each.amplitude_arcsec for each in self.orders)
 
     def shows(self, motion: Motion) -> Stretch | None:
@@ -106,11 +100,9 @@ class OrderSeries(Effect):
         return away_from_reversals(motion)
 
     def pieces(self) -> tuple[Self, ...]:
-        """Returns one effect per order."""
         return tuple(self.model_copy(update={"orders": (each,)}) for each in self.orders)
 
     def joined(self, other: Effect) -> Self | None:
-        """Returns the effect with the orders of two series over the same angle."""
         if other.name != self.name or not isinstance(other, OrderSeries):
             return None
         own = {each.order for each in self.orders}
@@ -123,12 +115,10 @@ class OrderSeries(Effect):
         return max((each.amplitude_arcsec for each in self.orders), default=0.0)
 
     def waves(self) -> tuple[tuple[float, float, float], ...]:
-        """Returns its orders."""
         turns = self.turns_per_motor_turn()
         return tuple((each.order * turns, each.amplitude_arcsec, each.phase_deg) for each in self.orders)
 
     def named_coefficients(self) -> tuple[Coefficient, ...]:
-        """Returns the names of amplitude and phase of each order."""
         return named_orders(self.orders)
 
     def tidied(self, ratio: float) -> Self:
@@ -280,14 +270,11 @@ def compensated_orders(effects: Iterable[Effect]) -> list[MotorOrder]:
 class OrderTracker(Memoryless):
     """On-line tracker of a series of harmonics; ``scale`` is radians of order 1 per motor degree."""
 
-    __slots__ = ("_highest", "_lower", "_scale")
-
     def __init__(self, amplitudes: tuple[complex, ...], scale: float = RAD_PER_DEG) -> None:
         self._highest, *self._lower = amplitudes
         self._scale = scale
 
     def peek(self, motor_deg: float, moment: Moment) -> float:
-        """Returns the error at this motor angle, arcsec."""
         # `horner`, inlined because it is called several times in each control cycle.
         turn = cmath.rect(1.0, self._scale * motor_deg)
         total = self._highest

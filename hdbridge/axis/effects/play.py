@@ -1,7 +1,5 @@
 """Stop operator: follows the motor, limited to plus or minus one; the building block of dead zones."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from hdbridge.axis.effects.base import FloatArray, Start
@@ -33,8 +31,6 @@ def stop(motor_deg: FloatArray, width_deg: float, start: Start) -> FloatArray:
 
 class Stop:
     """On-line stop operator: `at` evaluates, `to` moves."""
-
-    __slots__ = ("_angle", "_gain", "_value")
 
     def __init__(self, width_deg: float, start: Start) -> None:
         self._gain = 2.0 / width_deg

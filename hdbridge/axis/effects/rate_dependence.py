@@ -1,10 +1,8 @@
 """Growth of the elastic loop with speed: friction rises with the logarithm of the sliding rate."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any, ClassVar, Self
 
 import numpy as np
 from pydantic import Field
@@ -63,7 +61,7 @@ class RateDependence(Linear):
     )
 
     @classmethod
-    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[RateDependence]:
+    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[Self]:
         """Yields growth from far below the speeds of the record, and from just below them."""
         fastest = top_speed_deg_s(observations.motion)
         if has_loop(base):
@@ -74,12 +72,10 @@ class RateDependence(Linear):
                 )  # fmt: skip
 
     def coordinate(self, motion: Motion, ratio: float) -> Coordinate:
-        """Returns the absolute speed."""
         speed = np.abs(speed_of(motion, self.name))
         return Coordinate("speed, forward or backward", "motor deg/s", speed, spacing=Spacing.FILLED)
 
     def scales(self) -> tuple[Part, Effect]:
-        """Returns the loop."""
         return Part.LOOP, self.loop.law()
 
     def columns(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
@@ -89,11 +85,9 @@ class RateDependence(Linear):
         return (rate * self.loop.law().predict(motion, start))[:, np.newaxis]
 
     def tracker(self, start: Start = Start.VIRGIN) -> Tracker:
-        """Returns an on-line tracker; speed comes from the moment."""
         return _Tracker(self, self.loop.law().tracker(start))
 
     def bound_arcsec(self) -> float:
-        """Growth at the highest speed."""
         return self._most() * abs(self.loop.offset_arcsec)
 
     def slope_bound_arcsec_per_deg(self) -> float:
@@ -121,8 +115,6 @@ class RateDependence(Linear):
 
 
 class _Tracker(Tracker):
-    __slots__ = ("_gain", "_limit", "_loop", "_reference")
-
     def __init__(self, effect: RateDependence, loop: Tracker) -> None:
         self._loop = loop
         self._gain = 0.01 * effect.growth_percent / math.log(10.0)
@@ -131,7 +123,6 @@ class _Tracker(Tracker):
 
     @property
     def memory_deg(self) -> float:
-        """Memory of the loop."""
         return self._loop.memory_deg
 
     def peek(self, motor_deg: float, moment: Moment) -> float:

@@ -1,9 +1,7 @@
 """Gear ratio that differs from the model's."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any, ClassVar, Self
 
 import numpy as np
 from pydantic import Field
@@ -67,8 +65,7 @@ class RatioError(Linear):
         return 1.0 / (1.0 / ratio + self.ramp_arcsec_per_turn / (DEG_PER_TURN * ARCSEC_PER_DEG))
 
     @classmethod
-    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[RatioError]:  # noqa: ARG003
-        """Yields the single candidate."""
+    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[Self]:
         yield cls(ramp_arcsec_per_turn=1.0)
 
     def implausible(self, observations: Observations) -> str:
@@ -104,21 +101,16 @@ class RatioError(Linear):
         return (angle / DEG_PER_TURN)[:, np.newaxis]
 
     def tracker(self, start: Start = Start.VIRGIN) -> Tracker:
-        """Returns a stateless on-line tracker."""
         return _Tracker(self.ramp_arcsec_per_turn / DEG_PER_TURN, self.limit_deg)
 
     def bound_arcsec(self) -> float:
-        """Ramp at the limit."""
         return abs(self.ramp_arcsec_per_turn) / DEG_PER_TURN * self.limit_deg
 
     def slope_bound_arcsec_per_deg(self) -> float:
-        """Slope of the ramp, if it falls."""
         return max(-self.ramp_arcsec_per_turn, 0.0) / DEG_PER_TURN
 
 
 class _Tracker(Memoryless):
-    __slots__ = ("_limit", "_slope")
-
     def __init__(self, slope: float, limit: float) -> None:
         self._slope = slope
         self._limit = limit

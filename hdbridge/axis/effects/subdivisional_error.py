@@ -1,7 +1,5 @@
 """Interpolation error of the load encoder, whose sine signals are not perfect sines."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Annotated, Any, ClassVar, Self
@@ -10,6 +8,7 @@ import numpy as np
 from pydantic import Field, field_validator
 
 from hdbridge.axis.effects.base import (
+    Angleless,
     Cause,
     Channel,
     Coefficient,
@@ -53,7 +52,7 @@ IN_STEP = 0.85
 explains its square, 0.72, of the line's."""
 
 
-class SubdivisionalError(Effect):
+class SubdivisionalError(Angleless):
     """Sum over k = 1, 2, 4 of A_k cos(k lines theta_L + phi_k).
 
     The load angle must be the predicted one, error included. A line is often only a few hundred arcsec wide,
@@ -97,18 +96,14 @@ class SubdivisionalError(Effect):
         return orders
 
     @classmethod
-    def proposals(
-        cls,
-        observations: Observations,
-        base: Sequence[Effect],  # noqa: ARG003
-    ) -> Iterator[SubdivisionalError]:
+    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[Self]:
         """Yields one whose line spans a few samples of the record, as an example."""
         step_deg = float(np.median(np.abs(np.diff(observations.motion.motor_deg)))) / observations.ratio
         lines = round(DEG_PER_TURN / max(2.7 * step_deg, 0.02))
         yield cls(lines_per_turn=max(lines, 1800), orders=orders_from([1]))
 
     @classmethod
-    def at_lines(cls, lines_per_turn: int) -> Iterator[SubdivisionalError]:
+    def at_lines(cls, lines_per_turn: int) -> Iterator[Self]:
         """Yields the effects of which this many periods per load turn can be a spectral line."""
         for numbers in ((1,), _HARMONICS):
             yield cls(lines_per_turn=lines_per_turn, orders=orders_from(numbers))
@@ -146,16 +141,13 @@ class SubdivisionalError(Effect):
         return Coordinate(name, "arcsec", np.mod(load, line_deg) * ARCSEC_PER_DEG, bins=48)
 
     def named_coefficients(self) -> tuple[Coefficient, ...]:
-        """Returns the names of amplitude and phase of each order."""
         return named_orders(self.orders)
 
     def predict(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
-        """Returns the error in arcsec, shape (n,)."""
         error: FloatArray = horner(phasors(self.orders), turn_of(self._angle(motion))).real
         return error
 
     def tracker(self, start: Start = Start.VIRGIN) -> Tracker:
-        """Returns an on-line tracker; the load angle comes from the moment."""
         return _Tracker(phasors(self.orders), RAD_PER_DEG * self.lines_per_turn)
 
     def columns(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
@@ -172,22 +164,13 @@ class SubdivisionalError(Effect):
         return self.model_copy(update=update)
 
     def bound_arcsec(self) -> float:
-        """Sum of the amplitudes."""
         return sum(each.amplitude_arcsec for each in self.orders)
-
-    def slope_bound_arcsec_per_deg(self) -> float:
-        """Zero, because the load angle is the moment's predicted one, independent of the motor
-        angle tried.
-        """
-        return 0.0
 
     def _angle(self, motion: Motion) -> FloatArray:
         return (RAD_PER_DEG * self.lines_per_turn) * motion.channel(Channel.LOAD_ANGLE, self.name)
 
 
 class _Tracker(Memoryless):
-    __slots__ = ("_phasors", "_scale")
-
     def __init__(self, amplitudes: tuple[complex, ...], scale: float) -> None:
         self._phasors = amplitudes
         self._scale = scale

@@ -1,9 +1,7 @@
 """Growth of the synchronous part with load, because the mesh deflects."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Self
 
 import numpy as np
 
@@ -65,7 +63,7 @@ class TorqueModulation(TorqueGrowth, Linear):
     orders: Orders
 
     @classmethod
-    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[TorqueModulation]:
+    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[Self]:
         """Yields growth with the torque and with its magnitude, over the range of the record."""
         largest = top(observations.motion, Channel.LOAD_TORQUE)
         if not largest or not has_orders(base):
@@ -76,7 +74,6 @@ class TorqueModulation(TorqueGrowth, Linear):
             yield cls(orders=orders_of(base), growth_percent_per_nm=1.0, signed=signed, limit_nm=limit)
 
     def coordinate(self, motion: Motion, ratio: float) -> Coordinate:
-        """Returns the torque, or its magnitude."""
         channel = Channel(self.torque)
         torque, name = motion.channel(channel, self.name), channel.title
         if self.signed:
@@ -84,11 +81,9 @@ class TorqueModulation(TorqueGrowth, Linear):
         return Coordinate(f"{name}, either direction", "Nm", np.abs(torque), spacing=Spacing.FILLED)
 
     def scales(self) -> tuple[Part, Effect]:
-        """Returns the ripple."""
         return Part.ORDERS, MotorOrders(orders=self.orders)
 
     def needs(self) -> frozenset[Channel]:
-        """Returns the torque channel."""
         return frozenset({Channel(self.torque)})
 
     def columns(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
@@ -98,11 +93,9 @@ class TorqueModulation(TorqueGrowth, Linear):
         return column[:, np.newaxis]
 
     def tracker(self, start: Start = Start.VIRGIN) -> Tracker:
-        """Returns a stateless on-line tracker."""
         return _Tracker(self)
 
     def bound_arcsec(self) -> float:
-        """Growth of the ripple at the highest torque."""
         return self.most() * sum(each.amplitude_arcsec for each in self.orders)
 
     def slope_bound_arcsec_per_deg(self) -> float:
@@ -115,8 +108,6 @@ class TorqueModulation(TorqueGrowth, Linear):
 
 
 class _Tracker(Memoryless):
-    __slots__ = ("_gain", "_load_nm", "_orders")
-
     def __init__(self, effect: TorqueModulation) -> None:
         self._orders = OrderTracker(phasors(effect.orders))
         self._gain = 0.01 * effect.growth_percent_per_nm

@@ -1,7 +1,5 @@
 """On-line evaluation of an effect: queried at any angle any number of times, advanced once per cycle."""
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 
 from hdbridge.axis.effects.motion import Moment
@@ -13,8 +11,6 @@ class Tracker(ABC):
     `peek` returns the error at a motor angle reached from the present state, as often as it is called. Only
     `advance` changes the state.
     """
-
-    __slots__ = ()
 
     @property
     def memory_deg(self) -> float:
@@ -38,14 +34,9 @@ class Tracker(ABC):
 class Memoryless(Tracker):
     """Base class of trackers without state, for which `advance` equals `peek`."""
 
-    __slots__ = ()
-
     def advance(self, motor_deg: float, moment: Moment) -> float:
-        """Returns the same as `peek`."""
         return self.peek(motor_deg, moment)
 
 
 class Level(Memoryless):
     """Base class of trackers whose error is the same at every motor angle: the moment alone decides."""
-
-    __slots__ = ()

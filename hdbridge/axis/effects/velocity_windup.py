@@ -1,15 +1,14 @@
 """Wind-up of the gear by drag on the output: seals, bearings, grease, a cable."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any, ClassVar, Self
 
 import numpy as np
 from pydantic import Field
 
 from hdbridge.axis.effects.base import (
+    Angleless,
     Cause,
     Channel,
     Compensable,
@@ -39,7 +38,7 @@ from the law's 1 if all values are equally likely.
 """
 
 
-class VelocityWindup(Linear):
+class VelocityWindup(Angleless, Linear):
     """-(coulomb sgn(v) + viscous v / (1 + |v| / shear)): drag over stiffness; zero at rest.
 
     Dry friction that remains at rest belongs to the elastic loop. The viscous part thins with shear: at the
@@ -89,7 +88,7 @@ class VelocityWindup(Linear):
     )
 
     @classmethod
-    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[VelocityWindup]:  # noqa: ARG003
+    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[Self]:
         """Yields drags that bend below, at and above the speeds of the record."""
         fastest = top_speed_deg_s(observations.motion)
         for share in (0.15, 1.0, 6.0):
@@ -123,22 +122,14 @@ class VelocityWindup(Linear):
         return (EXPONENT * self.viscous_arcsec_s_per_deg * speed * bent)[:, np.newaxis]
 
     def tracker(self, start: Start = Start.VIRGIN) -> Tracker:
-        """Returns an on-line tracker; speed comes from the moment."""
         return _Tracker(self)
 
     def bound_arcsec(self) -> float:
-        """Wind-up at the highest speed."""
         viscous = self.limit_deg_s / (1.0 + self.limit_deg_s / self.shear_deg_s)
         return abs(self.coulomb_arcsec) + abs(self.viscous_arcsec_s_per_deg) * viscous
 
-    def slope_bound_arcsec_per_deg(self) -> float:
-        """Zero, because the speed is the command's, independent of the angle."""
-        return 0.0
-
 
 class _Tracker(Level):
-    __slots__ = ("_coulomb", "_limit", "_shear", "_viscous")
-
     def __init__(self, effect: VelocityWindup) -> None:
         self._coulomb = effect.coulomb_arcsec
         self._viscous = effect.viscous_arcsec_s_per_deg

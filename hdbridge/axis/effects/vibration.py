@@ -1,7 +1,5 @@
 """Vibration at a fixed frequency in time: a fan, a pump, a neighbouring machine, a resonance."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Annotated, Any, ClassVar, Self
@@ -10,6 +8,7 @@ import numpy as np
 from pydantic import Field
 
 from hdbridge.axis.effects.base import (
+    Angleless,
     Cause,
     Channel,
     Coefficient,
@@ -30,7 +29,7 @@ from hdbridge.axis.effects.base import (
 from hdbridge.axis.effects.orders import cosines_and_sines
 
 
-class Vibration(Effect):
+class Vibration(Angleless):
     """amplitude cos(2 pi f t + phase)."""
 
     name: ClassVar[str] = "vibration"
@@ -74,28 +73,24 @@ class Vibration(Effect):
     ]
 
     @classmethod
-    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[Vibration]:  # noqa: ARG003
+    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[Self]:
         """Yields a fast vibration that the record can resolve, as an example."""
         fast_hz = 0.137 / max(observations.period_s, 1e-6)
         yield cls(frequency_hz=min(max(fast_hz, 0.3), 40.0), amplitude_arcsec=1.0, phase_deg=0.0)
 
     def coordinate(self, motion: Motion, ratio: float) -> Coordinate:
-        """Returns the time within a period."""
         period_s = 1.0 / self.frequency_hz
         within = 1e3 * np.mod(motion.channel(Channel.TIME, self.name), period_s)
         return Coordinate(f"time within a period of {1e3 * period_s:.4g} ms", "ms", within, bins=48)
 
     def named_coefficients(self) -> tuple[Coefficient, ...]:
-        """Returns the names of amplitude and phase."""
         return (Coefficient("", (0, 1), ()),)
 
     def predict(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
-        """Returns the error in arcsec, shape (n,)."""
         error: FloatArray = self.amplitude_arcsec * np.cos(self._angle(motion) + math.radians(self.phase_deg))
         return error
 
     def tracker(self, start: Start = Start.VIRGIN) -> Tracker:
-        """Returns an on-line tracker; it depends only on the clock."""
         return _Tracker(self)
 
     def columns(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
@@ -118,20 +113,13 @@ class Vibration(Effect):
         return self.model_copy(update=update)
 
     def bound_arcsec(self) -> float:
-        """The amplitude."""
         return self.amplitude_arcsec
-
-    def slope_bound_arcsec_per_deg(self) -> float:
-        """Zero, because it depends on time alone."""
-        return 0.0
 
     def _angle(self, motion: Motion) -> FloatArray:
         return (2.0 * math.pi * self.frequency_hz) * motion.channel(Channel.TIME, self.name)
 
 
 class _Tracker(Memoryless):
-    __slots__ = ("_amplitude", "_omega", "_phase")
-
     def __init__(self, effect: Vibration) -> None:
         self._amplitude = effect.amplitude_arcsec
         self._omega = 2.0 * math.pi * effect.frequency_hz

@@ -1,7 +1,5 @@
 """Warmth of the gear, which drives the drifts."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from typing import Annotated, ClassVar, Final, Literal
@@ -87,8 +85,6 @@ class Warmed(Effect):
 
 class WarmthState:
     """On-line warmth: `at` evaluates, `to` advances."""
-
-    __slots__ = ("_by_time", "_final", "_limit", "_reference", "_start", "_tau", "_temperature", "_time")
 
     def __init__(self, effect: Warmed) -> None:
         self._tau = effect.tau_s

@@ -1,7 +1,5 @@
 """Lost motion that grows with the distance run."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Annotated, Any, ClassVar, Self
@@ -76,7 +74,7 @@ class Wear(Linear):
     ] = 10_000.0
 
     @classmethod
-    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[Wear]:  # noqa: ARG003
+    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[Self]:
         """Yields widths from that of a gap to that of the elastic loop."""
         yield from (cls(growth_arcsec_per_kiloturn=1.0, width_deg=each) for each in (0.5, 4.0, 20.0))
 
@@ -105,18 +103,15 @@ class Wear(Linear):
         return self.model_copy(update={"turns_before": self.turns_before + turns})
 
     def tracker(self, start: Start = Start.VIRGIN) -> Tracker:
-        """Returns an on-line tracker; its first `advance` only sets the motor position."""
         return _Tracker(self, start, math.inf)
 
     def gentle_tracker(self, start: Start, fall_arcsec_per_deg: float) -> Tracker | None:
-        """Returns a tracker whose crossing takes as much motor angle as the present height requires."""
         if self.growth_arcsec_per_kiloturn >= 0.0:
             return None
         crossing = fall_arcsec_per_deg - self._fastest_growth()
         return _Tracker(self, start, crossing) if crossing > 0.0 else None
 
     def bound_arcsec(self) -> float:
-        """Height at the limit."""
         return abs(self._half(self.turns_limit))
 
     def slope_bound_arcsec_per_deg(self) -> float:
@@ -141,8 +136,6 @@ def _kiloturns(turns: float, exponent: float) -> float:
 
 class _Tracker(Tracker):
     """State: the stop operator's value, the distance run (degrees), the last angle."""
-
-    __slots__ = ("_angle", "_before", "_distance", "_fall", "_gain", "_half", "_limit", "_value")
 
     def __init__(self, effect: Wear, start: Start, fall_arcsec_per_deg: float) -> None:
         """``fall_arcsec_per_deg`` limits the slope of the crossing."""

@@ -1,15 +1,14 @@
 """Zero shift with temperature, because housing, encoder mount and gear expand differently."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any, ClassVar, Self
 
 import numpy as np
 from pydantic import Field
 
 from hdbridge.axis.effects import coordinate as over
 from hdbridge.axis.effects.base import (
+    Angleless,
     Cause,
     Compensable,
     Coordinate,
@@ -26,7 +25,7 @@ from hdbridge.axis.effects.base import (
 from hdbridge.axis.effects.warmth import Warmed, WarmthState
 
 
-class ZeroDrift(Linear, Warmed):
+class ZeroDrift(Angleless, Linear, Warmed):
     """drift times the gear's warmth."""
 
     name: ClassVar[str] = "zero_drift"
@@ -70,7 +69,7 @@ class ZeroDrift(Linear, Warmed):
     drift_arcsec_per_k: Annotated[float, Field(ge=-1000, le=1000, description="shift per kelvin")]
 
     @classmethod
-    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[ZeroDrift]:  # noqa: ARG003
+    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[Self]:
         """Yields effects driven by temperature if it changes, else by time."""
         for driven_by, tau_s in cls.lags(observations):
             yield cls(drift_arcsec_per_k=1.0, tau_s=tau_s, driven_by=driven_by)
@@ -84,21 +83,13 @@ class ZeroDrift(Linear, Warmed):
         return self.warmth(motion)[:, np.newaxis]
 
     def tracker(self, start: Start = Start.VIRGIN) -> Tracker:
-        """Returns an on-line tracker, in equilibrium at its first moment."""
         return _Tracker(self.drift_arcsec_per_k, WarmthState(self))
 
     def bound_arcsec(self) -> float:
-        """Bound at the highest warmth."""
         return abs(self.drift_arcsec_per_k) * self.limit_k
-
-    def slope_bound_arcsec_per_deg(self) -> float:
-        """Zero, because it depends on temperature and time."""
-        return 0.0
 
 
 class _Tracker(Tracker):
-    __slots__ = ("_drift", "_warmth")
-
     def __init__(self, drift: float, warmth: WarmthState) -> None:
         self._drift = drift
         self._warmth = warmth

@@ -124,8 +124,6 @@ class TransmissionModel:
 class ModelTracker(Tracker):
     """Sum of the trackers of all effects."""
 
-    __slots__ = ("_trackers",)
-
     def __init__(self, trackers: list[Tracker]) -> None:
         self._trackers = trackers
 

@@ -14,7 +14,7 @@ import typer
 from rich.markup import escape
 from rich.table import Table
 
-from hdbridge.cli.options import console, notes, write_json
+from hdbridge.cli.options import note, say, write_json
 from hdbridge.errors import DaemonError, HdbridgeError, InputError
 
 if TYPE_CHECKING:
@@ -67,7 +67,7 @@ def _name(at: str | None, client: Client) -> None:
     machine = f"machine at {client.address}" if place is None else f"machine '{place.stem}' at {place}"
     given = next((each for each in ("HDBRIDGE_SOCKET", "HDBRIDGE_URL") if os.environ.get(each)), None)
     source = f" (from {given})" if given else ""
-    notes.print(f"{machine}{source}", markup=False, soft_wrap=True)
+    note(f"{machine}{source}")
 
 
 @contextmanager
@@ -142,7 +142,7 @@ def stopped_by_signals(client: Client, *names: str) -> Iterator[None]:
         for name in names:
             with suppress(HdbridgeError):  # the daemon's own supervision remains
                 client.axis(name).stop()
-                notes.print(f"axis '{name}' is stopped; it stays enabled", markup=False, soft_wrap=True)
+                note(f"axis '{name}' is stopped; it stays enabled")
         raise
     finally:
         for each, handler in before.items():
@@ -155,11 +155,11 @@ def tell(state: AxisState, json_file: Path | None) -> None:
     load = "" if state.load_position_deg is None else f", load encoder {state.load_position_deg:.4f} deg"
     error = "" if state.error_arcsec is None else f", error {state.error_arcsec:+.2f} arcsec"
     target = "" if state.load_target_deg is None else f": target {state.load_target_deg:.4f} deg{load}{error}"
-    console.print(f"axis '{state.name}' is {state.state}{target}", markup=False, soft_wrap=True)
+    say(f"axis '{state.name}' is {state.state}{target}")
     if state.fault is not None:
-        console.print(f"stopped: {state.fault}", markup=False, soft_wrap=True)
+        say(f"stopped: {state.fault}")
     if state.adaptation.response is not None:
-        console.print(str(state.adaptation.response), markup=False, soft_wrap=True)
+        say(str(state.adaptation.response))
 
 
 def concerns(state: AxisState) -> Iterator[str]:

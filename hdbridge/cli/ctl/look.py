@@ -14,7 +14,7 @@ from rich.live import Live
 from rich.text import Text
 
 from hdbridge.cli.ctl.common import AtOption, TakeOption, axes_table, concerns, connected, document
-from hdbridge.cli.options import JsonOption, console, fitted, print_table, write_json
+from hdbridge.cli.options import JsonOption, console, fitted, print_table, say, write_json
 
 if TYPE_CHECKING:
     from hdbridge.client.messages import Event, LeaseState, MachineState, OuterState
@@ -26,10 +26,10 @@ def status(at: AtOption = None, json_file: JsonOption = None) -> None:
         state = client.state()
     write_json(json_file, document("ctl-status", state))
     for line in _machine(state):
-        console.print(line, markup=False, soft_wrap=True)
+        say(line)
     print_table(axes_table(state.axes))
     for line in _concerns(state):
-        console.print(line, markup=False, soft_wrap=True)
+        say(line)
 
 
 def watch(
@@ -69,9 +69,9 @@ def events(
         write_json(json_file, document("ctl-events", found))
         while True:
             if found.lost:
-                console.print(f"{found.lost} older ones are kept no more")
+                say(f"{found.lost} older ones are kept no more")
             for each in found.events:
-                console.print(_event(each), markup=False, soft_wrap=True)
+                say(_event(each))
             if not follow:
                 return
             sys.stdout.flush()
@@ -87,14 +87,14 @@ def lease(at: AtOption = None, force: TakeOption = False, json_file: JsonOption 
                 pass
         state = client.lease_state()
     write_json(json_file, document("ctl-lease", state))
-    console.print(_lease(state), markup=False, soft_wrap=True)
+    say(_lease(state))
 
 
 def mark(text: Annotated[str, typer.Argument(metavar="TEXT", help="One line.")], at: AtOption = None) -> None:
     """Write a remark into the flight recorder, at the present cycle."""
     with connected(at) as client:
         for each in client.mark(text):
-            console.print(_event(each), markup=False, soft_wrap=True)
+            say(_event(each))
 
 
 def _looks(count: int | None, every_s: float) -> Iterator[int]:

@@ -1,7 +1,5 @@
 """Power and motion of a daemon's axes. A command that moves holds the lease while it runs."""
 
-from __future__ import annotations
-
 from typing import Annotated
 
 import typer
@@ -18,17 +16,19 @@ from hdbridge.cli.ctl.common import (
     stopping,
     tell,
 )
-from hdbridge.cli.options import JsonOption, note_clamped
+from hdbridge.cli.options import (
+    AccelerationOption,
+    AnglesArgument,
+    HomingMethodOption,
+    HomingTimeoutOption,
+    JsonOption,
+    OffsetOption,
+    SwitchVelocityOption,
+    VelocityOption,
+    ZeroVelocityOption,
+    note_clamped,
+)
 from hdbridge.errors import InputError
-
-VelocityOption = Annotated[
-    float | None,
-    typer.Option("--velocity", min=1e-6, help="Speed of the load, deg/s; else the axis's limit."),
-]
-AccelerationOption = Annotated[
-    float | None,
-    typer.Option("--acceleration", min=1e-6, help="Acceleration of the load, deg/s2; else the axis's limit."),
-]
 
 
 def enable(
@@ -56,26 +56,13 @@ def reset(
 
 
 def home(
-    method: Annotated[
-        int,
-        typer.Option("--method", min=-128, max=127, help="Homing method, 6098h: see the drive's manual."),
-    ],
+    method: HomingMethodOption,
     axis: OneAxisArgument = None,
-    switch_velocity_deg_s: Annotated[
-        float | None,
-        typer.Option("--switch-velocity", min=1e-6, help="Speed towards the switch, deg/s of the load."),
-    ] = None,
-    zero_velocity_deg_s: Annotated[
-        float | None,
-        typer.Option("--zero-velocity", min=1e-6, help="Speed towards the zero, deg/s of the load."),
-    ] = None,
+    switch_velocity_deg_s: SwitchVelocityOption = None,
+    zero_velocity_deg_s: ZeroVelocityOption = None,
     acceleration_deg_s2: AccelerationOption = None,
-    offset_deg: Annotated[
-        float, typer.Option("--offset", help="Load angle of the home position (607Ch).")
-    ] = 0.0,
-    timeout_s: Annotated[
-        float, typer.Option("--timeout", min=0.1, max=3600.0, help="Longest time, s.")
-    ] = 60.0,
+    offset_deg: OffsetOption = 0.0,
+    timeout_s: HomingTimeoutOption = 60.0,
     at: AtOption = None,
     force: TakeOption = False,
     json_file: JsonOption = None,
@@ -111,9 +98,7 @@ def quick_stop(axes: AxesArgument = None, at: AtOption = None) -> None:
 
 def move(
     axis: AxisArgument,
-    angles_deg: Annotated[
-        list[float], typer.Argument(metavar="ANGLE...", help="Load angles in degrees, one after the other.")
-    ],
+    angles_deg: AnglesArgument,
     relative: Annotated[
         bool, typer.Option("--relative", help="Each angle is relative to the previous target.")
     ] = False,

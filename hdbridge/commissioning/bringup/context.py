@@ -1,24 +1,18 @@
 """State shared by the checks of a bring-up: axis file, bus, drive, and results so far."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from contextlib import AbstractContextManager, ExitStack, nullcontext
-from types import TracebackType
-from typing import TYPE_CHECKING, Self
 
+import can
+from canopen.objectdictionary import ObjectDictionary
+
+from hdbridge.axis import AxisConfig
 from hdbridge.clock import Clock
 from hdbridge.commissioning.bringup import TORQUE_PERCENT
 from hdbridge.commissioning.bringup.slow import SlowAxis
+from hdbridge.control.cycle import Feedback
 from hdbridge.drive.drive import Drive
 from hdbridge.drive.states import State
-
-if TYPE_CHECKING:
-    import can
-    from canopen.objectdictionary import ObjectDictionary
-
-    from hdbridge.axis import AxisConfig
-    from hdbridge.control.cycle import Feedback
 
 Connect = Callable[["AxisConfig"], AbstractContextManager[tuple["can.BusABC", Clock]]]
 """Opens an axis's bus and returns it with its clock."""
@@ -26,7 +20,7 @@ Interruptible = Callable[[], AbstractContextManager[Callable[[], bool]]]
 """Context that defers interrupts; the function that it yields reports if there was one."""
 
 
-class BringUpContext:
+class BringUpContext(ExitStack):
     """One axis under examination; a context manager that leaves the drive off and the bus closed.
 
     ``load`` reads the axis file and ``connect`` opens its bus; both are checks, so they are passed as
@@ -43,6 +37,7 @@ class BringUpContext:
         force: bool = False,
         interruptible: Interruptible = lambda: nullcontext(lambda: False),
     ) -> None:
+        super().__init__()
         self.load = load
         self.torque_percent = torque_percent
         self.interruptible = interruptible
@@ -57,20 +52,9 @@ class BringUpContext:
         self.rest_begins = 0
         self._connect = connect
         self._force = force
-        self._stack = ExitStack()
         self._axis: AxisConfig | None = None
         self._od: ObjectDictionary | None = None
         self._drive: Drive | None = None
-
-    def __enter__(self) -> Self:
-        """Returns the context; opens nothing yet."""
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        """Leaves the drive switched off and closes the bus."""
-        self._stack.__exit__(kind, error, trace)
 
     def admit(self, axis: AxisConfig, od: ObjectDictionary) -> None:
         """Stores the axis file and the EDS after they have been read."""
@@ -78,8 +62,8 @@ class BringUpContext:
 
     def connect(self) -> None:
         """Opens the bus; sends nothing yet. Raises `BusError`."""
-        bus, clock = self._stack.enter_context(self._connect(self.axis))
-        self._drive = self._stack.enter_context(Drive(bus, self.axis, clock, self._od, force=self._force))
+        bus, clock = self.enter_context(self._connect(self.axis))
+        self._drive = self.enter_context(Drive(bus, self.axis, clock, self._od, force=self._force))
 
     @property
     def axis(self) -> AxisConfig:

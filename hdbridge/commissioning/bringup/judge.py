@@ -1,18 +1,13 @@
 """Judgement of the measured figures, separate from their measurement. Pure."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from statistics import fmean, pstdev
-from typing import TYPE_CHECKING
 
+from hdbridge.axis import AxisConfig
 from hdbridge.axis.channels import BY_KEY
 from hdbridge.commissioning.bringup.checks import Verdict, failed, passed
 from hdbridge.commissioning.bringup.scale import SOURCE, Turned
 from hdbridge.units import ARCSEC_PER_DEG
-
-if TYPE_CHECKING:
-    from hdbridge.axis import AxisConfig
 
 
 def judge_rest(axis: AxisConfig, motor: Sequence[int], load: Sequence[int]) -> Verdict:

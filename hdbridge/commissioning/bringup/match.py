@@ -1,15 +1,10 @@
 """Assignment of scanned nodes to an axis file, and suggested lines for an axis file. Pure."""
 
-from __future__ import annotations
-
 from fractions import Fraction
-from typing import TYPE_CHECKING
 
+from hdbridge.axis import AxisConfig
 from hdbridge.commissioning.bringup.scan import ENCODER_UNITS_PER_TURN, Node, Scan
 from hdbridge.drive import objects
-
-if TYPE_CHECKING:
-    from hdbridge.axis import AxisConfig
 
 
 def identity_matches(axis: AxisConfig, node: Node) -> bool:

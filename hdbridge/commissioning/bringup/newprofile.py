@@ -1,19 +1,14 @@
 """New profile folder: a copy of a bundled one, or the data of a drive on the bus."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+from hdbridge.axis import BusConfig
 from hdbridge.commissioning.bringup.match import axis_lines
+from hdbridge.commissioning.bringup.scan import Node
 from hdbridge.errors import InputError
 from hdbridge.files.atomic import write_folder
 from hdbridge.files.bundled import bundled_profile
-
-if TYPE_CHECKING:
-    from hdbridge.axis import BusConfig
-    from hdbridge.commissioning.bringup.scan import Node
 
 FILES = ("axis.yaml", "model.yaml", "truth.yaml")
 _TO_FILL_IN = {

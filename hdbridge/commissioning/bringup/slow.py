@@ -4,16 +4,17 @@ Each `enabled` block switches power on at rest, and on every exit brings the axi
 again. Everything runs in the control cycle with full supervision.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from statistics import fmean
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import Final, NamedTuple
 
+import can
+
+from hdbridge.axis import AxisConfig
 from hdbridge.clock import Clock
 from hdbridge.commissioning.bringup.scale import Turned
 from hdbridge.control.cycle import Cycle, Feedback
@@ -28,11 +29,6 @@ from hdbridge.drive.switching import STANDING, STOP_TIMEOUT_S, until_enabled
 from hdbridge.drive.unwrap import wrap_int32
 from hdbridge.errors import HdbridgeError, SafetyStop
 from hdbridge.motion.procedures.moves import MotionLimits, MoveTo, Path
-
-if TYPE_CHECKING:
-    import can
-
-    from hdbridge.axis import AxisConfig
 
 MOTOR_SPEED_DEG_S: Final = 120.0
 """Speed of the moves, motor degrees per second, if the limits allow four times as much."""
@@ -74,8 +70,6 @@ def plan_travel(axis: AxisConfig, here_deg: float) -> TravelPlan | None:
 
 class QuietLink(Link):
     """Link that withholds some identifiers, like a master that has died."""
-
-    __slots__ = ("muted", "sent_s", "unheard", "withheld")
 
     def __init__(self, bus: can.BusABC, clock: Clock) -> None:
         super().__init__(bus, clock)

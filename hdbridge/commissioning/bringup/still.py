@@ -1,7 +1,5 @@
 """Checks that need no power: files, bus, node, identity, EDS, scaling, boot-up, encoders at rest."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from typing import Final
 
@@ -78,11 +76,8 @@ def answers(context: BringUpContext) -> Verdict:
             f"node {axis.drive.node_id} does not answer; on the bus: {others}",
             *(lines if found.nodes else (wiring, *lines)),
         )
-    complaints = device_type_complaints(axis, device_type)
-    if complaints:
-        return failed(
-            f"device type {device_type:08X}h is no CiA-402 drive", *(each.text for each in complaints)
-        )
+    if complaints := [*device_type_complaints(axis, device_type)]:
+        return failed(f"device type {device_type:08X}h is no CiA-402 drive", *complaints)
     return passed(f"node {axis.drive.node_id}, device type {device_type:08X}h (CiA 402)")
 
 
@@ -94,11 +89,11 @@ def identity(context: BringUpContext) -> Verdict:
         for address, name in IDENTITY
         if sdo.has(address.index, address.sub) or getattr(axis.drive.identity, name) is not None
     }
-    complaints = identity_complaints(axis, found)
+    remedies = [*identity_complaints(axis, found)]
     if sdo.has(objects.SUPPORTED_MODES.index, objects.SUPPORTED_MODES.sub):
-        complaints += mode_complaints(axis, sdo.fetch(objects.SUPPORTED_MODES))
+        remedies += mode_complaints(axis, sdo.fetch(objects.SUPPORTED_MODES))
     text = ", ".join(f"{name.replace('_', ' ')} {value:#x}" for name, value in found.items())
-    remedies = [each.text for each in complaints] + _retuned(context)
+    remedies += _retuned(context)
     return failed(text, *remedies, **found) if remedies else passed(text, **found)
 
 
@@ -179,11 +174,11 @@ def units(context: BringUpContext) -> Verdict:
         return {each: sdo.fetch(each) for each in addresses if sdo.has(each.index, each.sub)}
 
     readings = read(*scaling_addresses(axis))
-    complaints = scaling_complaints(axis, readings)
+    complaints = [*scaling_complaints(axis, readings)]
     said = ", ".join(f"{each.index:04X}h:{each.sub:02X} {value}" for each, value in readings.items())
     text = said or "the drive has no object that says how it counts"
     if complaints:
-        return failed(text, *(each.text for each in complaints))
+        return failed(text, *complaints)
     gear = readings.get(objects.GEAR_MOTOR, 1) / readings.get(objects.GEAR_SHAFT, 1)
     for key, known in (
         (MOTOR_COUNTS, objects.ENCODER_INCREMENTS in readings),

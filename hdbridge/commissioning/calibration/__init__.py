@@ -12,7 +12,7 @@ from hdbridge.commissioning.calibration.fit import fit
 from hdbridge.commissioning.calibration.identification import identify, measured_of
 from hdbridge.commissioning.calibration.journal import Journal
 from hdbridge.commissioning.calibration.measure import measure, start_journal
-from hdbridge.commissioning.calibration.pipeline import calibrate, conclude, concluded
+from hdbridge.commissioning.calibration.pipeline import calibrate, concluded
 from hdbridge.commissioning.calibration.result import Calibration, Offer, Stepped
 from hdbridge.commissioning.calibration.validation import Validation, validate
 
@@ -23,7 +23,6 @@ __all__ = [
     "Stepped",
     "Validation",
     "calibrate",
-    "conclude",
     "concluded",
     "fit",
     "identify",

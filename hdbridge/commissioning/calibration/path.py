@@ -6,8 +6,6 @@ response to a smooth target cannot reproduce it. The error with wind-up is that 
 the following lag.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -46,8 +44,8 @@ class PathError:
     """Mean error at rest after it."""
     settle_s: float
     """Time from the end of the path until the load has settled."""
-    delayed_arcsec: float = 0.0
-    """Rms over the path, wind-up and the servo's error in acceleration included; 0 in older files."""
+    delayed_arcsec: float
+    """Rms over the path, wind-up and the servo's error in acceleration included."""
 
 
 def path_errors(variants: Sequence[Sequence[PathRun]], ratio: float, lag_s: float) -> list[list[PathError]]:

@@ -1,9 +1,7 @@
 """Result of a calibration: the fit, the validation, and the offer for commit."""
 
-from __future__ import annotations
-
 import math
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -76,12 +74,7 @@ class Calibration:
                 for each in fit.intervals
             ],
             "changes": [
-                {
-                    "effect": each.effect,
-                    "parameter": each.parameter,
-                    "before": each.before,
-                    "after": each.after,
-                }
+                {name: getattr(each, name) for name in ("effect", "parameter", "before", "after")}
                 for each in (diff(self.active, self.model) if self.active else [])
                 if each.changed
             ],
@@ -103,14 +96,7 @@ class Calibration:
                 }
                 for each in fit.nuisances
             ],
-            "noise": {
-                "standing_arcsec": fit.noise.standing_arcsec,
-                "laps_arcsec": fit.noise.laps_arcsec,
-                "residual_arcsec": fit.noise.residual_arcsec,
-                "fitted_arcsec": fit.noise.fitted_arcsec,
-                "samples": fit.noise.samples,
-                "effective_samples": fit.noise.effective_samples,
-            },
+            "noise": asdict(fit.noise),
             "held_out": {
                 "before_arcsec": held_out.gain.before_arcsec if held_out.gain else None,
                 "after_arcsec": held_out.gain.after_arcsec if held_out.gain else None,
@@ -121,13 +107,7 @@ class Calibration:
                 "text": held_out.text,
             },
             "residual_tests": [
-                {
-                    "name": each.name,
-                    "passed": each.passed,
-                    "size_arcsec": _number(each.size_arcsec),
-                    "text": each.text,
-                }
-                for each in fit.residual_tests
+                {**asdict(each), "size_arcsec": _number(each.size_arcsec)} for each in fit.residual_tests
             ],
             "outliers": {"samples": fit.outliers.samples, "longest_run": fit.outliers.longest_run},
             "warnings": list(fit.warnings),

@@ -5,18 +5,19 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from pydantic import TypeAdapter
 
 from hdbridge.axis import AxisConfig
 from hdbridge.axis.model import TransmissionModel
 from hdbridge.commissioning.calibration.identification import resting
 from hdbridge.commissioning.calibration.measure import Pace
 from hdbridge.commissioning.evaluation.accuracy import AxisAccuracy, axis_accuracy
-from hdbridge.commissioning.evaluation.stepping import Scatter, SchemeResult, quantisation_floor_arcsec
+from hdbridge.commissioning.evaluation.stepping import Scatter, quantisation_floor_arcsec
 from hdbridge.control.bench import axis_view, compensation_for
 from hdbridge.control.rig import ProcedureBench, Rig, bench_on
 from hdbridge.control.survived import Survived, lines
@@ -40,9 +41,6 @@ class Stepped:
 
     model: str
     """Description of the model."""
-    cw: Scatter
-    ccw: Scatter
-    pooled: Scatter
     errors_arcsec: tuple[tuple[float, ...], tuple[float, ...]]
     """Error of each step, outward and back."""
     targets_deg: tuple[tuple[float, ...], tuple[float, ...]]
@@ -50,43 +48,31 @@ class Stepped:
     @classmethod
     def of(cls, model: str, outcome: SteppingOutcome) -> Stepped:
         """Creates it from the procedure's outcome."""
-        result = SchemeResult.of(outcome)
+        cw, ccw = outcome.cw, outcome.ccw
         return cls(
             model,
-            result.cw,
-            result.ccw,
-            result.pooled,
-            (
-                tuple(each.error_arcsec for each in outcome.cw),
-                tuple(each.error_arcsec for each in outcome.ccw),
-            ),
-            (tuple(each.target_deg for each in outcome.cw), tuple(each.target_deg for each in outcome.ccw)),
+            (tuple(each.error_arcsec for each in cw), tuple(each.error_arcsec for each in ccw)),
+            (tuple(each.target_deg for each in cw), tuple(each.target_deg for each in ccw)),
         )
+
+    @property
+    def cw(self) -> Scatter:
+        """Scatter outward."""
+        return Scatter.of(self.errors_arcsec[0])
+
+    @property
+    def ccw(self) -> Scatter:
+        """Scatter on the way back."""
+        return Scatter.of(self.errors_arcsec[1])
+
+    @property
+    def pooled(self) -> Scatter:
+        """Scatter of both directions together."""
+        return Scatter.of(sum(self.errors_arcsec, ()))
 
     def as_dict(self) -> dict[str, Any]:
-        """Returns plain data, which `from_dict` reads."""
-        return {
-            "model": self.model,
-            **{
-                name: {"three_sigma_arcsec": part.three_sigma_arcsec, "mean_arcsec": part.mean_arcsec}
-                for name, part in (("cw", self.cw), ("ccw", self.ccw), ("pooled", self.pooled))
-            },
-            "errors_arcsec": [list(each) for each in self.errors_arcsec],
-            "targets_deg": [list(each) for each in self.targets_deg],
-        }
-
-    @classmethod
-    def from_dict(cls, data: dict[str, Any]) -> Stepped:
-        """Restores it from `as_dict`."""
-        errors, targets = (
-            (tuple(map(float, data[name][0])), tuple(map(float, data[name][1])))
-            for name in ("errors_arcsec", "targets_deg")
-        )
-        cw, ccw, pooled = (
-            Scatter(data[name]["three_sigma_arcsec"], data[name]["mean_arcsec"])
-            for name in ("cw", "ccw", "pooled")
-        )
-        return cls(data["model"], cw, ccw, pooled, errors, targets)
+        """Returns plain data, which `Validation.from_dict` reads."""
+        return {**asdict(self), **{name: asdict(getattr(self, name)) for name in ("cw", "ccw", "pooled")}}
 
 
 def worse_ways(before: Stepped, after: Stepped) -> tuple[str, ...]:
@@ -167,17 +153,15 @@ class Validation:
 
     @classmethod
     def from_dict(cls, data: dict[str, Any]) -> Validation:
-        """Restores it from `as_dict`; the oldest files have no accuracy."""
-        floor = Floor(data["quantisation_floor_arcsec"], data["noise_floor_arcsec"])
-        measured = data.get("accuracy", {})
-        before, after = (_accuracy(measured.get(name)) for name in ("before", "after"))
+        """Restores it from `as_dict`."""
+        stepped = TypeAdapter(Stepped).validate_python
         return cls(
-            Stepped.from_dict(data["before"]),
-            Stepped.from_dict(data["after"]),
-            floor,
-            before,
-            after,
-            tuple(map(str, data.get("survived", ()))),
+            stepped(data["before"]),
+            stepped(data["after"]),
+            Floor(data["quantisation_floor_arcsec"], data["noise_floor_arcsec"]),
+            _accuracy(data["accuracy"]["before"]),
+            _accuracy(data["accuracy"]["after"]),
+            tuple(map(str, data["survived"])),
         )
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from enum import Enum
 from typing import TYPE_CHECKING, Any
 
@@ -82,10 +82,7 @@ class SchemeResult:
         """Returns the part of ``hdbridge step --json``; ``steps`` has each step's target and
         error, in order.
         """
-        scatter = {
-            name: {"three_sigma_arcsec": part.three_sigma_arcsec, "mean_arcsec": part.mean_arcsec}
-            for name, part in (("cw", self.cw), ("ccw", self.ccw), ("pooled", self.pooled))
-        }
+        scatter = {name: asdict(getattr(self, name)) for name in ("cw", "ccw", "pooled")}
         steps = {
             name: {
                 "target_deg": [each.target_deg for each in stands],

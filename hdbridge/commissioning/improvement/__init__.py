@@ -9,22 +9,19 @@
 Drive and dates are passed in; nothing here depends on whether the drive is simulated.
 """
 
-from hdbridge.commissioning.improvement.extension import Extension, extension_of
+from hdbridge.commissioning.improvement.extension import extension_of
 from hdbridge.commissioning.improvement.further import Choice, choose, untold
 from hdbridge.commissioning.improvement.improve import Source, improve
-from hdbridge.commissioning.improvement.result import Improvement, Round
-from hdbridge.commissioning.improvement.trial import Trial, try_out
+from hdbridge.commissioning.improvement.result import Improvement
+from hdbridge.commissioning.improvement.trial import Trial
 
 __all__ = [
     "Choice",
-    "Extension",
     "Improvement",
-    "Round",
     "Source",
     "Trial",
     "choose",
     "extension_of",
     "improve",
-    "try_out",
     "untold",
 ]

@@ -151,8 +151,6 @@ class DriftColumns:
 class _Tracked:
     """Two trackers of an effect, started in either direction, until both agree."""
 
-    __slots__ = ("_other", "_tracker", "known", "value")
-
     def __init__(self, effect: Effect) -> None:
         self._tracker = effect.tracker(Start.FORWARD)
         memoryless = isinstance(self._tracker, Memoryless)

@@ -1,7 +1,5 @@
 """Values of one axis after a turn, as plain numbers for the ring of samples."""
 
-from __future__ import annotations
-
 import math
 from typing import Final
 
@@ -25,19 +23,6 @@ _FRESH, _COMPENSATING, _LIMITED, _MEMORY_KNOWN, _CHANGING, _AT_REST, _UNDERRUN, 
 
 class AxisSampler:
     """Collects the sample of one axis in each turn."""
-
-    __slots__ = (
-        "_cycle",
-        "_follower",
-        "_image",
-        "_limited",
-        "_load_deg",
-        "_motor_deg",
-        "_outer",
-        "_outer_feed",
-        "_ratio",
-        "_supervision",
-    )
 
     def __init__(
         self, cycle: AxisCycle, follower: Follower, outer_feed: OuterFeed, outer: OuterCells

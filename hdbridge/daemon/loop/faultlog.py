@@ -1,7 +1,5 @@
 """Faults of the supervision as events: one when a fault begins, one when its reaction becomes more severe."""
 
-from __future__ import annotations
-
 import math
 from typing import Final, Protocol
 
@@ -31,8 +29,6 @@ class Tell(Protocol):
 
 class FaultLog:
     """Reports the faults of one axis without repeating those that persist."""
-
-    __slots__ = ("_axis", "_noted", "_over", "_seen", "_supervision", "_tell")
 
     def __init__(self, axis: int, supervision: Supervision, tell: Tell, period_s: float) -> None:
         self._axis, self._supervision, self._tell = axis, supervision, tell

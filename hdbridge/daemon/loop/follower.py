@@ -5,8 +5,6 @@
 `Follower.begin` starts all of it at the actual position. `Follower.follow` is called once per turn.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import Final
@@ -45,12 +43,6 @@ class AxisSetup:
 
 class Follower:
     """Computes the target of one axis, turn by turn."""
-
-    __slots__ = (
-        "_axis", "_has_channels", "_image", "_issued", "_load_loop", "_load_loop_on", "_most",
-        "_needs", "_observer", "_ratio", "compensating", "correction", "loop_arcsec", "sensed",
-        "set_point", "target_deg",
-    )  # fmt: skip
 
     def __init__(self, setup: AxisSetup, image: ProcessImage) -> None:
         config = setup.config

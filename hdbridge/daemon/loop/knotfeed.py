@@ -1,7 +1,5 @@
 """Transfer of a stream's knots from the shared memory to the set-point, a few before each turn."""
 
-from __future__ import annotations
-
 from typing import Final
 
 from hdbridge.daemon.memory.channels import Queue
@@ -21,8 +19,6 @@ class KnotFeed:
     Stream numbers increase. Knots of a stream that is over are discarded. Those of a later stream wait until
     it begins, because they may be handed over shortly before the present one ends.
     """
-
-    __slots__ = ("_ending", "_following", "_knots", "_set_point", "_stream")
 
     def __init__(self, knots: Queue[Knot], set_point: SetPoint) -> None:
         self._knots, self._set_point = knots, set_point

@@ -1,7 +1,5 @@
 """The set-points of the gateway, from the shared memory to a position at any time."""
 
-from __future__ import annotations
-
 import math
 from typing import Final
 
@@ -23,8 +21,6 @@ class OuterFeed:
     priority. An axis at rest waits for longer. Set-points of another series are dropped, so none from before
     an interruption takes effect.
     """
-
-    __slots__ = ("_before", "_knots", "_last", "_patience_s", "_series", "received_s")
 
     def __init__(self, knots: Queue[OuterKnot]) -> None:
         self._knots = knots

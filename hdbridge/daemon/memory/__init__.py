@@ -1,6 +1,6 @@
 """Shared memory of control and service process: rings, mailbox, relay. Lock-free."""
 
-from hdbridge.daemon.memory.channels import MailboxFullError, Queue, RingReader
+from hdbridge.daemon.memory.channels import MailboxFullError, RingReader
 from hdbridge.daemon.memory.layout import (
     AXIS_SAMPLE,
     NO_FAULT,
@@ -18,7 +18,7 @@ from hdbridge.daemon.memory.layout import (
     sample_dtype,
 )
 from hdbridge.daemon.memory.memory import Memory
-from hdbridge.daemon.memory.samples import SampleArray, SampleReader, joined_samples
+from hdbridge.daemon.memory.samples import SampleArray, joined_samples
 from hdbridge.daemon.memory.status import Cell, OuterCells
 
 __all__ = [
@@ -37,12 +37,10 @@ __all__ = [
     "OuterCells",
     "OuterKnot",
     "OuterView",
-    "Queue",
     "RelayedFrame",
     "RingReader",
     "SampleArray",
     "SampleFlag",
-    "SampleReader",
     "joined_samples",
     "sample_dtype",
 ]

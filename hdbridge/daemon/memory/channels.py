@@ -9,8 +9,6 @@ meanwhile. A slot begins and ends with its sequence number. On processors that m
 a checksum. `Format` converts between items and slots.
 """
 
-from __future__ import annotations
-
 import struct
 import threading
 import zlib
@@ -87,19 +85,6 @@ FOLLOWED: Final[Format[OuterKnot]] = Format(
 class _Slots(Generic[T]):
     """Slots of one section and its two counters, each in its own cache line."""
 
-    __slots__ = (
-        "_buffer",
-        "_checked",
-        "_head",
-        "_offset",
-        "_pack",
-        "_size",
-        "_slots",
-        "_struct",
-        "_tail",
-        "_unpack",
-    )
-
     def __init__(self, region: Region, place: Place, form: Format[T]) -> None:
         assert form.struct.size == place.slot_bytes
         self._buffer = region.view
@@ -135,8 +120,6 @@ class _Slots(Generic[T]):
 class Ring(_Slots[T]):
     """The producer's end of a ring; `RingReader` is a consumer's."""
 
-    __slots__ = ("_sequence",)
-
     def __init__(self, region: Region, place: Place, form: Format[T]) -> None:
         super().__init__(region, place, form)
         self._sequence: int = self._head[0]
@@ -150,8 +133,6 @@ class Ring(_Slots[T]):
 
 class RingReader(_Slots[T]):
     """Reads the items appended since it was created."""
-
-    __slots__ = ("_next",)
 
     def __init__(self, region: Region, place: Place, form: Format[T]) -> None:
         super().__init__(region, place, form)
@@ -182,8 +163,6 @@ class RingReader(_Slots[T]):
 
 class Queue(_Slots[T]):
     """Bounded queue with both ends; each process uses one of them."""
-
-    __slots__ = ("_misses", "_producing")
 
     def __init__(self, region: Region, place: Place, form: Format[T]) -> None:
         super().__init__(region, place, form)
@@ -254,8 +233,6 @@ class MailboxFullError(HdbridgeError):
 
 class Mailbox(Queue[Command]):
     """Commands from the service to the loop; bounded, so that a faulty service cannot flood the loop."""
-
-    __slots__ = ()
 
     def post(self, kind: CommandKind, axis: int = -1, *numbers: float, **fields: float) -> int:
         """Posts a command with the fields a to k; returns its id, used in the loop's events.

@@ -1,7 +1,5 @@
 """Ring of samples: the loop writes one packed slot per cycle, readers get arrays of them."""
 
-from __future__ import annotations
-
 import struct
 import zlib
 from collections.abc import Sequence
@@ -35,8 +33,6 @@ def joined_samples(batches: Sequence[SampleArray]) -> SampleArray:
 
 class SampleWriter:
     """The loop's end. It packs plain numbers without numpy, in a third of the time."""
-
-    __slots__ = ("_buffer", "_checked", "_head", "_offset", "_pack_into", "_sequence", "_size")
 
     def __init__(self, region: Region, layout: Layout) -> None:
         packed = sample_struct(layout.axes)

@@ -1,7 +1,5 @@
 """Status cells: numbers written by one process and monitored by the others."""
 
-from __future__ import annotations
-
 from enum import IntEnum
 from typing import Final
 
@@ -35,8 +33,6 @@ _LOOP_TIME: Final = Cell.LOOP_TIME_NS * _STRIDE
 
 class Status:
     """Access to the cells by name. Reads and writes are atomic."""
-
-    __slots__ = ("_cells",)
 
     def __init__(self, region: Region) -> None:
         self._cells = region.cells(STATUS_OFFSET, len(Cell) * _STRIDE)
@@ -73,8 +69,6 @@ class Status:
 
 class OuterCells:
     """The cells of one axis that gateway process and service share. To read or write one is whole."""
-
-    __slots__ = ("_at", "_buffer", "_cells")
 
     def __init__(self, region: Region, place: Place) -> None:
         self._cells = region.cells(place.offset, len(OuterCell) * _STRIDE)

@@ -7,8 +7,6 @@ of that layout, filled column by column, without encoding each message.
 One table of fields (`AXIS_FIELDS`, `MACHINE_FIELDS`) defines both schema and layout.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from enum import Enum
 from functools import cached_property
@@ -139,30 +137,18 @@ class Message:
         return [data[at : at + size] for at in range(0, count * size, size)]
 
     def decode(self, messages: list[bytes]) -> dict[str, NDArray[Any]]:
-        """Returns a column per field; those that are newer than the recording are NaN or 0.
-
-        Raises InputError if a message does not have this layout.
-        """
-        lengths = {len(each) for each in messages} or {self.layout.itemsize}
-        names = self.layout.names or ()
-        ends = np.cumsum([self.layout[name].itemsize for name in names])[1::2]
-        known = [name for name, end in zip(names[1::2], ends, strict=True) if end <= max(lengths)]
-        layout = np.dtype([(name, self.layout[name]) for name in names[: 2 * len(known)]])
-        if lengths != {layout.itemsize}:
-            raise InputError(f"its {self._short} messages are of another release of hdbridge")
-        rows = np.frombuffer(b"".join(messages), layout)
-        for place in names[: 2 * len(known) : 2]:
-            if not np.all(rows[place] == self._template[place]):
-                raise InputError(f"its {self._short} messages are of another release of hdbridge")
-        found = {}
-        for each in self._fields:
-            if each.name not in known:
-                found[each.name] = np.full(len(rows), np.nan if each.kind in ("f8", "f4") else 0)
-            elif each.kind == "enum":
-                found[each.name] = (rows[each.name][:, 0] & 0x7F) | (rows[each.name][:, 1] << 7)
-            else:
-                found[each.name] = rows[each.name]
-        return found
+        """Returns a column per field. Raises InputError if a message does not have this layout."""
+        if {len(each) for each in messages} <= {self.layout.itemsize}:
+            rows = np.frombuffer(b"".join(messages), self.layout)
+            tags = (self.layout.names or ())[::2]
+            if all(np.all(rows[each] == self._template[each]) for each in tags):
+                return {
+                    each.name: (rows[each.name][:, 0] & 0x7F) | (rows[each.name][:, 1] << 7)
+                    if each.kind == "enum"
+                    else rows[each.name]
+                    for each in self._fields
+                }
+        raise InputError(f"its {self._short} messages are of another release of hdbridge")
 
 
 def _varint(value: int) -> bytes:

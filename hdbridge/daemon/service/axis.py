@@ -19,7 +19,7 @@ from hdbridge.daemon.loop.states import AxisState
 from hdbridge.daemon.memory import CommandKind, EventKind
 from hdbridge.daemon.service.activity import Kind
 from hdbridge.daemon.service.axislink import AxisLink
-from hdbridge.daemon.service.commissioning import Commissioning, HomingRun
+from hdbridge.daemon.service.commissioning import Commissioning
 from hdbridge.daemon.service.core import ANSWER_S
 from hdbridge.daemon.service.models import AxisModels
 from hdbridge.daemon.service.moves import AxisMotion, WayPoint
@@ -127,7 +127,7 @@ class ServiceAxis:
                 self.is_prepared = False
                 seeds = link.seeds()
             else:
-                seeds = (await self._work(self.commissioning.prepare)).arguments()
+                seeds = await self._work(self.commissioning.prepare)
             try:
                 await link.do(CommandKind.ENABLE, POWER_S, **seeds)
             except HdbridgeError:
@@ -206,7 +206,7 @@ class ServiceAxis:
             await self._verify()
         self.core.log.note("the drive was verified; the axis is disabled", self.link.index)
 
-    async def home(self, holder: str, run: HomingRun) -> float:
+    async def home(self, holder: str, run: messages.Home) -> float:
         """Homes by a method of 6098h, disabled before and after; returns the load angle afterwards."""
         self.check_may(holder)
         async with self._alone("the axis is being homed"):
@@ -219,7 +219,7 @@ class ServiceAxis:
                 with suppress(HdbridgeError):
                     await self.link.do(CommandKind.RELEASE)
                 raise
-            await self.link.do(CommandKind.UNLEND, **seeds.arguments())
+            await self.link.do(CommandKind.UNLEND, **seeds)
             return positions.load_deg
 
     async def _verify(self, *, clear_fault: bool = False) -> None:
@@ -231,7 +231,7 @@ class ServiceAxis:
             seeds = await self._work(self.commissioning.seeds)
         if self.link.state is AxisState.LATCHED:
             await self.link.do(CommandKind.RESET, i=1)
-        await self.link.do(CommandKind.VERIFIED, **seeds.arguments())
+        await self.link.do(CommandKind.VERIFIED, **seeds)
 
     async def _rest(self) -> None:
         """Ends the drive's monitoring of the master if power is off."""

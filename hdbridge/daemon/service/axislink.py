@@ -1,23 +1,18 @@
 """Connection to one axis of the control process: commands with their answers, and its newest sample."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Final, Unpack
+from typing import Final, Unpack
 
+from hdbridge.axis import AxisConfig
 from hdbridge.daemon.loop.states import AxisState
 from hdbridge.daemon.memory import CommandKind, Event, EventKind, SampleFlag
 from hdbridge.daemon.service.activity import Activity
-from hdbridge.daemon.service.core import ANSWER_S, Arguments
+from hdbridge.daemon.service.core import ANSWER_S, Arguments, Core
 from hdbridge.daemon.service.reports import stop_hint
 from hdbridge.daemon.service.timing import POLL_S
 from hdbridge.drive.states import State
 from hdbridge.errors import DaemonError, InputError, RefusedError, SafetyStop
 from hdbridge.motion import MotionMode
-
-if TYPE_CHECKING:
-    from hdbridge.axis import AxisConfig
-    from hdbridge.daemon.service.core import Core
 
 _STOPPED: Final = frozenset({AxisState.QUICK_STOPPED, AxisState.LATCHED})
 _POWER: Final = tuple(State)

@@ -5,52 +5,22 @@ busy waits for `BUSY_S`. Other masters were listened for before the control proc
 nothing here listens for them.
 """
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, NamedTuple
 
 from hdbridge.axis import AxisConfig, Identity
+from hdbridge.client import messages
 from hdbridge.daemon.service.core import Arguments, Core
 from hdbridge.daemon.service.relaybus import RelayBus
+from hdbridge.drive.bootup import BootReport
 from hdbridge.drive.drive import Drive, Positions
 from hdbridge.drive.states import State
 from hdbridge.drive.values import Object, Value, find_object
 from hdbridge.errors import InputError, RefusedError
 
-if TYPE_CHECKING:
-    from hdbridge.drive.bootup import BootReport
-
 BUSY_S = 3.0
 """Maximum wait for a drive that is busy with another request."""
-TOWARDS_SWITCH = 0.1
-"""Default speed towards the switch, as a share of the axis's velocity limit."""
-TOWARDS_ZERO = 0.02
-
-
-class Seeds(NamedTuple):
-    """Position and statusword of a drive from which the control process starts."""
-
-    motor_counts: int
-    load_counts: int
-    statusword: int
-
-    def arguments(self) -> Arguments:
-        """Returns them as arguments of VERIFIED, UNLEND and ENABLE."""
-        return Arguments(i=self.motor_counts, j=self.load_counts, k=self.statusword)
-
-
-class HomingRun(NamedTuple):
-    """Parameters of a homing run; speeds and acceleration at the load, None for the axis's defaults."""
-
-    method: int
-    switch_velocity_deg_s: float | None = None
-    zero_velocity_deg_s: float | None = None
-    acceleration_deg_s2: float | None = None
-    offset_deg: float = 0.0
-    timeout_s: float = 60.0
 
 
 class Commissioning:
@@ -74,7 +44,7 @@ class Commissioning:
         """Identity that the drive reported, else the one that the axis file expects."""
         return self._drive.identity
 
-    def verify(self) -> Seeds:
+    def verify(self) -> Arguments:
         """Boots the drive and compares it with the axis file; power is off afterwards.
 
         Raises as `Drive.boot` does.
@@ -95,7 +65,7 @@ class Commissioning:
                 self._drive.quick_stop()
             self._drive.disable()
 
-    def prepare(self) -> Seeds:
+    def prepare(self) -> Arguments:
         """Prepares the drive to be enabled by the control process. Raises as `Drive.enable` does."""
         with self._asked("it is being made ready"):
             return self._seeds(self._drive.prepare())
@@ -111,22 +81,14 @@ class Commissioning:
             if self._drive.state() is State.FAULT:
                 self._drive.fault_reset()
 
-    def home(self, run: HomingRun) -> tuple[Positions, Seeds]:
+    def home(self, run: messages.Home) -> tuple[Positions, Arguments]:
         """Homes a drive that the control process has lent; power is off afterwards.
 
         Raises as `Drive.home` does; even then the axis stops and its power is off, if the drive answers.
         """
-        limits = self._drive.axis.limits
         with self._asked("it is being homed"):
             try:
-                positions = self._drive.home(
-                    run.method,
-                    run.switch_velocity_deg_s or TOWARDS_SWITCH * limits.velocity_deg_s,
-                    run.zero_velocity_deg_s or TOWARDS_ZERO * limits.velocity_deg_s,
-                    run.acceleration_deg_s2,
-                    run.offset_deg,
-                    run.timeout_s,
-                )
+                positions = self._drive.home(**run.model_dump())
             finally:
                 self._drive.disable()
             return positions, self._seeds(positions)
@@ -154,7 +116,7 @@ class Commissioning:
             self._drive.sdo.write_bytes(wanted.index, wanted.sub, data)
         return wanted
 
-    def seeds(self) -> Seeds:
+    def seeds(self) -> Arguments:
         """Reads the drive's present position and statusword."""
         with self._asked("its position is being read"):
             return self._seeds(self._drive.read_positions())
@@ -163,9 +125,11 @@ class Commissioning:
         """Closes the relay bus; the drive stays as it is."""
         self.bus.shutdown()
 
-    def _seeds(self, positions: Positions) -> Seeds:
+    def _seeds(self, positions: Positions) -> Arguments:
+        """Returns counts and statusword as arguments of VERIFIED, UNLEND and ENABLE."""
         self._drive.state()
-        return Seeds(positions.motor_counts, positions.load_counts, self._drive.image.statusword or 0)
+        statusword = self._drive.image.statusword or 0
+        return Arguments(i=positions.motor_counts, j=positions.load_counts, k=statusword)
 
     @contextmanager
     def _asked(self, doing: str) -> Iterator[None]:

@@ -4,23 +4,19 @@ The newest request wins: a move replaces any present motion and clears the queue
 if a motion is possible, before the present one changes.
 """
 
-from __future__ import annotations
-
 import asyncio
 import math
 from collections import deque
 from collections.abc import Coroutine, Sequence
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
+from hdbridge.axis.config import Limits
 from hdbridge.daemon.loop.states import AxisState
 from hdbridge.daemon.memory import CommandKind
 from hdbridge.daemon.service.activity import ENDS_WITH_LEASE, Activity, Kind
 from hdbridge.daemon.service.axislink import AxisLink
 from hdbridge.daemon.service.streams import ServiceStream
 from hdbridge.errors import HdbridgeError, InputError, RefusedError
-
-if TYPE_CHECKING:
-    from hdbridge.axis.config import Limits
 
 QUEUE_MOST: Final = 1000
 """Maximum number of waiting way points."""

@@ -5,8 +5,6 @@ buses, drives or clocks, so the same generator runs on a simulated and on a real
 either.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass
@@ -99,8 +97,6 @@ class Procedure(Protocol[Outcome]):
 
 class _Timed:
     """A leg that ends with its path."""
-
-    __slots__ = ()
 
     def ended(self, samples: Sequence[Sample]) -> bool:
         """Returns True."""

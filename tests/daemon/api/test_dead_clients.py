@@ -1,7 +1,5 @@
 """WebSocket clients that die or send garbage cause no traceback and do not stop the server."""
 
-from __future__ import annotations
-
 import base64
 import logging
 import os

@@ -1,7 +1,5 @@
 """Stop requests get through despite other connections, half requests and unread answers."""
 
-from __future__ import annotations
-
 import socket
 import subprocess
 import sys

@@ -3,8 +3,6 @@
 The change of an hour is packed into minutes, with rates and intervals to match; `test_hour` takes the hour.
 """
 
-from __future__ import annotations
-
 import pytest
 from support.adapting import FAULTS, FLOOR_ARCSEC, at_work, truth_of
 

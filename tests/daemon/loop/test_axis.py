@@ -1,7 +1,5 @@
 """An axis from unknown to moving and back, by commands through the memory and frames on the bus."""
 
-from __future__ import annotations
-
 import struct
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Shutdown: every axis comes to rest without power from any state, within a bounded time."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

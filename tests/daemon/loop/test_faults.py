@@ -1,7 +1,5 @@
 """Recovery from faults, their reports, and the unaffected axes. `test_reliability` has each fault."""
 
-from __future__ import annotations
-
 import errno
 import struct
 from collections.abc import Callable

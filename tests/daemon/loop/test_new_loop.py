@@ -1,7 +1,5 @@
 """The first SYNC of a new loop, or after the bus was down, puts no buffered set-point into force."""
 
-from __future__ import annotations
-
 import errno
 from collections.abc import Iterator
 from contextlib import contextmanager

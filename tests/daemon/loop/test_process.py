@@ -1,7 +1,5 @@
 """The control process: start and orderly end."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

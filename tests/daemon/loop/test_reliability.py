@@ -1,7 +1,5 @@
 """Every fault of the reliability table on the daemon with two axes in motion."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import pytest

@@ -1,7 +1,5 @@
 """Properties of the state table."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

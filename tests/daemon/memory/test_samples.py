@@ -1,7 +1,5 @@
 """The sample ring: samples are read once, whole and in order; lost ones are counted."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

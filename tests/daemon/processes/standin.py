@@ -4,8 +4,6 @@ HDBRIDGE_TEST_CONTROL, HDBRIDGE_TEST_SERVICE in the environment are an exit stat
 SIGUSR1 makes the service ask for the bus.
 """
 
-from __future__ import annotations
-
 import os
 import signal
 import sys

@@ -1,7 +1,5 @@
 """A keeper with stand-ins for its children."""
 
-from __future__ import annotations
-
 import os
 import sys
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The whole daemon on simulated drives: start, requests, killed processes, end."""
 
-from __future__ import annotations
-
 import os
 import signal
 import stat

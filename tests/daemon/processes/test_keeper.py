@@ -1,7 +1,5 @@
 """The keeper with stand-ins for its children: dead, hanging and ending processes."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal

@@ -1,7 +1,5 @@
 """Reading a folder while the recorder renames and removes its files."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from pathlib import Path

@@ -62,21 +62,5 @@ def test_messages_of_another_layout_are_refused():
             AXIS.decode([data[1], wrong])
 
 
-@pytest.mark.parametrize("message", [AXIS, MACHINE])
-def test_recordings_without_the_newest_fields_are_read(message):
-    made = samples(3)
-    data = axis_messages(made, 0) if message is AXIS else machine_messages(made)
-    offsets = [message.layout.fields[name][1] for name in message.layout.names]
-    for count in (len(offsets) - 2, len(offsets) - 8):
-        found = message.decode([each[: offsets[count]] for each in data])
-        whole = message.decode(data)
-        assert found.keys() == whole.keys()
-        for place, (name, column) in enumerate(found.items()):
-            if place < count // 2:
-                np.testing.assert_array_equal(column, whole[name])
-            else:
-                assert not np.any(np.nan_to_num(column.astype(float)))
-
-
 def test_no_messages_give_no_rows():
     assert len(AXIS.decode([])["cycle"]) == 0

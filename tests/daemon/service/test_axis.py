@@ -3,7 +3,7 @@
 import pytest
 from support.service import Service
 
-from hdbridge.daemon.service.commissioning import HomingRun
+from hdbridge.client import messages
 from hdbridge.errors import InputError, LeaseError, RefusedError
 
 
@@ -37,7 +37,7 @@ async def test_impossible_requests_are_refused_with_the_loops_text(service: Serv
         with pytest.raises(InputError, match="position limits"):
             await axis.move(token, 1e6)
         with pytest.raises(RefusedError, match="disable it first"):
-            await axis.home(token, HomingRun(35))
+            await axis.home(token, messages.Home(method=35))
         with pytest.raises(RefusedError, match="disable it first"):
             await axis.sdo_write(token, "6081h", "100")
         assert axis.state().at_rest

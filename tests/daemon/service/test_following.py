@@ -1,7 +1,5 @@
 """Watch and adaptation behind the service."""
 
-from __future__ import annotations
-
 import logging
 import threading
 from concurrent.futures import ThreadPoolExecutor

@@ -10,7 +10,6 @@ from support.service import Service, until
 from hdbridge.cli.ctl.look import _event as printed
 from hdbridge.client import messages
 from hdbridge.daemon.service.bridge import ServiceBridge
-from hdbridge.daemon.service.commissioning import HomingRun
 from hdbridge.drive.supervision import Fault
 from hdbridge.errors import HdbridgeError, RefusedError, SafetyStop
 
@@ -168,14 +167,14 @@ async def test_homes_and_stays_disabled(service: Service) -> None:
         await axis.enable(token)
         await axis.move(token, 5.0)
         await axis.disable(token)
-        await axis.home(token, HomingRun(35))
+        await axis.home(token, messages.Home(method=35))
         assert axis.state().state == "disabled"
         await bridge.core.timing.sleep(0.1)
         assert axis.state().motor_position_deg == pytest.approx(0.0, abs=1.0)
         await axis.enable(token)
         await axis.move(token, 1.0)
         with pytest.raises(RefusedError):
-            await axis.home(token, HomingRun(35))
+            await axis.home(token, messages.Home(method=35))
 
 
 async def test_a_homing_that_fails_leaves_the_axis_disabled(service: Service) -> None:
@@ -183,7 +182,7 @@ async def test_a_homing_that_fails_leaves_the_axis_disabled(service: Service) ->
         axis = bridge.axes["axis1"]
         token = bridge.lease.take("test")
         with pytest.raises(HdbridgeError):
-            await axis.home(token, HomingRun(1))
+            await axis.home(token, messages.Home(method=1))
         await until(bridge, lambda: axis.state().state == "disabled")
         assert axis.state().power == "switch on disabled"
         await axis.enable(token)

@@ -1,7 +1,5 @@
 """Routes of one axis: state, power, motion, stop, compensation, objects of the drive."""
 
-from __future__ import annotations
-
 from fastapi import APIRouter, Request
 
 from hdbridge.client import messages
@@ -18,7 +16,6 @@ from hdbridge.daemon.api.routes.parts import (
     stopped,
 )
 from hdbridge.daemon.service.bridge import ServiceBridge
-from hdbridge.daemon.service.commissioning import HomingRun
 from hdbridge.daemon.service.moves import WayPoint
 
 
@@ -82,7 +79,7 @@ def _add_motion(routes: APIRouter, bridge: ServiceBridge) -> None:
     ) -> messages.AxisState:
         """Home by a method of the drive, disabled before and after."""
         found = port(bridge, axis)
-        await kept(bridge, holder, request, found.home(holder, HomingRun(**home.model_dump())))
+        await kept(bridge, holder, request, found.home(holder, home))
         return found.state()
 
     @routes.post("/move", tags=["Move"], responses=refusals(MOVING))
