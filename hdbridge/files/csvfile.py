@@ -6,8 +6,6 @@ file that numpy's parser accepts costs about two microseconds per row; any other
 its error or to keep a column of text.
 """
 
-from __future__ import annotations
-
 import codecs
 import csv
 import gzip

@@ -4,8 +4,6 @@ A source is one recording of one joint that has not been read yet. Errors in a s
 later, by the worker that reads it; a wrong manifest or a place without recordings is an InputError.
 """
 
-from __future__ import annotations
-
 import csv
 import glob
 import hashlib

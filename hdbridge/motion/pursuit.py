@@ -1,7 +1,5 @@
 """Pursuit of a position that somebody else gives in each period, within the limits of the axis."""
 
-from __future__ import annotations
-
 import math
 
 from hdbridge.motion.generator import Bounds, Kinematics

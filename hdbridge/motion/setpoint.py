@@ -8,8 +8,6 @@ The set-point always stays within the position limits. A plan is accepted only i
 them, and braking has a fallback that always exists (`SetPoint._brake`). Rounding errors are clipped.
 """
 
-from __future__ import annotations
-
 import math
 
 from hdbridge.errors import InputError

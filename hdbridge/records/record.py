@@ -4,8 +4,6 @@ A record comes from hdbridge's own bench or from another program's CSV file; bot
 uneven. Angles are multi-turn degrees.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path

@@ -4,8 +4,6 @@
 compiled as a whole.
 """
 
-from __future__ import annotations
-
 from hdbridge.sim.encoder import Body, Disc, Late
 from hdbridge.sim.loaded_plant import LoadedPlant
 from hdbridge.sim.plant import Plant

@@ -111,7 +111,7 @@ def test_the_same_record_gives_the_same_bytes(tmp_path):
     assert (tmp_path / "a.csv").read_text().startswith(f"{HEAD},temperature_c\n0.0,0.0,0.0,20.1\n")
 
 
-def test_what_other_tools_write_is_read(tmp_path):
+def test_files_of_other_tools_are_read(tmp_path):
     path = tmp_path / "theirs.csv"
     path.write_bytes(
         b'\xef\xbb\xbf"time_s", motor_position_deg,load_position_deg,mode,rare\r\n'
@@ -140,7 +140,7 @@ def test_columns_must_be_there_and_of_one_length():
         Record({"time_s": np.zeros(2), "motor_position_deg": np.zeros(2), "load_position_deg": np.zeros(3)})
 
 
-def test_the_transmission_error_is_what_the_load_is_ahead():
+def test_the_transmission_error_is_positive_for_a_leading_load():
     one = Record(
         {
             "time_s": np.arange(2.0),
@@ -151,7 +151,7 @@ def test_the_transmission_error_is_what_the_load_is_ahead():
     assert one.transmission_error_arcsec(50.0) == pytest.approx([0.0, 1.0])
 
 
-def test_a_model_follows_the_commanded_angle_where_there_is_one():
+def test_a_model_follows_the_commanded_angle_if_recorded():
     target = np.linspace(0.0, 1.0, 101)
     assert record(motor_target_deg=target).motion().motor_deg.tolist() == target.tolist()
     one = record(load_torque_nm=np.ones(101))
@@ -190,12 +190,12 @@ def test_a_right_ratio_is_accepted_whatever_the_gear_does(ratio, travel, zero, o
     Record({**one.columns, "load_position_deg": moved}).check_ratio(ratio)
 
 
-def test_a_standing_axis_and_an_empty_record_say_nothing_of_the_ratio():
+def test_a_resting_axis_does_not_contradict_the_ratio():
     record(travel_deg=0.0).check_ratio(50.0)
     record(samples=0).check_ratio(50.0)
 
 
-def test_several_records_are_one_and_know_where_each_began():
+def test_concatenated_records_keep_their_starts():
     first, second = record(samples=11, extra=np.zeros(11)), record(samples=5)
     later = Record({**second.columns, "time_s": second.time_s + 100.0})
     both = concatenate([first, second, later])

@@ -29,7 +29,7 @@ def test_a_folder_is_searched_for_recordings_of_each_kind(tmp_path):
     assert names(find_sources([f"{tmp_path}/**/*.csv*"]), tmp_path)[-2:] == ["b.csv", "c/d.csv.gz"]
 
 
-def test_a_manifest_describes_what_is_found_and_adds_what_is_not(tmp_path):
+def test_a_manifest_describes_and_adds_recordings(tmp_path):
     (tmp_path / "a.csv").write_bytes(b"")
     (tmp_path / "b.log").write_bytes(b"")
     rows = ["path,joint,hours,axis", "a.csv,J1,5,", "b.log,J2,,article", "gone.csv,J3,,"]

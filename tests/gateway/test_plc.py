@@ -1,6 +1,4 @@
-"""A PLC-like master on the outer bus: it gets the load where it asks, and only when it asks."""
-
-from __future__ import annotations
+"""A PLC-like master on the outer bus moves the load to its targets, and only on request."""
 
 import shutil
 import struct
@@ -73,7 +71,7 @@ async def reset(bench):
 
 @pytest.mark.parametrize(
     ("period_ms", "drift_ppm"),
-    [(1, 200), (2, -200), (4, 0), (4, 200), (4, -200), (5, 200), (10, 0), (20, -200)],
+    [(1, 200), (2, -200), (4, 0), (5, 200), (20, -200)],
 )
 def test_the_set_point_is_that_of_a_drive_one_cycle_later(tmp_path, period_ms, drift_ppm):
     """No set-point is lost, at any outer cycle and with 200 ppm of drift."""
@@ -101,7 +99,7 @@ def test_the_set_point_is_that_of_a_drive_one_cycle_later(tmp_path, period_ms, d
     scene(tmp_path, scenario, period_s=1e-3 * period_ms, drift_ppm=drift_ppm)
 
 
-def test_it_points_where_the_master_asks(tmp_path):
+def test_the_load_reaches_the_masters_target(tmp_path):
     async def scenario(bench):
         await bench.enable()
         await stands(bench, within_deg=0.05)  # the correction is faded in
@@ -201,7 +199,7 @@ def stalled_loop(bench):
         (stalled_loop, (0x6010, 0x7500)),
     ],
 )
-def test_what_fails_inside_is_a_fault_outside_until_it_is_reset(tmp_path, happens, codes):
+def test_inner_failures_are_outer_faults_until_reset(tmp_path, happens, codes):
     async def scenario(bench):
         plc = bench.plc
         await bench.enable()
@@ -237,7 +235,7 @@ async def reset_and_go(bench):
     assert bench.plc.emergencies == []
 
 
-def test_a_client_takes_the_axis_by_force_and_gives_it_back(tmp_path):
+def test_a_client_takes_the_axis_by_force_and_returns_it(tmp_path):
     async def scenario(bench):
         plc, bridge = bench.plc, bench.bridge
         await bench.enable()
@@ -268,7 +266,7 @@ def test_a_client_takes_the_axis_by_force_and_gives_it_back(tmp_path):
     scene(tmp_path, scenario)
 
 
-def test_a_target_before_its_mode_and_a_mode_while_enabled_do_not_move_it(tmp_path):
+def test_early_targets_and_mode_changes_do_not_move_the_axis(tmp_path):
     async def scenario(bench):
         plc = bench.plc
         await bench.write(0x6060, 0, 1, 1)
@@ -406,7 +404,7 @@ def test_a_client_that_takes_the_axis_for_a_moment_ends_the_motion_of_the_gatewa
 @pytest.mark.parametrize(
     "withdraw", [nmt_stop, disable_voltage, lost_sync, client_by_force, client_for_a_moment]
 )
-def test_a_request_for_power_that_is_withdrawn_meanwhile_is_not_followed(tmp_path, withdraw, seen):
+def test_a_withdrawn_power_request_is_not_executed(tmp_path, withdraw, seen):
     async def scenario(bench):
         plc = bench.plc
         plc.begin()

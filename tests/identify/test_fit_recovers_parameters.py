@@ -1,4 +1,4 @@
-"""A fit finds what a made-up axis has, and says how well."""
+"""Fits recover the parameters of synthetic axes and their uncertainty."""
 
 from dataclasses import replace
 
@@ -95,7 +95,7 @@ def test_against_the_true_model_nothing_improves(bench):
     assert result.held_out.gain.before_arcsec == pytest.approx(0.5, rel=0.1)
 
 
-def test_an_axis_that_has_not_changed_is_offered_no_new_model(bench):
+def test_an_unchanged_axis_gets_no_new_model(bench):
     axis = bench.axis(motor_counts=8000.0, behind_counts=0.15)
     first = fit(axis.record(bench.plan(turns=6.0)), axis.ratio, bench.options)
     again = fit(
@@ -113,7 +113,7 @@ def test_shapes_far_from_the_typical_one_are_found(bench, width, exponent):
     assert result.interval("hysteresis", "offset_arcsec").value == pytest.approx(40.0, rel=0.01)
 
 
-def test_an_elastic_state_that_is_not_told_is_found(bench):
+def test_an_unknown_elastic_state_is_estimated(bench):
     plan = [
         ("reversal", bench.ramp(0.0, 6.0, 3.0)),
         ("standstill", np.full(200, 6.0)),
@@ -129,7 +129,7 @@ def test_an_elastic_state_that_is_not_told_is_found(bench):
     assert wrong > 3.0 * found
 
 
-def test_an_error_once_per_load_turn_bends_nothing_and_is_told(bench):
+def test_a_load_order_biases_nothing_and_is_reported(bench):
     axis = bench.axis(load_first=15.0)
     result = fit(axis.record(bench.plan(turns=40.0)), axis.ratio, bench.options)
     assert off(result, "hysteresis", "offset_arcsec", axis.offset) < 2.0
@@ -180,7 +180,7 @@ def test_spikes_are_left_out_and_counted(standard, bench):
         assert spiked.half_width < 1.5 * clean.half_width
 
 
-def test_a_delay_between_the_encoders_is_told_from_the_offset(bench):
+def test_encoder_delay_is_separated_from_the_offset(bench):
     axis = bench.axis()
     segments = axis.record(bench.plan())
     motor = np.concatenate([each.motor_deg for each in segments])

@@ -1,7 +1,5 @@
 """A gateway in simulated time: daemon, service, outer bus and a PLC-like master on it, in one thread."""
 
-from __future__ import annotations
-
 import math
 import os
 import struct

@@ -1,7 +1,5 @@
 """The set-points of the gateway, from the shared memory to a position at any time."""
 
-from __future__ import annotations
-
 import math
 from typing import Final
 

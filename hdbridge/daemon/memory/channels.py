@@ -9,8 +9,6 @@ meanwhile. A slot begins and ends with its sequence number. On processors that m
 a checksum. `Format` converts between items and slots.
 """
 
-from __future__ import annotations
-
 import struct
 import threading
 import zlib
