@@ -112,27 +112,6 @@ def test_every_key_is_described_in_the_reference() -> None:
     assert [key for key in sorted(keys) if f"`{key}`" not in reference] == []
 
 
-def test_every_cause_is_off_unless_the_file_says_so() -> None:
-    gear, load = Truth.load(ARTICLE).gear, Truth.load(ARTICLE).load_
-    assert not any(
-        (gear.flank, gear.torque_growth_per_nm, gear.stiffening, gear.backlash_arcsec, gear.second_hysteresis)
-    )
-    assert not any(
-        (
-            gear.rate_dependence,
-            gear.wear,
-            gear.ageing,
-            gear.creep,
-            gear.jumps,
-            gear.damage,
-            gear.roller,
-            gear.seat,
-        )
-    )
-    assert not any((load.stribeck, load.thinning, load.gravity, load.vibration))
-    assert not any((load.encoder.disc, load.encoder.late_ms, load.encoder.losses, load.encoder.signals))
-
-
 @pytest.mark.parametrize(
     ("old", "new", "complaint"),
     [
