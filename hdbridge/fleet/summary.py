@@ -122,7 +122,7 @@ class Summary:
         """Yields one line for each kind of fault in the data."""
         yield from counted(self.mistaken)
         for words, found in (
-            ("recordings that are there twice", self.duplicates),
+            ("duplicate recordings", self.duplicates),
             ("joints without a usable or a fresh recording", self.silent),
             ("recordings without a diagnosis", self.failed),
         ):
