@@ -194,7 +194,7 @@ def _orders(
         causes[0],
         difference.bound_arcsec(),
         named_parameters(difference, [Column(0, str(i)) for i in range(len(own))], apart),
-        "a change of orders that the model has: its synchronous part takes it over",
+        "orders of the model have changed, or were wrong: its synchronous part takes the change over",
         tuple(each.name for each in causes[1:]),
     )
 

@@ -27,7 +27,11 @@ TURNS_SEEN = 4.0
 PLACES = 8
 """Number of sectors of a motor turn that count as different places."""
 REPEATS_SHARE = 0.5
-"""Minimum share of the error's variance that repeats with each turn of the motor."""
+"""Minimum share of the error's variance that repeats with each motor turn, over `TURNS_SEEN` turns;
+over more turns, chance explains less.
+"""
+LEAST_REPEATS_SHARE = 0.1
+"""The same over any number of turns."""
 FOLLOWS_SHARE = 0.1
 """Maximum share of its distance from the motor that a command keeps when it is unwrapped."""
 
@@ -210,21 +214,32 @@ def _check_speed(path: Path, record: Record) -> None:
 
 
 def _check_turn(path: Path, record: Record, ratio: float) -> None:
-    """Raises InputError for angles in radians: the error repeats every 2 pi of the motor angle."""
+    """Raises InputError for angles in radians: the error repeats every 2 pi of the motor angle, more than
+    every 360.
+    """
     origin, motor = record.origin, record.motor_position_deg
     if origin is None or "motor" in origin.stated:
         return
-    if len(np.unique(np.floor(PLACES / math.tau * motor))) < PLACES * TURNS_SEEN:
+    step = np.abs(np.gradient(motor)) if len(motor) > 1 else np.zeros(len(motor))
+    shown = (step > 0.0) & (step < math.tau / PLACES)  # a longer step is an alias of another period
+    places = len(np.unique(np.floor(PLACES / math.tau * motor[shown])))
+    if places < PLACES * TURNS_SEEN:
         return  # a few places agree with any period
-    direction = np.sign(np.gradient(motor))
-    base = np.column_stack([np.ones_like(motor), motor, direction])
-    turns = np.column_stack([f(order * motor) for order in (1, 2) for f in (np.cos, np.sin)])
-    error = record.transmission_error_arcsec(ratio)
-    left, repeating = (
-        float(np.sum((error - columns @ np.linalg.lstsq(columns, error, rcond=None)[0]) ** 2))
-        for columns in (base, np.hstack([base, turns]))
-    )
-    if repeating < (1.0 - REPEATS_SHARE) * left:
+    base = np.column_stack([np.ones_like(motor), motor, np.sign(np.gradient(motor))])
+    error = record.transmission_error_arcsec(ratio)[shown]
+
+    def left(*periods: float) -> float:
+        waves = [
+            f(order * math.tau / period * motor)
+            for period in periods
+            for order in (1, 2)
+            for f in (np.cos, np.sin)
+        ]
+        columns = np.column_stack([base, *waves])[shown]
+        return float(np.sum((error - columns @ np.linalg.lstsq(columns, error, rcond=None)[0]) ** 2))
+
+    share = max(LEAST_REPEATS_SHARE, REPEATS_SHARE * PLACES * TURNS_SEEN / places)
+    if left(math.tau) < min((1.0 - share) * left(), left(DEG_PER_TURN)):
         raise InputError(
             f"{path}: the load's error repeats every 6.283 of the motor's angle, which is a turn in radians: "
             f"pass {option('--units', {'motor': 'rad', 'load': 'rad'})}, or "

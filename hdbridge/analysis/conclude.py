@@ -154,15 +154,15 @@ def _centred(time_s: FloatArray) -> FloatArray:
 
 def _whiteness(noise: NoiseModel) -> ResidualTest:
     size = math.hypot(noise.slow_arcsec, noise.place_arcsec)
-    wanders = [
-        f"by {arcsec:.2f} arcsec within {span}"
+    spans = [
+        f"{arcsec:.2f} arcsec within {span}"
         for arcsec, span in (
             (noise.slow_arcsec, f"{noise.slow_s:.1f} s"),
             (noise.place_arcsec, f"{noise.place_deg:.2f} deg of the motor"),
         )
         if arcsec >= LEAST_TOLD_ARCSEC
     ]
-    text = f"wanders {' and '.join(wanders)}; the intervals allow for it" if wanders else "does not wander"
+    text = f"correlated noise: {' and '.join(spans)}; the intervals allow for it" if spans else "white noise"
     return ResidualTest("whiteness", size < WORTH_ARCSEC, size, text)
 
 

@@ -57,6 +57,7 @@ from hdbridge.axis.model import TransmissionModel
 from hdbridge.records.given import Given, agreed_ratio, by_name
 from hdbridge.records.record import Record
 from hdbridge.records.recording import Recording
+from hdbridge.units import figure
 
 FIT_FIRST = "none yet: fit a model first (hdbridge fit), then diagnose with it"
 
@@ -362,12 +363,12 @@ class _Judge:
             experiment=FIT_FIRST if self.unfitted else for_unexplained(lives),
             peak_arcsec=size,
             lives_in=lives,
-            note=f"{left.arcsec:.2g} arcsec rms beyond the noise are left",
+            note=f"{figure(left.arcsec, 3)} arcsec rms beyond the noise are left",
         )
         loops = [each for each in findings if each.effect is not None and each.effect.changes is Part.LOOP]
         if many is None and loops and of_the_loop(self.estimator, left):
             # The best law is only an approximation: one finding, with its residual in the note.
-            note = f"the loop has another shape than either law: {left.arcsec:.2g} arcsec rms are left"
+            note = f"the loop has another shape than either law: {figure(left.arcsec, 3)} arcsec rms are left"
             told = replace(loops[0], note=note, lives_in=lives)
             return [told if each is loops[0] else each for each in findings]
         if size < self.estimator.floor_arcsec:

@@ -21,6 +21,7 @@ from hdbridge.analysis.views import ResidualViews, coordinates
 from hdbridge.axis.effects import CATALOGUE, Effect, FloatArray, IntArray, Motion, Start
 from hdbridge.axis.effects.kinematics import direction_of
 from hdbridge.axis.model import TransmissionModel
+from hdbridge.units import figure
 
 _UNEXPLAINED: Final = {
     "load angle": "two slow load turns both ways, then again with the load encoder re-clocked by 90 deg",
@@ -305,7 +306,7 @@ class Diagnosis:
             name = f"{certainty(each.probability)}{each.cause}{others}"
             if each.cause == UNEXPLAINED:
                 name = f"{UNEXPLAINED} that depends on the {each.lives_in or 'time'}"
-            words.append(f"{name}, {each.peak_arcsec:.2g} arcsec")
+            words.append(f"{name}, {figure(each.peak_arcsec, 3)} arcsec")
         return (
             f"The model is off by {self.baseline.rms_arcsec:.3g} arcsec rms: {'; '.join(words)}; "
             f"extended it is off by {self.extended.rms_arcsec:.3g}."

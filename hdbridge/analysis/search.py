@@ -251,7 +251,7 @@ class Search:
         An alias is rejected only if it is impossible, not if it is unidentifiable.
         """
         if violations := effect.violations():
-            return f"parameters that it cannot have ({violations[0]})"
+            return f"it fits best with impossible parameters: {violations[0]}"
         data = self.estimator.data
         return effect.implausible(data) or ("" if as_alias else effect.unidentifiable(data))
 

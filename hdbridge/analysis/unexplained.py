@@ -242,8 +242,8 @@ def _seen(
     if seen or not passes(views[0]):
         return seen, ""
     return [], (
-        f"{sizes[0]:.2g} arcsec beyond the noise depend on {views[0].name}, less than matters on this axis: "
-        f"{peak:.2g} arcsec, for a motor count is {count_arcsec:.2g}"
+        f"{sizes[0]:.2g} arcsec beyond the noise depend on {views[0].name}, below the threshold for this "
+        f"axis: {peak:.2g} arcsec (a motor count is {count_arcsec:.2g})"
     )
 
 

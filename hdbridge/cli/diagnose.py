@@ -31,6 +31,7 @@ from hdbridge.cli.options import (
 )
 from hdbridge.errors import InputError
 from hdbridge.files.outputs import Kind
+from hdbridge.units import figure
 
 if TYPE_CHECKING:
     from hdbridge.analysis.findings import Diagnosis, Finding, Parameter
@@ -204,8 +205,10 @@ def print_diagnosis(result: Diagnosis) -> None:
             table.add_row(
                 each.cause,
                 f"{each.probability:.2f}",
-                f"{each.peak_arcsec:.3g}",
-                f"{each.gain.before_arcsec:.3g} -> {each.gain.after_arcsec:.3g}" if each.gain else "not made",
+                figure(each.peak_arcsec, 3),
+                f"{figure(each.gain.before_arcsec, 3)} -> {figure(each.gain.after_arcsec, 3)}"
+                if each.gain
+                else "not made",
             )
         print_table(table)
     for each in result.findings:
@@ -234,8 +237,8 @@ def _details(finding: Finding) -> Iterator[str]:
 
 
 def _number(parameter: Parameter) -> str:
-    low, high = f"{parameter.low:.4g}", f"{parameter.high:.4g}"
-    return f"{parameter.value:.4g} ({low} to {high}) {parameter.unit}".rstrip()
+    value, low, high = map(figure, (parameter.value, parameter.low, parameter.high))
+    return f"{value} ({low} to {high}) {parameter.unit}".rstrip()
 
 
 def _print_figures(result: Diagnosis) -> None:
@@ -250,7 +253,7 @@ def _print_figures(result: Diagnosis) -> None:
 
 def _print_shares(shares: dict[str, dict[str, float]]) -> None:
     ranked = sorted(shares.items(), key=lambda each: -each[1]["share_of_baseline"])
-    table = figures_table("share of the difference that goes with", "", "as given", "extended")
+    table = figures_table("share of the difference explained by", "", "as given", "extended")
     for name, each in ranked:
         if max(each.values()) >= WORTH_TELLING:
             table.add_row(name, *(f"{100.0 * value:.1f} %" for value in each.values()))

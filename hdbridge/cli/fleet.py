@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from functools import cache, cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final
+from urllib.parse import unquote
 
 import typer
 
@@ -310,13 +311,14 @@ def _summarise(
     """Prints, writes and returns the summary; writes the pages of these joints and of all listed ones."""
     from rich.table import Table
 
+    from hdbridge.fleet.pages import shown
     from hdbridge.fleet.prior import write_prior
     from hdbridge.fleet.report import ROWS, fleet_page, hours_words
-    from hdbridge.fleet.summary import own_recordings, summarise
+    from hdbridge.fleet.summary import summarise
     from hdbridge.report.page import render
 
     rows = dataset.recordings()
-    latest = {joint: own[-1] for joint, own in own_recordings(rows)[0].items()}
+    latest = shown(rows)
     for joint in joints:
         if joint not in latest:
             close = nearest(joint, [*latest])
@@ -345,6 +347,8 @@ def _summarise(
     for line in summary.lines():
         say(line)
     target = page or dataset.folder / PAGE_NAME
+    for joint in dict.fromkeys(each for each in joints if each in found):
+        note(f"page of {joint}: {dataset.folder / unquote(found[joint])}")
     beside = target.resolve().parent == dataset.folder.resolve()
     if not beside:  # pages are in OUT
         found = {joint: (dataset.folder.resolve() / each).as_uri() for joint, each in found.items()}

@@ -1,11 +1,12 @@
 """Pages of single joints, next to the page of the fleet: `OUT/pages/JOINT-KEY.html`.
 
-The name contains the start of the key of the recording that is shown, so a page is out of date as soon as
-the joint has a newer recording, model or version.
+The name contains a hash of the key of the recording that is shown, so a page is out of date as soon as the
+joint has a newer recording, model or version.
 """
 
+import hashlib
 import shlex
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import fields, replace
 from pathlib import Path
 from urllib.parse import quote
@@ -14,16 +15,29 @@ from hdbridge.errors import InputError
 from hdbridge.files.atomic import make_folder, write_atomically
 from hdbridge.fleet.diagnosing import local_model, read
 from hdbridge.fleet.sources import Source
-from hdbridge.fleet.summary import Row
+from hdbridge.fleet.summary import Row, counted, own_recordings
+from hdbridge.report.words import sentence
 
 PAGES = "pages"
 KEY_DIGITS = 12
 
 
+def shown(rows: Sequence[Row]) -> dict[str, Row]:
+    """Returns the recording that the page of each joint shows: the last that is its own.
+
+    Its ``mistaken`` are the joint's recordings of another joint or encoder, or with other orders.
+    """
+    own, mistaken = own_recordings(rows)
+    return {
+        joint: {**each[-1], "mistaken": [one for one in mistaken if one.joint == joint]}
+        for joint, each in own.items()
+    }
+
+
 def links(folder: Path, latest: Mapping[str, Row]) -> dict[str, str]:
     """Returns the relative address of each joint's page that is there and up to date.
 
-    ``latest`` holds the recording to show for each joint.
+    ``latest`` is from `shown`.
     """
     there = {each.name for each in (folder / PAGES).glob("*.html")}
     names = {joint: _name(row) for joint, row in latest.items()}
@@ -31,14 +45,14 @@ def links(folder: Path, latest: Mapping[str, Row]) -> dict[str, str]:
 
 
 def write_page(folder: Path, row: Row) -> None:
-    """Diagnoses a recording of the data set again and writes the page; removes the joint's older pages.
+    """Diagnoses the recording to show again and writes the page; removes the joint's older pages.
 
     InputError if recording or model are not there any more.
     """
     from hdbridge.analysis.diagnosis import diagnose
     from hdbridge.axis.model import TransmissionModel
     from hdbridge.report.diagnosis import diagnosis_page
-    from hdbridge.report.page import render
+    from hdbridge.report.page import Section, Table, render
 
     given = {each.name: row[each.name] for each in fields(Source) if row.get(each.name)}
     source = Source(**{name: each for name, each in given.items() if name != "model"})
@@ -60,6 +74,15 @@ def write_page(folder: Path, row: Row) -> None:
         provenance=[(name, value) for name, value in known.items() if value],
         command=shlex.join(["hdbridge", "diagnose", source.path, *options]),
     )
+    if row["mistaken"]:
+        about = f"This is {Path(source.path).name}, the last recording of {source.joint} itself."
+        table = Table(["recording", "why"], [[each.path, each.text] for each in row["mistaken"]])
+        text = "File a recording under its own joint; after an exchange of the encoder, fit a new model."
+        page = replace(
+            page,
+            verdict=f"{about} {sentence('; '.join(counted(row['mistaken'])))} {page.verdict}",
+            sections=[Section("Recordings that do not fit this joint", text, [table]), *page.sections],
+        )
     pages = make_folder(folder / PAGES)
     older = [
         each for each in pages.glob("*.html") if each.name[: -KEY_DIGITS - 5] == _name(row)[: -KEY_DIGITS - 5]
@@ -71,4 +94,6 @@ def write_page(folder: Path, row: Row) -> None:
 
 
 def _name(row: Row) -> str:
-    return f"{quote(row['joint'], safe='')}-{row['key'][:KEY_DIGITS]}.html"
+    content = "\n".join([row["key"], *(each.path + each.text for each in row["mistaken"])])
+    digits = hashlib.sha256(content.encode()).hexdigest()[:KEY_DIGITS]
+    return f"{quote(row['joint'], safe='')}-{digits}.html"

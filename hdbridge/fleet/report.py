@@ -2,6 +2,7 @@
 rates at which causes are named.
 """
 
+import re
 import shlex
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -110,13 +111,13 @@ def _sections(summary: Summary, joint: Joint) -> Iterator[Section]:
         )  # fmt: skip
     mistaken = sorted(summary.mistaken, key=lambda each: ([*_KINDS].index(each.kind), each.joint, each.path))
     yield from _table(
-        "Exchanged, turned, twice",
+        "Exchanged joints, other encoders, duplicates",
         "Recordings that are not of their joint as it was. Those of another joint, of another encoder, and "
         "second copies count nowhere else on this page.",
         ["joint", "what", "why", "recording"],
         [
             *([joint(each.joint), _KINDS[each.kind], each.text, each.path] for each in mistaken),
-            *([joint(name), "there twice", f"the same samples as {first}", path]
+            *([joint(name), "duplicate", f"the same samples as {first}", path]
               for name, path, first in summary.duplicates),
         ],
     )  # fmt: skip
@@ -190,8 +191,10 @@ def _kind(path: str, reason: str) -> str:
     return bare if len(bare) <= _FAILURES else bare[:_FAILURES].rpartition(" ")[0] + " ..."
 
 
-def _words(cause: str) -> str:
-    return cause.replace("_", " ")
+def _words(name: str) -> str:
+    """Formats the name of a cause or a figure: `hysteresis.width_deg` is "hysteresis width, deg"."""
+    with_unit = re.sub(r"_(deg|arcsec)\b", r", \1", name)
+    return re.sub(r"(?<=[a-z])\.|\.(?=[a-z])|_", " ", with_unit)
 
 
 def _two(value: float) -> str:

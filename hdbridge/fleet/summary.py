@@ -118,15 +118,20 @@ class Summary:
 
     def lines(self) -> Iterator[str]:
         """Yields one line for each kind of fault in the data."""
-        for kind, count in Counter(each.kind for each in self.mistaken).items():
-            yield f"recordings {_KINDS[kind]}: {count}"
+        yield from counted(self.mistaken)
         for words, found in (
-            ("recordings that are there twice", self.duplicates),
+            ("duplicate recordings", self.duplicates),
             ("joints without a usable or a fresh recording", self.silent),
             ("recordings without a diagnosis", self.failed),
         ):
             if found:
                 yield f"{words}: {len(found)}"
+
+
+def counted(mistaken: Sequence[Mistaken]) -> Iterator[str]:
+    """Yields the number of recordings of each kind, in words."""
+    for kind, count in Counter(each.kind for each in mistaken).items():
+        yield f"recordings {_KINDS[kind]}: {count}"
 
 
 _KINDS: Final = {

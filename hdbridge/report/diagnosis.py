@@ -107,7 +107,9 @@ def _verdict(diagnosis: Diagnosis, stepping: Validation | None) -> str:
         if all(each.cause == UNEXPLAINED for each in diagnosis.findings):
             text += f" No cause of the catalogue fits it; {noise}."
         else:
-            text += f" With that in the model {after} remain, without it {own} at best; {noise}."
+            same = "a refit of its own parameters does the same"
+            alone = same if own == after else f"with only its own parameters refitted {own}"
+            text += f" With that in the model {after} remain; {alone}; {noise}."
     text = f"{diagnosis.capability.sentence()} {text}"
     if stepping is not None:
         before, now = stepping.before.pooled.three_sigma_arcsec, stepping.after.pooled.three_sigma_arcsec
@@ -313,7 +315,7 @@ def _could(diagnosis: Diagnosis) -> Section:
 
 
 def _remarks(diagnosis: Diagnosis) -> Iterator[tuple[str, str]]:
-    yield from (("the record lacks", each) for each in diagnosis.remarks)
+    yield from (("about the record", each) for each in diagnosis.remarks)
     yield from (("considered, not named", each.replace("_", " ")) for each in diagnosis.considered)
     yield "samples looked at", f"{len(diagnosis.traces.time_s):,}"
 

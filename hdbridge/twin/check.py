@@ -221,7 +221,7 @@ class Check:
             for name, times in self.unexplained.items()
         ]
         if self.unseen and not self.blind:
-            found.append(f"A change of {', '.join(self.unseen)} would not have shown")
+            found.append(f"This recording would not show a change in: {', '.join(self.unseen)}")
         return f"{'. '.join(found)}."
 
     @property

@@ -8,14 +8,16 @@ from support.fleet import MODEL, record
 
 @pytest.fixture(scope="session")
 def fleet(tmp_path_factory) -> Path:
-    """Three joints with three recordings each, a copy, a damaged and a missing file, a manifest."""
+    """Three joints with three recordings each (one with another encoder), a copy, bad files, a manifest."""
     folder = tmp_path_factory.mktemp("fleet")
     (folder / "model.yaml").write_text(MODEL)
     rows = ["path,joint,hours,batch"]
     for joint in range(3):
         for number in range(3):
             name = f"J{joint}-{number}.csv.gz"
-            record(10 * joint + number, extra_arcsec=3.0 * number * (joint == 0)).write_csv(folder / name)
+            zero = 77.0 * (name == "J2-2.csv.gz")
+            each = record(10 * joint + number, extra_arcsec=3.0 * number * (joint == 0), zero_deg=zero)
+            each.write_csv(folder / name)
             rows.append(f"{name},J{joint},{1000 * number + 10},{'A' if joint else 'B'}")
     (folder / "again.csv.gz").write_bytes((folder / "J1-1.csv.gz").read_bytes())
     (folder / "broken.csv").write_text("time_s,motor_position_deg,load_position_deg\n0,0,x\n")

@@ -42,6 +42,12 @@ def check_pages(folder):
     assert 'href="pages' not in (folder / "out" / "fleet.html").read_text()
     done = run_here(folder, "fleet", "report", "out", "--joint", "J2", "--pages")
     assert done.returncode == 0, done.stderr
+    (written,) = (folder / "out" / "pages").glob("J2-*.html")
+    assert f"page of J2: out/pages/{written.name}\n" in done.stderr
+    text = written.read_text()
+    assert "This is J2-1.csv.gz, the last recording of J2 itself." in text
+    assert "Recordings after the motor encoder was exchanged or its zero set: 1." in text
+    assert "all its orders are turned by" in text
     (folder / "out").rename(folder / "moved")
     page = (folder / "moved" / "fleet.html").read_text()
     links = dict(re.findall(r'<a href="(pages/[^"]+)">([^<]+)</a>', page))

@@ -3,6 +3,7 @@
 import gzip
 import math
 from collections.abc import Callable
+from contextlib import nullcontext
 from pathlib import Path
 
 import numpy as np
@@ -388,6 +389,25 @@ def test_errors_at_a_few_places_are_not_a_turn_in_radians(tmp_path: Path, seed: 
     path = tmp_path / "bench.csv"
     path.write_text(text(0.1 * np.arange(len(motor)), motor, load))
     check_records({path: Record.read_csv(path)}, RATIO)
+
+
+@pytest.mark.parametrize("step_deg", [0.5, 3.0, 12.35, 18.8, 30.0])
+def test_angles_are_taken_for_radians_only_if_they_are(tmp_path: Path, step_deg: float) -> None:
+    """Some steps in degrees are an alias of a turn in radians; half of the record is a loop at a reversal."""
+    swept = step_deg * np.arange(1500.0)
+    sine = 20.0 * np.sin(np.radians(swept))
+    motor = np.concatenate([swept, swept[-1] + sine])
+    loop = 30.0 * np.concatenate([np.ones(1500), sine / 20.0])
+    wave = 14.0 * np.cos(np.radians(2.0 * motor)) + 9.0 * np.cos(np.radians(4.0 * motor))
+    load = motor / RATIO + (wave + loop) / 3600.0
+    path = tmp_path / "bench.csv"
+    for in_unit, error in (
+        (np.asarray, nullcontext()),
+        (np.radians, pytest.raises(InputError, match="radians")),
+    ):
+        path.write_text(text(0.02 * np.arange(len(motor)), in_unit(motor), in_unit(load)))
+        with error:
+            check_records({path: Record.read_csv(path)}, RATIO)
 
 
 def test_a_wrapping_clock_is_reported_with_its_period(tmp_path: Path) -> None:

@@ -178,7 +178,7 @@ def test_findings_show_cause_size_gain_and_aliases(plain):
     text = words(plain)
     assert "off by 3.10 arcsec (rms): load order (once or twice per load turn) or compliance" in text
     assert "up to 4.00 arcsec" in text
-    assert "0.61 remain, without it 2.90 at best; the noise of a reading is 0.50" in text
+    assert "0.61 remain; with only its own parameters refitted 2.90; the noise of a reading is 0.50" in text
     assert "or one that it cannot be distinguished from" in text
     row = re.search(r"1\. load order</th>(.*?)</tr>", plain).group(1)
     assert re.findall(r">([^<>]+)</td>", row) == ["0.97", "4.00", "3.00", "0.50", "97 %", "yes"]
@@ -283,6 +283,10 @@ def test_no_findings_need_no_action():
     assert "What to do Nothing." in said
     assert "What was found" not in said
     assert "What this record could show" in said
+
+
+def test_a_large_size_has_no_exponent():
+    assert "load_order, 140 arcsec" in diagnosis(finding(peak_arcsec=140.2)).verdict()
 
 
 def test_guesses_are_labelled():

@@ -20,13 +20,17 @@ effects:
 """
 
 
-def record(seed, extra_arcsec=0.0, samples=700):
-    """Two sweeps each way over five turns of the motor, with an order 3 in addition."""
+def record(seed, extra_arcsec=0.0, samples=700, zero_deg=0.0):
+    """Two sweeps each way over five turns of the motor from its zero, with an order 3 in addition."""
     rng = np.random.default_rng(seed)
     time = np.linspace(0.0, 30.0, samples)
     motor = 900.0 * (1.0 - np.cos(2.0 * np.pi * time / 15.0))
     error = TransmissionModel.from_text(MODEL).predict(Motion(motor_deg=motor, time_s=time))
     error = error + extra_arcsec * np.cos(3.0 * np.radians(motor)) + rng.normal(0.0, 0.3, samples)
     return Record(
-        {"time_s": time, "motor_position_deg": motor, "load_position_deg": motor / 50.0 + error / 3600.0}
+        {
+            "time_s": time,
+            "motor_position_deg": motor + zero_deg,
+            "load_position_deg": motor / 50.0 + error / 3600.0,
+        }
     )

@@ -125,7 +125,8 @@ def test_a_check_is_silent_without_a_change() -> None:
     # No step comes near the limit, and the demo's friction does not depend on its temperature.
     assert told.unseen == ("current limit", "warmth")
     assert told.sentence == (
-        "Nothing has changed since the twin was made. A change of current limit, warmth would not have shown."
+        "Nothing has changed since the twin was made. "
+        "This recording would not show a change in: current limit, warmth."
     )
 
 
@@ -260,7 +261,7 @@ def test_unexplained_changes_are_reported() -> None:
         "Something has changed since the twin was made that no change of a cause explains. "
         "The twin leaves 21 times as much of the motor torque as when it was made. "
         "The twin leaves 242 times as much of the load error as when it was made. "
-        "A change of warmth would not have shown."
+        "This recording would not show a change in: warmth."
     )
 
 

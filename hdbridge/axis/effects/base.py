@@ -352,7 +352,10 @@ class Effect(Strict, ABC):
             type(self).model_validate(self.parameters())
         except ValidationError as error:
             return [
-                f"{'.'.join(map(str, each['loc'])) or self.name}: {each['msg']}" for each in error.errors()
+                f"{'.'.join(map(str, each['loc']))} = {each['input']:.3g}"
+                if isinstance(each["input"], float)
+                else f"{'.'.join(map(str, each['loc'])) or self.name}: {each['msg']}"
+                for each in error.errors()
             ]
         return []
 

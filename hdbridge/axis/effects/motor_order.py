@@ -12,7 +12,7 @@ class MotorOrders(OrderSeries):
 
     name: ClassVar[str] = "motor_order"
     about: ClassVar[Cause] = Cause(
-        title="motor order missing in the model",
+        title="motor order missing or wrong in the model",
         subject="orders",
         equation="sum over k of A_k cos(k theta_M + phi_k), k not among the synchronous part's orders",
         signature="repeats with every motor turn; the same in both directions, at every load angle and speed",
