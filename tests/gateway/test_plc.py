@@ -233,6 +233,22 @@ async def reset_and_go(bench):
     assert bench.plc.emergencies == []
 
 
+def test_a_lost_sync_is_the_cause_even_if_the_set_points_end_before_it_is_overdue(tmp_path):
+    async def scenario(bench):
+        await bench.enable()
+        await swing(bench)
+        await bench.wait(0.6)
+        bench.plc.cycling = False
+        nodes, process = bench.daemon.clock.nodes, bench._process
+        nodes.remove(process)  # it does not get the processor
+        await bench.until(lambda: bench.daemon.states[0].name == "STOPPING")
+        nodes.append(process)
+        assert await bench.read(0x603F) == 0x8700
+        assert bench.plc.emergencies == [0x8700]
+
+    scene(tmp_path, scenario, period_s=0.01)
+
+
 def test_a_client_takes_the_axis_by_force_and_gives_it_back(tmp_path):
     async def scenario(bench):
         plc, bridge = bench.plc, bench.bridge
