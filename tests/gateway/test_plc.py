@@ -13,7 +13,7 @@ from support.raised import without_load_encoder
 from support.service import play
 
 from hdbridge.daemon.loop.states import AxisState
-from hdbridge.daemon.memory import CommandKind
+from hdbridge.daemon.memory import Cell, CommandKind
 from hdbridge.motion import MotionMode
 
 STATE, ENABLED, FAULT, OFF = 0x6F, 0x27, 0x08, 0x40
@@ -247,6 +247,25 @@ def test_a_lost_sync_is_the_cause_even_if_the_set_points_end_before_it_is_overdu
         assert bench.plc.emergencies == [0x8700]
 
     scene(tmp_path, scenario, period_s=0.01)
+
+
+def test_a_fault_of_the_gateway_is_reported_once_with_its_cause_and_recorded(tmp_path):
+    async def scenario(bench):
+        kept: list[str] = []
+        bench.bridge.marks.append(kept.append)
+        await bench.enable()
+        await swing(bench)
+        await bench.wait(0.6)
+        status = bench.daemon.memory.status
+        pid = status.loop_pid
+        status.set(Cell.LOOP_PID, 0)  # as the keeper does when the control process has died
+        await faulted(bench, 0x6010)
+        status.set(Cell.LOOP_PID, pid)
+        await bench.wait(0.2)
+        notes = [each.text for each in bench.bridge.events().events if each.kind == "note"]
+        assert notes[1:] == kept == ["gateway fault 6010h: the control process is dead, hung or late"]
+
+    scene(tmp_path, scenario)
 
 
 def test_a_client_takes_the_axis_by_force_and_gives_it_back(tmp_path):

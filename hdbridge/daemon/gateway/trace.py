@@ -17,7 +17,7 @@ from canopen.sdo.exceptions import SdoAbortedError
 
 from hdbridge.device.nmt import Nmt, NmtCommand
 from hdbridge.drive.dictionary import find
-from hdbridge.drive.emergencies import error_name
+from hdbridge.drive.emergencies import gateway_error
 from hdbridge.drive.link import Frame
 from hdbridge.drive.states import State, decode
 from hdbridge.drive.unwrap import wrap_int32
@@ -127,7 +127,7 @@ class Trace:
             self._on_lss_answer(frame.time_s, data)
         elif can_id == self._value(0x1014) & 0x7FF and len(data) == 8:
             code = int.from_bytes(data[:2], "little")
-            self._say(frame.time_s, f"EMCY {code:04X}h: {error_name(code)}" if code else "EMCY: error reset")
+            self._say(frame.time_s, f"EMCY {gateway_error(code)}" if code else "EMCY: error reset")
         else:
             self._on_pdo(frame)
         self._watch(frame.time_s)
