@@ -11,6 +11,7 @@ import pytest
 from support.command import run_here
 
 from hdbridge.canframe import DataFrame
+from hdbridge.errors import BusInUseError
 
 PROFILE = Path(__file__).parents[2] / "profiles" / "article"
 MACHINE = """
@@ -57,6 +58,22 @@ def test_the_ideal_drive_answers_on_the_bus_of_the_gateway(tmp_path):
             seen.append((message.arbitration_id, bytes(message.data)))
         assert (0x705, b"\0") in seen
         bus.send(DataFrame(0x000, b"\x01\x05"))
+
+
+def test_a_second_node_of_the_same_id_is_refused(tmp_path):
+    path = machine(tmp_path)
+
+    with can.Bus(interface="udp_multicast", channel="239.74.163.11", port=43210) as bus:
+
+        def answer(message):
+            if message.arbitration_id == 0x605:
+                bus.send(DataFrame(0x585, b"\x43\x00\x10\x00\x92\x01\x02\x00"))
+
+        notifier = can.Notifier(bus, [answer])
+        done = run_here(tmp_path, "simulate", path, "--gateway", "--duration", "0.1")
+        notifier.stop()
+    assert done.returncode == BusInUseError.exit_status
+    assert "a node 5 is on this bus already (585h); stop it first" in done.stderr
 
 
 @pytest.mark.parametrize(
