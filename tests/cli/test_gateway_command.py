@@ -90,6 +90,21 @@ def test_a_second_node_of_the_same_id_is_refused(tmp_path):
             "{interface: virtual, channel: hdbridge}",
             "virtual:hdbridge is the bus of the drives; expected another one",
         ),
+        (
+            "{article: 5}",
+            "{}",
+            "machine.yaml:8:10: gateway.nodes: found an empty mapping; expected a map",
+        ),
+        (
+            "udp_multicast, channel: 239.74.163.11",
+            "socketcann, channel: can1",
+            "machine.yaml:7:20: gateway.bus.interface: python-can has no interface 'socketcann'",
+        ),
+        (
+            "239.74.163.11",
+            "1.2.3.4",
+            "machine.yaml:7:44: gateway.bus.channel: found '1.2.3.4'; expected a multicast address",
+        ),
     ],
 )
 def test_an_impossible_gateway_is_refused_by_check(tmp_path, replaced, by, words):
