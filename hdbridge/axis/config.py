@@ -6,6 +6,7 @@ checked before anything moves; an error names file, line and column.
 
 import math
 from decimal import Decimal
+from ipaddress import ip_address
 from pathlib import Path
 from typing import Annotated, Literal, Self
 
@@ -40,6 +41,18 @@ class BusConfig(_Part):
     options: dict[str, str | int | float | bool] = Field(
         default_factory=dict, description="further options of the interface, passed on unchanged"
     )
+
+    @field_validator("channel")
+    @classmethod
+    def _multicast(cls, channel: str | int, info: ValidationInfo) -> str | int:
+        if info.data.get("interface") == "udp_multicast":
+            try:
+                valid = ip_address(channel).is_multicast
+            except ValueError:
+                valid = False
+            if not valid:
+                raise ValueError(f"found {channel!r}; expected a multicast address, for example 239.0.0.1")
+        return channel
 
 
 class Identity(_Part):

@@ -82,9 +82,10 @@ def doctor(
             f"node {node_id}: nothing was heard on the outer bus; expected the other master's frames"
         )
     if trace.mistakes:
+        advice, count = trace.mistakes.most_common(1)[0]
+        which = f"{count} times" if count > 1 else "the first"
         raise DriveError(
-            f"node {node_id}: {trace.mistakes.total()} mistakes of the other master; most often: "
-            f"{trace.mistakes.most_common(1)[0][0]}"
+            f"node {node_id}: mistakes of the other master: {trace.mistakes.total()}; {which}: {advice}"
         )
 
 

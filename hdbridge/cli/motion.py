@@ -110,7 +110,12 @@ def print_motion(result: MotionTest) -> None:
         table.add_row(str(order.order), f"{order.frequency_hz:.0f}", *map(_figure, figures))
     print_table(table)
     if result.paths:
-        print_table(_paths(result))
+        from hdbridge.report.motion import PATH_COLUMNS, path_rows
+
+        paths = figures_table("Errors on a path, rms arcsec", *PATH_COLUMNS)
+        for row in path_rows(result):
+            paths.add_row(*row)
+        print_table(paths)
     if result.response is not None:
         say(
             f"response known up to {result.response.known_to_hz:.0f} Hz, "
@@ -122,24 +127,6 @@ def print_motion(result: MotionTest) -> None:
         say(f"the compensation removes half of the ripple or more up to {reached:g} deg/s")
     for line in result.remarks:
         say(f"note: {line}")
-
-
-def _paths(result: MotionTest) -> Table:
-    title = (
-        "Error on a path, rms arcsec, with the wind-up in acceleration and corrected for it, and time until "
-        "the load has settled, ms"
-    )
-    columns = ("none", "static", "filtered", "wound up", "corrected", "settled", "static", "filtered")
-    table = figures_table(title, "path", *columns)
-    for each in result.paths:
-        variants = (each.none, each.static, each.filtered)
-        table.add_row(
-            each.name,
-            *(_figure(one.path_arcsec if one else None) for one in variants),
-            *(_figure(one.delayed_arcsec if one else None) for one in (each.filtered, each.wind_up)),
-            *(f"{1000.0 * one.settle_s:.0f}" if one else "" for one in variants),
-        )
-    return table
 
 
 def _figure(value: float | None) -> str:

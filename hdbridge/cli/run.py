@@ -75,15 +75,13 @@ def command(
     changes = {name: given for name, given in (("interface", interface), ("channel", channel)) if given}
     held = held.on_bus(**changes) if changes else held
     simulation = _simulation(held, truth or [], seed, speed) if simulate else None
-    if (gateway := held.gateway) is not None:
-        check_interface(gateway.bus.interface, f"{held.path}: gateway.bus.interface")
-        if gateway.bus.interface == "virtual":
-            raise InputError(
-                f"{held.path}: gateway.bus: 'virtual' reaches no other process; expected the interface "
-                "of the other master (socketcan, or udp_multicast without hardware)"
-            )
+    if (gateway := held.gateway) is not None and gateway.bus.interface == "virtual":
+        raise InputError(
+            f"{held.path}: gateway.bus: 'virtual' reaches no other process; expected the interface "
+            "of the other master (socketcan, or udp_multicast without hardware)"
+        )
     if simulation is None:
-        where = "--interface" if interface else f"{held.path}: bus.interface"
+        where = "--interface" if interface else held.axes[0].config.where("bus.interface")
         check_interface(held.bus.interface, where)
         _check_real(held, truth or [], speed)
     log = LogSettings(*eventlog.handed_over())

@@ -21,7 +21,7 @@ from hdbridge.cli.options import (
 )
 from hdbridge.cli.session import Session, simulated_by
 from hdbridge.clock import Clock, MonotonicClock
-from hdbridge.errors import InputError
+from hdbridge.errors import BusInUseError, InputError
 
 if TYPE_CHECKING:
     import can
@@ -81,9 +81,25 @@ def command(
         TemporaryDirectory(prefix="hdbridge-gateway-") as folder,
     ):
         node = make(bus, clock, Path(folder))
+        _refuse_another(bus, clock, node.node_id)
         note(f"{name} drive: node {node.node_id} on {bus.channel_info}; Ctrl-C ends it")
         end = float("inf") if duration_s is None else clock.now() + duration_s
         run(bus, node, clock, lambda: interrupted() or clock.now() >= end)
+
+
+def _refuse_another(bus: can.BusABC, clock: Clock, node_id: int) -> None:
+    """Raises `BusInUseError` if the bus has a node of this id: it answers, or sends by itself."""
+    from hdbridge.drive.link import Link
+    from hdbridge.drive.manners import listening_s
+
+    link = Link(bus, clock)
+    link.send(0x600 + node_id, b"\x40\x00\x10\x00\0\0\0\0")  # SDO upload of 1000h, which every node has
+    end_s = clock.now() + listening_s()
+    while (frame := link.recv(end_s)) is not None:
+        if frame.can_id & 0x7F == node_id and frame.can_id >> 7 in (0x1, 0x3, 0x5, 0x7, 0x9, 0xB, 0xE):
+            raise BusInUseError(
+                f"{link.name}: a node {node_id} is on this bus already ({frame.can_id:03X}h); stop it first"
+            )
 
 
 def _simulated(

@@ -19,6 +19,7 @@ from hdbridge.daemon.machinechecks import (
     Places,
     agreed,
     check_gateway,
+    check_interfaces,
     check_load,
     check_tcp,
     check_together,
@@ -177,6 +178,7 @@ class Machine:
         check_together(axes, places)
         check_load([axis.config for axis in axes], bus, places)
         check_tcp(file, places)
+        check_interfaces(file, places)
         check_gateway(file, axes, bus, places)
         return cls(
             file.name, path.absolute(), tuple(axes), bus, realtime,

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, TypeVar
 from hdbridge.axis import AxisConfig, BusConfig
 from hdbridge.daemon.machinefile import MachineFile, token_complaint
 from hdbridge.drive.busload import check_bus_load
+from hdbridge.drive.link import unknown_interface
 from hdbridge.errors import InputError
 from hdbridge.files.yamlfile import Document, Location
 
@@ -122,6 +123,14 @@ def check_gateway(file: MachineFile, axes: Sequence[Axis], bus: BusConfig, place
                 f"{gateway.counts_per_turn} counts_per_turn: the limits of '{name}' do not fit into 32 bits; "
                 f"expected at most {int((1 << 31) / farthest) - 1}",
             )
+
+
+def check_interfaces(file: MachineFile, places: Places) -> None:
+    """Checks that python-can has the interfaces of the file."""
+    gateway = file.gateway
+    for at, bus in ((("bus",), file.bus), (("gateway", "bus"), gateway.bus if gateway else None)):
+        if bus is not None and (unknown := unknown_interface(bus.interface)):
+            raise places.error((*at, "interface"), unknown)
 
 
 def check_tcp(file: MachineFile, places: Places) -> None:

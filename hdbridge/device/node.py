@@ -175,6 +175,11 @@ class DriveNode:
         """True while SYNC drives the node."""
         return self._sync_due_s < _NEVER
 
+    def sync_is_late(self, now_s: float) -> bool:
+        """Returns True while SYNC is late by so much that the node runs on its own clock."""
+        left = self.behaviour.sync_timeout_periods - 0.5
+        return self._sync_due_s - left * self._period_s <= now_s
+
     @property
     def period_s(self) -> float:
         """The period of 60C2h, or of SYNC if the drive measures it."""

@@ -101,6 +101,24 @@ _FAMILIES: Final[dict[int, str]] = {
     0xF: "additional functions",
 }
 
+_GATEWAY: Final[dict[int, str]] = {
+    0x5440: "the inner drive left 'operation enabled'",
+    0x6010: "the control process is dead, hung or late",
+    0x7500: "the inner bus or drive is lost",
+    0x8100: "NMT stop or reset, or the outer interface is down",
+    0x8700: "SYNC is late",
+    0xFF00: "the inner drive is in fault",
+    0xFF01: "a client of the daemon has the axis",
+    0xFF02: "power was refused, did not come, or was lost",
+    0xFF03: "quick stop by a client",
+}
+"""What the gateway means by these codes."""
+
+
+def gateway_error(code: int) -> str:
+    """Returns an error code of the gateway with its cause, for example ``8700h: SYNC is late``."""
+    return f"{code:04X}h: {_GATEWAY.get(code) or error_name(code)}"
+
 
 def error_name(code: int) -> str:
     """Returns the name of an error code, for example ``following error`` for 8611h, or the name

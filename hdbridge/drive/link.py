@@ -234,13 +234,18 @@ def check_interface(interface: str, where: str) -> None:
     """Raises `InputError` if python-can has no such interface; ``where`` is the key or option
     that names it.
     """
-    if interface not in can.VALID_INTERFACES:
-        known = sorted(can.VALID_INTERFACES)
-        close = nearest(interface, known)
-        hint = f"; did you mean '{close}'?" if close else ""
-        raise InputError(
-            f"{where}: python-can has no interface {interface!r}; expected one of {', '.join(known)}{hint}"
-        )
+    if unknown := unknown_interface(interface):
+        raise InputError(f"{where}: {unknown}")
+
+
+def unknown_interface(interface: str) -> str | None:
+    """Returns an error text if python-can has no such interface, else None."""
+    if interface in can.VALID_INTERFACES:
+        return None
+    known = sorted(can.VALID_INTERFACES)
+    close = nearest(interface, known)
+    hint = f"; did you mean '{close}'?" if close else ""
+    return f"python-can has no interface {interface!r}; expected one of {', '.join(known)}{hint}"
 
 
 def absent_interface(settings: BusSettings) -> str | None:

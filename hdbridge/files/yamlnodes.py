@@ -154,13 +154,19 @@ class _Composer:
                 raise self._error(event, f"key '{key.value}' appears twice, first in line {first}")
             children[key.value] = (key, self._node(next(self._events), depth + 1))
         data = {name: child.value for name, (_, child) in children.items()}
-        return Node(line, column, data, "a mapping", children)
+        return Node(line, column, data, "a mapping" if data else "an empty mapping", children)
 
     def _sequence(self, line: int, column: int, depth: int) -> Node:
         children: list[Node] = []
         while not isinstance(event := next(self._events), yaml.SequenceEndEvent):
             children.append(self._node(event, depth + 1))
-        return Node(line, column, [each.value for each in children], "a list", children)
+        return Node(
+            line,
+            column,
+            [each.value for each in children],
+            "a list" if children else "an empty list",
+            children,
+        )
 
     def _scalar(self, event: yaml.ScalarEvent) -> str | int | float | bool | None:
         text: str = event.value

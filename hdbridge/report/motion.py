@@ -7,6 +7,15 @@ from hdbridge.axis.model.response import Response
 from hdbridge.commissioning.calibration.motion import MotionTest, Ripple
 from hdbridge.report.page import Chart, Grid, Mark, Page, Section, Series, Table
 
+PATH_COLUMNS = ("path", "correction", "path error", "with wind-up", "at rest", "settled after, ms")
+PATH_WORDS = (
+    "Errors of the load over a move at the limits and over a sine, rms arcsec. The path error is without the "
+    "servo's lag and the wind-up of the load; 'with wind-up' has them in, the same curve with the static and "
+    "the filtered correction. If that figure grows while the path error falls, the error that the filter "
+    "removed had hidden a part of the curve. At rest: mean error after the path. "
+    "Settled: the load stays within 3 arcsec of its rest."
+)
+
 
 def motion_page(axis_name: str, result: MotionTest) -> Page:
     """Returns the page of one test."""
@@ -32,9 +41,8 @@ def motion_sections(result: MotionTest) -> list[Section]:
         sections.append(
             Section(
                 "Path error",
-                "Error of the load over a move at the limits and over a sine, without the lag of the servo "
-                "and the wind-up of the load. Settled: the load stays within 3 arcsec of its rest.",
-                [_paths(result)],
+                PATH_WORDS,
+                [Table([*PATH_COLUMNS], path_rows(result))],
             )
         )
     if result.response is not None:
@@ -100,8 +108,9 @@ def _spectrum(ripple: Ripple) -> Chart:
     return Chart(f"{ripple.speed_deg_s:g} deg/s", "frequency, Hz", "amplitude, arcsec", series)
 
 
-def _paths(result: MotionTest) -> Table:
-    rows = [
+def path_rows(result: MotionTest) -> list[list[str]]:
+    """Returns a row of `PATH_COLUMNS` for each path and correction."""
+    return [
         [
             each.name,
             name,
@@ -115,12 +124,10 @@ def _paths(result: MotionTest) -> Table:
             ("none", each.none),
             ("static", each.static),
             ("filtered", each.filtered),
-            ("filtered, wind-up", each.wind_up),
+            ("wind-up compensated", each.wind_up),
         )
         if one is not None
     ]
-    names = ("path, rms arcsec", "with wind-up", "at rest, arcsec", "settled after, ms")
-    return Table(["path", "correction", *names], rows)
 
 
 def _response(response: Response) -> list[Chart]:

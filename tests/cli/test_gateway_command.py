@@ -9,6 +9,7 @@ import pytest
 from support.command import run_here
 
 from hdbridge.canframe import DataFrame
+from hdbridge.errors import BusInUseError
 
 PROFILE = Path(__file__).parents[2] / "profiles" / "article"
 MACHINE = """
@@ -57,6 +58,22 @@ def test_the_ideal_drive_answers_on_the_bus_of_the_gateway(tmp_path):
         bus.send(DataFrame(0x000, b"\x01\x05"))
 
 
+def test_a_second_node_of_the_same_id_is_refused(tmp_path):
+    path = machine(tmp_path)
+
+    with can.Bus(interface="udp_multicast", channel="239.74.163.11", port=43210) as bus:
+
+        def answer(message):
+            if message.arbitration_id == 0x605:
+                bus.send(DataFrame(0x585, b"\x43\x00\x10\x00\x92\x01\x02\x00"))
+
+        notifier = can.Notifier(bus, [answer])
+        done = run_here(tmp_path, "simulate", path, "--gateway", "--duration", "0.1")
+        notifier.stop()
+    assert done.returncode == BusInUseError.exit_status
+    assert "a node 5 is on this bus already (585h); stop it first" in done.stderr
+
+
 @pytest.mark.parametrize(
     ("replaced", "by", "words"),
     [
@@ -70,6 +87,21 @@ def test_the_ideal_drive_answers_on_the_bus_of_the_gateway(tmp_path):
             "{interface: udp_multicast, channel: 239.74.163.11, options: {port: 43210}}",
             "{interface: virtual, channel: hdbridge}",
             "virtual:hdbridge is the bus of the drives; expected another one",
+        ),
+        (
+            "{article: 5}",
+            "{}",
+            "machine.yaml:8:10: gateway.nodes: found an empty mapping; expected a map",
+        ),
+        (
+            "udp_multicast, channel: 239.74.163.11",
+            "socketcann, channel: can1",
+            "machine.yaml:7:20: gateway.bus.interface: python-can has no interface 'socketcann'",
+        ),
+        (
+            "239.74.163.11",
+            "1.2.3.4",
+            "machine.yaml:7:44: gateway.bus.channel: found '1.2.3.4'; expected a multicast address",
         ),
     ],
 )

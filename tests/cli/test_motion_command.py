@@ -13,6 +13,7 @@ from hdbridge.axis.model import TransmissionModel
 from hdbridge.axis.model.response import LeadFilter, Response
 from hdbridge.commissioning.calibration.motion import motion_test
 from hdbridge.errors import InputError
+from hdbridge.report.motion import PATH_COLUMNS
 from hdbridge.sim.lockstep import simulated_bench
 
 OF_ANOTHER_CYCLE = Response(
@@ -51,7 +52,8 @@ def test_measures_and_proposes_the_response_and_the_committed_model_uses_it(hdbr
         assert abs(each["wind_up"]["rest_arcsec"]) < abs(each["static"]["rest_arcsec"]) + 0.5
     # The article's load on its spring: 0.225 kg m2 on 16,000 Nm/rad.
     assert result["wind_up"]["inertia_over_stiffness_s2"] == pytest.approx(0.225 / 16000.0, rel=0.1)
-    assert "Path error" in (tmp_path / "out.html").read_text()
+    page = (tmp_path / "out.html").read_text()
+    assert all(word in page and word in done.stdout for word in (*PATH_COLUMNS, "wind-up compensated"))
     assert "Gain" in (tmp_path / "out.html").read_text()
     done = hdbridge("model", "commit", "fast")
     assert done.returncode == 0, done.stderr

@@ -150,7 +150,7 @@ def test_a_missing_package_is_reported_with_its_install_command(
     monkeypatch.setitem(sys.modules, module, None)
     with (
         pytest.raises(BusError, match=f"needs the package {package} for it: python -m pip install {package}"),
-        open_bus(BusConfig(interface=interface, channel="x"), shared=True),
+        open_bus(BusConfig(interface=interface, channel="239.0.0.9"), shared=True),
     ):
         pass
 

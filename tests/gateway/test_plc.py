@@ -15,7 +15,7 @@ from hdbridge.axis import AxisConfig
 from hdbridge.axis.model import TransmissionModel
 from hdbridge.daemon.gateway.objects import rest_deg
 from hdbridge.daemon.loop.states import AxisState
-from hdbridge.daemon.memory import CommandKind
+from hdbridge.daemon.memory import Cell, CommandKind
 from hdbridge.motion import MotionMode
 
 STATE, ENABLED, FAULT, OFF = 0x6F, 0x27, 0x08, 0x40
@@ -233,6 +233,41 @@ async def reset_and_go(bench):
     await bench.wait(0.5)
     assert bench.plc.statusword & STATE == ENABLED
     assert bench.plc.emergencies == []
+
+
+def test_a_lost_sync_is_the_cause_even_if_the_set_points_end_before_it_is_overdue(tmp_path):
+    async def scenario(bench):
+        await bench.enable()
+        await swing(bench)
+        await bench.wait(0.6)
+        bench.plc.cycling = False
+        nodes, process = bench.daemon.clock.nodes, bench._process
+        nodes.remove(process)  # it does not get the processor
+        await bench.until(lambda: bench.daemon.states[0].name == "STOPPING")
+        nodes.append(process)
+        assert await bench.read(0x603F) == 0x8700
+        assert bench.plc.emergencies == [0x8700]
+
+    scene(tmp_path, scenario, period_s=0.01)
+
+
+def test_a_fault_of_the_gateway_is_reported_once_with_its_cause_and_recorded(tmp_path):
+    async def scenario(bench):
+        kept: list[str] = []
+        bench.bridge.marks.append(kept.append)
+        await bench.enable()
+        await swing(bench)
+        await bench.wait(0.6)
+        status = bench.daemon.memory.status
+        pid = status.loop_pid
+        status.set(Cell.LOOP_PID, 0)  # as the keeper does when the control process has died
+        await faulted(bench, 0x6010)
+        status.set(Cell.LOOP_PID, pid)
+        await bench.wait(0.2)
+        notes = [each.text for each in bench.bridge.events().events if each.kind == "note"]
+        assert notes[1:] == kept == ["gateway fault 6010h: the control process is dead, hung or late"]
+
+    scene(tmp_path, scenario)
 
 
 def test_a_client_takes_the_axis_by_force_and_returns_it(tmp_path):

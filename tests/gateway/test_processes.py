@@ -72,6 +72,12 @@ def test_a_foreign_master_moves_the_axis_and_a_dead_gateway_does_not(tmp_path: P
             patience.until(lambda: abs(daemon.axis()["load_target_deg"] - 3.0) < 1e-6)
             patience.until(lambda: abs(node.sdo[0x6064].raw - 3 * COUNTS_PER_DEG) < 100)
 
+            os.kill(daemon.pids("control")[-1], signal.SIGKILL)
+            patience.until(lambda: node.sdo[0x6041].raw & 0x4F == 0x08, lambda: daemon.events[-12:])
+            assert node.sdo[0x603F].raw == 0x6010
+            daemon.until_axis("disabled")
+            node.state = "OPERATION ENABLED"
+
             (process,) = daemon.pids("gateway")
             os.kill(process, signal.SIGKILL)
             patience.until(lambda: daemon.axis()["state"] == "disabled", lambda: daemon.events[-12:])

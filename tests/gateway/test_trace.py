@@ -91,6 +91,7 @@ def test_a_correct_master_has_no_findings(outer):
     configured = outer.trace.configured()
     assert any(text.startswith("6060h:00 'Modes of operation' = 8") for text in configured)
     assert any(text.startswith("SYNC every 4.000 ms") for text in configured)
+    assert {each[-1] for each in configured if "COB-ID" in each} == {"h"}
 
 
 def lost_sync(outer):
@@ -139,6 +140,12 @@ def held_reset(outer):
     outer.node.firmware._stage.reset = lambda: None
     outer.node.firmware._stage.is_resetting = True
     outer.cycle(0x8F, 1_000_000, 100)
+
+
+def reset_and_enabled_at_once(outer):
+    outer.begin()
+    outer.cycle(0x80, 1_000_000, 5)
+    outer.cycle(0x8F, 1_000_000, 5)
 
 
 def short_rpdo(outer):
@@ -197,6 +204,7 @@ def rpdo_too_early(outer):
         (beyond_the_limits, "the software limits (607Dh) are -14400000 to 14400000"),
         (enabled_at_once, "no transition from switch on disabled"),
         (held_reset, "bit 7 acts by its rising edge"),
+        (reset_and_enabled_at_once, "bit 7 acts by its rising edge"),
         (short_rpdo, "6 bytes are mapped in 1600h"),
         (mapped_while_valid, "to change a PDO: set bit 31"),
         (no_such_mode, "the modes are 1, 6, 7, 8 (6502h)"),
@@ -227,7 +235,7 @@ def test_the_command_reads_a_bus_log(outer, tmp_path):
     assert done.returncode == 4, done.stderr
     assert "refused with" in done.stdout
     assert "the modes are 1, 6, 7, 8 (6502h)" in done.stdout
-    assert "1 mistakes of the other master" in done.stderr
+    assert "mistakes of the other master: 1; the first: the modes" in done.stderr
     done = run_here(tmp_path, "gateway", "doctor", "machine.yaml", "--log", "none.log")
     assert done.returncode == 2
     assert "none.log: no such file" in done.stderr

@@ -49,7 +49,10 @@ def main(arguments: list[str]) -> int:
 
 
 class SimulatedClock:
-    """The virtual clock of simulated drives: its time in the last turn of the loop, plus the time since."""
+    """The virtual clock of simulated drives: its time in the last turn of the loop, plus the time since.
+
+    It waits for a loop that is late, but not for one whose process is gone.
+    """
 
     def __init__(self, memory: Memory, speed: float) -> None:
         self._status, self._reader = memory.status, memory.reader()
@@ -63,7 +66,9 @@ class SimulatedClock:
         if len(samples):
             self._turn_s = 1e-9 * int(samples[-1]["time_ns"])
             self._turned_s = time.monotonic()
-        since_s = min((time.monotonic() - self._turned_s) * self._speed, self._period_s)
+        since_s = (time.monotonic() - self._turned_s) * self._speed
+        if self._status.loop_pid:
+            since_s = min(since_s, self._period_s)
         self._latest_s = max(self._latest_s, self._turn_s + since_s)
         return self._latest_s
 

@@ -19,6 +19,7 @@ from hdbridge.daemon.loop.faultlog import FAULT_INDEX
 from hdbridge.daemon.loop.states import AxisState
 from hdbridge.daemon.memory import NO_FAULT, Memory, OuterCell, OuterKnot, OuterView, SampleArray, SampleFlag
 from hdbridge.device.behaviour import Behaviour, Controlword
+from hdbridge.device.emergency import ErrorCode
 from hdbridge.device.modes import InterpolatedPosition
 from hdbridge.device.node import FRAMES_PER_POLL, DriveNode
 from hdbridge.device.powerstate import PowerStage
@@ -163,7 +164,12 @@ class LoadAxis(PowerStage):
         if self._cells[OuterCell.REFUSED] == self._wanted:
             return NOT_POWERED if self._cells[OuterCell.HELD] else TAKEN
         if was_on and not self.is_on:
-            return TAKEN if sample["state"] == AxisState.ENABLED else NOT_POWERED
+            if sample["state"] == AxisState.ENABLED:
+                return TAKEN
+            # The set-points end before SYNC is overdue if this process got the processor late.
+            node = self._node
+            outer = node is not None and node.firmware.follows_the_bus and node.sync_is_late(now_s)
+            return ErrorCode.SYNC_LOST if outer else NOT_POWERED
         if not self.is_on and now_s - self._wanted_s > POWER_S:
             return NOT_POWERED
         return 0
@@ -349,10 +355,12 @@ class Gateway:
         if now_s - self._looked_s < 0.5 * self._memory.period_s:
             return
         self._looked_s = now_s
-        turns = self._memory.status.loop_count
+        status = self._memory.status
+        turns = status.loop_count
         if turns != self._turns:
             self._turns, self._turned_s = turns, now_s
         samples, _ = self._reader.read()
         newest = samples[-1:] if len(samples) else None
+        alive = status.loop_pid != 0 and now_s - self._turned_s < DEAD_S
         for load in self.axes.values():
-            load.look(newest, now_s, now_s - self._turned_s < DEAD_S)
+            load.look(newest, now_s, alive)

@@ -17,7 +17,7 @@ from canopen.sdo.exceptions import SdoAbortedError
 
 from hdbridge.device.nmt import Nmt, NmtCommand
 from hdbridge.drive.dictionary import find
-from hdbridge.drive.emergencies import error_name
+from hdbridge.drive.emergencies import gateway_error
 from hdbridge.drive.link import Frame
 from hdbridge.drive.states import State, decode
 from hdbridge.drive.unwrap import wrap_int32
@@ -127,7 +127,7 @@ class Trace:
             self._on_lss_answer(frame.time_s, data)
         elif can_id == self._value(0x1014) & 0x7FF and len(data) == 8:
             code = int.from_bytes(data[:2], "little")
-            self._say(frame.time_s, f"EMCY {code:04X}h: {error_name(code)}" if code else "EMCY: error reset")
+            self._say(frame.time_s, f"EMCY {gateway_error(code)}" if code else "EMCY: error reset")
         else:
             self._on_pdo(frame)
         self._watch(frame.time_s)
@@ -198,8 +198,7 @@ class Trace:
             self._on_target(time_s, value)
             return
         self._values[index, sub] = self.written[index, sub] = value
-        shown = f"{value & 0xFFFFFFFF:08X}h" if 0x1000 <= index <= 0x1FFF and len(raw) == 4 else str(value)
-        self._say(time_s, f"{self._name(index, sub)} = {shown}")
+        self._say(time_s, self._assignment(index, sub, value))
 
     def _on_value(self, time_s: float, index: int, value: int, sub: int) -> None:
         if index == 0x6041:
@@ -304,16 +303,16 @@ class Trace:
 
     def _on_controlword(self, time_s: float, word: int) -> None:
         before, self._word = self._word, word
-        if word & 0x80 and self._state is State.FAULT:
-            self._reset_since_s = self._reset_since_s or time_s
-            if before is not None and before & 0x80 and time_s - self._reset_since_s > 0.2:
-                self._say_once(
-                    time_s, "reset", f"controlword {word:04X}h: fault reset held, still in fault",
-                    "bit 7 acts by its rising edge: take it back to 0 before the next attempt",
-                )  # fmt: skip
-        else:
+        if not word & 0x80:
             self._reset_since_s = None
             self._over("reset")
+        elif self._reset_since_s is None:
+            self._reset_since_s = time_s
+        elif word != before or (self._state is State.FAULT and time_s - self._reset_since_s > 0.2):
+            self._say_once(
+                time_s, "reset", f"controlword {word:04X}h: fault reset held",
+                "bit 7 acts by its rising edge, and no other command acts while it is set: take it back to 0",
+            )  # fmt: skip
         if word == before:
             return
         advice = ""
@@ -399,7 +398,7 @@ class Trace:
 
     def configured(self) -> list[str]:
         """Returns what the master has configured, one line each."""
-        lines = [f"{self._name(index, sub)} = {value}" for (index, sub), value in self.written.items()]
+        lines = [self._assignment(*key, value) for key, value in self.written.items()]
         period_s = self.period_s
         if period_s is not None:
             lines.append(f"SYNC every {1000 * period_s:.3f} ms, at most {1000 * self.jitter_s:.3f} ms off")
@@ -416,6 +415,12 @@ class Trace:
     def _name(self, index: int, sub: int) -> str:
         variable = find(self._od, index, sub)
         return f"{index:04X}h:{sub:02X}" + (f" '{variable.qualname}'" if variable is not None else "")
+
+    def _assignment(self, index: int, sub: int, value: int) -> str:
+        """Returns ``name = value``; 32-bit values of the communication profile are hexadecimal."""
+        variable = find(self._od, index, sub)
+        wide = 0x1000 <= index <= 0x1FFF and variable is not None and variable.data_type == 0x07
+        return f"{self._name(index, sub)} = " + (f"{value & 0xFFFFFFFF:08X}h" if wide else str(value))
 
     def _number(self, index: int, sub: int, raw: bytes) -> int:
         variable = find(self._od, index, sub)

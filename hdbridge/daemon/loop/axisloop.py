@@ -393,7 +393,7 @@ class AxisLoop:
         if self._unfed:
             self._unfed = False
             if not set_point.at_rest:
-                words = "the set-points of the gateway ended in motion, or came too late; it loses its power"
+                words = "the set-points of the gateway ended in motion; it loses its power"
                 self._tell(self.index, EventKind.UNDERRUN, self._motion_id, 0, words)
             self._happened(Happening.UNFED)
         if set_point.underrun is not self._underrun:

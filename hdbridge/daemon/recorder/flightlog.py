@@ -23,7 +23,7 @@ from hdbridge.errors import InputError
 
 MESSAGE_BYTES: Final = 256
 """Maximum size of a message with its index entry, before compression."""
-KEPT_FOR: Final = frozenset({EventKind.STOPPED, EventKind.BUS_DOWN})
+KEPT_FOR: Final = frozenset({EventKind.STOPPED, EventKind.BUS_DOWN, EventKind.UNDERRUN})
 """Events that count as a fault."""
 MARK: Final = "MARK"
 _KEPT_NAMES: Final = frozenset({each.name for each in KEPT_FOR} | {MARK})

@@ -121,7 +121,7 @@ class ServiceBridge:
         for axis in self.axes.values():
             self._start(self._take_over(axis))
         if (gateway := self.machine.gateway) is not None:
-            master = OuterMaster(self.core, gateway)
+            master = OuterMaster(self.core, gateway, self.mark)
             self._start(master.keep())
             for name in gateway.nodes:
                 self._start(master.serve(self.axes[name]))
@@ -344,9 +344,9 @@ class ServiceBridge:
         axes = [self._axis(name) for name in moves]
         await run_together(holder, axes, moves, speed, wait=wait)
 
-    def mark(self, text: str) -> None:
-        """Adds a remark to the event log and the flight recorder, at the present cycle."""
-        self.core.log.note(text)
+    def mark(self, text: str, axis: int = -1) -> None:
+        """Adds a remark to the event log and the flight recorder, which keeps the time around it."""
+        self.core.log.note(text, axis)
         for hear in self.marks:
             hear(text)
 

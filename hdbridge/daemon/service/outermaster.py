@@ -7,9 +7,10 @@ follows its set-points, and the next service takes it as it is.
 
 from __future__ import annotations
 
+import logging
 import math
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -17,6 +18,7 @@ import numpy as np
 from hdbridge.daemon.loop.states import AxisState
 from hdbridge.daemon.memory import CommandKind, Event, OuterCell, OuterCells, SampleArray
 from hdbridge.daemon.service.timing import POLL_S
+from hdbridge.drive.emergencies import gateway_error
 from hdbridge.drive.states import State
 from hdbridge.errors import HdbridgeError
 from hdbridge.motion import MotionMode
@@ -26,6 +28,7 @@ if TYPE_CHECKING:
     from hdbridge.daemon.service.axis import ServiceAxis
     from hdbridge.daemon.service.core import Core
 
+_log: Final = logging.getLogger(__name__)
 _OWN: Final = frozenset({AxisState.ENABLING, AxisState.ENABLED})
 _STOPPED: Final = frozenset({AxisState.UNVERIFIED, AxisState.QUICK_STOPPED, AxisState.LATCHED})
 SETTLES_S: Final = 2.0
@@ -68,8 +71,9 @@ class Latency:
 class OuterMaster:
     """Holds the lease for the gateway and serves its axes."""
 
-    def __init__(self, core: Core, settings: GatewaySettings) -> None:
-        self._core = core
+    def __init__(self, core: Core, settings: GatewaySettings, mark: Callable[[str, int], None]) -> None:
+        """``mark`` reports a fault and has the recorder keep the time around it."""
+        self._core, self._mark = core, mark
         self._patience_s = 1e-3 * settings.timeout_ms
         self._name = f"the master on {settings.bus.interface}:{settings.bus.channel}"
         self._token = ""
@@ -87,9 +91,17 @@ class OuterMaster:
         cells = self._core.memory.outer[axis.link.index]
         timing = self._core.timing
         prepare_s = timing.clock.now()
-        granted_by = ""
+        granted_by = noted = ""
+        error_code = cells.view.error_code
         while True:
             await timing.sleep(POLL_S)
+            before, error_code = error_code, cells.view.error_code
+            if error_code not in (0, before):
+                fault = gateway_error(error_code)
+                _log.error("gateway fault", {"axis": axis.name, "error": fault})
+                self._mark(f"gateway fault {fault}", axis.link.index)
+            if not self._core.memory.status.loop_pid:
+                continue  # each of these requests needs the control process, and waits for it
             holds = self._core.lease.holds(self._token)
             granted_by = granted_by or self._token  # an earlier service may have granted it
             cells[OuterCell.HELD] = int(holds)
@@ -114,8 +126,11 @@ class OuterMaster:
                 ):
                     prepare_s = timing.clock.now() + PREPARE_AGAIN_S
                     await axis.prepare()
+                noted = ""
             except HdbridgeError as error:
-                self._core.log.note(f"for {self._name}: {error}", axis.link.index)
+                if str(error) != noted:
+                    noted = str(error)
+                    self._core.log.note(f"for {self._name}: {error}", axis.link.index)
 
     def _is_left(self, axis: ServiceAxis, cells: OuterCells) -> bool:
         """Returns True if the axis has power by a request that is over, of this or an earlier process."""
