@@ -40,7 +40,7 @@ def test_usual_values_do_not_follow_as_a_robot_joint_does(joint: int) -> None:
 def test_a_twin_of_three_recordings_follows_as_the_fourth_does() -> None:
     twin, compared = real_records.twin_of_others(recordings_of(4), 0)
     assert twin.findings == (), "its following error is left, so no value is the axis's"
-    for signal, share in (("load_error", 0.5), ("following_error", 0.5), ("motor_torque", 0.9)):
+    for signal, share in (("load_error", 0.5), ("following_error", 0.5), ("motor_torque", 0.3)):
         usual, now = compared["usual values"].row(signal), compared["twin"].row(signal)
         assert usual is not None
         assert now is not None
