@@ -41,6 +41,7 @@ from hdbridge.twin.fit import FIT_S, in_best_structure, start_of
 from hdbridge.twin.misfit import Replays, coarse, prepare
 from hdbridge.twin.parameters import default_truth
 from hdbridge.twin.replay import replay
+from hdbridge.twin.response import with_response
 from hdbridge.twin.twin import fit_twin, judge
 
 
@@ -77,9 +78,9 @@ def start(axis: AxisConfig, foreign: Foreign) -> Truth:
 
 
 def servo_only(recording: Recording, axis: AxisConfig, begun: Truth, workers: int) -> Truth:
-    """Fits servo structures alone, without the usual servo first."""
+    """Fits servo structures and the fall-back alone, without the usual servo first."""
     with Replays(coarse(prepare(recording, axis, begun), FIT_S), workers) as replays:
-        return in_best_structure(replays, start_of(begun, replays.data)).truth
+        return with_response(replays, in_best_structure(replays, start_of(begun, replays.data))).truth
 
 
 def shares(other: Recording, axis: AxisConfig, truth: Truth, seed: int) -> str:

@@ -12,6 +12,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from itertools import compress
 from typing import Any, Self
 
 import numpy as np
@@ -26,7 +27,6 @@ from hdbridge.records.recording import Recording
 from hdbridge.sim.truth import Truth
 from hdbridge.twin.fit import (
     SOFT,
-    Fitted,
     fitted_rows,
     free_parameters,
     intervals_of,
@@ -289,42 +289,29 @@ def _by_ratio(
         return Check((), grown, grown, unseen, blind)
     legs = legs_of_rows(data, fitted_rows(data, everything=True))
     named: list[str] = []
-    best: Fitted | None = None
-    left, now = _excess(grown), grown
+    best, left, now = twin, _excess(grown), grown
     for number in range(MOST_NAMED):
         fits = {}
         for cause in (each for each in groups if each not in named):
             own = tuple(each for name in (*named, cause) for each in groups[name])
-            start, prior = best.truth if best else twin, np.array(coordinates(twin, own))
             fits[cause] = solve(
-                replays,
-                start,
-                own,
-                STEPS,
-                prior,
-                known=Scales(was),
-                everything=True,
-                tempered=True,
-                linear=False,
-            )
+                replays, best, own, STEPS, np.array(coordinates(twin, own)), known=Scales(was),
+                everything=True, tempered=True, linear=False,
+            )  # fmt: skip
             progress((number + len(fits) / len(groups)) / MOST_NAMED)
-        cause = min(fits, key=lambda each: fits[each].cost)
-        now_grown = growth(data, fits[cause].residuals, was)
-        near = fits[cause].vector
-        rivals = [
-            each
-            for each, fit in fits.items()
-            if each != cause and not told_apart(near, fit.vector - near, legs)
-        ]
-        explained = left - _excess(now_grown)
-        if rivals or explained < max(EXPLAINED * _excess(grown), REST * left if named else 0.0):
+        cause, fit = min(fits.items(), key=lambda each: each[1].cost)
+        after = growth(data, fit.residuals, was)
+        explained = left - _excess(after)
+        certain = all(
+            other is fit or told_apart(fit.vector, other.vector - fit.vector, legs) for other in fits.values()
+        )
+        if not certain or explained < max(EXPLAINED * _excess(grown), REST * left if named else 0.0):
             break
-        named, best, left, now = [*named, cause], fits[cause], _excess(now_grown), now_grown
+        named, best, left, now = [*named, cause], fit.truth, _excess(after), after
         if max(now.values()) <= GROWN:
             break
     progress(1.0)
-    changes = tuple(_ratio(groups[cause], twin, best.truth) for cause in named) if best else ()
-    return Check(changes, grown, now, unseen)
+    return Check(tuple(_ratio(groups[cause], twin, best) for cause in named), grown, now, unseen)
 
 
 def _excess(grown: Mapping[str, float]) -> float:
@@ -348,17 +335,15 @@ def _shows(replays: Replays, twin: Truth, own: Sequence[Parameter], was: Mapping
 
 def _ratio(own: Sequence[Parameter], before: Truth, after: Truth) -> Finding:
     """Reports a change as a ratio, because neither value is the axis's."""
-    moved = []
-    for each in own:
-        (was,), (now,) = coordinates(before, [each]), coordinates(after, [each])
-        if each.linear:
-            moved.append((abs(now - was) / each.least_change, Moved(each.name, each.unit, 0.0, now - was)))
-        else:
-            times = Moved(each.name, "times what it was", 1.0, math.exp(now - was))
-            moved.append((abs(now - was) / each.least_change, times))
-    size = max(size for size, _ in moved)
-    shown = tuple(each for times, each in moved if times >= min(1.0, size))
-    return Finding(own[0].cause, shown)
+    off = np.subtract(coordinates(after, own), coordinates(before, own))
+    sizes = np.abs(off) / [each.least_change for each in own]
+    moved = [
+        Moved(each.name, each.unit, 0.0, by)
+        if each.linear
+        else Moved(each.name, "times what it was", 1.0, math.exp(by))
+        for each, by in zip(own, off.tolist(), strict=True)
+    ]
+    return Finding(own[0].cause, tuple(compress(moved, sizes >= min(1.0, np.max(sizes)))))
 
 
 @dataclass(frozen=True, eq=False)

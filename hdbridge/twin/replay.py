@@ -111,24 +111,13 @@ LARGEST_UNKNOWN = 0.25
 """Maximum share of a recording that is excluded for its unknown history."""
 
 
-def stands(moved: NDArray[np.bool_], motor_deg: FloatArray, within_deg: float) -> NDArray[np.bool_]:
-    """Returns the mask of rows from which command and motor stay at rest until the command moves again."""
-    rest = np.cumsum(moved)
-    last = np.searchsorted(rest, rest, side="right") - 1
-    away = np.abs(motor_deg - motor_deg[last]) > within_deg
-    rows = np.arange(len(rest))
-    last_away = np.maximum.accumulate(np.where(away | moved, rows, -1))
-    given: NDArray[np.bool_] = last_away < rows
-    return given
-
-
 class Standing(NamedTuple):
     """Rows of a part at which friction may hold the motor, so that its torque depends on the past."""
 
     stuck: NDArray[np.bool_]
     """Mask of the rows at which the command has been at rest for `RINGING_S`."""
     still: NDArray[np.bool_]
-    """Mask of the rows at which the motor stands; see `stands`."""
+    """Mask of the rows from which command and motor stay at rest until the command moves again."""
     held: NDArray[np.intp]
     """Rows that show its holding torque: every `HELD_S`, and the last. The last one alone would not do,
     because the integral may have moved until the motor broke away."""
@@ -136,12 +125,15 @@ class Standing(NamedTuple):
 
 def standing(part: Record, count_deg: float) -> Standing:
     """Returns the rows of a part at which friction may hold the motor; ``count_deg`` is one motor count."""
-    target, time_s = part.motor_target_deg, part.time_s
+    target, motor_deg, time_s = part.motor_target_deg, part.motor_position_deg, part.time_s
     assert target is not None  # commands_of has refused it
     moved = np.diff(target, prepend=target[0]) != 0.0
     before_s = time_s[0] if begins_in_motion(part) else -np.inf
     stuck = time_s - np.maximum.accumulate(np.where(moved, time_s, before_s)) > RINGING_S
-    still = stands(moved, part.motor_position_deg, STANDS_COUNTS * count_deg)
+    rest, rows = np.cumsum(moved), np.arange(len(moved))
+    last = np.searchsorted(rest, rest, side="right") - 1
+    away = np.abs(motor_deg - motor_deg[last]) > STANDS_COUNTS * count_deg
+    still = np.maximum.accumulate(np.where(away | moved, rows, -1)) < rows
     rested_s = time_s - np.maximum.accumulate(np.where(moved, time_s, time_s[0]))
     times = np.floor(rested_s / HELD_S)
     told = still & (times >= 1.0)

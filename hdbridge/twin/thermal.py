@@ -39,16 +39,9 @@ method, and motors are rated by it). The housing warms less."""
 MATTERS_K: Final = 5.0
 """Smallest change of that temperature rise that matters in practice."""
 RESISTANCE: Final = Parameter(
-    "thermal resistance",
-    "temperature.resistance_k_per_w",
-    "K/W",
-    1e-4,
-    1e3,
-    0.7,
-    0.25,
-    AMBIENT.cause,
+    "thermal resistance", "temperature.resistance_k_per_w", "K/W", 1e-4, 1e3, 0.7, 0.25, AMBIENT.cause,
     _WARM_UP,
-)
+)  # fmt: skip
 TIME_CONSTANT: Final = Parameter(
     "thermal time constant", "temperature.time_constant_s", "s", 1.0, 1e6, 0.7, 0.25, AMBIENT.cause, _WARM_UP
 )
