@@ -175,9 +175,9 @@ class Settle:
     """Standstill until motor and load have settled, or until the time-out.
 
     Settled means that over the last ``window_s`` the means of the load's two halves agree within
-    ``drift_arcsec``, and that the mean of the motor is as near to its target, or within a count. Friction can
-    hold a motor beside its target until the servo's integrator releases it. Means are used instead of
-    extremes, so that encoder noise does not prevent settling.
+    ``drift_arcsec``, and that the mean of the motor is within ``drift_arcsec`` or half a count of its target.
+    Friction can hold a motor beside its target until the servo's integrator releases it. Means are used
+    instead of extremes, so that encoder noise does not prevent settling.
     """
 
     window_s: float = 0.06
@@ -206,7 +206,7 @@ class Settle:
             return False
         window = self.window(samples)
         off_deg = abs(sum(each.motor_position_deg - each.motor_target_deg for each in window)) / len(window)
-        near_deg = max(self.drift_arcsec / 3600.0 * axis.ratio, axis.motor_count_deg)
+        near_deg = max(self.drift_arcsec / 3600.0 * axis.ratio, 0.5 * axis.motor_count_deg)
         return off_deg <= near_deg + 1e-9
 
     def window(self, samples: Sequence[Sample]) -> Sequence[Sample]:
