@@ -19,7 +19,7 @@ from hdbridge.analysis.regressors import Regressors
 from hdbridge.axis.effects import BoolArray, Effect, FloatArray, IntArray, Start
 from hdbridge.axis.effects.base import Memoryless
 from hdbridge.axis.effects.orders import waves
-from hdbridge.axis.effects.path import branches
+from hdbridge.axis.effects.path import branches, since_reversal_deg
 from hdbridge.units import ARCSEC_PER_DEG
 
 TARGET_BLOCKS = 30_000
@@ -70,6 +70,8 @@ class Blocks:
     """Number of the leg, from turning point to turning point, that contains the block."""
     locked_arcsec: FloatArray
     """Standard deviation of the rounding error of the motor angle that is constant over a leg."""
+    since_turn_deg: FloatArray
+    """Motor travel since the last turning point."""
     blur: FloatArray
     """Variance of each block due to uncertain turning points of the driving angle, arcsec squared."""
 
@@ -150,6 +152,7 @@ def make_blocks(samples: Samples, weight: FloatArray | None = None) -> Blocks:
         error_arcsec=weighted_error,
         leg=leg[middle],
         locked_arcsec=moving * locked_counts(speed, samples.count_deg) * rounding_arcsec,
+        since_turn_deg=mean(np.concatenate([since_reversal_deg(each) for each in parts])),
         blur=np.zeros(len(first)),
     )
 

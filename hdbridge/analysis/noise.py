@@ -1,10 +1,11 @@
 """Coloured noise, and least squares weighted by it.
 
-The noise has four parts: white noise (which may differ between standing and moving); a drift in time;
+The noise has five parts: white noise (which may differ between standing and moving); a drift in time;
 a drift over the motor's *travel*, because an axis rests anywhere within a count of its encoder, constant
-during a stop and different at the next one; and the rounding error that is constant over a leg, whose size
-follows from the count. The drifts are first-order Markov processes, so the inverse of their covariance is
-banded, and a fit costs no more than one with white noise (Rybicki and Press 1995).
+during a stop and different at the next one; the misfit of the loop's shape, which fades over each branch and
+differs between branches; and the rounding error that is constant over a leg, whose size follows from the
+count. The drifts are first-order Markov processes, so the inverse of their covariance is banded, and a fit
+costs no more than one with white noise (Rybicki and Press 1995).
 """
 
 from __future__ import annotations
@@ -22,12 +23,16 @@ from hdbridge.axis.effects import BoolArray, FloatArray, IntArray
 
 PIECES = 16
 PIECE_BLOCKS = 250
-SMALLEST_ARCSEC = 1e-3
+SMALLEST_ARCSEC, LARGEST_ARCSEC = 1e-3, 1e3
 DIFFERENCE = 1e-4
 """Step of the likelihood's derivatives, in logarithms. With a smaller one, rounding stops the fit early."""
 COLUMNS_AT_ONCE = 8
-CHAINS_KEPT = 8
+CHAINS_KEPT = 12
 """Size of the cache of chains: a derivative needs two at each length and one at a step from it."""
+LOOP_LENGTH = 0.3
+"""Correlation length of the misfit of a loop's shape, as a share of the travel over which it fades."""
+LOOP_DEG = 8.0, 40.0
+"""Range of that travel, as of the widths of loops. A longer one is a drift, a shorter one ringing."""
 SAME_LEG = 1e-8
 """Step between blocks of a leg, over which that error is constant: practically zero."""
 
@@ -46,6 +51,9 @@ class NoiseModel:
     place_arcsec: float = 0.0
     place_deg: float = 0.1
     """Drift over the motor's travel: standard deviation and correlation length."""
+    loop_arcsec: float = 0.0
+    loop_deg: float = 10.0
+    """Misfit of the loop's shape: standard deviation at a turning point, and travel over which it fades."""
 
     def white_variance(self, blocks: Blocks) -> FloatArray:
         """Returns the white variance of each block's mean; infinite for blocks without samples."""
@@ -54,7 +62,7 @@ class NoiseModel:
         return np.asarray(mean + blocks.blur)
 
 
-BEGIN = NoiseModel(1.0, 1.0, 1.0, 10.0, 1.0, 0.3)
+BEGIN = NoiseModel(1.0, 1.0, 1.0, 10.0, 1.0, 0.3, 1.0, 10.0)
 """Initial values of a noise fit; the result does not depend on them."""
 
 
@@ -109,6 +117,17 @@ class _Wanders:
             lambda: _chain(np.where(np.diff(blocks.leg) != 0, np.inf, SAME_LEG), blocks.locked_arcsec),
         )
 
+    def over_branches(self, length_deg: float) -> _Chain:
+        """Returns the misfit of the loop's shape, which fades over each branch and differs between them."""
+
+        def make() -> _Chain:
+            crossed = self._blocks.since_turn_deg / length_deg
+            way = np.maximum(np.abs(np.diff(crossed)) / LOOP_LENGTH, SAME_LEG)
+            fresh = self._fresh | (np.diff(self._blocks.leg) != 0)
+            return _chain(np.where(fresh, np.inf, way), 1.0 / (1.0 + crossed**2))
+
+        return self._once(("loop", length_deg), make)
+
     def _along(self, place: FloatArray, extent: FloatArray, length: float) -> _Chain:
         way = np.maximum(np.abs(np.diff(place)), 1e-9 * length) / length
         return _chain(np.where(self._fresh, np.inf, way), np.sqrt(_averaged(extent / length)))
@@ -160,6 +179,9 @@ class Precision:
         if noise.place_arcsec > 0:
             chains.append(wanders.in_place(noise.place_deg))
             self._loads.append(noise.place_arcsec * chains[-1].load)
+        if noise.loop_arcsec > 0:
+            chains.append(wanders.over_branches(noise.loop_deg))
+            self._loads.append(noise.loop_arcsec * chains[-1].load)
         if np.any(blocks.locked_arcsec):
             chains.append(wanders.over_legs())
             self._loads.append(chains[-1].load)
@@ -233,8 +255,9 @@ def fit_noise(residual: FloatArray, blocks: Blocks, parameters: int, begin: Nois
         standing, moving, *wanders = np.exp(x).tolist()
         return NoiseModel(moving if always else standing, standing if still else moving, *wanders)
 
-    lower = np.log([SMALLEST_ARCSEC, SMALLEST_ARCSEC, SMALLEST_ARCSEC, 0.3, SMALLEST_ARCSEC, 0.01])
-    upper = np.log([1e3, 1e3, 1e3, 600.0, 1e3, 60.0])
+    least, most = SMALLEST_ARCSEC, LARGEST_ARCSEC
+    lower = np.log([least, least, least, 0.3, least, 0.01, least, LOOP_DEG[0]])
+    upper = np.log([most, most, most, 600.0, most, 60.0, most, LOOP_DEG[1]])
 
     wanders = _Wanders(part)
 

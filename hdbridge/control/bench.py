@@ -123,6 +123,7 @@ def axis_view(axis: AxisConfig) -> AxisView:
             limits.acceleration_deg_s2,
             limits.jerk_deg_s3,
         ),
+        abs(axis.motor_encoder.degrees(1)),
     )
 
 
@@ -381,7 +382,7 @@ class Bench:
                 self._place = target_deg
                 if interrupted():
                     raise KeyboardInterrupt
-                if elapsed_s >= duration_s and move.ended(samples):
+                if elapsed_s >= duration_s and move.ended(samples, self.view):
                     return samples
                 elapsed_s += period_s
         finally:

@@ -10,7 +10,7 @@ from support.legs import Leg, measured
 
 from hdbridge.analysis.blocks import make_blocks
 from hdbridge.analysis.identification import outlying, standing_arcsec, usable_samples
-from hdbridge.analysis.noise import NoiseModel, Precision, fit_noise
+from hdbridge.analysis.noise import LOOP_LENGTH, NoiseModel, Precision, fit_noise
 
 
 def blocks_of(count, rng, motor=None, error=None, kind="sweep"):
@@ -25,18 +25,27 @@ def blocks_of(count, rng, motor=None, error=None, kind="sweep"):
 @settings(deadline=None, max_examples=15)
 @given(
     st.floats(0.2, 3.0), st.floats(0.0, 2.0), st.floats(0.5, 50.0), st.floats(0.0, 2.0), st.floats(1.0, 50.0),
-    st.sampled_from([0.0, 0.3]), st.integers(0, 1000),
+    st.sampled_from([0.0, 0.3]), st.sampled_from([0.0, 2.0]), st.integers(0, 1000),
 )  # fmt: skip
-def test_the_banded_inverse_is_the_dense_one(white, slow, slow_s, place, place_deg, locked, seed):
+def test_the_banded_inverse_is_the_dense_one(white, slow, slow_s, place, place_deg, locked, loop, seed):
     rng = np.random.default_rng(seed)
     blocks, _ = blocks_of(40, rng)
     legs = np.sort(rng.integers(0, 5, 40))
-    blocks = replace(blocks, leg=legs, locked_arcsec=locked * rng.uniform(size=40))
-    noise = NoiseModel(white, white, slow, slow_s, place, place_deg)
+    crossed = np.sort(rng.uniform(0.0, 3.0, 40))
+    blocks = replace(
+        blocks, leg=legs, locked_arcsec=locked * rng.uniform(size=40), since_turn_deg=20.0 * crossed
+    )
+    noise = NoiseModel(white, white, slow, slow_s, place, place_deg, loop, 20.0)
     dense = np.diag(noise.white_variance(blocks))
     for size, length, at in ((slow, slow_s, blocks.time_s), (place, place_deg, blocks.travel_deg)):
         dense += size**2 * np.exp(-np.abs(at[:, np.newaxis] - at) / length)
     dense += np.outer(blocks.locked_arcsec, blocks.locked_arcsec) * (legs[:, np.newaxis] == legs)
+    fading = loop / (1.0 + crossed**2)
+    dense += (
+        np.outer(fading, fading)
+        * np.exp(-np.abs(crossed[:, np.newaxis] - crossed) / LOOP_LENGTH)
+        * (legs[:, np.newaxis] == legs)
+    )
     columns = rng.normal(size=(40, 3))
     precision = Precision(noise, blocks)
     assert precision.apply(columns) == pytest.approx(np.linalg.solve(dense, columns), rel=1e-5, abs=1e-6)

@@ -41,7 +41,7 @@ def walk(procedure, error_arcsec=lambda load_deg, direction: 0.0, axis=AXIS):
             place = target
             load = target + error_arcsec(target, direction) / 3600
             reply.append(Sample(clock, target, target * 50, target * 50, load, 0.0))
-            over = clock - began >= path.duration_s and move.ended(reply)
+            over = clock - began >= path.duration_s and move.ended(reply, axis)
             clock += PERIOD
             if over:
                 break
@@ -86,10 +86,12 @@ def test_settle_waits_for_the_load_and_gives_up_at_its_timeout():
         ]
 
     def end(samples):
-        return next(s[-1].time_s for i in range(20, 400) if settle.ended(s := samples[:i]))
+        return next(s[-1].time_s for i in range(20, 400) if settle.ended(s := samples[:i], AXIS))
 
     assert end(creeping(50, 0.4)) == pytest.approx(0.45, abs=0.03)
     assert end(creeping(50, 9.0)) == pytest.approx(1.0, abs=0.01)
+    stuck = [each._replace(motor_position_deg=0.05 * (each.time_s < 0.6)) for each in creeping(0, 0)]
+    assert end(stuck) == pytest.approx(0.66, abs=0.01)
     assert len(settle.window(creeping(0, 0)[:100])) == pytest.approx(0.06 / PERIOD, abs=1)
 
 

@@ -136,7 +136,7 @@ class PlantBench:
         samples = self._follow([way.at(cycle * period_s) for cycle in range(cycles)])
         first_s = float(self._samples[-1]["time_s"][0])
         if isinstance(move, Settle):
-            while not move.ended(samples):
+            while not move.ended(samples, axis_view(self._rig.axis)):
                 samples += self._follow([self._place])
         last_s = float(self._samples[-1]["time_s"][-1])
         self._legs.append(Segment(kind=move.kind, start_s=first_s, end_s=last_s))

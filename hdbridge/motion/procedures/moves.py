@@ -41,6 +41,8 @@ class AxisView:
 
     ratio: float
     limits: MotionLimits
+    motor_count_deg: float = 0.0
+    """Count of the motor encoder."""
 
 
 class Sample(NamedTuple):
@@ -77,7 +79,7 @@ class Move(Protocol):
         """Returns the path from the present load target."""
         ...
 
-    def ended(self, samples: Sequence[Sample]) -> bool:
+    def ended(self, samples: Sequence[Sample], axis: AxisView) -> bool:
         """Returns True to end the leg; called each cycle after the path's duration."""
         ...
 
@@ -98,7 +100,7 @@ class Procedure(Protocol[Outcome]):
 class _Timed:
     """A leg that ends with its path."""
 
-    def ended(self, samples: Sequence[Sample]) -> bool:
+    def ended(self, samples: Sequence[Sample], axis: AxisView) -> bool:
         """Returns True."""
         return True
 
@@ -166,10 +168,12 @@ class Dwell(_Timed):
 
 @dataclass(frozen=True, slots=True)
 class Settle:
-    """Standstill until the load encoder has settled, or until the time-out.
+    """Standstill until motor and load have settled, or until the time-out.
 
-    Settled means that over the last ``window_s`` the means of the two halves agree within ``drift_arcsec``.
-    Means are used instead of extremes, so that encoder noise does not prevent settling.
+    Settled means that over the last ``window_s`` the means of the load's two halves agree within
+    ``drift_arcsec``, and that the mean of the motor is within ``drift_arcsec`` or half a count of its target.
+    Friction can hold a motor beside its target until the servo's integrator releases it. Means are used
+    instead of extremes, so that encoder noise does not prevent settling.
     """
 
     window_s: float = 0.06
@@ -182,7 +186,7 @@ class Settle:
         """Returns a path without motion."""
         return Path(max(self.minimum_s, self.window_s), lambda _: start_deg, start_deg, start_deg)
 
-    def ended(self, samples: Sequence[Sample]) -> bool:
+    def ended(self, samples: Sequence[Sample], axis: AxisView) -> bool:
         """Returns True if the last window is settled, or on time-out."""
         last = samples[-1].time_s
         if last - samples[0].time_s >= self.timeout_s:
@@ -194,7 +198,12 @@ class Settle:
             if last - self.window_s < each.time_s <= last - 0.5 * self.window_s
         ]
         drift = abs(sum(late) / len(late) - sum(early) / len(early)) if early else math.inf
-        return drift * 3600.0 <= self.drift_arcsec
+        if drift * 3600.0 > self.drift_arcsec:
+            return False
+        window = self.window(samples)
+        off_deg = abs(sum(each.motor_position_deg - each.motor_target_deg for each in window)) / len(window)
+        near_deg = max(self.drift_arcsec / 3600.0 * axis.ratio, 0.5 * axis.motor_count_deg)
+        return off_deg <= near_deg + 1e-9
 
     def window(self, samples: Sequence[Sample]) -> Sequence[Sample]:
         """Returns the samples of the last window, measured at rest."""

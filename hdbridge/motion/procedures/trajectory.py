@@ -143,6 +143,6 @@ class Follow:
 
         return Path(count * period_s, at, self._lowest, self._highest)
 
-    def ended(self, samples: Sequence[Sample]) -> bool:
+    def ended(self, samples: Sequence[Sample], axis: AxisView) -> bool:
         """Returns True, because the leg ends with its path."""
         return True

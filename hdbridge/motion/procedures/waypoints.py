@@ -24,7 +24,7 @@ class Hold:
         """Returns a path without motion."""
         return Path(0.0, lambda _: start_deg, start_deg, start_deg)
 
-    def ended(self, samples: Sequence[Sample]) -> bool:
+    def ended(self, samples: Sequence[Sample], axis: AxisView) -> bool:
         """Returns True if the time is over or the axis was released."""
         if not self.begun:
             self.begun, self._since_s = True, samples[0].time_s
