@@ -60,6 +60,7 @@ UNCALIBRATED = (
     "the probabilities are calibrated on bench plans (hdbridge measure); for any other record they may be "
     "too high"
 )
+LOSES = "it does not predict what is left out"
 FIT_FIRST = "none yet: fit a model first (hdbridge fit), then diagnose with it"
 
 
@@ -164,7 +165,6 @@ class _Judge:
         """Turns the result of the search into a diagnosis."""
         estimator, given = self.estimator, self.model.effects
         fitted = self.search.eliminated(fitted, self._stopped, self.considered)
-        fitted = self.search.eliminated(fitted, self._unproven, self.considered)
         fitted = with_measured(self.search, fitted)
         fitted = as_calibrated(estimator, fitted, given)
         judged = self._likely_only(fitted)
@@ -252,18 +252,6 @@ class _Judge:
                 return place, reason
         return None
 
-    def _unproven(self, fitted: Fitted) -> tuple[int, str] | None:
-        """Returns the cause that predicts least of what is left out, if that is nothing."""
-        gains = {}
-        for place in range(len(self.model.effects), len(fitted.hypothesis.effects)):
-            without = self.estimator.fit(fitted.hypothesis.without(place))
-            if (gain := held_out(self.estimator, fitted, without)) is not None:
-                gains[place] = gain
-        place = min(gains, key=lambda each: gains[each].significance, default=-1)
-        if place < 0 or gains[place].predicts:
-            return None
-        return place, f"it does not predict the {gains[place].over} that are left out"
-
     def _likely_only(self, fitted: Fitted) -> _Judged:
         """Judges the findings and removes those that are improbable or normal for any axis.
 
@@ -277,7 +265,8 @@ class _Judge:
             ]
             doubted = [each for each in judged.findings if each not in likely]
             self.considered.extend(
-                f"{each.cause}: more likely something else" + f" (prior: {each.prior})" * bool(each.prior)
+                f"{each.cause}: {'more likely something else' if each.probability else LOSES}"
+                + f" (prior: {each.prior})" * bool(each.prior)
                 for each in doubted
             )
             effects = {id(each.effect) for each in doubted}

@@ -174,6 +174,11 @@ class Finding:
         """True if what is written of it predicts data that were held out better than the model does."""
         return self.gain is not None and self.gain.predicts and not self.left_alone
 
+    @property
+    def refuted(self) -> bool:
+        """True for a cause that does not predict what was left out."""
+        return self.gain is not None and not (self.within or self.gain.predicts)
+
     def refusal(self) -> str:
         """Returns the reason not to offer it as an improvement of the model; empty if there is none."""
         if self.cause == "unexplained":

@@ -53,18 +53,12 @@ class Gain:
         return 1.0 - (self.after_arcsec / max(self.before_arcsec, 1e-12)) ** 2
 
     @property
-    def significance(self) -> float:
-        """Fall of the squares in standard errors, by its scatter between stretches."""
+    def sure(self) -> bool:
+        """True if the squares fall significantly, by their scatter between stretches."""
         fall = self.before_arcsec2 - self.after_arcsec2
         if len(fall) < 2:
-            return 0.0
-        error = float(np.std(fall, ddof=1)) / math.sqrt(len(fall))
-        return float(np.mean(fall)) / max(error, 1e-300)
-
-    @property
-    def sure(self) -> bool:
-        """True if the squares fall significantly."""
-        return self.significance > SURE
+            return False
+        return float(np.mean(fall)) > SURE * float(np.std(fall, ddof=1)) / math.sqrt(len(fall))
 
     @property
     def repeated(self) -> bool:
@@ -91,7 +85,7 @@ class Gain:
 FOLDS = 8
 STRETCHES = 64
 REPEATS = 3
-"""Minimum number of recordings or moves that count as repetitions."""
+"""Minimum number of recordings that count as repetitions."""
 
 
 def repeats(estimator: Estimator) -> tuple[IntArray, str]:
