@@ -9,6 +9,7 @@ from typing import Any, Final
 import numpy as np
 
 from hdbridge.analysis.driving import settling
+from hdbridge.analysis.gain import REPEATS
 from hdbridge.analysis.identification import GENTLE_DEG_S2
 from hdbridge.analysis.prepared import Observed, Samples
 from hdbridge.analysis.scales import Scales
@@ -109,6 +110,7 @@ def capability(
     scales: Scales,
 ) -> Capability:
     """Summarises the identifiability of all causes for a record and a model ``base``."""
+    one_way = scales.one_way_repeated if len(data.full.chains) >= REPEATS else scales.one_way
     subject = {name: CATALOGUE[name].about.subject or name.replace("_", " ") for name in causes}
     subjects = tuple(dict.fromkeys(subject.values()))
     alike: dict[str, list[set[str]]] = {}
@@ -132,7 +134,7 @@ def capability(
         identified=tuple(each for each in subjects if each in separable),
         confused=tuple(sorted(tuple(sorted(each, key=order)) for each in groups)),
         unseen=tuple(each for each in subjects if each not in alike),
-        most=scales.one_way if data.reversals < 2 else scales.surest,
+        most=scales.surest if data.reversals >= 2 else one_way,
     )
 
 

@@ -17,7 +17,7 @@ import numpy as np
 from scipy.sparse.csgraph import connected_components
 
 from hdbridge.analysis.blocks import Blocks, Design, clusters
-from hdbridge.analysis.gain import Gain
+from hdbridge.analysis.gain import RECORDINGS, REPEATS, Gain
 from hdbridge.analysis.identification import (
     KNOWN,
     FitResult,
@@ -181,11 +181,6 @@ def _level(figures: NoiseFigures) -> ResidualTest:
 FOLDS = 4
 STRETCHES = 40
 """Number of stretches of time; each fold takes every fourth."""
-RECORDINGS = "recordings"
-CELL_DEG = 30.0
-SAME_WAY = 0.8
-"""Minimum share of a recording in cells of the motor angle that other recordings also cover, for it to
-count as the same travel."""
 
 
 def held_out(
@@ -197,7 +192,7 @@ def held_out(
     variance of samples within their blocks, which no model of this kind changes.
     """
     design, blocks, active = state.design, state.design.blocks, state.options.active
-    fold, over = folds(design)
+    fold, stretch, over = folds(design)
     written = {place for place, each in enumerate(solution.effects) if not each.violations()}
     shift = [at for at, each in enumerate(solution.columns) if each.effect < 0]
     kept = shift + [at for at, each in enumerate(solution.columns) if each.effect in written]
@@ -224,7 +219,6 @@ def held_out(
         return HeldOut(
             None, None, math.nan, "nothing was held out: there is too little data to leave any out"
         )
-    stretch = blocks.chain if over == RECORDINGS else clusters(blocks, STRETCHES)
     number = len(np.unique(fold[used]))
 
     def gain(left: FloatArray) -> Gain:
@@ -243,13 +237,10 @@ def held_out(
 def gain_of_law(before: tuple[State, Solution], after: tuple[State, Solution]) -> Gain:
     """Compares two laws by what a fit to the other folds leaves of each, with the nuisances refitted."""
     design = before[0].design
-    fold, over = folds(design)
-    blocks, stretch = (
-        design.blocks,
-        design.blocks.chain if over == RECORDINGS else clusters(design.blocks, STRETCHES),
-    )
-    squares = [blocks.count * _left_out(state, solution, fold) ** 2 for state, solution in (before, after)]
-    return Gain(over, int(np.max(fold)) + 1, *sums(np.stack([blocks.count, *squares], axis=1), stretch).T)
+    fold, stretch, over = folds(design)
+    count = design.blocks.count
+    squares = [count * _left_out(state, solution, fold) ** 2 for state, solution in (before, after)]
+    return Gain(over, int(np.max(fold)) + 1, *sums(np.stack([count, *squares], axis=1), stretch).T)
 
 
 def _left_out(state: State, solution: Solution, fold: IntArray) -> FloatArray:
@@ -264,42 +255,28 @@ def _left_out(state: State, solution: Solution, fold: IntArray) -> FloatArray:
     return left
 
 
-def folds(design: Design) -> tuple[IntArray, str]:
-    """Assigns each block to a fold; returns the folds (b,) and a description of what is left out.
+def folds(design: Design) -> tuple[IntArray, IntArray, str]:
+    """Returns the fold and the stretch of each block (b,), and a description of what is left out.
 
     Sweeps are divided by motor turns, every fourth one in both directions. Motion that turns back within a
     motor turn (sines, reversals) is divided by stretches of time, so that no fold holds all reversals: the
-    others would not determine the loop. Several short recordings of the
-    same travel are left out whole: their residual is correlated from one stretch to the next, and neighbours
-    would predict it.
+    others would not determine the loop. Several short recordings of unknown motion are left out whole: their
+    residual is correlated from one stretch to the next, and neighbours would predict it.
     """
     blocks = design.blocks
-    lowest = float(np.min(blocks.motor_deg))
-    turns = float(np.ptp(blocks.motor_deg)) / DEG_PER_TURN
-    by_turn = np.floor((blocks.motor_deg - lowest) / DEG_PER_TURN).astype(np.intp) % FOLDS
-    by_time = clusters(blocks, STRETCHES) % FOLDS
-    if turns < 2 * FOLDS:
-        return (blocks.chain % FOLDS, RECORDINGS) if _alike(design) else (by_time, "stretches of time")
+    turns = (blocks.motor_deg - np.min(blocks.motor_deg)) / DEG_PER_TURN
+    stretch = clusters(blocks, STRETCHES)
+    if np.max(turns) < 2 * FOLDS:
+        if blocks.chain[-1] + 1 >= REPEATS and not np.any(design.samples.among(blocks.kind, KNOWN)):
+            return blocks.chain % FOLDS, blocks.chain, RECORDINGS
+        return stretch % FOLDS, stretch, "stretches of time"
     order = np.argsort(blocks.leg, kind="stable")
     begins = np.flatnonzero(np.diff(blocks.leg[order], prepend=-1))
     angle = blocks.motor_deg[order]
     span_deg = np.maximum.reduceat(angle, begins) - np.minimum.reduceat(angle, begins)
     local = np.isin(blocks.leg, blocks.leg[order][begins][span_deg < DEG_PER_TURN])
     words = "motor turns, and stretches of sines and reversals," if local.any() else "motor turns"
-    return counted(np.where(local, by_time, by_turn)), words
-
-
-def _alike(design: Design) -> bool:
-    """Returns True for recordings of unknown motion that each cover the same travel as the others."""
-    blocks = design.blocks
-    if np.any(design.samples.among(blocks.kind, KNOWN)) or int(blocks.chain[-1]) == 0:
-        return False
-    cell = np.floor(blocks.motor_deg / CELL_DEG).astype(np.intp)
-    for chain in range(int(blocks.chain[-1]) + 1):
-        own = blocks.chain == chain
-        if np.any(own) and np.mean(np.isin(cell[own], cell[~own])) < SAME_WAY:
-            return False
-    return True
+    return counted(np.where(local, stretch, turns.astype(np.intp)) % FOLDS), stretch, words
 
 
 # Result.

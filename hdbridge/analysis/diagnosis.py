@@ -40,9 +40,7 @@ from hdbridge.analysis.search import (
 )
 from hdbridge.analysis.swing import ORDINARY_HZ, seen_swing, settled, without
 from hdbridge.analysis.unexplained import (
-    LESS,
     Rest,
-    does_more,
     is_unexplained,
     many_of_one,
     of_the_loop,
@@ -59,6 +57,11 @@ from hdbridge.records.record import Record
 from hdbridge.records.recording import Recording
 from hdbridge.units import figure
 
+UNCALIBRATED = (
+    "the probabilities are calibrated on bench plans (hdbridge measure); for any other record they may be "
+    "too high"
+)
+LOSES = "it does not predict what is left out"
 FIT_FIRST = "none yet: fit a model first (hdbridge fit), then diagnose with it"
 
 
@@ -163,7 +166,6 @@ class _Judge:
         """Turns the result of the search into a diagnosis."""
         estimator, given = self.estimator, self.model.effects
         fitted = self.search.eliminated(fitted, self._stopped, self.considered)
-        fitted = self.search.eliminated(fitted, self._shadow, self.considered)
         fitted = with_measured(self.search, fitted)
         fitted = as_calibrated(estimator, fitted, given)
         judged = self._likely_only(fitted)
@@ -187,7 +189,10 @@ class _Judge:
             identifiability=visible,
             capability=capability(estimator.data, given, visible, estimator.scales),
             by_kind=self._by_kind(before, after),
-            remarks=(*estimator.data.remarks, *([judged.left.remark] if judged.left.remark else [])),
+            remarks=(
+                *estimator.data.remarks,
+                *filter(None, (judged.left.remark, self._uncalibrated(findings))),
+            ),
             model=extended,
             traces=Traces(
                 measured_arcsec=measured,
@@ -229,6 +234,10 @@ class _Judge:
             self.considered.extend(f"{each.cause}: it cannot be written into the model" for each in missing)
             findings = [each for each in findings if each not in missing]
 
+    def _uncalibrated(self, findings: Sequence[Finding]) -> str:
+        """Returns a remark if the probabilities of the findings were fitted to other records; else empty."""
+        return UNCALIBRATED if findings and len(self.estimator.data.full.kinds) == 1 else ""
+
     def _stopped(self, fitted: Fitted) -> tuple[int, str] | None:
         """Returns the weakest cause that fails its gate, else an implausible or unidentifiable one."""
         places = range(len(self.model.effects), len(fitted.hypothesis.effects))
@@ -244,23 +253,6 @@ class _Judge:
                 return place, reason
         return None
 
-    def _shadow(self, fitted: Fitted) -> tuple[int, str] | None:
-        """Returns the cause with the least effect relative to the residual, if it may be an artefact."""
-        estimator, base = self.estimator, len(self.model.effects)
-        left = replace(rest(estimator, fitted), fast_arcsec=0.0)  # fast residuals cause no artefacts
-        if len(fitted.hypothesis.effects) == base or not is_unexplained(estimator, left):
-            return None
-        share = {
-            place: does_more(estimator, fitted, place)
-            for place, effect in enumerate(fitted.hypothesis.effects[base:], base)
-            # Exempt: spectral lines, which the residual does not resemble, and effects of any normal axis.
-            if not (effect.sought is not None and effect.sought.is_line) and not effect.ordinary_arcsec
-        }
-        place = min(share, key=lambda each: share[each], default=-1)
-        if place < 0 or share[place] > estimator.scales.shadow:
-            return None
-        return place, LESS
-
     def _likely_only(self, fitted: Fitted) -> _Judged:
         """Judges the findings and removes those that are improbable or normal for any axis.
 
@@ -274,7 +266,8 @@ class _Judge:
             ]
             doubted = [each for each in judged.findings if each not in likely]
             self.considered.extend(
-                f"{each.cause}: more likely something else" + f" (prior: {each.prior})" * bool(each.prior)
+                f"{each.cause}: {'more likely something else' if each.probability else LOSES}"
+                + f" (prior: {each.prior})" * bool(each.prior)
                 for each in doubted
             )
             effects = {id(each.effect) for each in doubted}
@@ -308,9 +301,14 @@ class _Judge:
         unknown = is_unexplained(estimator, left) or many_of_one(findings, estimator.scales) is not None
         findings = weighed(findings, Context(left.arcsec, excess, unknown), estimator.scales, self.prior)
         if estimator.data.reversals < 2:  # speed, torque, place and time are correlated
-            most = estimator.scales.one_way
-            findings = [replace(each, probability=min(each.probability, most)) for each in findings]
+            findings = [self._one_way(each) for each in findings]
         return _Judged(fitted, findings, left)
+
+    def _one_way(self, finding: Finding) -> Finding:
+        """Limits the probability of a cause seen in one direction only."""
+        scales, repeated = self.estimator.scales, finding.gain is not None and finding.gain.repeated
+        most = scales.one_way_repeated if repeated else scales.one_way
+        return replace(finding, probability=min(finding.probability, most))
 
     def _finding(self, fitted: Fitted, place: int) -> Finding:
         effect = fitted.hypothesis.effects[place]

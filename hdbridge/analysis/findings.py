@@ -173,7 +173,12 @@ class Finding:
     @property
     def gains(self) -> bool:
         """True if what is written of it predicts data that were held out better than the model does."""
-        return self.gain is not None and self.gain.recovered > 0.0 and not self.left_alone
+        return self.gain is not None and self.gain.predicts and not self.left_alone
+
+    @property
+    def refuted(self) -> bool:
+        """True for a cause that does not predict what was left out."""
+        return self.gain is not None and not (self.within or self.gain.predicts)
 
     def refusal(self) -> str:
         """Returns the reason not to offer it as an improvement of the model; empty if there is none."""
@@ -183,7 +188,7 @@ class Finding:
             return "the record does not distinguish a change of it from " + ", ".join(self.aliases)
         if self.gain is None:
             return "nothing was held out: the record is too short to leave any of it out"
-        if self.gain.recovered <= 0.0:
+        if not self.gain.predicts:
             return (
                 f"no gain on held-out data, {self.gain.before_arcsec:.3g} to {self.gain.after_arcsec:.3g} "
                 "arcsec rms"

@@ -10,10 +10,12 @@ import numpy as np
 from hdbridge.analysis.hypothesis import Estimator, Fitted
 from hdbridge.analysis.linear import counted, of_number, steps_without
 from hdbridge.analysis.noise import White
-from hdbridge.axis.effects import FloatArray
+from hdbridge.axis.effects import FloatArray, IntArray
+from hdbridge.axis.effects.kinematics import direction_of
 
 SURE = 2.0
 """Minimum significance of a gain, standard errors."""
+RECORDINGS = "recordings"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -58,6 +60,16 @@ class Gain:
             return False
         return float(np.mean(fall)) > SURE * float(np.std(fall, ddof=1)) / math.sqrt(len(fall))
 
+    @property
+    def repeated(self) -> bool:
+        """True if each of several recordings, left out whole, is predicted better."""
+        return self.over == RECORDINGS and self.sure
+
+    @property
+    def predicts(self) -> bool:
+        """True if it lowers the error of what was left out; of whole recordings, significantly."""
+        return self.repeated or (self.over != RECORDINGS and self.recovered > 0.0)
+
     def as_dict(self) -> dict[str, float | str]:
         """Returns the entries for the provenance of a model file."""
         return {
@@ -67,24 +79,43 @@ class Gain:
         }
 
 
-# Gain of a finding: whole stretches of time are left out in turn.
+# Gain of a finding: what repeats is left out in turn.
 
 
 FOLDS = 8
 STRETCHES = 64
-OVER = "stretches of time"
+REPEATS = 3
+"""Minimum number of recordings that count as repetitions."""
+
+
+def repeats(estimator: Estimator) -> tuple[IntArray, str]:
+    """Numbers the points (m,) by what repeats: recordings, else moves, else stretches of time; and its name.
+
+    Errors that a repetition shares are no evidence.
+    """
+    points = estimator.data.points
+    begins = np.array([each.rows.start for each in estimator.data.full.chains], dtype=np.intp)
+    if len(begins) >= REPEATS:
+        return counted(np.searchsorted(begins, estimator.data.runs[estimator.index], "right")), RECORDINGS
+    stretch = of_number(estimator.time_s, STRETCHES)
+    moving, direction = points.speed_deg_s != 0.0, direction_of(points.motion)
+    begins = 1 + np.flatnonzero((moving[1:] & ~moving[:-1]) | (np.diff(direction) != 0.0))
+    if len(begins) < FOLDS:
+        return counted(stretch), "stretches of time"
+    move = np.searchsorted(begins, estimator.index, "right")
+    return counted(move * STRETCHES + stretch), "moves"  # a long one in several parts
 
 
 def held_out(estimator: Estimator, fitted: Fitted, without: Fitted) -> Gain | None:
-    """Leaves out stretches in turn; ``without`` is the fit without the effect or the change in question.
+    """Leaves out repetitions in turn; ``without`` is the fit without the effect or the change in question.
 
     None if the record is too short.
     """
     before, after = without.linearised, fitted.linearised
-    stretch = counted(of_number(estimator.time_s, STRETCHES))
+    stretch, over = repeats(estimator)
     fold = stretch % FOLDS
     samples = np.bincount(stretch).astype(np.float64)
-    if len(samples) < FOLDS or len(stretch) - np.max(np.bincount(fold)) < after.columns.shape[1]:
+    if len(samples) < REPEATS or len(stretch) - np.max(np.bincount(fold)) < after.columns.shape[1]:
         return None
     squares = []
     for fit in (before, after):
@@ -93,4 +124,4 @@ def held_out(estimator: Estimator, fitted: Fitted, without: Fitted) -> Gain | No
         for number, step in enumerate(steps):
             left[fold == number] -= fit.columns[fold == number] @ step
         squares.append(np.asarray(np.bincount(stretch, (left / estimator.weight) ** 2), dtype=np.float64))
-    return Gain(OVER, FOLDS, samples, squares[0], squares[1])
+    return Gain(over, int(np.max(fold)) + 1, samples, squares[0], squares[1])

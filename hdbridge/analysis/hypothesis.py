@@ -221,11 +221,14 @@ class Estimator:
         turning, signs = branches(full.motor_deg, start)
         turns = np.array(turning[1:-1], dtype=np.intp)
         count = full.reading.resolution_deg if full.commanded else CHATTER_COUNTS * full.reading.unaided_deg
-        moved = full.motor_deg.copy()
-        moved[turns] += (COUNTS * count + missed_deg(full.motor_deg, turns)) * np.array(signs[:-1])
-        other = replace(full.motion, motor_deg=moved)
-        for each in loops:
-            change += each.predict(other, start) - each.predict(full.motion, start)
+        beyond = (COUNTS * count + missed_deg(full.motor_deg, turns)) * np.array(signs[:-1])
+        later, earlier = full.motor_deg.copy(), full.motor_deg.copy()
+        later[turns] += beyond
+        earlier[turns - 1] = full.motor_deg[turns] + beyond
+        for moved in (later, earlier):
+            motion = replace(full.motion, motor_deg=moved)
+            moved_by = sum(each.predict(motion, start) - each.predict(full.motion, start) for each in loops)
+            change = np.where(np.abs(moved_by) > np.abs(change), moved_by, change)
         return turns, change
 
     def begun(self, effects: Sequence[Effect]) -> FloatArray:

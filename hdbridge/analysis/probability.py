@@ -91,7 +91,8 @@ def weighed(
     for each in findings:
         terms = features(each, largest, context, scales)
         more = prior.log_odds(each.cause, scales) if prior else 0.0
-        likely = min(probability(terms, scales, more), 1.0 if each.gains else UNPROVEN)
+        most = 0.0 if each.refuted else 1.0 if each.gains else UNPROVEN
+        likely = min(probability(terms, scales, more), most)
         found = replace(each, probability=likely, terms=terms)
         weighed.append(prior.narrowed(found) if prior else found)
     return weighed

@@ -94,11 +94,6 @@ class Scales:
     noisy: float = _scale(1.5, "times what a channel's noise costs", 0.0, "that cost is itself estimated")
     # Unexplained residual.
     plain_arcsec: float = _scale(1.0, "arcsec", math.inf, "twice the floor, for a residual without a name")
-    shadow: float = _scale(2.0, "times the square of the residual", 0.0, "a name does more than it misses")
-    episodes: float = _scale(
-        0.1, "share of a record", 0.0, "a residual in a shorter part does not count elsewhere"
-    )
-    acts: float = _scale(0.1, "share of an effect's peak", 0.0, "samples where the effect counts as acting")
     near: float = _scale(
         0.4,
         "share of the largest piece",
@@ -124,6 +119,9 @@ class Scales:
     named_from: float = _scale(0.3, "probability", 0.0, "of the names below it one in eleven was right")
     one_way: float = _scale(
         0.6, "probability", 1.0, "without reversals place, speed, torque and time are aliases"
+    )
+    one_way_repeated: float = _scale(
+        0.8, "probability", 1.0, "of the names in 60 records of four equal moves one way 27 of 33 were right"
     )
 
     def described(self) -> dict[str, dict[str, float | str]]:

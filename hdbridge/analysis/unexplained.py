@@ -34,9 +34,6 @@ FEW = 50
 """Minimum number of points for a statement about a record."""
 TAIL = 3.0
 """Travel after a reversal, in widths of a loop, after which even a gradual memory has faded."""
-LESS = "does less than what is left unexplained"
-EPISODES = 30
-"""Number of stretches in which the residual is compared, to see if it is present everywhere."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -133,32 +130,6 @@ def of_the_loop(estimator: Estimator, left: Rest) -> bool:
     return not left.seen and bool(left.apart_arcsec <= most)
 
 
-def does_more(estimator: Estimator, fitted: Fitted, place: int) -> float:
-    """Returns the squares that an effect explains where it acts, relative to those of the residual there.
-
-    It acts where it exceeds a share of its maximum. The tenth of the record with the largest residual is
-    ignored, because a residual in one episode (say, small swings of a motor that sticks at reversals) does
-    not cast doubt on an effect seen everywhere else. Without reversals an episode is a place, and all points
-    count.
-    """
-    effect, weight, scales = fitted.hypothesis.effects[place], estimator.weight, estimator.scales
-    residual = fitted.residual / weight
-    values = estimator.columns(effect, fitted.hypothesis.start) @ effect.coefficients()
-    values = np.abs(values - np.median(values))
-    rows = values > scales.acts * float(np.quantile(values, 1.0 - estimator.rare))
-    if estimator.data.reversals >= 2:
-        number = np.floor(EPISODES * np.arange(len(residual)) / len(residual)).astype(np.intp)
-        most = np.argsort(np.bincount(number, fitted.residual**2))[
-            -round(float(scales.episodes) * EPISODES) :
-        ]
-        apart = ~np.isin(number, most)
-        if np.any(rows & apart):
-            rows &= apart
-    without = estimator.fit(fitted.hypothesis.without(place)).residual[rows] / weight[rows]
-    does = float(np.mean(without**2) - np.mean(residual[rows] ** 2))
-    return does / max(beyond_noise(estimator, residual, rows) ** 2, 1e-12)
-
-
 def beyond_noise(estimator: Estimator, residual: FloatArray, rows: BoolArray | slice = slice(None)) -> float:
     """Returns the root mean square over blocks of `BLOCK_S`, less the share of white noise, arcsec."""
     mean, white = _blocks(estimator, residual, rows)
@@ -218,7 +189,8 @@ def _seen(
     scales, start, weight = estimator.scales, fitted.hypothesis.start, estimator.weight[rows]
     count_arcsec = estimator.count_arcsec
     gain = scales.enter + scales.penalty
-    peak = max(count_arcsec, math.hypot(scales.plain_arcsec, 0.5 * _angle_step_arcsec(estimator)))
+    half_steps = 0.5 * _angle_step_arcsec(estimator), 0.5 * estimator.data.load_count_arcsec
+    peak = max(count_arcsec, math.hypot(scales.plain_arcsec, *half_steps))
     laws = [each for each in fitted.hypothesis.effects if each.part is None]
     for law in laws:  # the larger its contribution, the larger the error of its formula
         does = estimator.columns(law, start)[rows] @ law.coefficients()
