@@ -24,7 +24,7 @@ from hdbridge.axis.effects import BoolArray, FloatArray, IntArray, Motion, Start
 from hdbridge.errors import InputError
 from hdbridge.records.record import OPTIONAL, REQUIRED, Record
 from hdbridge.records.recording import Segment
-from hdbridge.units import ARCSEC_PER_DEG
+from hdbridge.units import ARCSEC_PER_DEG, DEG_PER_TURN
 
 SEGMENTS = (128, 64, 32)
 """Segment lengths of the spectrum, samples. The longest with enough segments is used, because its lines
@@ -364,7 +364,7 @@ def gather(
             f"at least {LEAST_SAMPLES}: record more"
         )
     prepared = observed(record, ratio)
-    record = prepared.record
+    origin, record = record.origin, prepared.record
     time = record.time_s
     part_of = np.repeat(np.arange(len(record.starts)), np.diff([*record.starts, len(time)]))
     zero = part_of if independent_zeros else np.zeros_like(part_of)
@@ -381,6 +381,9 @@ def gather(
         remarks.append("no standstill: the noise is taken from differences of neighbouring samples")
     if turns < 2:
         remarks.append("hardly a reversal: hysteresis and all that depends on direction cannot be seen")
+    span = float(np.ptp(record.motor_position_deg))
+    if origin is not None and "motor" not in origin.stated and span < 2.0 * DEG_PER_TURN:
+        remarks.append(f"the motor's angle spans {span:.3g}: too little to check that it is not in radians")
     usable = ~settling(full.of_kind(*ON_THE_WAY) & ~still, time)
     full = replace(full, usable=usable if np.mean(usable) >= LEAST_SETTLED else np.ones_like(usable))
     steps = np.diff(time)

@@ -54,10 +54,18 @@ def test_the_columns_are_those_of_the_contract(whole):
             assert pq.read_schema(part).names == list(columns)
 
 
-def test_an_interrupted_run_resumes_and_ends_with_the_same_bytes(fleet, scheduler, whole, tmp_path):
+def test_an_interrupted_run_resumes_and_ends_with_the_same_bytes(
+    fleet, scheduler, whole, tmp_path, monkeypatch
+):
+    monkeypatch.setattr("hdbridge.fleet.engine.INCREMENT_S", 0.0)
     seen = []
+
+    def progress(now):
+        seen.append(now)
+        assert len(Dataset(tmp_path).recordings()) == now.done  # even kill -9 loses nothing
+
     with pytest.raises(KeyboardInterrupt):
-        go(fleet, tmp_path, scheduler, progress=seen.append, interrupted=lambda: bool(seen))
+        go(fleet, tmp_path, scheduler, progress=progress, interrupted=lambda: bool(seen))
     assert 1 <= len(Dataset(tmp_path).recordings()) < 12
     end = go(fleet, tmp_path, scheduler)
     assert end.known >= 1

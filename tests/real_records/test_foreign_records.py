@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from typer.testing import CliRunner
 
 from hdbridge.analysis.checks import check_records
+from hdbridge.analysis.prepared import gather
 from hdbridge.cli import app
 from hdbridge.errors import InputError
 from hdbridge.files import csvfile
@@ -408,6 +409,18 @@ def test_angles_are_taken_for_radians_only_if_they_are(tmp_path: Path, step_deg:
         path.write_text(text(0.02 * np.arange(len(motor)), in_unit(motor), in_unit(load)))
         with error:
             check_records({path: Record.read_csv(path)}, RATIO)
+
+
+@pytest.mark.parametrize(
+    ("turns", "units", "remarked"), [(1.0, None, 1), (1.0, "motor=deg", 0), (4.0, None, 0)]
+)
+def test_too_short_a_travel_to_know_radians_is_remarked(
+    tmp_path: Path, turns: float, units: str | None, remarked: int
+) -> None:
+    path = tmp_path / "bench.csv"
+    path.write_text(text(motor=MOTOR * turns / 4.0, load=MOTOR * turns / 4.0 / RATIO))
+    remarks = gather(Record.read_csv(path, units=units), RATIO).remarks
+    assert sum("not in radians" in each for each in remarks) == remarked
 
 
 def test_a_wrapping_clock_is_reported_with_its_period(tmp_path: Path) -> None:
