@@ -5,8 +5,6 @@ in the changelog. Each is loaded on first use, so importing hdbridge costs nothi
 without notice.
 """
 
-from __future__ import annotations
-
 import sys
 from importlib import import_module
 from types import MappingProxyType, ModuleType

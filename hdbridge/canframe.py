@@ -1,7 +1,5 @@
 """CAN message of the control cycle, cheap to create and to copy, for both ends of the bus."""
 
-from __future__ import annotations
-
 import can
 from can.typechecking import Channel
 

@@ -1,7 +1,5 @@
 """Common strictness of all models of files and of their parts."""
 
-from __future__ import annotations
-
 from pydantic import BaseModel, ConfigDict
 
 

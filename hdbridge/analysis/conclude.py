@@ -267,8 +267,9 @@ def _left_out(state: State, solution: Solution, fold: IntArray) -> FloatArray:
 def folds(design: Design) -> tuple[IntArray, str]:
     """Assigns each block to a fold; returns the folds (b,) and a description of what is left out.
 
-    Sweeps are divided by motor turns, every fourth one in both directions. Local motions (sines, reversals)
-    are divided by stretches of time, so that no fold holds all reversals. Several short recordings of the
+    Sweeps are divided by motor turns, every fourth one in both directions. Motion that turns back within a
+    motor turn (sines, reversals) is divided by stretches of time, so that no fold holds all reversals: the
+    others would not determine the loop. Several short recordings of the
     same travel are left out whole: their residual is correlated from one stretch to the next, and neighbours
     would predict it.
     """
@@ -279,7 +280,11 @@ def folds(design: Design) -> tuple[IntArray, str]:
     by_time = clusters(blocks, STRETCHES) % FOLDS
     if turns < 2 * FOLDS:
         return (blocks.chain % FOLDS, RECORDINGS) if _alike(design) else (by_time, "stretches of time")
-    local = design.samples.among(blocks.kind, ("sine", "reversal"))
+    order = np.argsort(blocks.leg, kind="stable")
+    begins = np.flatnonzero(np.diff(blocks.leg[order], prepend=-1))
+    angle = blocks.motor_deg[order]
+    span_deg = np.maximum.reduceat(angle, begins) - np.minimum.reduceat(angle, begins)
+    local = np.isin(blocks.leg, blocks.leg[order][begins][span_deg < DEG_PER_TURN])
     words = "motor turns, and stretches of sines and reversals," if local.any() else "motor turns"
     return counted(np.where(local, by_time, by_turn)), words
 

@@ -296,7 +296,8 @@ class Diagnosis:
     def _found(self) -> str:
         if not self.findings:
             return (
-                "Nothing found: the model differs from the measurement by no more than noise and calibration."
+                f"Nothing found: the model is off by {self.baseline.rms_arcsec:.3g} arcsec rms, which noise, "
+                "calibration and the unknown motion before the record can explain."
             )
         words = []
         for each in self.findings:

@@ -4,8 +4,6 @@ Each is an object of the drive that arrives by PDO, with its unit, its plausible
 the last reading is held. `hdbridge.drive.channels` follows them on line.
 """
 
-from __future__ import annotations
-
 from typing import TYPE_CHECKING, Annotated, Final, Literal, NamedTuple, Self
 
 from pydantic import Field, create_model, model_validator

@@ -4,8 +4,6 @@
 checked before anything moves; an error names file, line and column.
 """
 
-from __future__ import annotations
-
 import math
 from decimal import Decimal
 from ipaddress import ip_address

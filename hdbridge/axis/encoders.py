@@ -1,7 +1,5 @@
 """Encoders of the axis file: their scaling, and the source of the load encoder's reading."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Annotated, ClassVar, Final, Literal, Self
 

@@ -6,8 +6,6 @@ are printed); 7 the daemon cannot be reached, or refuses this client now; 130 Ct
 the record kept).
 """
 
-from __future__ import annotations
-
 import errno
 import io
 import os

@@ -118,9 +118,9 @@ def command(
         return
     od = None
     if profile is not None and machine_file(profile) is not None:
-        config, settings = gateway_axis(profile, axis)
+        config, settings, model = gateway_axis(profile, axis)
         opened, node_id = bare_bus(settings.bus, force=force), settings.nodes[config.name]
-        od = eds_of(config, settings) if eds is None else None
+        od = eds_of(config, settings, model) if eds is None else None
     elif profile is not None:
         session = Session(profile, simulate, truth, seed, interface, channel, force, borrow)
         config, opened = session.axis, session.connected()

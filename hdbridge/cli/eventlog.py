@@ -4,8 +4,6 @@ The library reports events through `logging`: a name and a dictionary of facts. 
 control cycle; its events are logged when the axis is at rest.
 """
 
-from __future__ import annotations
-
 import logging
 from pathlib import Path
 

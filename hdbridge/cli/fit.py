@@ -1,7 +1,5 @@
 """``hdbridge fit``: a model from recordings alone, hdbridge's own or any CSV files."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
 

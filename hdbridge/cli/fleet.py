@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cache, cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final
 
@@ -144,7 +144,12 @@ class Fleet:
         from hdbridge.fleet.sources import find_sources
 
         return find_sources(
-            self.sources or [], self.manifest, stored, may_be_empty=may_be_empty, timeout_s=self.timeout_s
+            self.sources or [],
+            self.manifest,
+            stored,
+            may_be_empty=may_be_empty,
+            timeout_s=self.timeout_s,
+            report=_note_once,
         )
 
     def diagnose(
@@ -362,6 +367,10 @@ def _with_pages(folder: Path, latest: Mapping[str, Row], wanted: Collection[str]
                     note(f"no page of {each}: {problem}")
         there = links(folder, latest)
     return there
+
+
+_note_once = cache(note)
+"""Prints a remark the first time only, because `watch` reads the manifest again and again."""
 
 
 def _check_memory(text: str) -> None:

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from canopen.objectdictionary import ObjectDictionary
 
     from hdbridge.axis import AxisConfig
+    from hdbridge.axis.model import TransmissionModel
     from hdbridge.daemon.machinefile import GatewaySettings
     from hdbridge.drive.link import Frame
 
@@ -55,9 +56,9 @@ def doctor(
     from hdbridge.daemon.gateway.trace import Trace
 
     logged = None if log is None else _begun(_logged(log))
-    config, settings = gateway_axis(machine, axis)
+    config, settings, model = gateway_axis(machine, axis)
     node_id = settings.nodes[config.name]
-    trace = Trace(node_id, eds_of(config, settings))
+    trace = Trace(node_id, eds_of(config, settings, model))
     rows: list[dict[str, Any]] = []
     begun_s: float | None = None
     frames = logged if logged is not None else _heard(settings, duration_s)
@@ -88,13 +89,13 @@ def doctor(
         )
 
 
-def eds_of(axis: AxisConfig, settings: GatewaySettings) -> ObjectDictionary:
+def eds_of(axis: AxisConfig, settings: GatewaySettings, model: TransmissionModel) -> ObjectDictionary:
     """The object dictionary of a gateway axis, read from its EDS as another master does."""
     from hdbridge.daemon.gateway.objects import write_eds
     from hdbridge.files.edsfile import read_eds
 
     with TemporaryDirectory(prefix="hdbridge-gateway-") as folder:
-        return read_eds(write_eds(Path(folder), axis, settings), settings.nodes[axis.name]).dictionary
+        return read_eds(write_eds(Path(folder), axis, settings, model), settings.nodes[axis.name]).dictionary
 
 
 def _heard(settings: GatewaySettings, duration_s: float) -> Iterator[Frame]:
@@ -129,8 +130,11 @@ def _logged(path: Path) -> Iterator[Frame]:
         note(f"{path}: {problem}")
 
 
-def gateway_axis(machine: str, name: str | None) -> tuple[AxisConfig, GatewaySettings]:
-    """An axis of a machine's gateway, and the gateway; InputError if it has none, or the name is needed."""
+def gateway_axis(machine: str, name: str | None) -> tuple[AxisConfig, GatewaySettings, TransmissionModel]:
+    """An axis of a machine's gateway, the gateway, and the axis's model.
+
+    InputError if the machine has no gateway, or the name is needed.
+    """
     from hdbridge.daemon.machine import Machine
 
     found = Machine.find(machine)
@@ -145,7 +149,8 @@ def gateway_axis(machine: str, name: str | None) -> tuple[AxisConfig, GatewaySet
         )
     if name is not None and name not in names:
         raise InputError(f"--axis {name}: is not in the gateway; expected one of: {', '.join(names)}")
-    return found.axis(name or names[0]).config, found.gateway
+    axis = found.axis(name or names[0])
+    return axis.config, found.gateway, axis.model()
 
 
 COMMANDS: Final = {"eds": eds, "doctor": doctor}

@@ -1,7 +1,5 @@
 """``hdbridge home``: homing by the drive."""
 
-from __future__ import annotations
-
 from hdbridge.cli.options import (
     AccelerationOption,
     HomingMethodOption,

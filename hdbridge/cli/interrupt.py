@@ -1,7 +1,5 @@
 """Ctrl-C requests a controlled stop: the control cycle ends its period and stops the axis first."""
 
-from __future__ import annotations
-
 import signal
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager

@@ -1,7 +1,5 @@
 """``hdbridge measure``: a recording of an axis by a plan, without a fit."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
 

@@ -1,7 +1,5 @@
 """``hdbridge model``: the history of an axis's model or twin: look, compare, commit, go back."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from datetime import datetime
 from pathlib import Path

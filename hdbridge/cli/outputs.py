@@ -4,8 +4,6 @@ An option that writes carries its `Kind` in its annotation, `Annotated[Path | No
 Kind.JSON]`. Every other file or folder that a command is given counts as an input.
 """
 
-from __future__ import annotations
-
 import functools
 import inspect
 import typing

@@ -1,7 +1,5 @@
 """Replacement of characters that the output encoding cannot represent."""
 
-from __future__ import annotations
-
 import codecs
 from typing import Final
 

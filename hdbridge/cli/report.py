@@ -1,7 +1,5 @@
 """``hdbridge report``: the report of a calibration, again from its recording."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
 

@@ -1,7 +1,5 @@
 """``hdbridge reset``: resets a fault of the drive."""
 
-from __future__ import annotations
-
 from hdbridge.cli.options import JsonOption, say, write_json
 from hdbridge.cli.session import Session, on_axis
 

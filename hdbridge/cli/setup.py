@@ -1,7 +1,5 @@
 """``hdbridge setup``: from a wired drive to a compensated axis, by a sequence of ordinary commands."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import re

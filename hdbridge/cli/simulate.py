@@ -137,14 +137,14 @@ def _ideal(machine: str, name: str | None) -> tuple[str, BusConfig, Maker]:
     from hdbridge.daemon.gateway.slave import BEHAVIOUR
     from hdbridge.device.node import DriveNode
 
-    axis, settings = gateway_axis(machine, name)
+    axis, settings, model = gateway_axis(machine, name)
 
     def make(bus: can.BusABC, clock: Clock, folder: Path) -> DriveNode:
         plate = nameplate(axis, settings)
         plant = IdealAxis(axis.gear.ratio * plate.load_counts_per_turn / plate.motor_counts_per_turn)
         return DriveNode(
-            bus, plant, write_eds(folder, axis, settings), settings.nodes[axis.name], clock, plate, BEHAVIOUR,
-            bit_rate_bps=settings.bus.bitrate_bps,
+            bus, plant, write_eds(folder, axis, settings, model), settings.nodes[axis.name], clock, plate,
+            BEHAVIOUR, bit_rate_bps=settings.bus.bitrate_bps,
         )  # fmt: skip
 
     return "ideal", settings.bus, make

@@ -1,7 +1,5 @@
 """Refused command lines, reported in the one-line form of every hdbridge error."""
 
-from __future__ import annotations
-
 import errno
 import math
 import os

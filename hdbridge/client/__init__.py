@@ -4,8 +4,6 @@ Imports nothing of the daemon. `messages` needs only pydantic, the clients the e
 they are imported on first use.
 """
 
-from __future__ import annotations
-
 from importlib import import_module
 from typing import TYPE_CHECKING, Any, Final
 

@@ -1,7 +1,5 @@
 """Address of a daemon, and its discovery: a single daemon on this computer needs no address."""
 
-from __future__ import annotations
-
 import os
 import re
 import socket

@@ -4,8 +4,6 @@ A ``moving`` call requires the lease. A call that ``waits`` is answered when a m
 time-out: the daemon's supervision bounds it.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final, Generic, TypeVar

@@ -1,7 +1,5 @@
 """WebSockets of both clients: settings, messages, and the errors for their failures."""
 
-from __future__ import annotations
-
 import ssl
 from collections.abc import Iterable
 from typing import Any, Final

@@ -1,14 +1,12 @@
 """HTTP transport of both clients: settings, requests, and the errors for its failures."""
 
-from __future__ import annotations
-
 import asyncio
 import select
 import ssl
 import threading
 import time
 from collections.abc import Callable
-from typing import Any, TypeVar
+from typing import Any, Self, TypeVar
 
 import httpx
 
@@ -31,7 +29,7 @@ class TlsSocket(ssl.SSLSocket):
     _calls: threading.Lock
     _timeout_s: float | None
 
-    def __new__(cls, *arguments: Any, **options: Any) -> TlsSocket:
+    def __new__(cls, *arguments: Any, **options: Any) -> Self:
         made = super().__new__(cls, *arguments, **options)
         made._calls, made._timeout_s = threading.Lock(), None
         return made

@@ -1,7 +1,5 @@
 """Checks of the EDS against the node: objects, types, access, limits, defaults, PDO mapping."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from typing import Final
 

@@ -1,7 +1,5 @@
 """Checks of CiA 402 that need no power: objects, units, modes, and the states up to *ready to switch on*."""
 
-from __future__ import annotations
-
 import struct
 from typing import Final
 

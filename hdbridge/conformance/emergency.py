@@ -1,7 +1,5 @@
 """Checks of EMCY, the error objects, stored parameters and identity."""
 
-from __future__ import annotations
-
 import struct
 from typing import Final
 

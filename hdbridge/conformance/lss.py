@@ -3,8 +3,6 @@
 Only the node with the identity in 1018h is selected, so no other node on the bus takes a command.
 """
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Callable
 from typing import Final

@@ -1,7 +1,5 @@
 """Checks of CiA 402 with power: states, options, moves, cyclic targets, homing; the axis moves a little."""
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Callable
 from typing import Final

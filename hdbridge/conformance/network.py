@@ -1,7 +1,5 @@
 """Checks of network management: NMT, boot-up, heartbeat, node guarding."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from itertools import pairwise
 from statistics import median

@@ -1,7 +1,5 @@
 """Checks of PDOs and SYNC: communication and mapping parameters, transmission types, timers, reception."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from itertools import pairwise
 from statistics import median

@@ -1,7 +1,5 @@
 """Checks of SDO: expedited, segmented and block transfers, and requests that a server must refuse."""
 
-from __future__ import annotations
-
 import struct
 from binascii import crc_hqx
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """The suite: all checks in their order, and the run."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 

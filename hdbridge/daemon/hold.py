@@ -1,7 +1,5 @@
 """Creation of a daemon: log, lock, sockets and shared memory, which outlive its processes, and the keeper."""
 
-from __future__ import annotations
-
 import os
 import secrets
 import socket

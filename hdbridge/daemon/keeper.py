@@ -20,8 +20,6 @@ If a child cannot start (the bus cannot be opened, a folder cannot be written), 
 child's exit status.
 """
 
-from __future__ import annotations
-
 import logging
 import os
 import selectors

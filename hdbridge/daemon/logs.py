@@ -4,8 +4,6 @@ Each process logs to standard error, which under systemd is the journal, and wit
 control process logs how it starts, and nothing while the loop turns.
 """
 
-from __future__ import annotations
-
 import logging
 import os
 import sys

@@ -4,8 +4,6 @@
 once and passes it to the other processes, so edits of a file take effect at the next start.
 """
 
-from __future__ import annotations
-
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass, replace

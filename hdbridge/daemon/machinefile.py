@@ -4,8 +4,6 @@ A user writes ``machine.yaml``; the program never changes it. `hdbridge.daemon.m
 the profiles that it names.
 """
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 from typing import Annotated, Literal

@@ -4,8 +4,6 @@ It assembles bridge, API, recorder, watch, adaptation and log, and ends them in 
 blocking work runs in threads. If it dies, the axes complete the commands they have.
 """
 
-from __future__ import annotations
-
 import asyncio
 import os
 import signal

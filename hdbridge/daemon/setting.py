@@ -1,7 +1,5 @@
 """Compensation setting of an axis, as sent by the service to the control process."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Choices that CiA 301 and CiA 402 leave to a drive's firmware, and that real drives make differently."""
 
-from __future__ import annotations
-
 from enum import Enum
 
 from pydantic import Field

@@ -6,8 +6,6 @@ PDO mappings are compiled from entries once (``pdo.py``), so the cyclic path onl
 calls bound functions.
 """
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Callable, Iterator
 from enum import IntEnum

@@ -1,7 +1,5 @@
 """Errors of the simulated drive: active errors, error register, history and EMCY messages."""
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Callable
 from enum import IntEnum

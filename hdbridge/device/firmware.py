@@ -4,8 +4,6 @@ The node calls ``advance`` once per period, and ``control`` through the controlw
 goes through the dictionary. The firmware reads no clock: it adds up the periods.
 """
 
-from __future__ import annotations
-
 from typing import Final
 
 from hdbridge.device.behaviour import Behaviour, Controlword

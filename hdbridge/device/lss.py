@@ -4,8 +4,6 @@ It does no I/O and changes nothing that is in use: a new node id is pending unti
 communication, so no command of the LSS master disturbs an axis in operation.
 """
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Callable
 from typing import Final

@@ -4,8 +4,6 @@ A mode turns set-points into the demand of the next period. Power states, stoppi
 firmware's.
 """
 
-from __future__ import annotations
-
 import math
 from typing import ClassVar, Final
 

@@ -4,8 +4,6 @@ The plant counts without bound and knows no home; the user has int32 positions w
 All motion is computed in the plant's counts; int32 appears only when objects are read or written.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Final, Protocol
 

@@ -1,7 +1,5 @@
 """Data that distinguish simulated drives: serial number, encoders, gear, rated torque."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Final
 

@@ -1,7 +1,5 @@
 """NMT states and commands, as CiA 301 numbers them."""
 
-from __future__ import annotations
-
 from enum import IntEnum
 
 

@@ -7,8 +7,6 @@ Before the first SYNC, and when SYNC is missing for one and a half periods, the 
 so a drive without a master can still stop. Single-threaded: everything happens inside ``poll``.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Stored parameters (1010h, 1011h): a master's configuration survives a reset, and with a file power-off."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable, Iterator
 from contextlib import suppress

@@ -4,8 +4,6 @@ Each PDO guards its communication and mapping parameters in the dictionary. When
 is compiled to one ``struct`` and the bound readers or writers; a cycle only calls those.
 """
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Callable, Sequence
 from functools import partial

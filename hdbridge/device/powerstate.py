@@ -3,8 +3,6 @@
 Written from the profile, independently of the master's table, so that one checks the other.
 """
 
-from __future__ import annotations
-
 from enum import Enum, IntEnum
 from typing import Final
 

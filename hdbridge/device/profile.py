@@ -1,7 +1,5 @@
 """Trapezoidal velocity profiles of the moves and stops that the simulated drive generates."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

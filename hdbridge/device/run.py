@@ -1,7 +1,5 @@
 """Runs nodes in real time on any bus: one thread waits for a frame or the next event of a node."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from typing import Final, Protocol

@@ -3,8 +3,6 @@
 It does no I/O: the node passes eight data bytes and sends the answers that are returned.
 """
 
-from __future__ import annotations
-
 import struct
 from binascii import crc_hqx
 from enum import Enum, IntEnum

@@ -1,7 +1,5 @@
 """Time and period of SYNC without its reception jitter."""
 
-from __future__ import annotations
-
 from typing import Final
 
 LONGEST_PERIOD_S: Final = 1.0

@@ -1,7 +1,5 @@
 """Fits the boot-up's writes to a drive: objects that its EDS lacks or fixes are left to the drive. Pure."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 

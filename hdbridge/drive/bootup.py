@@ -5,8 +5,6 @@ written and read back afterwards. The first mismatch ends the boot-up with an er
 unless the object may be left to the drive.
 """
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Iterable
 from dataclasses import dataclass, field

@@ -10,8 +10,6 @@ Refuted, revisited and revised. Real-Time Systems 35 (2007) 239-272). g counts t
 the checksum that are subject to stuffing; the other 13 are not.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from typing import Final
 

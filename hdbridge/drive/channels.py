@@ -6,8 +6,6 @@ reading is held for the time given in the axis file. After that the channel is l
 readings return.
 """
 
-from __future__ import annotations
-
 from hdbridge.axis.channels import BY_KEY, MeasuredChannel
 from hdbridge.drive.objects import IntegerType
 from hdbridge.drive.supervision import Fault

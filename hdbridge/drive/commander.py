@@ -4,8 +4,6 @@ While it waits it keeps up the master's duties: it processes heartbeats and emer
 own heartbeat, without which the drive stops.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from itertools import pairwise
 from typing import Final

@@ -1,7 +1,5 @@
 """The drive's object dictionary according to its EDS: objects, types and values."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Final
 

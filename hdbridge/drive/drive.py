@@ -9,8 +9,6 @@ For the control cycle, `enable()` prepares everything and hands over to ``image.
 the states by PDO, while SYNC and set-points are already running.
 """
 
-from __future__ import annotations
-
 import logging
 from contextlib import suppress
 from types import TracebackType

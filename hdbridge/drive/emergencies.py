@@ -4,8 +4,6 @@ A table and one look-up: the name of the code if the profiles define it, else th
 digits.
 """
 
-from __future__ import annotations
-
 from typing import Final
 
 HEARTBEAT_LOST: Final = 0x8130

@@ -6,8 +6,6 @@ messages are copied by their constructor instead of the general deep copy that p
 for each receiver.
 """
 
-from __future__ import annotations
-
 import select
 import socket
 import struct

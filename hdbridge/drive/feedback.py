@@ -1,7 +1,5 @@
 """Measurements of one control cycle. Data only."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 

@@ -1,7 +1,5 @@
 """Gain objects of the servo: the CiA-402 parameter sets of its loops, if the drive has them."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Final
 

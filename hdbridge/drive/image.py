@@ -4,8 +4,6 @@
 cycle packs and unpacks with it.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterable, Sequence
 from typing import Final

@@ -1,7 +1,5 @@
 """One master per CAN interface and computer: a lock that ends with the process that holds it."""
 
-from __future__ import annotations
-
 import os
 import re
 import tempfile

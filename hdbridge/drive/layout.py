@@ -13,8 +13,6 @@ PDOs. Position demand and torque are left out if the drive cannot send them. A l
 id sends its TPDO1.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator, Sequence
 from typing import Final, NamedTuple
 

@@ -5,8 +5,6 @@ becomes a `BusError` that names it, frames that CANopen does not use are dropped
 deadline is on the monotonic clock that was passed in.
 """
 
-from __future__ import annotations
-
 import errno
 import logging
 import os

@@ -6,8 +6,6 @@ those that would stop the axis while this master runs: SYNC, NMT commands, the h
 set-points.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Callable, Container
 from typing import Final

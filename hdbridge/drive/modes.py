@@ -4,13 +4,11 @@ Each is a handshake of controlword and statusword bits defined in CiA 402-2. A m
 long ends with a quick stop.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from itertools import count
-from typing import Final
+from typing import Final, Self
 
 from hdbridge.axis import AxisConfig
 from hdbridge.drive import objects
@@ -71,7 +69,7 @@ class ProfileMove:
         velocity_deg_s: float | None,
         acceleration_deg_s2: float | None,
         timeout_s: float | None,
-    ) -> ProfileMove:
+    ) -> Self:
         """Builds a move; angles, speeds and accelerations are at the load and default to the axis's limits.
 
         Raises `InputError` if a value is not finite or outside the limits. Without ``timeout_s`` the time-out
@@ -123,7 +121,7 @@ class Homing:
         acceleration_deg_s2: float | None,
         offset_deg: float,
         timeout_s: float,
-    ) -> Homing:
+    ) -> Self:
         """Builds a homing run, with defaults from the axis's limits.
 
         Raises `InputError` if a value is not finite or beyond the limits.

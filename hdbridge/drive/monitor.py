@@ -4,8 +4,6 @@ Bookkeeping only; nothing is decided here. Every receiver passes its frames on t
 heartbeat that arrives during an SDO transfer is not lost.
 """
 
-from __future__ import annotations
-
 from collections import deque
 from dataclasses import dataclass, field
 from typing import Final, NamedTuple

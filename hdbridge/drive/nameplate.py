@@ -4,8 +4,6 @@ Every difference is a line of text: the key of the axis file, its value, and the
 refuses the drive with the first one; the bring-up shows them all.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from fractions import Fraction
 from typing import Final

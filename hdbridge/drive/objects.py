@@ -4,11 +4,9 @@ Everything is keyed by (index, sub-index). If the EDS of a drive gives an object
 does, the EDS wins, because the drive answers according to it.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from enum import Enum, IntEnum
-from typing import Final, NamedTuple
+from typing import Final, NamedTuple, Self
 
 from hdbridge.errors import InputError
 
@@ -56,7 +54,7 @@ class IntegerType(Enum):
         return int.from_bytes(data, "little", signed=self.signed)
 
     @classmethod
-    def named(cls, name: object) -> IntegerType:
+    def named(cls, name: object) -> Self:
         """Returns the type with a name ("int32") or an equivalent member of another string enum.
 
         Raises `InputError` for an unknown name.

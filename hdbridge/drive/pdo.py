@@ -5,11 +5,10 @@ length is rejected as a whole, and only integers within the range of their type 
 an out-of-range target never reach the bus.
 """
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from typing import Self
 
 from hdbridge.drive.objects import Address, IntegerType
 from hdbridge.errors import DriveError, InputError
@@ -43,7 +42,7 @@ class PdoEntry:
     type: IntegerType
 
     @classmethod
-    def of(cls, address: Address) -> PdoEntry:
+    def of(cls, address: Address) -> Self:
         """Returns the entry that maps a known object."""
         return cls(address.index, address.sub, address.type)
 

@@ -5,10 +5,8 @@ kept, so that one glitch costs one cycle. The drive's following error is checked
 itself (6065h and 6066h).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, Self
 
 from hdbridge.axis import AxisConfig
 from hdbridge.units import ARCSEC_PER_DEG
@@ -33,7 +31,7 @@ class Plausibility:
     """Maximum difference between the motor position and the drive's demand."""
 
     @classmethod
-    def of(cls, axis: AxisConfig) -> Plausibility:
+    def of(cls, axis: AxisConfig) -> Self:
         """Derives the limits from an axis file."""
         step_deg = OVERSPEED * axis.limits.velocity_deg_s * axis.drive.cycle_s
         floor_deg = FLOOR_ARCSEC / ARCSEC_PER_DEG

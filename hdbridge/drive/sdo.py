@@ -9,8 +9,6 @@ of every answer's length, and errors with advice.
 Never used inside the control cycle.
 """
 
-from __future__ import annotations
-
 import logging
 import struct
 from typing import Final

@@ -10,8 +10,6 @@ path, because each must be requested explicitly: leaving a fault (15), resuming 
 course a fault (13).
 """
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Iterator
 from enum import Enum

@@ -5,8 +5,6 @@ The cycle reports the faults it saw, and the table gives the reaction. A stop is
 again. The table is data. A fault with another reaction is another row, not an `if`.
 """
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Iterable
 from enum import Enum, IntEnum

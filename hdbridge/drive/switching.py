@@ -1,7 +1,5 @@
 """Power in the control cycle: waiting for enable, and the states in which an axis may be at rest."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from typing import Final

@@ -1,7 +1,5 @@
 """Frames that are not PDOs of the cycle: node status, and signs of another master on the bus."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from typing import Final
 

@@ -1,7 +1,5 @@
 """Unwraps a wrapping counter into a continuous position. Pure."""
 
-from __future__ import annotations
-
 from typing import Final
 
 INT32_RANGE: Final = 1 << 32

@@ -1,7 +1,5 @@
 """Conversion of object values between bytes and text, by the type given in the EDS."""
 
-from __future__ import annotations
-
 import math
 import re
 import struct

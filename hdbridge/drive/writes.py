@@ -5,8 +5,6 @@ boot-up reads each object first, writes those that hold another value, in this o
 `hdbridge.drive.bootplan` leaves objects that are optional in CiA 402 to a drive that lacks them.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace

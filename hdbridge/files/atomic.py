@@ -4,8 +4,6 @@ Pipes and character devices hold nothing that could be kept: they are written di
 a file.
 """
 
-from __future__ import annotations
-
 import fcntl
 import itertools
 import os

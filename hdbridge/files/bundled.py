@@ -4,8 +4,6 @@ In an installed wheel they are in ``hdbridge/_bundled``, in a working copy in th
 ``profiles`` next to the package.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Literal
 

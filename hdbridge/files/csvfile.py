@@ -6,8 +6,6 @@ file that numpy's parser accepts costs about two microseconds per row; any other
 its error or to keep a column of text.
 """
 
-from __future__ import annotations
-
 import codecs
 import csv
 import gzip
@@ -35,6 +33,17 @@ Column = NDArray[Any]
 
 MAXIMUM_BYTES = 2 << 30
 _GZIP_MAGIC = b"\x1f\x8b"
+_OTHER_FILES: Final = {
+    b"PK\x03\x04": "a ZIP archive, such as an Excel workbook",
+    b"\xd0\xcf\x11\xe0": "an Excel workbook of the old kind, .xls",
+    b"PAR1": "a Parquet file",
+    b"\x89HDF": "an HDF5 or MATLAB file",
+    b"MATLAB": "a MATLAB file",
+    b"TDSm": "a TDMS file",
+    b"MDF ": "an MDF file",
+    b"\x89MCAP": "an MCAP file",
+}
+"""Kinds of binary files by their first bytes, as the magic files of file(1) list them."""
 _GZIP_LEVEL = 4  # beyond it time grows several-fold and the size hardly falls
 _ROWS_AT_ONCE = 50_000
 _PIECE_BYTES = 1 << 20
@@ -79,7 +88,7 @@ class CsvFile:
 
     def __init__(self, path: Path, wanted: Collection[str] = ()) -> None:
         self.path = path
-        content, encoding = _content(path)
+        content, encoding = text_of(path)
         self._held: bytes | None = content  # kept until it is read, because a stream can be read only once
         self._layout = found = _layout(path, content, wanted)
         said = ("comments left out" if _commented(content) else "", encoding)
@@ -142,7 +151,7 @@ class CsvFile:
 
     def _text(self) -> bytes:
         """Returns the text with comments blanked and the spaces between two columns replaced by one tab."""
-        content = _content(self.path)[0] if self._held is None else self._held
+        content = text_of(self.path)[0] if self._held is None else self._held
         if _commented(content):
             content = _COMMENT.sub(b"", content)
         if self._layout.separator == " ":
@@ -267,7 +276,7 @@ def _wrong(text: str) -> InputError:
     return InputError(one_line(text))
 
 
-def _content(path: Path) -> tuple[bytes, str]:
+def text_of(path: Path) -> tuple[bytes, str]:
     """Returns the file's text, decompressed, in UTF-8 without byte-order mark, and its encoding if it was
     another.
     """
@@ -293,6 +302,9 @@ def _content(path: Path) -> tuple[bytes, str]:
             return content.decode("utf-16").encode(), "UTF-16 text"
         except UnicodeError:
             raise _wrong(f"{path}: UTF-16 text that is damaged; expected CSV in UTF-8") from None
+    for magic, kind in _OTHER_FILES.items():
+        if content.startswith(magic) and b"\0" in content:
+            raise _wrong(f"{path}: {kind}; expected CSV: export the samples as CSV")
     content = content.removeprefix(codecs.BOM_UTF8)
     try:
         content.decode()

@@ -5,8 +5,6 @@ descriptions are brought into the form that canopen accepts. A value that cannot
 line, section and key: as an `InputError` if an object cannot be described without it, else in `Eds.unread`.
 """
 
-from __future__ import annotations
-
 import io
 import re
 from collections.abc import Iterable, Iterator, Mapping

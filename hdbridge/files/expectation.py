@@ -1,7 +1,5 @@
 """Expected value of a pydantic model's field, as text for error messages and reference pages."""
 
-from __future__ import annotations
-
 import difflib
 import types
 from collections.abc import Iterator, Sequence

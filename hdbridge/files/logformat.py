@@ -4,8 +4,6 @@ The library reports events through `logging`: the message is the event's name, i
 facts.
 """
 
-from __future__ import annotations
-
 import json
 import logging
 import sys

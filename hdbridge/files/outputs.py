@@ -5,8 +5,6 @@ file that makes a folder a profile or a recording. Pipes and character devices a
 (`write_atomically`); sockets, disks and folders are refused. Everything is checked before anything moves.
 """
 
-from __future__ import annotations
-
 import os
 import re
 import stat

@@ -1,10 +1,8 @@
 """Files of one axis, found from user input or a machine file."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Final, Self
 
 from hdbridge.errors import InputError
 from hdbridge.files.bundled import bundled_profile
@@ -38,7 +36,7 @@ class Profile:
         return self.twin if self.twin.is_file() else self.truth
 
     @classmethod
-    def find(cls, text: str, base: Path = Path()) -> Profile:
+    def find(cls, text: str, base: Path = Path()) -> Self:
         """Finds a profile by folder, axis file, or name of a bundled profile; raises `InputError` if there is
         none.
 

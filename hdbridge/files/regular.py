@@ -1,7 +1,5 @@
 """Opens regular files only, because opening a named pipe would wait for its writer."""
 
-from __future__ import annotations
-
 import errno
 import os
 import stat

@@ -243,11 +243,9 @@ class Dataset:
         parts += sorted((self.folder / INCREMENTS).glob(f"{name}-*.parquet"))
         for path in parts:
             try:
-                rows = pq.ParquetFile(path).read(columns).to_pylist()
+                yield from pq.ParquetFile(path).read(columns).to_pylist()
             except (OSError, pa.ArrowException) as problem:
                 raise InputError(f"{path}: cannot be read: {problem}; remove it and run again") from None
-            missing = dict.fromkeys(columns or COLUMNS[name])  # columns that an older version did not write
-            yield from ({**missing, **row} for row in rows)
 
 
 def _mark_duplicates(rows: Sequence[dict[str, Any]]) -> None:

@@ -88,7 +88,7 @@ def axes_of(path: str) -> list[str] | str:
 
     try:
         with fetched(path) as file:
-            return [each.name for each in overview(file).about.axes]
+            return [each.name for each in overview(file).about.axes] or f"{path}: no axis in this recording"
     except Exception as problem:
         return _reason(problem)
 

@@ -28,10 +28,8 @@ from hdbridge.fleet.sources import Source, Stored, with_axes
 if TYPE_CHECKING:
     from distributed import Client
 
-BATCH: Final = 64
-"""Number of rows after which an increment is written."""
-BATCH_S: Final = 30.0
-"""Time after which an increment is written."""
+INCREMENT_S: Final = 1.0
+"""Minimum time between two increments: `kill -9` loses the finished recordings of so long at most."""
 POLL_S: Final = 0.25
 AHEAD: Final = 2000
 """Maximum number of tasks submitted to the scheduler at a time."""
@@ -377,7 +375,7 @@ class _Run:
         else:
             self._failed += bool(row.get("reason"))
             self._rows.append(row)
-        if len(self._rows) >= BATCH or time.monotonic() - self._written_s > BATCH_S:
+        if time.monotonic() - self._written_s > INCREMENT_S:
             self._write()
         self._report()
 

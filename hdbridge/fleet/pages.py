@@ -4,8 +4,6 @@ The name contains the start of the key of the recording that is shown, so a page
 the joint has a newer recording, model or version.
 """
 
-from __future__ import annotations
-
 import shlex
 from collections.abc import Mapping
 from dataclasses import fields, replace

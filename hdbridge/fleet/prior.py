@@ -4,8 +4,6 @@ It holds, for each cause, how often joints of each group have it, how often the 
 with and without it, and how its parameters vary between joints. All of it is estimated from the fleet.
 """
 
-from __future__ import annotations
-
 import math
 from collections import defaultdict
 from collections.abc import Mapping, Sequence

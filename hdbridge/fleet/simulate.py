@@ -4,8 +4,6 @@ Each joint is the bundled demo axis with a gear of its own. Its recordings come 
 (`hdbridge.sim`), which shares no code with the diagnosis. `answers.json` holds the hidden causes and faults.
 """
 
-from __future__ import annotations
-
 import gzip
 import json
 import math

@@ -4,15 +4,14 @@ A source is one recording of one joint that has not been read yet. Errors in a s
 later, by the worker that reads it; a wrong manifest or a place without recordings is an InputError.
 """
 
-from __future__ import annotations
-
 import csv
 import glob
 import hashlib
+import io
 import os
 import posixpath
 from collections import defaultdict
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -22,6 +21,7 @@ from typing import Any, Final
 
 from hdbridge import __version__
 from hdbridge.errors import InputError
+from hdbridge.files.csvfile import text_of
 from hdbridge.files.expectation import nearest, one_line
 from hdbridge.files.profile import Profile
 from hdbridge.records.recording import ABOUT_NAME, CSV_NAMES, recordings_among
@@ -46,6 +46,9 @@ MANIFEST: Final[Mapping[str, str]] = {
     "unwrap": "`--unwrap` of a CSV file",
 }
 """Columns of a manifest. Only ``path`` is required."""
+NUMBERS: Final = ("ratio", "hours")
+MANIFEST_NAMES: Final = ("manifest.csv", "manifest.parquet")
+"""File names that are not taken for a recording."""
 MARKS: Final = ("size", "ETag", "mtime", "LastModified", "created")
 """Attributes of a remote file that change with its content, as fsspec's file systems name them."""
 
@@ -125,18 +128,31 @@ def find_sources(
     *,
     may_be_empty: bool = False,
     timeout_s: float = TIMEOUT_S,
+    report: Callable[[str], None] = lambda _: None,
 ) -> list[Source]:
     """Returns all recordings at the given places and in the manifest, each once, sorted by path.
 
-    InputError for a place that does not exist or holds no recording (unless it ``may_be_empty``), and for a
-    wrong manifest. A recording that is ``stored`` unchanged is not opened. ``timeout_s`` is the longest wait
-    for the first answer of a server.
+    InputError for a place that does not exist or holds no recording (unless it ``may_be_empty``), for a wrong
+    manifest, and for a manifest at a place that is not named as one. A recording that is ``stored`` unchanged
+    is not opened. ``timeout_s`` is the longest wait for the first answer of a server. Ignored parts of the
+    manifest are passed to ``report``.
     """
-    found: dict[tuple[str, str | None], Source] = dict(read_manifest(manifest)) if manifest else {}
+    found = read_manifest(manifest, report) if manifest else {}
+    if not found and not given and not may_be_empty:
+        raise InputError(
+            f"{manifest}: no row; expected one for each recording, below the names of the columns"
+        )
+    own = manifest and os.path.abspath(manifest)  # noqa: PTH100 - as `_listing` does
     described = {path for path, _ in found}
     marks: dict[str, str] = {}
     for place in given:
-        marked = _recordings(_listing(place, timeout_s), described)
+        files = _listing(place, timeout_s)
+        for each in [*files]:
+            if posixpath.basename(each) in MANIFEST_NAMES or each == own:
+                if not manifest:
+                    raise InputError(f"{place}: contains a manifest; pass it as well: --manifest {each}")
+                del files[each]
+        marked = _recordings(files, described)
         if not marked and not may_be_empty:
             raise InputError(
                 f"{place}: no recording; expected recording folders, or files that end in .csv, .csv.gz "
@@ -255,47 +271,72 @@ def _with_about(source: Source, stored: Stored) -> Source:
     )
 
 
-def read_manifest(path: Path) -> dict[tuple[str, str | None], Source]:
-    """Reads a manifest, CSV or Parquet; sources by path and axis. InputError names the wrong row."""
+def read_manifest(
+    path: Path, report: Callable[[str], None] = lambda _: None
+) -> dict[tuple[str, str | None], Source]:
+    """Reads a manifest, CSV or Parquet; sources by path and axis. InputError names the wrong row.
+
+    Other columns and repeated rows are ignored and passed to ``report``.
+    """
+    names, rows = _table(path)
+    ignored = [name for name in names if name and name not in MANIFEST]
+    for name in ignored:
+        if close := nearest(name, list(MANIFEST)):
+            raise InputError(
+                f"{path}: unknown column '{name}' (did you mean {close}?); expected {', '.join(MANIFEST)}"
+            )
+    if "path" not in names:
+        raise InputError(f"{path}: the column 'path' is missing; found {', '.join(names) or 'nothing'}")
+    if ignored:
+        report(f"{path}: ignored unknown columns: {', '.join(ignored)}")
+    found: dict[tuple[str, str | None], Source] = {}
+    for number, row in enumerate(rows, 2):
+        if not any(row.values()):
+            continue  # a blank row of a spreadsheet
+        source = _described({name: row[name] for name in MANIFEST if name in row}, path, number)
+        key = (source.path, source.axis if source.is_flight else None)
+        before = found.setdefault(key, source)
+        if before != source:
+            raise InputError(
+                f"{path}:{number}: {row['path']} already has a row, with other values; expected one for each "
+                "recording"
+            )
+        if before is not source:
+            report(f"{path}:{number}: repeats the row of {row['path']}, which counts once")
+    return found
+
+
+def _table(path: Path) -> tuple[list[str], list[dict[str, Any]]]:
+    """Returns the names of the columns of a CSV or Parquet file, and its rows."""
     if not path.is_file():
         raise InputError(f"{path}: no such file; expected a manifest, CSV or Parquet")
     try:
         if path.suffix == ".parquet":
             import pyarrow.parquet as pq
 
-            names, rows = pq.read_schema(path).names, pq.read_table(path).to_pylist()
-        else:
-            with path.open(encoding="utf-8-sig", newline="") as file:
-                reader = csv.DictReader(file, strict=True)
-                names, rows = list(reader.fieldnames or ()), list(reader)
+            return pq.read_schema(path).names, pq.read_table(path).to_pylist()
+        lines = io.StringIO(text_of(path)[0].decode(), newline="")
+        head = lines.readline()
+        lines.seek(0)
+        separator = max(",;\t", key=head.count)
+        reader = csv.DictReader(lines, strict=True, delimiter=separator)
+        rows = list(reader)
+        if separator != ",":  # written where the decimal sign is a comma
+            rows = [row | {name: (row.get(name) or "").replace(",", ".") for name in NUMBERS} for row in rows]
+        return list(reader.fieldnames or ()), rows
+    except InputError:
+        raise
     except Exception as problem:  # the readers raise many types of errors
         raise InputError(f"{path}: cannot be read: {str(problem).splitlines()[0]}") from None
-    for name in names:
-        if name not in MANIFEST:
-            close = nearest(name, list(MANIFEST))
-            hint = f" (did you mean {close}?)" if close else ""
-            raise InputError(f"{path}: unknown column '{name}'{hint}; expected {', '.join(MANIFEST)}")
-    if "path" not in names:
-        raise InputError(f"{path}: the column 'path' is missing; found {', '.join(names) or 'nothing'}")
-    found: dict[tuple[str, str | None], Source] = {}
-    for number, row in enumerate(rows, 2):
-        source = _described(row, path, number)
-        key = (source.path, source.axis if source.is_flight else None)
-        if key in found:
-            raise InputError(
-                f"{path}:{number}: {row['path']} has a row already; expected one for each recording"
-            )
-        found[key] = source
-    return found
 
 
 def _described(row: Mapping[str, Any], manifest: Path, number: int) -> Source:
     folder = manifest.absolute().parent
     values: dict[str, Any] = {}
     for name, value in row.items():
-        if name is None or (isinstance(value, str) and not value.strip()) or value is None:
+        if value is None or not str(value).strip():
             continue
-        if name in {"ratio", "hours"}:
+        if name in NUMBERS:
             try:
                 values[name] = float(value)
             except ValueError:

@@ -4,8 +4,6 @@ Every rate, scatter and prior is estimated from the fleet itself, so a joint is 
 diagnosis of the other joints on everyday records. If the data do not decide, the answer is None.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

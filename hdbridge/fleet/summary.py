@@ -5,8 +5,6 @@ joint is listed only if a cause repeats over its recordings more often than the 
 names explains, and if it appeared after the first recording or grows.
 """
 
-from __future__ import annotations
-
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass

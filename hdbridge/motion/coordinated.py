@@ -9,8 +9,6 @@ line are passed in motion. Rounding a corner without a rest means leaving the po
 by choosing other points.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from contextlib import suppress

@@ -5,8 +5,6 @@ and the axis's velocity. The result is None if ruckig finds no solution, or only
 caller then decides what is safe.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from typing import NamedTuple

@@ -1,7 +1,5 @@
 """Modes of motion of a set-point."""
 
-from __future__ import annotations
-
 from enum import IntEnum
 
 

@@ -1,7 +1,5 @@
 """Pursuit of a position that somebody else gives in each period, within the limits of the axis."""
 
-from __future__ import annotations
-
 import math
 
 from hdbridge.motion.generator import Bounds, Kinematics
@@ -54,7 +52,7 @@ class Pursuit:
             most = min(self._fastest, velocity + change, self._speed(upper - position))
             wanted = min(max(wanted, least), most)
             position = min(max(position + wanted * period_s, lower), upper)
-        self.state = state = Kinematics(position, wanted, (wanted - velocity) / period_s)
+        self.state = state = tuple.__new__(Kinematics, (position, wanted, (wanted - velocity) / period_s))
         return state
 
     def _speed(self, distance_deg: float) -> float:

@@ -8,8 +8,6 @@ The set-point always stays within the position limits. A plan is accepted only i
 them, and braking has a fallback that always exists (`SetPoint._brake`). Rounding errors are clipped.
 """
 
-from __future__ import annotations
-
 import math
 
 from hdbridge.errors import InputError
@@ -217,7 +215,8 @@ class SetPoint:
         if self._stream is not None:
             return self._step_stream(self._stream)
         if self._pursuit is not None:
-            self._set(self._pursuit.step(*self._aim))
+            state = self._pursuit.step(*self._aim)  # within the limits
+            self._position_deg, self._velocity_deg_s, self._acceleration_deg_s2 = state
             return self._position_deg
         if self._mode is MotionMode.JOG:
             self._left -= 1

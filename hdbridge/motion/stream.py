@@ -5,11 +5,9 @@ have their extremes in closed form. Accepted knots can therefore be followed to 
 checks.
 """
 
-from __future__ import annotations
-
 import math
 from collections import deque
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 from hdbridge.errors import InputError
 from hdbridge.motion.generator import Bounds, Kinematics
@@ -48,7 +46,7 @@ class Cubic(NamedTuple):
         end_s: float,
         end_deg: float,
         to_deg_s: float,
-    ) -> Cubic:
+    ) -> Self:
         """Returns the cubic with these ends."""
         period_s = end_s - begin_s
         step = end_deg - begin_deg

@@ -4,8 +4,6 @@ A record's own columns are in the units that their names state. A file of anothe
 `CsvColumns`: the options ``--columns``, ``--units`` and ``--unwrap`` of the command line.
 """
 
-from __future__ import annotations
-
 import math
 import re
 import shlex

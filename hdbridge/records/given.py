@@ -1,7 +1,5 @@
 """Measurements accepted by `fit` and `diagnose`: one or several records or recordings."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Diagnosis of a record whose angles contradict the gear ratio, and the option that corrects it."""
 
-from __future__ import annotations
-
 import math
 from typing import Final
 

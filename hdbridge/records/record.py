@@ -4,8 +4,6 @@ A record comes from hdbridge's own bench or from another program's CSV file; bot
 uneven. Angles are multi-turn degrees.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -89,9 +87,8 @@ class Record:
         found, origin = read(file, said)
         record = cls(found, str(path), origin=origin)
         if len(record) < minimum_samples:
-            raise InputError(
-                f"{path}: {len(record)} samples are too few; expected at least {minimum_samples}"
-            )
+            count = f"{len(record)} sample{'s' * (len(record) != 1)}"
+            raise InputError(f"{path}: {count}; expected at least {minimum_samples}")
         backwards = np.flatnonzero(np.diff(record.time_s) < 0.0)
         if len(backwards):
             row = int(backwards[0]) + 1

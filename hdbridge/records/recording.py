@@ -5,8 +5,6 @@ latter is written last and contains the former's checksum: a folder without it i
 modified raw data are detected.
 """
 
-from __future__ import annotations
-
 import hashlib
 import importlib.metadata
 import platform

@@ -4,8 +4,6 @@ A wrap jumps in one angle and not in the other, whereas a concatenated record ju
 constant, whereas a misread sample is off by any amount and the next one is right again.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from typing import Final, NamedTuple

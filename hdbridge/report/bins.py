@@ -1,7 +1,5 @@
 """Binned means of a coordinate, for charts."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Final
 

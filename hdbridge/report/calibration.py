@@ -1,7 +1,5 @@
 """Report page of a calibration: measurements, fitted model, and its reliability."""
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Callable, Iterator

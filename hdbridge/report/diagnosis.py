@@ -1,7 +1,5 @@
 """Report page of a diagnosis: verdict, advice, each finding with its chart, and all observations."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Final
 

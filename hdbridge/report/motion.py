@@ -1,7 +1,5 @@
 """Report page of the motion test: ripple over speed, and the measured response."""
 
-from __future__ import annotations
-
 import math
 
 from hdbridge import __version__

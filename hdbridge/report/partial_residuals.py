@@ -5,8 +5,6 @@ part of the model (ripple that grows with torque, a loop that grows with speed) 
 over that coordinate, by least squares in each bin.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from typing import Final
 

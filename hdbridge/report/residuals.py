@@ -1,7 +1,5 @@
 """Charts of residuals: the partial residual of a finding, and the residuals over every coordinate."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import replace
 from typing import Final

@@ -1,7 +1,5 @@
 """Report page of a stepping test under several compensation schemes."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from typing import Final

@@ -1,7 +1,5 @@
 """Sections of a stepping test before and after: the gain of a new model on the axis itself."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from typing import Final
 

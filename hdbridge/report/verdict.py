@@ -1,7 +1,5 @@
 """Status of a page, and the next commands."""
 
-from __future__ import annotations
-
 from hdbridge.commissioning.calibration.result import Offer
 from hdbridge.report.page import Command, Status
 

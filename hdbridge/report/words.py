@@ -1,7 +1,5 @@
 """Formatting of numbers and sentences for pages."""
 
-from __future__ import annotations
-
 from typing import Final
 
 from hdbridge import units

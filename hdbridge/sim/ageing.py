@@ -4,8 +4,6 @@ Stiffening grease and settling preload change the loop; wear of the teeth change
 is evaluated once per substep, in order of time.
 """
 
-from __future__ import annotations
-
 import math
 from typing import ClassVar
 

@@ -4,8 +4,6 @@ It contains everything that `hdbridge.sim.machine` does in a cycle except noise,
 whole and advanced by one call per cycle.
 """
 
-from __future__ import annotations
-
 import math
 
 from hdbridge.sim.encoder import FixedErrors, Losses

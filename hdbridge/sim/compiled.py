@@ -10,8 +10,6 @@ similar functions are those of the C library that Python uses. What cannot be la
 in Python.
 """
 
-from __future__ import annotations
-
 import hashlib
 import inspect
 import math

@@ -1,7 +1,5 @@
 """Conditions that the pieces of the gear depend on."""
 
-from __future__ import annotations
-
 from hdbridge.sim.state import state
 
 

@@ -3,8 +3,6 @@
 Each error is a reading error in degrees of the encoder's shaft; the shaft itself does not move.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable
 from typing import Final, Protocol

@@ -4,8 +4,6 @@ This produces records in bulk: the same loops, mechanics and encoders as behind 
 times faster than real time. All moves begin and end at rest, with continuous speed.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from typing import NamedTuple

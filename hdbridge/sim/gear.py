@@ -5,8 +5,6 @@ The error is a sum of pieces, each one physical cause. To add a cause, write a c
 the `Conditions`. A cause that is off has no piece and costs nothing.
 """
 
-from __future__ import annotations
-
 import math
 from typing import ClassVar, Protocol
 

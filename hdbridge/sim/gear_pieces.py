@@ -3,8 +3,6 @@
 Each piece is evaluated once per substep, in order of time, so those with a state advance by one substep.
 """
 
-from __future__ import annotations
-
 import math
 import random
 from typing import ClassVar, Final

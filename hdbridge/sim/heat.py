@@ -1,7 +1,5 @@
 """Temperature of motor and gear, and its effect on the motor's friction."""
 
-from __future__ import annotations
-
 import math
 
 from hdbridge.sim.gear_pieces import WarmthFactor

@@ -4,8 +4,6 @@ Each law is rate-independent and advances from one motor angle to the next. The 
 of motion, so a closed loop of the motor angle has a positive area, the integral of error by angle.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Final, Protocol
 

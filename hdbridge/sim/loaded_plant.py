@@ -5,8 +5,6 @@ deviation of the spring from its linear first stage. The linear step thus stays 
 stands exactly where the torques balance.
 """
 
-from __future__ import annotations
-
 import math
 
 from hdbridge.sim.plant import RAD_PER_DEG, Plant

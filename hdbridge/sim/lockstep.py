@@ -6,8 +6,6 @@ drive to the next. So nothing sleeps, there are no races, and the same run gives
 are real python-can messages over python-can ``virtual`` buses.
 """
 
-from __future__ import annotations
-
 import gc
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager

@@ -4,8 +4,6 @@
 compiled as a whole.
 """
 
-from __future__ import annotations
-
 from hdbridge.sim.encoder import Body, Disc, Late
 from hdbridge.sim.loaded_plant import LoadedPlant
 from hdbridge.sim.plant import Plant
@@ -42,6 +40,8 @@ class Loops:
     _late_motor: Late
     _plain: bool
     """True if the demand is not delayed and the encoders are ideal."""
+    _rounded_nm: float
+    """Largest rounding error of the torque that the drive reports: half a thousandth of the rated one."""
     _torque_nm: float
     _with_body: bool
     _with_disc: bool
@@ -55,7 +55,7 @@ class Loops:
         motor, load = truth.motor.encoder, truth.load_.encoder
         self.plant = LoadedPlant(truth) if loaded or LoadedPlant.needed(truth) else Plant(truth)
         self.servo = Servo(truth)
-        self._torque_nm = 0.0
+        self._torque_nm, self._rounded_nm = 0.0, 0.0005 * truth.motor.rated_torque_nm
         self._with_disc = motor.disc is not None
         self._disc = Disc(motor.disc or TrueDisc(radius_mm=1.0))
         self._body = Body(load, dt_s)
@@ -82,9 +82,11 @@ class Loops:
         self._late_demand.begin(demand_deg)
 
     def hold(self, torque_nm: float) -> None:
-        """Shifts the integral so that the motor's torque at rest is ``torque_nm``."""
-        self.servo.shift(torque_nm - self._torque_nm)
-        self._torque_nm = torque_nm
+        """Shifts the integral so that the motor's torque at rest rounds to the reading ``torque_nm``."""
+        off_nm = torque_nm - self._torque_nm
+        off_nm -= min(max(off_nm, -self._rounded_nm), self._rounded_nm)
+        self.servo.shift(off_nm)
+        self._torque_nm += off_nm
 
     def follow(self, demand_deg: float, demand_deg_s: float, substeps: int, slow: Slow) -> Seen:
         """Runs some substeps in closed loop, in which the demand moves linearly."""

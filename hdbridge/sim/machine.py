@@ -4,8 +4,6 @@ Deterministic: the same truth, seed and commands give the same numbers bit for b
 advances it by whole substeps.
 """
 
-from __future__ import annotations
-
 import math
 import random
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """Sums of orders, evaluated as a polynomial in exp(i angle): one complex exponential, then Horner's rule."""
 
-from __future__ import annotations
-
 import cmath
 import math
 from collections.abc import Iterable

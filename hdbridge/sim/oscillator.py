@@ -1,7 +1,5 @@
 """Damped mass on a spring with a moving base: exact step for linear motion of the base."""
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple, Protocol
 

@@ -4,8 +4,6 @@ If the computer is late, virtual time is late with it: nothing is skipped, and l
 a rush. A stall of the computer is therefore not a fault of a simulated bus.
 """
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Callable

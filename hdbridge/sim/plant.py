@@ -10,8 +10,6 @@ momentary ratio by one or two per cent; the reaction neglects this, the angles d
 `Plant` has a linear spring and a load without external torques; `hdbridge.sim.loaded_plant` has the rest.
 """
 
-from __future__ import annotations
-
 import math
 
 from hdbridge.sim.conditions import Conditions

@@ -4,8 +4,6 @@ The command's speed and direction of each control cycle change the demand that t
 that the drive reports. Nothing is changed once the command has been at rest for the length of the responses.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -8,8 +8,6 @@ Like real drives of this class it closes its loops on an interpolated encoder: a
 middle of the commanded count, not anywhere within it.
 """
 
-from __future__ import annotations
-
 import math
 
 from hdbridge.sim.encoder import Late

@@ -4,8 +4,6 @@ Declared attributes can be laid out in memory, so that the methods can be compil
 They are numbers, tuples and lists of numbers, and further objects of such classes.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Final, TypeVar
 

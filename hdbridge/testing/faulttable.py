@@ -5,8 +5,6 @@ the drive, its encoders, other nodes and the interface. Faults of the program it
 number, a full disk) must be made by the program.
 """
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager

@@ -1,7 +1,5 @@
 """History of a simulated drive: events, frames, and true angles period by period."""
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Bus of simulated drives: in lockstep or in real time, within this process or on the computer."""
 
-from __future__ import annotations
-
 import tempfile
 import threading
 import time

@@ -1,12 +1,10 @@
 """Settings of a test's simulated drive: profile, truth, seed, bus; checked before the drive is created."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Final
+from typing import Any, Final, Self
 
 from pydantic import ValidationError
 
@@ -38,7 +36,7 @@ class BusChoice:
         return f"{self.interface}:{self.channel}" if self.channel else self.interface
 
     @classmethod
-    def parse(cls, text: str) -> BusChoice:
+    def parse(cls, text: str) -> Self:
         """Parses ``virtual``, ``lockstep`` or ``INTERFACE:CHANNEL``; raises `InputError` for
         anything else.
         """
@@ -75,7 +73,7 @@ class Settings:
         truth: str | Path | None = None,
         folder: Path | None = None,
         firmware: Mapping[str, Any] = MappingProxyType({}),
-    ) -> Settings:
+    ) -> Self:
         """Loads and checks the settings; raises a one-line `InputError`.
 
         ``folder`` is the base of relative paths, by default the present one. Without ``truth``, the profile's

@@ -1,7 +1,5 @@
 """Simulated drive as used in a test."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager

@@ -19,7 +19,7 @@ from hdbridge.axis.effects import Channel, FloatArray
 from hdbridge.errors import InputError
 from hdbridge.records.record import Record
 from hdbridge.records.recording import Segment
-from hdbridge.twin.replay import STANDS_COUNTS, stands, unknown_rows
+from hdbridge.twin.replay import standing, unknown_rows
 from hdbridge.units import ARCSEC_PER_DEG
 
 # ----------------------------------------------------------------
@@ -255,10 +255,9 @@ def compare(measured: Record, simulated: Record, legs: Sequence[Segment], ratio:
     motor = measured.motor_position_deg
     count_deg = least_change(np.concatenate([np.diff(motor[part]) for part in parts]), motor)
     groups = _groups(measured.time_s, legs, ~unknown_rows(measured, count_deg))
-    # At standstill, the torque depends on a thousandth of a count.
-    target, reach_deg = real.command_deg, STANDS_COUNTS * count_deg
-    moved = np.concatenate([np.diff(target[part], prepend=target[part.start]) != 0.0 for part in parts])
-    goes = ~np.concatenate([stands(moved[part], motor[part], reach_deg) for part in parts])
+    # At rest, the torque depends on a thousandth of a count.
+    rests = [standing(part, count_deg) for part in measured.parts()]
+    goes = ~np.concatenate([each.stuck | each.still for each in rests])
     rows = [
         row
         for kind, inside in groups.items()

@@ -33,18 +33,15 @@ from hdbridge.sim.truth import Truth
 from hdbridge.twin.compare import noise_of, rms
 from hdbridge.twin.parameters import FOLLOWING, LOAD, TORQUE, with_load_encoder
 from hdbridge.twin.replay import (
-    RINGING_S,
     RUN_IN_S,
     STANDS_COUNTS,
     Commands,
-    begins_in_motion,
     commands_of,
     continuous,
     demand_deg,
-    held_rows,
     legs_of,
     run,
-    stands,
+    standing,
     stretches,
     unknown_rows,
 )
@@ -316,31 +313,20 @@ def _piece(
     out = np.zeros(len(part))
     for each in held_out:
         out[(part.time_s >= each.start_s) & (part.time_s <= each.end_s)] = 1.0
-    target = part.motor_target_deg
-    assert target is not None  # commands_of has refused it
-    moved = np.abs(np.diff(target, prepend=target[0]))
     travelled = np.abs(np.diff(part.motor_position_deg, prepend=part.motor_position_deg[0]))
-    before_s = part.time_s[0] if begins_in_motion(part) else -np.inf
-    last_moved_s = np.maximum.accumulate(np.where(moved > 0.0, part.time_s, before_s))
-    stuck = part.time_s - last_moved_s > RINGING_S
     everywhere = np.where(judged, 1.0, 0.0)
     elastic = unknown | (np.cumsum(travelled) < (UNKNOWN_DEG if remembers(base) else 0.0))
     # Between two parts the drive's loops may have been restarted.
     loops = elastic | (np.cumsum(np.where(judged, travelled, 0.0)) <= UNKNOWN_DEG)
-    count_deg = 360.0 / axis.motor_encoder.counts_per_turn
-    still = stands(moved > 0.0, part.motor_position_deg, STANDS_COUNTS * count_deg)
+    stuck, still, held = standing(part, 360.0 / axis.motor_encoder.counts_per_turn)
     rests = stuck & still
     torque = part.columns.get("motor_torque_nm")
     if torque is not None:
         # The holding torque at rest is the value of the integral.
-        held = held_rows(part, moved > 0.0, still)
         known = held[0] if len(held) else len(loops)
         loops[known:] = unknown[known:]
-        cycles = commands.lead + 1 + np.floor(commands.row_cycles[held]).astype(int)
-        told = tuple(zip(cycles.tolist(), torque[held].tolist(), strict=True))
-        commands = replace(commands, held=(*commands.held, *told))
     measured = {
-        FOLLOWING: target - part.motor_position_deg,
+        FOLLOWING: part.columns["motor_target_deg"] - part.motor_position_deg,
         TORQUE: torque if torque is not None else np.zeros(len(part)),
         LOAD: part.load_position_deg * ARCSEC_PER_DEG,
     }

@@ -16,6 +16,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -121,17 +122,32 @@ def stands(moved: NDArray[np.bool_], motor_deg: FloatArray, within_deg: float) -
     return given
 
 
-def held_rows(part: Record, moved: NDArray[np.bool_], still: NDArray[np.bool_]) -> NDArray[np.intp]:
-    """Returns the rows that show the holding torque of a motor at rest: every `HELD_S`, and the last.
+class Standing(NamedTuple):
+    """Rows of a part at which friction may hold the motor, so that its torque depends on the past."""
 
-    The last one alone would not do, because the integral may have moved until the motor broke away.
-    """
-    rested_s = part.time_s - np.maximum.accumulate(np.where(moved, part.time_s, part.time_s[0]))
+    stuck: NDArray[np.bool_]
+    """Mask of the rows at which the command has been at rest for `RINGING_S`."""
+    still: NDArray[np.bool_]
+    """Mask of the rows at which the motor stands; see `stands`."""
+    held: NDArray[np.intp]
+    """Rows that show its holding torque: every `HELD_S`, and the last. The last one alone would not do,
+    because the integral may have moved until the motor broke away."""
+
+
+def standing(part: Record, count_deg: float) -> Standing:
+    """Returns the rows of a part at which friction may hold the motor; ``count_deg`` is one motor count."""
+    target, time_s = part.motor_target_deg, part.time_s
+    assert target is not None  # commands_of has refused it
+    moved = np.diff(target, prepend=target[0]) != 0.0
+    before_s = time_s[0] if begins_in_motion(part) else -np.inf
+    stuck = time_s - np.maximum.accumulate(np.where(moved, time_s, before_s)) > RINGING_S
+    still = stands(moved, part.motor_position_deg, STANDS_COUNTS * count_deg)
+    rested_s = time_s - np.maximum.accumulate(np.where(moved, time_s, time_s[0]))
     times = np.floor(rested_s / HELD_S)
     told = still & (times >= 1.0)
     told[1:-1] &= (times[1:-1] > times[:-2]) | moved[2:]
     told[-1:] = False
-    return np.flatnonzero(told)
+    return Standing(stuck, still, np.flatnonzero(told))
 
 
 def begins_in_motion(part: Record) -> bool:
@@ -267,11 +283,24 @@ def commands_of(part: Record, axis: AxisConfig, truth: Truth) -> Commands:
         off.insert(0, slice(lead - math.ceil(0.5 * STANDING_S / cycle_s), lead - ON_BEFORE))
     off = [each for each in off if each.stop > each.start]
     torque_nm = part.columns.get(Channel.MOTOR_TORQUE.value)
-    held = () if torque_nm is None or not holds else ((lead, float(torque_nm[0])),)
+    held: list[tuple[int, float]] = []
+    if torque_nm is not None:
+        held += [(lead, float(torque_nm[0]))] if holds else []
+        rows = standing(part, 360.0 / axis.motor_encoder.counts_per_turn).held
+        known = lead + 1 + np.floor(cycles[rows]).astype(np.intp)
+        held += zip(known.tolist(), torque_nm[rows].tolist(), strict=True)
     warmth_c = part.columns.get(Channel.TEMPERATURE.value)
     start_c = None if warmth_c is None else float(warmth_c[0])
     return Commands(
-        (*map(float, approach), *recorded), lead, cycles, time_s, cycle_s, told_nm, tuple(off), held, start_c
+        (*map(float, approach), *recorded),
+        lead,
+        cycles,
+        time_s,
+        cycle_s,
+        told_nm,
+        tuple(off),
+        tuple(held),
+        start_c,
     )
 
 

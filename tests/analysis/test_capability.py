@@ -1,4 +1,4 @@
-"""Laws of the sentence on what a record can show: it follows the motion and the channels, nothing else."""
+"""Summary of the effects that a record can show: it depends on the motion and the channels only."""
 
 from __future__ import annotations
 

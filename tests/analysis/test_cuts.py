@@ -1,4 +1,4 @@
-"""Records that were put together from several, and readings that are none."""
+"""Concatenated records and invalid readings."""
 
 from __future__ import annotations
 

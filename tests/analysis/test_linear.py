@@ -1,4 +1,4 @@
-"""Systems that are singular: what no column shows stays at zero, whatever rounding says."""
+"""Singular systems: coefficients without data stay at zero despite rounding."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Calibration and diagnosis find the same where they fit the same terms to the same record."""
+"""Calibration and diagnosis agree if they fit the same terms to the same record."""
 
 from __future__ import annotations
 

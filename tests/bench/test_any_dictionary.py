@@ -1,7 +1,5 @@
 """Check, boot-up and steps on simulated drives that carry other dictionaries than the project's own."""
 
-from __future__ import annotations
-
 import math
 import re
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Shared by the tests of the bring-up: the article's axis with one thing wrong, and what is found."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field

@@ -1,7 +1,5 @@
 """The doctor's list on a simulated drive with one thing wrong: each is found, and its key named."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Judgement of measured figures: the keys that are at fault, and the limits between pass and fail."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

@@ -1,6 +1,4 @@
-"""A scan finds the nodes of a bus, and leaves everything as it was."""
-
-from __future__ import annotations
+"""A scan finds the nodes of a bus and changes nothing."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager

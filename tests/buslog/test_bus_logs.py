@@ -1,7 +1,5 @@
 """``hdbridge record import``: logs of a bus on which another master drives a simulated axis."""
 
-from __future__ import annotations
-
 import math
 import struct
 from collections.abc import Callable

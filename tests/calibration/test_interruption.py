@@ -1,4 +1,4 @@
-"""Whatever ends a calibration: what was measured is kept, and it goes on from there."""
+"""Interrupted calibrations keep their measurements and can be resumed."""
 
 import signal
 

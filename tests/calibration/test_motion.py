@@ -1,4 +1,4 @@
-"""A calibration whose plan has the test in motion: the response is measured, kept, and carried over."""
+"""Calibration with the motion test: the response is measured, stored and carried over."""
 
 from hdbridge.axis.model import TransmissionModel
 

@@ -1,4 +1,4 @@
-"""`hdbridge check` and `step` with the dictionaries of other drives: what is left to them, and what is refused."""
+"""`hdbridge check` and `step` with the dictionaries of other drives."""
 
 # ruff: noqa: E501  (tables)
 

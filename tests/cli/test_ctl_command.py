@@ -1,4 +1,4 @@
-"""`hdbridge ctl`, against the API as it is served over a machine without drives."""
+"""`hdbridge ctl` against the API, served over a machine without drives."""
 
 import json
 import os

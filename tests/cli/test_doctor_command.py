@@ -35,12 +35,6 @@ def test_doctor_without_motion(hdbridge):
     assert "as far as it can be checked without motion" in done.stdout
 
 
-def test_doctor_on_a_real_bus_without_a_drive(hdbridge):
-    done = hdbridge("doctor", "article")
-    assert done.returncode == 2
-    assert "bus.interface: found virtual" in done.stdout
-
-
 def test_a_real_axis_moves_only_with_consent(hdbridge, monkeypatch):
     """The bus is simulated, but the command does not know it."""
     real = Session.connected

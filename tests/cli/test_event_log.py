@@ -1,4 +1,4 @@
-"""`-v`, `--log` and shell completion: what stands before the command."""
+"""`-v`, `--log` and shell completion."""
 
 import json
 import os

@@ -1,7 +1,5 @@
 """``hdbridge gateway`` and the key ``gateway`` of a machine file."""
 
-from __future__ import annotations
-
 import shutil
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""`hdbridge model`: look, compare, commit, go back; and what a kill leaves."""
+"""`hdbridge model`: show, compare, commit, roll back; state after a kill."""
 
 import json
 

@@ -1,4 +1,4 @@
-"""`hdbridge move` and `hdbridge home`: an axis that goes where it is told."""
+"""`hdbridge move` and `hdbridge home`."""
 
 import json
 import os

@@ -1,4 +1,4 @@
-"""`hdbridge new`: a profile's folder for who has installed hdbridge from a wheel."""
+"""`hdbridge new` for installations from a wheel."""
 
 import pytest
 

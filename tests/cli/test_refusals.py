@@ -1,4 +1,4 @@
-"""Every command, every argument and option: what cannot be right is refused in one line, and nothing happens.
+"""Invalid arguments and options of every command are refused in one line, without side effects.
 
 The commands, their parameters and the ranges of those come from the command line itself.
 """

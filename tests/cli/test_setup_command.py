@@ -1,7 +1,5 @@
 """`hdbridge setup`: unattended on a simulated drive, interrupted, resumed, and its questions."""
 
-from __future__ import annotations
-
 import json
 import os
 import pty

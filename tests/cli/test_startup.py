@@ -26,7 +26,6 @@ print("scipy" in sys.modules, status)
         (("--help",), 0),
         (("model", "log", "article"), 0),
         (("scan", "--interface", "socketcan"), 2),
-        (("doctor", "--help"), 0),
         (("check", "article"), 0),
     ],
 )

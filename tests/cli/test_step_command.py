@@ -55,12 +55,6 @@ def test_check_explains_the_files(hdbridge):
         assert fact in done.stdout
 
 
-def test_a_single_scheme_is_run(hdbridge, tmp_path):
-    done = hdbridge("step", "article", "--simulate", "--count", 3, "--scheme", "both", "--json", "out.json")
-    assert done.returncode == 0, done.stderr
-    assert "none" not in json.loads((tmp_path / "out.json").read_text())
-
-
 def test_a_profile_without_a_model_gets_advice(hdbridge):
     done = hdbridge("step", "demo", "--simulate")
     assert done.returncode == 2

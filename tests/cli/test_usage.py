@@ -1,4 +1,4 @@
-"""A command line that is refused: one line, as for a wrong file, with what was given."""
+"""Invalid command lines give one line with the given and the expected value."""
 
 import pytest
 

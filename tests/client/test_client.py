@@ -1,4 +1,4 @@
-"""The client without asyncio, against the API as it is served."""
+"""The synchronous client against the served API."""
 
 import os
 import pwd

@@ -1,4 +1,4 @@
-"""The examples of docs/daemon-api.md, each run as it stands against a served machine."""
+"""The examples of docs/daemon-api.md run against a served machine."""
 
 import re
 from pathlib import Path

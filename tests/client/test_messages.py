@@ -1,4 +1,4 @@
-"""The messages: what a request refuses, that closed sets are those of the house, errors there and back."""
+"""API messages: validation of requests, enumerations, errors in both directions."""
 
 import json
 import math

@@ -1,7 +1,5 @@
 """The synchronous client is the asyncio one without its keywords."""
 
-from __future__ import annotations
-
 import pytest
 import synchronous_client
 

@@ -1,4 +1,4 @@
-"""Nothing moves under a model of another gear, axis or drive; what cuts a model is said."""
+"""Models of another gear, axis or drive cause no motion; limits that cut a model are reported."""
 
 from dataclasses import replace
 from pathlib import Path

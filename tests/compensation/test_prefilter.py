@@ -1,4 +1,4 @@
-"""The correction in motion: its filter has the gain it is said to have, and changes nothing at rest."""
+"""Compensation in motion: the filter has its stated gain and no effect at rest."""
 
 import math
 from dataclasses import replace

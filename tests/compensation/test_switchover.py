@@ -1,4 +1,4 @@
-"""Another model in motion: no step, within the caps, and in the end what the new model alone would do."""
+"""Model changes in motion: no step, within the limits, ending at the new model."""
 
 import pickle
 from pathlib import Path

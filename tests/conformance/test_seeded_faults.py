@@ -3,8 +3,6 @@
 A fault changes the frames between the node and the bus, or substitutes one behaviour.
 """
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Callable
 from operator import attrgetter

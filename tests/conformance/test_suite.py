@@ -1,6 +1,4 @@
-"""The conformance suite: its verdicts are right, it restores what it changes, and power stays off."""
-
-from __future__ import annotations
+"""The conformance suite: correct verdicts, restored settings, power off."""
 
 import json
 import logging

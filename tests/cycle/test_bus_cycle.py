@@ -1,4 +1,4 @@
-"""One control cycle for several axes: its order, silent axes, who comes and goes, what it tells of a turn."""
+"""One control cycle for several axes: order, silent axes, joining and leaving, figures of a turn."""
 
 from __future__ import annotations
 

@@ -1,12 +1,10 @@
-"""Everything at once and in any order: commands that make sense or none, faults, mad services.
+"""Random commands, faults and failing services in any order.
 
 The laws (`support.daemonlaws`) are checked on every frame that leaves the loop: no target outside the limits,
 stale at enable, or farther from the last than the limits of velocity and slew allow; no power without an
 ENABLE command since it was last taken away; nothing to an axis that is not verified; each command answered
 once.
 """
-
-from __future__ import annotations
 
 import math
 import struct

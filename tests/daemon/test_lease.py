@@ -1,4 +1,4 @@
-"""One client at a time holds the right to move, whatever order they ask in."""
+"""One client at a time holds the lease, for any order of requests."""
 
 import itertools
 

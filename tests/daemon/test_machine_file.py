@@ -1,8 +1,6 @@
-"""The machine file: what it means, and one exact line for everything that can be wrong in it."""
+"""The machine file: its meaning, and one exact line for every error."""
 
 # ruff: noqa: E501  (the table of complaints shows each on one line)
-
-from __future__ import annotations
 
 import pickle
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Parts of the daemon's processes: runtime folder, start, notification, patience, log."""
 
-from __future__ import annotations
-
 import json
 import logging
 import os

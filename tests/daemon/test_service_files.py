@@ -1,6 +1,4 @@
-"""The files with which systemd runs the daemon: what they say, and that systemd takes them."""
-
-from __future__ import annotations
+"""The systemd unit files: content, and acceptance by systemd."""
 
 import configparser
 import shutil

@@ -1,7 +1,5 @@
 """Shared by the tests of the simulated drive: a motor without physics, a master of raw frames."""
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Iterator
 from pathlib import Path

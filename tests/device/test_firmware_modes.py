@@ -1,6 +1,4 @@
-"""Operating modes: CSP, PP and HM as a master sees them, and what holds for all of them."""
-
-from __future__ import annotations
+"""Operating modes CSP, IP, PP and HM as a master sees them."""
 
 import pytest
 
@@ -49,14 +47,14 @@ def test_ip_holds_its_position_until_interpolation_is_enabled(ip, master, motor)
     assert (motor.motor_counts, feedback[0] & 0x1000) == (500, 0)
 
 
-def test_ip_begins_where_the_axis_stands_whatever_was_in_its_record(ip, master, motor):
+def test_ip_starts_at_the_actual_position(ip, master, motor):
     for word in (0x07, 0x07, 0x0F, 0x0F):
         ip(word, 12_345)
     assert motor.motor_counts == 0
     assert master.read(0x60C1, 1) == 12_345  # of the RPDO; interpolation is not enabled
 
 
-def test_ip_knows_linear_interpolation_only(master):
+def test_ip_supports_linear_interpolation_only(master):
     assert master.write(0x60C0, 0, -1, 2) == 0x06090030
     master.put(0x60C0, 0, 0, 2)
 
@@ -124,7 +122,7 @@ def test_targets_stay_within_the_software_limits(master, start, target):
     assert not row[0] & LIMIT
 
 
-def test_an_axis_beyond_a_limit_may_stay_and_come_back_but_go_no_further(master, motor):
+def test_an_axis_beyond_a_limit_may_only_return(master, motor):
     motor.position = 500.0
     master.put(0x607D, 1, -100, 4)
     master.put(0x607D, 2, 100, 4)

@@ -1,7 +1,5 @@
 """Power states, stops and faults of the drive, by SDO and PDO. Every state and word: test_state_machine."""
 
-from __future__ import annotations
-
 import struct
 
 import pytest
@@ -140,7 +138,7 @@ def test_the_history_keeps_the_last_eight_newest_first(master):
     assert [master.read(0x1003, sub) for sub in range(3)] == [0, 0, 0]
 
 
-def test_the_brake_closes_at_rest_and_not_before(master, motor):
+def test_the_brake_closes_only_at_rest(master, motor):
     master.enable_csp()
     master.cruise(40, 10)
     master.control(0x00)
@@ -178,7 +176,7 @@ def test_following_error_is_a_fault(master, motor):
     assert master.statusword & 0x2000 == 0
 
 
-def test_following_error_can_be_switched_off_and_is_shown(master, motor):
+def test_following_error_supervision_can_be_disabled(master, motor):
     master.put(0x6065, 0, 0xFFFFFFFF, 4)
     master.enable_csp()
     motor.stuck = True

@@ -3,8 +3,6 @@
 Nothing here asserts how long anything takes: events are waited for, generously.
 """
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Iterator
 from pathlib import Path
@@ -125,7 +123,7 @@ class BrokenBus(can.BusABC):
         raise can.CanOperationError("network is down")
 
 
-def test_a_drive_whose_bus_is_gone_runs_on_and_gives_up_in_the_end(motor):
+def test_a_drive_without_its_bus_runs_on_and_finally_gives_up(motor):
     clock = VirtualClock()
     with BrokenBus() as bus:
         node = DriveNode(bus, motor, EDS, 1, clock)

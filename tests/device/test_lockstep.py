@@ -1,6 +1,4 @@
-"""The lockstep bus and the virtual clock: time passes only in waiting, and always the same way."""
-
-from __future__ import annotations
+"""The lockstep bus and the virtual clock: deterministic time that passes only while waiting."""
 
 import struct
 from pathlib import Path
@@ -29,7 +27,7 @@ def message(can_id: int, data: bytes = b"", **flags) -> can.Message:
     return can.Message(arbitration_id=can_id, data=data, is_extended_id=False, **flags)
 
 
-def test_time_stands_still_but_for_waiting(master):
+def test_time_passes_only_while_waiting(master):
     before = master.clock.now()
     master.put(0x607A, 0, 5, 4)
     master.bus.recv(0)
@@ -50,7 +48,7 @@ def test_a_wait_ends_with_the_frame(master):
     assert frame.timestamp == master.clock.now() == pytest.approx(before + 0.03)
 
 
-def test_a_wait_for_nobody_ends():
+def test_a_wait_without_peers_ends():
     clock = VirtualClock(5.0)
     with LockstepBus("nobody-here", clock) as bus:
         assert bus.recv(1.0) is None
@@ -66,7 +64,7 @@ def test_filters_hold(master):
     assert [can_id for can_id, _ in master.take()] == [0x181]
 
 
-def test_others_on_the_channel_are_heard_by_master_and_drive(motor):
+def test_other_nodes_on_the_channel_are_received(motor):
     with (
         lockstep_bench(motor, EDS, channel="shared-channel") as (bus, _, _),
         can.Bus(interface="virtual", channel="shared-channel", ignore_config=True) as other,
@@ -132,7 +130,7 @@ def test_the_nameplate_is_that_of_the_axis():
         assert bus.recv(0).data[4:] == struct.pack("<I", plate.gear_motor_turns)
 
 
-def test_two_benches_do_not_meet(motor):
+def test_two_benches_are_isolated(motor):
     with (
         lockstep_bench(motor, EDS) as (bus_a, _, node_a),
         lockstep_bench(type(motor)(), EDS) as (bus_b, _, _),
@@ -162,14 +160,14 @@ def run_several(node_ids: list[int]) -> dict[int, list[bytes]]:
     return frames
 
 
-def test_several_axes_share_a_bus_and_do_not_disturb_each_other():
+def test_axes_on_one_bus_do_not_disturb_each_other():
     together = run_several([1, 2, 5])
     assert all(len(frames) == 200 for frames in together.values())
     for node_id in (1, 2, 5):
         assert together[node_id] == run_several([node_id])[node_id]
 
 
-def test_two_simulated_drives_cannot_be_one_node():
+def test_two_simulated_drives_need_different_node_ids():
     twice = [SimulatedAxis(ARTICLE, EDS, 4), SimulatedAxis(ARTICLE, EDS, 4)]
     with pytest.raises(InputError, match="node 4"), simulated_benches(twice):
         pass

@@ -1,7 +1,5 @@
 """LSS: python-canopen's master finds, selects and numbers a drive; nothing that it sends disturbs an axis."""
 
-from __future__ import annotations
-
 import struct
 
 import canopen.lss
@@ -50,7 +48,7 @@ def heartbeats(frames):
     return [(can_id - 0x700, data[0]) for can_id, data in frames if 0x700 <= can_id < 0x780]
 
 
-def test_it_is_selected_by_its_identity_only(master, lss):
+def test_a_node_is_selected_by_its_exact_identity(master, lss):
     known = identity(master)
     for place in range(4):
         wrong = [part + (place == index) for index, part in enumerate(known)]
@@ -89,7 +87,7 @@ def test_a_node_id_is_pending_until_the_communication_is_reset(master, lss):
     assert heartbeats(master.take()) == [(1, 0)]
 
 
-def test_a_stored_node_id_outlives_a_reset_of_the_node(master, lss):
+def test_a_stored_node_id_survives_a_node_reset(master, lss):
     lss.send_switch_state_global(lss.CONFIGURATION_STATE)
     lss.configure_node_id(PENDING_ID)
     lss.store_configuration()
@@ -106,7 +104,7 @@ def test_a_node_id_out_of_range_is_refused(master, lss, node_id):
     assert heartbeats(master.take()) == [(1, 0)]
 
 
-def test_without_a_node_id_it_is_silent_until_a_fast_scan_has_found_it(master, lss):
+def test_a_node_without_id_is_silent_until_a_fast_scan(master, lss):
     known = identity(master)
     assert lss.fast_scan() == (False, None)
     lss.send_switch_state_global(lss.CONFIGURATION_STATE)
@@ -123,7 +121,7 @@ def test_without_a_node_id_it_is_silent_until_a_fast_scan_has_found_it(master, l
     assert heartbeats(master.seen)[-1] == (PENDING_ID, 0)
 
 
-def test_it_answers_to_a_range_of_identities(master, lss):
+def test_a_node_answers_to_identity_ranges(master, lss):
     vendor, product, revision, serial = identity(master)
     for span, answered in (
         ((vendor, product, revision, revision, serial, serial), True),

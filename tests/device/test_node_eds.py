@@ -1,7 +1,5 @@
 """The EDS: read without a complaint, complete in itself, and true of the node."""
 
-from __future__ import annotations
-
 import logging
 import re
 import struct
@@ -96,7 +94,7 @@ def test_identifiers_follow_the_node_id(declared):
 @pytest.mark.parametrize(
     "content", [None, b"", b"[1000]\n", b"\xff\xfe\x00", b"[1000]\nParameterName=x\nDataType=zz\n"]
 )
-def test_what_is_no_eds_is_refused_in_one_line(tmp_path, content):
+def test_an_invalid_eds_is_refused_in_one_line(tmp_path, content):
     path = tmp_path / "bad.eds"
     if content is not None:
         path.write_bytes(content)
@@ -126,7 +124,7 @@ def bench(tmp_path, motor):
     return make
 
 
-def test_what_the_eds_lacks_is_not_on_the_bus_and_the_drive_works_without_it(bench, motor):
+def test_objects_missing_in_the_eds_are_absent_and_the_drive_still_works(bench, motor):
     with bench((r"\[6085\][^[]*", ""), (r"\[60C2(sub\d)?\][^[]*", ""), (r"\[607Dsub2\][^[]*", "")) as master:
         assert master.abort_of_read(0x6085) == NO_OBJECT
         assert master.write(0x60C2, 1, 4, 1) == NO_OBJECT
@@ -153,7 +151,7 @@ def test_a_period_of_zero_is_that_of_sync(bench, motor):
         assert motor.motor_counts == target
 
 
-def test_a_vendors_own_object_may_have_the_number_of_one_of_the_simulated_drives(bench, motor):
+def test_a_vendor_object_may_reuse_a_number_of_the_simulated_drive(bench, motor):
     with bench(
         (r"(\[2000\][^[]*DataType=)0x0009(\n[^[]*DefaultValue=).*", r"\g<1>0x0005\g<2>7"),
         (r"(\[2100\][^[]*DataType=)0x0003", r"\g<1>0x0009"),
@@ -178,7 +176,7 @@ def test_objects_have_the_type_that_the_eds_gives_them(bench, motor):
         assert master.read(0x6064) == 40_000 - 65_536
 
 
-def test_a_number_that_is_a_text_by_the_eds_cannot_be_simulated(bench):
+def test_a_number_declared_as_text_cannot_be_simulated(bench):
     with (
         pytest.raises(InputError, match=r"own\.eds: 6064h:00 .* data type 0009h"),
         bench((r"(\[6064\][^[]*DataType=)0x0004", r"\g<1>0x0009")),
@@ -197,7 +195,7 @@ def test_a_fixed_mapping_with_a_gap_in_it(bench, motor):
         assert (master.state, master.read(0x607A)) == ("ready", 77)
 
 
-def test_a_default_mapping_of_an_object_that_is_not_there_is_no_pdo(bench):
+def test_a_default_mapping_of_a_missing_object_disables_the_pdo(bench):
     with bench((r"\[6062\][^[]*", "")) as master:
         assert (master.read(0x1A01, 0), master.read(0x1A00, 0)) == (0, 3)
         master.nmt(1)

@@ -1,6 +1,4 @@
-"""NMT, heartbeats, boot-up and what the node ignores."""
-
-from __future__ import annotations
+"""NMT, heartbeats, boot-up, and time with and without SYNC."""
 
 import pytest
 
@@ -23,7 +21,7 @@ def test_reset_node_restores_everything_and_switches_off(master):
     assert master.read(0x1800, 1) == 0x181
 
 
-def test_the_sync_identifier_can_be_moved_but_it_produces_none(master):
+def test_the_sync_identifier_can_be_changed_but_not_produced(master):
     assert master.write(0x1005, 0, 0x40000080, 4) == 0x06090030
     master.put(0x1005, 0, 0x90, 4)
     master.nmt(1)
@@ -63,7 +61,7 @@ def test_with_sync_the_axis_runs_one_period_each(master, motor):
     assert motor.elapsed_s - before == pytest.approx(0.4)
 
 
-def test_a_missed_sync_is_made_up_by_the_clock(master, motor):
+def test_a_missed_sync_is_bridged_by_the_clock(master, motor):
     master.nmt(1)
     master.cycle()
     before = motor.elapsed_s
@@ -83,7 +81,7 @@ def test_odd_periods_add_up(master, motor):
     assert motor.elapsed_s - before == pytest.approx(1.3, abs=0.0005)
 
 
-def test_a_stalled_process_does_not_make_up_for_hours(master, motor):
+def test_a_stalled_process_does_not_catch_up_hours(master, motor):
     before = motor.elapsed_s
     master.node.poll(master.clock.now() + 3600.0)
     assert motor.elapsed_s - before < 1.1

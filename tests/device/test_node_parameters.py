@@ -1,7 +1,5 @@
 """Stored parameters: they outlive a reset and, with a file, the process."""
 
-from __future__ import annotations
-
 import struct
 from contextlib import contextmanager
 
@@ -26,7 +24,7 @@ def stored(channel, store):
         yield RawMaster(bus, clock, node, motor)
 
 
-def test_stored_parameters_outlive_a_reset_and_the_process(tmp_path):
+def test_stored_parameters_survive_a_reset_and_the_process(tmp_path):
     store = tmp_path / "parameters.json"
     with stored("store-1", store) as master:
         master.write(0x6065, 0, 1234, 4)

@@ -1,7 +1,5 @@
 """PDOs: mapping over SDO, transmission types, SYNC semantics, deadlines, lengths."""
 
-from __future__ import annotations
-
 import struct
 
 import pytest
@@ -34,7 +32,7 @@ def sync(master) -> list[tuple[int, bytes]]:
     return master.take()
 
 
-def test_refused_values_in_a_pdo_are_dropped_alone(master):
+def test_only_the_refused_values_of_a_pdo_are_dropped(master):
     assert remap(master, 2, [0x60600008, 0x60810020], receive=True) == 0
     master.nmt(1)
     master.send(0x301, struct.pack("<bI", 3, 777))
@@ -60,7 +58,7 @@ def test_a_target_is_reached_one_period_after_the_sync_that_takes_it(master):
     assert positions == [0, 50, 50]
 
 
-def test_what_one_sync_sends_belongs_together(master):
+def test_tpdos_of_one_sync_are_consistent(master):
     master.enable_csp()
     for k in range(1, 20):
         _, actual, _, load, demand = master.cycle(0x0F, 10 * k)
@@ -84,7 +82,7 @@ def test_a_late_rpdo_stops_an_axis_in_csp(master, option, state):
     assert master.read(0x606C) == 0
 
 
-def test_a_late_rpdo_matters_to_nobody_else(master):
+def test_a_late_rpdo_is_harmless_without_power(master):
     master.put(0x1400, 5, 10, 2)
     master.nmt(1)
     master.cycle(0x06)

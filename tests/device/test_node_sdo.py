@@ -1,7 +1,5 @@
 """The SDO server: transfers, abort codes, and requests that make no sense."""
 
-from __future__ import annotations
-
 import struct
 
 import pytest
@@ -82,7 +80,7 @@ def test_the_period_is_fixed_while_the_axis_is_enabled(master):
 
 @given(data=st.binary(min_size=1, max_size=64), stated=st.booleans())
 @settings(max_examples=30, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-def test_what_is_written_in_segments_is_read_back(master, data, stated):
+def test_segmented_writes_read_back(master, data, stated):
     assert download(master, *LABEL, data, -1 if stated else None) == 0
     if len(data) > 4:
         assert upload(master, *LABEL) == data

@@ -4,8 +4,6 @@ The table is the standard's own, by its numbers, with the bit patterns of its co
 RPDOs, and the state comes back in the statusword of a TPDO.
 """
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Iterator
 from contextlib import contextmanager

@@ -52,14 +52,14 @@ def holds(known: float, result: Diagnosis) -> bool:
     return stays and abs(size.value - RUN_OUT_ARCSEC) < 1.5
 
 
-def test_a_known_spring_is_not_given_up_for_a_run_out_of_the_load_encoder(
+def test_a_known_spring_is_not_replaced_by_load_encoder_eccentricity(
     run_out: Callable[[int], tuple[float, Diagnosis]],
 ) -> None:
     assert holds(*run_out(400))
 
 
 @pytest.mark.slow
-def test_run_outs_beside_known_springs(run_out: Callable[[int], tuple[float, Diagnosis]]) -> None:
+def test_eccentricity_next_to_known_springs(run_out: Callable[[int], tuple[float, Diagnosis]]) -> None:
     """Without a prior the spring was lost in 8 of 8; five of six right is then less likely than 1e-6."""
     assert sum(holds(*run_out(seed)) for seed in SEEDS) >= 5
 

@@ -1,4 +1,4 @@
-"""A known spring that has changed is found as such, or told as what else it may be."""
+"""Changed springs are found, or reported with their aliases."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def spring_of(model: TransmissionModel) -> float:
     return float(spring.parameters()["c1_arcsec_per_nm"])
 
 
-def test_a_spring_that_has_changed_is_found_and_the_model_takes_it_over(
+def test_a_changed_spring_is_found_and_written_to_the_model(
     columns: Columns, known: TransmissionModel
 ) -> None:
     """Under a torque that goes with nothing else."""
@@ -46,7 +46,9 @@ def test_a_spring_that_has_changed_is_found_and_the_model_takes_it_over(
     assert not found.refusal()
 
 
-def test_a_change_that_a_run_out_may_be_is_left_alone(columns: Columns, known: TransmissionModel) -> None:
+def test_a_change_explained_by_eccentricity_is_not_reported(
+    columns: Columns, known: TransmissionModel
+) -> None:
     """Under a mass off centre the torque goes once per turn, as a run-out does."""
     record = columns({"compliance": {"c1": NOW, "c2": NOW, "t1": 1e3}}, torque_nm=9.0)
     result = diagnose(Record(record), known)
@@ -58,7 +60,7 @@ def test_a_change_that_a_run_out_may_be_is_left_alone(columns: Columns, known: T
     assert size.low < KNOWN < NOW < size.high
 
 
-def test_a_spring_within_its_calibration_is_no_finding(columns: Columns, known: TransmissionModel) -> None:
+def test_a_spring_within_its_calibration_is_not_reported(columns: Columns, known: TransmissionModel) -> None:
     spring = {"c1": 1.03 * KNOWN, "c2": 1.03 * KNOWN, "t1": 1e3}
     result = diagnose(Record(columns({"compliance": spring}, torque_nm=6.0)), known)
     assert not result.findings

@@ -29,7 +29,7 @@ def files(
     return tmp_path / "record.csv.gz", tmp_path / "model.yaml"
 
 
-def test_it_writes_findings_and_an_extended_model(files: tuple[Path, Path], tmp_path: Path) -> None:
+def test_writes_findings_and_an_extended_model(files: tuple[Path, Path], tmp_path: Path) -> None:
     out, new, page = (tmp_path / name for name in ("out.json", "new.yaml", "page.html"))
     command = ["diagnose", str(files[0]), "--model", str(files[1]), "--json", str(out), "--extend", str(new)]
     command += ["--html", str(page)]

@@ -1,4 +1,4 @@
-"""Hidden effects are found by their names, and nothing is found where nothing is."""
+"""Hidden effects are named, and a healthy axis yields no finding."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def names(diagnosis: Diagnosis) -> list[str]:
     return [each.cause for each in diagnosis.findings]
 
 
-def test_nothing_hidden_is_nothing_found(diagnosed: Diagnosed) -> None:
+def test_nothing_is_found_in_a_healthy_axis(diagnosed: Diagnosed) -> None:
     result = diagnosed()
     assert names(result) == []
     assert result.extended.rms_arcsec < result.baseline.rms_arcsec
@@ -36,7 +36,7 @@ def test_nothing_hidden_is_nothing_found(diagnosed: Diagnosed) -> None:
         ("creep", {"size": 4.0, "tau": 3.0}),
     ],
 )
-def test_a_finding_gains_on_what_it_has_not_seen_and_is_offered(
+def test_a_finding_improves_held_out_data_and_is_offered(
     diagnosed: Diagnosed, cause: str, effect: dict[str, Any]
 ) -> None:
     result = diagnosed({cause: effect})
@@ -48,7 +48,7 @@ def test_a_finding_gains_on_what_it_has_not_seen_and_is_offered(
     assert result.extended.rms_arcsec < 1.5 * diagnosed().extended.rms_arcsec + 0.1
 
 
-def test_parameters_come_with_intervals_that_hold_the_truth(diagnosed: Diagnosed) -> None:
+def test_intervals_contain_the_true_parameters(diagnosed: Diagnosed) -> None:
     found = diagnosed({"vibration": {"size": 3.0, "hz": 3.3}}).findings[0].parameters
     assert found["frequency_hz"].value == pytest.approx(3.3, abs=1e-3)
     assert found["amplitude_arcsec"].low < 3.0 < found["amplitude_arcsec"].high
@@ -62,13 +62,13 @@ def test_once_per_load_turn_without_a_torque_channel_may_be_gravity(diagnosed: D
     assert "mass" in found.experiment
 
 
-def test_a_changed_encoder_cannot_be_told_from_the_first_motor_order(diagnosed: Diagnosed) -> None:
+def test_motor_encoder_eccentricity_is_an_alias_of_the_first_motor_order(diagnosed: Diagnosed) -> None:
     found = diagnosed({"motor_encoder_eccentricity": {"orders": [(1, 4.0, 100.0)]}}).findings[0]
     assert {found.cause, *found.aliases} == {"motor_encoder_eccentricity", "motor_order"}
     assert "re-clock" in found.experiment
 
 
-def test_what_is_in_no_catalogue_is_unexplained_and_says_where(diagnosed: Diagnosed) -> None:
+def test_unknown_causes_are_unexplained_with_their_location(diagnosed: Diagnosed) -> None:
     first = diagnosed({"unknown": {"kind": "one_way", "size": 6.0}}).findings[0]
     assert first.cause == "unexplained"
     assert "direction" in first.lives_in
@@ -79,7 +79,7 @@ def test_two_effects_at_once(diagnosed: Diagnosed) -> None:
     assert set(names(diagnosed(hidden))) == set(hidden)
 
 
-def test_the_extended_model_predicts_what_was_found(
+def test_the_extended_model_predicts_the_finding(
     diagnosed: Diagnosed, columns: Callable[..., dict[str, Any]]
 ) -> None:
     hidden = {"motor_order": {"orders": [(7, 4.0, 60.0)]}}
@@ -90,7 +90,7 @@ def test_the_extended_model_predicts_what_was_found(
     assert again.findings == ()
 
 
-def test_the_document_has_its_contract(diagnosed: Diagnosed) -> None:
+def test_the_document_follows_its_contract(diagnosed: Diagnosed) -> None:
     data = diagnosed({"motor_order": {"orders": [(5, 4.0, 30.0)]}}).as_dict()
     assert data["schema"] == "hdbridge.diagnosis/1"
     assert set(data["baseline"]) == {"rms_arcsec", "three_sigma_arcsec"} == set(data["extended"])
@@ -109,7 +109,7 @@ def test_too_short_a_record_is_refused(
         diagnose(Record(few), model)
 
 
-def test_a_model_that_needs_a_channel_says_so(columns: Callable[..., dict[str, Any]]) -> None:
+def test_a_model_needing_a_channel_reports_it(columns: Callable[..., dict[str, Any]]) -> None:
     text = (
         "schema: hdbridge.model/1\nratio: 50\neffects:\n"
         "  - effect: compliance\n    parameters: {c1_arcsec_per_nm: 9, "
@@ -126,7 +126,7 @@ def test_the_same_record_gives_the_same_answer(
     assert diagnose(Record(columns(hidden)), model).as_dict() == diagnosed(hidden).as_dict()
 
 
-def test_a_bare_short_record_gives_no_confident_wrong_name(model: TransmissionModel) -> None:
+def test_a_short_record_yields_no_confident_wrong_cause(model: TransmissionModel) -> None:
     """One way, no command, no standstill, coarse counts, noise: hardly anything can be said."""
     rng = np.random.default_rng(3)
     time = np.arange(150) * 0.02
@@ -139,7 +139,7 @@ def test_a_bare_short_record_gives_no_confident_wrong_name(model: TransmissionMo
 
 
 @pytest.mark.parametrize(("counts", "digits"), [(2**14, 9), (8000, 7)])
-def test_the_digits_of_a_file_name_nothing(
+def test_rounded_digits_yield_no_cause(
     columns: Callable[..., dict[str, Any]], model: TransmissionModel, counts: int, digits: int
 ) -> None:
     """Without a command the reading drives the loop, and its count is hidden by the digits that were kept."""

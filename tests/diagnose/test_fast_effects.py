@@ -1,4 +1,4 @@
-"""Fast effects are not noise: the floor beside them, their frequency, and decay soon after a stop."""
+"""Fast effects are separated from noise: floor, frequency, and decay after a stop."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def often_enough(right: int, of: int, rate: float) -> bool:
 
 
 @pytest.mark.parametrize("hz", [3.0, 8.0, 15.0, 22.0])
-def test_a_vibration_is_no_noise(hz: float) -> None:
+def test_a_vibration_is_not_noise(hz: float) -> None:
     time_s = np.arange(6000) / 50.0
     noise = 0.3 * np.random.default_rng(int(hz)).standard_normal(len(time_s))
     shaken = noise + 5.0 * np.cos(2.0 * np.pi * hz * time_s)
@@ -45,18 +45,18 @@ def test_a_vibration_is_no_noise(hz: float) -> None:
     assert noise_arcsec(shaken, still, 0.0, 0.0, True) == pytest.approx(0.3, rel=0.25)
 
 
-def test_white_noise_is_found_in_short_stretches_and_something_slow_is_none_of_it() -> None:
+def test_white_noise_is_estimated_without_slow_terms() -> None:
     rng = np.random.default_rng(4)
     rows = np.arange(20_000) % 50 < 40
     slow = 40.0 * np.sin(np.arange(len(rows)) / 300.0)
     assert between_lines(rng.standard_normal(len(rows)) + slow, rows) == pytest.approx(1.0, rel=0.1)
 
 
-def test_too_little_of_it_has_no_spectrum() -> None:
+def test_a_short_vibration_has_no_spectrum() -> None:
     assert between_lines(np.zeros(60), np.ones(60, dtype=bool)) == np.inf
 
 
-def test_a_vibration_leaves_nothing_at_a_rate_that_shows_it_whole(plant: ModuleType) -> None:
+def test_a_resolved_vibration_is_removed_completely(plant: ModuleType) -> None:
     found = diagnosed(plant, {"vibration": {"size": 5.0, "hz": 10.43}}, seed=31, rate_hz=50.0)
     assert names(found) == ["vibration"]
     assert found.noise_floor_arcsec == pytest.approx(NOISE_ARCSEC, rel=0.15)
@@ -81,15 +81,15 @@ def damaged(seed: int) -> dict[str, Any]:
     }
 
 
-def test_creep_that_is_over_half_a_second_after_a_stop_is_named(plant: ModuleType) -> None:
+def test_fast_creep_is_named(plant: ModuleType) -> None:
     assert names(diagnosed(plant, {"creep": {"size": 4.0, "tau": 0.5, "build": 1.0}}, seed=43)) == ["creep"]
 
 
-def test_a_damaged_tooth_is_named_beside_an_order_of_the_load(plant: ModuleType) -> None:
+def test_a_damaged_tooth_is_named_next_to_a_load_order(plant: ModuleType) -> None:
     assert names(diagnosed(plant, damaged(51), seed=51)) == ["load_order", "local_defect"]
 
 
-def test_more_than_an_arcsec_that_depends_on_nothing_is_unexplained(plant: ModuleType) -> None:
+def test_an_unattributed_arcsec_is_unexplained(plant: ModuleType) -> None:
     """The error wanders in motion by 1.7 arcsec; a count of the motor adds 0.9 arcsec rms."""
     record = plant.record(plant.Truth(), plant.Plan(rate_hz=16.0, scale=0.1, load_turns=1.05, steps=8), 71)
     time_s = record["time_s"]
@@ -117,7 +117,7 @@ def one_way(seed: int) -> Record:
     return concatenate(moves)
 
 
-def test_a_term_in_speed_is_no_vibration_because_moves_are_alike() -> None:
+def test_a_speed_term_is_not_a_vibration_of_equal_moves() -> None:
     found = [
         names(diagnose(one_way(seed), TransmissionModel(100.0, ()), independent_zeros=True))
         for seed in range(20, 26)
@@ -128,8 +128,6 @@ def test_a_term_in_speed_is_no_vibration_because_moves_are_alike() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("draw", [creeping, damaged])
-def test_what_is_hidden_is_named_and_nothing_else(
-    plant: ModuleType, draw: Callable[[int], dict[str, Any]]
-) -> None:
+def test_only_hidden_causes_are_named(plant: ModuleType, draw: Callable[[int], dict[str, Any]]) -> None:
     right = sum(set(names(diagnosed(plant, draw(seed), seed))) == set(draw(seed)) for seed in range(601, 613))
     assert often_enough(right, 12, 0.95)

@@ -1,4 +1,4 @@
-"""A gain is what a hold-out gave; without one there is none, and what does not gain is not offered."""
+"""Gains are validated on held-out data; findings without a gain are not offered."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def wider(diagnosed: Diagnosed) -> Diagnosis:
     return found
 
 
-def test_a_change_that_is_not_there_loses_on_what_is_held_out(
+def test_a_spurious_change_worsens_held_out_data(
     columns: Callable[..., dict[str, Any]],
 ) -> None:
     """Orders of nothing but noise: a fit always gains by them in itself."""
@@ -48,7 +48,7 @@ def test_a_change_that_is_not_there_loses_on_what_is_held_out(
     assert gain.after_arcsec > gain.before_arcsec
 
 
-def test_a_changed_loop_is_held_out(wider: Diagnosis, model: TransmissionModel) -> None:
+def test_a_changed_loop_is_validated_on_held_out_data(wider: Diagnosis, model: TransmissionModel) -> None:
     (found,) = wider.findings
     assert found.gain is not None
     assert len(found.gain.samples) > 30
@@ -78,7 +78,7 @@ def test_a_cause_without_a_gain_is_not_more_likely_than_not(wider: Diagnosis, ga
     assert unproven.probability <= 0.5 < known.probability
 
 
-def test_a_finding_that_cannot_be_written_is_none(
+def test_a_finding_that_cannot_be_written_is_dropped(
     diagnosed: Diagnosed, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Its parameters are out of bounds once everything is fitted together."""
@@ -91,7 +91,7 @@ def test_a_finding_that_cannot_be_written_is_none(
     assert "velocity_windup" not in {each.name for each in result.model.effects}
 
 
-def test_what_may_be_nothing_is_not_offered(diagnosed: Diagnosed, model: TransmissionModel) -> None:
+def test_uncertain_findings_are_not_offered(diagnosed: Diagnosed, model: TransmissionModel) -> None:
     found = diagnosed({"motor_order": {"orders": [(5, 4.0, 30.0)]}})
     finding = found.findings[0]
     unsure = {name: replace(each, low=0.0) for name, each in finding.parameters.items()}
@@ -101,7 +101,7 @@ def test_what_may_be_nothing_is_not_offered(diagnosed: Diagnosed, model: Transmi
     assert "motor_order" not in {each.name for each in extension.model.effects}
 
 
-def test_nothing_is_held_out_of_something_unexplained(diagnosed: Diagnosed) -> None:
+def test_unexplained_findings_have_no_hold_out(diagnosed: Diagnosed) -> None:
     first = diagnosed({"unknown": {"kind": "one_way", "size": 6.0}}).findings[0]
     assert first.cause == "unexplained"
     assert first.gain is None
@@ -110,7 +110,7 @@ def test_nothing_is_held_out_of_something_unexplained(diagnosed: Diagnosed) -> N
     assert data["not_offered"]
 
 
-def test_what_is_not_named_is_not_written(
+def test_unnamed_findings_are_not_written(
     diagnosed: Diagnosed, columns: Callable[..., dict[str, Any]]
 ) -> None:
     """Several near-equal orders of the flexspline are one unknown, and none of them goes into the model."""

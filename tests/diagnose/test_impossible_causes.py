@@ -1,4 +1,4 @@
-"""Causes that cannot be, or cannot be separated, whatever fits: teeth are whole, one speed is one clock."""
+"""Physically impossible or inseparable causes are not named, however well they fit."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def test_any_whole_tooth_number_may_be_the_true_one(teeth: int, true_teeth: int,
 
 
 @given(st.integers(60, 400), st.floats(0.05, 0.45), st.integers(-20, 20))
-def test_a_part_of_a_tooth_is_no_ratio_on_an_arc_of_the_load(teeth: int, part: float, more: int) -> None:
+def test_fractional_teeth_are_not_a_ratio_error_on_an_arc(teeth: int, part: float, more: int) -> None:
     true_ratio = (teeth + more + part) / 2.0
     if abs(true_ratio * 2.0 / teeth - 1.0) > 1.1e-3:
         assert "no teeth have the ratio" in judged(teeth / 2.0, true_ratio, 0.9)
@@ -78,7 +78,7 @@ def test_the_scale_of_an_encoder_may_be_a_little_wrong(teeth: int, share: float,
     assert not judged(teeth / 2.0, (1.0 + share) * teeth / 2.0, turns)
 
 
-def test_an_arc_of_a_load_order_is_never_a_ratio_error_alone() -> None:
+def test_a_load_order_on_an_arc_keeps_its_ratio_alias() -> None:
     there = [(0.1, 2.0), (-0.1, 2.0)] * 3
     (found,) = diagnose(sweeps(lambda load: 20.0 * np.cos(np.radians(load) + 1.0), *there), MODEL).findings
     assert "load_order" in {found.cause, *found.aliases}
@@ -111,7 +111,7 @@ def test_two_speeds_separate_place_from_time(legs: list[tuple[float, float]], al
     [([(0.2, 4.0)], False), ([(0.2, 4.0), (-0.2, 4.0)], False), ([(0.2, 4.0), (-0.2, 1.55)], True)],
     ids=["one way", "there and back", "two speeds"],
 )
-def test_equal_steps_over_many_lines_do_not_show_them(
+def test_equal_steps_over_many_lines_do_not_show_line_errors(
     legs: list[tuple[float, float]], resolved: bool
 ) -> None:
     """At 4 motor turns per second the load passes 7.2 lines of 1800 between two samples."""

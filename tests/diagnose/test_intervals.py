@@ -1,4 +1,4 @@
-"""The 95 % intervals of parameters hold the truth as often as they say, and are no wider than needed."""
+"""95 % intervals of parameters have their nominal coverage and a reasonable width."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def hidden(seed: int) -> tuple[dict[str, Any], Hypothesis, dict[str, float]]:
     return effects, Hypothesis(sought, Start.FORWARD), truth
 
 
-def test_intervals_hold_the_truth_as_often_as_they_say(
+def test_intervals_have_their_nominal_coverage(
     columns: Columns, model: TransmissionModel, plant: ModuleType
 ) -> None:
     gear = {
@@ -92,7 +92,7 @@ def test_intervals_hold_the_truth_as_often_as_they_say(
     assert np.median(halves) < 0.02
 
 
-def test_a_shape_that_is_hardly_known_is_known_by_its_logarithm_and_within_its_range() -> None:
+def test_poorly_known_shapes_have_log_intervals_within_their_range() -> None:
     drag = VelocityWindup(coulomb_arcsec=1.0, viscous_arcsec_s_per_deg=0.02, shear_deg_s=1000.0)
     (shape,) = drag.shape
     for deviation, factor in ((0.3, math.exp(0.3 * NORMAL_95)), (30.0, math.inf)):
@@ -101,9 +101,7 @@ def test_a_shape_that_is_hardly_known_is_known_by_its_logarithm_and_within_its_r
         assert told[shape.name].high == pytest.approx(min(1000.0 * factor, shape.upper), rel=1e-3)
 
 
-def test_a_change_of_an_order_is_no_better_known_than_what_it_has_changed_from(
-    columns: Columns, plant: ModuleType
-) -> None:
+def test_a_changed_order_is_as_uncertain_as_its_reference(columns: Columns, plant: ModuleType) -> None:
     inside: list[bool] = []
     for seed in range(30, 34):
         rng = np.random.default_rng(seed)
@@ -129,7 +127,7 @@ def swinging(columns: dict[str, Any], orders: Any, frequency_hz: float) -> dict[
     return {**columns, "load_position_deg": columns["load_position_deg"] + beyond / 3600.0}
 
 
-def test_an_order_is_told_as_it_is_at_rest_though_the_load_swings(
+def test_orders_are_reported_at_rest_despite_load_swing(
     columns: Columns, model: TransmissionModel, plant: ModuleType
 ) -> None:
     order = (7, 5.0, 40.0)
@@ -140,9 +138,7 @@ def test_an_order_is_told_as_it_is_at_rest_though_the_load_swings(
     assert found.high - found.low < 0.2
 
 
-def test_flanks_a_shift_apart_are_told_by_the_shift_of_either(
-    columns: Columns, model: TransmissionModel
-) -> None:
+def test_shifted_flanks_are_reported_by_their_shift(columns: Columns, model: TransmissionModel) -> None:
     found = diagnose(Record(columns({"direction_phase": {"shift": 7.0}})), model).findings[0]
     assert found.cause == "direction_phase"
     shift = found.parameters["shift_deg"]
@@ -150,7 +146,7 @@ def test_flanks_a_shift_apart_are_told_by_the_shift_of_either(
     assert shift.high - shift.low < 0.7
 
 
-def test_the_time_of_a_lost_count_is_known_to_a_few_samples(
+def test_the_time_of_a_count_loss_is_found_within_a_few_samples(
     columns: Columns, model: TransmissionModel
 ) -> None:
     record = columns({"count_loss": {"size": 5.0, "at": 0.3}})

@@ -1,4 +1,4 @@
-"""A long record is averaged, and what is fitted to it alike: its figures are those of its samples."""
+"""Averaging a long record keeps the figures of its samples."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from hdbridge.records.record import Record
 ORDERS = ((2, 9.0, -132.0), (8, 2.0, 124.0), (24, 2.0, 30.0))
 
 
-def test_fast_orders_are_as_large_in_a_long_record_as_they_are() -> None:
+def test_averaging_keeps_the_amplitude_of_fast_orders() -> None:
     """150,000 samples at two motor turns a second: in means over three samples order 24 loses an eighth."""
     count, turns = 150_000, 60.0
     time_s = np.arange(count) / 200.0

@@ -40,12 +40,12 @@ def drifting(columns: Callable[..., dict[str, Any]], model: TransmissionModel) -
     return run
 
 
-def test_a_ripple_is_told_at_a_temperature_of_the_record(drifting: Callable[..., Diagnosis]) -> None:
+def test_ripple_is_reported_at_a_recorded_temperature(drifting: Callable[..., Diagnosis]) -> None:
     """At 20 degrees, far below the coldest that was measured, this one would be next to nothing."""
     assert names(drifting(0.08, rise_k=14.0, warmer_k=12.0)) == ["amplitude_drift"]
 
 
-def test_a_drift_is_told_from_the_temperature_of_the_model(drifting: Callable[..., Diagnosis]) -> None:
+def test_drift_is_reported_from_the_model_temperature(drifting: Callable[..., Diagnosis]) -> None:
     """From any other the amplitudes of the model would have changed beside it."""
     result = drifting(0.025, rise_k=10.0, warmer_k=14.0)
     assert names(result) == ["amplitude_drift"]
@@ -53,7 +53,7 @@ def test_a_drift_is_told_from_the_temperature_of_the_model(drifting: Callable[..
     assert growth.value == pytest.approx(2.5, rel=0.15)  # the gear follows the sensor with a lag
 
 
-def test_a_drift_of_ripple_stands_beside_a_much_larger_skew(diagnosed: Diagnosed) -> None:
+def test_ripple_drift_is_found_next_to_a_larger_skew(diagnosed: Diagnosed) -> None:
     """One lies between the directions, the other in both alike."""
     effects = {"channel_skew": {"ms": 0.7}, "amplitude_drift": {"ripple": 0.006}}
     assert set(names(diagnosed(effects, temperature_rise_k=14.0))) == {"channel_skew", "amplitude_drift"}
@@ -71,7 +71,7 @@ def test_a_ripple_that_is_loaded_and_warm_has_grown_by_both(diagnosed: Diagnosed
     assert drift.value == pytest.approx(-4.0, rel=0.12)  # the gear follows the sensor with a lag
 
 
-def test_what_is_left_in_one_episode_casts_no_shadow_on_what_is_seen_everywhere(
+def test_residuals_of_one_episode_do_not_hide_global_causes(
     columns: Callable[..., dict[str, Any]], model: TransmissionModel
 ) -> None:
     record = columns({"torque_modulation": {"growth": 0.03}}, torque_nm=9.0)
@@ -84,14 +84,14 @@ def test_what_is_left_in_one_episode_casts_no_shadow_on_what_is_seen_everywhere(
     assert names(diagnose(Record(record), model)) == ["unexplained", "torque_modulation"]
 
 
-def test_a_wind_up_that_every_axis_has_is_allowed_for_and_not_named(diagnosed: Diagnosed) -> None:
+def test_ordinary_wind_up_is_modelled_but_not_named(diagnosed: Diagnosed) -> None:
     result = diagnosed({"inertial_windup": {"s2": 6e-6}})
     assert names(result) == []
     assert "inertial_windup: no more than usual" in result.considered
     assert "inertial_windup" not in {each.name for each in result.model.effects}
 
 
-def test_small_steps_beside_a_large_one_are_what_something_slow_has_left(diagnosed: Diagnosed) -> None:
+def test_small_steps_next_to_a_large_one_are_not_named(diagnosed: Diagnosed) -> None:
     effects = {"count_loss": {"size": 6.0, "at": 0.4}, "creep": {"size": 4.0, "tau": 3.0}}
     result = diagnosed(effects)
     assert set(names(result)) == set(effects)
@@ -118,7 +118,7 @@ def test_a_spring_needs_no_order_for_the_noise_of_its_sensor(sprung: Callable[..
     assert result.findings[0].parameters["c1_arcsec_per_nm"].value == pytest.approx(1.5, rel=0.1)
 
 
-def test_a_spring_under_a_torque_that_is_measured_with_noise_is_no_load_order(
+def test_a_spring_under_noisy_torque_is_not_a_load_order(
     sprung: Callable[..., Diagnosis],
 ) -> None:
     (found,) = sprung({"c1": 3.0, "c2": 3.0, "t1": 4.0}, torque_nm=2.0, noise_nm=0.1).findings
@@ -143,16 +143,16 @@ def test_a_vibration_that_swells_and_fades_is_one(
     assert names(diagnose(Record(record), model)).count("vibration") == 1
 
 
-def test_two_that_grow_with_speed_are_found_where_each_hides_the_other(diagnosed: Diagnosed) -> None:
+def test_two_speed_dependent_causes_hiding_each_other_are_found(diagnosed: Diagnosed) -> None:
     effects = {"rate_dependence": {"growth": 0.06, "reference": 2.0}, "channel_skew": {"ms": -0.2}}
     assert set(names(diagnosed(effects))) == {"rate_dependence", "channel_skew"}
 
 
-def test_what_is_over_half_a_second_after_a_stop_is_no_creep(diagnosed: Diagnosed) -> None:
+def test_settling_within_half_a_second_is_not_creep(diagnosed: Diagnosed) -> None:
     assert "creep" not in names(diagnosed({"creep": {"size": 4.0, "tau": 0.1}}))
 
 
-def test_what_takes_far_longer_than_any_rest_is_no_creep(diagnosed: Diagnosed) -> None:
+def test_relaxation_longer_than_any_rest_is_not_creep(diagnosed: Diagnosed) -> None:
     assert "creep" not in names(diagnosed({"creep": {"size": 4.0, "tau": 400.0, "build": 0.02}}))
 
 
@@ -161,9 +161,7 @@ def test_a_wider_loop_of_the_same_height_has_changed(diagnosed: Diagnosed) -> No
 
 
 @pytest.mark.parametrize("seed", [2, 3])
-def test_a_loop_that_sticks_is_no_loss_of_counts_where_it_only_turns_round(
-    plant: ModuleType, seed: int
-) -> None:
+def test_a_sticking_loop_is_not_count_loss(plant: ModuleType, seed: int) -> None:
     """A friction that is higher at rest, shaken to and fro within its own width."""
     rng = np.random.default_rng(seed)
     time_s = np.arange(0.0, 28.0, 1.0 / 256.0)
@@ -206,19 +204,19 @@ ALONE = Context(left_arcsec=0.1, excess=1.0, unexplained=False)
         replace(ALONE, unexplained=True),
     ],
 )
-def test_a_name_beside_what_nobody_can_explain_is_less_sure(beside: Context) -> None:
+def test_unexplained_residuals_lower_the_probability_of_a_cause(beside: Context) -> None:
     (alone,) = weighed([finding("count_loss", 4000.0, 2.0)], ALONE, Scales())
     (doubtful,) = weighed([finding("count_loss", 4000.0, 2.0)], beside, Scales())
     assert doubtful.probability < alone.probability
 
 
-def test_better_seen_is_surer() -> None:
+def test_stronger_evidence_raises_the_probability() -> None:
     (weak,) = weighed([finding("creep", 400.0, 1.0)], ALONE, Scales())
     (strong,) = weighed([finding("creep", 40000.0, 4.0)], ALONE, Scales())
     assert weak.probability < strong.probability < 1.0
 
 
-def test_a_load_that_lags_is_a_loop_of_the_other_sign(
+def test_a_lagging_load_is_a_loop_of_the_opposite_sign(
     columns: Callable[..., dict[str, Any]], plant: ModuleType
 ) -> None:
     """Nothing is named where the model has it lag as well; where it has it lead, its loop has changed."""
@@ -241,6 +239,6 @@ def test_a_load_that_lags_is_a_loop_of_the_other_sign(
     ],
     ids=["more equal orders than one cause has", "bursts beside an order of the load"],
 )
-def test_what_no_cause_describes_leads(diagnosed: Diagnosed, effects: dict[str, Any]) -> None:
+def test_an_unexplained_residual_leads_the_list(diagnosed: Diagnosed, effects: dict[str, Any]) -> None:
     """Without `Scales.near` the orders are one cause; the bursts are larger than the load's order."""
     assert names(diagnosed(effects))[0] == "unexplained"

@@ -47,7 +47,7 @@ def test_a_hidden_cause_is_named_first() -> None:
     holds(verdicts, 0.95, "silent")
 
 
-def test_where_nothing_is_hidden_nothing_is_named() -> None:
+def test_nothing_is_named_if_nothing_is_hidden() -> None:
     holds(judged(NONE[::2], [1]), 0.98, "silent")
 
 
@@ -59,13 +59,13 @@ def test_the_rates_over_all_causes() -> None:
 
 
 @pytest.mark.slow
-def test_two_at_once() -> None:
+def test_rates_for_two_hidden_causes() -> None:
     verdicts = judged(PAIRS, MORE)
     holds(verdicts, 0.9, "all_right")
     holds(verdicts, 0.9, "silent")
 
 
 @pytest.mark.slow
-def test_nothing_and_what_nobody_knows() -> None:
+def test_rates_for_healthy_and_unknown() -> None:
     holds(judged(NONE, MORE), 0.98, "silent")
     holds(judged(UNKNOWN, MORE), 0.9, "unexplained")

@@ -1,4 +1,4 @@
-"""A wrong ratio has the same slope over the whole travel; what has it in a part of it only is none."""
+"""A wrong ratio has the same slope over the whole travel."""
 
 from __future__ import annotations
 
@@ -31,12 +31,12 @@ def sloping(
     return run
 
 
-def test_an_even_slope_is_a_wrong_ratio(sloping: Callable[[float, float], Diagnosis]) -> None:
+def test_a_uniform_slope_is_a_wrong_ratio(sloping: Callable[[float, float], Diagnosis]) -> None:
     assert [each.cause for each in sloping(0.0, 8.0).findings] == ["ratio_error"]
 
 
 @pytest.mark.parametrize("begins", [0.4, 0.6])
-def test_a_slope_that_begins_on_the_way_is_no_wrong_ratio(
+def test_a_slope_on_part_of_the_travel_is_not_a_wrong_ratio(
     sloping: Callable[[float, float], Diagnosis], begins: float
 ) -> None:
     assert "ratio_error" not in {each.cause for each in sloping(begins, 8.0).findings}

@@ -23,7 +23,7 @@ from hdbridge.axis.model import TransmissionModel
 from hdbridge.records.record import Record
 
 
-def test_a_drag_that_does_not_bend_is_told_as_a_delay_and_stays_its_alias(
+def test_linear_drag_is_reported_as_a_delay_with_alias(
     diagnosed: Callable[..., Diagnosis],
 ) -> None:
     straight = {"coulomb": 0.0, "viscous": 0.02, "shear": 1e9}
@@ -44,7 +44,7 @@ def test_a_drag_that_does_not_bend_is_told_as_a_delay_and_stays_its_alias(
         ),
     ],
 )
-def test_a_load_that_winds_up_as_it_speeds_up_makes_no_delay_of_a_drag(
+def test_inertial_wind_up_does_not_turn_drag_into_a_delay(
     diagnosed: Callable[..., Diagnosis], drag: dict[str, float], inertia_s2: float, names: set[str]
 ) -> None:
     """A delay has a part in acceleration, too, and its straight line in speed may cancel that of a drag."""
@@ -52,7 +52,9 @@ def test_a_load_that_winds_up_as_it_speeds_up_makes_no_delay_of_a_drag(
     assert {each.cause for each in result.findings} == names
 
 
-def test_what_was_refused_is_told_where_nothing_else_explains_it(diagnosed: Callable[..., Diagnosis]) -> None:
+def test_refused_causes_are_reported_if_nothing_else_explains_them(
+    diagnosed: Callable[..., Diagnosis],
+) -> None:
     """A load that runs ahead as it speeds up is no inertia on a spring, and no delay either."""
     result = diagnosed({"inertial_windup": {"s2": -1.2e-4}})
     assert [each.cause for each in result.findings] == ["unexplained"]
@@ -68,7 +70,7 @@ def test_what_was_refused_is_told_where_nothing_else_explains_it(diagnosed: Call
         ({"kind": "heated", "size": 6.0, "tau": 40.0}, CountLoss),  # rises within seconds, not at once
     ],
 )
-def test_no_piece_of_something_unknown_is_named(
+def test_parts_of_an_unknown_cause_are_not_named(
     diagnosed: Callable[..., Diagnosis], unknown: dict[str, Any], refused: type[Effect]
 ) -> None:
     result = diagnosed({"unknown": unknown})
@@ -76,7 +78,7 @@ def test_no_piece_of_something_unknown_is_named(
     assert f"{refused.name}: not the same everywhere" in result.considered
 
 
-def test_behind_what_is_refused_the_search_goes_on(
+def test_the_search_continues_after_a_refusal(
     columns: Callable[..., dict[str, Any]], model: TransmissionModel, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Four causes that cannot be seem to explain more than the one that can."""

@@ -1,4 +1,4 @@
-"""Seeing: what a residual goes with, and what it does not."""
+"""Views of the residual: its correlation with each coordinate."""
 
 from dataclasses import replace
 
@@ -31,7 +31,7 @@ def seen(given_arcsec):
     return ResidualViews(given_arcsec, noise, DIRECTION, TIME_S, {each.name: each for each in found})
 
 
-def test_noise_goes_with_nothing():
+def test_noise_correlates_with_nothing():
     shares = seen(np.zeros(COUNT)).shares()
     assert max(left for _, left in shares.values()) < 0.01
 
@@ -45,7 +45,7 @@ def test_noise_goes_with_nothing():
     ],
     ids=["wave", "sides", "step"],
 )
-def test_a_residual_goes_with_the_coordinate_that_it_is_made_of(error, home):
+def test_a_residual_correlates_with_its_coordinate(error, home):
     before = {name: each[0] for name, each in seen(error + RNG.normal(size=COUNT)).shares().items()}
     variance = float(np.mean(error**2))
     assert before[home] == pytest.approx(variance / (variance + 1.0), abs=0.06)
@@ -53,7 +53,7 @@ def test_a_residual_goes_with_the_coordinate_that_it_is_made_of(error, home):
     assert all(before[each] < 0.1 for each in others)
 
 
-def test_what_is_opposite_in_the_two_directions_is_seen_over_the_angle():
+def test_direction_dependent_residuals_are_seen_over_the_angle():
     error = 5.0 * DIRECTION * np.cos(np.radians(LOAD_DEG))
     both = seen(error)
     blind = replace(both.coordinates["load angle"], both_ways=False)
@@ -74,7 +74,7 @@ def test_bins_lose_no_point_and_keep_the_mean(points, spacing):
     assert total == pytest.approx(np.mean(y**2), rel=1e-6, abs=1e-6)
 
 
-def test_way_and_time_since_a_reversal_begin_anew_at_each():
+def test_travel_and_time_restart_at_each_reversal():
     motor = np.array([0.0, 1.0, 2.0, 2.0, 1.0, 0.0, 3.0])
     motion = Motion(motor_deg=motor, time_s=np.arange(7.0))
     # A rest belongs to the motion before it: the axis has not turned round yet.
@@ -82,7 +82,7 @@ def test_way_and_time_since_a_reversal_begin_anew_at_each():
     assert over.time_since_reversal(motion).values.tolist() == [SMALLEST_TIME_S, 1.0, 2.0, 3.0, 1.0, 2.0, 1.0]
 
 
-def test_an_axis_that_never_turns_counts_from_its_beginning():
+def test_without_reversals_travel_counts_from_the_start():
     motion = Motion(motor_deg=np.zeros(4), time_s=np.arange(4.0))
     assert np.all(over.since_reversal(motion).values == SMALLEST_WAY_DEG)
     assert over.time_since_reversal(motion).values.tolist() == [SMALLEST_TIME_S, 1.0, 2.0, 3.0]
@@ -95,7 +95,7 @@ def test_time_since_a_stop_or_start():
     assert over.since_change(motion).values.tolist() == [least, 1.0, least, 1.0, least, least]
 
 
-def test_a_stretch_foretells_nothing_of_itself():
+def test_a_stretch_does_not_predict_itself():
     values = np.where((TIME_S > 400.0) & (TIME_S < 405.0), 5.0, 0.0)  # within one stretch
     told = predicted(Coordinate("time", "s", TIME_S, bins=25), values, DIRECTION, folds(TIME_S))
     assert np.all(told[values > 0.0] == 0.0)

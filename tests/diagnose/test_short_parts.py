@@ -1,4 +1,4 @@
-"""Parts of hardly any sample, as of a task that was interrupted as it began; the motion before a record."""
+"""Parts of few samples, and the motion before a record."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from hdbridge.records.record import Record, concatenate
 from hdbridge.units import ARCSEC_PER_DEG
 
 
-def test_a_part_of_one_sample_is_no_obstacle(
+def test_a_part_of_one_sample_is_accepted(
     columns: Callable[..., dict[str, Any]], model: TransmissionModel
 ) -> None:
     whole = Record({name: np.asarray(each)[:1500] for name, each in columns({}).items()})
@@ -25,7 +25,7 @@ def test_a_part_of_one_sample_is_no_obstacle(
 
 
 @pytest.mark.parametrize("back_deg", [3.0, 1.5])
-def test_the_motion_before_a_record_is_no_cause(back_deg: float) -> None:
+def test_the_motion_before_a_record_is_not_a_cause(back_deg: float) -> None:
     effects = (Synchronous(orders=[{"order": 2, "amplitude_arcsec": 14.0, "phase_deg": 20.0}]), USUAL_LOOP)
     time_s = 0.016 * np.arange(3000)
     turns_s, speeds_deg_s = (0.5, 1.5, 12.0, 12.8, 30.0, 30.8), (0.0, -600.0, -600.0, 600.0, 600.0, -600.0)

@@ -37,7 +37,7 @@ def stiffening(
 Stiffening = Callable[[int], tuple[dict[str, float], Diagnosis]]
 
 
-def test_a_spring_that_stiffens_is_found_with_its_stages(stiffening: Stiffening) -> None:
+def test_a_stiffening_spring_is_found_with_its_stages(stiffening: Stiffening) -> None:
     spring, result = stiffening(200)
     (found,) = result.findings
     assert found.cause == "compliance"
@@ -47,7 +47,7 @@ def test_a_spring_that_stiffens_is_found_with_its_stages(stiffening: Stiffening)
 
 
 @pytest.mark.slow
-def test_no_load_order_is_named_for_the_bend_of_a_spring(stiffening: Stiffening) -> None:
+def test_a_curved_spring_is_not_a_load_order(stiffening: Stiffening) -> None:
     """A screen that offers the spring at a few fixed bends adds an order in half of the records.
 
     At that rate none in eight happens in one of 250 runs.

@@ -1,4 +1,4 @@
-"""Intervals hold what leaves nothing in a residual: a law of another form, a look-alike that hides beside."""
+"""Intervals include systematic errors: another law, or a hidden look-alike."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def enough(inside: list[bool]) -> bool:
     return sum(inside) >= least(len(inside), HELD)
 
 
-def test_a_drag_that_falls_off_by_another_power_of_the_speed_is_within_its_intervals(
+def test_drag_with_another_exponent_is_within_its_intervals(
     columns: Columns, model: TransmissionModel
 ) -> None:
     """The plant's falls off with the power 0.8 of the speed, the law's with the first."""
@@ -84,7 +84,7 @@ def test_a_drag_that_falls_off_by_another_power_of_the_speed_is_within_its_inter
     ],
     ids=["beside a drag that falls off by another power of the speed", "beside a load's own wind-up"],
 )
-def test_what_is_there_without_a_delay_is_no_evidence_of_one(
+def test_effects_present_without_delay_are_not_evidence_of_delay(
     columns: Columns, model: TransmissionModel, effects: Any, beside: list[type[Effect]]
 ) -> None:
     estimator = Estimator(gather(Record(columns(effects)), 50.0))
@@ -94,7 +94,7 @@ def test_what_is_there_without_a_delay_is_no_evidence_of_one(
     assert found.robust < 0.5 * found.needed
 
 
-def test_a_motor_that_comes_back_within_its_counts_at_rest_is_no_evidence_of_creep(
+def test_motor_motion_within_a_count_at_rest_is_not_creep(
     plant: ModuleType, columns: Columns, model: TransmissionModel, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The motor is 0.8 counts ahead of its command, stays so for 0.3 s after each stop, and then lets go."""
@@ -117,7 +117,7 @@ def test_a_motor_that_comes_back_within_its_counts_at_rest_is_no_evidence_of_cre
     assert found.robust < 0.5 * found.needed
 
 
-def test_a_motor_that_stops_short_of_its_turns_within_a_count_is_not_a_change_of_the_loop(
+def test_turning_short_by_a_count_is_not_a_changed_loop(
     plant: ModuleType, columns: Columns, model: TransmissionModel, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Friction holds it 0.4 counts from its command at every turn."""
@@ -137,7 +137,7 @@ def test_a_motor_that_stops_short_of_its_turns_within_a_count_is_not_a_change_of
     assert not loops & {each.cause for each in found.findings}
 
 
-def test_the_wind_up_of_a_load_that_swings_on_its_spring_is_within_its_interval(
+def test_wind_up_of_a_swinging_load_is_within_its_interval(
     plant: ModuleType, model: TransmissionModel
 ) -> None:
     """The law is that far below the resonance, and these moves speed up in 0.15 s."""
@@ -173,7 +173,7 @@ def test_the_height_of_a_bump_of_another_form_is_within_its_interval(
     assert enough(inside), inside
 
 
-def test_a_run_out_beside_an_unknown_spring_is_as_little_known_as_it_is(
+def test_eccentricity_next_to_an_unknown_spring_is_as_uncertain_as_it_should_be(
     columns: Columns, model: TransmissionModel
 ) -> None:
     """Under one mass a spring's wind-up goes once per turn as the run-out does: only their sum is seen."""
@@ -193,7 +193,7 @@ def test_a_run_out_beside_an_unknown_spring_is_as_little_known_as_it_is(
     assert enough(inside), inside
 
 
-def test_a_run_out_that_a_spring_may_hide_has_it_as_an_alias(diagnosed: Callable[..., Diagnosis]) -> None:
+def test_eccentricity_has_the_spring_as_an_alias(diagnosed: Callable[..., Diagnosis]) -> None:
     run_out = {"load_order": {"orders": [(1, 8.0, 60.0), (2, 4.0, 10.0)]}}
     (found,) = diagnosed(run_out, torque_nm=9.0).findings
     assert found.cause == LoadOrders.name

@@ -1,4 +1,4 @@
-"""Causes that the catalogue lacks: the smallest visible size, and what must not count as one."""
+"""Causes outside the catalogue: smallest detectable size, and exclusions."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ LOOPS = {"hysteresis_parameters", "hysteresis_memory"}
 
 
 @pytest.mark.parametrize(("size", "width"), [(5.0, 12.0), (5.0, 8.0)])
-def test_what_acts_in_a_small_part_of_a_record_is_unexplained(
+def test_local_unknown_effects_are_unexplained(
     diagnosed: Callable[..., Diagnosis], size: float, width: float
 ) -> None:
     """Less than half an arcsecond rms is left of it, as much as a cause needs at its peak."""
@@ -22,7 +22,7 @@ def test_what_acts_in_a_small_part_of_a_record_is_unexplained(
     assert found.lives_in in {"load angle", "position"}
 
 
-def test_what_is_less_than_a_motor_count_is_a_remark(diagnosed: Callable[..., Diagnosis]) -> None:
+def test_effects_below_a_motor_count_are_remarks(diagnosed: Callable[..., Diagnosis]) -> None:
     """A count of the motor is 3.2 arcsec at the load: nobody can act on less."""
     result = diagnosed({"unknown": {"kind": "packet", "size": 2.8, "width": 12.0}})
     assert not result.findings
@@ -31,7 +31,7 @@ def test_what_is_less_than_a_motor_count_is_a_remark(diagnosed: Callable[..., Di
 
 
 @pytest.mark.parametrize("law", ["dahl", "bouc_wen"])
-def test_what_another_law_leaves_at_its_reversals_is_the_loops(
+def test_residuals_of_another_law_at_reversals_belong_to_the_loop(
     diagnosed: Callable[..., Diagnosis], law: str
 ) -> None:
     """An arcsecond rms, but none of it where the axis has gone on further than a loop remembers."""
@@ -43,7 +43,7 @@ def test_what_another_law_leaves_at_its_reversals_is_the_loops(
         assert found.cause in LOOPS | {"unexplained"}
 
 
-def test_what_follows_the_direction_far_from_the_reversals_is_no_changed_loop(
+def test_direction_effects_far_from_reversals_are_not_a_changed_loop(
     diagnosed: Callable[..., Diagnosis],
 ) -> None:
     """A ring that is carried along by more than a turn of the motor before it slips."""

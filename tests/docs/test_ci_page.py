@@ -1,7 +1,5 @@
 """The example of docs/ci.md, in docs/ci-example: on every bus that is here, by real runs of pytest."""
 
-from __future__ import annotations
-
 import os
 import re
 import subprocess
@@ -71,7 +69,7 @@ def test_the_workflow_runs_what_is_tested_here():
     ]
 
 
-def test_what_stands_for_gitlab_does_the_same():
+def test_the_gitlab_file_does_the_same():
     after = ci_page.PAGE.read_text("utf-8").split("GitLab CI, in", 1)[1]
     lines = re.search(r"\n\n((?: {4}.*\n)+)", after)
     assert lines is not None
@@ -83,7 +81,7 @@ def test_what_stands_for_gitlab_does_the_same():
 @pytest.mark.parametrize(
     ("has_vcan", "bus"), [(True, "socketcan:vcan0"), (False, "udp_multicast:239.74.163.2")]
 )
-def test_the_workflow_takes_vcan_where_it_is(tmp_path: Path, has_vcan: bool, bus: str):
+def test_the_workflow_uses_vcan_if_present(tmp_path: Path, has_vcan: bool, bus: str):
     (script,) = (each for each in steps() if "modprobe" in each)
     sudo = tmp_path / "sudo"
     sudo.write_text(f"#!/bin/sh\nexit {0 if has_vcan else 1}\n", encoding="utf-8")
@@ -97,7 +95,7 @@ def test_the_workflow_takes_vcan_where_it_is(tmp_path: Path, has_vcan: bool, bus
     assert environment.read_text(encoding="utf-8") == f"BUS={bus}\n"
 
 
-def test_the_program_knows_nothing_of_hdbridge(tmp_path):
+def test_the_program_does_not_import_hdbridge(tmp_path):
     """The workflow runs on a runner without a CAN interface."""
     ci_page.write(tmp_path)
     loaded = "sorted(each for each in sys.modules if each.partition('.')[0] in ('hdbridge', 'canopen'))"

@@ -33,7 +33,7 @@ def command_lines(page: Path) -> list[str]:
 
 
 @pytest.mark.parametrize("page", PAGES, ids=name)
-def test_links_lead_somewhere(page):
+def test_links_are_valid(page):
     text = re.sub(r"^```.*?^```", "", page.read_text(encoding="utf-8"), flags=re.DOTALL | re.MULTILINE)
     lost = []
     for link in re.findall(r"\]\(([^)\s]+)\)", text):
@@ -66,7 +66,7 @@ def test_commands_on_the_pages_exist_with_their_options(page):
     assert [each for each in wrong if each] == []
 
 
-def test_the_check_of_command_lines_finds_what_is_wrong():
+def test_the_command_line_check_finds_errors():
     refused = command_reference.refused
     assert refused("hdbridge step my-axis --simulate --count 60   # with a remark") is None
     assert refused("hdbridge model activate my-axis 3 --reason summer") is None
@@ -82,7 +82,7 @@ def test_the_reference_of_commands_is_up_to_date():
     assert page == command_reference.page(), "run python tools/command_reference.py"
 
 
-def test_every_command_stands_under_a_heading_and_every_option_says_what_it_does():
+def test_every_command_has_a_heading_and_every_option_a_description():
     page = command_reference.page()
     for command in command_reference.commands():
         assert f"### `{command.usage}`" in page
@@ -112,7 +112,7 @@ def test_examples_of_the_library_run(number, tmp_path, monkeypatch, capsys):
     assert capsys.readouterr().out.splitlines() == promised
 
 
-def test_the_example_of_the_readme_runs_as_it_stands(monkeypatch, capsys):
+def test_the_readme_example_runs(monkeypatch, capsys):
     """From a fresh clone's folder, no longer than it is meant to be, with the answer that the page prints."""
     text = (ROOT / "README.md").read_text(encoding="utf-8")
     (program,) = re.findall(r"```python\n(.*?)```", text, re.DOTALL)

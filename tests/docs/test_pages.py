@@ -25,7 +25,7 @@ def _name(path):
     ],
 )
 @pytest.mark.timeout(1800)
-def test_the_commands_of_the_page_do_what_it_shows(path, tmp_path):
+def test_documented_commands_give_the_documented_output(path, tmp_path):
     (tmp_path / "page").mkdir()
     wrong, _ = pages.run(path, tmp_path / "page")
     assert not wrong, "\n".join([*wrong, f"run python tools/pages.py --write {_name(path)}"])
@@ -54,7 +54,7 @@ def run(text, tmp_path):
     return pages.run(tmp_path / "page.md", tmp_path / "page")
 
 
-def test_variables_folders_and_files_stay_from_command_to_command(tmp_path):
+def test_variables_folders_and_files_persist_between_commands(tmp_path):
     page = """# Page
 ```sh
 mkdir folder && cd folder   # with a remark
@@ -99,7 +99,7 @@ two
         ("<!-- exit status: 2 -->\n```sh\nfalse\n```", "exit status 1, not 2"),
     ],
 )
-def test_what_is_not_as_shown_is_reported(block, complaint, tmp_path):
+def test_differences_from_the_page_are_reported(block, complaint, tmp_path):
     wrong, _ = run(f"# Page\n\n{block}\n", tmp_path)
     assert complaint in "\n".join(wrong)
 
@@ -110,7 +110,7 @@ def test_figures_within_the_tolerance_dates_and_widths_may_differ(tmp_path):
     assert run(f"# Page\n\n```console\n$ echo '{printed}'\n{shown}\n```\n", tmp_path)[0] == []
 
 
-def test_outputs_are_written_into_the_page_and_dates_stay(tmp_path):
+def test_outputs_are_written_into_the_page_but_dates_are_kept(tmp_path):
     page = (
         "# Page\n\n```console\n$ echo '  9.5 at 2026-11-25T10:00:00Z'\n  3.5 at 2026-01-05T13:30:00Z\n```\n"
     )
@@ -118,7 +118,7 @@ def test_outputs_are_written_into_the_page_and_dates_stay(tmp_path):
     assert pages.rewritten(page, found) == page.replace("  3.5 at", "  9.5 at")
 
 
-def test_a_page_that_is_not_run_says_why():
+def test_an_unrunnable_page_states_the_reason():
     page = pages.read("<!-- not run: no drive -->\n\n# Page\n\n```sh\nhdbridge move my-axis 3\n```\n")
     assert page.commands == []
     assert [reason for _, reason in page.left_out] == ["no drive"]

@@ -1,7 +1,5 @@
 """Shared by the tests of the master: an axis description, and a bus whose peers answer in lockstep."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any

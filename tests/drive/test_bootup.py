@@ -1,6 +1,4 @@
-"""Booting a drive: what is checked, in which order it is written, and every way it is refused."""
-
-from __future__ import annotations
+"""Booting a drive: checks, order of writes, and every refusal."""
 
 from collections.abc import Callable
 from typing import Any
@@ -98,7 +96,7 @@ def test_a_drive_that_answers_seconds_after_its_boot_up_message(
     assert Drive(bus, axis, clock, tiny.od).boot().state is State.SWITCH_ON_DISABLED
 
 
-def test_a_drive_that_boots_and_never_answers_was_heard(
+def test_a_drive_that_boots_but_never_answers_is_reported_as_heard(
     drive: Drive, tiny: Any, bus: Any, clock: Any
 ) -> None:
     tiny.bus_peers = bus.peers
@@ -109,7 +107,7 @@ def test_a_drive_that_boots_and_never_answers_was_heard(
     assert 4.0 <= clock.now() <= 5.0
 
 
-def test_a_node_that_is_stopped_was_heard(drive: Drive, tiny: Any) -> None:
+def test_a_stopped_node_is_reported_as_heard(drive: Drive, tiny: Any) -> None:
     tiny.values[0x1017, 0] = 100
     tiny.nmt_state = 4
     tiny.nmt = tiny.sdo = lambda _: None
@@ -117,7 +115,7 @@ def test_a_node_that_is_stopped_was_heard(drive: Drive, tiny: Any) -> None:
         drive.boot()
 
 
-def test_an_absent_drive_and_who_is_there_instead(
+def test_an_absent_drive_lists_the_present_nodes(
     drive: Drive, tiny: Any, bus: Any, peer_bus: can.BusABC
 ) -> None:
     tiny.silent = True
@@ -157,7 +155,7 @@ def test_another_drive_or_another_scale_is_refused(
     assert tiny.sdo_order == []
 
 
-def test_a_feed_that_only_informs(bus: Any, tiny: Any, clock: Any, build_axis: Any) -> None:
+def test_a_feed_that_does_not_scale(bus: Any, tiny: Any, clock: Any, build_axis: Any) -> None:
     """If 6092h does not scale, the error names the line that does; with it, the drive is accepted."""
     tiny.values[0x6092, 1] = 360_000
     with pytest.raises(IdentityError, match=r"'feed_scales: false' under axis.yaml: drive"):
@@ -170,7 +168,9 @@ def test_a_feed_that_only_informs(bus: Any, tiny: Any, clock: Any, build_axis: A
         Drive(bus, build_axis(drive__feed_scales=False), clock, tiny.od).boot()
 
 
-def test_what_the_eds_lacks_is_left_out(drive: Drive, tiny: Any, bus: Any, axis: Any, clock: Any) -> None:
+def test_objects_missing_in_the_eds_are_not_written(
+    drive: Drive, tiny: Any, bus: Any, axis: Any, clock: Any
+) -> None:
     for index in (0x6072, 0x1029):
         del tiny.od[index]
         del tiny.values[index, 0 if index == 0x6072 else 1]
@@ -179,7 +179,7 @@ def test_what_the_eds_lacks_is_left_out(drive: Drive, tiny: Any, bus: Any, axis:
     assert [row.index for row in left_to_drive(axis, tiny.od)] == [0x1029, 0x6072]
 
 
-def test_what_there_is_no_doing_without_is_refused_before_anything_is_sent(
+def test_missing_mandatory_objects_are_refused_before_anything_is_sent(
     tiny: Any, bus: Any, axis: Any, clock: Any
 ) -> None:
     with pytest.raises(InputError, match=r"drive\.eds: none\.eds lacks 6040h:00 controlword, .* more"):
@@ -229,7 +229,7 @@ def stated(bus: Any, clock: Any, tiny: Any, build_axis: Callable[..., AxisConfig
 
 
 @pytest.mark.parametrize(("key", "field"), WRITTEN)
-def test_a_value_that_does_not_stick_is_found(
+def test_a_value_that_is_not_kept_is_detected(
     stated: Drive, tiny: Any, key: tuple[int, int], field: str
 ) -> None:
     tiny.stuck.add(key)
@@ -253,7 +253,7 @@ def refusing(code: int, held: int = 0) -> Callable[[bytes], list[bytes]]:
 
 @pytest.mark.parametrize("key", [(0x605A, 0), (0x605D, 0), (0x605B, 0), (0x6007, 0), (0x1029, 1)])
 @pytest.mark.parametrize("code", [0x06090030, 0x06090031, 0x06010002, 0x08000000])
-def test_a_value_that_nobody_chose_is_left_to_a_drive_that_refuses_it(
+def test_a_default_refused_by_the_drive_is_left_to_it(
     drive: Drive, tiny: Any, key: tuple[int, int], code: int
 ) -> None:
     tiny.scripts[key] = refusing(code, held=5)
@@ -268,7 +268,7 @@ def test_a_value_that_nobody_chose_is_left_to_a_drive_that_refuses_it(
     assert tiny.nmt_state == 5
 
 
-def test_a_read_only_limit_is_left_to_the_drive_even_if_it_is_stated(stated: Drive, tiny: Any) -> None:
+def test_a_read_only_limit_is_left_to_the_drive_even_if_stated(stated: Drive, tiny: Any) -> None:
     for key in ((0x6065, 0), (0x605A, 0)):
         tiny.scripts[key] = refusing(0x06010002, held=2)
     report = stated.boot()
@@ -281,7 +281,7 @@ def test_a_drive_that_refuses_its_cycle_is_refused(drive: Drive, tiny: Any) -> N
         drive.boot()
 
 
-def test_what_the_drive_holds_already_is_not_written(drive: Drive, tiny: Any) -> None:
+def test_values_already_held_are_not_written(drive: Drive, tiny: Any) -> None:
     first = drive.boot()
     assert first.written
     tiny.sdo_order.clear()
@@ -291,7 +291,7 @@ def test_what_the_drive_holds_already_is_not_written(drive: Drive, tiny: Any) ->
     assert tiny.sdo_order == []
 
 
-def test_an_object_that_can_only_be_written_is_written(drive: Drive, tiny: Any) -> None:
+def test_a_write_only_object_is_written(drive: Drive, tiny: Any) -> None:
     tiny.od[0x605A].access_type = "wo"
     tiny.scripts[0x605A, 0] = lambda request: [b"\x60" + request[1:4] + bytes(4)]
     assert 0x605A in {row.index for row in drive.boot().written}
@@ -304,7 +304,7 @@ def test_an_object_that_can_only_be_written_is_written(drive: Drive, tiny: Any) 
     assert 0x605A in {row.index for row in drive.boot().written}
 
 
-def test_a_pdo_whose_mapping_is_right_is_not_mapped_again(drive: Drive, tiny: Any) -> None:
+def test_a_correct_mapping_is_not_written_again(drive: Drive, tiny: Any) -> None:
     drive.boot()
     tiny.values[0x1800, 2] = 255
     tiny.sdo_order.clear()
@@ -333,7 +333,7 @@ def test_a_node_that_does_not_start(drive: Drive, tiny: Any) -> None:
         drive.boot()
 
 
-def test_a_drive_left_under_power_is_switched_off_first(drive: Drive, tiny: Any) -> None:
+def test_a_powered_drive_is_switched_off_first(drive: Drive, tiny: Any) -> None:
     tiny.state, tiny.controlword = 0x27, 0x0F
     assert drive.boot().state is State.SWITCH_ON_DISABLED
     assert tiny.sdo_order[0] == (0x6040, 0, 0)
@@ -346,7 +346,7 @@ def test_a_drive_that_stays_under_power_is_refused(drive: Drive, tiny: Any) -> N
         drive.boot()
 
 
-def test_a_drive_in_fault_boots_and_says_so(drive: Drive, tiny: Any) -> None:
+def test_a_drive_in_fault_boots_and_reports_it(drive: Drive, tiny: Any) -> None:
     tiny.fail()
     assert drive.boot().state is State.FAULT
 

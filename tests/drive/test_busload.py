@@ -1,6 +1,4 @@
-"""The load of the bus: bits of a frame by its very worst case, and what a cycle's axes make of it."""
-
-from __future__ import annotations
+"""Bus load: worst-case bits of a frame and of a cycle."""
 
 import pytest
 from hypothesis import given
@@ -40,13 +38,13 @@ def test_bits_of_a_frame() -> None:
 
 
 @given(st.integers(0, 8), st.data())
-def test_no_frame_is_longer_than_that(length: int, data: st.DataObject) -> None:
+def test_no_frame_is_longer_than_the_worst_case(length: int, data: st.DataObject) -> None:
     bits = data.draw(st.lists(st.integers(0, 1), min_size=34 + 8 * length, max_size=34 + 8 * length))
     assert len(stuffed_bits(bits)) + 13 <= frame_bits(length)
 
 
 @pytest.mark.parametrize("length", range(9))
-def test_and_the_worst_one_is_as_long(length: int) -> None:
+def test_the_worst_case_frame_exists(length: int) -> None:
     # Five alike, then four of the other kind in turns: each stuff bit begins the next run.
     bits, value = [0] * 5, 1
     while len(bits) < 34 + 8 * length:
@@ -63,7 +61,7 @@ def test_a_cycle_is_the_sum_of_its_frames() -> None:
     assert cycle_bits(axes(2)) == pytest.approx(two)
 
 
-def test_a_channel_counts_as_often_as_it_comes(build_axis) -> None:
+def test_a_channel_counts_in_proportion_to_its_rate(build_axis) -> None:
     torque = {
         "source": {"index": 0x2101, "type": "int32"},
         "newton_metres_per_count": 0.001,
@@ -86,7 +84,7 @@ def test_the_load_needs_a_bit_rate() -> None:
     assert bus_load([with_bus(axis, 1_000_000) for axis in axes(2)]) == load
 
 
-def test_more_axes_than_the_bus_carries_are_refused_with_what_would_fit() -> None:
+def test_too_many_axes_are_refused_with_a_feasible_alternative() -> None:
     fast = axes(6, cycle_ms=2.0)
     assert check_bus_load(axes(6), 1_000_000) < MAXIMUM_LOAD
     with pytest.raises(InputError) as refused:
@@ -104,7 +102,7 @@ def test_more_axes_than_the_bus_carries_are_refused_with_what_would_fit() -> Non
         check_bus_load(fast[:4], 1_000_000)
 
 
-def test_axes_that_disagree_are_refused() -> None:
+def test_axes_with_different_bus_settings_are_refused() -> None:
     with pytest.raises(InputError, match=r"drive\.cycle_ms gives 8.*gives 4"):
         bus_load([axis_of(1), axis_of(2, cycle_ms=8.0)], 1_000_000)
     with pytest.raises(InputError, match=r"bus\.bitrate_bps gives 500000.*gives 1e\+06"):

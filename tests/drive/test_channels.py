@@ -1,7 +1,5 @@
 """Load torque and temperature: mapped, read back, scaled, checked, held and given up."""
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Callable
 from typing import Any
@@ -27,7 +25,7 @@ def follower(**changes: Any) -> ChannelFollower:
     return ChannelFollower("load_torque", LoadTorque.model_validate(TORQUE | changes), cycle_ms=4)
 
 
-def test_both_come_as_values_with_their_units(build_axis: Build) -> None:
+def test_both_channels_are_scaled(build_axis: Build) -> None:
     image = ProcessImage(build_axis(load_torque=TORQUE | {"direction": -1}, temperature=TEMPERATURE))
     assert image.readings == (None, None)
     assert image.accept(0x381, struct.pack("<i", 1500))
@@ -36,7 +34,7 @@ def test_both_come_as_values_with_their_units(build_axis: Build) -> None:
     assert image.readings == pytest.approx((-1.5, -3.5))
 
 
-def test_what_comes_equally_often_shares_a_pdo(build_axis: Build) -> None:
+def test_channels_of_equal_rate_share_a_pdo(build_axis: Build) -> None:
     image = ProcessImage(build_axis(load_torque=TORQUE, temperature=TEMPERATURE | {"every_cycles": 1}))
     assert image.accept(0x381, struct.pack("<ih", 1500, 215))
     image.step_channels()
@@ -52,7 +50,7 @@ def test_a_temperature_may_be_in_kelvin() -> None:
     assert each.value == pytest.approx(20.0)
 
 
-def test_the_plan_maps_them_and_says_which_key_decides(build_axis: Build) -> None:
+def test_the_plan_maps_channels_and_names_their_key(build_axis: Build) -> None:
     axis = build_axis(load_torque=TORQUE, temperature=TEMPERATURE)
     rows = {(row.index, row.sub): row for row in plan(axis)}
     assert (rows[0x1A02, 1].value, rows[0x1A02, 1].field) == (0x2101_0020, "load_torque.source")
@@ -72,7 +70,7 @@ def test_the_plan_maps_them_and_says_which_key_decides(build_axis: Build) -> Non
         ({"index": 0x6065, "type": "uint32"}, r"load_torque\.source\.index: .* 6065h:00 cannot be mapped"),
     ],
 )
-def test_what_the_eds_says_otherwise_is_refused(
+def test_contradictions_to_the_eds_are_refused(
     build_axis: Build, source: dict[str, Any], complaint: str
 ) -> None:
     od = load_eds(bundled_folder("eds") / "hdbridge-402.eds", 1)
@@ -80,9 +78,7 @@ def test_what_the_eds_says_otherwise_is_refused(
         plan(build_axis(load_torque=TORQUE | {"source": source}), od)
 
 
-def test_a_drive_that_does_not_take_the_mapping_is_refused(
-    bus: Any, clock: Any, tiny: Any, build_axis: Build
-) -> None:
+def test_a_drive_refusing_the_mapping_is_refused(bus: Any, clock: Any, tiny: Any, build_axis: Build) -> None:
     tiny.scripts[0x1A02, 1] = lambda request: [b"\x80" + request[1:4] + (0x06040041).to_bytes(4, "little")]
     with pytest.raises(SdoError, match=r"cannot map it.*load_torque\.source decides it"):
         Drive(bus, build_axis(load_torque=TORQUE), clock, load_eds_with_2101()).boot()
@@ -96,7 +92,7 @@ def load_eds_with_2101() -> Any:
     return load_eds(bundled_folder("eds") / "hdbridge-402.eds", 1)
 
 
-def test_a_reading_that_cannot_be_is_not_believed() -> None:
+def test_implausible_readings_are_rejected() -> None:
     each = follower()
     each.accept(10_000)
     assert each.step() is None
@@ -109,7 +105,7 @@ def test_a_reading_that_cannot_be_is_not_believed() -> None:
 
 
 @pytest.mark.parametrize("counts", [-(2**15), 2**15 - 1])
-def test_the_ends_of_the_type_are_no_reading(counts: int) -> None:
+def test_the_extremes_of_the_type_are_not_readings(counts: int) -> None:
     each = follower(source={"index": 0x2101, "type": "int16"})
     each.accept(counts)
     assert each.value is None
@@ -117,7 +113,7 @@ def test_the_ends_of_the_type_are_no_reading(counts: int) -> None:
     assert each.value is not None
 
 
-def test_what_stays_away_is_held_and_then_lost_and_may_come_back() -> None:
+def test_missing_readings_are_held_then_lost_and_may_return() -> None:
     each = follower(hold_ms=20)
     each.accept(1000)
     assert each.step() is None
@@ -139,9 +135,7 @@ def test_before_the_first_reading_there_is_nothing_to_hold() -> None:
 
 
 @given(every=st.integers(2, 30), missed=st.integers(0, 5), late=st.lists(st.integers(0, 1), max_size=20))
-def test_one_that_comes_every_so_many_cycles_is_missed_once_each_time(
-    every: int, missed: int, late: list[int]
-) -> None:
+def test_a_slow_channel_is_missed_once_per_period(every: int, missed: int, late: list[int]) -> None:
     each = follower(every_cycles=every, hold_ms=4 * every * 10)
     arrivals = {i * every + shift for i, shift in enumerate([*late, 0])}
     first = max(arrivals) + 1

@@ -1,7 +1,5 @@
 """Enabling, moving, homing, faults, and that a drive is never left enabled."""
 
-from __future__ import annotations
-
 import math
 import struct
 from collections.abc import Callable, Iterator
@@ -53,9 +51,7 @@ def test_before_the_boot_nothing_is_enabled(bus: Any, clock: Any, tiny: Any, axi
     assert bus.sent == []
 
 
-def test_a_mode_that_the_drive_lacks_or_does_not_take(
-    bus: Any, clock: Any, tiny: Any, axis: AxisConfig
-) -> None:
+def test_an_unsupported_or_refused_mode(bus: Any, clock: Any, tiny: Any, axis: AxisConfig) -> None:
     tiny.values[0x6502, 0] = 0x80
     with Drive(bus, axis, clock, tiny.od) as drive:
         drive.boot()
@@ -81,7 +77,7 @@ def test_an_axis_outside_its_limits_is_not_enabled(drive: Drive, tiny: Any) -> N
     drive.enable(Mode.HM)
 
 
-def test_a_drive_that_does_not_follow_a_transition(drive: Drive, tiny: Any) -> None:
+def test_a_drive_ignoring_a_transition(drive: Drive, tiny: Any) -> None:
     original = tiny.control
     tiny.control = lambda word: original(word) if word & 0x0F != 0x07 else None
     with pytest.raises(
@@ -91,9 +87,7 @@ def test_a_drive_that_does_not_follow_a_transition(drive: Drive, tiny: Any) -> N
 
 
 @pytest.mark.parametrize("stale", [0x0000, 0x0033, 0xFFFF])
-def test_a_stale_or_senseless_statusword_is_never_taken_for_enabled(
-    drive: Drive, tiny: Any, stale: int
-) -> None:
+def test_a_stale_or_invalid_statusword_never_counts_as_enabled(drive: Drive, tiny: Any, stale: int) -> None:
     state = tiny.value
     tiny.value = lambda key: stale if key == (0x6041, 0) else state(key)
     with pytest.raises(DriveError):
@@ -114,7 +108,7 @@ def test_a_profile_move_arrives(drive: Drive, tiny: Any, clock: Any) -> None:
 
 
 @pytest.mark.parametrize("target", [math.nan, math.inf, -math.inf, 400.01, -1e9])
-def test_targets_that_are_none_are_refused_before_anything_is_sent(
+def test_impossible_targets_are_refused_before_anything_is_sent(
     drive: Drive, tiny: Any, target: float
 ) -> None:
     drive.enable(Mode.PP)
@@ -140,7 +134,9 @@ def test_a_blocked_axis_is_stopped_after_a_bounded_time(drive: Drive, tiny: Any)
     assert tiny.state == 0x07
 
 
-def test_a_fault_on_the_way_is_told_with_its_code(drive: Drive, tiny: Any, bus: Any, clock: Any) -> None:
+def test_a_fault_during_a_move_is_reported_with_its_code(
+    drive: Drive, tiny: Any, bus: Any, clock: Any
+) -> None:
     drive.enable(Mode.PP)
 
     def fault_after_a_while() -> None:
@@ -203,7 +199,7 @@ def test_halt_stops_and_stays_enabled(drive: Drive, tiny: Any, bus: Any) -> None
     assert tiny.state == 0x27
 
 
-def test_quick_stop_and_the_way_out_of_it(drive: Drive, tiny: Any) -> None:
+def test_quick_stop_and_recovery(drive: Drive, tiny: Any) -> None:
     drive.enable(Mode.PP)
     assert drive.quick_stop() is State.QUICK_STOP_ACTIVE
     with pytest.raises(TransitionError, match="disable it first"):
@@ -255,13 +251,13 @@ def test_leaving_when_a_boot_failed_disables_too(bus: Any, clock: Any, tiny: Any
     assert tiny.state == 0x40
 
 
-def test_a_drive_that_only_listens_is_disabled_all_the_same(session: Any, tiny: Any) -> None:
+def test_a_silent_drive_is_still_disabled(session: Any, tiny: Any) -> None:
     with pytest.raises(DriveError, match=r"not certain that power is off.*enable input"):
         session(lambda drive: setattr(tiny, "send", lambda function, data: None))
     assert tiny.state == 0x40
 
 
-def test_a_broken_bus_on_the_way_out_is_added_to_the_error(session: Any, bus: Any) -> None:
+def test_a_broken_bus_on_exit_is_added_to_the_error(session: Any, bus: Any) -> None:
     def cut_the_cable(drive: Drive) -> None:
         bus.refuse = can.CanOperationError("Failed to transmit: Network is down", 100)
         drive.read_positions()
@@ -271,9 +267,7 @@ def test_a_broken_bus_on_the_way_out_is_added_to_the_error(session: Any, bus: An
     assert any("not certain that power is off" in note for note in caught.value.__notes__)
 
 
-def test_a_drive_in_fault_is_left_alone_on_the_way_out(
-    bus: Any, clock: Any, tiny: Any, axis: AxisConfig
-) -> None:
+def test_a_drive_in_fault_is_left_alone_on_exit(bus: Any, clock: Any, tiny: Any, axis: AxisConfig) -> None:
     with Drive(bus, axis, clock, tiny.od) as drive:
         drive.boot()
         tiny.fail()

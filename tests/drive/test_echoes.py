@@ -1,7 +1,5 @@
 """Back ends that give a master its own frames back: the echo is dropped, a second master is not."""
 
-from __future__ import annotations
-
 import socket
 from collections.abc import Iterator
 from contextlib import ExitStack
@@ -69,9 +67,7 @@ def test_the_same_frame_from_another_master_is_received(links: tuple[Link, Link]
     assert heard(far) == (0x080, b"")
 
 
-def test_a_frame_of_a_node_that_marks_nothing_is_received(
-    links: tuple[Link, Link], multicast: BusConfig
-) -> None:
+def test_unmarked_frames_are_received(links: tuple[Link, Link], multicast: BusConfig) -> None:
     near, _ = links
     with open_bus(multicast, shared=True) as node:
         node.send(can.Message(arbitration_id=0x181, data=b"\x01", is_extended_id=False))

@@ -1,6 +1,4 @@
-"""The process image: layout, scaling with direction, limits, and what reaches the bus."""
-
-from __future__ import annotations
+"""The process image: scaling, limits and packed frames."""
 
 import math
 import struct
@@ -52,7 +50,7 @@ def test_a_frame_of_the_wrong_length_changes_nothing(
     assert (image.statusword, image.motor_counts) == (0x0040, 100)
 
 
-def test_a_second_node_may_carry_the_load_encoder(build_axis: Callable[..., AxisConfig]) -> None:
+def test_a_second_node_may_send_the_load_position(build_axis: Callable[..., AxisConfig]) -> None:
     source = {"index": 0x6004, "subindex": 0, "type": "uint32", "node": 2, "range_counts": 1000}
     image = ProcessImage(build_axis(load_encoder__source=source))
     assert image.tpdo_ids == (0x181, 0x281, 0x182)
@@ -106,12 +104,12 @@ def test_only_targets_within_the_limits_are_packed(
 
 
 @pytest.mark.parametrize("deg", [math.nan, math.inf, -math.inf, 1e300, 20_100.0])
-def test_angles_that_are_no_targets(deg: float, axis: AxisConfig) -> None:
+def test_impossible_angles_are_refused(deg: float, axis: AxisConfig) -> None:
     with pytest.raises(InputError, match="not sent"):
         ProcessImage(axis).target_counts_for(deg)
 
 
-def test_before_power_the_target_is_where_the_axis_is(axis: AxisConfig) -> None:
+def test_before_power_the_target_is_the_actual_position(axis: AxisConfig) -> None:
     image = ProcessImage(axis)
     # Beyond int32, by way of a wrap, and outside the limits: still no reason to send another target.
     image.seed(motor_counts=2**31 - 10, load_counts=5, statusword=0x0040)
@@ -204,7 +202,7 @@ def test_a_command_may_be_split_over_two_frames(other: Callable[[str], ProcessIm
         image.pack_rpdo(1 << 31)
 
 
-def test_the_statusword_is_taken_from_wherever_it_is_mapped(other: Callable[[str], ProcessImage]) -> None:
+def test_the_statusword_is_read_from_any_tpdo(other: Callable[[str], ProcessImage]) -> None:
     image = other(mapped(OWN, 0x1801, 0x60E40120, 0x60410010, kind=1))
     assert image.tpdo_ids == (0x181, 0x281, 0x381)
     data = struct.pack("<iH", 5, 0x1237)
@@ -216,7 +214,7 @@ def test_the_statusword_is_taken_from_wherever_it_is_mapped(other: Callable[[str
     assert (image.statusword, image.load_counts) == (0x1237, 5)
 
 
-def test_without_a_demand_the_target_stands_in_that_the_drive_has_reached(
+def test_without_6062h_the_demand_is_the_earlier_target(
     other: Callable[[str], ProcessImage],
 ) -> None:
     """A target sent after SYNC k is taken at SYNC k+1, and reached at SYNC k+2."""
@@ -233,7 +231,7 @@ def test_without_a_demand_the_target_stands_in_that_the_drive_has_reached(
     assert image.demand_counts == 990
 
 
-def test_without_a_torque_there_is_none(other: Callable[[str], ProcessImage]) -> None:
+def test_without_6077h_the_torque_is_unknown(other: Callable[[str], ProcessImage]) -> None:
     image = other(without(OWN, 0x6077))
     image.accept(0x181, struct.pack("<Hi", 0x0027, 5))
     assert math.isnan(image.torque_permille)

@@ -4,8 +4,6 @@ durand brings its own SDO server, NMT, heartbeat, SYNC and PDO handling; only th
 here. Its notifier thread is replaced by a poll, so that the test is in lockstep.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from typing import Any
 

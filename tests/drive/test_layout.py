@@ -1,6 +1,4 @@
-"""Which PDO carries what, on drives with free, fixed, few and small PDOs."""
-
-from __future__ import annotations
+"""PDO layout on drives with free, fixed, few and small PDOs."""
 
 from collections.abc import Callable
 from itertools import pairwise
@@ -50,7 +48,7 @@ def test_free_mappings_get_the_standard_layout(laid_out: Any) -> None:
     assert found.absent == ()
 
 
-def test_what_the_drive_cannot_send_is_left_out_and_room_is_used(laid_out: Any) -> None:
+def test_unavailable_objects_are_omitted_and_their_room_used(laid_out: Any) -> None:
     found = laid_out(without(OWN, 0x6077, 0x6062))
     assert told(found) == {0x181: [STATUS, POSITION], 0x281: [LOAD], 0x201: [CONTROL, TARGET]}
     assert [each.index for each in found.absent] == [0x6077, 0x6062]
@@ -58,7 +56,7 @@ def test_what_the_drive_cannot_send_is_left_out_and_room_is_used(laid_out: Any) 
     assert [each.index for each in found.absent] == [0x6062]
 
 
-def test_a_type_of_the_drives_own_decides_what_fits(laid_out: Any) -> None:
+def test_the_drives_own_types_decide_what_fits(laid_out: Any) -> None:
     found = laid_out(stating(OWN, "6077", DataType="0x0004"))
     assert told(found) == {
         0x181: [STATUS, POSITION],
@@ -85,12 +83,12 @@ def test_fixed_mappings_are_used_in_any_order_and_split(laid_out: Any) -> None:
     assert [each.is_fixed for each in found.cyclic] == [True, True, False]
 
 
-def test_of_fixed_mappings_the_fewest_are_used(laid_out: Any) -> None:
+def test_as_few_fixed_mappings_as_possible_are_used(laid_out: Any) -> None:
     eds = mapped(mapped(OWN, 0x1400, CONTROL), 0x1401, CONTROL, TARGET)
     assert [each.number for each in laid_out(eds).rpdos] == [2]
 
 
-def test_a_pdo_that_does_not_come_with_every_sync_serves_channels_only(laid_out: Any) -> None:
+def test_a_pdo_not_sent_on_every_sync_serves_channels_only(laid_out: Any) -> None:
     eds = mapped(mapped(OWN, 0x1800, STATUS, POSITION, kind=5), 0x1801, 0x21000010, kind=5)
     channel = {"source": {"index": 0x2100, "type": "int16"}, "celsius_per_count": 0.1, "every_cycles": 25}
     found = laid_out(eds, temperature=channel)
@@ -98,7 +96,7 @@ def test_a_pdo_that_does_not_come_with_every_sync_serves_channels_only(laid_out:
     assert [(each.number, each.every) for each in found.channels] == [(2, 5)]
 
 
-def test_a_channel_may_come_with_the_encoders(laid_out: Any) -> None:
+def test_a_channel_may_share_the_encoders_pdo(laid_out: Any) -> None:
     channel = {"source": {"index": 0x2100, "type": "int16"}, "celsius_per_count": 0.1}
     found = laid_out(mapped(OWN, 0x1800, STATUS, POSITION, 0x21000010, kind=1), temperature=channel)
     assert (found.channels, words(found.cyclic[0])[-1]) == ((), 0x21000010)
@@ -135,7 +133,7 @@ def test_a_pdo_that_is_invalid_for_good_does_not_exist(laid_out: Any) -> None:
     assert [each.number for each in found.cyclic] == [2, 3]
 
 
-def test_a_fixed_mapping_of_which_nothing_is_known_is_not_used(laid_out: Any) -> None:
+def test_an_unknown_fixed_mapping_is_not_used(laid_out: Any) -> None:
     eds = stating(mapped(OWN, 0x1800, STATUS, POSITION), section(0x1A00, 2), DefaultValue=None)
     assert [each.number for each in laid_out(eds).cyclic] == [2, 3]
     eds = mapped(eds, 0x1801, 0x60410001)
@@ -163,18 +161,18 @@ def test_more_channels_than_pdos(laid_out: Any) -> None:
         ({"index": 0x607D}, r"load_encoder\.source\.index: none\.eds says that 607Dh:01 cannot be mapped"),
     ],
 )
-def test_the_load_encoder_is_what_the_eds_says(laid_out: Any, source: dict[str, Any], complaint: str) -> None:
+def test_the_load_encoder_must_match_the_eds(laid_out: Any, source: dict[str, Any], complaint: str) -> None:
     with pytest.raises(InputError, match=complaint):
         laid_out(OWN, load_encoder__source=source)
 
 
-def test_another_node_is_not_what_this_eds_describes(laid_out: Any) -> None:
+def test_the_eds_does_not_describe_other_nodes(laid_out: Any) -> None:
     found = laid_out(OWN, load_encoder__source={"index": 0x6004, "subindex": 0, "type": "uint32", "node": 2})
     assert told(found)[0x182] == [0x60040020]
 
 
 @pytest.mark.parametrize("index", [0x6041, 0x6064, 0x6040, 0x607A])
-def test_what_is_needed_must_be_mappable_or_mapped(laid_out: Any, index: int) -> None:
+def test_mandatory_objects_must_be_mappable_or_mapped(laid_out: Any, index: int) -> None:
     eds = stating(OWN, f"{index:04X}", PDOMapping=0)
     with pytest.raises(InputError, match=rf"says that {index:04X}h:00 .* cannot be mapped to a PDO"):
         laid_out(eds)

@@ -1,6 +1,4 @@
-"""The link: what it drops, what it raises, and that it never waits for ever."""
-
-from __future__ import annotations
+"""The link: dropped frames, errors, bounded waits."""
 
 import errno
 import sys
@@ -55,7 +53,7 @@ def link_to(closing: deque[can.BusABC], bus: FakeBus) -> Link:
     return Link(bus, MonotonicClock())
 
 
-def test_what_canopen_does_not_use_is_dropped_and_counted(closing: deque[can.BusABC]) -> None:
+def test_frames_unused_by_canopen_are_dropped_and_counted(closing: deque[can.BusABC]) -> None:
     link = link_to(
         closing,
         FakeBus(
@@ -93,7 +91,7 @@ def test_an_interface_that_went_down_stays_down(closing: deque[can.BusABC], code
         OSError(errno.ENOBUFS, "No buffer space available"),
     ],
 )
-def test_a_full_queue_is_told_apart_and_does_not_last(closing: deque[can.BusABC], error: Exception) -> None:
+def test_a_full_transmit_queue_is_a_temporary_error(closing: deque[can.BusABC], error: Exception) -> None:
     bus = FakeBus(on_send=error)
     link = link_to(closing, bus)
     with pytest.raises(TransmitBufferFull, match="dropped"):
@@ -111,7 +109,7 @@ def test_bus_off_is_the_end_of_the_link(closing: deque[can.BusABC]) -> None:
         link.send(1, b"")
 
 
-def test_a_wall_clock_that_is_set_back_does_not_hold_the_wait(
+def test_setting_back_the_wall_clock_does_not_extend_a_wait(
     closing: deque[can.BusABC], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     walls = iter(range(10_000, 0, -100))
@@ -120,7 +118,7 @@ def test_a_wall_clock_that_is_set_back_does_not_hold_the_wait(
     assert link.recv(time.monotonic() + 0.001) is None
 
 
-def test_a_link_to_a_closed_bus_says_so() -> None:
+def test_a_link_to_a_closed_bus_reports_it() -> None:
     bus = can.Bus(interface="virtual", channel="closed", ignore_config=True)
     link = Link(bus, MonotonicClock())
     bus.shutdown()
@@ -142,7 +140,7 @@ def test_opening_an_unknown_interface() -> None:
     ("interface", "module", "package"),
     [("udp_multicast", "msgpack", "msgpack"), ("slcan", "serial", "pyserial")],
 )
-def test_a_missing_package_is_said_with_the_line_that_installs_it(
+def test_a_missing_package_is_reported_with_its_install_command(
     monkeypatch: pytest.MonkeyPatch, interface: str, module: str, package: str
 ) -> None:
     def refuse(**options: object) -> None:
@@ -167,7 +165,7 @@ def test_an_opened_bus_is_closed_again() -> None:
         bus.send(message())
 
 
-def test_what_the_interface_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_options_passed_to_the_interface(monkeypatch: pytest.MonkeyPatch) -> None:
     told: dict[str, object] = {}
 
     def bus(**options: object) -> FakeBus:

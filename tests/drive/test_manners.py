@@ -1,7 +1,5 @@
 """A master listens before it speaks, and holds a lock on its interface while it does."""
 
-from __future__ import annotations
-
 import os
 import pwd
 import re
@@ -70,7 +68,7 @@ def identifiers(witness: can.BusABC) -> set[int]:
     ],
     ids=lambda value: value if isinstance(value, str) else f"{value[0]:03X}h",
 )
-def test_a_drive_that_another_master_has_is_left_alone(frame: tuple[int, bytes], name: str) -> None:
+def test_a_drive_of_another_master_is_left_alone(frame: tuple[int, bytes], name: str) -> None:
     with bench(frame) as (bus, clock, witness), Drive(bus, AXIS, clock) as drive:
         with pytest.raises(BusInUseError, match=f"another master is on this bus: .*{name}") as refused:
             drive.boot()
@@ -85,24 +83,24 @@ def test_the_slowest_other_master_is_heard() -> None:
         Drive(bus, AXIS, clock).boot()
 
 
-def test_frames_of_other_nodes_are_no_master() -> None:
+def test_frames_of_other_nodes_are_not_a_master() -> None:
     others = ((0x702, b"\x05"), (0x182, bytes(8)), (0x202, bytes(6)), (0x602, bytes(8)), (0x081, bytes(8)))
     with bench(*others) as (bus, clock, _), Drive(bus, AXIS, clock) as drive:
         drive.boot()
 
 
-def test_what_waited_before_is_not_of_now() -> None:
+def test_old_frames_are_not_evidence_of_a_master() -> None:
     with bench() as (bus, clock, witness), Drive(bus, AXIS, clock) as drive:
         witness.send(can.Message(arbitration_id=0x080, is_extended_id=False))
         drive.boot()
 
 
-def test_who_insists_speaks() -> None:
+def test_force_skips_the_check() -> None:
     with bench((0x77F, b"\x05")) as (bus, clock, _), Drive(bus, AXIS, clock, force=True) as drive:
         drive.boot()
 
 
-def test_it_listens_once_and_not_on_a_bus_of_its_own() -> None:
+def test_listens_once_and_not_on_a_private_bus() -> None:
     with bench() as (bus, clock, _), Drive(bus, AXIS, clock) as drive:
         drive.listen()
         begun_s = clock.now()
@@ -134,7 +132,7 @@ def test_one_master_per_interface_on_a_machine(tmp_path: Path) -> None:
         pass
 
 
-def test_who_holds_an_interface_is_found_without_knowing_which(tmp_path):
+def test_holders_of_all_interfaces_are_listed(tmp_path):
     assert holders(tmp_path) == {}
     with InterfaceLock("socketcan", "can0", tmp_path), InterfaceLock("slcan", "/dev/ttyUSB0", tmp_path):
         (tmp_path / "hdbridge-socketcan-can7.lock").touch()  # of one that has ended
@@ -150,7 +148,7 @@ def test_the_virtual_bus_needs_no_lock(tmp_path: Path) -> None:
         assert not list(tmp_path.iterdir())
 
 
-def test_the_lock_goes_with_its_process(tmp_path: Path) -> None:
+def test_the_lock_ends_with_its_process(tmp_path: Path) -> None:
     program = (
         "import sys, time; from pathlib import Path\n"
         "from hdbridge.drive.interfacelock import InterfaceLock\n"
@@ -168,7 +166,7 @@ def test_the_lock_goes_with_its_process(tmp_path: Path) -> None:
             pass
 
 
-def test_a_lock_that_cannot_be_opened_is_said(tmp_path: Path) -> None:
+def test_an_unusable_lock_is_reported(tmp_path: Path) -> None:
     (tmp_path / "hdbridge-socketcan-can0.lock").symlink_to(tmp_path / "elsewhere")
     with (
         pytest.raises(BusError, match="lock of the CAN interface"),

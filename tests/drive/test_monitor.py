@@ -1,14 +1,12 @@
 """Heartbeats, boot-up messages and emergencies."""
 
-from __future__ import annotations
-
 import math
 
 from hdbridge.drive import Frame, NetworkMonitor, NmtState
 from hdbridge.drive.monitor import EMERGENCIES_KEPT
 
 
-def test_heartbeats_tell_state_and_age() -> None:
+def test_heartbeats_give_state_and_age() -> None:
     monitor = NetworkMonitor(1)
     status = monitor.nodes[1]
     assert math.isinf(status.heartbeat_age_s(0.0))
@@ -21,7 +19,7 @@ def test_heartbeats_tell_state_and_age() -> None:
     assert status.heartbeat_age_s(3.0) == 1.0
 
 
-def test_what_is_not_its_own_is_left_to_others() -> None:
+def test_frames_of_other_nodes_are_not_consumed() -> None:
     monitor = NetworkMonitor(1)
     for can_id in (0x702, 0x080, 0x181, 0x581, 0x082):
         assert not monitor.dispatch(Frame(can_id, b"\x05", 0.0))

@@ -1,6 +1,4 @@
-"""The PDO codec: what goes in comes out, and what does not fit never gets as far as a frame."""
-
-from __future__ import annotations
+"""The PDO codec: round trip and rejected values."""
 
 import math
 import struct
@@ -48,13 +46,13 @@ def test_data_of_another_length_is_rejected(layout: tuple[PdoCodec, list[int]], 
 
 @pytest.mark.parametrize("kind", IntegerType)
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf, 1.0, None, "1"])
-def test_what_is_no_integer_is_not_packed(kind: IntegerType, bad: object) -> None:
+def test_non_integers_are_not_packed(kind: IntegerType, bad: object) -> None:
     with pytest.raises(InputError, match="nothing was sent"):
         PdoCodec([PdoEntry(0x607A, 0, kind)]).pack([bad])  # type: ignore[list-item]
 
 
 @pytest.mark.parametrize("kind", IntegerType)
-def test_the_range_of_each_type_ends_where_it_should(kind: IntegerType) -> None:
+def test_types_have_their_exact_range(kind: IntegerType) -> None:
     codec = PdoCodec([PdoEntry(0x607A, 0, kind)])
     for value in (kind.minimum, kind.maximum):
         assert codec.unpack(codec.pack([value])) == (value,)

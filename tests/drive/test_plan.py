@@ -1,6 +1,4 @@
-"""The list of what a boot-up writes: values, units, order, and what is refused."""
-
-from __future__ import annotations
+"""The boot plan: values, units, order and refusals."""
 
 from collections.abc import Callable
 from typing import Any

@@ -1,7 +1,5 @@
 """The SDO client against nodes that answer late, wrongly, too much, or not at all."""
 
-from __future__ import annotations
-
 import struct
 from typing import Any
 
@@ -59,7 +57,7 @@ def test_a_long_value_is_written_in_segments(client: SdoClient, tiny: Any, bus: 
     assert bytes(received) == b"twelve bytes"
 
 
-def test_no_answer_ends_after_bounded_retries(client: SdoClient, tiny: Any, clock: Any, bus: Any) -> None:
+def test_retries_are_bounded(client: SdoClient, tiny: Any, clock: Any, bus: Any) -> None:
     tiny.silent = True
     with pytest.raises(
         SdoError, match=r"node 1, object 6064h:00 'Position actual value': read failed after 3"
@@ -69,7 +67,7 @@ def test_no_answer_ends_after_bounded_retries(client: SdoClient, tiny: Any, cloc
     assert [message.data[0] for message in bus.sent] == [0x40, 0x80] * 3
 
 
-def test_one_lost_answer_is_made_up_for(client: SdoClient, tiny: Any) -> None:
+def test_a_lost_answer_is_retried(client: SdoClient, tiny: Any) -> None:
     answers: list[list[bytes]] = [[], []]
 
     def forgetful(request: bytes) -> list[bytes]:
@@ -79,7 +77,7 @@ def test_one_lost_answer_is_made_up_for(client: SdoClient, tiny: Any) -> None:
     assert client.read(0x6064) == -7
 
 
-def test_a_late_answer_is_not_taken_for_another_object(client: SdoClient, tiny: Any) -> None:
+def test_a_late_answer_is_not_used_for_another_object(client: SdoClient, tiny: Any) -> None:
     other = b"\x43\x64\x60\x00" + struct.pack("<i", 99)
     tiny.scripts[0x607A, 0] = lambda request: [other, expedited(request, struct.pack("<i", 5))]
     tiny.send(0x580, other)
@@ -96,7 +94,7 @@ def test_a_late_answer_is_not_taken_for_another_object(client: SdoClient, tiny: 
         (0x0123_4567, "vendor-specific.*manual"),
     ],
 )
-def test_an_abort_is_told_with_what_to_do_and_not_repeated(
+def test_an_abort_is_reported_with_a_remedy_and_not_retried(
     client: SdoClient, tiny: Any, code: int, text: str
 ) -> None:
     calls = []
@@ -178,7 +176,7 @@ def test_a_slow_drip_of_segments_ends_too(bus: Any, clock: Any, tiny: Any) -> No
     assert clock.now() < 2.5
 
 
-def test_a_larger_object_than_announced_or_taken(client: SdoClient, tiny: Any) -> None:
+def test_wrong_announced_sizes_are_refused(client: SdoClient, tiny: Any) -> None:
     tiny.scripts[0x1008, 0] = lambda request: [b"\x41" + request[1:4] + (10**6).to_bytes(4, "little")]
     with pytest.raises(SdoError, match="more than the 4096 bytes"):
         client.read_text(0x1008)
@@ -188,7 +186,7 @@ def test_a_larger_object_than_announced_or_taken(client: SdoClient, tiny: Any) -
         client.read_text(0x1008)
 
 
-def test_what_arrives_meanwhile_is_not_lost(bus: Any, clock: Any, tiny: Any) -> None:
+def test_frames_arriving_meanwhile_are_not_lost(bus: Any, clock: Any, tiny: Any) -> None:
     monitor = NetworkMonitor(1)
     client = SdoClient(Link(bus, clock), monitor, 1, tiny.od)
 
@@ -230,17 +228,17 @@ def test_types_without_an_eds(bus: Any, clock: Any, tiny: Any) -> None:
         client.read(0x2222)
 
 
-def test_an_object_that_is_no_integer(client: SdoClient) -> None:
+def test_a_non_integer_object_is_refused(client: SdoClient) -> None:
     with pytest.raises(SdoError, match="not an integer by the EDS"):
         client.read(0x1008)
 
 
-def test_a_foreign_answer_does_not_help(client: SdoClient, tiny: Any, peer_bus: can.BusABC) -> None:
+def test_an_answer_of_the_wrong_kind_is_refused(client: SdoClient, tiny: Any, peer_bus: can.BusABC) -> None:
     tiny.scripts[0x6064, 0] = lambda request: [b"\x60" + request[1:4] + bytes(4)]
     with pytest.raises(SdoError, match="Unexpected response 0x60"):
         client.read(0x6064)
 
 
-def test_an_old_answer_for_the_same_object_is_not_taken_for_the_new_one(client: SdoClient, tiny: Any) -> None:
+def test_an_old_answer_for_the_same_object_is_ignored(client: SdoClient, tiny: Any) -> None:
     tiny.send(0x580, b"\x43\x64\x60\x00" + struct.pack("<i", 99))
     assert client.read(0x6064) == 1000

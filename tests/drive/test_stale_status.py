@@ -1,7 +1,5 @@
 """A status from before a command is not taken for its answer, on drives that show it for a while."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -33,7 +31,7 @@ def drive_that_shows_late(delay_ms: float) -> Iterator[tuple[Drive, DriveNode]]:
 
 @pytest.mark.parametrize("delay_ms", DELAYS_MS)
 @pytest.mark.parametrize("first", [35, 34])
-def test_an_axis_that_is_homed_again_is_homed_when_it_says_so(delay_ms: float, first: int) -> None:
+def test_repeated_homing_ends_only_when_complete(delay_ms: float, first: int) -> None:
     with drive_that_shows_late(delay_ms) as (drive, node):
         drive.home(first, 2.0, 1.0)
         away = drive.move_to(0.5)
@@ -47,7 +45,7 @@ def test_an_axis_that_is_homed_again_is_homed_when_it_says_so(delay_ms: float, f
 
 
 @pytest.mark.parametrize("delay_ms", DELAYS_MS)
-def test_homing_that_is_over_at_once_is_noticed(delay_ms: float) -> None:
+def test_immediately_finished_homing_is_noticed(delay_ms: float) -> None:
     with drive_that_shows_late(delay_ms) as (drive, _):
         for place_deg in (0.3, 0.6):
             drive.move_to(place_deg)
@@ -56,7 +54,7 @@ def test_homing_that_is_over_at_once_is_noticed(delay_ms: float) -> None:
 
 
 @pytest.mark.parametrize("delay_ms", DELAYS_MS)
-def test_an_error_of_the_homing_before_is_not_this_ones(delay_ms: float) -> None:
+def test_an_error_of_the_previous_homing_is_ignored(delay_ms: float) -> None:
     with drive_that_shows_late(delay_ms) as (drive, node):
         drive.enable(Mode.HM)
         node.firmware._modes[6]._failed = True  # type: ignore[attr-defined]
@@ -68,14 +66,14 @@ def test_an_error_of_the_homing_before_is_not_this_ones(delay_ms: float) -> None
     st.sampled_from(DELAYS_MS),
     st.lists(st.floats(-2.0, 2.0).map(lambda deg: round(deg, 3)), min_size=1, max_size=4),
 )
-def test_a_move_has_arrived_when_it_says_so(delay_ms: float, places_deg: list[float]) -> None:
+def test_a_move_ends_only_on_arrival(delay_ms: float, places_deg: list[float]) -> None:
     with drive_that_shows_late(delay_ms) as (drive, _):
         for place_deg in (*places_deg, places_deg[-1]):
             assert drive.move_to(place_deg).motor_deg == pytest.approx(50.0 * place_deg, abs=0.1)
 
 
 @pytest.mark.parametrize("delay_ms", DELAYS_MS)
-def test_power_and_modes_are_what_the_drive_has_not_what_it_showed(delay_ms: float) -> None:
+def test_power_and_modes_are_the_current_ones(delay_ms: float) -> None:
     with drive_that_shows_late(delay_ms) as (drive, node):
         for mode in (Mode.PP, Mode.HM, Mode.PP):
             drive.enable(mode)

@@ -1,7 +1,5 @@
 """The CiA-402 state table: decoding, every legal and every illegal transition, ways, the diagram."""
 
-from __future__ import annotations
-
 from itertools import pairwise, product
 from pathlib import Path
 
@@ -61,7 +59,7 @@ def test_decoding_looks_at_the_state_bits_only(state: State, word: int, other_bi
 
 
 @pytest.mark.parametrize("word", [None, -1, 0x1_0000, 0x0001, 0x0003, 0x0022, 0x0045, 0x0067, 0x002C])
-def test_no_or_undefined_statusword_is_unknown(word: int | None) -> None:
+def test_missing_or_undefined_statuswords_are_unknown(word: int | None) -> None:
     assert decode(word) is State.UNKNOWN
 
 
@@ -80,9 +78,7 @@ def test_every_pair_is_legal_as_in_the_standard_or_raises(state: State, command:
 
 
 @pytest.mark.parametrize(("state", "target"), list(product(State, State)))
-def test_every_way_ends_at_its_target_by_legal_commands_or_raises_and_changes_nothing(
-    state: State, target: State
-) -> None:
+def test_every_path_uses_legal_commands_or_raises_without_change(state: State, target: State) -> None:
     walk = PowerWalk()
     walk.observe(STATUSWORDS.get(state))
     aim, word = walk.aim, walk.controlword()
@@ -104,7 +100,7 @@ def test_every_way_ends_at_its_target_by_legal_commands_or_raises_and_changes_no
         assert any(row.command is None or word & row.command.mask == row.command.word for row in rows)
 
 
-def test_the_ways_into_and_out_of_power() -> None:
+def test_paths_into_and_out_of_power() -> None:
     up = [State.SWITCH_ON_DISABLED, State.READY_TO_SWITCH_ON, State.SWITCHED_ON, State.OPERATION_ENABLED]
     assert list(states_on_the_way(State.SWITCH_ON_DISABLED, State.OPERATION_ENABLED)) == up
     assert [controlword_for(state, State.OPERATION_ENABLED) for state in up] == [0x06, 0x07, 0x0F, 0x0F]
@@ -115,7 +111,7 @@ def test_the_ways_into_and_out_of_power() -> None:
 
 
 @pytest.mark.parametrize("state", [State.FAULT, State.FAULT_REACTION_ACTIVE, State.UNKNOWN])
-def test_no_way_leads_out_of_a_fault_or_the_unknown(state: State) -> None:
+def test_no_path_leads_out_of_fault_or_unknown(state: State) -> None:
     with pytest.raises(TransitionError, match="cannot go from"):
         controlword_for(state, State.OPERATION_ENABLED)
 
@@ -123,7 +119,7 @@ def test_no_way_leads_out_of_a_fault_or_the_unknown(state: State) -> None:
 @pytest.mark.parametrize(
     "state", [s for s in State if s not in (State.OPERATION_ENABLED, State.QUICK_STOP_ACTIVE)]
 )
-def test_nobody_is_enabled_in_order_to_be_stopped(state: State) -> None:
+def test_quick_stop_is_never_reached_by_enabling(state: State) -> None:
     with pytest.raises(TransitionError):
         controlword_for(state, State.QUICK_STOP_ACTIVE)
 
@@ -171,7 +167,7 @@ def enabled_walk() -> PowerWalk:
         (0x0001, 0x02),
     ],
 )
-def test_a_drive_that_drops_out_by_itself_is_not_enabled_again(word: int, controlword: int) -> None:
+def test_a_drive_that_drops_out_is_not_enabled_again(word: int, controlword: int) -> None:
     walk = enabled_walk()
     walk.observe(word)
     assert walk.aim is not State.OPERATION_ENABLED
@@ -181,7 +177,7 @@ def test_a_drive_that_drops_out_by_itself_is_not_enabled_again(word: int, contro
     assert walk.controlword() != 0x0F
 
 
-def test_a_quick_stop_holds_until_it_is_left_on_purpose() -> None:
+def test_a_quick_stop_holds_until_an_explicit_request() -> None:
     walk = enabled_walk()
     walk.quick_stop()
     assert walk.controlword() == 0x02
@@ -192,13 +188,13 @@ def test_a_quick_stop_holds_until_it_is_left_on_purpose() -> None:
 
 
 @given(words=st.lists(st.integers(0, 0xFFFF), max_size=30))
-def test_without_an_aim_no_statusword_ever_makes_it_enable(words: list[int]) -> None:
+def test_without_a_goal_no_statusword_leads_to_enabling(words: list[int]) -> None:
     walk = PowerWalk()
     for word in words:
         walk.observe(word)
         assert walk.controlword() & 0x0F not in (0x06, 0x07, 0x0F)
 
 
-def test_the_diagram_of_the_docs_is_that_of_the_table() -> None:
+def test_the_documented_diagram_matches_the_table() -> None:
     page = Path(__file__).parents[2] / "docs" / "architecture.md"
     assert mermaid() in page.read_text(encoding="utf-8")

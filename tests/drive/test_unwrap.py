@@ -1,6 +1,4 @@
-"""Unwrapping a counter: a wrap has no effect, whatever the path and the width."""
-
-from __future__ import annotations
+"""Unwrapping a counter of any width along any path."""
 
 import pytest
 from hypothesis import given
@@ -28,7 +26,7 @@ def test_any_path_of_moves_below_half_the_range_is_followed(start: int, moves: l
     start=st.integers(0, 2**33),
     steps=st.lists(st.floats(-0.499, 0.499), max_size=20),
 )
-def test_a_counter_may_begin_anew_anywhere(modulus: int, start: int, steps: list[float]) -> None:
+def test_a_counter_may_wrap_anywhere(modulus: int, start: int, steps: list[float]) -> None:
     unwrap = Unwrap(modulus)
     position = start % modulus
     unwrap.update(position)
@@ -43,7 +41,7 @@ def test_wrapping_stays_in_int32_and_is_modular(value: int) -> None:
     assert (wrap_int32(value) - value) % 2**32 == 0
 
 
-def test_reset_starts_from_where_it_is_told() -> None:
+def test_reset_starts_at_the_given_position() -> None:
     unwrap = Unwrap()
     unwrap.update(5)
     unwrap.reset()

@@ -3,14 +3,14 @@
 from hdbridge.axis.effects import CATALOGUE, aliases_of
 
 
-def test_a_look_alike_looks_alike_from_both_sides():
+def test_look_alikes_are_symmetric():
     for name in CATALOGUE:
         assert name not in aliases_of(name)
         for other in aliases_of(name):
             assert name in aliases_of(other)
 
 
-def test_the_classic_pairs_are_told():
+def test_the_classic_pairs_are_listed():
     for one, other in [
         ("load_order", "compliance"), ("velocity_windup", "channel_skew"), ("ratio_error", "wear"),
         ("motor_order", "motor_encoder_eccentricity"), ("zero_drift", "count_loss"),

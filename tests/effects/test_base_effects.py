@@ -116,7 +116,7 @@ def test_law_follows_the_formula_between_reversals():
     np.testing.assert_allclose(error, expected, atol=1e-9)
 
 
-def test_saturation_is_no_relay():
+def test_saturation_is_not_a_relay():
     """A saturated reversal leaves the offset gradually; taken literally the law would jump by 80 arcsec."""
     tracker = ARTICLE.tracker()
     for angle in (0.0, 100.0):
@@ -133,7 +133,7 @@ def test_direction_holds_at_rest():
     )
 
 
-def test_start_is_what_it_says():
+def test_the_start_value_is_used():
     ahead = np.array([0.0, 1.0, 9.9, 10.0, 15.0])
     virgin = ARTICLE.predict(Motion(ahead))
     assert virgin[0] == 0
@@ -145,14 +145,14 @@ def test_start_is_what_it_says():
     assert all(b > a for a, b in pairwise(backward))
 
 
-def test_back_and_forth_comes_back_to_where_it_was():
+def test_back_and_forth_returns_to_the_start():
     """Any excursion within the loop, out and back by the same angle, closes."""
     for depth in (0.01, 0.5, 3.0, 9.0):
         path = np.array([0.0, 50.0, 50.0 - depth, 50.0])
         assert ARTICLE.predict(Motion(path))[-1] == pytest.approx(40.0)
 
 
-def test_it_does_not_remember_return_points():
+def test_return_points_are_not_remembered():
     """The law has no return-point memory: that is its known weakness, and an effect of its own."""
     back_step = np.array([0.0, -50.0, -45.0, -47.0, -45.0, -40.0])
     straight = np.array([0.0, -50.0, -40.0])
@@ -167,9 +167,7 @@ def test_it_does_not_remember_return_points():
     reach=st.floats(1.05, 4.0),
     start=st.sampled_from(list(Start)),
 )
-def test_a_load_that_lags_mirrors_one_that_leads_and_a_reversed_path_closes(
-    law, size, width, n, reach, start
-):
+def test_a_lagging_load_mirrors_a_leading_one(law, size, width, n, reach, start):
     once = reach * width * np.sin(np.linspace(0.0, 2.0 * np.pi, 401))
     motion = Motion(np.tile(once[:-1], 3))
     leads, lags = (law(offset_arcsec=sign * size, width_deg=width, exponent=n) for sign in (1, -1))

@@ -60,7 +60,7 @@ def test_speed_acceleration_and_direction_are_backward_differences_over_uneven_t
     assert [observer.moment(a, t) for a, t in zip(motion.motor_deg, motion.time_s, strict=True)] == seen
 
 
-def test_a_record_that_knows_its_speed_better_is_believed():
+def test_a_recorded_speed_takes_precedence():
     motion = Motion(
         np.zeros(3), np.arange(3.0), motor_speed_deg_s=np.array([5.0, 0.0, -5.0]),
         motor_acceleration_deg_s2=np.array([1.0, 2.0, 3.0]),
@@ -92,7 +92,7 @@ def test_an_eccentric_disc_has_no_third_order():
         MotorEncoderEccentricity(orders=(MotorOrder(order=3, amplitude_arcsec=1, phase_deg=0),))
 
 
-def test_a_new_motor_order_is_sought_where_the_model_has_none():
+def test_new_motor_orders_are_sought_outside_the_model():
     model = [
         Synchronous(orders=tuple(MotorOrder(order=k, amplitude_arcsec=1, phase_deg=0) for k in (1, 2, 4)))
     ]
@@ -298,11 +298,11 @@ def test_play_for_an_inverse_is_crossed_no_steeper_than_asked_and_is_the_same_be
     ],
     ids=lambda each: each.name,
 )
-def test_what_is_no_play_has_no_gentler_form(effect):
+def test_only_backlash_has_a_gentle_form(effect):
     assert effect.gentle_tracker(Start.FORWARD, 50.0) is None
 
 
-def test_after_a_stop_the_load_relaxes_exponentially_however_it_is_sampled():
+def test_the_load_relaxes_exponentially_at_any_sampling():
     effect = Creep(parts=(Relaxation(amplitude_arcsec=6, tau_s=2),), build_up=0.01)
     for rest in ([2.0, 4.0, 10.0], [0.3, 1.9, 2.0, 3.0, 4.0, 7.7, 10.0]):
         time_s = np.array([0.0, 1.0, *[1.0 + each for each in rest]])
@@ -350,7 +350,7 @@ def test_ripple_and_loop_change_with_warmth():
     np.testing.assert_allclose(effect.predict(motion, Start.FORWARD), 0.1 * ripple - 0.2 * 40)
 
 
-def test_a_lag_over_a_long_record_keeps_its_digits():
+def test_a_lag_over_a_long_record_keeps_its_precision():
     """A million samples, half of them at steps a thousand times the time constant."""
     count = 200_000
     time_s = np.cumsum(np.where(np.arange(count) % 2, 1e-3, 1e3))
@@ -380,7 +380,7 @@ STEEP = [
 
 
 @pytest.mark.parametrize("effect", STEEP, ids=lambda each: each.name)
-def test_the_slope_bound_is_what_the_steepest_fall_reaches(effect):
+def test_the_slope_bound_is_tight(effect):
     angle = np.linspace(0, 1000, 200_001)
     falls = -np.diff(effect.predict(Motion(angle), Start.BACKWARD)) / np.diff(angle)
     falls = falls[1:]  # in the first step the direction changes, which is the command's doing

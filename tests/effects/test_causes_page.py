@@ -1,4 +1,4 @@
-"""docs/causes.md is what the catalogue says."""
+"""docs/causes.md matches the catalogue."""
 
 import catalogue_docs
 

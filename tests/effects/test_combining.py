@@ -1,4 +1,4 @@
-"""Effects combine in a model, and the compensation corrects what it should."""
+"""Effects combined in a model, and their compensation."""
 
 import math
 
@@ -38,7 +38,7 @@ def names(effects):
     return [each.name for each in effects]
 
 
-def test_the_law_with_memory_takes_the_place_of_the_plain_one_and_back():
+def test_the_law_with_memory_replaces_the_plain_one_and_back():
     memory = HysteresisMemory.candidate(RATIO, BASE)
     effects = extended(BASE, memory)
     assert names(effects) == ["synchronous", "hysteresis_memory"]
@@ -71,7 +71,7 @@ def test_changed_parameters_go_into_the_models_own_loop(law):
     np.testing.assert_allclose(effects[1].predict(path), loop.predict(path) + change.predict(path), atol=1e-9)
 
 
-def test_a_new_cause_is_added_and_a_known_one_renewed():
+def test_new_causes_are_added_and_known_ones_updated():
     once = extended(BASE, Backlash.of_gap(10.0, RATIO))
     assert names(once) == ["synchronous", "hysteresis", "backlash"]
     twice = extended(once, Backlash.of_gap(5.0, RATIO))
@@ -79,7 +79,7 @@ def test_a_new_cause_is_added_and_a_known_one_renewed():
     assert twice[2].gap_arcsec == 5.0
 
 
-def test_what_is_carried_follows_what_it_was_copied_from():
+def test_copied_parameters_follow_their_source():
     effects = extended(BASE, RateDependence.candidate(RATIO, BASE))
     effects = extended(effects, HysteresisParameters.candidate(RATIO, BASE))
     assert effects[2].loop == Loop(offset_arcsec=48, width_deg=20, exponent=1.6)
@@ -101,7 +101,7 @@ def test_errors_of_the_measurement_are_left_out_of_the_compensation():
     assert CountLoss.compensable.why
 
 
-def test_a_shrinking_loop_beside_the_models_own_does_not_fall():
+def test_a_shrinking_additional_loop_stays_monotonic():
     drift = AmplitudeDrift.candidate(RATIO, BASE)
     assert drift.slope_bound_arcsec_per_deg() == math.inf
     assert math.isfinite(fall_bound([*BASE, drift]))
@@ -111,7 +111,7 @@ def test_a_shrinking_loop_beside_the_models_own_does_not_fall():
     assert fall_bound(BASE) == sum(each.slope_bound_arcsec_per_deg() for each in BASE)
 
 
-def test_what_cannot_be_of_one_model_is_told():
+def test_incompatible_effects_are_reported():
     order = LoadOrders.candidate(80.0)
     assert conflicts([*BASE, order], 80.0) == ()
     (told,) = conflicts([*BASE, order], RATIO)
@@ -121,7 +121,7 @@ def test_what_cannot_be_of_one_model_is_told():
     assert told.startswith("'hysteresis_memory' stands in place of 'hysteresis'")
 
 
-def test_a_scheme_that_asks_for_hysteresis_gets_the_law_that_stands_in_its_place():
+def test_the_hysteresis_scheme_uses_the_substituted_law():
     model = TransmissionModel(ratio=RATIO, effects=extended(BASE, HysteresisMemory.candidate(RATIO, BASE)))
     assert names(model.only(["hysteresis"]).effects) == ["hysteresis_memory"]
     assert names(model.only(["synchronous"]).effects) == ["synchronous"]

@@ -35,7 +35,7 @@ def law(test):
     return pytest.mark.parametrize("name", NAMES)(settings(max_examples=12, deadline=None)(test))
 
 
-def test_every_effect_of_the_catalogue_is_held_to_these_laws():
+def test_every_effect_is_tested():
     assert set(EXAMPLES) == set(CATALOGUE)
 
 
@@ -194,7 +194,7 @@ def test_a_candidate_is_within_physical_bounds_and_fits_the_gear(name):
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_violations_tell_of_parameters_that_a_fit_drove_out_of_bounds(name):
+def test_out_of_bound_parameters_are_reported_as_violations(name):
     effect = CATALOGUE[name].candidate(50.0, BASE)
     astray = effect.fitted(1e9 * np.ones(len(effect.coefficients())))
     assert astray.violations()
@@ -202,14 +202,14 @@ def test_violations_tell_of_parameters_that_a_fit_drove_out_of_bounds(name):
 
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("factor", [-1e3, 1e3, 1e6])
-def test_tidying_what_a_fit_drove_out_of_bounds_leaves_its_violations(name, factor):
+def test_tidying_keeps_violations(name, factor):
     candidate = CATALOGUE[name].candidate(50.0)
     effect = candidate.fitted(factor * candidate.coefficients())
     assert bool(effect.tidied(50.0).violations()) >= bool(effect.violations())
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_every_effect_is_told_in_full(name):
+def test_every_effect_is_described_completely(name):
     kind = CATALOGUE[name]
     about = kind.about
     for text in (

@@ -1,4 +1,4 @@
-"""Return-point memory: its figures, and the same law made in another way, of stop operators."""
+"""Return-point memory: its figures, and the equivalent sum of stop operators."""
 
 from itertools import pairwise
 
@@ -62,7 +62,7 @@ grid_steps = st.one_of(st.integers(-4, 4), st.integers(-4, 4), st.integers(-30, 
 
 @given(path=st.lists(grid_steps, min_size=1, max_size=40), start=st.sampled_from(list(Start)))
 @settings(deadline=None)
-def test_it_is_a_sum_of_stop_operators(path, start):
+def test_the_law_is_a_sum_of_stop_operators(path, start):
     """With stops at multiples of a grid the sum is exact for paths on (twice) that grid, whatever the law."""
     grid = GEAR["width_deg"] / 40
     thresholds = grid * np.arange(1, 21)
@@ -79,7 +79,7 @@ def test_it_is_a_sum_of_stop_operators(path, start):
     np.testing.assert_allclose(MEMORY.predict(Motion(angles), start)[1:], expected, atol=1e-8)
 
 
-def test_back_on_the_virgin_curve_its_first_reversal_is_forgotten_too():
+def test_the_first_reversal_is_forgotten_on_the_virgin_curve():
     """Out, back, out past the first reversal, and then far back: as if it had gone out straight."""
     tail = [6.0, -4.0, -8.0]
     looped = MEMORY.predict(Motion(np.array([0.0, 3.0, 1.0, *tail])))

@@ -1,7 +1,5 @@
 """The effect of docs/add-an-effect.md, taken from the page: found, drawn, written, compensated, forecast."""
 
-from __future__ import annotations
-
 import html
 import importlib.util
 import re
@@ -61,7 +59,7 @@ def diagnosis(taut_cable: type[Effect], model: TransmissionModel) -> Diagnosis:
     return diagnose(Record(columns), model)
 
 
-def test_it_is_found_with_its_parameters(diagnosis: Diagnosis) -> None:
+def test_the_effect_is_found_with_its_parameters(diagnosis: Diagnosis) -> None:
     (found,) = diagnosis.findings
     assert found.cause == "taut_cable"
     assert found.probability > 0.9
@@ -71,13 +69,13 @@ def test_it_is_found_with_its_parameters(diagnosis: Diagnosis) -> None:
     assert not found.refusal()
 
 
-def test_it_is_drawn_over_what_it_depends_on(diagnosis: Diagnosis) -> None:
+def test_the_effect_is_plotted_over_its_coordinate(diagnosis: Diagnosis) -> None:
     page = html.unescape(render(diagnosis_page(diagnosis, title="an axis")))
     assert "cable that comes taut" in page
     assert "Residual without it, over the position" in page
 
 
-def test_the_extended_model_holds_it_and_goes_through_a_file(diagnosis: Diagnosis) -> None:
+def test_the_extended_model_with_the_effect_survives_a_file(diagnosis: Diagnosis) -> None:
     assert diagnosis.extended.rms_arcsec < 1.2 * diagnosis.noise_floor_arcsec
     again = TransmissionModel.from_text(diagnosis.model.dump())
     (cable,) = [each for each in again.effects if each.name == "taut_cable"]
@@ -85,7 +83,7 @@ def test_the_extended_model_holds_it_and_goes_through_a_file(diagnosis: Diagnosi
     assert "pull_arcsec_per_deg" in again.uncertainty["taut_cable"]
 
 
-def test_it_is_compensated(diagnosis: Diagnosis) -> None:
+def test_the_effect_is_compensated(diagnosis: Diagnosis) -> None:
     inverse, gear = Inverse(diagnosis.model, Start.FORWARD), diagnosis.model.tracker(Start.FORWARD)
     now = Moment()
     inverse.begin(0.0, now)
@@ -97,9 +95,7 @@ def test_it_is_compensated(diagnosis: Diagnosis) -> None:
         assert motor / diagnosis.model.ratio + error / 3600.0 == pytest.approx(load_deg, abs=1e-6)
 
 
-def test_what_a_record_or_a_plan_could_show_of_it_is_forecast(
-    diagnosis: Diagnosis, model: TransmissionModel
-) -> None:
+def test_visibility_of_the_effect_is_forecast(diagnosis: Diagnosis, model: TransmissionModel) -> None:
     assert diagnosis.identifiability["taut_cable"].detectable
     sweep = {"procedure": "sweep", "motor_turns_per_s": 1.0, "load_turns": 1}
     plan = Plan.model_validate({"schema": "hdbridge.plan/1", "name": "turn", "procedures": [sweep]})
@@ -107,7 +103,7 @@ def test_what_a_record_or_a_plan_could_show_of_it_is_forecast(
     assert forecast["detectable"]
 
 
-def test_a_name_is_taken_once(taut_cable: type[Effect]) -> None:
+def test_effect_names_are_unique(taut_cable: type[Effect]) -> None:
     assert "taut_cable" in causes()
     assert register(taut_cable) is taut_cable
 

@@ -1,4 +1,4 @@
-"""Whatever bytes a file holds, it is read or refused in one line; nothing else ever comes out."""
+"""Any bytes in a file are read or refused in one line."""
 
 # ruff: noqa: E501  (tables)
 

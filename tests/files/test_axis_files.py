@@ -1,4 +1,4 @@
-"""The axis file: what it means, and one exact line for everything that can be wrong in it."""
+"""The axis file: its meaning, and one exact line for every error."""
 
 # ruff: noqa: E501  (the table of complaints shows each on one line)
 
@@ -48,7 +48,7 @@ def load(folder: Path, text: str) -> AxisConfig:
     return AxisConfig.load(folder / "axis.yaml")
 
 
-def test_a_good_file_gives_nested_values_and_defaults(folder):
+def test_a_valid_file_gives_nested_values_and_defaults(folder):
     axis = load(folder, GOOD)
     assert (axis.name, axis.drive.cycle_s, axis.drive.interpolation_period) == ("test", 0.004, (4, -3))
     assert (axis.drive.heartbeat_ms, axis.drive.master_node_id, axis.drive.quick_stop_option) == (50, 127, 2)
@@ -65,7 +65,7 @@ def test_a_good_file_gives_nested_values_and_defaults(folder):
     assert AxisConfig.load(folder) == axis
 
 
-def test_it_cannot_be_changed(folder):
+def test_the_configuration_is_immutable(folder):
     axis = load(folder, GOOD)
     with pytest.raises(ValueError, match="frozen"):
         axis.gear.ratio = 40  # type: ignore[misc]
@@ -206,7 +206,7 @@ def test_the_bundled_profiles_are_right(name):
     assert axis.eds_path.parent == bundled_folder("eds")
 
 
-def test_an_unknown_profile_names_those_that_there_are():
+def test_an_unknown_profile_lists_the_known_ones():
     with pytest.raises(InputError) as caught:
         bundled_profile("articel")
     assert str(caught.value) == (
@@ -226,7 +226,7 @@ def test_bundled_files_are_found_in_a_wheel_and_in_a_working_copy(tmp_path):
     assert bundled_folder("eds", copy / "hdbridge") == copy / "eds"
 
 
-def test_where_a_key_stands(tmp_path):
+def test_the_line_of_a_key_is_known(tmp_path):
     path = tmp_path / "axis.yaml"
     text = (bundled_profile("article") / "axis.yaml").read_text()
     path.write_text(text)

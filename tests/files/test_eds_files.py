@@ -104,7 +104,7 @@ def sections_in(case):
         "".join(sorted(SECTIONS, reverse=True)),
     ],
 )  # fmt: skip
-def test_a_file_says_the_same_however_it_is_written(tmp_path, original, content):
+def test_equivalent_spellings_give_the_same_dictionary(tmp_path, original, content):
     found = read(tmp_path, content)
     assert described(found.dictionary) == original
     assert found.unread == ()
@@ -122,7 +122,7 @@ def test_a_file_says_the_same_however_it_is_written(tmp_path, original, content)
         ("0X1F", 31),
     ],
 )
-def test_the_vendor_number_is_read_or_counts_as_not_given(tmp_path, original, text, number):
+def test_the_vendor_number_is_read_or_missing(tmp_path, original, text, number):
     found = read(tmp_path, TEXT.replace("VendorNumber=0x00004844", f"VendorNumber={text}"))
     assert described(found.dictionary) == original
     assert found.dictionary.device_information.vendor_number == number
@@ -147,7 +147,7 @@ def test_numbers_of_a_signed_object(tmp_path, key, text, value):
     assert getattr(variable, {"LowLimit": "min", "HighLimit": "max", "DefaultValue": "default"}[key]) == value
 
 
-def test_a_limit_that_cannot_be_read_counts_as_not_given_and_is_named(tmp_path):
+def test_unreadable_limits_are_ignored_and_reported(tmp_path):
     found = read(tmp_path, re.sub(r"(\[605A\][^[]*?HighLimit=).*", r"\g<1>eight", TEXT))
     line = 1 + found_line(re.sub(r"(\[605A\][^[]*?HighLimit=).*", r"\g<1>eight", TEXT), "HighLimit=eight")
     assert found.dictionary[0x605A].max is None
@@ -172,7 +172,7 @@ def found_line(text, piece):
         ("[1003]\n", "[1003]\nCompactSubObj=999\n", "[1003] CompactSubObj: found '999'; expected a number from"),
     ],
 )  # fmt: skip
-def test_what_an_object_needs_and_cannot_be_read_is_refused_with_its_place(tmp_path, old, new, place):
+def test_unreadable_mandatory_keys_are_refused_with_their_location(tmp_path, old, new, place):
     content = TEXT.replace(old, new, 1)
     line = found_line(content, new) + 2
     with pytest.raises(InputError) as caught:
@@ -186,7 +186,7 @@ def test_an_object_without_a_type_is_refused(tmp_path):
         read(tmp_path, content)
 
 
-def test_of_two_keys_or_sections_with_one_name_the_first_holds(tmp_path, original):
+def test_the_first_of_duplicate_keys_or_sections_counts(tmp_path, original):
     found = read(tmp_path, TEXT + "[6064]\nParameterName=Another\nDataType=zz\n")
     assert described(found.dictionary) == original
 
@@ -235,7 +235,7 @@ def test_a_type_of_the_files_own(tmp_path):
 @pytest.mark.parametrize(
     "content", [b"", b"\x1a", b"\xff\xfe", b"not an EDS", b"[FileInfo]\nFileName=x\n", b"\0" * 999]
 )
-def test_what_is_no_eds_is_refused(tmp_path, content):
+def test_files_that_are_not_eds_are_refused(tmp_path, content):
     with pytest.raises(InputError, match=r"drive\.eds: cannot be read as an EDS"):
         read(tmp_path, content)
 

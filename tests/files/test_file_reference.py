@@ -1,4 +1,4 @@
-"""The reference of the files says what the code expects."""
+"""The file reference matches the code."""
 
 import re
 

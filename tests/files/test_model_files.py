@@ -1,4 +1,4 @@
-"""The model file: exact round trip, one exact line for what is wrong, and the binding to its drive."""
+"""The model file: exact round trip, one exact line for errors, binding to its drive."""
 
 # ruff: noqa: E501  (the table of complaints shows each on one line)
 
@@ -56,7 +56,7 @@ WORDS = {
 """Descriptions of the effects' own fields."""
 
 
-def test_the_words_of_a_field_are_its_type_its_range_and_its_description():
+def test_fields_are_described_by_type_range_and_text():
     assert WORDS["exponent"] == "a number above 1, at most 6 (shape n of the branch)"
 
 
@@ -204,7 +204,7 @@ def test_binding_a_model_keeps_the_rest_of_its_provenance(axis):
         bound.check_bound_to(axis)
 
 
-def test_effects_that_stand_in_each_others_place_are_refused():
+def test_mutually_exclusive_effects_are_refused():
     text = (
         "schema: hdbridge.model/1\nratio: 50\neffects:\n"
         "- effect: hysteresis\n  parameters: {offset_arcsec: 40, width_deg: 20, exponent: 1.6}\n"

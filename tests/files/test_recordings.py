@@ -1,4 +1,4 @@
-"""Recording folders: what comes back, what is refused."""
+"""Recording folders: round trip and refusals."""
 
 import numpy as np
 import pytest
@@ -35,7 +35,7 @@ FULL = Recording(
 )
 
 
-def test_a_recording_comes_back_as_it_was(tmp_path):
+def test_recordings_read_back_unchanged(tmp_path):
     FULL.save(tmp_path / "one")
     assert sorted(each.name for each in (tmp_path / "one").iterdir()) == ["record.csv.gz", "recording.yaml"]
     assert Recording.load(tmp_path / "one") == FULL
@@ -49,7 +49,7 @@ def test_the_same_recording_gives_the_same_bytes(tmp_path):
         assert (tmp_path / "one" / file).read_bytes() == (tmp_path / "two" / file).read_bytes()
 
 
-def test_a_record_without_a_sample_is_kept_too(tmp_path):
+def test_empty_records_are_kept(tmp_path):
     Recording(record(samples=0)).save(tmp_path / "one")
     assert len(Recording.load(tmp_path / "one").record) == 0
 
@@ -60,7 +60,7 @@ def test_a_recording_is_never_overwritten(tmp_path):
         FULL.save(tmp_path / "one")
 
 
-def test_a_changed_record_is_noticed(tmp_path):
+def test_a_modified_record_is_detected(tmp_path):
     FULL.save(tmp_path / "one")
     record(samples=9).write_csv(tmp_path / "one" / "record.csv.gz")
     with pytest.raises(InputError) as caught:
@@ -116,7 +116,7 @@ def test_bare_csv_files_and_folders_make_one_recording_in_the_order_given(tmp_pa
     assert (same.axis, same.ratio, same.drive) == ("article", 50.0, FULL.drive)
 
 
-def test_the_pieces_of_a_kind_have_their_samples():
+def test_segments_of_a_kind_return_their_samples():
     pieces = list(FULL.pieces("step"))
     assert [segment.notes["scheme"] for segment, _ in pieces] == ["both"]
     assert pieces[0][1].time_s == pytest.approx([0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9], abs=0.06)

@@ -50,9 +50,11 @@ def record(samples: int = 101, ratio: float = 50.0, travel_deg: float = 400.0, *
         (f"{HEAD}\n0,1,2\n1,1\n".encode(), ":3: 2 values; expected 3, one for each column"),
         (f"{HEAD}\n0,1,2\n1,1,2,3\n".encode(), ":3: 4 values; expected 3, one for each column"),
         (f"{HEAD}\n0,1,2,3\n1,1,2,3\n".encode(), ":2: 4 values; expected 3, one for each column"),
-        (f"{HEAD}\n0,1,2\n".encode(), ": 1 samples are too few; expected at least 2"),
-        (f"{HEAD}\n".encode(), ": 0 samples are too few; expected at least 2"),
+        (f"{HEAD}\n0,1,2\n".encode(), ": 1 sample; expected at least 2"),
+        (f"{HEAD}\n".encode(), ": 0 samples; expected at least 2"),
         (f"{HEAD},note\n0,1,2,\x81\n".encode("latin-1"), ":2: neither UTF-8 nor Windows-1252 text; expected CSV in UTF-8"),
+        (b"PK\x03\x04\x14\x00\x06\x00\x08\x90", ": a ZIP archive, such as an Excel workbook; expected CSV: export the samples as CSV"),
+        (b"PAR1\x15\x04\x15\x00\x90", ": a Parquet file; expected CSV: export the samples as CSV"),
         (gzip.compress(f"{HEAD}\n0,1,2\n".encode(), mtime=0)[:-9], ": gzip data are damaged or cut off (Compressed file ended before the end-of-stream marker was reached)"),
     ],
 )  # fmt: skip
@@ -109,7 +111,7 @@ def test_the_same_record_gives_the_same_bytes(tmp_path):
     assert (tmp_path / "a.csv").read_text().startswith(f"{HEAD},temperature_c\n0.0,0.0,0.0,20.1\n")
 
 
-def test_what_other_tools_write_is_read(tmp_path):
+def test_files_of_other_tools_are_read(tmp_path):
     path = tmp_path / "theirs.csv"
     path.write_bytes(
         b'\xef\xbb\xbf"time_s", motor_position_deg,load_position_deg,mode,rare\r\n'
@@ -138,7 +140,7 @@ def test_columns_must_be_there_and_of_one_length():
         Record({"time_s": np.zeros(2), "motor_position_deg": np.zeros(2), "load_position_deg": np.zeros(3)})
 
 
-def test_the_transmission_error_is_what_the_load_is_ahead():
+def test_the_transmission_error_is_positive_for_a_leading_load():
     one = Record(
         {
             "time_s": np.arange(2.0),
@@ -149,7 +151,7 @@ def test_the_transmission_error_is_what_the_load_is_ahead():
     assert one.transmission_error_arcsec(50.0) == pytest.approx([0.0, 1.0])
 
 
-def test_a_model_follows_the_commanded_angle_where_there_is_one():
+def test_a_model_follows_the_commanded_angle_if_recorded():
     target = np.linspace(0.0, 1.0, 101)
     assert record(motor_target_deg=target).motion().motor_deg.tolist() == target.tolist()
     one = record(load_torque_nm=np.ones(101))
@@ -188,12 +190,12 @@ def test_a_right_ratio_is_accepted_whatever_the_gear_does(ratio, travel, zero, o
     Record({**one.columns, "load_position_deg": moved}).check_ratio(ratio)
 
 
-def test_a_standing_axis_and_an_empty_record_say_nothing_of_the_ratio():
+def test_a_resting_axis_does_not_contradict_the_ratio():
     record(travel_deg=0.0).check_ratio(50.0)
     record(samples=0).check_ratio(50.0)
 
 
-def test_several_records_are_one_and_know_where_each_began():
+def test_concatenated_records_keep_their_starts():
     first, second = record(samples=11, extra=np.zeros(11)), record(samples=5)
     later = Record({**second.columns, "time_s": second.time_s + 100.0})
     both = concatenate([first, second, later])

@@ -6,7 +6,7 @@ import pytest
 from support.fleet import MODEL, record
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def fleet(tmp_path_factory) -> Path:
     """Three joints with three recordings each, a copy, a damaged and a missing file, a manifest."""
     folder = tmp_path_factory.mktemp("fleet")
@@ -24,7 +24,7 @@ def fleet(tmp_path_factory) -> Path:
     return folder
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def scheduler():
     """The address of a cluster with two workers."""
     distributed = pytest.importorskip("distributed")

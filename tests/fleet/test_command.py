@@ -7,7 +7,7 @@ import pytest
 from support.command import run_here
 
 
-def test_run_and_report_print_and_write_what_they_say(fleet, scheduler, tmp_path):
+def test_run_and_report_print_and_write_the_named_files(fleet, scheduler, tmp_path):
     model, manifest = fleet / "model.yaml", fleet / "manifest.csv"
     done = run_here(
         tmp_path, "fleet", "run", "--manifest", manifest, "--out", "out", "--model", model,
@@ -68,19 +68,20 @@ def check_pages(folder):
         (["run", ".", "--out", "out", "--memory", "1MB"], "at least 200MB"),
         (["run", ".", "--out", "out", "--scheduler", "tcp://a:1", "--workers", "2"], "--workers"),
         (["run", ".", "--out", "."], "not written by hdbridge fleet"),
+        (["run", "--manifest", "mine.csv", "--out", "out"], "mine.csv: no row"),
         (["report", "."], "no recordings in this folder"),
         (["simulate", "."], "is not empty"),
     ],
 )
-def test_what_is_wrong_is_refused_before_anything_is_written(tmp_path, arguments, complaint):
-    (tmp_path / "mine.csv").write_text("mine")
+def test_invalid_input_is_refused_before_anything_is_written(tmp_path, arguments, complaint):
+    (tmp_path / "mine.csv").write_text("path,joint\n")
     done = run_here(tmp_path, "fleet", *arguments)
     assert done.returncode == 2
     assert complaint in done.stderr
     assert [each.name for each in tmp_path.iterdir()] == ["mine.csv"]
 
 
-def test_a_scheduler_that_is_not_there_is_an_error_of_one_line(tmp_path):
+def test_an_absent_scheduler_is_a_one_line_error(tmp_path):
     dask = pytest.importorskip("dask")
     (tmp_path / "mine.csv").write_text("mine")
     with dask.config.set({"distributed.comm.timeouts.connect": "1s"}):

@@ -118,7 +118,7 @@ def test_recordings_behind_sftp(files, monkeypatch, tmp_path):
         ("http://127.0.0.1:{}/x/*.csv", b""),
     ],
 )
-def test_a_server_of_something_else_or_a_silent_one_is_an_error_of_one_line(place, words, monkeypatch):
+def test_a_wrong_or_silent_server_is_a_one_line_error(place, words, monkeypatch):
     pytest.importorskip("s3fs")
     pytest.importorskip("paramiko")
     with socket.create_server(("127.0.0.1", 0)) as server:

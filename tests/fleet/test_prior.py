@@ -1,4 +1,4 @@
-"""The fleet as a prior of one joint: it weighs names that the record supports, and makes none."""
+"""The fleet as a prior of one joint: it weighs supported causes and adds none."""
 
 import json
 import math
@@ -55,7 +55,7 @@ def test_a_fleet_like_the_records_of_the_formula_changes_nothing():
 
 
 @given(st.floats(-50, 50), st.floats(0.01, 10), st.floats(-50, 50), st.floats(0.01, 10))
-def test_an_interval_with_the_fleets_range_is_no_wider_and_holds_both_or_stays(value, own, middle, deviation):
+def test_fleet_ranges_never_widen_an_interval(value, own, middle, deviation):
     given_ = Parameter(value, "arcsec", value - 1.96 * own, value + 1.96 * own)
     found = given_.combined(middle, deviation)
     assert found.high - found.low <= given_.high - given_.low + 1e-9
@@ -65,7 +65,7 @@ def test_an_interval_with_the_fleets_range_is_no_wider_and_holds_both_or_stays(v
         assert min(value, middle) - 1e-6 <= found.value <= max(value, middle) + 1e-6
 
 
-def test_intervals_with_the_fleets_range_hold_as_often_as_they_say():
+def test_intervals_with_the_fleet_range_have_nominal_coverage():
     rng = np.random.default_rng(3)
     true = rng.normal(8.0, 1.0, 2000)
     seen = true + rng.normal(0.0, 1.5, 2000)
@@ -103,7 +103,7 @@ def prior(tmp_path):
     return tmp_path / "fleet.parquet"
 
 
-def test_the_prior_knows_what_is_common_where_and_which_names_mean_nothing(prior):
+def test_the_prior_holds_group_rates_and_meaningless_names(prior):
     everyone, ill, well = (read_prior(prior, of) for of in ({}, {"batch": "B"}, {"batch": "A"}))
     assert well.right["motor_order"] < everyone.right["motor_order"] < ill.right["motor_order"]
     assert ill.right["motor_order"] > 0.99
@@ -115,7 +115,7 @@ def test_the_prior_knows_what_is_common_where_and_which_names_mean_nothing(prior
     assert 0.3 < deviation < 1.5
 
 
-def test_a_cause_that_the_first_recording_could_not_show_has_not_appeared_since():
+def test_causes_invisible_at_first_are_not_reported_as_new():
     rows = []
     for joint, peak in enumerate((0.5, 6.0, *[0.0] * 30)):
         for number in range(5):

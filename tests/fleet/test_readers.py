@@ -1,4 +1,4 @@
-"""The data set in the programs that it is written for; each is skipped where it is not installed."""
+"""The data set in other programs, each skipped if not installed."""
 
 import pytest
 

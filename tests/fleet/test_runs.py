@@ -31,7 +31,7 @@ def whole(fleet, scheduler, tmp_path_factory):
     return out, go(fleet, out, scheduler)
 
 
-def test_every_recording_is_a_row_and_a_bad_one_says_why(fleet, whole):
+def test_every_recording_is_a_row_and_bad_ones_give_the_reason(fleet, whole):
     out, end = whole
     rows = {Path(row["path"]).name: row for row in Dataset(out).recordings()}
     assert len(rows) == end.done == end.total == 12
@@ -87,7 +87,7 @@ def test_a_joint_without_a_model_gets_one_from_its_earliest_recording(fleet, sch
     assert [each.name for each in (tmp_path / "out" / "models").iterdir()] == ["J%2F1.yaml"]
 
 
-def test_nothing_that_is_wrong_with_a_recording_is_raised(fleet, tmp_path):
+def test_errors_of_a_recording_are_never_raised(fleet, tmp_path):
     model = local_model(str(fleet / "model.yaml"))
     (tmp_path / "empty.csv").write_bytes(b"")
     (tmp_path / "no.mcap").write_bytes(b"no")
@@ -102,7 +102,7 @@ def test_nothing_that_is_wrong_with_a_recording_is_raised(fleet, tmp_path):
     )
 
 
-def test_a_task_leaves_nothing_to_the_collector_of_cycles(fleet):
+def test_a_task_leaves_no_reference_cycles(fleet):
     """A worker collects rarely, so its memory would grow by what each diagnosis caches."""
     model = local_model(str(fleet / "model.yaml"))
     source = Source(str(fleet / "J1-0.csv.gz"), joint="J", ratio=50.0)

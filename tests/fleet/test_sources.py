@@ -29,7 +29,7 @@ def test_a_folder_is_searched_for_recordings_of_each_kind(tmp_path):
     assert names(find_sources([f"{tmp_path}/**/*.csv*"]), tmp_path)[-2:] == ["b.csv", "c/d.csv.gz"]
 
 
-def test_a_manifest_describes_what_is_found_and_adds_what_is_not(tmp_path):
+def test_a_manifest_describes_and_adds_recordings(tmp_path):
     (tmp_path / "a.csv").write_bytes(b"")
     (tmp_path / "b.log").write_bytes(b"")
     rows = ["path,joint,hours,axis", "a.csv,J1,5,", "b.log,J2,,article", "gone.csv,J3,,"]
@@ -64,6 +64,7 @@ def test_a_manifest_may_be_parquet(tmp_path):
         ("joint\nJ1\n", "'path' is missing"),
         ("path,jiont\na,b\n", "did you mean joint"),
         ("path,ratio\na.csv,fifty\n", "m.csv:2: ratio: found 'fifty'"),
+        ("file,joint\na.csv,J\n", "'path' is missing; found file, joint"),
         ("path,joint\na.csv,J\na.csv,K\n", "m.csv:3: .*already"),
         ("path,joint\n,J\n", "m.csv:2: path"),
     ],
@@ -74,12 +75,43 @@ def test_a_wrong_manifest_is_refused_with_its_line(tmp_path, text, complaint):
         read_manifest(tmp_path / "m.csv")
 
 
+@pytest.mark.parametrize(
+    ("content", "remark"),
+    [
+        (b"\xef\xbb\xbfpath;joint;hours\r\na.csv;0012;1,5\r\n;;\r\n", None),
+        ("path\tjoint\thours\na.csv\t0012\t1.5\n".encode("utf-16"), None),
+        (
+            "path,joint,hours,Prüfer\na.csv,0012,1.5,Jörg\n".encode("cp1252"),
+            "ignored unknown columns: Prüfer",
+        ),
+        (b"path,joint,hours\na.csv,0012,1.5\na.csv,0012,1.5\n", "m.csv:3: repeats the row of a.csv"),
+    ],
+)
+def test_a_manifest_is_read_as_spreadsheets_write_it(tmp_path, content, remark):
+    (tmp_path / "m.csv").write_bytes(content)
+    remarks: list[str] = []
+    (found,) = read_manifest(tmp_path / "m.csv", remarks.append).values()
+    assert (found.path, found.joint, found.hours) == (str(tmp_path / "a.csv"), "0012", 1.5)
+    assert len(remarks) == (remark is not None)
+    assert all(remark in each for each in remarks)
+
+
 @given(st.binary(max_size=200))
 def test_any_bytes_as_a_manifest_are_read_or_refused(tmp_path_factory, data):
     path = tmp_path_factory.mktemp("bytes") / "m.csv"
     path.write_bytes(data)
     with suppress(InputError):
         read_manifest(path)
+
+
+def test_a_manifest_in_a_folder_is_not_a_recording(tmp_path):
+    (tmp_path / "a.csv").write_bytes(b"")
+    (tmp_path / "manifest.csv").write_text("path,joint\na.csv,J\n")
+    with pytest.raises(InputError, match=f"--manifest {tmp_path}/manifest.csv"):
+        find_sources([str(tmp_path)])
+    (tmp_path / "manifest.csv").rename(tmp_path / "other.csv")
+    (found,) = find_sources([str(tmp_path)], tmp_path / "other.csv")
+    assert found.joint == "J"
 
 
 def test_places_without_a_recording_are_refused(tmp_path):

@@ -28,14 +28,14 @@ def test_shares_lie_within_their_intervals_between_none_and_all(pairs):
         assert 0.0 <= each.low <= each.value <= each.high <= 1.0
 
 
-def test_a_small_group_is_drawn_to_the_others_and_a_large_one_is_not():
+def test_small_groups_shrink_toward_the_fleet():
     found = prevalence({"small": (2, 2), "large": (180, 200), "a": (4, 100), "b": (6, 100), "c": (5, 100)})
     assert found["small"].value < 0.9
     assert found["large"].value == pytest.approx(0.9, abs=0.04)
     assert found["small"].high - found["small"].low > 4.0 * (found["large"].high - found["large"].low)
 
 
-def test_intervals_of_shares_hold_as_often_as_they_say():
+def test_share_intervals_have_nominal_coverage():
     rng = np.random.default_rng(1)
     held = total = 0
     for _ in range(40):
@@ -64,14 +64,14 @@ def test_a_cause_that_repeats_is_distinguished_from_names_at_random():
     assert chosen_well <= 0.06 * (chosen_ill + chosen_well)
 
 
-def test_a_cause_that_every_diagnosis_names_now_and_then_is_nobodys():
+def test_a_cause_named_now_and_then_everywhere_is_attributed_to_no_joint():
     rng = np.random.default_rng(3)
     found = repeats((rng.random((300, 5)) < 0.2).tolist())
     assert np.sum(within_false_discoveries(found.probability, 0.05)) == 0
 
 
 @given(st.lists(st.floats(0, 1), max_size=40), st.floats(0.001, 0.5))
-def test_claims_together_are_wrong_no_more_often_than_allowed(values, rate):
+def test_the_family_wise_error_rate_holds(values, rate):
     probability = np.array(values)
     chosen = within_false_discoveries(probability, rate)
     if chosen.any():
@@ -91,7 +91,7 @@ def test_normal_values_are_no_outliers_and_far_ones_are(seed):
     assert 8.0 < normal_range(values).value < 12.0
 
 
-def test_of_few_or_equal_values_none_is_an_outlier():
+def test_few_or_equal_values_have_no_outlier():
     assert not outliers(np.array([1.0, 1.0, 1.0, 99.0])).any()
     assert not outliers(np.ones(50)).any()
     assert outliers(np.array([])).shape == (0,)
@@ -110,7 +110,7 @@ def aged(rng, joints, changing, recordings=5, scatter=0.3, sd=0.2):
     return series, slope
 
 
-def test_hours_to_a_limit_hold_as_often_as_they_say():
+def test_hours_to_a_limit_have_nominal_coverage():
     rng = np.random.default_rng(7)
     held = known = stay = 0
     for _ in range(6):
@@ -129,7 +129,7 @@ def test_hours_to_a_limit_hold_as_often_as_they_say():
 
 
 @pytest.mark.parametrize("height", [200.0, 2000.0])
-def test_a_step_in_one_joint_hides_no_other_and_has_no_trend_of_its_own(height):
+def test_a_step_in_one_joint_is_not_a_trend(height):
     for seed in range(3):
         series, _ = aged(np.random.default_rng(seed), 25, 5)
         step = replace(series[-1], value=series[-1].value + height * (np.arange(5) == 4))
@@ -138,7 +138,7 @@ def test_a_step_in_one_joint_hides_no_other_and_has_no_trend_of_its_own(height):
         assert found[-1].hours_to(1e6) is None
 
 
-def test_a_limit_that_is_passed_is_reached_now():
+def test_a_passed_limit_is_reached_now():
     hours = np.arange(5.0) * 1000.0
     (trend,) = trends([Series(hours, 10.0 + hours / 500.0, np.full(5, 0.01))])
     assert trend.hours_to(5.0).high == 0.0
@@ -152,7 +152,7 @@ def test_one_recording_has_no_trend_and_neither_has_nothing():
     assert trends([empty, alone]) == [None, None]
 
 
-def test_what_follows_the_temperature_is_not_taken_for_ageing():
+def test_temperature_effects_are_not_ageing():
     rng = np.random.default_rng(5)
     series = []
     for _ in range(30):
@@ -199,7 +199,7 @@ def test_swapped_and_turned_joints_are_found_and_nothing_else(seed, since, angle
             assert each is None
 
 
-def test_an_order_that_grows_makes_nobody_else_of_a_joint():
+def test_a_growing_order_does_not_change_the_joint_identity():
     rng = np.random.default_rng(4)
     orders = drawn_orders(rng, 10, 5)
     orders[3, :, 4] += np.arange(5) * 3.0

@@ -84,7 +84,7 @@ def test_an_unchanged_recording_is_not_read_again(place, here, monkeypatch):
     assert rows_by_name(place) == before
 
 
-def test_only_what_has_changed_is_read_and_only_new_content_is_diagnosed(place, here):
+def test_only_changed_files_are_read_and_new_content_diagnosed(place, here):
     go(place, here)
     os.utime(place / "a.csv.gz", (1, 1))
     text = (place.parent / "m.csv").read_text()
@@ -126,7 +126,7 @@ def test_a_changed_model_is_noticed_without_a_changed_recording(place, here):
     assert (len(hashes), len(set(hashes))) == (3, 1)
 
 
-def test_a_recording_of_which_recording_yaml_is_missing_is_not_complete():
+def test_a_recording_without_recording_yaml_is_incomplete():
     files = [
         "in/x/record.csv.gz",
         "in/y/record-001.csv.gz",
@@ -146,7 +146,7 @@ def test_a_name_with_brackets_is_a_name_in_a_manifest(tmp_path):
     assert missing.stamp is None
 
 
-def test_a_file_that_grows_waits_until_it_does_not(place, here):
+def test_growing_files_are_deferred(place, here):
     dataset = Dataset(place.parent / "out")
     whole = (place / "a.csv.gz").read_bytes()
     (place / "a.csv.gz").write_bytes(whole[:100])
@@ -192,7 +192,7 @@ def test_a_listing_that_fails_later_is_tried_again(place):
     assert taken == [4]
 
 
-def test_watch_once_takes_what_is_new_and_says_so(place, scheduler):
+def test_watch_once_takes_new_recordings_and_reports_them(place, scheduler):
     folder = place.parent
     command = ["fleet", "watch", "in", "--manifest", "m.csv", "--out", "out", "--model", "model.yaml"]
     command += ["--scheduler", scheduler, "--once", "--interval", "0.1"]
@@ -208,7 +208,7 @@ def test_watch_once_takes_what_is_new_and_says_so(place, scheduler):
 
 
 @pytest.mark.parametrize(("verb", "status"), [pytest.param("run", 130, marks=pytest.mark.slow), ("watch", 0)])
-def test_ctrl_c_ends_the_command_and_keeps_what_is_done(fleet, tmp_path, verb, status):
+def test_ctrl_c_ends_the_command_and_keeps_finished_results(fleet, tmp_path, verb, status):
     """SIGINT goes to the whole group of processes, as from a terminal."""
     for number in range(30):
         shutil.copy(fleet / f"J{number % 3}-{number // 3 % 3}.csv.gz", tmp_path / f"{number:02d}.csv.gz")

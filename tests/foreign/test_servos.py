@@ -12,7 +12,7 @@ from foreign.response import motor_response
 from foreign.servos import INTERPOLATIONS, STRUCTURES, Piv, StateFeedback
 
 FINE = Encoders(1 << 20, 64, 0.0, 1 << 23, 0.0)
-AXES = [(seed, structure) for seed in (1, 2) for structure in STRUCTURES]
+AXES = [(1, structure) for structure in STRUCTURES]
 
 
 @pytest.fixture(params=AXES, ids=[f"{structure}-{seed}" for seed, structure in AXES])
@@ -111,7 +111,7 @@ def test_on_a_stiff_axis_the_steps_are_those_of_the_textbook():
     assert settled_s == pytest.approx(5.83 / rate, rel=0.05)  # (1 + x) exp(-x) = 0.02 at x = 5.83
 
 
-def test_at_rest_the_load_stands_where_the_static_law_puts_it(axis):
+def test_the_load_at_rest_follows_the_static_law(axis):
     machine, cycle_s = axis.machine(), axis.cycle_ms / 1000.0
     motor_deg, ratio = [], axis.mechanics.ratio
     for target_deg in (43.56, 87.12, 80.0, 83.0, 20.0, 300.0, 297.0):
@@ -148,7 +148,7 @@ def test_at_even_speed_each_order_shows_at_its_frequency_with_the_amplitude_in_c
     assert np.abs(measured - expected) == pytest.approx(0.0, abs=0.06 * np.abs(expected).max())
 
 
-def test_limits_hold_and_what_was_wound_up_comes_down_again(axis):
+def test_limits_hold_and_integrators_recover(axis):
     machine, cycle_s = axis.machine(), axis.cycle_ms / 1000.0
     machine.torque_limit_permille = 800.0
     far_deg = 3000.0
@@ -163,9 +163,9 @@ def test_limits_hold_and_what_was_wound_up_comes_down_again(axis):
 
 @pytest.mark.parametrize("structure", STRUCTURES)
 def test_a_seed_draws_one_axis_within_the_ranges(structure):
-    axes = [draw(seed, structure) for seed in range(8)]
+    axes = [draw(seed, structure) for seed in range(4)]
     assert axes[3] == draw(3, structure)
-    assert len({axis.mechanics for axis in axes}) == 8
+    assert len({axis.mechanics for axis in axes}) == 4
     for axis in axes:
         m, servo = axis.mechanics, axis.servo
         assert 15.0 <= m.held_hz <= 80.0
@@ -177,7 +177,7 @@ def test_a_seed_draws_one_axis_within_the_ranges(structure):
         assert axis.following_error_deg <= 360.0
 
 
-def test_one_seed_one_record_whatever_ran_before():
+def test_one_seed_gives_one_record():
     def record(truth: Truth) -> list[tuple[int, ...]]:
         machine, before, rows = truth.machine(), 0, []
         for target in counts(truth, np.linspace(0.0, 90.0, 500)).astype(int).tolist():

@@ -1,7 +1,5 @@
 """Two clocks for a day: the set-points of the other master lose nothing and are one inner cycle late."""
 
-from __future__ import annotations
-
 from bisect import bisect_right
 from collections import deque
 from random import Random

@@ -1,7 +1,5 @@
 """The fault table on the bus of the other master: each fault is survived, or stops the axis in its time."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

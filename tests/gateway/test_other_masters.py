@@ -1,4 +1,4 @@
-"""What other makers' masters send from power-on to motion, frame by frame, and what CiA 301 and 402 answer.
+"""Start-up sequences of other makers' masters, frame by frame, and the answers by CiA 301 and 402.
 
 - Lely and ros2_canopen: boot procedure of CiA 302-2 with a configuration in the manner of dcfgen; then as the
   drive class `Motor402`: it enables with halt set and in no mode, homes, and polls 6061h
@@ -11,8 +11,6 @@
 A line is a frame that is sent (>), one that must come next with its identifier (<), a remote frame (R), SDO
 writes and reads (w, r), or SYNCs with an RPDO before each, until a frame matches (sync). A dot is any digit.
 """
-
-from __future__ import annotations
 
 import re
 from contextlib import contextmanager

@@ -1,7 +1,5 @@
 """The whole daemon with a gateway, in processes of its own, and python-canopen as the foreign master."""
 
-from __future__ import annotations
-
 import os
 import signal
 from pathlib import Path

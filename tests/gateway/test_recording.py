@@ -1,6 +1,4 @@
-"""A flight recording of a gateway: what the other master asked for on its bus, and what it saw."""
-
-from __future__ import annotations
+"""A flight recording of a gateway: requests and statuswords of the other master."""
 
 import numpy as np
 import pytest

@@ -1,6 +1,4 @@
-"""The doctor of the outer side: what a master configures and gets wrong, from the frames on its bus."""
-
-from __future__ import annotations
+"""The doctor of the outer side: configuration and mistakes of a master, from its frames."""
 
 import struct
 
@@ -80,7 +78,7 @@ def outer(tmp_path):
         yield Outer(tester, node)
 
 
-def test_a_right_master_makes_no_mistake_and_its_configuration_is_listed(outer):
+def test_a_correct_master_has_no_findings(outer):
     outer.begin()
     outer.enable()
     for k in range(50):
@@ -217,7 +215,7 @@ def rpdo_too_early(outer):
         (stored_by_lss, "the node id that lasts is that of the machine file"),
     ],
 )
-def test_a_mistake_is_named_once_with_what_to_do(outer, does, words):
+def test_each_mistake_is_reported_once_with_its_remedy(outer, does, words):
     does(outer)
     found = [each for each in outer.advice if words in each]
     assert len(found) == 1, outer.lines[-8:]

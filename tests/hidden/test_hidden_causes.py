@@ -5,8 +5,6 @@ that are not in the catalogue. Sizes are 5 arcsec at the load (an interpolation 
 0.3 arcsec of noise. Each plan is what an engineer would run who suspects the cause.
 """
 
-from __future__ import annotations
-
 import json
 import os
 from collections.abc import Iterator
@@ -215,7 +213,7 @@ def test_every_cause_of_the_catalogue_has_its_bench() -> None:
 
 
 @pytest.mark.parametrize("cell", of(SINGLE | PAIRS), indirect=True)
-def test_what_is_hidden_is_named_and_nothing_else(cell: Cell) -> None:
+def test_only_hidden_causes_are_named(cell: Cell) -> None:
     hidden = {each.cause for each in cell.hidden}
     there = hidden.union(*(each.brings for each in cell.hidden))
     named = [{each.cause, *each.aliases} for each in cell.diagnosis.findings]
@@ -227,7 +225,7 @@ def test_what_is_hidden_is_named_and_nothing_else(cell: Cell) -> None:
 
 
 @pytest.mark.parametrize("cell", of(SINGLE | PAIRS), indirect=True)
-def test_the_extended_model_brings_the_axis_back_or_says_why_not(cell: Cell) -> None:
+def test_the_extended_model_restores_accuracy_or_explains(cell: Cell) -> None:
     extension = extension_of(cell.diagnosis, TransmissionModel.load(cell.model))
     left = {each.cause for each in cell.hidden if not CATALOGUE[each.cause].compensable.possible}
     for cause in left:
@@ -257,7 +255,7 @@ def test_the_command_says_the_same_of_the_recording_folder(cell: Cell, tmp_path:
 
 
 @pytest.mark.parametrize("cell", of(NONE), indirect=True)
-def test_where_nothing_is_hidden_nothing_is_found(cell: Cell) -> None:
+def test_nothing_is_found_if_nothing_is_hidden(cell: Cell) -> None:
     assert not cell.diagnosis.findings, told(cell)
     extension = extension_of(cell.diagnosis, TransmissionModel.load(cell.model))
     assert cell.step(extension.model) < MOST_OF_FLOOR * cell.floor_arcsec
@@ -271,7 +269,7 @@ def test_another_law_of_the_loop_is_called_that_and_nothing_else(cell: Cell) -> 
 
 
 @pytest.mark.parametrize("cell", of(UNKNOWN), indirect=True)
-def test_what_is_not_in_the_catalogue_is_unexplained_and_where_it_lives_is_told(cell: Cell) -> None:
+def test_unknown_causes_are_unexplained_with_their_coordinate(cell: Cell) -> None:
     findings = cell.diagnosis.findings
     assert [each.cause for each in findings] == ["unexplained"], told(cell)
     assert findings[0].lives_in
@@ -289,7 +287,7 @@ def test_the_same_seed_gives_the_same_record_bit_for_bit(tmp_path: Path) -> None
     assert record("another", 2) != once
 
 
-def test_a_drive_tells_the_ratio_that_its_gear_was_sold_with() -> None:
+def test_a_drive_reports_the_nominal_ratio() -> None:
     data = bare_truth().model_dump(by_alias=True)
     data["gear"]["ratio"] = 49.99981
     nameplate = nameplate_of(Truth.model_validate(data))

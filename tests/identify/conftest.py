@@ -1,6 +1,4 @@
-"""Records of made-up axes, written from the formulas: nothing here is shared with what is tested."""
-
-from __future__ import annotations
+"""Records of synthetic axes from the formulas, independent of the tested code."""
 
 from dataclasses import dataclass, field
 

@@ -67,17 +67,17 @@ def settled(bench):
     return fit(segments, axis.ratio, replace(bench.options, effects=effects))
 
 
-def test_its_parameters_are_found_beside_the_others(settled):
+def test_its_parameters_are_found_with_the_others(settled):
     assert settled.interval("settling", "height_arcsec").value == pytest.approx(25.0, abs=0.5)
     assert settled.interval("settling", "decay_s").value == pytest.approx(40.0, rel=0.05)
     assert settled.interval("hysteresis", "width_deg").value == pytest.approx(18.0, rel=0.04)
 
 
-def test_its_uncertainty_stands_in_the_model(settled):
+def test_its_uncertainty_is_stored_in_the_model(settled):
     assert set(settled.model.uncertainty["settling"]) == {"height_arcsec", "decay_s"}
 
 
-def test_an_effect_without_its_channel_is_left_out_in_words(bench):
+def test_an_effect_without_its_channel_is_omitted_with_a_note(bench):
     axis = bench.axis()
     effects = (*bench.options.effects, Wants(height_arcsec=1.0, decay_s=10.0))
     result = fit(axis.record(bench.plan(turns=8.0)), axis.ratio, replace(bench.options, effects=effects))

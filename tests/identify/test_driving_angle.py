@@ -1,4 +1,4 @@
-"""The angle that the hysteresis sees: without chatter, turned round only where the motor turned."""
+"""Driving angle of the hysteresis: without chatter, reversing only with the motor."""
 
 from itertools import accumulate
 
@@ -27,7 +27,7 @@ def test_the_count_is_found_at_any_speed(counts, seed):
     assert quantum_deg(np.round(even / count) * count) == pytest.approx(count, rel=1e-6)
 
 
-def test_what_has_no_counts_has_none():
+def test_a_signal_without_counts_has_no_count():
     assert quantum_deg(np.cumsum(np.random.default_rng(1).uniform(0.0, 1.0, 3000))) == 0.0
     assert quantum_deg(np.zeros(100)) == 0.0
 
@@ -48,7 +48,7 @@ def test_chatter_of_a_count_makes_no_turns():
     assert np.max(np.abs(path - true)) < 2.5 * count
 
 
-def test_a_lagging_motor_turns_where_it_turned_and_not_where_it_was_told_to():
+def test_reversals_of_a_lagging_motor_use_the_actual_angle():
     time = 0.5 + np.arange(3000) / 250.0
     command = 30.0 * np.cos(2 * np.pi * time / 4.0)
     motor = 29.0 * np.cos(2 * np.pi * time / 4.0 - 0.05)
@@ -80,7 +80,7 @@ def test_a_motor_that_rests_and_continues_in_the_same_direction_does_not_turn(co
 
 
 @pytest.mark.parametrize("rate_hz", [25.0, 50.0, 100.0, 250.0])
-def test_what_follows_the_acceleration_is_as_large_as_it_is_at_any_sampling_rate(rate_hz: float) -> None:
+def test_acceleration_effects_are_independent_of_the_sampling_rate(rate_hz: float) -> None:
     """Moves that speed up and slow down as half a cosine in 0.25 s, told in whole counts."""
     time = np.arange(0.0, 60.0, 1.0 / rate_hz)
     turn, amplitude = 2.0 * np.pi / 0.5, 45.0

@@ -1,4 +1,4 @@
-"""Fast sweeps of which nothing is said: what they cannot show is left out, and nothing is made up."""
+"""Fast sweeps without segment information: undetermined terms are left out."""
 
 import numpy as np
 import pytest
@@ -55,7 +55,7 @@ def test_no_hysteresis_is_larger_than_what_was_seen(bench, speed, acceleration, 
         assert any(each.startswith("hysteresis: left out") for each in result.warnings)
 
 
-def test_fast_sweeps_still_tell_the_orders_and_the_offset(bench):
+def test_fast_sweeps_still_determine_orders_and_offset(bench):
     result = fit([record(bench, 600.3, 4000.0, 12.0, 2, False)], 20.0, bench.options)
     found = {each.order.number: each.amplitude_arcsec for each in result.orders}
     assert found == pytest.approx({1: 5.0, 2: 9.0, 6: 3.0}, abs=0.3)

@@ -1,6 +1,4 @@
-"""The law of the loop is the one that predicts what was left out of the fit."""
-
-from __future__ import annotations
+"""The hysteresis law is chosen by prediction of held-out data."""
 
 from dataclasses import replace
 from typing import Any
@@ -51,7 +49,7 @@ def test_friction_that_yields_before_it_slips_is_fitted_with_memory(bench: Any) 
     assert "offset_arcsec" in found.model.uncertainty["hysteresis_memory"]
 
 
-def test_a_law_of_the_active_model_that_is_not_this_axiss_is_given_up(standard: Any, bench: Any) -> None:
+def test_a_wrong_law_of_the_active_model_is_replaced(standard: Any, bench: Any) -> None:
     (plain,) = [each for each in standard.model.effects if isinstance(each, Hysteresis)]
     active = TransmissionModel(20.0, (HysteresisMemory(**plain.parameters()),))
     options = replace(bench.options, highest_order=6, active=active)

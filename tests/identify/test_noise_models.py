@@ -44,7 +44,7 @@ def test_the_banded_inverse_is_the_dense_one(white, slow, slow_s, place, place_d
     assert precision.log_likelihood(columns[:, 0]) == pytest.approx(expected, rel=1e-5, abs=1e-5)
 
 
-def test_blocks_left_out_have_no_say():
+def test_excluded_blocks_have_no_influence():
     rng = np.random.default_rng(1)
     blocks, _ = blocks_of(30, rng)
     out = np.zeros(30, dtype=bool)
@@ -105,7 +105,7 @@ def test_a_load_is_left_time_to_settle_after_a_turn_but_not_most_of_the_way():
     assert np.mean(samples.usable[3200:]) > 0.6
 
 
-def test_what_is_the_same_over_a_leg_is_no_motion_of_the_leg():
+def test_constants_over_a_leg_are_not_motion():
     """Legs that are read wrong by as much as their counts allow do not move a mean by more than its error."""
     rng = np.random.default_rng(7)
     motor = np.round(np.concatenate([rng.uniform(5.0, 30.0, 50).cumsum() * s for s in (1, -1, 1, -1)]) / 0.09)
@@ -131,7 +131,7 @@ def test_a_motor_between_two_counts_is_neither_noise_at_rest_nor_an_outlier():
     assert outlying(error, calm, count / 50.0 * 3600.0)[1].samples == 0
 
 
-def test_what_moved_unseen_or_slowly_is_not_at_rest():
+def test_slow_or_unseen_motion_is_not_rest():
     rng = np.random.default_rng(7)
     still = rng.normal(size=(3, 1000)) * 0.5 / 3600.0
     time = np.arange(1000) / 250.0

@@ -1,4 +1,4 @@
-"""Spectra by least squares at the true angles, and which orders a record can tell apart."""
+"""Least-squares spectra at the true angles, and the separability of orders."""
 
 import numpy as np
 import pytest
@@ -40,7 +40,7 @@ def test_a_stepping_test_shows_each_order_where_it_is():
     assert lines[5].amplitude_arcsec < 1e-6
 
 
-def test_orders_that_the_angles_cannot_tell_apart_are_named():
+def test_indistinguishable_orders_are_named():
     motor = np.arange(200) * 45.0 + 1e-6
     found = all_fitted(motor, waves(motor, [(1, 3.0, 0.0)]), motor_orders(9))
     pairs = {(each.order.number, other.number) for each in found for other in each.aliases}

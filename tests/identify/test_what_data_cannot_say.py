@@ -1,4 +1,4 @@
-"""Limits of a record: the fit reports what cannot be determined, and does not invent it."""
+"""Limits of a record: undetermined terms are reported, not invented."""
 
 from dataclasses import replace
 
@@ -21,7 +21,7 @@ def test_without_a_reversal_hysteresis_is_left_out(bench):
     assert found == pytest.approx({1: 5.0, 2: 9.0, 6: 3.0}, abs=0.15)
 
 
-def test_a_stepping_test_tells_the_offset_but_not_the_shape(bench):
+def test_a_stepping_test_determines_the_offset_but_not_the_shape(bench):
     axis = bench.axis(noise=1.0)
     plan = []
     places = [*range(1, 61), *range(59, -1, -1)]
@@ -40,7 +40,7 @@ def test_a_stepping_test_tells_the_offset_but_not_the_shape(bench):
     assert result.interval("hysteresis", "offset_arcsec").value == pytest.approx(40.0, rel=0.02)
 
 
-def test_one_speed_cannot_tell_a_delay_and_says_what_it_would_be_worth(bench):
+def test_one_speed_does_not_determine_a_delay(bench):
     axis = bench.axis()
     plan = [("sweep", bench.ramp(0.0, 3600.0, 200.3)), ("sweep", bench.ramp(3600.0, 0.0, 200.3))]
     result = fit(axis.record(plan), axis.ratio, bench.options)
@@ -48,7 +48,7 @@ def test_one_speed_cannot_tell_a_delay_and_says_what_it_would_be_worth(bench):
     assert not any(each.name == "delay_ms" for each in result.nuisances)
 
 
-def test_a_short_record_says_that_it_saw_no_load_turn(bench):
+def test_a_short_record_reports_the_missing_load_turn(bench):
     axis = bench.axis()
     result = fit(axis.record(bench.plan(turns=8.0)), axis.ratio, bench.options)
     assert any("0.4" in each and "load turns" in each for each in result.warnings)
@@ -117,7 +117,7 @@ def test_hardly_any_samples_are_refused():
 
 
 @pytest.mark.parametrize(("unit_deg", "turns"), [(57.29578, 10.0), (360.0, 4.0)])
-def test_both_angles_in_another_unit_show_in_how_little_the_axis_went(bench, unit_deg, turns):
+def test_a_wrong_unit_of_both_angles_shows_in_the_travel(bench, unit_deg, turns):
     axis = bench.axis()
     record = [
         replace(each, motor_deg=each.motor_deg / unit_deg, load_deg=each.load_deg / unit_deg)

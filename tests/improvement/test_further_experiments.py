@@ -36,14 +36,14 @@ def known(pytestconfig):
     return TransmissionModel.load(folder / "model.yaml"), axis_view(AxisConfig.load(folder))
 
 
-def test_what_two_sweeps_of_a_load_turn_tell_is_told_by_them(known):
+def test_two_load_turn_sweeps_answer_their_questions(known):
     choice = choice_of(Left((found("ratio_error", "load_order"),)), known)
     assert "load-turn" in choice.plan.name
     assert choice.separates == ("ratio_error or load_order",)
     assert choice.duration_s > 60
 
 
-def test_the_shortest_that_tells_is_taken_and_not_twice(known):
+def test_the_shortest_sufficient_experiment_is_chosen_once(known):
     left = Left((found("velocity_windup", "channel_skew"),))
     first = choice_of(left, known)
     second = choice_of(left, known, done={first.plan.name})
@@ -51,7 +51,7 @@ def test_the_shortest_that_tells_is_taken_and_not_twice(known):
     assert second is None or second.plan.name != first.plan.name
 
 
-def test_what_only_a_person_can_tell_moves_nothing(known):
+def test_questions_only_a_person_can_answer_cause_no_motion(known):
     assert choice_of(Left((found("motor_order", "motor_encoder_eccentricity"),)), known) is None
     assert choice_of(Left((found("load_order", "compliance"),)), known) is None
 
@@ -61,7 +61,7 @@ def test_with_nothing_open_there_is_nothing_to_run(known):
     assert choice_of(Left((found("motor_order"),)), known) is None
 
 
-def test_something_unexplained_is_looked_at_where_it_lives(known):
+def test_unexplained_residuals_are_measured_at_their_coordinate(known):
     left = Left((found("unexplained", lives_in="load angle"),))
     assert choice_of(left, known).plan.name == machine_for_unexplained("load angle") == "two-load-turns"
     assert choice_of(left, known, done={"two-load-turns"}) is None
@@ -75,7 +75,7 @@ def test_every_experiment_suits_a_real_axis(known, name):
     assert len(tasks.tasks) == len(plan.procedures) + 1
 
 
-def test_what_the_way_cannot_tell_is_not_told_however_well_it_fits(known):
+def test_insufficient_travel_yields_no_answer(known):
     short = Plan.model_validate(
         {
             "schema": "hdbridge.plan/1",

@@ -1,4 +1,4 @@
-"""`hdbridge improve` on the simulated drive: what is hidden is named, and the axis points better."""
+"""`hdbridge improve` on the simulated drive: the hidden cause is named and positioning improves."""
 
 import json
 
@@ -32,7 +32,7 @@ def test_a_hidden_cause_is_named_and_the_axis_points_better(improved_once):
     assert "100 %" in err
 
 
-def test_the_model_says_where_it_comes_from_and_waits(improved_once):
+def test_the_model_states_its_provenance_and_is_pending(improved_once):
     cell, *_ = improved_once
     assert (cell.axis / "model.yaml").read_text().endswith("{reason: an earlier calibration}\n")
     model = TransmissionModel.load(cell.axis / "pending.yaml")
@@ -114,7 +114,7 @@ def test_with_nothing_hidden_nothing_is_proposed_and_no_file_changes(cell):
     assert (cell.folder / "rec" / "recording.yaml").exists()
 
 
-def test_what_can_be_compensated_brings_stepping_back_to_the_floor(cell):
+def test_compensable_causes_bring_stepping_back_to_the_floor(cell):
     cell.hide("hysteresis_memory", 15.0)
     result, *_ = cell.improve()
     assert causes(result) == ["hysteresis_memory"]
@@ -126,7 +126,7 @@ def test_what_can_be_compensated_brings_stepping_back_to_the_floor(cell):
     )
 
 
-def test_what_cannot_be_compensated_is_said_and_nothing_is_proposed(cell):
+def test_uncompensable_causes_are_reported_without_a_proposal(cell):
     profile = cell.files()
     cell.hide("count_loss", 8.0, seed=3)
     hidden = (cell.axis / "truth.yaml").read_bytes()
@@ -139,12 +139,12 @@ def test_what_cannot_be_compensated_is_said_and_nothing_is_proposed(cell):
     assert cell.files() == {**profile, "truth.yaml": hidden}
 
 
-def test_auto_runs_the_experiment_that_tells_apart_what_a_short_way_cannot(cell):
+def test_auto_runs_the_separating_experiment(cell):
     """An eccentric disc of the load encoder, on four turns of the motor: a wrong ratio would look alike."""
     cell.hide("load_order", 12.0, seed=3)
     result, _, err = cell.improve("--plan", "narrow.yaml", "--auto", "--rounds", 1)
     (one,) = result["rounds"]
-    assert "ratio_error or load_order" in one["tells"]
+    assert "ratio_error or load_order" in one["separates"]
     assert "round 1" in err
     assert causes(result) == ["load_order"]
     assert result["recordings"] == ["rec", "rec/round-1"]
@@ -157,4 +157,4 @@ def test_auto_runs_the_experiment_that_tells_apart_what_a_short_way_cannot(cell)
     assert narrow["offered"] is False
     assert "not yet distinguished from load_order" in out
     assert "--auto" in out
-    assert "ratio_error or load_order" in narrow["further"]["tells"]
+    assert "ratio_error or load_order" in narrow["further"]["separates"]

@@ -103,7 +103,7 @@ NEARLY_AS_NARROW = stepped(*(1.1, -1.0, 0.8, -1.0) * 8)
     ],
     ids=["big steps", "small steps", "the same", "by chance", "one worse"],
 )
-def test_better_is_better_somewhere_and_worse_nowhere(big, small, better):
+def test_better_means_better_somewhere_and_worse_nowhere(big, small, better):
     assert Trial(Validation(*big, Floor(1.0, 0.5)), small).improves is better
 
 
@@ -116,7 +116,7 @@ def both_ways(cw, ccw):
     return Stepped.of("a model", SteppingOutcome(cw=stands[0], ccw=stands[1]))
 
 
-def test_what_got_worse_in_one_direction_is_said():
+def test_worsening_in_one_direction_is_reported():
     """The two ways come together, so the whole is better; the way back alone is not."""
     before, after = both_ways((20.0, 1.0), (-20.0, 1.0)), both_ways((0.0, 1.0), (0.0, 2.0))
     checked = Validation(before, after, Floor(1.0, 0.5))

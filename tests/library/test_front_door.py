@@ -21,7 +21,7 @@ def test_importing_it_loads_nothing():
 
 
 @pytest.mark.parametrize("name", hdbridge.__all__)
-def test_every_name_is_there_and_says_what_it_is(name):
+def test_every_public_name_is_documented(name):
     found = getattr(hdbridge, name)
     assert found.__name__ == name
     assert found.__doc__
@@ -51,7 +51,7 @@ def test_a_function_is_not_hidden_by_the_module_of_its_name(name):
     )
 
 
-def test_every_error_stands_at_the_front_door():
+def test_every_error_is_public():
     kinds = [each for each in vars(errors).values() if isinstance(each, type)]
     raised = {each.__name__ for each in kinds if issubclass(each, errors.HdbridgeError)}
     assert raised <= set(hdbridge.__all__)

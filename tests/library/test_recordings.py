@@ -51,7 +51,7 @@ def test_a_diagnosis_of_a_run_is_the_document_of_the_command(run, fitted):
         ),
     ],
 )
-def test_what_no_axis_can_have_made_is_refused_by_both(run, model, axis, spoil, complaint):
+def test_impossible_records_are_refused_by_both(run, model, axis, spoil, complaint):
     spoilt = spoil(run.record)
     with pytest.raises(InputError, match=complaint):
         fit(spoilt, axis=axis)
@@ -90,6 +90,6 @@ def test_a_recording_that_is_given_twice_is_refused(run, model):
 
 
 @pytest.mark.parametrize("given", ["one.csv", ["one.csv"], [np.zeros(3)]])
-def test_what_is_no_recording_is_refused_with_what_reads_one(given):
+def test_other_objects_are_refused_with_advice(given):
     with pytest.raises(InputError, match=r"is not a recording; expected .* Recording.load\(path\)"):
         fit(given)

@@ -1,6 +1,4 @@
-"""Pursuit of positions that somebody else gives: exact if the limits allow it, within them in any case."""
-
-from __future__ import annotations
+"""Pursuit of external positions: exact within the limits, limited otherwise."""
 
 import math
 
@@ -29,7 +27,7 @@ def following(at_deg=0.0):
         st.tuples(st.floats(-1e3, 1e3), st.integers(1, 60), st.sampled_from([0.0, 0.02])), max_size=30
     )
 )
-def test_the_limits_hold_whatever_is_aimed_at(goals):
+def test_limits_hold_for_any_target(goals):
     point = following()
     before = velocity = 0.0
     for goal, turns, spacing_s in [*goals, (5.0, 1500, 0.0)]:
@@ -49,7 +47,7 @@ def test_the_limits_hold_whatever_is_aimed_at(goals):
     goals=st.lists(st.tuples(st.floats(-30, 30), st.integers(1, 40)), min_size=1, max_size=8),
     spacing_s=st.sampled_from([0.0, 0.02]),
 )
-def test_a_stop_does_not_turn_the_axis_round(goals, spacing_s):
+def test_a_stop_does_not_reverse_the_axis(goals, spacing_s):
     point = following()
     for goal, turns in goals:
         for _ in range(turns):

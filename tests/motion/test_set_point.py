@@ -1,4 +1,4 @@
-"""Laws of the set-point: whatever is asked of it, in any order."""
+"""Laws of the set-point for any order of requests."""
 
 import math
 
@@ -123,7 +123,7 @@ def test_any_order_of_calls_with_any_numbers_stays_within_the_limits(limits, per
 
 @settings(max_examples=60, deadline=None)
 @given(LIMIT_SETS, st.lists(st.tuples(COMMANDS, st.integers(0, 120)), max_size=4), st.floats(0.0, 1.0))
-def test_a_move_that_is_taken_reaches_its_target_exactly_and_rests(limits, calls, share):
+def test_an_accepted_move_reaches_its_target_exactly_and_rests(limits, calls, share):
     set_point = SetPoint(limits, PERIOD_S)
     for command, steps in calls:
         asked(set_point, command)
@@ -155,7 +155,7 @@ def test_a_move_from_rest_or_in_motion_is_never_refused_within_the_limits(moves)
         follow(set_point, LIMITS, PERIOD_S, int(wait_s / PERIOD_S))
 
 
-def test_a_gentle_move_in_motion_brakes_as_hard_as_it_must_to_stay_within_the_limits():
+def test_a_gentle_move_brakes_harder_to_stay_within_the_limits():
     set_point = SetPoint(LIMITS, PERIOD_S)
     set_point.goto(LIMITS.position_max_deg)
     while set_point.position_deg < 112.0:
@@ -191,7 +191,7 @@ def test_a_jog_brakes_before_the_limit_and_waits_there(limit):
 
 
 @given(st.floats(1.0, 60.0), st.floats(0.05, 1.0))
-def test_a_jog_that_nobody_renews_runs_for_its_time_and_stops(velocity, timeout_s):
+def test_an_unrenewed_jog_runs_for_its_time_and_stops(velocity, timeout_s):
     set_point = SetPoint(LIMITS, PERIOD_S)
     set_point.jog(velocity, timeout_s)
     periods = 0
@@ -204,7 +204,7 @@ def test_a_jog_that_nobody_renews_runs_for_its_time_and_stops(velocity, timeout_
     assert set_point.mode is MotionMode.HOLD
 
 
-def test_a_jog_renewed_goes_on_at_its_speed():
+def test_a_renewed_jog_continues_at_its_speed():
     set_point = SetPoint(LIMITS, PERIOD_S)
     for _ in range(20):
         set_point.jog(7.0, 0.1)
@@ -244,7 +244,7 @@ def test_an_axis_outside_its_limits_moves_inwards_only():
         ((10.0, None, math.inf), "acceleration of inf"),
     ],
 )
-def test_a_refused_move_says_why(arguments, message):
+def test_a_refused_move_gives_the_reason(arguments, message):
     with pytest.raises(InputError, match=message):
         SetPoint(LIMITS, PERIOD_S).goto(*arguments)
 
@@ -256,5 +256,5 @@ def test_limits_without_room_are_refused():
         SetPoint(LIMITS.__class__(0.0, 1.0, 60.0, 0.0, 4000.0), PERIOD_S)
 
 
-def test_no_knot_would_be_taken_outside_a_stream():
+def test_no_knot_is_accepted_outside_a_stream():
     assert SetPoint(LIMITS, PERIOD_S).room == 0

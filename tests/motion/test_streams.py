@@ -29,7 +29,7 @@ def sine(time_s: float, size: float = 5.0, omega: float = 4.0) -> tuple[float, f
 
 
 @given(st.integers(1, 25))
-def test_it_is_at_each_knot_exactly_and_near_the_path_between(every):
+def test_knots_are_met_exactly_and_the_path_closely(every):
     set_point = streaming()
     periods = 10 * every
     for number in range(0, periods + 1, every):
@@ -42,7 +42,7 @@ def test_it_is_at_each_knot_exactly_and_near_the_path_between(every):
         assert position == pytest.approx(wanted, abs=5.0 * (4.0 * every * PERIOD_S) ** 4 / 384.0 + 1e-12)
 
 
-def test_out_of_knots_in_motion_it_brakes_with_limited_jerk():
+def test_running_out_of_knots_in_motion_brakes_with_limited_jerk():
     set_point = streaming()
     for number in range(51):
         set_point.knot(number * PERIOD_S, *sine(number * PERIOD_S))
@@ -64,7 +64,7 @@ def test_out_of_knots_in_motion_it_brakes_with_limited_jerk():
     assert not set_point.underrun
 
 
-def test_at_a_knot_at_rest_it_waits_and_goes_on_from_there():
+def test_running_out_of_knots_at_rest_waits_and_continues():
     set_point = streaming(timeout_s=0.1)
     set_point.knot(0.0, 0.0, 0.0)
     set_point.knot(0.4, 1.0, 0.0)
@@ -97,7 +97,7 @@ def test_a_rest_between_two_periods_costs_no_time_of_the_knots_behind_it():
     assert set_point.position_deg == pytest.approx(0.5, abs=1e-9)
 
 
-def test_out_of_knots_between_two_periods_it_goes_on_at_its_speed():
+def test_a_late_knot_between_periods_keeps_the_speed():
     set_point = streaming()
     end_s = 0.2021
     set_point.knot(0.0, 0.0, 0.0)
@@ -108,7 +108,7 @@ def test_out_of_knots_between_two_periods_it_goes_on_at_its_speed():
     assert position - before == pytest.approx(10.0 * PERIOD_S, abs=200.0 * PERIOD_S**2)
 
 
-def test_time_begins_only_when_it_is_told_to():
+def test_time_starts_on_request():
     set_point = SetPoint(LIMITS, PERIOD_S)
     set_point.stream(1.0)
     set_point.knot(0.0, 0.0, 0.0)
@@ -119,7 +119,7 @@ def test_time_begins_only_when_it_is_told_to():
     assert set_point.step() > 0.0
 
 
-def test_a_first_knot_that_is_later_makes_it_wait():
+def test_a_later_first_knot_delays_the_start():
     set_point = streaming()
     set_point.knot(0.04, 0.0, 0.0)
     set_point.knot(0.44, 1.0, 0.0)
@@ -141,7 +141,7 @@ def test_a_first_knot_that_is_later_makes_it_wait():
         ((100.0, 120.0, -5.0), "leads through"),
     ],
 )
-def test_a_knot_that_leaves_the_limits_is_refused_and_the_stream_goes_on(knot, message):
+def test_a_knot_beyond_the_limits_is_refused_and_the_stream_continues(knot, message):
     set_point = streaming()
     set_point.knot(0.0, 0.0, 0.0)
     with pytest.raises(InputError, match=message):
@@ -152,7 +152,7 @@ def test_a_knot_that_leaves_the_limits_is_refused_and_the_stream_goes_on(knot, m
     assert set_point.position_deg == 1.0
 
 
-def test_a_stream_begins_at_rest_where_the_axis_stands():
+def test_a_stream_starts_at_rest_at_the_present_position():
     for knot in ((0.0, 1e-5, 0.0), (0.0, 0.0, 1.0), (-0.1, 0.0, 0.0)):
         with pytest.raises(InputError, match="begins at"):
             streaming().knot(*knot)
@@ -164,7 +164,7 @@ def test_a_stream_begins_at_rest_where_the_axis_stands():
         set_point.stream(1.0)
 
 
-def test_what_waits_is_bounded():
+def test_the_buffer_is_bounded():
     set_point = streaming()
     for number in range(MOST_KNOTS + 1):
         set_point.knot(number * PERIOD_S, 0.0, 0.0)
@@ -182,7 +182,7 @@ def test_what_waits_is_bounded():
     st.lists(st.floats(-8.0, 4.0), min_size=1, max_size=3),
     st.floats(0.3, 1.0),
 )
-def test_a_coordinated_plan_is_taken_and_arrives_at_once(limits, first, second, share):
+def test_a_coordinated_plan_is_accepted_and_arrives_simultaneously(limits, first, second, share):
     starts = {"a": 3.0, "b": -7.0}
     points = [{"a": x, "b": y} for x, y in zip(first, second, strict=False)]
     plan = coordinated(starts, points, {"a": limits, "b": LIMITS}, PERIOD_S, share)
@@ -252,6 +252,6 @@ def test_points_on_a_straight_line_are_passed_in_motion_and_corners_at_rest():
         ([{"a": math.nan}], "axis 'a'"),
     ],
 )
-def test_a_coordinated_move_that_cannot_be_is_refused(points, message):
+def test_an_impossible_coordinated_move_is_refused(points, message):
     with pytest.raises(InputError, match=message):
         coordinated({"a": 0.0}, points, {"a": LIMITS}, PERIOD_S)

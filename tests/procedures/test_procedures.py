@@ -126,7 +126,7 @@ PROCEDURES = [
 
 
 @pytest.mark.parametrize("procedure", PROCEDURES, ids=lambda each: type(each).__name__)
-def test_the_rehearsal_foretells_what_the_bench_will_see(procedure):
+def test_the_rehearsal_predicts_the_bench_run(procedure):
     rehearsal = rehearse(procedure, AXIS)
     legs, _ = walk(procedure)
     targets = [sample.load_target_deg for _, samples in legs for sample in samples]
@@ -142,7 +142,7 @@ def test_the_rehearsal_foretells_what_the_bench_will_see(procedure):
     [Stepping(count=500), Sweep(-10, 500, 5.0), Standstill(float("nan")), Standstill(-401.0)],
     ids=["stepping", "sweep", "nan", "standstill"],
 )
-def test_what_would_leave_the_limits_is_refused_before_anything_moves(procedure):
+def test_leaving_the_limits_is_refused_before_anything_moves(procedure):
     with pytest.raises(InputError, match=r"the axis file allows -400 to 400|no trajectory"):
         rehearse(procedure, AXIS)
 

@@ -1,4 +1,4 @@
-"""An own trajectory: what it is refused for before anything moves, and where it leads."""
+"""User trajectories: refusals before any motion, and execution."""
 
 import math
 
@@ -28,7 +28,7 @@ def path_of(trajectory):
     return moves.send([]).path(float(trajectory.load_deg[0]), AXIS.limits)
 
 
-def test_a_function_is_followed_as_it_is():
+def test_a_function_is_followed_exactly():
     path = path_of(Trajectory.of(rounded, 2.0))
     assert path.duration_s == pytest.approx(2.0)
     at = np.linspace(0.0, 2.0, 777)
@@ -58,13 +58,13 @@ def test_set_points_are_met():
         (lambda: Trajectory.of(rounded, -1.0), "expected a duration above 0"),
     ],
 )
-def test_it_is_refused_before_anything_moves(trajectory, complaint):
+def test_an_invalid_trajectory_is_refused_before_anything_moves(trajectory, complaint):
     with pytest.raises(InputError, match=complaint):
         rehearse(trajectory(), AXIS)
 
 
 @given(st.floats(-80.0, 80.0), st.floats(-80.0, 80.0), st.floats(1.0, 1.5))
-def test_what_keeps_to_the_limits_is_not_refused(start_deg, end_deg, slower):
+def test_a_trajectory_within_the_limits_is_accepted(start_deg, end_deg, slower):
     """Differences over a millisecond never say more than the derivatives are."""
     way = abs(end_deg - start_deg) or 1.0
     # Largest of the rounded move of a way in a time: 2 w/t, 2 pi w/t2, 4 pi2 w/t3.
@@ -78,7 +78,7 @@ def test_what_keeps_to_the_limits_is_not_refused(start_deg, end_deg, slower):
     rehearse(Trajectory.of(path, time_s), AXIS)
 
 
-def test_the_axis_follows_it_and_says_how_well():
+def test_the_axis_follows_the_trajectory_and_reports_the_error():
     profile = bundled_profile("article")
     axis = AxisConfig.load(profile)
     with simulated(axis) as drive:

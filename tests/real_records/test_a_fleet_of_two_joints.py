@@ -1,9 +1,7 @@
-"""A fleet of two measured joints: what it says, and what it refuses to say.
+"""A fleet of two measured joints: supported and refused statements.
 
 Four one-way moves of a second each, all within minutes: nothing can have changed, so nobody is to be listed.
 """
-
-from __future__ import annotations
 
 import os
 from pathlib import Path
@@ -30,14 +28,14 @@ SOURCES = [
 ]
 
 
-def test_without_a_model_it_says_that_the_moves_do_not_make_one():
+def test_without_a_model_the_moves_do_not_suffice_for_one():
     for own in (SOURCES[:4], SOURCES[4:]):
         reason = fitted(own, "model.yaml").reason
         assert reason.startswith("no model could be fitted")
         assert "slow sweeps" in reason
 
 
-def test_it_names_what_a_recording_shows_but_lists_nobody_and_gives_no_hours(tmp_path):
+def test_findings_are_named_without_ranking_or_forecast(tmp_path):
     bare = model_in("schema: hdbridge.model/1\nratio: 100.0\neffects: []\n", "model.yaml")
     dataset = Dataset(tmp_path / "out")
     dataset.create()

@@ -1,6 +1,4 @@
-"""`hdbridge fit` on short records of other benches: refused, or fitted with what is not known said once."""
-
-from __future__ import annotations
+"""`hdbridge fit` on short foreign records: refused, or fitted with its limits reported once."""
 
 import json
 from pathlib import Path
@@ -40,7 +38,7 @@ def test_a_rest_and_the_beginning_of_a_fast_move_are_refused(tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize("turns", [0.3, 3.0])
-def test_what_cannot_be_told_apart_is_said_in_few_lines(tmp_path: Path, turns: float) -> None:
+def test_inseparable_causes_are_reported_briefly(tmp_path: Path, turns: float) -> None:
     path = write(tmp_path / "bench.csv", np.linspace(0.0, 360.0 * turns, 600))
     result = CliRunner().invoke(app, ["fit", str(path), "--ratio", "100"], catch_exceptions=False)
     assert result.exit_code == 0
@@ -79,7 +77,7 @@ def test_less_than_a_turn_resolves_no_order(tmp_path: Path) -> None:
     assert "orders are not fitted" in said
 
 
-def test_the_residual_is_what_the_written_model_leaves(tmp_path: Path) -> None:
+def test_the_residual_is_that_of_the_written_model(tmp_path: Path) -> None:
     """A drag passes for a delay of one encoder, which is fitted beside the model and no part of it."""
     paths = moves(tmp_path, 2.0, (30.0,) * 3, drag=0.02)
     out = tmp_path / "model.yaml"
@@ -99,7 +97,7 @@ def test_the_residual_is_what_the_written_model_leaves(tmp_path: Path) -> None:
     assert f"residual {noise['residual_arcsec']:.2f} arcsec rms; {noise['fitted_arcsec']:.2f} with" in said
 
 
-def test_a_model_that_is_worse_on_what_was_left_out_is_not_written(tmp_path: Path) -> None:
+def test_a_model_worse_on_held_out_data_is_not_written(tmp_path: Path) -> None:
     """Ripple that has another phase in each recording: any two foretell the third badly."""
     paths = moves(tmp_path, 2.0, (0.0, 60.0, 120.0))
     out = tmp_path / "model.yaml"

@@ -1,7 +1,5 @@
 """CSV files of other benches: dialects, columns, units and wrapped counters; one line for each error."""
 
-from __future__ import annotations
-
 import gzip
 import math
 from collections.abc import Callable
@@ -79,9 +77,7 @@ def commands(path: Path) -> list[list[str]]:
 
 
 @pytest.mark.parametrize(("content", "expected"), WRONG.values(), ids=WRONG.keys())
-def test_what_is_wrong_is_said_in_one_line_and_nothing_is_written(
-    folder: Path, content: str, expected: str
-) -> None:
+def test_errors_are_one_line_and_nothing_is_written(folder: Path, content: str, expected: str) -> None:
     path = folder / "bench.csv"
     path.write_text(content)
     for command in commands(path):
@@ -107,7 +103,7 @@ AS_IT_COMES = {
 
 
 @pytest.mark.parametrize("content", AS_IT_COMES.values(), ids=AS_IT_COMES.keys())
-def test_what_other_programs_write_reads_the_same(tmp_path: Path, content: bytes) -> None:
+def test_files_of_other_programs_read_the_same(tmp_path: Path, content: bytes) -> None:
     (tmp_path / "plain.csv").write_text(text())
     (tmp_path / "bench.csv").write_bytes(content)
     plain, other = (Record.read_csv(tmp_path / name) for name in ("plain.csv", "bench.csv"))
@@ -145,7 +141,7 @@ ASSUMED = {
 
 
 @pytest.mark.parametrize(("content", "remark"), ASSUMED.values(), ids=ASSUMED.keys())
-def test_another_dialect_is_read_and_one_line_says_what_was_assumed(
+def test_another_dialect_is_read_with_one_line_on_assumptions(
     folder: Path, content: str, remark: str
 ) -> None:
     path, plain = folder / "bench.csv", folder / "plain.csv"
@@ -292,7 +288,7 @@ ADVISED: dict[str, tuple[str, str, str]] = {
 
 
 @pytest.mark.parametrize(("content", "expected", "advice"), ADVISED.values(), ids=ADVISED.keys())
-def test_advice_works_when_it_is_followed(folder: Path, content: str, expected: str, advice: str) -> None:
+def test_the_given_advice_works(folder: Path, content: str, expected: str, advice: str) -> None:
     path = folder / "bench.csv"
     path.write_text(content)
     for command in commands(path):
@@ -312,7 +308,7 @@ def test_advice_works_when_it_is_followed(folder: Path, content: str, expected: 
 @pytest.mark.parametrize("bits", [12, 16, 24])
 @pytest.mark.parametrize("form", [counter, signed])
 @pytest.mark.parametrize("backwards", [False, True])
-def test_a_wrapped_counter_is_named_with_its_size_and_unwrapped_by_it(
+def test_a_wrapped_counter_is_reported_with_its_size_and_unwrapped(
     tmp_path: Path, bits: int, form: Callable[[int, np.ndarray], np.ndarray], backwards: bool
 ) -> None:
     """Both angles in counts, of a motor encoder whose counter wraps several times."""
@@ -336,7 +332,7 @@ def test_a_wrapped_counter_is_named_with_its_size_and_unwrapped_by_it(
     np.testing.assert_allclose(np.diff(unwrapped.motor_position_deg), np.diff(counts * 360.0 / per_turn))
 
 
-def test_a_counter_of_many_turns_is_named_with_its_own_size(tmp_path: Path) -> None:
+def test_a_multi_turn_counter_is_reported_with_its_size(tmp_path: Path) -> None:
     path = tmp_path / "bench.csv"
     counts = np.round(LOAD * 2.0**26 / 360.0) + 2.0**31 - 2.0**20
     path.write_text(text(load=signed(32, counts)))
@@ -348,7 +344,7 @@ def test_a_counter_of_many_turns_is_named_with_its_own_size(tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize("jump_deg", [12.08, 47.3, 150.0, 505.0])
-def test_a_single_jump_that_is_no_period_is_no_counter(jump_deg: float) -> None:
+def test_a_single_jump_is_not_a_counter_wrap(jump_deg: float) -> None:
     """A reading that slips once, as in a measured record, is not advised to be unwrapped."""
     slow = np.round(MOTOR / 10.0, 8)
     slipped = np.where(np.arange(COUNT) > 100, slow + jump_deg, slow)
@@ -394,7 +390,7 @@ def test_errors_at_a_few_places_are_not_a_turn_in_radians(tmp_path: Path, seed: 
     check_records({path: Record.read_csv(path)}, RATIO)
 
 
-def test_a_clock_that_wraps_is_named_with_its_period(tmp_path: Path) -> None:
+def test_a_wrapping_clock_is_reported_with_its_period(tmp_path: Path) -> None:
     path = tmp_path / "bench.csv"
     path.write_text(text(time=(TIME * 1000.0 + 65_000.0) % 65_536.0))
     with pytest.raises(InputError, match=r"time that does not run backwards: .* pass --unwrap time=65536$"):
@@ -475,7 +471,7 @@ def test_wrong_options_are_refused_in_one_line(folder: Path, options: list[str],
         assert "\n" not in str(result.exception)
 
 
-def test_diagnose_takes_a_profile_and_says_how_to_get_a_model(folder: Path) -> None:
+def test_diagnose_accepts_a_profile_and_explains_how_to_get_a_model(folder: Path) -> None:
     record = folder / "bench.csv"
     record.write_text(text())
     alone = CliRunner().invoke(app, ["diagnose", str(record)])
@@ -498,7 +494,7 @@ def test_diagnose_takes_a_profile_and_says_how_to_get_a_model(folder: Path) -> N
 
 
 @pytest.mark.parametrize("compressed", [False, True], ids=["plain", "gzip"])
-def test_a_file_too_large_to_hold_is_refused_before_it_is_held(
+def test_a_file_too_large_for_memory_is_refused_before_loading(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, compressed: bool
 ) -> None:
     monkeypatch.setattr(csvfile, "MAXIMUM_BYTES", 1 << 12)
@@ -508,7 +504,7 @@ def test_a_file_too_large_to_hold_is_refused_before_it_is_held(
         Record.read_csv(path)
 
 
-def test_samples_taken_twice_change_nothing_that_is_said(folder: Path) -> None:
+def test_duplicate_samples_change_no_result(folder: Path) -> None:
     path = folder / "bench.csv"
     twice = np.r_[0:100, 99:199]
     path.write_text(text(TIME[twice], MOTOR[twice], LOAD[twice]))
@@ -517,7 +513,7 @@ def test_samples_taken_twice_change_nothing_that_is_said(folder: Path) -> None:
     assert (folder / "out.json").is_file()
 
 
-def test_a_measurement_that_is_named_twice_is_refused(folder: Path) -> None:
+def test_a_record_given_twice_is_refused(folder: Path) -> None:
     (folder / "bench.csv").write_text(text())
     (folder / "copy.csv").write_text(text())
     for other, said in (("copy.csv", "holds the same samples as"), ("bench.csv", "is named twice")):

@@ -1,11 +1,9 @@
-"""Records that other people measured: is what is in them named, and does it hold on what was left out?
+"""Published measurements: causes are named and hold on held-out data.
 
 The records are not part of the project (licences; docs/real-records.md names the sources). They are looked
 for in the folder that HDBRIDGE_REAL_RECORDS names, else beside the repository; without them these tests are
 skipped.
 """
-
-from __future__ import annotations
 
 import os
 from pathlib import Path
@@ -79,7 +77,7 @@ def test_a_robot_joint_is_named_and_the_names_predict_the_recording_left_out(
 
 
 @pytest.mark.parametrize(("joint", "most"), [(4, 1.1), (5, 1.2)])
-def test_what_is_named_predicts_a_recording_left_out_as_a_regression_does(
+def test_findings_predict_a_held_out_recording_like_a_regression(
     joints: dict[int, list[Record]], joint: int, most: float
 ) -> None:
     """Wanted is 1.1 for both; joint 5's speed term is not accepted in four recordings of a second."""
@@ -114,7 +112,7 @@ def test_half_the_samples_with_or_without_the_command_name_the_same(
     assert found.extended.rms_arcsec < 0.45 * found.baseline.rms_arcsec
 
 
-def test_zeros_that_differ_are_told_and_nothing_is_named_for_them(
+def test_different_zeros_are_reported_without_a_cause(
     joints: dict[int, list[Record]], tmp_path: Path
 ) -> None:
     NOTHING.save(tmp_path / "model.yaml")
@@ -168,7 +166,7 @@ def test_return_point_memory_fits_the_damper_and_predicts_its_other_motion() -> 
 
 
 @pytest.mark.parametrize("name", ["sine", "earthquake"])
-def test_the_damper_is_told_to_have_return_point_memory_where_its_motion_shows_it(name: str) -> None:
+def test_return_point_memory_of_the_damper_is_reported_if_visible(name: str) -> None:
     """A sine turns at ever other places: no loop within a loop, and both laws leave the same of it."""
     time, angle, force = damper(name)
     record = Record(
@@ -188,7 +186,7 @@ def test_the_damper_is_told_to_have_return_point_memory_where_its_motion_shows_i
 
 
 @pytest.mark.parametrize("joint", [4, 5])
-def test_the_command_makes_nothing_worse(joints: dict[int, list[Record]], joint: int) -> None:
+def test_command_worsens_no_record(joints: dict[int, list[Record]], joint: int) -> None:
     """The recordings end in motion, the command ahead of the motor by some degrees."""
     told = [Record.read_csv(each) for each in measured(f"cobot-command/joint{joint}-*.csv")]
     without, beside = (

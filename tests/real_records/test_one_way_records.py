@@ -1,6 +1,4 @@
-"""A short move one way is never given a confident name: place, time, speed and torque go together in it."""
-
-from __future__ import annotations
+"""A short one-way move yields no confident cause: place, time, speed and torque coincide."""
 
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Inference from four rows of scatter and mean to the runs behind them, tried on known runs."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 from typing import Any
@@ -49,13 +47,13 @@ def test_the_ranges_hold_what_was_put_in(seed: int) -> None:
     assert low - 1.0 <= 100.0 * np.mean(one_way > 0.0) <= high + 1.0
 
 
-def test_rows_that_no_one_error_can_leave_are_told() -> None:
+def test_inconsistent_rows_are_reported() -> None:
     rows = {"none": (30.0, 0.0), "synchronous": (3.0, 0.0), "hysteresis": (3.0, 0.0), "both": (90.0, 0.0)}
     found = TOOL.budget(rows, 10.0, 40.0, 2.8)[ONE]
     assert "hysteresis correction: no variance of it is possible" in found
 
 
-def test_the_page_says_what_the_script_computes() -> None:
+def test_the_page_matches_the_script() -> None:
     page = (ROOT / "docs" / "method.md").read_text(encoding="utf-8")
     section = page.split("### Table 3 as data")[1].split("\n## ")[0]
     computed = ARTICLE.figures()

@@ -1,9 +1,7 @@
-"""Agreement of a simulated drive with two robot joints that somebody else measured.
+"""Agreement of a simulated drive with two published robot joints.
 
 The records are looked for as in `test_measured_records.py`; without them these tests are skipped.
 """
-
-from __future__ import annotations
 
 import os
 from pathlib import Path
@@ -26,7 +24,7 @@ def recordings_of(joint: int) -> list[Recording]:
 
 
 @pytest.mark.parametrize("joint", [4, 5])
-def test_usual_values_do_not_follow_as_a_robot_joint_does(joint: int) -> None:
+def test_typical_values_do_not_match_a_robot_joint(joint: int) -> None:
     """Its drive lags the command by 8 ms; a usual one follows within two or three."""
     truth = translate(real_records.joint_axis()).truth
     for recording in recordings_of(joint):
@@ -37,7 +35,7 @@ def test_usual_values_do_not_follow_as_a_robot_joint_does(joint: int) -> None:
 
 
 @pytest.mark.slow
-def test_a_twin_of_three_recordings_follows_as_the_fourth_does() -> None:
+def test_a_twin_of_three_recordings_predicts_the_fourth() -> None:
     twin, compared = real_records.twin_of_others(recordings_of(4), 0)
     assert twin.findings == (), "its following error is left, so no value is the axis's"
     for signal, share in (("load_error", 0.5), ("following_error", 0.5), ("motor_torque", 0.9)):

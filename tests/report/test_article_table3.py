@@ -24,7 +24,7 @@ def page():
     return (ROOT / "docs" / "method.md").read_text(encoding="utf-8")
 
 
-def test_the_computed_table_of_the_page_is_the_computed_one(figures, page):
+def test_the_table_on_the_page_matches_the_script(figures, page):
     for scheme, parts in figures["computed"].items():
         cells = re.search(rf"^\| {scheme} \|(.*)\|$", page, re.MULTILINE).group(1)
         shown = [float(each.replace("−", "-")) for each in re.findall(r"[−\d.]+", cells)]
@@ -39,7 +39,7 @@ def test_every_step_of_the_test_ends_saturated_so_it_cannot_see_the_shape(figure
     assert figures["largest_change_with_widths_5_to_40_and_n_1.2_to_2.5_arcsec"] < 1e-9
 
 
-def test_without_counts_only_the_exact_inverse_leaves_nothing(tool):
+def test_without_quantisation_only_the_exact_inverse_is_perfect(tool):
     model = tool.TransmissionModel.load(tool.bundled_profile("article") / "model.yaml")
     fine = 8000 * 1024
     exact = tool.statistics(*tool.step_errors(model, model, fine))["pooled"][0]
@@ -67,7 +67,7 @@ def test_single_figures(figures, name, value):
     assert figures[name] == pytest.approx(value, abs=0.06)
 
 
-def test_orders_above_half_the_sampling_appear_where_the_page_says(figures):
+def test_aliased_orders_appear_as_documented(figures):
     assert figures["aliases"]["6"] == pytest.approx(2.26, abs=0.005)
     assert figures["aliases"]["8"] == pytest.approx(0.26, abs=0.005)
     assert figures["aliases"]["4"] == 4

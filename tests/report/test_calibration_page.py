@@ -1,4 +1,4 @@
-"""The page of a calibration shows what was found, and what could not be."""
+"""The calibration page shows the result and its limits."""
 
 import dataclasses
 import json
@@ -130,14 +130,14 @@ def test_error_is_shown_over_both_angles_in_both_directions(plain):
     assert mean["mean, backward"]["y"][5] == pytest.approx(-30.0, abs=0.6)
 
 
-def test_a_loop_is_parted_where_nothing_was_measured(plain):
+def test_a_loop_is_interrupted_at_gaps(plain):
     _, charts = plain
     measured, predicted = charts["Sine of ±45 deg"]["series"]
     assert None not in measured["y"]
     assert [i for i, y in enumerate(predicted["y"]) if y is None] == [200]
 
 
-def test_the_spectrum_sets_the_threshold_against_the_orders_that_it_is_for(plain):
+def test_the_spectrum_shows_the_threshold_over_candidate_orders(plain):
     _, charts = plain
     (chart,) = (each for each in charts.values() if each["y_log"])
     alone, together, threshold, chosen = chart["series"]
@@ -148,7 +148,7 @@ def test_the_spectrum_sets_the_threshold_against_the_orders_that_it_is_for(plain
 
 
 @pytest.mark.parametrize("order", [2, 15])
-def test_the_line_of_each_order_alone_peaks_at_the_order_with_its_amplitude(order):
+def test_the_line_of_each_order_peaks_at_its_amplitude(order):
     """Though four bins in ten hold no sample, and their width takes 2.2 % off order 15."""
     fit = fitted()
     wave = 5.0 * np.cos(np.radians(order * fit.traces.motor_deg + 20.0))
@@ -167,7 +167,7 @@ def test_figures_have_the_digits_that_their_interval_allows(plain):
     assert re.findall(r">([^<>]+)</td>", row) == ["5.000", "0.031", "arcsec"]
 
 
-def test_what_cannot_be_known_stands_in_brackets(plain):
+def test_unknown_values_are_in_brackets(plain):
     text, _ = plain
     row = re.search(r"hysteresis: width.*?</tr>", text).group(0)
     assert "(20)" in row
@@ -175,19 +175,19 @@ def test_what_cannot_be_known_stands_in_brackets(plain):
     assert "In brackets: not determined by these data." in text
 
 
-def test_notes_are_announced_at_the_top_and_stay_text(plain):
+def test_notes_are_announced_at_the_top_and_escaped(plain):
     text, _ = plain
     assert "Read the note under" in text
     assert "the width &lt;cannot&gt; be known" in text
 
 
-def test_a_change_of_phase_goes_the_short_way_round():
+def test_phase_changes_are_wrapped():
     text, _ = read(dataclasses.replace(result(), active=model(4.0, -170.0, 30.0)))
     row = re.search(r"synchronous, order 2: phase.*?</tr>", text).group(0)
     assert "\N{MINUS SIGN}20" in row
 
 
-def test_before_and_after_are_drawn_to_one_scale():
+def test_before_and_after_share_a_scale():
     errors = ((30.0, 32.0), (-30.0, -28.0))
     targets = ((1.0, 2.0), (2.0, 1.0))
     before = Stepped("no compensation", errors, targets)
@@ -219,7 +219,7 @@ def test_before_and_after_are_drawn_to_one_scale():
     ],
     ids=["pending", "offered", "refused", "fitted"],
 )
-def test_the_verdict_begins_with_what_became_of_the_model_and_names_the_next_command(offer, word, commands):
+def test_the_verdict_states_the_models_fate_and_the_next_command(offer, word, commands):
     text, _ = read(result(axis="demo", offer=offer))
     verdict = text[text.index('<div class="verdict') : text.index("<section>")]
     assert re.search(r'class="status">(.*?)</strong>', verdict)[1] == word
@@ -234,7 +234,7 @@ def test_a_fit_without_stepping_and_reference_pose_has_a_page_too(plain):
     assert len(text) < 1_000_000
 
 
-def test_where_nothing_was_held_out_it_says_so():
+def test_missing_hold_out_is_reported():
     said = "nothing was held out: there is too little data to leave any out"
     fit = dataclasses.replace(fitted(), held_out=HeldOut(None, None, float("nan"), said))
     calibration = dataclasses.replace(result(), fit=fit)

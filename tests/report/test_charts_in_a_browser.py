@@ -1,4 +1,4 @@
-"""Charts are enlarged by keyboard, touch and buttons. Asked of a real browser where there is one."""
+"""Charts are zoomed by keyboard, touch and buttons, in a real browser."""
 
 import json
 import re
@@ -88,7 +88,7 @@ def test_a_chart_is_reached_and_enlarged_by_the_keyboard(told):
         assert span(told["plus"][axis]) == pytest.approx(span(told["whole"][axis]) / 1.6)
 
 
-def test_arrows_move_what_is_seen_as_far_as_there_is_something(told):
+def test_arrows_pan_within_the_data(told):
     assert told["right"]["x"][0] > told["plus"]["x"][0]
     assert told["right"]["y"] == told["plus"]["y"]
     assert told["up"]["y"][0] > told["right"]["y"][0]
@@ -96,11 +96,11 @@ def test_arrows_move_what_is_seen_as_far_as_there_is_something(told):
     assert span(told["edge"]["x"]) == pytest.approx(span(told["plus"]["x"]))
 
 
-def test_the_whole_chart_comes_back_and_never_less(told):
+def test_zooming_out_ends_at_the_whole_chart(told):
     assert told["minus"] == told["escape"] == told["doubled"] == told["whole"]
 
 
-def test_two_fingers_enlarge_about_the_place_between_them(told):
+def test_two_fingers_zoom_about_their_centre(told):
     whole, pinched = told["whole"], told["pinched"]
     assert span(pinched["x"]) == pytest.approx(span(whole["x"]) / 2.0, rel=0.01)
     assert sum(pinched["x"]) == pytest.approx(sum(whole["x"]), rel=0.01)
@@ -111,5 +111,5 @@ def test_one_finger_moves_an_enlarged_chart_sideways_only(told):
     assert told["dragged"]["y"] == told["pinched"]["y"]
 
 
-def test_there_are_buttons_too(told):
+def test_buttons_zoom(told):
     assert span(told["button"]["x"]) < span(told["whole"]["x"])

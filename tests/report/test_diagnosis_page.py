@@ -1,4 +1,4 @@
-"""The page of a diagnosis says what was found, shows it where it lives, and tells what to do."""
+"""The diagnosis page shows findings, their charts and the remedy."""
 
 import dataclasses
 import html
@@ -174,7 +174,7 @@ def plain():
     return page(finding(aliases=("compliance",)), provenance={"record": "r.csv"})
 
 
-def test_it_says_cause_size_gain_and_what_else_it_could_be(plain):
+def test_findings_show_cause_size_gain_and_aliases(plain):
     text = words(plain)
     assert "off by 3.10 arcsec (rms): load order (once or twice per load turn) or compliance" in text
     assert "up to 4.00 arcsec" in text
@@ -187,7 +187,7 @@ def test_it_says_cause_size_gain_and_what_else_it_could_be(plain):
     assert units["size"] == units["with"] == "arcsec"
 
 
-def test_it_says_what_to_do_and_to_measure_next(plain):
+def test_the_page_shows_remedy_and_next_measurement(plain):
     text = words(plain)
     assert "measure next Two slow load turns both ways." in text
     assert "Centre the load encoder" in text
@@ -199,7 +199,7 @@ def test_parameters_stand_with_their_interval(plain):
     assert re.findall(r">([^<>]+)</td>", row) == ["4.031", "0.031", "4.000", "4.062", "arcsec"]
 
 
-def test_what_was_looked_at_and_could_have_been_seen_is_told(plain):
+def test_examined_and_detectable_causes_are_listed(plain):
     text = words(plain)
     assert "no command (motor_target_deg)" in text
     assert "creep: not seen in enough independent stretches" in text
@@ -220,7 +220,7 @@ def test_a_finding_is_drawn_over_its_coordinate_with_its_own_curve(plain):
     assert np.median(bars) == pytest.approx(0.5, rel=0.2)
 
 
-def test_backlash_is_drawn_over_the_way_since_the_reversal():
+def test_backlash_is_plotted_over_travel_since_the_reversal():
     chart = charts(page(finding("backlash")))[
         "Residual without it, over the motor angle since the last reversal"
     ]
@@ -242,7 +242,7 @@ def test_a_cause_that_scales_the_ripple_is_drawn_as_a_scale():
 
 
 @pytest.mark.parametrize("cause", causes())
-def test_every_cause_of_the_catalogue_has_a_picture(cause):
+def test_every_cause_has_a_chart(cause):
     text = page(finding(cause))
     assert CATALOGUE[cause].about.title in html.unescape(text)
     chart = next(iter(charts(text).values()))
@@ -250,14 +250,14 @@ def test_every_cause_of_the_catalogue_has_a_picture(cause):
     assert max(abs(value) for curve in curves for value in curve) > 0.01
 
 
-def test_a_change_of_orders_is_drawn_as_it_was_found():
+def test_changed_orders_are_plotted_as_found():
     change = MotorOrders(orders=(MotorOrder(order=2, amplitude_arcsec=3.0, phase_deg=90.0),))
     text = page(finding("motor_order", effect=change))
     angle, curve = series(charts(text)["Residual without it, over the motor angle"], "the finding, forward")
     assert curve == pytest.approx(-3.0 * np.sin(np.radians(2.0 * angle)), abs=0.05)
 
 
-def test_something_unexplained_has_no_name_and_no_curve():
+def test_unexplained_findings_have_no_name_or_curve():
     text = page(unexplained())
     said = words(text)
     assert "something unexplained that depends on the load angle and direction, up to " in said
@@ -272,11 +272,11 @@ def test_something_unexplained_has_no_name_and_no_curve():
     ]
 
 
-def test_what_lives_in_an_unknown_coordinate_is_drawn_over_time():
+def test_findings_without_a_coordinate_are_plotted_over_time():
     assert "Unexplained residual, over the time" in charts(page(unexplained("the moon's phase")))
 
 
-def test_nothing_found_is_said_and_nothing_is_to_be_done():
+def test_no_findings_need_no_action():
     text = page()
     said = words(text)
     assert "Nothing found" in said
@@ -285,7 +285,7 @@ def test_nothing_found_is_said_and_nothing_is_to_be_done():
     assert "What this record could show" in said
 
 
-def test_a_guess_is_called_one():
+def test_guesses_are_labelled():
     assert "(rms): perhaps load order" in words(page(finding(probability=0.5)))
     assert "(rms): probably load order" in words(page(finding(probability=0.8)))
 
@@ -304,7 +304,7 @@ def test_the_residual_is_shown_over_every_coordinate_to_one_scale(plain):
     assert order.index("Over the load angle") < order.index("Over the motor angle")
 
 
-def test_simulation_stands_beside_measurement(plain):
+def test_simulation_is_shown_next_to_measurement(plain):
     chart = charts(plain)["Closer: where the extended model gains most"]
     assert {each["label"] for each in chart["series"]} == {
         "measured",
@@ -313,7 +313,7 @@ def test_simulation_stands_beside_measurement(plain):
     }
 
 
-def test_a_stepping_test_says_what_was_gained_on_the_axis():
+def test_the_stepping_test_shows_the_gain_on_the_axis():
     targets = ((1.0, 2.0), (2.0, 1.0))
     before = Stepped("the active model", ((4.0, -4.0), (4.0, -4.0)), targets)
     after = Stepped("the extended model", ((3.2 / 3.0, -3.2 / 3.0), (3.2 / 3.0, -3.2 / 3.0)), targets)
@@ -328,7 +328,7 @@ def test_a_stepping_test_says_what_was_gained_on_the_axis():
     assert "--extend" not in said
 
 
-def test_what_comes_from_outside_stays_text():
+def test_external_text_is_escaped():
     evil = "</script><script>alert(1)</script><b>&"
     odd = dataclasses.replace(finding(), experiment=evil, note=evil, lives_in=evil)
     text = render(
@@ -340,7 +340,7 @@ def test_what_comes_from_outside_stays_text():
     assert evil in "".join(Reader(text).text)
 
 
-def test_the_picture_of_a_changed_loop_is_of_the_loop_that_the_model_has():
+def test_a_changed_loop_is_plotted_with_the_models_loop():
     """A finding may come from a fit with more freedom than the model has; the picture must not repeat it."""
     told = CATALOGUE["hysteresis_parameters"].candidate(RATIO, MODEL.effects)
     boasted = told.model_copy(update={"offset_arcsec": told.base.offset_arcsec + 100.0})

@@ -38,12 +38,12 @@ def test_a_figure_has_four_digits_and_an_exponent_only_far_from_one(value, text)
         (31.6192, math.inf, ("31.62", "inf")),
     ],
 )
-def test_a_value_is_told_as_far_as_its_interval_goes(value, half_width, texts):
+def test_values_are_rounded_to_their_interval(value, half_width, texts):
     assert with_interval(value, half_width) == texts
 
 
 @given(st.floats(1e-9, 1e9), st.floats(1e-6, 1.0))
-def test_what_rounding_takes_is_a_small_part_of_the_interval(value, share):
+def test_rounding_loses_a_small_part_of_the_interval(value, share):
     half_width = share * value
     text, half = with_interval(value, half_width)
     assert abs(float(text) - value) <= 0.06 * half_width

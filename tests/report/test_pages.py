@@ -1,4 +1,4 @@
-"""Pages open without a network, hold what they were given, and cannot be broken out of by it."""
+"""Pages work offline, keep their data and escape it."""
 
 import hashlib
 import json
@@ -39,7 +39,7 @@ def charts_in(text):
     return json.loads(re.search(r"const CHARTS = (.*);\n", text).group(1))
 
 
-def test_a_page_names_nothing_outside_itself():
+def test_a_page_has_no_external_references():
     chart = Chart("c", "x", "y", [Series("s", [0, 1], [1, 2], mark) for mark in Mark])
     reader = Reader(render(page_of(chart, Table(["a"], [["b"], [1.5]]), Facts([("k", "v")]))))
     for tag, attributes in reader.tags:
@@ -48,7 +48,7 @@ def test_a_page_names_nothing_outside_itself():
 
 
 @given(st.text(max_size=60))
-def test_text_stays_text(words):
+def test_text_is_escaped(words):
     evil = words + "</script><script>alert(1)</script><b>&"
     chart = Chart(evil, evil, evil, [Series(evil, [0.0], [1.0])])
     text = render(page_of(chart, Facts([(evil, evil)]), Table([evil], [[evil]]), title=evil, verdict=evil))
@@ -98,7 +98,7 @@ def test_a_thinned_cloud_is_about_as_wide_as_the_whole():
     assert np.std(thinned(x, y, 4000)[1]) > 2.0
 
 
-def test_what_was_thinned_says_so():
+def test_thinned_charts_are_labelled():
     time = np.arange(20_000.0)
     short, long = charts_in(
         render(
@@ -112,7 +112,7 @@ def test_what_was_thinned_says_so():
     assert long["note"].startswith("every 5th point")
 
 
-def test_charts_of_a_grid_stand_in_the_order_of_the_page():
+def test_charts_keep_the_page_order():
     one, two, three = (Chart(name, "x", "y", [Series(name, [0], [0])]) for name in "abc")
     text = render(page_of(Grid([one, two], columns=3), three))
     assert [each["series"][0]["label"] for each in charts_in(text)] == ["a", "b", "c"]
@@ -180,7 +180,7 @@ def outcome(cw, ccw):
     )
 
 
-def test_the_stepping_page_says_the_result_in_one_sentence():
+def test_the_stepping_page_states_the_result_in_one_sentence():
     results = {
         Scheme.NONE: SchemeResult.of(outcome([40, 44], [-40, -36])),
         Scheme.BOTH: SchemeResult.of(outcome([1, -1], [0.5, -0.5])),
@@ -210,7 +210,7 @@ def test_the_pooled_figures_come_first_and_every_column_of_figures_has_its_unit(
     assert re.findall(r"<td>(.*?)</td>", row)[0] == "120.15"
 
 
-def test_without_compensation_the_verdict_speaks_of_none():
+def test_without_compensation_the_verdict_mentions_none():
     results = {Scheme.NONE: SchemeResult.of(outcome([40, 44], [-40, -36]))}
     text = render(stepping_page("a", results, 2.8, {}))
     assert "With no compensation, the load's error at rest is 120.15 arcsec" in " ".join(Reader(text).text)

@@ -1,7 +1,5 @@
 """Code that several processes have compiled and kept on disk runs together in one."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys
@@ -55,7 +53,7 @@ def said(program: str, *arguments: object, **environment: str) -> list[str]:
     return done.stdout.splitlines()
 
 
-def test_a_layout_has_the_same_name_in_each_process_and_no_other_has_it(
+def test_layout_names_are_unique_and_stable_between_processes(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(sys, "argv", ["", "16", "32"])

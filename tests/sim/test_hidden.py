@@ -1,7 +1,5 @@
 """Causes that are hidden in the simulated axis: each really has the size that its description states."""
 
-from __future__ import annotations
-
 import random
 from collections.abc import Callable
 from functools import cache
@@ -175,7 +173,7 @@ def test_every_cause_can_be_hidden_and_has_a_size_to_check() -> None:
 
 
 @pytest.mark.parametrize("cause", EXPECTED)
-def test_a_hidden_cause_has_the_size_that_it_states(cause: str) -> None:
+def test_a_hidden_cause_has_its_stated_size(cause: str) -> None:
     rng = random.Random(f"size of {cause}")
     wanted = size_of(cause, rng)
     known, hidden = hide(axis(), cause, rng, wanted, RUN)

@@ -1,7 +1,5 @@
 """The causes in the simulated axis, each by its physics; the sizes are tested in test_hidden."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from pathlib import Path
@@ -90,7 +88,7 @@ def test_the_stages_of_the_spring_join() -> None:
 
 
 @pytest.mark.parametrize("sense", [1.0, -1.0])
-def test_friction_at_the_load_holds_it_back_and_gives_way_before_it_slips(sense: float) -> None:
+def test_load_friction_yields_before_it_slips(sense: float) -> None:
     """The load lags by the wind-up of the friction, and after a reversal it follows less than the motor."""
     sliders = [{"limit_nm": 1.0, "travel_deg": 0.02}, {"limit_nm": 2.0, "travel_deg": 0.1}]
     machine, exercise = moved(axis(load__presliding=sliders), sense * 100.0, speed_deg_s=60.0)
@@ -235,7 +233,7 @@ def test_an_eccentric_disc_reads_e_over_r_once_per_turn() -> None:
     )
 
 
-def test_the_servo_stands_wrong_by_what_the_motor_s_disc_reads_wrong() -> None:
+def test_motor_encoder_eccentricity_displaces_the_servo() -> None:
     truth = axis(motor__encoder__disc={"radius_mm": 20.0, "eccentricity_um": 50.0})
     machine, _ = moved(truth, 90.0)
     assert machine.motor_counts == pytest.approx(90.0 * 512_000 / 360.0, abs=2)
@@ -263,7 +261,7 @@ def test_a_late_sample_is_the_angle_of_that_time(late_s: float) -> None:
     assert late.deg == pytest.approx(7.0 * (100 * 0.0005 - late_s))
 
 
-def test_a_late_motor_sample_is_late_on_the_bus_and_not_in_the_loops() -> None:
+def test_a_late_motor_sample_affects_the_bus_but_not_the_loops() -> None:
     machines = [Machine(axis(motor__encoder__late_ms=late_ms), 1) for late_ms in (0.0, 3.0)]
     for machine in machines:
         Exercise(machine).lead(lambda seconds: 400.0 * seconds, 0.5)
@@ -320,7 +318,7 @@ def test_the_gear_yields_in_time_to_a_load() -> None:
     assert error_arcsec(machine) == pytest.approx(expected, rel=0.02)
 
 
-def test_wear_is_lost_motion_in_either_direction_and_grows_with_the_way() -> None:
+def test_wear_is_lost_motion_and_grows_with_travel() -> None:
     wear = {"arcsec_per_1000_turns": 1000.0, "exponent": 1.0}
     machine, exercise = moved(axis(gear__wear=wear), 3600.0)
     forth = error_arcsec(machine)
@@ -331,7 +329,7 @@ def test_wear_is_lost_motion_in_either_direction_and_grows_with_the_way() -> Non
     assert back == pytest.approx(11.0, abs=0.2)
 
 
-def test_hours_of_work_change_loop_and_tooth_error_evenly_and_then_no_further() -> None:
+def test_hours_of_work_change_loop_and_tooth_error_up_to_a_limit() -> None:
     loop = {"law": "rolling_friction", "offset_arcsec": 40.0, "width_deg": 20.0, "exponent": 1.6}
     ageing = {
         "duration_s": 20.0,
@@ -423,7 +421,7 @@ def test_dahl_s_law_is_its_differential_equation(exponent: float) -> None:
 
 
 @pytest.mark.parametrize("exponent", [1.3, 1.6, 2.0, 2.6])
-def test_a_loop_that_remembers_has_the_branch_of_the_one_that_does_not(exponent: float) -> None:
+def test_the_first_branch_is_the_same_with_memory(exponent: float) -> None:
     truth = RollingFriction(law="rolling_friction", offset_arcsec=40.0, width_deg=20.0, exponent=exponent)
     laws = [law_of(each, 0.0) for each in (truth, remembering(truth))]
     worst = 0.0

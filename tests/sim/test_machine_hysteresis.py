@@ -1,7 +1,5 @@
 """The hysteresis laws of the simulated gear."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections.abc import Callable, Iterable
@@ -128,7 +126,7 @@ def test_long_motion_ends_at_the_offset_of_its_direction(make: Callable[[], Law]
 
 
 @every_law
-def test_the_way_counts_and_not_its_pieces(make: Callable[[], Law]) -> None:
+def test_the_path_counts_not_its_steps(make: Callable[[], Law]) -> None:
     turns = [30.0, 24.0, 29.0, 27.5, 45.0, 44.0]
     coarse = along(make(), turns, step_deg=0.5)[-1][1]
     fine = along(make(), turns, step_deg=0.003)[-1][1]
@@ -154,7 +152,7 @@ def after_an_excursion(law: Law, back_deg: float) -> float:
 
 
 @pytest.mark.parametrize("back_deg", [0.5, 2.0, 5.0])
-def test_maxwell_slip_goes_on_as_if_the_excursion_had_not_been(back_deg: float) -> None:
+def test_maxwell_slip_forgets_closed_excursions(back_deg: float) -> None:
     assert after_an_excursion(maxwell(), back_deg) == pytest.approx(
         after_an_excursion(maxwell(), 0.0), abs=1e-9
     )

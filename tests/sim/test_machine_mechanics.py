@@ -1,7 +1,5 @@
 """The mechanics of the simulated axis alone: spring, inertias, friction, coupling."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 from typing import Any
@@ -104,7 +102,7 @@ def test_a_torque_within_the_friction_moves_nothing_and_one_beyond_it_does() -> 
     assert plant.now.motor_deg > 0.0
 
 
-def test_a_motor_whose_friction_is_higher_near_rest_sticks_and_keeps_its_speed_by_less() -> None:
+def test_stribeck_friction_sticks_and_falls_with_speed() -> None:
     truth = plain(motor__stribeck={"rise": 0.5, "speed_rad_s": 3.0}, motor__viscous_nm_s_per_rad=0.0)
     plant = Plant(truth)
     for _ in range(1000):

@@ -1,7 +1,5 @@
 """The simulated axis in motion and at rest: loops, friction, encoders, heat."""
 
-from __future__ import annotations
-
 import math
 import statistics
 from pathlib import Path
@@ -137,7 +135,7 @@ def test_a_small_reversal_stands_at_the_static_law() -> None:
 
 
 @pytest.mark.parametrize("profile", ["article", "demo"])
-def test_small_steps_to_and_fro_stay_within_half_a_count(profile: str) -> None:
+def test_small_alternating_steps_stay_within_half_a_count(profile: str) -> None:
     axis = Axis(truth(profile))
     for counts in (300, 7, 1, 1, -1, -2, 9, -30, 60, 2, -5, 13, -100, -4):
         axis.move(counts, settle_s=0.5)
@@ -282,7 +280,7 @@ def record(seed: int) -> list[tuple[int, int, int, float, float]]:
     return rows
 
 
-def test_the_seed_is_in_the_noise_of_the_load_encoder_and_nowhere_else() -> None:
+def test_the_seed_affects_only_load_encoder_noise() -> None:
     one, other = record(3), record(4)
     assert [row[1] for row in one] != [row[1] for row in other]
     assert [row[:1] + row[2:] for row in one] == [row[:1] + row[2:] for row in other]

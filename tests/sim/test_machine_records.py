@@ -1,7 +1,5 @@
 """Records of the plant with every cause off: they stay as they have always been, bit for bit."""
 
-from __future__ import annotations
-
 import hashlib
 import math
 import struct
@@ -56,8 +54,6 @@ def fingerprint(truth: Truth) -> str:
         ("demo", 0.5, "86c1a0be6d214d71"),
     ],
 )
-def test_with_every_cause_off_the_records_are_what_they_were(
-    profile: str, substep_ms: float, expected: str
-) -> None:
+def test_without_causes_records_are_unchanged(profile: str, substep_ms: float, expected: str) -> None:
     truth = Truth.load(PROFILES / profile).model_copy(update={"substep_ms": substep_ms})
     assert fingerprint(truth) == expected

@@ -1,7 +1,5 @@
 """Virtual time at the pace of real time: never ahead of it, and late without a rush."""
 
-from __future__ import annotations
-
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -35,7 +33,7 @@ def test_time_passes_at_its_speed(speed: float) -> None:
     assert real.now_s - 1000.0 == pytest.approx(0.4 / speed)
 
 
-def test_a_short_delay_is_made_up_for() -> None:
+def test_a_short_delay_is_caught_up() -> None:
     clock, real = paced()
     clock.sleep_until(50.1)
     real.now_s += 0.5 * FORGIVEN_S
@@ -44,7 +42,7 @@ def test_a_short_delay_is_made_up_for() -> None:
     assert real.now_s - 1000.0 == pytest.approx(0.5)
 
 
-def test_after_a_long_stall_it_goes_on_at_its_pace_and_skips_nothing() -> None:
+def test_after_a_long_stall_time_continues_without_skipping() -> None:
     clock, real = paced()
     clock.sleep_until(50.1)
     real.now_s += 3600.0
@@ -55,7 +53,7 @@ def test_after_a_long_stall_it_goes_on_at_its_pace_and_skips_nothing() -> None:
 
 
 @given(st.lists(st.tuples(st.floats(0.0, 0.5), st.floats(0.001, 0.1)), max_size=50))
-def test_it_is_never_ahead_of_real_time(turns: list[tuple[float, float]]) -> None:
+def test_time_is_never_ahead_of_real_time(turns: list[tuple[float, float]]) -> None:
     clock, real = paced()
     deadline_s = 50.0
     for busy_s, period_s in turns:
@@ -66,6 +64,6 @@ def test_it_is_never_ahead_of_real_time(turns: list[tuple[float, float]]) -> Non
 
 
 @pytest.mark.parametrize("speed", [0.0, -1.0, float("nan"), float("inf")])
-def test_a_speed_that_is_none_is_refused(speed: float) -> None:
+def test_an_invalid_speed_is_refused(speed: float) -> None:
     with pytest.raises(InputError, match="expected a finite number above 0"):
         PacedClock(0.0, speed)

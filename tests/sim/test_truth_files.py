@@ -1,6 +1,4 @@
-"""Truth files: what the simulated axis is, read strictly."""
-
-from __future__ import annotations
+"""Truth files, read strictly."""
 
 import re
 from pathlib import Path
@@ -80,7 +78,7 @@ def test_the_inertias_are_1_to_3_and_the_load_s_resonance_is_realistic() -> None
         ("name: article", "", r"key 'name' is missing"),
     ],
 )
-def test_a_wrong_truth_file_is_refused_with_place_and_reason(old: str, new: str, complaint: str) -> None:
+def test_a_wrong_truth_file_is_refused_with_location_and_reason(old: str, new: str, complaint: str) -> None:
     with pytest.raises(InputError, match=complaint) as raised:
         changed(old, new)
     assert re.match(r"truth\.yaml:\d+:\d+: ", str(raised.value))
@@ -158,12 +156,12 @@ def test_every_cause_is_off_unless_the_file_says_so() -> None:
         ),
     ],
 )
-def test_a_cause_that_makes_no_sense_is_refused(old: str, new: str, complaint: str) -> None:
+def test_an_invalid_cause_is_refused(old: str, new: str, complaint: str) -> None:
     with pytest.raises(InputError, match=complaint):
         changed(old, new)
 
 
-def test_where_a_twin_s_values_come_from_is_kept_and_changes_nothing() -> None:
+def test_provenance_of_twin_values_is_kept_and_has_no_effect() -> None:
     told = "\nintervals: {gear.stiffness_nm_per_rad: [15500, 16400]}\nprovenance: {axis: article}\n"
     twin = Truth.from_text(ARTICLE.read_text() + told)
     assert twin.intervals == {"gear.stiffness_nm_per_rad": (15500.0, 16400.0)}
@@ -173,7 +171,7 @@ def test_where_a_twin_s_values_come_from_is_kept_and_changes_nothing() -> None:
         Truth.from_text(ARTICLE.read_text() + "\nintervals: {gear.ratio: [51, 49]}\n")
 
 
-def test_a_fault_is_put_in_by_keys_of_a_section() -> None:
+def test_a_fault_is_added_by_keys_of_a_section() -> None:
     truth = Truth.load(ARTICLE)
     assert truth.changed() is truth
     worn = truth.changed(gear={"backlash_arcsec": 12.0}, load={"coulomb_nm": 0.5})

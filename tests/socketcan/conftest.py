@@ -3,8 +3,6 @@
 Run by ``tools/socketcan.sh`` where the kernel has no vcan; without an interface these tests are skipped.
 """
 
-from __future__ import annotations
-
 import atexit
 import re
 import shutil

@@ -1,7 +1,5 @@
 """A master that enables the drive and moves it for ever: to be killed by a test."""
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The example of docs/ci.md on a real CAN stack: the motion program in a process of its own."""
 
-from __future__ import annotations
-
 from tests.support import ci_page
 
 

@@ -1,7 +1,5 @@
 """The whole daemon on a real Linux CAN stack: its bus spoilt or taken away, its processes killed."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess
@@ -98,7 +96,7 @@ def test_the_daemon_survives(benches: Benches, row: DaemonRow) -> None:
             benches.end()
 
 
-def test_a_borrowed_step_runs_to_its_end_and_the_axis_moves_again_when_enabled(benches: Benches) -> None:
+def test_a_borrowed_step_completes_and_the_axis_moves_again_when_enabled(benches: Benches) -> None:
     daemon = benches.bench().daemon
     command = ("step", unhurried_profile(), "--interface", "socketcan", "--channel", OURS, "--count", 3)
     done = subprocess.run(

@@ -3,8 +3,6 @@
 That master keeps sending *enable operation* and targets. None of it may move the axis.
 """
 
-from __future__ import annotations
-
 import os
 import signal
 import struct
@@ -168,7 +166,7 @@ def test_without_its_gateway_process_the_axis_stops_and_waits_for_the_master(tmp
 
 
 @pytest.mark.usefixtures("interface")
-def test_without_its_control_process_the_drive_stops_by_itself(tmp_path: Path) -> None:
+def test_without_its_control_process_the_drive_stops_on_its_own(tmp_path: Path) -> None:
     with under_way(tmp_path) as (daemon, plc, witness):
         gateways, (control,) = daemon.pids("gateway"), daemon.pids("control")
         witness.begin()
@@ -183,7 +181,7 @@ def test_without_its_control_process_the_drive_stops_by_itself(tmp_path: Path) -
 
 
 @pytest.mark.usefixtures("interface")
-def test_without_its_keeper_everything_stops_in_order_and_ends(tmp_path: Path) -> None:
+def test_without_its_keeper_the_daemon_stops_in_order_and_ends(tmp_path: Path) -> None:
     with under_way(tmp_path) as (daemon, plc, witness):
         killed(witness, daemon.process.pid)
         daemon.process.wait()

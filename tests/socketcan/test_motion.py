@@ -5,8 +5,6 @@ As a script it prints the figures at the given speeds:
     PYTHONPATH=tests:. tools/socketcan.sh --slowed 400 .venv/bin/python -m tests.socketcan.test_motion 38 76
 """
 
-from __future__ import annotations
-
 import math
 import sys
 import tempfile

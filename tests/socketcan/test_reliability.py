@@ -1,7 +1,5 @@
 """Every fault of the reliability table on a real Linux CAN stack, and the manners of the commands there."""
 
-from __future__ import annotations
-
 import re
 import shutil
 import subprocess
@@ -159,7 +157,7 @@ def check(bench: VcanBench, row: Row, character: Character) -> None:
 
 
 @pytest.mark.parametrize("command", ["step", "run"])
-def test_a_bus_that_another_master_has_is_left_alone(
+def test_a_bus_of_another_master_is_left_alone(
     command: str,
     interface: str,
     profile: Path,

@@ -1,7 +1,5 @@
 """The control cycle and the simulated drive, two processes on a real Linux CAN stack."""
 
-from __future__ import annotations
-
 import re
 import subprocess
 import sys
@@ -38,7 +36,7 @@ def test_candump_shows_one_cycle_in_order(master, interface: str, tmp_path: Path
     assert periods[0] > 0.4 * expected  # late ones are skipped, never made up for by a burst
 
 
-def test_link_down_latches_and_the_way_back_is_a_new_link(
+def test_link_down_latches_and_recovery_needs_a_new_link(
     master, another_master, may_configure, interface: str
 ) -> None:
     master.run(50)
@@ -55,7 +53,7 @@ def test_link_down_latches_and_the_way_back_is_a_new_link(
         assert again.run(50)[-1].fresh
 
 
-def test_a_killed_master_leaves_an_axis_that_stands_and_is_disabled(
+def test_a_killed_master_leaves_a_stopped_and_disabled_axis(
     simulated, another_master, interface: str, profile: Path
 ) -> None:
     script = Path(__file__).with_name("master_to_kill.py")

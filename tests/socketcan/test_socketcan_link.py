@@ -1,6 +1,4 @@
-"""The cycle's link on a real socket: what vcan, vxcan and slcan do to it."""
-
-from __future__ import annotations
+"""The cycle's link on real sockets: vcan, vxcan and slcan."""
 
 import os
 import select
@@ -67,7 +65,7 @@ def test_remote_and_extended_frames_are_dropped_and_counted(pair) -> None:
     assert (link.dropped.remote, link.dropped.extended) == (1, 1)
 
 
-def test_an_interface_that_goes_down_is_gone_for_good(pair, may_configure, interface: str) -> None:
+def test_an_interface_that_went_down_stays_unusable(pair, may_configure, interface: str) -> None:
     link, _ = pair
     may_configure("link", "set", "down", interface)
     with pytest.raises(BusError, match="interface"):
@@ -107,7 +105,7 @@ def stuck_slcan(may_configure) -> Iterator[str]:
         os.close(theirs)
 
 
-def test_a_full_transmit_queue_is_told_apart(stuck_slcan: str) -> None:
+def test_a_full_transmit_queue_has_its_own_error(stuck_slcan: str) -> None:
     with can.Bus(interface="socketcan", channel=stuck_slcan, ignore_config=True) as bus:
         link = fast_link(Link(bus, MonotonicClock()))
 

@@ -1,7 +1,5 @@
 """Simulated axis at work with adaptation, over real frames, while its gear changes."""
 
-from __future__ import annotations
-
 import math
 import random
 from collections.abc import Callable, Iterator, Sequence

@@ -1,7 +1,5 @@
 """API for clients: served by uvicorn in a thread, over a Unix socket and TCP."""
 
-from __future__ import annotations
-
 import asyncio
 import threading
 from collections.abc import AsyncIterator, Iterator

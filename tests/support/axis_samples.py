@@ -5,8 +5,6 @@ notice changes of the numbers. The motor follows its target one cycle late, both
 encoder is noisy.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Headless Chromium, driven by its DevTools protocol: shows and operates a page as a person would."""
 
-from __future__ import annotations
-
 import json
 import os
 import re

@@ -1,7 +1,5 @@
 """Drives that all conform to CiA 402 but behave differently where it leaves the choice to the firmware."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import product

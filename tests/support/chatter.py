@@ -1,7 +1,5 @@
 """Another participant of a virtual bus."""
 
-from __future__ import annotations
-
 import can
 
 

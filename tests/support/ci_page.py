@@ -1,7 +1,5 @@
 """Example files of docs/ci.md."""
 
-from __future__ import annotations
-
 import shutil
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Runs ``hdbridge ARGS...`` in the tests' own process, which saves half a second of start-up each time."""
 
-from __future__ import annotations
-
 import io
 import subprocess
 import sys

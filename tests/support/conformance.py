@@ -1,7 +1,5 @@
 """Nodes on the virtual bus for the conformance suite, in simulated time."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path

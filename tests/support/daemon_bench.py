@@ -1,7 +1,5 @@
 """Bench for the fault rows of a whole daemon on a real CAN stack: its cable, its listener, its recovery."""
 
-from __future__ import annotations
-
 import shutil
 import struct
 import subprocess

@@ -1,7 +1,5 @@
 """Faults that the whole daemon must survive on a real CAN stack, as rows for `docs/reliability.md`."""
 
-from __future__ import annotations
-
 import os
 import signal
 import socket

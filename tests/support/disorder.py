@@ -1,9 +1,7 @@
-"""Random events on both buses of a gateway, and the laws that hold whatever happens.
+"""Random events on both buses of a gateway, and the laws that always hold.
 
 The laws look at the control loop's samples and at what the outer master has sent, not at the gateway.
 """
-
-from __future__ import annotations
 
 import errno
 import struct

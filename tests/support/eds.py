@@ -1,7 +1,5 @@
 """Other dictionaries for drives, made from the project's own EDS."""
 
-from __future__ import annotations
-
 import re
 import shutil
 from pathlib import Path

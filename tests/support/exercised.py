@@ -1,7 +1,5 @@
 """The simulated axis: without a bus, and booted on one."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path

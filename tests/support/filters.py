@@ -1,7 +1,5 @@
 """Linear filters and binomial quantiles; `scipy.signal` and `scipy.stats` take a second to load."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

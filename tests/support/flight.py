@@ -1,7 +1,5 @@
 """Samples and a machine for the tests of the flight recorder."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """A gateway in simulated time: daemon, service, outer bus and a PLC-like master on it, in one thread."""
 
-from __future__ import annotations
-
 import math
 import os
 import struct
@@ -269,12 +267,12 @@ def gateway_bench(
         nodes = {axis.name: NODE + place for place, axis in enumerate(service.machine.axes)}
         settings = GatewaySettings(bus=bus, nodes=nodes)
         service.machine = replace(service.machine, gateway=settings)
-        configs = [axis.config for axis in service.machine.axes]
+        axes = [(axis.config, axis.model()) for axis in service.machine.axes]
 
         outer = stack.enter_context(OuterBus(channel))
 
         def gateway() -> Gateway:
-            return Gateway(outer, configs, settings, service.daemon.memory, clock, folder)
+            return Gateway(outer, axes, settings, service.daemon.memory, clock, folder)
 
         plcs = [Plc(channel, clock, period_s, drift_ppm, node, syncs=node == NODE) for node in nodes.values()]
         for plc in plcs:

@@ -3,8 +3,6 @@
 Each happens while the axis follows the master at half its top speed. The true load is observed.
 """
 
-from __future__ import annotations
-
 import errno
 import math
 from collections.abc import Awaitable, Callable

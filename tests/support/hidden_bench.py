@@ -6,8 +6,6 @@ per cent off. Everything in between is what a user has: frames on a python-can b
 ``hdbridge diagnose``, model files.
 """
 
-from __future__ import annotations
-
 import math
 import random
 from collections.abc import Iterator, Sequence

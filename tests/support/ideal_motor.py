@@ -1,7 +1,5 @@
 """A motor without physics, for tests of the drive in front of it."""
 
-from __future__ import annotations
-
 
 class IdealMotor:
     """Follows the demand at once, unless it is ``stuck``; coasts with constant friction."""

@@ -1,7 +1,5 @@
 """Changes of nested mappings by dotted keys, with two underscores for the dot."""
 
-from __future__ import annotations
-
 import copy
 from collections.abc import Mapping
 from typing import Any

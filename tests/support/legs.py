@@ -1,7 +1,5 @@
 """Synthetic legs, joined into a measurement for identification."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Hook that acts as another process does on a file just before this one opens it."""
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager

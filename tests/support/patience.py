@@ -1,7 +1,5 @@
 """Time-out of tests that wait for another thread or process: a bound for hangs, not a measure of speed."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from typing import Final, TypeVar

@@ -5,8 +5,6 @@ holds, sweeps again) at a fine time step. The elastic law is one of several, wit
 through the whole run. Effects are added by formula, encoders are quantised, and slow noise is added.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, field
 from itertools import pairwise

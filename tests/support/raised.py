@@ -1,7 +1,5 @@
 """The article's axis with limits at which its servo filters the correction, and its measured response."""
 
-from __future__ import annotations
-
 import re
 import shutil
 from dataclasses import replace

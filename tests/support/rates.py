@@ -1,7 +1,5 @@
 """Test of a claimed rate against a count."""
 
-from __future__ import annotations
-
 from support.filters import binomial_quantile
 
 CHANCE = 0.01

@@ -6,8 +6,6 @@ bus. Each has a `Bench`. `FURTHER` lists faults that only a daemon can show, eac
 `docs/reliability.md` from the results.
 """
 
-from __future__ import annotations
-
 import json
 import math
 import os

@@ -1,7 +1,5 @@
 """Bench of the daemon for the rows of `reliability`: two axes in motion on virtual time."""
 
-from __future__ import annotations
-
 import errno
 from collections.abc import Iterator
 from contextlib import contextmanager

@@ -1,7 +1,5 @@
 """Whole daemon in its own processes, and the parts of a client that its tests need."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal

@@ -1,7 +1,5 @@
 """Service of the daemon on a stepped control loop: one thread, virtual time, asyncio."""
 
-from __future__ import annotations
-
 import asyncio
 import re
 import shutil

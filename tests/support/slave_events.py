@@ -1,10 +1,8 @@
-"""Random events on one slave, and the laws that hold whatever happens.
+"""Random events on one slave, and the laws that always hold.
 
 The laws look at the motor's demand and at the frames that the master has sent, not at the firmware: no demand
 outside the limits, no motion without a request in the present life of the drive and the master.
 """
-
-from __future__ import annotations
 
 import struct
 from random import Random

@@ -1,7 +1,5 @@
 """Model with a spring of its axis."""
 
-from __future__ import annotations
-
 from hdbridge.axis.model import TransmissionModel
 
 

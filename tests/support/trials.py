@@ -3,8 +3,6 @@
 The plant (plant.py) shares no code with the effects.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Set
 from dataclasses import dataclass
 from typing import Any

@@ -1,7 +1,5 @@
 """Two simulated axes on one virtual bus and one clock, driven by one `BusCycle`."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field

@@ -1,7 +1,5 @@
 """A program that knows nothing of hdbridge but the frames: it moves the simulated drive in lockstep."""
 
-from __future__ import annotations
-
 import shutil
 import struct
 from collections.abc import Iterator

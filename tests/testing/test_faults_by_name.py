@@ -1,6 +1,4 @@
-"""Every fault that `drive.fault` knows, by what a program on the bus then sees."""
-
-from __future__ import annotations
+"""Every fault of `drive.fault`, by its effect on the bus."""
 
 import struct
 from pathlib import Path
@@ -326,11 +324,11 @@ CHECKS = {name: found for name, found in globals().items() if name in FAULTS}
 
 
 @pytest.mark.parametrize("name", FAULTS)
-def test_a_fault_is_made_as_its_row_says(drive, program, name):
+def test_each_fault_is_injected_as_described(drive, program, name):
     CHECKS[name](drive, program)
 
 
-def test_what_is_checked_above_was_asked_for(drive, program):
+def test_without_a_fault_no_symptom_is_seen(drive, program):
     """A drive under way without a fault shows nothing of it."""
     assert tpdos(drive, program, "heartbeat_lost") == [BOTH] * 3
     assert drive.emergencies == ()
@@ -362,21 +360,21 @@ def test_the_drive_lists_its_faults(drive):
         ("lost_tpdo", {"after_s": 1.0, "beyond_deg": 3.0}, "both given"),
     ],
 )  # fmt: skip
-def test_what_is_no_fault_is_refused_with_what_is(drive, name, arguments, complaint):
+def test_unknown_faults_are_refused_with_the_known_ones(drive, name, arguments, complaint):
     with pytest.raises(InputError, match=complaint):
         drive.fault(name, **arguments)
 
 
 @pytest.mark.parametrize("name", ["program_stalls"])
-def test_a_fault_that_the_bus_cannot_have_is_refused(name):
+def test_a_fault_impossible_on_the_bus_is_refused(name):
     with simulated_drive("article", bus="virtual") as drive, pytest.raises(InputError, match="lockstep"):
         drive.fault(name, after_s=0.1)
 
 
-# ------------------------------------------------------------------ when
+# ------------------------------------------------------------------ time and angle of a fault
 
 
-def test_a_fault_comes_at_its_time_and_ends_after_its_time(drive, program):
+def test_a_fault_starts_and_ends_at_its_time(drive, program):
     begin_s = drive.now
     fault = drive.fault("encoder_jump", after_s=0.1, for_s=0.05)
     program.move(100)
@@ -385,7 +383,7 @@ def test_a_fault_comes_at_its_time_and_ends_after_its_time(drive, program):
 
 
 @pytest.mark.parametrize("step", [40, -40])
-def test_a_fault_comes_where_the_load_passes_an_angle(drive, program, step):
+def test_a_fault_starts_at_a_load_angle(drive, program, step):
     here = drive.truth.load_deg
     fault = drive.fault("encoder_glitch", beyond_deg=here + (0.5 if step > 0 else -0.5))
     for _ in range(100):
@@ -395,7 +393,7 @@ def test_a_fault_comes_where_the_load_passes_an_angle(drive, program, step):
     assert drive.truth.load_deg == pytest.approx(here + (0.5 if step > 0 else -0.5), abs=0.1)
 
 
-def test_a_fault_that_waits_can_be_called_off(drive, program):
+def test_a_pending_fault_can_be_cancelled(drive, program):
     fault = drive.fault("cable_pulled", after_s=0.1)
     fault.end()
     fault.end()

@@ -1,7 +1,5 @@
 """The fixture `hdbridge_drive` as a user's pytest has it."""
 
-from __future__ import annotations
-
 import shutil
 import subprocess
 import sys
@@ -42,7 +40,7 @@ def test_pytest_loads_next_to_nothing_for_it():
     assert done.stdout.strip() == "['hdbridge', 'hdbridge.pytest_plugin']"
 
 
-def test_a_drive_with_nothing_said(session):
+def test_a_drive_with_default_options(session):
     session(PASSES).assert_outcomes(passed=1)
     done = session(show("in_process"), "-s")
     done.stdout.fnmatch_lines(["*got True <simulated drive 1, axis 'demo', on virtual: switch on disabled>*"])
@@ -59,7 +57,7 @@ def test_marker_before_command_line_before_ini_file(session, pytester):
     done.stdout.fnmatch_lines(["*got True*'article', on lockstep*"])
 
 
-def test_a_marker_on_the_module_holds_where_the_test_says_nothing(session):
+def test_a_module_marker_gives_defaults(session):
     text = (
         "import pytest\n"
         "pytestmark = pytest.mark.hdbridge_drive(profile='article', bus='lockstep')\n"
@@ -84,7 +82,7 @@ def test_two_tests_have_two_drives(session):
     session(text).assert_outcomes(passed=4)
 
 
-def test_a_twin_is_taken_before_a_truth_and_paths_start_where_they_are_written(session, pytester):
+def test_a_twin_precedes_a_truth_and_paths_are_relative_to_their_origin(session, pytester):
     axis = pytester.mkdir("axes") / "mine"
     shutil.copytree(bundled_profile("demo"), axis)
     marked = "import pytest\n@pytest.mark.hdbridge_drive(profile='axes/mine', bus='lockstep')\n"
@@ -100,7 +98,7 @@ def test_a_twin_is_taken_before_a_truth_and_paths_start_where_they_are_written(s
     done.stdout.fnmatch_lines(["*mine/truth.yaml: no such file, and no twin.yaml beside it*"])
 
 
-def test_what_is_wrong_is_said_in_one_line(session):
+def test_errors_are_one_line(session):
     done = session(PASSES, "--hdbridge-profile", "articel", "--tb", "short")
     done.assert_outcomes(errors=1)
     done.stdout.fnmatch_lines(["hdbridge_drive: articel: no such file*one of: *did you mean 'article'?"])
@@ -119,7 +117,7 @@ def test_a_marker_with_a_wrong_name_is_refused(session, mark, complaint):
     )
 
 
-def test_a_test_that_fails_tells_what_the_drive_went_through(session):
+def test_a_failing_test_prints_the_drives_history(session):
     text = """
         import pytest
 
@@ -146,13 +144,13 @@ def test_a_test_that_fails_tells_what_the_drive_went_through(session):
     )
 
 
-def test_a_wrong_call_is_shown_at_the_tests_own_line(session):
+def test_a_wrong_call_is_reported_at_the_line_of_the_test(session):
     done = session("def test_it(hdbridge_drive):\n    hdbridge_drive.fault('encoder_jmp')\n")
     done.stdout.fnmatch_lines([">*hdbridge_drive.fault('encoder_jmp')", "E *did you mean 'encoder_jump'*"])
     assert "def find" not in done.stdout.str()
 
 
-def test_pytest_tells_of_fixture_marker_and_options(session):
+def test_pytest_lists_fixture_marker_and_options(session):
     session(PASSES, "--fixtures").stdout.fnmatch_lines(
         ["hdbridge_drive*", "*A simulated CiA-402 drive on a bus*"]
     )
@@ -160,7 +158,7 @@ def test_pytest_tells_of_fixture_marker_and_options(session):
     session(PASSES, "--help").stdout.fnmatch_lines(["*--hdbridge-bus=BUS*"])
 
 
-def test_a_program_that_leaves_its_bus_open_does_no_harm(session):
+def test_a_bus_left_open_is_harmless(session):
     text = """
         import can
         import pytest

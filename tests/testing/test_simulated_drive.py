@@ -1,7 +1,5 @@
 """`hdbridge.testing.simulated_drive`: the drive on its buses, its time and its history."""
 
-from __future__ import annotations
-
 import threading
 import time
 from collections import deque
@@ -41,7 +39,7 @@ def test_the_same_seed_gives_the_same_frames():
         ({"truth": "none.yaml"}, "none.yaml"),
     ],
 )
-def test_what_cannot_be_is_refused_in_one_line(choice, complaint):
+def test_impossible_options_are_refused_in_one_line(choice, complaint):
     with pytest.raises(HdbridgeError, match=complaint) as refused, simulated_drive(**choice):
         pass
     assert "\n" not in str(refused.value)
@@ -59,14 +57,14 @@ def test_true_angles_and_their_trace(drive, program):
     assert trace[-1].load_deg - trace[-11].load_deg == pytest.approx(10 * 40 * 360 / 400_000, rel=0.05)
 
 
-def test_true_angles_are_not_what_a_faulty_encoder_says(drive, program):
+def test_true_angles_ignore_encoder_faults(drive, program):
     before = drive.truth.load_deg
     drive.fault("encoder_jump", counts=800_000)
     program.move(3)
     assert drive.truth.load_deg - before < 0.5
 
 
-def test_the_log_has_what_happened_in_order(drive, program):
+def test_the_log_is_in_order(drive, program):
     drive.fault("drive_fault")
     program.move(30)
     drive.note("seen")
@@ -89,7 +87,7 @@ def test_the_log_has_what_happened_in_order(drive, program):
     assert times == sorted(times)
 
 
-def test_the_frames_that_the_drive_saw_and_sent(drive, program):
+def test_frames_seen_and_sent_by_the_drive(drive, program):
     program.cycle()
     seen = [(each.message.arbitration_id, each.sent) for each in drive.frames]
     assert [each for each in seen if each[0] != 0x701][-4:] == [
@@ -109,7 +107,7 @@ def test_nothing_grows_without_bound():
     ]
 
 
-def test_time_of_the_drive_stands_in_for_the_module_time(drive):
+def test_drive_time_replaces_the_time_module(drive):
     begin = drive.time.monotonic(), drive.time.time(), drive.time.perf_counter(), drive.time.monotonic_ns()
     drive.time.sleep(2.0)
     end = drive.time.monotonic(), drive.time.time(), drive.time.perf_counter(), drive.time.monotonic_ns()
@@ -118,7 +116,7 @@ def test_time_of_the_drive_stands_in_for_the_module_time(drive):
     assert drive.now == pytest.approx(2.0)
 
 
-def test_waiting_for_what_does_not_come_ends_with_the_log(drive):
+def test_a_vain_wait_ends_with_the_log(drive):
     drive.note("here")
     with pytest.raises(TimeoutError, match=r"rest did not come about in 2 s\n(.*\n)*.*here"):
         drive.wait_until(lambda: False, timeout_s=2.0, what="rest")
@@ -144,14 +142,14 @@ def test_a_second_thread_in_lockstep_is_refused_with_the_remedy(drive):
         bus.send(can.Message(arbitration_id=0x080, is_extended_id=False))
 
 
-def test_a_bus_is_only_there_with_its_drive():
+def test_a_bus_exists_only_with_its_drive():
     with simulated_drive("article", bus="virtual") as drive:
         interface, channel = drive.interface, drive.channel
     with pytest.raises(can.CanInitializationError, match="no simulated drive has this channel"):
         can.Bus(interface=interface, channel=channel, ignore_config=True)
 
 
-def test_in_real_time_the_drive_lives_by_itself():
+def test_in_real_time_the_drive_runs_on_its_own():
     """Faults, log and filters from any thread; the program blocks in `recv` meanwhile."""
     with simulated_drive("article", bus="virtual") as drive, drive.open_bus() as bus:
         bus.set_filters([{"can_id": 0x081, "can_mask": 0x7FF}])
@@ -189,7 +187,7 @@ def test_two_drives_on_one_bus(bus, second_axis):
             simulated_drive(str(second_axis), beside=one).__enter__()
 
 
-def test_a_second_drive_on_a_bus_of_the_machine_says_how_it_is_put_there():
+def test_a_second_drive_on_a_real_bus_is_refused_with_advice():
     bus = "udp_multicast:239.74.163.10"
     with (
         simulated_drive("article", bus=bus),
@@ -199,7 +197,7 @@ def test_a_second_drive_on_a_bus_of_the_machine_says_how_it_is_put_there():
         pass
 
 
-def test_a_drive_whose_bus_has_failed_is_told_of(monkeypatch):
+def test_a_failed_bus_of_a_drive_is_reported(monkeypatch):
     """Its thread has ended: the test does not go on as if nothing were."""
     monkeypatch.setattr("hdbridge.device.run.PATIENCE_S", 0.0)
 
@@ -216,7 +214,7 @@ def test_a_drive_whose_bus_has_failed_is_told_of(monkeypatch):
         use()
 
 
-def test_an_interface_of_the_machine_is_not_taken_away():
+def test_a_real_interface_is_not_taken_down():
     with (
         simulated_drive("article", bus="udp_multicast:239.74.163.8") as drive,
         pytest.raises(InputError, match="not the drive's to take away"),
@@ -224,7 +222,7 @@ def test_an_interface_of_the_machine_is_not_taken_away():
         drive.fault("bus_down")
 
 
-def test_a_bus_of_the_machine_is_for_one_drive_after_the_other():
+def test_drives_take_turns_on_a_real_bus():
     """As with workers of pytest-xdist on one vcan0: the second waits until the first has ended."""
     bus = "udp_multicast:239.74.163.9"
     order = []

@@ -7,7 +7,7 @@ from pathlib import Path
 TOOL = Path(__file__).parents[2] / "tools" / "compile_tests.py"
 
 
-def test_pytest_takes_what_was_rewritten_before(pytester, monkeypatch):
+def test_pytest_uses_precompiled_tests(pytester, monkeypatch):
     monkeypatch.delenv("PYTHONDONTWRITEBYTECODE", raising=False)
     pytester.makepyfile(test_sum="def test_sum():\n    assert 1 + 1 == 2\n")
     subprocess.run([sys.executable, TOOL, pytester.path], check=True)

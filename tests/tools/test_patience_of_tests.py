@@ -28,7 +28,7 @@ def limits(tree: ast.AST) -> Iterator[int]:
                 yield node.lineno
 
 
-def test_no_test_has_a_limit_of_its_own():
+def test_no_test_has_its_own_time_out():
     found = []
     for path in TESTS.rglob("*.py"):
         name = str(path.relative_to(TESTS))

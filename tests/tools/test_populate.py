@@ -24,7 +24,7 @@ print(sum(page & 1 for page in pages.raw))
     shutil.which("cc") is None or (sys.platform, platform.machine()) != ("linux", "x86_64"),
     reason="needs a C compiler, and Linux on x86-64",
 )
-def test_an_arena_has_its_pages_before_it_is_touched(tmp_path):
+def test_memory_is_populated_before_it_is_touched(tmp_path):
     library = tmp_path / "populate.so"
     subprocess.run(["cc", "-O2", "-shared", "-fPIC", "-o", library, SOURCE], check=True)
 

@@ -1,7 +1,5 @@
 """The diagram of probabilities counts each name once, in the bin of its probability."""
 
-from __future__ import annotations
-
 import re
 
 import pytest
@@ -13,7 +11,7 @@ names = st.lists(st.tuples(st.floats(0.0, 1.0), st.booleans()), min_size=1, max_
 
 
 @given(names)
-def test_every_name_is_counted_once_and_the_score_is_the_mean_square(
+def test_every_name_is_counted_once_and_the_brier_score_is_right(
     pairs: list[tuple[float, bool]],
 ) -> None:
     text = diagram([{"given": chance, "right": right} for chance, right in pairs])

@@ -36,7 +36,7 @@ def run_with(tmp_path: Path):
     return run
 
 
-def test_a_kernel_that_does_not_boot_is_unavailable_and_says_why(run_with) -> None:
+def test_an_unbootable_kernel_is_unavailable_with_a_reason(run_with) -> None:
     done = run_with(linux_uml="echo Kernel panic: no floating point; kill -ABRT $$")
     assert done.returncode == UNAVAILABLE
     assert "Kernel panic: no floating point" in done.stderr
@@ -50,7 +50,7 @@ def test_a_kernel_that_boots_and_then_dies_has_failed(run_with) -> None:
     assert done.returncode == BROKEN
 
 
-def test_a_compiler_that_fails_is_said_and_the_kernel_tried_as_it_is(run_with) -> None:
+def test_a_failing_compiler_is_reported_and_the_kernel_tried_as_is(run_with) -> None:
     done = run_with(cc="echo no such header >&2; exit 1", linux_uml="echo preload=$LD_PRELOAD; exit 1")
     assert done.returncode == UNAVAILABLE
     assert "no such header" in done.stderr
@@ -66,7 +66,7 @@ def test_real_time_priority_is_given_on_request_only(run_with, options, policy) 
     assert f"scheduling policy: {policy}" in done.stderr
 
 
-def test_two_at_once_have_a_processor_each(run_with, tmp_path: Path) -> None:
+def test_two_runs_get_a_processor_each(run_with, tmp_path: Path) -> None:
     if len(os.sched_getaffinity(0)) < 2:
         pytest.skip("this machine has one processor")
     # Each waits for the other, and says where it was with its last words.
@@ -83,7 +83,7 @@ def test_two_at_once_have_a_processor_each(run_with, tmp_path: Path) -> None:
     assert len({each[1] for each in processors if each}) == 2, said
 
 
-def test_to_compute_takes_next_to_no_time_and_an_hour_of_idleness_is_not_waited_for() -> None:
+def test_computing_takes_little_time_and_idle_time_is_skipped() -> None:
     """Time is the guest's own: a machine that takes the processor away does not show in it.
 
     From the command's first moment, before anything has been idle: to count takes the machine a tenth of a

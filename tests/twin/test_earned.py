@@ -100,7 +100,7 @@ STICKS = {"friction's rise at rest": 0.5, "Stribeck speed": 8.0}
         (with_growth(0.0), with_growth(-0.012), warm_and_cold, {"friction growth": -0.012}),
     ],
 )
-def test_a_part_is_taken_in_where_the_axis_has_it(
+def test_a_part_is_added_if_the_axis_has_it(
     start: Truth, axis: Truth, record: Callable[[Truth], Recording], earned: dict[str, float]
 ) -> None:
     with Replays(prepare(record(axis), AXIS, start), 1) as replays:
@@ -112,7 +112,7 @@ def test_a_part_is_taken_in_where_the_axis_has_it(
     assert found.truth.motor.coulomb_nm == pytest.approx(TRUTH.motor.coulomb_nm, rel=0.03)
 
 
-def test_a_torque_limit_is_read_off_where_the_motor_stays_at_it() -> None:
+def test_a_torque_limit_is_read_from_saturation() -> None:
     limited = with_values(TRUTH, {LIMIT: LIMIT_PERCENT})
     begun = start_of(TRUTH, prepare(recorded(limited), AXIS, TRUTH))
     assert begun.servo.torque_limit_percent == pytest.approx(LIMIT_PERCENT, rel=0.01)
@@ -131,7 +131,7 @@ def test_a_torque_limit_is_fitted_where_a_replay_without_it_leaves_more() -> Non
     assert 0.0 < upper - lower < 0.05 * LIMIT_PERCENT
 
 
-def test_a_highest_torque_that_was_all_that_was_needed_is_no_limit() -> None:
+def test_a_peak_torque_is_not_a_limit() -> None:
     with Replays(prepare(recorded(), AXIS, TRUTH), 1) as replays:
         highest_nm = max(float(np.max(np.abs(each.measured["motor torque"]))) for each in replays.data.pieces)
         within = with_values(TRUTH, {LIMIT: 100.0 * highest_nm / TRUTH.motor.rated_torque_nm})
@@ -140,7 +140,7 @@ def test_a_highest_torque_that_was_all_that_was_needed_is_no_limit() -> None:
     assert usual.truth.servo.torque_limit_percent == TRUTH.servo.torque_limit_percent
 
 
-def test_another_law_of_the_loop_is_taken_in_where_the_load_shows_it() -> None:
+def test_another_hysteresis_law_is_adopted_if_the_load_shows_it() -> None:
     dahl = by_each_law(TRUTH)[-1]
     assert dahl.gear.hysteresis is not None
     assert dahl.gear.hysteresis.law == "dahl"
@@ -158,7 +158,7 @@ def test_another_law_of_the_loop_is_taken_in_where_the_load_shows_it() -> None:
         assert value_in(found.truth, BY_NAME[name]) == pytest.approx(value_in(dahl, BY_NAME[name]), rel=0.03)
 
 
-def test_a_loop_that_explains_the_load_stays_as_it_is() -> None:
+def test_a_sufficient_loop_is_unchanged() -> None:
     with Replays(prepare(recorded(), AXIS, TRUTH), 1) as replays:
         assert with_loop(replays, fitted(replays, TRUTH)) is None
 

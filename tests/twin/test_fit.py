@@ -40,7 +40,7 @@ from hdbridge.twin.misfit import Data, Replays, deviation, expected, misfit, pre
 from hdbridge.twin.parameters import BY_NAME, FOLLOWING, coordinates, free_value, with_values
 
 
-def test_what_slopes_would_still_take_is_no_scatter_of_the_legs() -> None:
+def test_remaining_descent_is_not_scatter_of_the_legs() -> None:
     rng = np.random.default_rng(1)
     slopes = rng.standard_normal((600, 1)) + 0.01 * rng.standard_normal((600, 3))  # a valley
     spread, legs = np.full(3, 0.7), np.repeat([0.0, 1.0], 300)
@@ -54,7 +54,7 @@ def test_what_slopes_would_still_take_is_no_scatter_of_the_legs() -> None:
         assert np.all(np.linalg.eigvalsh(covariance / 0.49) < 1.0 + 1e-9), "nor than before the fit"
 
 
-def test_intervals_hold_the_truth_where_one_leg_draws_the_fit_more_than_the_others() -> None:
+def test_intervals_cover_the_truth_with_a_dominant_leg() -> None:
     """Each leg has a value of its own, and one of eight has as much information as four others."""
     legs = np.repeat(np.arange(8.0), 50)
     slopes = np.where(legs == 0.0, 2.0, 1.0)[:, None]
@@ -69,7 +69,7 @@ def test_intervals_hold_the_truth_where_one_leg_draws_the_fit_more_than_the_othe
     assert 0.88 <= np.mean(np.abs(off) < 1.96) <= 0.98
 
 
-def test_what_a_simulation_next_to_unstable_shows_of_one_direction_leaves_the_others_to_the_prior() -> None:
+def test_a_nearly_unstable_simulation_informs_one_direction_only() -> None:
     rng = np.random.default_rng(2)
     slopes = 1e10 * np.outer(rng.standard_normal(200), [1.0, 2.0, -1.0])
     along = principal(slopes, np.full(3, 0.7))
@@ -84,7 +84,7 @@ AXIS = AxisConfig.load(DEMO)
 VISCOUS = with_values(Truth.load(DEMO), {"viscous friction": 5e-4})
 
 
-def test_where_the_weight_is_told_one_way_is_enough_for_friction() -> None:
+def test_with_known_weight_one_direction_suffices_for_friction() -> None:
     """Friction has one sense there; a weight of which nobody knows would be as good a reason for it."""
 
     def one_way(bench: Exercise) -> None:
@@ -105,7 +105,7 @@ def sight(shape: Callable[[Rows], Rows]) -> Callable[[Sequence[Rows]], list[Rows
     return lambda places: [shape(place) for place in places]
 
 
-def test_wide_differences_see_through_what_differs_from_replay_to_replay() -> None:
+def test_wide_differences_average_out_replay_noise() -> None:
     rng = np.random.default_rng(4)
     where, rough = rng.uniform(size=400), 0.2
 
@@ -169,7 +169,7 @@ def test_a_load_feed_forward_that_was_fitted_at_a_wrong_frequency_is_found_at_th
     )
 
 
-def test_a_place_that_leads_back_to_the_same_minimum_is_no_other() -> None:
+def test_a_start_leading_to_the_same_minimum_is_not_another() -> None:
     late = (BY_NAME["servo dead time"],)
     begun = with_values(SPRUNG, {"servo dead time": 1.0})
     with Replays(data(), 1) as replays:
@@ -205,7 +205,7 @@ def fed_forward(truth: Truth) -> float:
         (lambda truth: feedforwards(truth, SPRUNG), fed_forward),
     ],
 )
-def test_a_start_elsewhere_keeps_what_is_known(
+def test_a_start_elsewhere_keeps_known_values(
     places: Callable[[Truth], list[Truth]], kept: Callable[[Truth], float]
 ) -> None:
     found = places(LATE)
@@ -291,7 +291,7 @@ def sweeps(bench: Exercise) -> None:
     bench.hold(0.2)
 
 
-def test_rounding_leads_a_fit_astray_that_takes_it_for_noise_and_no_other() -> None:
+def test_rounding_misleads_only_a_fit_that_treats_it_as_noise() -> None:
     recording = Recording(record_of(TRUTH, sweeps), axis="demo", ratio=50.0)
     true = np.array(coordinates(TRUTH, PARAMETERS))
     data = prepare(recording, AXIS, TRUTH)
@@ -326,7 +326,7 @@ def test_half_the_squares_are_the_loss_of_log_likelihood(half: float, stray: flo
 
 
 @pytest.mark.parametrize("spread", [0.02, 0.1, 0.5, 2.0])
-def test_readings_in_steps_show_how_far_a_simulation_is_off(spread: float) -> None:
+def test_quantised_readings_show_the_simulation_error(spread: float) -> None:
     rng = np.random.default_rng(0)
     angle = rng.uniform(-100.0, 100.0, 4000)
     read = np.round(angle + spread * rng.standard_normal(4000))
@@ -335,7 +335,7 @@ def test_readings_in_steps_show_how_far_a_simulation_is_off(spread: float) -> No
     assert found == pytest.approx(spread, rel=0.15)
 
 
-def test_what_a_reading_is_known_to_be_off_by_is_no_deviation_of_the_others() -> None:
+def test_a_known_offset_of_one_reading_does_not_affect_others() -> None:
     """A third of the readings are of a motor that sticks: where it breaks away no replay can tell."""
     rng = np.random.default_rng(3)
     spread = np.where(np.arange(6000) % 3, 0.0, rng.uniform(0.0, 0.2, 6000))

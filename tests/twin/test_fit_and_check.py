@@ -1,4 +1,4 @@
-"""A twin is fitted to what an axis does, states its certainty, and says what has changed since."""
+"""A twin is fitted to an axis, states its uncertainty, and detects changes."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def test_a_replay_of_the_true_axis_leaves_rounding_and_noise() -> None:
         assert np.median(np.abs(inside)) < 2.0 * floor[name], name
 
 
-def test_a_torque_counts_once_the_motor_has_left_what_was_before_the_recording() -> None:
+def test_torque_counts_after_the_motor_leaves_its_initial_state() -> None:
     data = prepare(recorded(), AXIS, TRUTH)
     travelled_deg = np.cumsum(np.abs(np.diff(recorded().record.motor_position_deg, prepend=0.0)))
     counts = counted(data)["motor torque"]
@@ -92,7 +92,7 @@ def test_a_drawn_recording_is_as_rounded_and_noisy_as_a_measured_one() -> None:
         assert np.std(each[counts]) == pytest.approx(np.sqrt(2.0) * noise_arcsec, rel=0.2)
 
 
-def test_regressions_read_inertia_friction_and_lag_off_the_recording() -> None:
+def test_regressions_estimate_inertia_friction_and_lag() -> None:
     found = read_off(prepare(recorded(), AXIS, TRUTH))
     assert found["load inertia"] == pytest.approx(TRUTH.load_.inertia_kg_m2, rel=0.2)
     assert found["Coulomb friction"] == pytest.approx(TRUTH.motor.coulomb_nm, rel=0.02)
@@ -109,7 +109,7 @@ def test_least_squares_lead_from_wrong_values_to_the_true_ones() -> None:
         assert found == pytest.approx(true, rel=0.03, abs=0.05), each.name
 
 
-def test_a_twin_has_the_noise_of_the_load_encoder_and_says_how_sure_it_is() -> None:
+def test_a_twin_has_encoder_noise_and_uncertainty() -> None:
     known = twin()
     assert known.load_.encoder.noise_arcsec == pytest.approx(TRUTH.load_.encoder.noise_arcsec, rel=0.15)
     for name in NAMES:
@@ -119,7 +119,7 @@ def test_a_twin_has_the_noise_of_the_load_encoder_and_says_how_sure_it_is() -> N
         assert lower <= found <= upper, name
 
 
-def test_a_check_is_silent_where_nothing_has_changed() -> None:
+def test_a_check_is_silent_without_a_change() -> None:
     told = check(recorded(seed=1), AXIS, twin(), workers=1)
     assert told.changes == ()
     # No step comes near the limit, and the demo's friction does not depend on its temperature.
@@ -129,7 +129,7 @@ def test_a_check_is_silent_where_nothing_has_changed() -> None:
     )
 
 
-def test_a_gear_whose_warmth_is_recorded_has_not_changed_by_it() -> None:
+def test_recorded_warmth_is_not_a_change() -> None:
     """A warming by 20 K lowers the friction by a fifth, which matters."""
     grows = TRUTH.temperature.model_copy(update={"friction_growth_per_k": -0.01, "reference_c": 22.0})
     warm = TRUTH.model_copy(update={"temperature": grows.model_copy(update={"start_c": 42.0})})
@@ -140,7 +140,7 @@ def test_a_gear_whose_warmth_is_recorded_has_not_changed_by_it() -> None:
     assert "warmth" not in found.unseen
 
 
-def test_a_check_says_what_a_twin_that_knows_little_would_not_have_shown() -> None:
+def test_a_check_lists_changes_an_uncertain_twin_would_miss() -> None:
     known = twin()
     about = known.provenance["fit"]
     vague = [[1e9 * value for value in row] for row in about["covariance"]]
@@ -163,7 +163,7 @@ def with_torque(recording: Recording, torque: np.ndarray) -> Recording:
 
 
 @pytest.mark.parametrize("seen", [lambda recording: recording, disturbed])
-def test_a_check_names_what_has_changed_and_not_what_a_twin_is_off_by(
+def test_a_check_names_changes_not_misfit(
     seen: Callable[[Recording], Recording],
 ) -> None:
     # Shorter by less than anybody would care for, but with more inertia other rows show it.
@@ -218,7 +218,7 @@ def test_such_a_twin_names_a_change_by_its_ratio() -> None:
 
 
 @pytest.mark.parametrize("twin_of", [twin, replay_only])
-def test_more_misfit_than_when_the_twin_was_made_is_never_nothing(twin_of: Callable[[], Truth]) -> None:
+def test_increased_misfit_is_never_silent(twin_of: Callable[[], Truth]) -> None:
     """A torque that hunts, which no parameter of the simulated drive brings about."""
     recording = recorded(seed=1, count=1)
     torque = recording.record.columns["motor_torque_nm"]
@@ -253,7 +253,7 @@ def test_a_twin_that_leaves_all_of_a_signal_shows_no_change() -> None:
     assert told.sentence == "The twin explains too little of this axis to show a change."
 
 
-def test_what_no_cause_explains_is_no_nothing() -> None:
+def test_unexplained_changes_are_reported() -> None:
     grown = {"following error": 1.1, "motor torque": 21.0, "load error": 242.0}
     told = Check((), grown, grown, ("warmth",))
     assert told.sentence == (
@@ -264,7 +264,7 @@ def test_what_no_cause_explains_is_no_nothing() -> None:
     )
 
 
-def test_a_check_needs_a_twin_that_was_fitted() -> None:
+def test_a_check_needs_a_fitted_twin() -> None:
     with pytest.raises(InputError, match=r"provenance\.fit"):
         check(recorded(), AXIS, TRUTH)
 
@@ -273,7 +273,7 @@ PARAMETERS = free_parameters(TRUTH)
 PRIOR = np.array([each.spread for each in PARAMETERS])
 
 
-def test_what_a_fit_knows_better_than_the_prior_is_as_the_fit_says_and_nothing_worse() -> None:
+def test_the_fit_replaces_the_prior_only_if_better() -> None:
     """Residuals of six legs and sixteen parameters gave 81 in the logarithm of an inertia."""
     rng, size = np.random.default_rng(1), len(PRIOR)
     some = rng.standard_normal((size, size))

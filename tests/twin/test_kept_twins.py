@@ -1,4 +1,4 @@
-"""Twins of a profile: pending until committed, kept, undone; and used wherever an axis is simulated."""
+"""Twins of a profile: pending, committed, rolled back, and used by the simulated axis."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def test_a_twin_is_pending_until_it_is_committed_and_activations_are_undone(prof
     assert store.log(profile) == []
 
 
-def test_what_a_twin_says_reads_back_exactly(profile: Path) -> None:
+def test_twins_read_back_exactly(profile: Path) -> None:
     """With a line for each interval and for each row of the covariance."""
     rows = [[1e-05, -2.5e-07], [-2.5e-07, 0.0400001]]
     fit = {"parameters": ["Coulomb friction", "load inertia"], "covariance": rows, "noise": {}}
@@ -65,7 +65,7 @@ def test_what_a_twin_says_reads_back_exactly(profile: Path) -> None:
     assert sum(each.startswith("motor.coulomb_nm: [0.045") for each in lines) == 1
 
 
-def test_a_twin_that_was_kept_with_a_line_for_each_number_reads_as_before(profile: Path) -> None:
+def test_the_older_twin_layout_is_read(profile: Path) -> None:
     text = KeptTwin(Truth.load(profile)).dump()
     text += "intervals:\n  motor.coulomb_nm:\n    - 0.03\n    - 0.04\n"
     text += "provenance:\n  fit:\n    covariance:\n      -\n        - 0.1\n        - 0.2\n"
@@ -85,7 +85,7 @@ def test_a_twin_of_another_drive_or_gear_is_refused(profile: Path) -> None:
         TWINS.propose(profile, KeptTwin(other.truth.model_copy(update={"gear": gear})), "", DATE)
 
 
-def test_the_simulated_drive_is_the_twin_where_there_is_one(profile: Path) -> None:
+def test_the_simulated_drive_uses_an_existing_twin(profile: Path) -> None:
     data = Truth.load(profile).model_dump(by_alias=True)
     data["motor"]["encoder"]["counts_per_turn"] = 4000
     (profile / "twin.yaml").write_text(KeptTwin(Truth.model_validate(data)).dump())
@@ -105,7 +105,7 @@ def test_the_difference_of_two_twins_has_half_widths(profile: Path) -> None:
     assert "gear.motor_orders[2].amplitude_arcsec" in rows
 
 
-def test_the_model_command_keeps_twins_too(profile: Path) -> None:
+def test_the_model_command_manages_twins(profile: Path) -> None:
     assert "no twin yet" in run_here(profile, "model", "log", profile, "--twin").stdout
     TWINS.propose(profile, twin_of(profile), "made of a recording", DATE)
     assert "coulomb_nm" in run_here(profile, "model", "diff", profile, "--twin").stdout

@@ -66,11 +66,11 @@ def left(truth: Truth, recording: Recording | None = None) -> dict[str, float]:
     return {name: float(np.sqrt(np.mean(np.square(each)))) for name, each in found.items()}
 
 
-def test_another_zero_of_the_command_is_no_following_error() -> None:
+def test_a_command_offset_is_not_a_following_error() -> None:
     assert left(TRUTH, told_by_another_zero())[FOLLOWING] == pytest.approx(left(TRUTH)[FOLLOWING], rel=0.05)
 
 
-def test_a_count_is_no_other_zero() -> None:
+def test_a_count_is_not_a_zero_offset() -> None:
     """A motor may rest so far from its command; in motion it is a following error like any other."""
     data = prepare(told_by_another_zero(1), AXIS, TRUTH)
     counts = np.concatenate([each.counts[FOLLOWING] for each in data.pieces]) > 0.0
@@ -82,7 +82,7 @@ def test_a_count_is_no_other_zero() -> None:
         assert row.difference < 0.1, "motor degrees: two counts"
 
 
-def test_a_motor_that_is_late_says_nothing_of_the_load_error() -> None:
+def test_a_late_motor_does_not_affect_the_load_error() -> None:
     """The load comes along: 3 ms at 600 degrees per second are 130 arcsec of it."""
     late = with_values(TRUTH, {"servo dead time": 3.0})
     assert left(late)[FOLLOWING] > 10.0 * left(TRUTH)[FOLLOWING]
@@ -99,7 +99,7 @@ def test_a_wrong_spring_or_load_stays_in_the_load_error(name: str, factor: float
     assert left(wrong)[LOAD] > 3.0 * left(TRUTH)[LOAD]
 
 
-def test_rest_does_not_scale_what_is_left_in_motion() -> None:
+def test_rest_does_not_scale_residuals_of_motion() -> None:
     """Most of this recording is rest, where hardly anything is left."""
     data = prepare(recorded(), AXIS, TRUTH)
     moving = np.concatenate([each.rest for each in data.pieces]) == 0.0
@@ -109,7 +109,7 @@ def test_rest_does_not_scale_what_is_left_in_motion() -> None:
     assert scales(data, off).deviation[FOLLOWING] > 1.3 * size
 
 
-def test_a_channel_that_a_fit_has_made_worse_counts_as_before() -> None:
+def test_a_worsened_channel_keeps_its_weight() -> None:
     data = prepare(recorded(), AXIS, TRUTH)
     worse = with_values(TRUTH, {"gear stiffness": 0.3 * TRUTH.gear.stiffness_nm_per_rad})
     parameters = (BY_NAME["gear stiffness"],)
@@ -133,7 +133,7 @@ def test_a_small_change_of_a_parameter_changes_the_residuals_by_as_little() -> N
     assert np.linalg.norm(moved[1] - 2.0 * moved[0]) < 0.05 * np.linalg.norm(moved[1])
 
 
-def test_a_motor_that_stands_says_no_torque_and_once_where_the_load_came_to_rest() -> None:
+def test_a_resting_motor_contributes_one_load_residual_and_no_torque() -> None:
     (piece,) = prepare(recorded(), AXIS, TRUTH).pieces
     record = recorded().record
     target, motor = record.motor_target_deg, record.motor_position_deg
@@ -175,7 +175,7 @@ def test_a_motor_sets_out_from_the_torque_that_held_it() -> None:
     assert np.max(np.abs(off)) < 0.1 * np.max(np.abs(before))
 
 
-def test_the_load_counts_at_once_where_the_gear_does_not_remember() -> None:
+def test_without_memory_the_load_counts_at_once() -> None:
     plain = with_values(TRUTH, {})
     gear = plain.gear.model_copy(update={"hysteresis": None, "second_hysteresis": None, "backlash_arcsec": 0})
     for truth, at_once in ((TRUTH, False), (plain.model_copy(update={"gear": gear}), True)):
@@ -224,7 +224,7 @@ def test_a_smooth_replay_is_off_by_as_much_as_is_expected_of_a_drives_steps() ->
     assert off_deg < least.deviation[FOLLOWING] < 4.0 * off_deg
 
 
-def test_noise_in_motion_is_found_whatever_the_motion_is() -> None:
+def test_noise_in_motion_is_estimated_for_any_motion() -> None:
     assert noise_in_motion(noisy("motion")) == pytest.approx(NOISE, rel=0.25)
     # At rest it says nothing of it, and none is less than the rounding.
     assert noise_in_motion(noisy("rest")) == pytest.approx(noise_in_motion(as_measured()), rel=0.1)
@@ -235,7 +235,7 @@ def test_noise_in_motion_is_found_whatever_the_motion_is() -> None:
     assert noise_in_motion(replace(as_measured(), pieces=tuple(still))) == noise_floor(as_measured())
 
 
-def test_what_is_left_within_the_noise_of_the_motion_is_explained() -> None:
+def test_residuals_within_motion_noise_are_explained() -> None:
     data = noisy("motion")
     left = {
         name: np.concatenate(

@@ -68,19 +68,19 @@ def named(axis: Truth, quick: float) -> tuple[tuple[Finding, ...], tuple[Alike, 
     return found, (*sets, *alike(fitted, legs_of_rows(replays.data, fitted_rows(replays.data))))
 
 
-def test_nothing_is_named_where_the_start_was_right() -> None:
+def test_nothing_is_named_for_a_correct_start() -> None:
     found, _ = named(TRUTH, quick=50.0)
     assert found == ()
 
 
-def test_only_what_was_wrong_is_named_where_the_motion_tells() -> None:
+def test_only_wrong_values_are_named_if_the_motion_shows_them() -> None:
     found, sets = named(with_values(TRUTH, {"servo dead time": 1.0, "Coulomb friction": 0.06}), quick=50.0)
     assert {each.cause for each in found} == {"servo dead time", "friction"}
     assert all(each.aliases == () for each in found)
     assert sets == ()
 
 
-def test_a_lag_is_a_set_where_the_motion_does_not_tell_a_dead_time_from_a_filter() -> None:
+def test_dead_time_and_filter_are_a_set_if_inseparable() -> None:
     found, sets = named(with_values(TRUTH, {"servo dead time": 1.0, "Coulomb friction": 0.06}), quick=0.01)
     (lag,) = (each for each in found if each.cause != "friction")
     assert {lag.cause, *lag.aliases} == {"servo dead time", "command filter"}
@@ -99,14 +99,12 @@ def noise(seed: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize(("size", "least", "most"), [(0.01, 0.005, 0.05), (0.5, 1.0, 1.0)])
-def test_a_change_below_the_noise_is_told_as_seldom_as_a_false_alarm_may_be(
-    size: float, least: float, most: float
-) -> None:
+def test_changes_below_the_noise_keep_the_false_alarm_rate(size: float, least: float, most: float) -> None:
     told = [told_apart(noise(seed), size * CHANGE, LEG_OF_ROW) for seed in range(400)]
     assert least <= np.mean(told) <= most
 
 
-def test_residuals_that_go_together_within_a_leg_hide_a_change_that_white_noise_would_show() -> None:
+def test_correlated_residuals_hide_changes_that_white_noise_would_show() -> None:
     """In each leg they are as large as the change, of a sign of its own; white ones are as large in all."""
     change = 0.5 * CHANGE
     signs = np.random.default_rng(3).choice([-1.0, 1.0], 12)
@@ -116,7 +114,7 @@ def test_residuals_that_go_together_within_a_leg_hide_a_change_that_white_noise_
     assert told_apart(white, change, LEG_OF_ROW)
 
 
-def test_a_rival_that_leaves_less_is_not_told_apart() -> None:
+def test_a_better_rival_is_reported_as_inseparable() -> None:
     assert not told_apart(CHANGE, -CHANGE, LEG_OF_ROW)
 
 

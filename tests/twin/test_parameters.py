@@ -1,4 +1,4 @@
-"""The table of what a twin may change."""
+"""The table of a twin's adjustable parameters."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def test_a_section_that_a_parameter_needs_is_as_good_as_none() -> None:
     assert with_sections(DEMO, PARAMETERS) is DEMO
 
 
-def test_a_section_that_is_not_there_has_no_value() -> None:
+def test_a_missing_section_has_no_value() -> None:
     bare = DEMO.model_copy(update={"servo": DEMO.servo.model_copy(update={"load_feedforward": None})})
     assert value_in(bare, BY_NAME["load feed-forward"]) is None
 

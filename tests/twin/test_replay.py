@@ -37,10 +37,9 @@ from hdbridge.twin.replay import (
     continuous,
     counted_cycles,
     doubts,
-    held_rows,
     legs_of,
     replay,
-    stands,
+    standing,
     stretches,
     unknown_rows,
 )
@@ -145,7 +144,7 @@ def test_a_part_begins_as_warm_as_it_was_recorded() -> None:
     assert np.median(apart) > 0.1 * truth.motor.coulomb_nm
 
 
-def test_without_a_command_there_is_nothing_to_replay() -> None:
+def test_a_recording_without_commands_is_refused() -> None:
     axis, truth = demo()
     time_s = np.arange(10) * 0.004
     record = Record({"time_s": time_s, "motor_position_deg": time_s, "load_position_deg": time_s})
@@ -215,7 +214,7 @@ def recorded() -> Recording:
     return Recording(record_of(TRUTH, moves), axis="demo", ratio=50.0)
 
 
-def test_two_processes_give_what_one_gives() -> None:
+def test_two_processes_give_the_same_result() -> None:
     truths = [with_values(TRUTH, {"Coulomb friction": each}) for each in (0.034, 0.05)]
     data = prepare(recorded(), AXIS, TRUTH)
     with Replays(data, 1) as alone, Replays(data, 2) as together:
@@ -264,7 +263,7 @@ def test_rows_are_counted_whatever_their_stamps_are_late_by(late: dict[int, floa
     assert found == pytest.approx(cycles[kept])
 
 
-def test_rows_that_follow_no_cycle_stay_where_they_are() -> None:
+def test_rows_off_any_cycle_are_kept() -> None:
     rng = np.random.default_rng(0)
     time_s = np.cumsum(rng.uniform(0.002, 0.006, 400))
     assert counted_cycles(time_s, 0.004) == pytest.approx((time_s - time_s[0]) / 0.004)
@@ -277,7 +276,7 @@ def record_at(time_s: np.ndarray, target: np.ndarray, motor: np.ndarray | None =
                    "load_position_deg": motor / 50.0})  # fmt: skip
 
 
-def test_legs_of_a_bare_record_are_cut_where_its_command_sets_out(bare: Record) -> None:
+def test_legs_of_a_bare_record_start_with_each_move(bare: Record) -> None:
     legs = legs_of(Recording(bare, axis="demo", ratio=50.0))
     assert len(legs) == 5
     assert (legs[0].start_s, legs[-1].end_s) == (bare.time_s[0], bare.time_s[-1])
@@ -326,7 +325,7 @@ def test_a_leg_is_a_motion(time_s: np.ndarray, angle: np.ndarray, spans: list[tu
         ),
     ],
 )
-def test_a_wrong_torque_or_a_late_command_is_noticed(
+def test_a_wrong_torque_or_a_late_command_is_detected(
     bare: Record, name: str, wrong: Callable[[np.ndarray], np.ndarray], says: str | None
 ) -> None:
     recording = Recording(Record({**bare.columns, name: wrong(bare.columns[name])}), axis="demo", ratio=50.0)
@@ -349,14 +348,31 @@ def moved_twice(creeps_deg: float) -> tuple[Record, np.ndarray]:
 
 
 @pytest.mark.parametrize(("creeps_deg", "count"), [(COUNT_DEG, 5), (100.0 * COUNT_DEG, 1)])
-def test_a_standing_motor_tells_its_torque_again_and_again_and_at_last(creeps_deg: float, count: int) -> None:
+def test_a_resting_motor_reports_torque_repeatedly(creeps_deg: float, count: int) -> None:
     """The integral goes on meanwhile: what it comes to at the end may be after the motor broke away."""
     record, moved = moved_twice(creeps_deg)
-    held = held_rows(record, moved, stands(moved, record.motor_position_deg, 1.5 * COUNT_DEG))
+    _, still, held = standing(record, COUNT_DEG)
+    assert still[held].all()
     assert held[-1] == 99, "the last row of the rest"
     assert np.all(np.abs(np.diff(record.time_s[held[:-1]]) - HELD_S) < 1.5 * CYCLE_S)
     assert len(held) == count
     assert not moved[held].any()
+
+
+def test_a_standing_motor_is_held_by_its_recorded_torque_in_the_replay_that_judges_a_twin() -> None:
+    """Soft loops that have not settled would wind up, and begin the next motion with another torque."""
+    rests = record_of(
+        TRUTH, lambda bench: [bench.move(40.0, 300.0, 3000.0), bench.hold(1.0), bench.move(9.0, 90.0, 900.0)]
+    )
+    servo = TRUTH.servo.model_copy(
+        update={"position_gain_per_s": 8.0, "integral_of": "position", "integral_time_ms": 45.0}
+    )
+    soft = TRUTH.model_copy(update={"servo": servo})
+    again = replay(Recording(rests, axis="demo", ratio=50.0), AXIS, soft)
+    *_, held = standing(rests, COUNT_DEG)
+    off_nm = (again.columns["motor_torque_nm"] - rests.columns["motor_torque_nm"])[held]
+    assert len(held) > 5
+    assert np.max(np.abs(off_nm)) < 0.1 * TRUTH.motor.coulomb_nm
 
 
 def ended_in_motion(first_s: float, then_s: float) -> Record:
@@ -376,7 +392,7 @@ def test_a_load_rings_as_long_after_an_unknown_stop_however_short_the_procedure_
     assert unknown[record.starts[1] :].all()
 
 
-def test_no_more_of_a_recording_is_unknown_than_it_can_do_without() -> None:
+def test_the_unknown_start_of_a_recording_is_bounded() -> None:
     unknown = unknown_rows(ended_in_motion(1.0, 1.2), COUNT_DEG)
     assert np.mean(unknown) == pytest.approx(LARGEST_UNKNOWN, abs=0.02)
 

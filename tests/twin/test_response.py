@@ -91,7 +91,7 @@ def test_a_command_at_rest_is_followed_without_any_response() -> None:
     assert response.demand_counts == response.torque_nm == 0.0
 
 
-def test_what_a_servo_leaves_is_taken_over_by_a_response_that_held_out_legs_confirm() -> None:
+def test_a_response_confirmed_by_held_out_legs_is_adopted() -> None:
     with Replays(foreign(), 1) as replays:
         fitted = found_at(replays, TRUTH)
         better = with_response(replays, fitted)

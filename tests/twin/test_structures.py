@@ -94,9 +94,7 @@ def shares(other: Recording, axis: AxisConfig, truth: Truth) -> dict[str, float]
 
 @pytest.mark.parametrize("cycle_ms", [1.0, 4.0])
 @pytest.mark.parametrize("dead_time_ms", [0.5, 15.0])
-def test_a_start_has_the_lag_that_was_read_off_and_a_dead_time_that_is_possible(
-    cycle_ms: float, dead_time_ms: float
-) -> None:
+def test_a_start_uses_the_measured_lag_and_a_feasible_dead_time(cycle_ms: float, dead_time_ms: float) -> None:
     usual = default_truth(AxisConfig.load(Path(__file__).parents[2] / "profiles" / "demo"))
     late = with_values(usual, {"servo dead time": dead_time_ms, "command filter": 2.0})
     for truth, parameters in starts(late, cycle_ms):

@@ -1,4 +1,4 @@
-"""Thermal constants are learned from a warm-up, and stay as they were where nothing shows them."""
+"""Thermal constants are learned from a warm-up and otherwise unchanged."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ def test_constants_that_are_off_by_factors_are_learned_from_a_warm_up(seed: int)
     assert after.temperature.resistance_k_per_w == pytest.approx(HEATS[seed].resistance_k_per_w, rel=0.15)
 
 
-def test_seconds_leave_them_as_they_were_and_say_so() -> None:
+def test_seconds_of_motion_leave_thermal_constants_unchanged() -> None:
     heat = TrueTemperature(ambient_c=23.0, resistance_k_per_w=2.0, time_constant_s=600.0, copper_loss_w=5.0)
     recording = warmed(heat, 0, 0.1, rests=0.0)
     after, told = with_warmth(recording, AXIS, fitted(recording), TRUTH)
@@ -102,7 +102,7 @@ def test_seconds_leave_them_as_they_were_and_say_so() -> None:
         assert lower < 0.5 * usual < 2.0 * usual < upper, each.name
 
 
-def test_what_happened_between_two_parts_is_not_guessed() -> None:
+def test_the_time_between_parts_is_not_guessed() -> None:
     """Two parts of a warm-up that follow by one row when put together: the second has its own reading."""
     whole = warmed(HEATS[0], 2, 12.0).record
     parts = [Recording(whole.rows(0, len(whole) // 3)), Recording(whole.rows(len(whole) // 2, len(whole)))]
@@ -112,13 +112,13 @@ def test_what_happened_between_two_parts_is_not_guessed() -> None:
     assert lower <= HEATS[0].time_constant_s <= upper
 
 
-def test_without_the_temperature_a_truth_stays_what_it_is() -> None:
+def test_without_temperature_the_truth_is_unchanged() -> None:
     recording = warmed(HEATS[0], 0, 0.3, rests=0.0)
     columns = {name: each for name, each in recording.record.columns.items() if name != "temperature_c"}
     assert with_warmth(Recording(Record(columns)), AXIS, fitted(recording), TRUTH) == (TRUTH, None)
 
 
-def test_what_grows_with_the_warmth_does_so_from_where_it_did() -> None:
+def test_warmth_dependent_terms_keep_their_reference() -> None:
     """Its reference was the ambient temperature, which has become another one."""
     grows = TRUTH.temperature.model_copy(update={"friction_growth_per_k": -0.01})
     start = TRUTH.model_copy(update={"temperature": grows})

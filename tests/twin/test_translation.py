@@ -1,4 +1,4 @@
-"""Models as truth files: the simulated drive then errs as the model says."""
+"""Models as truth files: the simulated drive errs like the model."""
 
 from __future__ import annotations
 
@@ -297,7 +297,7 @@ def test_a_loop_in_which_the_load_lags_is_friction_at_the_load(law: type[effects
     assert translation.truth.load_.presliding
 
 
-def test_what_the_plant_cannot_do_is_said() -> None:
+def test_effects_beyond_the_plant_are_reported() -> None:
     parts = (
         effects.Synchronous(
             orders=(*ORDERS, effects.MotorOrder(order=600, amplitude_arcsec=1.0, phase_deg=0.0))
@@ -314,7 +314,7 @@ def test_what_the_plant_cannot_do_is_said() -> None:
         assert rows[name].note
 
 
-def test_a_stage_of_the_spring_that_no_torque_reaches_is_left_out() -> None:
+def test_unreachable_spring_stages_are_omitted() -> None:
     """A diagnosis names a linear spring so: the other stages begin beyond any torque."""
     linear = effects.Compliance(
         c1_arcsec_per_nm=31.0,
@@ -330,7 +330,7 @@ def test_a_stage_of_the_spring_that_no_torque_reaches_is_left_out() -> None:
     assert [row.note for row in made.rows] == [""]
 
 
-def test_of_an_effect_of_ones_own_it_is_said_that_it_has_no_counterpart() -> None:
+def test_custom_effects_without_counterpart_are_reported() -> None:
     class Draught(effects.Synchronous):
         """Not of the catalogue."""
 
@@ -360,7 +360,7 @@ def test_any_effect_makes_a_plant_that_moves(name: str, data: st.DataObject) -> 
     assert abs(machine.true_load_deg) < 1.0
 
 
-def test_what_the_model_does_not_speak_of_stays_as_it_was_given() -> None:
+def test_values_outside_the_model_are_unchanged() -> None:
     given = Truth.load(PROFILE)
     translation = translate(AXIS, TransmissionModel(N, BASIC), given)
     truth = translation.truth

@@ -82,7 +82,7 @@ def figures(told: dict[str, Any], which: str) -> dict[str, dict[str, Any]]:
     return {each["channel"]: each for each in told[which]["figures"] if each["kind"] == "all"}
 
 
-def test_what_the_simulation_gets_wrong_is_told_channel_by_channel(profile: Path, recording: Path) -> None:
+def test_simulation_errors_are_reported_by_channel(profile: Path, recording: Path) -> None:
     done = run_here(
         profile, "twin", profile, recording, "--compare", "--json", "told.json", "--html", "page.html"
     )
@@ -104,7 +104,7 @@ def test_what_the_simulation_gets_wrong_is_told_channel_by_channel(profile: Path
     assert f"hdbridge calibrate {profile}" in done.stderr
 
 
-def test_an_active_model_says_how_the_simulation_errs(profile: Path, recording: Path) -> None:
+def test_the_active_model_explains_the_simulation_error(profile: Path, recording: Path) -> None:
     run_here(profile, "twin", profile, recording, "--compare", "--json", "without.json")
     orders = tuple(MotorOrder(order=k, amplitude_arcsec=30.0, phase_deg=0.0) for k in (2, 5))
     loop = Hysteresis(offset_arcsec=31.5, width_deg=26.0, exponent=1.72)
@@ -133,7 +133,7 @@ def test_an_active_model_says_how_the_simulation_errs(profile: Path, recording: 
         (("--html", "recording.csv", "nowhere"), "no such file"),
     ],
 )
-def test_what_makes_no_sense_is_refused(
+def test_invalid_options_are_refused(
     profile: Path, recording: Path, options: tuple[str, ...], complaint: str
 ) -> None:
     done = run_here(profile, "twin", profile, recording, *options)
@@ -199,9 +199,7 @@ def run(profile: Path, recording: Path, monkeypatch: pytest.MonkeyPatch) -> Run:
     return run
 
 
-def test_a_twin_that_is_better_is_kept_as_pending_with_all_that_is_known(
-    profile: Path, recording: Path, run: Run
-) -> None:
+def test_a_better_twin_is_kept_as_pending(profile: Path, recording: Path, run: Run) -> None:
     said, told, page = run(fitted(Truth.load(DEMO)))
     assert "friction: Coulomb friction 0.068 -> 0.034 Nm" in said
     assert "unexplained: motor torque is left with 2.5 times its noise" in said
@@ -217,7 +215,7 @@ def test_a_twin_that_is_better_is_kept_as_pending_with_all_that_is_known(
     assert "model commit" in page
 
 
-def test_a_twin_that_is_no_better_is_not_kept(profile: Path, run: Run) -> None:
+def test_a_twin_without_improvement_is_not_kept(profile: Path, run: Run) -> None:
     said, told, page = run(fitted(Truth.load(profile)))
     assert "not kept" in said
     assert "Coulomb friction" not in said, "nothing is known of it"
@@ -228,7 +226,7 @@ def test_a_twin_that_is_no_better_is_not_kept(profile: Path, run: Run) -> None:
     assert not (profile / "pending-twin.yaml").exists()
 
 
-def test_values_that_are_not_the_axis_s_are_offered_as_a_replay_only(profile: Path, run: Run) -> None:
+def test_values_fitting_the_replay_only_are_offered_as_such(profile: Path, run: Run) -> None:
     said, told, page = run(fitted(Truth.load(DEMO), "replay", 22.0))
     headline = (
         "The twin replays this drive (motor torque to 4 %), but its values are not the axis's: motor torque "
@@ -248,7 +246,7 @@ def test_values_that_are_not_the_axis_s_are_offered_as_a_replay_only(profile: Pa
     assert pending.intervals == {}
 
 
-def test_values_that_no_axis_has_are_refused(profile: Path, run: Run) -> None:
+def test_implausible_values_are_refused(profile: Path, run: Run) -> None:
     demo = Truth.load(DEMO)
     for values, complaint in (
         ({"friction feed-forward": 3.0}, "friction feed-forward 3 Nm; expected at most the friction"),

@@ -4,15 +4,12 @@ from hdbridge.axis.effects.amplitude_drift import AmplitudeDrift
 from hdbridge.axis.effects.backlash import Backlash
 from hdbridge.axis.effects.base import (
     MEASURED,
-    SLOT,
-    BoolArray,
     Cause,
     Channel,
     Compensable,
     Effect,
     Experiment,
     FloatArray,
-    IntArray,
     Moment,
     Motion,
     Moves,
@@ -22,11 +19,10 @@ from hdbridge.axis.effects.base import (
     Sought,
     Start,
     Tracker,
-    readings,
     unmet,
 )
 from hdbridge.axis.effects.basic import BASIC, USUAL_LOOP, is_ripple, ripple
-from hdbridge.axis.effects.carried import Loop, loop_of, orders_of
+from hdbridge.axis.effects.carried import Loop
 from hdbridge.axis.effects.channel_skew import ChannelSkew
 from hdbridge.axis.effects.combine import compensable, conflicts, extended, fall_bound, in_place, refreshed
 from hdbridge.axis.effects.compliance import Compliance
@@ -41,6 +37,7 @@ from hdbridge.axis.effects.inertial_windup import InertialWindup
 from hdbridge.axis.effects.kinematics import Observer, moments
 from hdbridge.axis.effects.load_order import LoadOrders
 from hdbridge.axis.effects.local_defect import LocalDefect
+from hdbridge.axis.effects.motion import BoolArray, IntArray, readings
 from hdbridge.axis.effects.motor_encoder_eccentricity import MotorEncoderEccentricity
 from hdbridge.axis.effects.motor_order import MotorOrders
 from hdbridge.axis.effects.orders import MotorOrder
@@ -123,10 +120,8 @@ def aliases_of(name: str) -> tuple[str, ...]:
 
 
 __all__ = [
-    "BASIC",
     "CATALOGUE",
     "MEASURED",
-    "SLOT",
     "USUAL_LOOP",
     "AmplitudeDrift",
     "Backlash",
@@ -184,9 +179,7 @@ __all__ = [
     "fall_bound",
     "in_place",
     "is_ripple",
-    "loop_of",
     "moments",
-    "orders_of",
     "readings",
     "refreshed",
     "register",

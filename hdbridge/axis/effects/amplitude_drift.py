@@ -1,10 +1,8 @@
 """Temperature dependence of ripple and friction."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any, ClassVar, Self
 
 import numpy as np
 from pydantic import Field
@@ -81,7 +79,7 @@ class AmplitudeDrift(Linear, Warmed):
     ]
 
     @classmethod
-    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[AmplitudeDrift]:
+    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[Self]:
         """Yields effects driven by temperature if it changes, else by time."""
         if has_orders(base) and has_loop(base):
             for driven_by, tau_s in cls.lags(observations):
@@ -116,7 +114,7 @@ class AmplitudeDrift(Linear, Warmed):
             each._counted(told) if isinstance(each, AmplitudeDrift) else told.counted(each) for each in now
         )
 
-    def _counted(self, told: Told) -> AmplitudeDrift:
+    def _counted(self, told: Told) -> Self:
         return self.model_copy(
             update={
                 "ripple_percent_per_k": self.ripple_percent_per_k * told.per_ripple,

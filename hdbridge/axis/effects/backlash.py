@@ -1,7 +1,5 @@
 """Dead zone behind the gear: a loose key, a worn coupling, a gear stage on the output."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from typing import Annotated, ClassVar, Self
 
@@ -79,7 +77,7 @@ class Backlash(Linear):
         return cls(gap_arcsec=gap_arcsec, crossing_deg=_crossing_deg(gap_arcsec, ratio, softness))
 
     @classmethod
-    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[Backlash]:
+    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[Self]:
         """Yields gaps from a hard contact to a soft one."""
         yield from (cls(gap_arcsec=1.0, crossing_deg=each) for each in (0.05, 0.15, 0.4, 1.0, 2.5, 6.0))
 

@@ -40,15 +40,12 @@ from hdbridge.axis.effects.motion import (
     AT_REST,
     MEASURED,
     SLOT,
-    BoolArray,
     Channel,
     FloatArray,
-    IntArray,
     Moment,
     Motion,
     Start,
     missing_error,
-    readings,
 )
 from hdbridge.axis.effects.observations import Observations
 from hdbridge.axis.effects.tracker import Level, Memoryless, Tracker
@@ -59,7 +56,6 @@ __all__ = [
     "MEASURED",
     "SLOT",
     "Angleless",
-    "BoolArray",
     "Cause",
     "Channel",
     "Coefficient",
@@ -68,7 +64,6 @@ __all__ = [
     "Effect",
     "Experiment",
     "FloatArray",
-    "IntArray",
     "Level",
     "Linear",
     "Memoryless",
@@ -83,7 +78,6 @@ __all__ = [
     "Stretch",
     "Tracker",
     "missing_error",
-    "readings",
     "unmet",
 ]
 

@@ -1,7 +1,5 @@
 """The two basic parts of every calibrated model: motor-synchronous ripple and elastic loop."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from typing import Final
 

@@ -5,8 +5,6 @@ tracked and read on its own, it carries a copy of the part that it modulates, ta
 created; `combine.refreshed` keeps the copy up to date.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from typing import Annotated
 

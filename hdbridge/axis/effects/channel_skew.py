@@ -1,7 +1,5 @@
 """Time skew between the samples of the two encoders."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Annotated, Any, ClassVar, Self
 
@@ -94,7 +92,7 @@ class ChannelSkew(Angleless, Linear):
         return cls(ratio=ratio, delay_ms=delay_ms, second_order_ms2=delay_ms * delay_ms)
 
     @classmethod
-    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[ChannelSkew]:
+    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[Self]:
         yield cls(ratio=observations.ratio, delay_ms=1.0, second_order_ms2=1.0)
 
     def columns(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:

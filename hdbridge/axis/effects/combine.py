@@ -2,8 +2,6 @@
 compensable effects.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable
 

@@ -1,7 +1,5 @@
 """Wind-up of the gear by the load torque: a spring that stiffens at two torques."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import pairwise
 from typing import Annotated, Any, ClassVar, Literal, Self
@@ -101,7 +99,7 @@ class Compliance(Angleless, Linear):
         return self
 
     @classmethod
-    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[Compliance]:
+    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[Self]:
         """Yields a linear spring, and springs that stiffen once or twice within the torques of the record."""
         largest = top(observations.motion, Channel.LOAD_TORQUE)
         if largest:

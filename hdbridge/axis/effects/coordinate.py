@@ -1,10 +1,8 @@
 """Quantities along a motion that an error may depend on: for plots, and for unexplained residuals."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from enum import Enum
-from typing import Final
+from typing import Final, Self
 
 import numpy as np
 
@@ -51,7 +49,7 @@ class Coordinate:
         """Name and unit, for a plot axis."""
         return f"{self.name}, {self.unit}" if self.unit else self.name
 
-    def at(self, rows: BoolArray | IntArray) -> Coordinate:
+    def at(self, rows: BoolArray | IntArray) -> Self:
         """Returns the coordinate at some of the samples."""
         return replace(self, values=self.values[rows])
 

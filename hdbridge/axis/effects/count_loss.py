@@ -1,7 +1,5 @@
 """Counts lost by an encoder, or a tooth jumped: a persistent step at one time."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Annotated, Any, ClassVar, Self
 
@@ -77,7 +75,7 @@ class CountLoss(Angleless):
     ]
 
     @classmethod
-    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[CountLoss]:
+    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[Self]:
         """Yields one step in the middle of the record, as an example."""
         if observations.motion.time_s is not None:
             middle = float(np.quantile(observations.motion.time_s, 0.5))

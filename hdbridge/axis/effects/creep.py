@@ -1,7 +1,5 @@
 """Creep: slow relaxation of strain after a stop."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Annotated, Any, ClassVar, Self
@@ -93,7 +91,7 @@ class Creep(Angleless):
     ] = 1.0
 
     @classmethod
-    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[Creep]:
+    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[Self]:
         """Yields single exponentials; those found are combined afterwards."""
         for tau_s in (0.3, 1.0, 3.0, 10.0, 30.0, 100.0):
             for build_up in (0.03, 0.3, 1.0):

@@ -1,7 +1,5 @@
 """Descriptive tables of an effect: texts, shape parameters, and its part in a model."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field

@@ -1,10 +1,8 @@
 """Shift of the synchronous part with the direction of travel, because other tooth flanks carry."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any, ClassVar, Self
 
 import numpy as np
 from pydantic import Field
@@ -74,7 +72,7 @@ class DirectionPhase(Linear):
     ]
 
     @classmethod
-    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[DirectionPhase]:
+    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[Self]:
         """Yields a start at zero shift."""
         if has_orders(base):
             yield cls(orders=orders_of(base), shift_deg=0.0)

@@ -9,8 +9,6 @@ gear's own slope, 3600 / N arcsec per motor degree. Just after a reversal the fo
 inverse uses a slope that it can invert (`gentle_tracker`).
 """
 
-from __future__ import annotations
-
 import math
 from abc import abstractmethod
 from collections.abc import Mapping

@@ -1,9 +1,7 @@
 """Orders of the wave generator relative to the flexspline, which turns backwards."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Self
 
 import numpy as np
 
@@ -38,7 +36,7 @@ class FlexsplineOrders(OrderSeries):
     ratio: Ratio
 
     @classmethod
-    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[FlexsplineOrders]:
+    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[Self]:
         """Yields orders 1 to 8 one by one; those found are combined afterwards."""
         ratio = observations.ratio
         for number in missing_orders(cls(ratio=ratio, orders=orders_from(range(1, 9))), base):

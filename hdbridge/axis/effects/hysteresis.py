@@ -13,10 +13,8 @@ For 1 < n <= 2 the slope at the reversal is infinite, so a measured, quantised a
 input: one encoder count of chatter is several arcseconds. Drive it with the command.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
-from typing import ClassVar
+from typing import ClassVar, Self
 
 import numpy as np
 
@@ -57,7 +55,7 @@ class Hysteresis(ElasticLoop):
     )
 
     @classmethod
-    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[Hysteresis]:
+    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[Self]:
         """Yields a narrow, a typical and a wide loop for a model without one."""
         if all(each.part is not Part.LOOP for each in base):
             for width in (3.0, 20.0, 60.0):

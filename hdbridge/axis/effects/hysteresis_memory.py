@@ -17,12 +17,10 @@ width.
 infinitely steeply where the plain law rises, and would have to repeat the plain law's parameters.
 """
 
-from __future__ import annotations
-
 import math
 from bisect import bisect_left
 from collections.abc import Iterator, Sequence
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple, Self
 
 import numpy as np
 
@@ -62,14 +60,14 @@ class HysteresisMemory(ElasticLoop):
         return _MemoryTracker(self.offset_arcsec, width_deg, self.exponent, start, steepest)
 
     @classmethod
-    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[HysteresisMemory]:
+    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[Self]:
         """Yields the model's plain loop under this law."""
         for each in base:
             if isinstance(each, Hysteresis):
                 yield cls(**each.parameters())
 
     @classmethod
-    def of_change(cls, before: Effect, now: Effect) -> HysteresisMemory | None:
+    def of_change(cls, before: Effect, now: Effect) -> Self | None:
         return now if isinstance(now, cls) and not isinstance(before, cls) else None
 
     @classmethod

@@ -1,7 +1,5 @@
 """Changed elastic loop: another offset, width or exponent than in the model."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Annotated, Any, ClassVar, Self
@@ -62,7 +60,7 @@ class HysteresisParameters(Effect):
     exponent: Annotated[float, Field(gt=1, le=6, description="new exponent")]
 
     @classmethod
-    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[HysteresisParameters]:
+    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[Self]:
         """Yields the model's loop with a larger width."""
         if any(each.part is Part.LOOP for each in base):
             loop = loop_of(base)
@@ -70,7 +68,7 @@ class HysteresisParameters(Effect):
             yield cls(base=loop, **now)
 
     @classmethod
-    def of_change(cls, before: Effect, now: Effect) -> HysteresisParameters | None:
+    def of_change(cls, before: Effect, now: Effect) -> Self | None:
         if before.part is not Part.LOOP or not isinstance(now, type(before)):
             return None
         return cls(base=loop_of([before]), **loop_of([now]).model_dump(exclude={"memory"}))

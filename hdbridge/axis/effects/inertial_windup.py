@@ -1,9 +1,7 @@
 """Wind-up of the gear by the load's own inertia during acceleration."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any, ClassVar, Self
 
 import numpy as np
 from pydantic import Field
@@ -64,7 +62,7 @@ class InertialWindup(Angleless, Linear):
     ] = 1e6
 
     @classmethod
-    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[InertialWindup]:
+    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[Self]:
         yield cls(ratio=observations.ratio, inertia_over_stiffness_s2=1e-5)
 
     def columns(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:

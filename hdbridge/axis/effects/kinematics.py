@@ -12,8 +12,6 @@ correction into the next. If a record has a better speed (from the procedure, or
 encoder), `Motion` holds it and it is used directly.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import numpy as np

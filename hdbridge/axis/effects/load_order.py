@@ -2,11 +2,9 @@
 the spline.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 from pydantic import Field
 
@@ -68,7 +66,7 @@ class LoadOrders(OrderSeries):
     ] = "unknown"
 
     @classmethod
-    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[LoadOrders]:
+    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[Self]:
         """Yields orders 1 to 4 one by one; those found are combined afterwards."""
         ratio = observations.ratio
         for number in missing_orders(cls(ratio=ratio, orders=orders_from(range(1, 5))), base):

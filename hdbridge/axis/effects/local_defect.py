@@ -1,11 +1,9 @@
 """Bump at one load angle: a damaged tooth."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any, ClassVar, Self
 
 import numpy as np
 from pydantic import Field
@@ -83,7 +81,7 @@ class LocalDefect(Linear):
     ]
 
     @classmethod
-    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[LocalDefect]:
+    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[Self]:
         """Yields a tooth in the middle of the travel, as an example."""
         load = float(np.median(observations.motion.motor_deg)) / observations.ratio
         yield cls(

@@ -1,7 +1,5 @@
 """Motion of an axis as input of effects: channels, motions of whole records, moments of a control loop."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import Enum

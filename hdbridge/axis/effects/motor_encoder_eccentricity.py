@@ -1,9 +1,7 @@
 """Eccentricity of the motor encoder disc, whose reading error becomes a real motor position error."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Self
 
 from hdbridge.axis.effects.base import Cause, Compensable, Effect, Observations, Part
 from hdbridge.axis.effects.orders import OrderSeries, orders_from
@@ -39,14 +37,12 @@ class MotorEncoderEccentricity(OrderSeries):
     """Eccentricity and tilt."""
 
     @classmethod
-    def proposals(
-        cls, observations: Observations, base: Sequence[Effect]
-    ) -> Iterator[MotorEncoderEccentricity]:
+    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[Self]:
         """Yields both orders, whether or not the model has them, because they come from one disc."""
         yield cls(orders=orders_from((1, 2)))
 
     @classmethod
-    def of_change(cls, before: Effect, now: Effect) -> MotorEncoderEccentricity | None:
+    def of_change(cls, before: Effect, now: Effect) -> Self | None:
         return cls._change(before, now)
 
     def turns_per_motor_turn(self) -> float:

@@ -1,9 +1,7 @@
 """Additional orders of the motor angle that the model's synchronous part lacks."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Self
 
 from hdbridge.axis.effects.base import Cause, Compensable, Effect, Experiment, Observations, Part
 from hdbridge.axis.effects.orders import HIGHEST_MOTOR_ORDER, OrderSeries, missing_orders, orders_from
@@ -45,13 +43,13 @@ class MotorOrders(OrderSeries):
         return 1.0
 
     @classmethod
-    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[MotorOrders]:
+    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[Self]:
         """Yields single orders; those found are combined afterwards."""
         for number in missing_orders(cls(orders=orders_from(range(1, HIGHEST_MOTOR_ORDER + 1))), base):
             yield cls(orders=orders_from([number]))
 
     @classmethod
-    def of_change(cls, before: Effect, now: Effect) -> MotorOrders | None:
+    def of_change(cls, before: Effect, now: Effect) -> Self | None:
         return cls._change(before, now)
 
     @classmethod

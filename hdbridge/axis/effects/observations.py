@@ -1,7 +1,5 @@
 """Properties of a record that an effect may use before any fit, to propose itself or to decline."""
 
-from __future__ import annotations
-
 from typing import Final, Protocol
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Harmonic series over an angle that turns with the motor: common base of all order effects."""
 
-from __future__ import annotations
-
 import cmath
 import math
 from abc import abstractmethod

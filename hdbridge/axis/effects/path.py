@@ -1,11 +1,9 @@
 """Motor path divided at its reversals: the basis of loops, dead zones and memory."""
 
-from __future__ import annotations
-
 import weakref
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Final
+from typing import Final, Self
 
 import numpy as np
 
@@ -40,7 +38,7 @@ class Path:
     _kept: dict[object, FloatArray] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, motor_deg: FloatArray, start: Start) -> Path:
+    def of(cls, motor_deg: FloatArray, start: Start) -> Self:
         """Divides an angle of at least one sample."""
         turning, signs = branches(motor_deg, start)
         angles, lengths = motor_deg[turning], np.diff(turning)

@@ -1,7 +1,5 @@
 """Stop operator: follows the motor, limited to plus or minus one; the building block of dead zones."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from hdbridge.axis.effects.base import FloatArray, Start

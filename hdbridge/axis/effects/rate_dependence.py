@@ -1,10 +1,8 @@
 """Growth of the elastic loop with speed: friction rises with the logarithm of the sliding rate."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any, ClassVar, Self
 
 import numpy as np
 from pydantic import Field
@@ -63,7 +61,7 @@ class RateDependence(Linear):
     )
 
     @classmethod
-    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[RateDependence]:
+    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[Self]:
         """Yields growth from far below the speeds of the record, and from just below them."""
         fastest = top_speed_deg_s(observations.motion)
         if has_loop(base):

@@ -1,9 +1,7 @@
 """Gear ratio that differs from the model's."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any, ClassVar, Self
 
 import numpy as np
 from pydantic import Field
@@ -67,7 +65,7 @@ class RatioError(Linear):
         return 1.0 / (1.0 / ratio + self.ramp_arcsec_per_turn / (DEG_PER_TURN * ARCSEC_PER_DEG))
 
     @classmethod
-    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[RatioError]:
+    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[Self]:
         yield cls(ramp_arcsec_per_turn=1.0)
 
     def implausible(self, observations: Observations) -> str:

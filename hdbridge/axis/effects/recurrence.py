@@ -1,7 +1,5 @@
 """First-order lags over a whole record: the exact exponential step, for any sampling."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from hdbridge.axis.effects.base import FloatArray

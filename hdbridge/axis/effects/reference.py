@@ -5,8 +5,6 @@ the sum is the same. The reference is chosen so that the amplitudes are those of
 temperature the drift would come with an apparent change of the model's own orders or loop.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Final

@@ -1,7 +1,5 @@
 """Interpolation error of the load encoder, whose sine signals are not perfect sines."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Annotated, Any, ClassVar, Self
@@ -98,14 +96,14 @@ class SubdivisionalError(Angleless):
         return orders
 
     @classmethod
-    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[SubdivisionalError]:
+    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[Self]:
         """Yields one whose line spans a few samples of the record, as an example."""
         step_deg = float(np.median(np.abs(np.diff(observations.motion.motor_deg)))) / observations.ratio
         lines = round(DEG_PER_TURN / max(2.7 * step_deg, 0.02))
         yield cls(lines_per_turn=max(lines, 1800), orders=orders_from([1]))
 
     @classmethod
-    def at_lines(cls, lines_per_turn: int) -> Iterator[SubdivisionalError]:
+    def at_lines(cls, lines_per_turn: int) -> Iterator[Self]:
         """Yields the effects of which this many periods per load turn can be a spectral line."""
         for numbers in ((1,), _HARMONICS):
             yield cls(lines_per_turn=lines_per_turn, orders=orders_from(numbers))

@@ -1,9 +1,7 @@
 """Synchronous part: errors that repeat with every turn of the motor (the wave generator)."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Self
 
 from hdbridge.axis.effects.base import Cause, Compensable, Effect, Observations, Part
 from hdbridge.axis.effects.orders import MotorOrder, OrderSeries
@@ -41,7 +39,7 @@ class Synchronous(OrderSeries):
     """Teeth and the wave generator's bearing wear."""
 
     @classmethod
-    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[Synchronous]:
+    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[Self]:
         """Yields none, because its orders are read from a spectrum."""
         return iter(())
 

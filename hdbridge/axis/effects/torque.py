@@ -1,7 +1,5 @@
 """Growth with torque: the torque channel, its limit, and the growth of the ripple."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from typing import Annotated, Literal
 

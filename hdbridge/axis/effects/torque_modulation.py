@@ -1,9 +1,7 @@
 """Growth of the synchronous part with load, because the mesh deflects."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Self
 
 import numpy as np
 
@@ -65,7 +63,7 @@ class TorqueModulation(TorqueGrowth, Linear):
     orders: Orders
 
     @classmethod
-    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[TorqueModulation]:
+    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[Self]:
         """Yields growth with the torque and with its magnitude, over the range of the record."""
         largest = top(observations.motion, Channel.LOAD_TORQUE)
         if not largest or not has_orders(base):

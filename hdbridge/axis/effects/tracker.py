@@ -1,7 +1,5 @@
 """On-line evaluation of an effect: queried at any angle any number of times, advanced once per cycle."""
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 
 from hdbridge.axis.effects.motion import Moment

@@ -1,10 +1,8 @@
 """Wind-up of the gear by drag on the output: seals, bearings, grease, a cable."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any, ClassVar, Self
 
 import numpy as np
 from pydantic import Field
@@ -90,7 +88,7 @@ class VelocityWindup(Angleless, Linear):
     )
 
     @classmethod
-    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[VelocityWindup]:
+    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[Self]:
         """Yields drags that bend below, at and above the speeds of the record."""
         fastest = top_speed_deg_s(observations.motion)
         for share in (0.15, 1.0, 6.0):

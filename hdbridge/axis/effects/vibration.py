@@ -1,7 +1,5 @@
 """Vibration at a fixed frequency in time: a fan, a pump, a neighbouring machine, a resonance."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Annotated, Any, ClassVar, Self
@@ -75,7 +73,7 @@ class Vibration(Angleless):
     ]
 
     @classmethod
-    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[Vibration]:
+    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[Self]:
         """Yields a fast vibration that the record can resolve, as an example."""
         fast_hz = 0.137 / max(observations.period_s, 1e-6)
         yield cls(frequency_hz=min(max(fast_hz, 0.3), 40.0), amplitude_arcsec=1.0, phase_deg=0.0)

@@ -1,7 +1,5 @@
 """Warmth of the gear, which drives the drifts."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from typing import Annotated, ClassVar, Final, Literal

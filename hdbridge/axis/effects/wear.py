@@ -1,7 +1,5 @@
 """Lost motion that grows with the distance run."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Annotated, Any, ClassVar, Self
@@ -76,7 +74,7 @@ class Wear(Linear):
     ] = 10_000.0
 
     @classmethod
-    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[Wear]:
+    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[Self]:
         """Yields widths from that of a gap to that of the elastic loop."""
         yield from (cls(growth_arcsec_per_kiloturn=1.0, width_deg=each) for each in (0.5, 4.0, 20.0))
 

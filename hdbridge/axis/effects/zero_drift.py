@@ -1,9 +1,7 @@
 """Zero shift with temperature, because housing, encoder mount and gear expand differently."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any, ClassVar, Self
 
 import numpy as np
 from pydantic import Field
@@ -71,7 +69,7 @@ class ZeroDrift(Angleless, Linear, Warmed):
     drift_arcsec_per_k: Annotated[float, Field(ge=-1000, le=1000, description="shift per kelvin")]
 
     @classmethod
-    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[ZeroDrift]:
+    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[Self]:
         """Yields effects driven by temperature if it changes, else by time."""
         for driven_by, tau_s in cls.lags(observations):
             yield cls(drift_arcsec_per_k=1.0, tau_s=tau_s, driven_by=driven_by)

@@ -1,7 +1,5 @@
 """Binding of a model or twin to its axis, gear and drive."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

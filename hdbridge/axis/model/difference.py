@@ -1,7 +1,5 @@
 """Differences between two models, parameter by parameter. Pure."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from typing import Any, NamedTuple
 

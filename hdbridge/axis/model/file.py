@@ -1,7 +1,5 @@
 """Model file: schema, reading with errors that give the place, and writing."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from typing import Any, Literal, NamedTuple

@@ -5,9 +5,8 @@ amplitude and phase. `Response` holds the measured points and the filter weights
 `hdbridge.analysis.response` computes both.
 """
 
-from __future__ import annotations
-
 import math
+from typing import Self
 
 from pydantic import Field, model_validator
 
@@ -34,7 +33,7 @@ class LeadFilter(Strict):
     )
 
     @model_validator(mode="after")
-    def _check(self) -> LeadFilter:
+    def _check(self) -> Self:
         first, second = (*self.feedback, 0.0, 0.0)[:2]
         if not abs(first) < 1.0 + second < 2.0:
             raise ValueError(f"feedback {list(self.feedback)} is not stable: measure the response again")
@@ -74,7 +73,7 @@ class Response(Strict):
     )
 
     @model_validator(mode="after")
-    def _check(self) -> Response:
+    def _check(self) -> Self:
         columns = (self.frequency_hz, self.gain, self.phase_deg, self.uncertainty)
         if not self.frequency_hz or len({len(each) for each in columns}) != 1:
             raise ValueError("expected frequency_hz, gain, phase_deg and uncertainty of the same length")

@@ -16,8 +16,6 @@ recorded anywhere, so the record cannot be wrong: it is the one whose bytes mode
 The date of each step is passed in.
 """
 
-from __future__ import annotations
-
 import fcntl
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence

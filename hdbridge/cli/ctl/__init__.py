@@ -7,8 +7,6 @@ model.py         compensation, models, adaptation
 objects.py       objects of the drive
 """
 
-from __future__ import annotations
-
 from typing import Final
 
 from hdbridge.cli.ctl import look, model, motion, objects

@@ -1,7 +1,5 @@
 """Commands for compensation, models and adaptation of a daemon's axes."""
 
-from __future__ import annotations
-
 from typing import Annotated
 
 import typer

@@ -1,7 +1,5 @@
 """Power and motion of a daemon's axes. A command that moves holds the lease while it runs."""
 
-from __future__ import annotations
-
 from typing import Annotated
 
 import typer

@@ -1,7 +1,5 @@
 """The lease: the right to move, held by one client at a time."""
 
-from __future__ import annotations
-
 from datetime import datetime
 
 from pydantic import ConfigDict, Field

@@ -1,7 +1,5 @@
 """Live samples and events, and the messages of the two WebSockets."""
 
-from __future__ import annotations
-
 from datetime import datetime
 from enum import StrEnum
 from typing import Annotated, Final, Literal

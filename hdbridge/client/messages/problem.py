@@ -1,8 +1,6 @@
 """Errors as ``application/problem+json`` (RFC 9457), and their conversion to `hdbridge.errors`."""
 
-from __future__ import annotations
-
-from typing import Final
+from typing import Final, Self
 
 from pydantic import Field
 
@@ -50,7 +48,7 @@ class Problem(Report):
     )
 
     @classmethod
-    def of(cls, error: HdbridgeError, axis: str | None = None) -> Problem:
+    def of(cls, error: HdbridgeError, axis: str | None = None) -> Self:
         """Returns the problem for an error."""
         kind, (status, title) = next(row for row in STATUS.items() if isinstance(error, row[0]))
         detail = str(error)

@@ -1,7 +1,5 @@
 """Requests of a client to an axis or the machine; values are checked before anything moves."""
 
-from __future__ import annotations
-
 from typing import Annotated, Final, Literal
 
 from pydantic import ConfigDict, Field, StringConstraints

@@ -1,7 +1,5 @@
 """State of the machine and its axes."""
 
-from __future__ import annotations
-
 from datetime import datetime
 
 from pydantic import Field

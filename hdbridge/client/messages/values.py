@@ -1,7 +1,5 @@
 """Values that several messages share: bounded numbers, names, enumerations, and the two base classes."""
 
-from __future__ import annotations
-
 from enum import StrEnum
 from typing import Annotated, Final
 

@@ -1,7 +1,5 @@
 """List of checks run in order: a check, its outcomes, and the checks it depends on."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from enum import Enum

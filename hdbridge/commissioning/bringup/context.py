@@ -1,7 +1,5 @@
 """State shared by the checks of a bring-up: axis file, bus, drive, and results so far."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from contextlib import AbstractContextManager, ExitStack, nullcontext
 

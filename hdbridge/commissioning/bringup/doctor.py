@@ -1,7 +1,5 @@
 """Checks of `doctor`, in order. A new check is a function and a row."""
 
-from __future__ import annotations
-
 from typing import Final
 
 from hdbridge.commissioning.bringup import moving, still

@@ -1,7 +1,5 @@
 """Judgement of the measured figures, separate from their measurement. Pure."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from statistics import fmean, pstdev
 

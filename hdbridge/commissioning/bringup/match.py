@@ -1,7 +1,5 @@
 """Assignment of scanned nodes to an axis file, and suggested lines for an axis file. Pure."""
 
-from __future__ import annotations
-
 from fractions import Fraction
 
 from hdbridge.axis import AxisConfig

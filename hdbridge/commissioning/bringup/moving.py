@@ -1,7 +1,5 @@
 """Checks under power: enable at rest, a nudge, a motor turn each way, and every way to stop."""
 
-from __future__ import annotations
-
 from typing import Final
 
 from hdbridge.commissioning.bringup.checks import Verdict, failed, not_possible, passed

@@ -1,7 +1,5 @@
 """New profile folder: a copy of a bundled one, or the data of a drive on the bus."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

@@ -4,8 +4,6 @@ Only SDO read requests are sent (and an SDO abort if one was not answered). A no
 SDO client is left alone, because a second client on the same channel would spoil its transfer.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Final

@@ -4,8 +4,6 @@ Each `enabled` block switches power on at rest, and on every exit brings the axi
 again. Everything runs in the control cycle with full supervision.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress

@@ -1,7 +1,5 @@
 """Checks that need no power: files, bus, node, identity, EDS, scaling, boot-up, encoders at rest."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from typing import Final
 

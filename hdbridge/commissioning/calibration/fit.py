@@ -1,7 +1,5 @@
 """Fits a model to recordings alone, made by hdbridge or by others."""
 
-from __future__ import annotations
-
 from hdbridge.analysis.checks import check_once, check_records
 from hdbridge.axis import AxisConfig
 from hdbridge.axis.model import TransmissionModel

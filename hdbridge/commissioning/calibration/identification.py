@@ -1,7 +1,5 @@
 """Joins recordings into one measurement and identifies the axis from it (`hdbridge.analysis.identify`)."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path

@@ -5,8 +5,6 @@ measurement ends (Ctrl-C, a fault, a kill, a power cut), the folder holds all ta
 samples of an interrupted task if there was time to write them. `Journal.open` resumes it.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from datetime import datetime
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Runs a plan on a bench, without compensation, into a journal."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass

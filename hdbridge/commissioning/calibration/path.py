@@ -6,8 +6,6 @@ response to a smooth target cannot reproduce it. The error with wind-up is that 
 the following lag.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Whole calibration, from a booted drive to a pending model, and its result read again from its folder."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace

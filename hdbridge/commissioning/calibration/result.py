@@ -1,7 +1,5 @@
 """Result of a calibration: the fit, the validation, and the offer for commit."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import asdict, dataclass
 from pathlib import Path

@@ -6,8 +6,6 @@ error). The positioning deviation is x_ij = P_ij - P_i; the arrow gives the dire
 definitions are those of ISO 230-2:2014, clause 3, for expanded results without measurement uncertainty.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 

@@ -1,11 +1,9 @@
 """Stepping test under each compensation scheme, one after the other on one axis."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Any, Self
 
 from hdbridge.axis import AxisConfig
 from hdbridge.axis.model import TransmissionModel
@@ -27,7 +25,7 @@ class Comparison:
     quantisation_floor_arcsec: float
 
     @classmethod
-    def of(cls, axis: AxisConfig, runs: dict[Scheme, Run[SteppingOutcome]]) -> Comparison:
+    def of(cls, axis: AxisConfig, runs: dict[Scheme, Run[SteppingOutcome]]) -> Self:
         """Evaluates the completed runs."""
         floor = quantisation_floor_arcsec(axis.motor_encoder.counts_per_turn, axis.gear.ratio)
         return cls({scheme: SchemeResult.of(run.outcome) for scheme, run in runs.items()}, runs, floor)

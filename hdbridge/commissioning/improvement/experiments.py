@@ -3,8 +3,6 @@
 The causes that an experiment separates are not listed here but predicted (`analysis.identifiability`).
 """
 
-from __future__ import annotations
-
 from typing import Any, Final
 
 from hdbridge.analysis.findings import depends_on

@@ -1,7 +1,5 @@
 """Selection of the findings for the proposed model, and of the causes to separate them from."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 

@@ -1,7 +1,5 @@
 """Further experiments that separate the causes which a diagnosis cannot separate."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -32,7 +30,7 @@ class Choice:
             "experiment": self.plan.name,
             "about": self.plan.about,
             "duration_s": self.duration_s,
-            "tells": list(self.separates),
+            "separates": list(self.separates),
         }
 
 

@@ -1,7 +1,5 @@
 """Complete workflow, from a booted drive to a pending model that improves positioning."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace

@@ -1,9 +1,7 @@
 """Result of an improvement as plain values; `Improvement.as_dict` is the JSON document."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 from hdbridge.analysis.findings import Diagnosis
@@ -25,16 +23,6 @@ class Round:
     """Alternatives that it was predicted to separate; empty if it existed already."""
     found: tuple[str, ...]
     """Findings after it, each with its alternatives."""
-
-    def as_dict(self) -> dict[str, Any]:
-        """Returns the round as data."""
-        return {
-            "experiment": self.experiment,
-            "about": self.about,
-            "recording": self.recording,
-            "tells": list(self.separates),
-            "found": list(self.found),
-        }
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -78,7 +66,7 @@ class Improvement:
             "compensated": [each.cause for each in self.extension.carried],
             "not_compensated": list(self.extension.left),
             "not_told_from": {name: list(each) for name, each in self.unseparated.items()},
-            "rounds": [each.as_dict() for each in self.rounds],
+            "rounds": [asdict(each) for each in self.rounds],
             "further": self.further.as_dict() if self.further else None,
             "advice": list(self.advice),
             "survived": list(self.survived),

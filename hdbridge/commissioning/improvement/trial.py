@@ -1,7 +1,5 @@
 """Trial of an extended model: stepping with both models in turns, to see if positioning improves."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace

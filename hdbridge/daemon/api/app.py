@@ -1,7 +1,5 @@
 """The application: all routes over one `Bridge`, errors as problem documents, and its own description."""
 
-from __future__ import annotations
-
 from http import HTTPStatus
 from typing import Any, Final
 

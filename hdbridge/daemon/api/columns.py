@@ -1,7 +1,5 @@
 """Conversion of samples to the columns that clients receive. Pure."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Sequence
 from typing import Any, Final
 

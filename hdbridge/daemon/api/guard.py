@@ -5,8 +5,6 @@ never refused to an authorised client: it does not count among the requests unde
 waited for. A refusal closes the connection, so that the rest of a refused body is not read.
 """
 
-from __future__ import annotations
-
 import asyncio
 import json
 import logging

@@ -3,8 +3,6 @@
 A sink of the observer: `take` costs a few microseconds per batch. Everything else is read when scraped.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from typing import Any, Final

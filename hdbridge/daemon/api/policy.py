@@ -5,8 +5,6 @@ its ``Host`` is not a name of this machine (DNS rebinding), or its ``Origin`` is
 request (a foreign page). A token alone does not prevent either.
 """
 
-from __future__ import annotations
-
 import ipaddress
 import re
 from dataclasses import dataclass

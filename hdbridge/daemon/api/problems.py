@@ -1,7 +1,5 @@
 """Errors of the API as ``application/problem+json`` (RFC 9457), never with a stack trace."""
 
-from __future__ import annotations
-
 import logging
 from http import HTTPStatus
 

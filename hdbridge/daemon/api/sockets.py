@@ -4,8 +4,6 @@ A server that binds a Unix socket itself makes it writable for everybody (uvicor
 with its final mode, so it is never open to others, not even for a moment.
 """
 
-from __future__ import annotations
-
 import errno
 import grp
 import os

@@ -1,7 +1,5 @@
 """Counts of API requests for `/metrics`; one object for all listeners."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager

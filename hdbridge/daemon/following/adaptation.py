@@ -5,8 +5,6 @@ if neither wear nor temperature can cause it. Then learning is frozen until the 
 the last windows before it are reverted. Pure: observations contain the time.
 """
 
-from __future__ import annotations
-
 import math
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence

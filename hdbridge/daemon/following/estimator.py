@@ -12,8 +12,6 @@ Parameters may be held: their uncertainty is accounted for, but neither they nor
 (Schmidt's consider filter). Without forgetting, the result is that of `analysis.linear` for one batch.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass

@@ -6,8 +6,6 @@
 Uses no thread and no clock: samples contain the time. Only the adaptation's files are written.
 """
 
-from __future__ import annotations
-
 import math
 from datetime import datetime
 from typing import Any, Final, NamedTuple

@@ -23,8 +23,6 @@ Frozen and noisy end automatically once the reading has been good for a while. A
 encoder's zero is unknown: that lasts until `reset`, or until the drive is verified or homed again.
 """
 
-from __future__ import annotations
-
 import math
 from collections import deque
 from collections.abc import Sequence

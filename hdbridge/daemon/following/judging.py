@@ -21,8 +21,6 @@ longer, so one bad second or move raises nothing. There are no verdicts about th
 load encoder.
 """
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass

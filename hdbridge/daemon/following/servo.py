@@ -5,8 +5,6 @@ them. So neither a change of the gear nor a fault of the load encoder counts. Wh
 these runs refines the response. Uses no clock.
 """
 
-from __future__ import annotations
-
 from statistics import median
 from typing import Any, Final
 

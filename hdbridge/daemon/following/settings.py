@@ -1,7 +1,5 @@
 """Keys under ``adaptation`` of a machine file: what the adaptation may change, and how fast."""
 
-from __future__ import annotations
-
 from typing import Annotated, Literal
 
 from pydantic import Field

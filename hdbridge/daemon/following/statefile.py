@@ -4,8 +4,6 @@
 committed model; the adaptation of another model starts without it.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import logging

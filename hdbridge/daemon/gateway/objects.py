@@ -11,9 +11,11 @@ from typing import TYPE_CHECKING, Final
 
 from hdbridge.device.dictionary import BUNDLED
 from hdbridge.device.nameplate import Nameplate
+from hdbridge.units import ARCSEC_PER_DEG
 
 if TYPE_CHECKING:
     from hdbridge.axis import AxisConfig
+    from hdbridge.axis.model import TransmissionModel
     from hdbridge.daemon.machinefile import GatewaySettings
 
 BRIDGE: Final = 0x2200
@@ -77,7 +79,28 @@ def nameplate(axis: AxisConfig, settings: GatewaySettings) -> Nameplate:
     )
 
 
-def _defaults(axis: AxisConfig, settings: GatewaySettings) -> Mapping[str, int | str]:
+def rest_deg(axis: AxisConfig, model: TransmissionModel | None) -> float:
+    """Returns how far from its target the load may rest, degrees.
+
+    The motor rests within a count of its own target. To this add three standard deviations of the rounding of
+    both encoders to counts and of the model's residual, as its calibration found it on held-out data. Without
+    a model the error may be as large as the largest correction that the axis file allows.
+    """
+    motor_deg, load_deg = (
+        abs(axis.motor_encoder.degrees(1)) / axis.gear.ratio,
+        abs(axis.load_encoder.degrees(1)),
+    )
+    if model is None or not model.effects:
+        return motor_deg + axis.compensation.maximum_arcsec / ARCSEC_PER_DEG
+    held_out = model.provenance.get("held_out")
+    residual_arcsec = held_out.get("after_arcsec", 0.0) if isinstance(held_out, Mapping) else 0.0
+    rounding_deg = math.hypot(motor_deg, load_deg) / math.sqrt(12.0)
+    return motor_deg + 3.0 * math.hypot(rounding_deg, residual_arcsec / ARCSEC_PER_DEG)
+
+
+def _defaults(
+    axis: AxisConfig, settings: GatewaySettings, model: TransmissionModel | None
+) -> Mapping[str, int | str]:
     limits, plate = axis.limits, nameplate(axis, settings)
     counts = settings.counts_per_turn / 360.0
 
@@ -92,7 +115,7 @@ def _defaults(axis: AxisConfig, settings: GatewaySettings) -> Mapping[str, int |
         "2000": axis.name,
         "6065": unsigned(_FOLLOWING_TIME_S * limits.velocity_deg_s),
         "6066": round(1000.0 * _FOLLOWING_TIME_S),
-        "6067": max(1, unsigned(abs(axis.motor_encoder.degrees(20)) / axis.gear.ratio)),
+        "6067": unsigned(rest_deg(axis, model)),
         "6068": 10,
         "6072": min(round(10.0 * limits.torque_percent), 0xFFFF),
         "6076": plate.rated_torque_mnm,
@@ -119,8 +142,8 @@ def _defaults(axis: AxisConfig, settings: GatewaySettings) -> Mapping[str, int |
     }
 
 
-def eds(axis: AxisConfig, settings: GatewaySettings) -> str:
-    """The EDS of a gateway axis, as text."""
+def eds(axis: AxisConfig, settings: GatewaySettings, model: TransmissionModel | None = None) -> str:
+    """The EDS of a gateway axis that is compensated by a model, as text."""
     made = RawConfigParser(strict=False, delimiters="=")
     made.optionxform = str  # type: ignore[assignment, method-assign]
     made.read_string(BUNDLED.read_text(encoding="utf-8"))
@@ -136,7 +159,7 @@ def eds(axis: AxisConfig, settings: GatewaySettings) -> str:
         "Line2": "Velocities are in increments/s, accelerations in increments/s2, torques in per mille.",
         "Line3": "60E4h:01 is the motor encoder. 60F4h is the error at the load.",
     }
-    for section, value in _defaults(axis, settings).items():
+    for section, value in _defaults(axis, settings, model).items():
         made[section]["DefaultValue"] = str(value)
     made["6098"].update(LowLimit="35", HighLimit="37")
     for section in _WITHOUT:
@@ -147,10 +170,12 @@ def eds(axis: AxisConfig, settings: GatewaySettings) -> str:
     return text.getvalue().rstrip() + "\n"
 
 
-def write_eds(folder: Path, axis: AxisConfig, settings: GatewaySettings) -> Path:
+def write_eds(
+    folder: Path, axis: AxisConfig, settings: GatewaySettings, model: TransmissionModel | None = None
+) -> Path:
     """Writes the EDS of a gateway axis into a folder; returns its path."""
     path = folder / f"{axis.name}.eds"
-    path.write_text(eds(axis, settings), encoding="utf-8")
+    path.write_text(eds(axis, settings, model), encoding="utf-8")
     return path
 
 

@@ -106,7 +106,13 @@ def serve(start: Start) -> None:
         simulation = start.simulation
         clock: Clock = MonotonicClock() if simulation is None else SimulatedClock(memory, simulation.speed)
         gateway = Gateway(
-            bus, [axis.config for axis in machine.axes], settings, memory, clock, Path(folder), store_of
+            bus,
+            [(axis.config, axis.model()) for axis in machine.axes],
+            settings,
+            memory,
+            clock,
+            Path(folder),
+            store_of,
         )
         status = memory.status
         status.set(Cell.GATEWAY_PID, os.getpid())

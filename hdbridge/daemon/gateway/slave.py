@@ -29,6 +29,7 @@ from hdbridge.units import ARCSEC_PER_DEG
 
 if TYPE_CHECKING:
     from hdbridge.axis import AxisConfig
+    from hdbridge.axis.model import TransmissionModel
     from hdbridge.daemon.machinefile import GatewaySettings
 
 BEHAVIOUR: Final = Behaviour.model_validate(
@@ -275,7 +276,7 @@ class Gateway:
     def __init__(
         self,
         bus: can.BusABC,
-        axes: Sequence[AxisConfig],
+        axes: Sequence[tuple[AxisConfig, TransmissionModel]],
         settings: GatewaySettings,
         memory: Memory,
         clock: Clock,
@@ -292,7 +293,7 @@ class Gateway:
         self._looked_s = -math.inf
         self.axes: dict[str, LoadAxis] = {}
         self.nodes: dict[str, DriveNode] = {}
-        for index, axis in enumerate(axes):
+        for index, (axis, model) in enumerate(axes):
             node_id = settings.nodes.get(axis.name)
             if node_id is None:
                 continue
@@ -300,7 +301,7 @@ class Gateway:
             node = DriveNode(
                 bus,
                 load,
-                write_eds(folder, axis, settings),
+                write_eds(folder, axis, settings, model),
                 node_id,
                 clock,
                 nameplate(axis, settings),

@@ -5,8 +5,6 @@ in which the drive is enabled. The state decides who answers (`_enabling`, `Foll
 the turn itself decides nothing. `AxisLoop.after` evaluates the result of the turn.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from typing import Final

@@ -1,7 +1,5 @@
 """Values of one axis after a turn, as plain numbers for the ring of samples."""
 
-from __future__ import annotations
-
 import math
 from typing import Final
 

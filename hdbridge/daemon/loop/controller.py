@@ -6,8 +6,6 @@ The part in brackets is `BusCycle.exchange`. Slow work, such as planning a move 
 compensation, runs after the RPDOs of one cycle and before the wait for the next.
 """
 
-from __future__ import annotations
-
 import os
 import time
 from collections.abc import Callable, Sequence

@@ -1,7 +1,5 @@
 """Faults of the supervision as events: one when a fault begins, one when its reaction becomes more severe."""
 
-from __future__ import annotations
-
 import math
 from typing import Final, Protocol
 

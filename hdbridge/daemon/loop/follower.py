@@ -5,8 +5,6 @@
 `Follower.begin` starts all of it at the actual position. `Follower.follow` is called once per turn.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import Final

@@ -1,7 +1,5 @@
 """The control process's CAN interface: opened at the start and reopened after each failure."""
 
-from __future__ import annotations
-
 from contextlib import ExitStack, suppress
 from types import TracebackType
 from typing import Final, Self

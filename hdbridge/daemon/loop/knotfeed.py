@@ -1,7 +1,5 @@
 """Transfer of a stream's knots from the shared memory to the set-point, a few before each turn."""
 
-from __future__ import annotations
-
 from typing import Final
 
 from hdbridge.daemon.memory.channels import Queue

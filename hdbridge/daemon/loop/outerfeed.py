@@ -1,7 +1,5 @@
 """The set-points of the gateway, from the shared memory to a position at any time."""
 
-from __future__ import annotations
-
 import math
 from typing import Final
 
@@ -30,24 +28,23 @@ class OuterFeed:
         self._patience_s = 0.0
         self.received_s = math.nan
         """When the newest set-point was received; NaN before the first."""
-        self._before = self._last = (0.0, 0.0)
-        """Time and position of the last two set-points."""
-
-    @property
-    def spacing_s(self) -> float:
-        """Time between the last two set-points."""
-        return min(self._last[0] - self._before[0], LONGEST_SPACING_S)
+        self.spacing_s = 0.0
+        """Time between the last two set-points, at most `LONGEST_SPACING_S`."""
+        self._first = True
+        self._last_s = self._last_deg = self._rate_deg_s = self._end_s = 0.0
+        """Time and position of the last set-point, the velocity to it, and the time at which they end."""
 
     def begin(self, series: int, patience_s: float, time_s: float, position_deg: float) -> None:
         """Begin at rest; ``patience_s``: longest time without a set-point at rest."""
         self._series, self._patience_s, self.received_s = series, patience_s, math.nan
-        self._before = self._last = (time_s + FIRST_KNOT_S, position_deg)
+        self._first, self._last_deg, self._rate_deg_s, self.spacing_s = True, position_deg, 0.0, 0.0
+        self._last_s = -math.inf
+        self._end_s = time_s + FIRST_KNOT_S
 
     def at(self, time_s: float) -> float | None:
         """The position at a time that never decreases; None once the set-points have ended."""
-        before, last = self._before, self._last
         for _ in range(KNOTS_A_TURN):
-            if before is not last and last[0] >= time_s:
+            if self._last_s >= time_s:
                 break
             knot = self._knots.take()
             if knot is None:
@@ -57,15 +54,20 @@ class OuterFeed:
                 continue
             if math.isnan(position_deg):
                 return None
-            if before is last or due_s > last[0]:
-                before = (time_s, last[1]) if before is last else last
-                last = (due_s if due_s > before[0] else math.nextafter(before[0], math.inf), position_deg)
+            if self._first or due_s > self._last_s:
+                self._take(time_s, due_s, position_deg)
                 self.received_s = received_s
-        self._before, self._last = before, last
-        if before is last:
-            return last[1] if time_s <= last[0] else None
-        length_s, step_deg = last[0] - before[0], last[1] - before[1]
-        patience_s = max(length_s, BRIDGED * self._patience_s) if step_deg else self._patience_s
-        if time_s > last[0] + patience_s:
+        if time_s > self._end_s:
             return None
-        return before[1] + step_deg * max(time_s - before[0], 0.0) / length_s if step_deg else last[1]
+        rate = self._rate_deg_s
+        return self._last_deg + rate * (time_s - self._last_s) if rate else self._last_deg
+
+    def _take(self, time_s: float, due_s: float, position_deg: float) -> None:
+        """Continues with the next set-point; the first is approached from the present time."""
+        begin_s = time_s if self._first else self._last_s
+        length_s, step_deg = due_s - begin_s, position_deg - self._last_deg
+        self._first, self._last_s, self._last_deg = False, due_s, position_deg
+        self._rate_deg_s = step_deg / length_s if length_s > 0.0 else 0.0
+        self.spacing_s = length_s if length_s < LONGEST_SPACING_S else LONGEST_SPACING_S
+        patience_s = self._patience_s
+        self._end_s = due_s + (max(length_s, BRIDGED * patience_s) if step_deg else patience_s)

@@ -4,8 +4,6 @@ It has one thread, one bus and the shared memory. All memory is allocated before
 loop runs, the process opens no files, writes no log and makes no SDO transfers of its own.
 """
 
-from __future__ import annotations
-
 import signal
 import sys
 import time

@@ -5,8 +5,6 @@ master's heartbeat come from the loop alone. While an axis may move, its nodes c
 or restarted.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from typing import Final
 

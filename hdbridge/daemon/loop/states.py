@@ -9,8 +9,6 @@ Only an ENABLE command leads to ENABLING, and only ENABLING leads to ENABLED. So
 automatically, nor after a stop before its latch is released.
 """
 
-from __future__ import annotations
-
 from enum import Enum, IntEnum
 from typing import Final, NamedTuple
 

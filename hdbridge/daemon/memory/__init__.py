@@ -1,6 +1,6 @@
 """Shared memory of control and service process: rings, mailbox, relay. Lock-free."""
 
-from hdbridge.daemon.memory.channels import MailboxFullError, Queue, RingReader
+from hdbridge.daemon.memory.channels import MailboxFullError, RingReader
 from hdbridge.daemon.memory.layout import (
     AXIS_SAMPLE,
     NO_FAULT,
@@ -37,7 +37,6 @@ __all__ = [
     "OuterCells",
     "OuterKnot",
     "OuterView",
-    "Queue",
     "RelayedFrame",
     "RingReader",
     "SampleArray",

@@ -9,8 +9,6 @@ meanwhile. A slot begins and ends with its sequence number. On processors that m
 a checksum. `Format` converts between items and slots.
 """
 
-from __future__ import annotations
-
 import struct
 import threading
 import zlib
@@ -80,7 +78,7 @@ COMMANDS: Final[Format[Command]] = Format(
 )
 KNOTS: Final[Format[Knot]] = Format(KNOT, lambda knot: knot, lambda _, values: Knot(*values))
 FOLLOWED: Final[Format[OuterKnot]] = Format(
-    KNOT, lambda knot: knot, lambda _, values: OuterKnot._make(values)
+    KNOT, lambda knot: knot, lambda _, values: tuple.__new__(OuterKnot, values)
 )
 
 
@@ -221,7 +219,8 @@ class Queue(_Slots[T]):
         """Removes and returns the next item; None if there is none."""
         item = self.peek()
         if item is not None:
-            self.drop()
+            self._misses = 0
+            self._tail[0] += 1
         return item
 
     def clear(self) -> None:

@@ -15,12 +15,10 @@ All numbers are in native byte order, because both ends run on one computer. A s
 sequence number, counted from 1. Any change here requires a new `VERSION`.
 """
 
-from __future__ import annotations
-
 import math
 import struct
 from enum import IntEnum, IntFlag
-from typing import Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple, Self
 
 import numpy as np
 
@@ -361,7 +359,7 @@ class Layout(NamedTuple):
     total: int
 
     @classmethod
-    def of(cls, axes: int) -> Layout:
+    def of(cls, axes: int) -> Self:
         """Returns the layout for ``axes`` axes; each section is preceded by two cache lines of counters."""
         end = PAGE
 

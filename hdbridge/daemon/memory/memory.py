@@ -1,7 +1,5 @@
 """The shared memory, as used by both processes."""
 
-from __future__ import annotations
-
 from typing import Self
 
 from hdbridge.daemon.memory.channels import (

@@ -4,14 +4,12 @@ A memfd has no name in any file system: no other process can open it, and it is 
 that holds it, however that one dies. It is sealed against shrinking, so that no access can fail later.
 """
 
-from __future__ import annotations
-
 import fcntl
 import mmap
 import os
 import platform
 import zlib
-from typing import Final
+from typing import Final, Self
 
 from hdbridge.daemon.memory.layout import AXES_AT_MOST, HEADER, MAGIC, VERSION, Layout
 from hdbridge.errors import InputError
@@ -34,7 +32,7 @@ class Region:
         self._cells = self.view.cast("q")
 
     @classmethod
-    def create(cls, layout: Layout, period_ns: int, *, checked: bool) -> Region:
+    def create(cls, layout: Layout, period_ns: int, *, checked: bool) -> Self:
         """Creates memory, all zero but for its header. ``checked``: slots have checksums."""
         fd = os.memfd_create("hdbridge", os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
         try:
@@ -50,7 +48,7 @@ class Region:
         return region
 
     @classmethod
-    def attach(cls, fd: int) -> tuple[Region, Layout, int]:
+    def attach(cls, fd: int) -> tuple[Self, Layout, int]:
         """Attaches to another process's memory; returns it, its layout and the period in ns.
 
         Raises `InputError` if the descriptor is not hdbridge's memory, or of another version.

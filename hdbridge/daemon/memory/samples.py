@@ -1,7 +1,5 @@
 """Ring of samples: the loop writes one packed slot per cycle, readers get arrays of them."""
 
-from __future__ import annotations
-
 import struct
 import zlib
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """The compensation setting of one axis: written by the service, acknowledged by the loop."""
 
-from __future__ import annotations
-
 import threading
 import zlib
 

@@ -1,7 +1,5 @@
 """Status cells: numbers written by one process and monitored by the others."""
 
-from __future__ import annotations
-
 from enum import IntEnum
 from typing import Final
 

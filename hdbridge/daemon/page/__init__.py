@@ -4,8 +4,6 @@ It consists of static files; all data comes over the API. Nothing is loaded from
 uPlot, which the reports include already, and `POLICY` forbids the browser to load anything from outside.
 """
 
-from __future__ import annotations
-
 from functools import cache
 from importlib.resources import files
 from typing import Final

@@ -1,7 +1,5 @@
 """Description of the machine in every file of a recording, so that each file is complete by itself."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass

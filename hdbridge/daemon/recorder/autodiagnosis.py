@@ -9,8 +9,6 @@ results are stored next to the recordings:
     FOLDER/diagnoses/DATE-AXIS/log.txt          output of the commands
 """
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

@@ -8,8 +8,6 @@ Cycles in which the axis was not enabled are omitted unless requested. A gap of 
 stay within a part, and time continues over them.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from itertools import pairwise

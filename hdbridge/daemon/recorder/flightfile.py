@@ -5,8 +5,6 @@ has all its chunks but no index: `mend` rewrites it as a finished one. Until it 
 ``.part``, and its writer holds a lock on it.
 """
 
-from __future__ import annotations
-
 import fcntl
 import json
 import os

@@ -6,8 +6,6 @@ are reported. A fault or a client's mark moves the files around its time aside, 
 remove them.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress

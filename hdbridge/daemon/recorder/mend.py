@@ -1,7 +1,5 @@
 """Mending of unfinished files: rewrites them up to their last complete chunk, with an index."""
 
-from __future__ import annotations
-
 import fcntl
 import os
 from collections.abc import Callable

@@ -4,8 +4,6 @@ The recorder may be active in the same folder: it renames a file when it is fini
 files. A recording is found under its present name as long as it exists.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import struct

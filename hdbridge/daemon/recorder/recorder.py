@@ -4,8 +4,6 @@
 too slow for is dropped, counted and reported. `flightlog` does the thread's work.
 """
 
-from __future__ import annotations
-
 import logging
 import queue
 import threading

@@ -1,7 +1,5 @@
 """Keys under ``recorder`` of a machine file: folder, size and age of flight recordings."""
 
-from __future__ import annotations
-
 from pydantic import Field
 
 from hdbridge.strictness import Strict

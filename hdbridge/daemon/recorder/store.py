@@ -7,8 +7,6 @@
 Names begin with the date in UTC, so they sort by time.
 """
 
-from __future__ import annotations
-
 import contextlib
 import os
 import shutil

@@ -7,8 +7,6 @@ of that layout, filled column by column, without encoding each message.
 One table of fields (`AXIS_FIELDS`, `MACHINE_FIELDS`) defines both schema and layout.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from enum import Enum
 from functools import cached_property

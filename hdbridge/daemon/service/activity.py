@@ -1,7 +1,5 @@
 """The present motion of an axis and the client that began it. A new activity replaces the present one."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from enum import Enum
 

@@ -1,7 +1,5 @@
 """Connection to one axis of the control process: commands with their answers, and its newest sample."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Final, Unpack
 

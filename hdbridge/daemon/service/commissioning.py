@@ -5,8 +5,6 @@ busy waits for `BUSY_S`. Other masters were listened for before the control proc
 nothing here listens for them.
 """
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager

@@ -1,7 +1,5 @@
 """Parts that the whole service shares: control process, event log, samples, clock and lease."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from itertools import count
 from typing import Final, TypedDict, Unpack

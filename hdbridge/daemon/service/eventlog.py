@@ -5,8 +5,6 @@ One list has every entry, for the service itself. Clients see the other one, whi
 its own numbering.
 """
 
-from __future__ import annotations
-
 import threading
 from collections import deque
 from collections.abc import Callable

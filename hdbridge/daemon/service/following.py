@@ -4,8 +4,6 @@ The committed model and its version stay in use. The control process compensates
 whatever the scheme. Watch and adaptation restart when another model is committed.
 """
 
-from __future__ import annotations
-
 import asyncio
 import logging
 from collections.abc import Callable, Sequence

@@ -1,7 +1,5 @@
 """Log lines for the control process's events, because that process writes no log."""
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Sequence
 from typing import Final

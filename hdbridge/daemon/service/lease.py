@@ -5,8 +5,6 @@ expires when its holder has made no request during the time-out, so that a dead 
 machine. Reading, stopping and quick-stopping require no lease.
 """
 
-from __future__ import annotations
-
 import math
 import secrets
 from collections.abc import Callable

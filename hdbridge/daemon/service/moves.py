@@ -4,8 +4,6 @@ The newest request wins: a move replaces any present motion and clears the queue
 if a motion is possible, before the present one changes.
 """
 
-from __future__ import annotations
-
 import asyncio
 import math
 from collections import deque

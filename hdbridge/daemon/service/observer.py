@@ -1,7 +1,5 @@
 """Distribution of samples and events to the recorder, the watch, the adaptation and live clients."""
 
-from __future__ import annotations
-
 import asyncio
 import logging
 from collections import deque

@@ -1,7 +1,5 @@
 """Connection of the flight recorder to the service: its models, remarks and state."""
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Sequence
 

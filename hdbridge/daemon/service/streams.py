@@ -5,8 +5,6 @@ point of a stream is at rest. The stream begins once it has `LEAD_S` of path or 
 may lag by that time.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from itertools import pairwise

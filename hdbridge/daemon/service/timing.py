@@ -1,7 +1,5 @@
 """Clock, sleep and threads of the service, passed in so that tests run on virtual time in one thread."""
 
-from __future__ import annotations
-
 import asyncio
 import threading
 import time

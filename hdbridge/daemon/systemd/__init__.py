@@ -1,7 +1,5 @@
 """systemd files that run a machine's daemon and configure its CAN interface. Writes nothing."""
 
-from __future__ import annotations
-
 import os
 import pwd
 import sys

@@ -1,7 +1,5 @@
 """Sequence of procedures as one, optionally with limited acceleration."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 

@@ -1,9 +1,8 @@
 """Runs at constant speed in both directions: ripple and response of the axis in motion."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Self
 
 from hdbridge.errors import InputError
 from hdbridge.motion.procedures.moves import AxisView, MoveTo, Sample, Steps
@@ -36,7 +35,7 @@ class EvenSpeed:
     window_s: float = WINDOW_S
 
     @classmethod
-    def spread(cls, axis: AxisView, shares: Sequence[float] = SHARES) -> EvenSpeed:
+    def spread(cls, axis: AxisView, shares: Sequence[float] = SHARES) -> Self:
         """Spreads speeds over shares of the fastest run that fits the travel.
 
         Raises `InputError` if the travel is too short for any run.

@@ -5,8 +5,6 @@ buses, drives or clocks, so the same generator runs on a simulated and on a real
 either.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Path test: moves at the axis's limits, there and back, and a sine; each with the rest that follows."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

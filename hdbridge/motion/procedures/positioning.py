@@ -1,7 +1,5 @@
 """Positioning test for machine tools (ISO 230-2): repeated approaches of targets from both sides."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

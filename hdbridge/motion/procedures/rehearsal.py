@@ -1,7 +1,5 @@
 """Rehearsal of a procedure on an ideal axis before anything moves: duration, extent, number of legs."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 

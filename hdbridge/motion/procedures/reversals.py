@@ -1,7 +1,5 @@
 """Nested reversals: first-order reversal curves, which show if a gear has return-point memory."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from hdbridge.motion.procedures.moves import AxisView, MoveTo, Steps

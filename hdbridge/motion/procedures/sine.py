@@ -1,7 +1,5 @@
 """Slow sines of several amplitudes: Lissajous loops of the hysteresis, some smaller than its width."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from hdbridge.motion.procedures.moves import AxisView, Dwell, MoveTo, Sine, Steps

@@ -2,8 +2,6 @@
 branches.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from hdbridge.motion.procedures.moves import AxisView, MoveTo, Settle, Steps

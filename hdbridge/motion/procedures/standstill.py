@@ -1,7 +1,5 @@
 """Standstill: encoder readings without motion are noise."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from hdbridge.motion.procedures.moves import AxisView, Dwell, MoveTo, Steps

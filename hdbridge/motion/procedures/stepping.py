@@ -1,7 +1,5 @@
 """Stepping test: deviation of the load from its target at rest, step by step."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Slow sweeps in both directions: the synchronous part, load orders, and the height of the loop."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from hdbridge.motion.procedures.moves import AxisView, MoveTo, Steps

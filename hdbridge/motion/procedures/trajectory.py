@@ -1,7 +1,5 @@
 """User-defined trajectory of the load: a function of time, or evenly spaced set-points."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

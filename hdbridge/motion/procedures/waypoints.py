@@ -1,7 +1,5 @@
 """Moves from one load angle to the next, holding the last."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field

@@ -1,7 +1,5 @@
 """Encoders of the truth file: geometry of the disc, signals, delayed samples, lost counts."""
 
-from __future__ import annotations
-
 from typing import Literal, Self
 
 from pydantic import Field, model_validator

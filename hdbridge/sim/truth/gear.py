@@ -1,7 +1,5 @@
 """Section ``gear`` of the truth file."""
 
-from __future__ import annotations
-
 import math
 from typing import Self
 

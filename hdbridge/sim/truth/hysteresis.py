@@ -1,7 +1,5 @@
 """Tooth errors and hysteresis laws of the truth file."""
 
-from __future__ import annotations
-
 from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator

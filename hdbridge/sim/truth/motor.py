@@ -1,7 +1,5 @@
 """Sections ``motor`` and ``servo`` of the truth file."""
 
-from __future__ import annotations
-
 from typing import Literal
 
 from pydantic import Field

@@ -1,7 +1,5 @@
 """Base class of all parts of a truth file."""
 
-from __future__ import annotations
-
 from hdbridge.strictness import Strict
 
 

@@ -1,7 +1,5 @@
 """Fastest resonance of the simulated axis, which its time step must resolve."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass

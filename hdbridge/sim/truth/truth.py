@@ -5,8 +5,6 @@ A calibration does not read this file; it must find the values. docs/ci.md descr
 Other modules of this package define the sections.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from pathlib import Path

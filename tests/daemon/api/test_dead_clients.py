@@ -1,6 +1,4 @@
-"""WebSocket clients that die, break off or talk nonsense: no traceback in the log, and the server goes on."""
-
-from __future__ import annotations
+"""WebSocket clients that die or send garbage cause no traceback and do not stop the server."""
 
 import base64
 import logging

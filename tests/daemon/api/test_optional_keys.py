@@ -1,7 +1,5 @@
 """Every client call works, whichever optional key of axis and machine file is left out."""
 
-from __future__ import annotations
-
 import asyncio
 import copy
 from collections.abc import Iterable, Iterator

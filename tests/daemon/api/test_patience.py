@@ -1,4 +1,4 @@
-"""Clients that begin and do not go on: closed after their time, which is a short one here."""
+"""Clients that stall are disconnected after a time-out, shortened here."""
 
 import socket
 

@@ -1,7 +1,5 @@
 """Remote access through a reverse proxy: nginx as the docs have it, and one that only terminates TLS."""
 
-from __future__ import annotations
-
 import asyncio
 import re
 import shutil

@@ -1,9 +1,7 @@
-"""A simulated axis whose gear changes while it works, over real frames: followed, and never made worse.
+"""A simulated axis whose gear changes at work, over real frames: followed and never made worse.
 
 The change of an hour is packed into minutes, with rates and intervals to match; `test_hour` takes the hour.
 """
-
-from __future__ import annotations
 
 import pytest
 from support.adapting import FAULTS, FLOOR_ARCSEC, at_work, truth_of

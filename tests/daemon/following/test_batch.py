@@ -1,4 +1,4 @@
-"""On one measured record the recursion without forgetting and the identification say the same."""
+"""Without forgetting, the recursion agrees with the identification on one measured record."""
 
 import numpy as np
 import pytest

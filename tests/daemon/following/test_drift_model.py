@@ -1,4 +1,4 @@
-"""The columns of what is followed: the effects' own, on line as over a whole record."""
+"""Design-matrix columns of the adaptation: the same on line and over a whole record."""
 
 import numpy as np
 import pytest

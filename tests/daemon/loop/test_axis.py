@@ -1,8 +1,5 @@
 """An axis from unknown to moving and back, by commands through the memory and frames on the bus."""
 
-from __future__ import annotations
-
-import math
 import struct
 from dataclasses import replace
 
@@ -129,29 +126,6 @@ def test_disabling_in_motion_brakes_first(enabled: SteppedDaemon) -> None:
     place = axis["load_position_deg"][-1]
     enabled.run(0.5)
     assert abs(record(enabled)["load_position_deg"][-1] - place) < 0.01
-
-
-@pytest.mark.parametrize(
-    ("fields", "words"),
-    [
-        ({"a": 401.0}, "position limits are -400 and 400"),
-        ({"a": math.nan}, "finite"),
-        ({"a": math.inf}, "finite"),
-        ({"a": 1.0, "b": -3.0}, "above 0"),
-        ({"a": 1.0, "c": math.inf}, "finite"),
-    ],
-)
-def test_an_invalid_move_is_refused_and_moves_nothing(
-    enabled: SteppedDaemon, fields: dict[str, float], words: str
-) -> None:
-    enabled.run(1.0)
-    sent = rpdos(enabled)
-    answer = enabled.order(K.MOVE, **{"b": math.nan, "c": math.nan, **fields})
-    assert answer.kind is E.REFUSED
-    assert words in answer.text
-    enabled.run(0.1)
-    assert len({target for _, target in sent}) == 1
-    assert enabled.states == [S.ENABLED]
 
 
 @pytest.mark.parametrize("statusword", [0x0008, 0x0027, 0x0000, -1, 1 << 40])

@@ -1,6 +1,4 @@
-"""The end: every axis at rest without power, whatever it was doing, and nobody is waited for for ever."""
-
-from __future__ import annotations
+"""Shutdown: every axis comes to rest without power from any state, within a bounded time."""
 
 import math
 

@@ -1,6 +1,4 @@
-"""Recovery from a fault, its reports, and the axes that go on. `test_reliability` has each fault itself."""
-
-from __future__ import annotations
+"""Recovery from faults, their reports, and the unaffected axes. `test_reliability` has each fault."""
 
 import errno
 import struct

@@ -1,7 +1,5 @@
 """A loop that runs for months leaves nothing behind in a turn."""
 
-from __future__ import annotations
-
 import gc
 import math
 import tracemalloc

@@ -1,7 +1,5 @@
 """The interface of the control process: heard before it is used, opened again when it works again."""
 
-from __future__ import annotations
-
 import errno
 from uuid import uuid4
 

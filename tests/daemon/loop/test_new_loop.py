@@ -1,7 +1,5 @@
 """The first SYNC of a new loop, or after the bus was down, puts no buffered set-point into force."""
 
-from __future__ import annotations
-
 import errno
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -43,7 +41,7 @@ def stays_without_power(daemon: SteppedDaemon, counts: list[PowerCount]) -> None
 
 
 @pytest.mark.parametrize("character", CHARACTERS, ids=str)
-@settings(max_examples=6)
+@settings(max_examples=3)
 @given(RUNNING_S, AWAY_S)
 def test_after_another_start_of_the_control_process(
     character: Character, running_s: float, away_s: float
@@ -57,7 +55,7 @@ def test_after_another_start_of_the_control_process(
 
 
 @pytest.mark.parametrize("character", CHARACTERS, ids=str)
-@settings(max_examples=6)
+@settings(max_examples=3)
 @given(RUNNING_S, AWAY_S)
 def test_after_the_bus_was_down(character: Character, running_s: float, away_s: float) -> None:
     with moving(character) as (daemon, counts):
@@ -70,7 +68,7 @@ def test_after_the_bus_was_down(character: Character, running_s: float, away_s: 
 
 
 @pytest.mark.parametrize("character", CHARACTERS, ids=str)
-@settings(max_examples=6)
+@settings(max_examples=3)
 @given(RUNNING_S, st.floats(0.012, 1.0))
 def test_after_the_control_process_hung(character: Character, running_s: float, away_s: float) -> None:
     with moving(character) as (daemon, counts):

@@ -1,6 +1,4 @@
-"""The control process itself: it begins, and ends in order for whoever asks."""
-
-from __future__ import annotations
+"""The control process: start and orderly end."""
 
 import os
 import subprocess

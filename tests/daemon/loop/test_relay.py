@@ -1,7 +1,5 @@
 """Requests that the relay accepts, by itself and on the bus."""
 
-from __future__ import annotations
-
 import pytest
 from support.daemon import SteppedDaemon
 

@@ -1,6 +1,4 @@
-"""Every fault of the reliability table on the daemon, two axes in motion: who stops, how soon, for good."""
-
-from __future__ import annotations
+"""Every fault of the reliability table on the daemon with two axes in motion."""
 
 from collections.abc import Callable
 

@@ -1,7 +1,5 @@
 """Rows of the fault table that need the daemon: clients that err, processes that end, a bus that is back."""
 
-from __future__ import annotations
-
 import errno
 import math
 import struct

@@ -1,7 +1,5 @@
 """No sequence of commands and faults makes the set-point jump: limits hold across interruptions."""
 
-from __future__ import annotations
-
 import errno
 import math
 import struct

@@ -1,6 +1,4 @@
-"""The table of states by itself: what it promises whatever the rows are."""
-
-from __future__ import annotations
+"""Properties of the state table."""
 
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The memory between processes: attached, hammered, killed."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

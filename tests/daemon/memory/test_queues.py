@@ -1,7 +1,5 @@
 """Mailbox, events, knots, frames and settings: bounded, in order, nothing twice."""
 
-from __future__ import annotations
-
 import pytest
 from hypothesis import settings
 from hypothesis import strategies as st

@@ -1,6 +1,4 @@
-"""The ring of samples: what is written is read, once, whole, in order, and what is lost is counted."""
-
-from __future__ import annotations
+"""The sample ring: samples are read once, whole and in order; lost ones are counted."""
 
 import math
 

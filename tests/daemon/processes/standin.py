@@ -1,10 +1,8 @@
-"""Stands in for a child of the keeper: ``control`` counts turns, the others say that they live.
+"""Stand-in for a child of the keeper: ``control`` counts turns, the others report that they are alive.
 
 HDBRIDGE_TEST_CONTROL, HDBRIDGE_TEST_SERVICE in the environment are an exit status with which it ends at once.
 SIGUSR1 makes the service ask for the bus.
 """
-
-from __future__ import annotations
 
 import os
 import signal

@@ -1,6 +1,4 @@
-"""A keeper whose children stand in for the real ones."""
-
-from __future__ import annotations
+"""A keeper with stand-ins for its children."""
 
 import os
 import sys

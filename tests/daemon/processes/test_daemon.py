@@ -1,6 +1,4 @@
-"""The whole daemon on simulated drives: started, asked, and what becomes of its processes."""
-
-from __future__ import annotations
+"""The whole daemon on simulated drives: start, requests, killed processes, end."""
 
 import os
 import signal

@@ -1,6 +1,4 @@
-"""The keeper with children that stand in for the real ones: who dies, hangs or is told to end."""
-
-from __future__ import annotations
+"""The keeper with stand-ins for its children: dead, hanging and ending processes."""
 
 import json
 import os

@@ -1,7 +1,5 @@
 """A bus that the daemon lends to a command, on a drive in another process."""
 
-from __future__ import annotations
-
 import json
 import os
 import random

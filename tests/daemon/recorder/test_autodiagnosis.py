@@ -1,6 +1,7 @@
 """From a verdict to a diagnosis next to the recording, by itself."""
 
 import json
+import os
 import shutil
 
 import pytest
@@ -26,6 +27,15 @@ def model_of(second_arcsec):
 MODEL = model_of(9.0)
 
 
+@pytest.fixture(autouse=True)
+def priorities(monkeypatch):
+    """Records the requested priorities: a process of the lowest one would wait for all other tests."""
+    asked = []
+    monkeypatch.setattr("os.sched_setscheduler", lambda pid, policy, param: asked.append(policy))
+    monkeypatch.setattr("os.setpriority", lambda which, pid, priority: asked.append(priority))
+    return asked
+
+
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory):
     """A folder with an unfinished recording of an axis whose second order has grown, and the time of day."""
@@ -40,7 +50,7 @@ def recorded(tmp_path_factory):
     log.close()
 
 
-def test_the_last_minutes_are_diagnosed_next_to_the_recording(recorded):
+def test_the_last_minutes_are_diagnosed_next_to_the_recording(recorded, priorities):
     folder, now_ns = recorded
     told = []
     diagnosis = AutoDiagnosis(folder, lambda: now_ns)
@@ -53,6 +63,7 @@ def test_the_last_minutes_are_diagnosed_next_to_the_recording(recorded):
     assert str(result) in words
     found = json.loads((result / "diagnosis.json").read_text())
     assert [each["cause"] for each in found["findings"]] == ["motor_encoder_eccentricity"]
+    assert {*priorities} == {19, os.SCHED_IDLE}
     assert (result / "why.txt").read_text() == "recalibrate: because\n"
     assert (result / "record" / "recording.yaml").exists()
     assert (result / "diagnosis.html").exists()

@@ -1,4 +1,4 @@
-"""From a flight recording to a record: lossless, cut where nothing is known, and fit for `diagnose`."""
+"""Export of flight recordings to records: lossless, cut at gaps, ready for `diagnose`."""
 
 import json
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""A disk that is full: nothing stops, what is missing is counted and said once, and it goes on by itself."""
+"""Full disks: recording pauses, the gap is counted and reported once, and recording resumes."""
 
 import subprocess
 import sys

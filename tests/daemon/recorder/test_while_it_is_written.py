@@ -1,6 +1,4 @@
-"""Whoever reads a folder in which the recorder is at work: files are renamed and removed at any moment."""
-
-from __future__ import annotations
+"""Reading a folder while the recorder renames and removes its files."""
 
 import json
 from collections.abc import Callable

@@ -1,4 +1,4 @@
-"""One axis through the service: power, moves, jogs, what is refused and in which words."""
+"""One axis through the service: power, moves, jogs and refusals."""
 
 import pytest
 from support.service import Service

@@ -1,7 +1,5 @@
 """Clients receive the newest events, however many legs of streams have ended meanwhile."""
 
-from __future__ import annotations
-
 from support.service import Service
 
 from hdbridge.daemon.memory import Event, EventKind

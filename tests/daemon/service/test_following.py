@@ -1,6 +1,4 @@
-"""Watch and adaptation behind the service: what is adapted, the control process compensates by."""
-
-from __future__ import annotations
+"""Watch and adaptation behind the service."""
 
 import logging
 import threading

@@ -1,4 +1,4 @@
-"""Way points, streams and coordinated moves: what follows what, and how they end."""
+"""Way points, streams and coordinated moves."""
 
 import asyncio
 import math

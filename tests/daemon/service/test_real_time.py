@@ -1,4 +1,4 @@
-"""The service as it runs: event loop, worker threads; the control loop in a thread."""
+"""The service in real time: event loop, worker threads, and the control loop in a thread."""
 
 import asyncio
 import math

@@ -1,4 +1,4 @@
-"""After each kind of stop: what a client is told, and what leads back. Never to power by itself."""
+"""Every kind of stop: report to clients and recovery, never to power without a request."""
 
 import errno
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Hides causes in the spring, the friction, the load, and the hysteresis."""
 
-from __future__ import annotations
-
 import cmath
 import math
 

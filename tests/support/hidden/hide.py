@@ -8,8 +8,6 @@ The names of the causes are those of the catalogue in docs/causes.md. ``unexplai
 causes outside the catalogue; ``unexplained:roller`` and the like choose one of them.
 """
 
-from __future__ import annotations
-
 import random
 from collections.abc import Callable, Iterable, Mapping
 from types import MappingProxyType

@@ -1,7 +1,5 @@
 """Hides causes in the encoders: geometry, signals, late samples, lost counts."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Site of a hidden cause: the axis, the intended run, the wanted size, and the random generator."""
 
-from __future__ import annotations
-
 import math
 import random
 from collections.abc import Callable, Mapping

@@ -1,7 +1,5 @@
 """Hides slow causes: temperature, wear, creep."""
 
-from __future__ import annotations
-
 import math
 
 from support.hidden.site import Hidden, Site

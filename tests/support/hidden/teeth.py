@@ -1,7 +1,5 @@
 """Hides causes in the teeth: orders, flanks, damage, the number of teeth."""
 
-from __future__ import annotations
-
 from hdbridge.sim.loaded_plant import GRAVITY_M_S2
 from support.hidden.elastic import hang_mass
 from support.hidden.site import ARCSEC_PER_RAD, ARCSEC_PER_TURN, Hidden, Site, solve

@@ -1,7 +1,5 @@
 """Hides causes outside the catalogue, for which "unexplained" is the right answer."""
 
-from __future__ import annotations
-
 from support.hidden.site import Hidden, Site
 
 

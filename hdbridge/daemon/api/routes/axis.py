@@ -1,7 +1,5 @@
 """Routes of one axis: state, power, motion, stop, compensation, objects of the drive."""
 
-from __future__ import annotations
-
 from fastapi import APIRouter, Request
 
 from hdbridge.client import messages

@@ -1,7 +1,5 @@
 """Routes of the machine: state, events, lease, motion of all axes, loan of the bus, remarks."""
 
-from __future__ import annotations
-
 from typing import Annotated
 
 from fastapi import APIRouter, Query, Request

@@ -1,7 +1,5 @@
 """Shared parts of the routes: the lease header, descriptions of errors, waiting for a motion."""
 
-from __future__ import annotations
-
 import asyncio
 from collections.abc import Awaitable
 from typing import Annotated, Any, Final, TypeVar

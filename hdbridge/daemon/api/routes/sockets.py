@@ -4,8 +4,6 @@ A slow client does not slow down the daemon: it gets the newest samples and the 
 set-points are accepted only as the buffer empties.
 """
 
-from __future__ import annotations
-
 import asyncio
 from typing import Final, TypeVar
 
