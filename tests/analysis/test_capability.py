@@ -77,7 +77,7 @@ def test_a_record_without_rests_shows_no_creep(speeds: list[float]) -> None:
 
 
 @FEW
-@given(st.lists(st.sampled_from([-60.0, -10.0, 0.0, 10.0, 60.0]), min_size=4, max_size=8).filter(any))
+@given(st.lists(st.sampled_from([-60.0, -10.0, 0.0, 10.0, 60.0]), min_size=8, max_size=10).filter(any))
 def test_effects_of_a_missing_channel_are_not_visible(speeds: list[float]) -> None:
     motor = path(speeds, 40.0)
     rng = np.random.default_rng(2)

@@ -67,10 +67,10 @@ def test_unreachable_targets_are_refused(hdbridge, arguments, complaint):
 def test_ctrl_c_ends_holding_in_order_and_stops_a_move(hdbridge, monkeypatch, leg, status):
     ended = leg.ended
 
-    def interrupted(self, samples):
+    def interrupted(self, samples, axis):
         if len(samples) == 30:
             os.kill(os.getpid(), signal.SIGINT)
-        return ended(self, samples) and len(samples) > 30
+        return ended(self, samples, axis) and len(samples) > 30
 
     monkeypatch.setattr(leg, "ended", interrupted)
     done = hdbridge("-v", "move", "article", 1, "--simulate", "--hold", 1e9 if leg is Hold else 0)
