@@ -220,12 +220,12 @@ def _check_turn(path: Path, record: Record, ratio: float) -> None:
     origin, motor = record.origin, record.motor_position_deg
     if origin is None or "motor" in origin.stated:
         return
-    step = np.abs(np.gradient(motor)) if len(motor) > 1 else np.zeros(len(motor))
-    shown = (step > 0.0) & (step < math.tau / PLACES)  # a longer step is an alias of another period
+    step = np.gradient(motor) if len(motor) > 1 else np.zeros(len(motor))
+    shown = (step != 0.0) & (np.abs(step) < math.tau / PLACES)  # a longer one is an alias of another period
     places = len(np.unique(np.floor(PLACES / math.tau * motor[shown])))
     if places < PLACES * TURNS_SEEN:
         return  # a few places agree with any period
-    base = np.column_stack([np.ones_like(motor), motor, np.sign(np.gradient(motor))])
+    base = np.column_stack([np.ones_like(motor), motor, np.sign(step)])
     error = record.transmission_error_arcsec(ratio)[shown]
 
     def left(*periods: float) -> float:

@@ -270,11 +270,9 @@ def folds(design: Design) -> tuple[IntArray, IntArray, str]:
         if blocks.chain[-1] + 1 >= REPEATS and not np.any(design.samples.among(blocks.kind, KNOWN)):
             return blocks.chain % FOLDS, blocks.chain, RECORDINGS
         return stretch % FOLDS, stretch, "stretches of time"
-    order = np.argsort(blocks.leg, kind="stable")
-    begins = np.flatnonzero(np.diff(blocks.leg[order], prepend=-1))
-    angle = blocks.motor_deg[order]
-    span_deg = np.maximum.reduceat(angle, begins) - np.minimum.reduceat(angle, begins)
-    local = np.isin(blocks.leg, blocks.leg[order][begins][span_deg < DEG_PER_TURN])
+    begins = np.flatnonzero(np.diff(blocks.leg, prepend=-1))
+    span_deg = np.maximum.reduceat(blocks.motor_deg, begins) - np.minimum.reduceat(blocks.motor_deg, begins)
+    local = (span_deg < DEG_PER_TURN)[counted(blocks.leg)]
     words = "motor turns, and stretches of sines and reversals," if local.any() else "motor turns"
     return counted(np.where(local, stretch, turns.astype(np.intp)) % FOLDS), stretch, words
 
