@@ -131,8 +131,8 @@ def info(
                 f"  another master: connected for {outer['connected_s']:.1f} s, 'operation enabled' for "
                 f"{outer['enabled_s']:.1f} s{errors}"
             )
-    for told in found.events:
-        say(f"{_date(told.time_ns):%H:%M:%S.%f}  {told.name}  {told.kind.lower()}  {told.text}")
+    for event in found.events:
+        say(f"{_date(event.time_ns):%H:%M:%S.%f}  {event.name}  {event.kind.lower()}  {event.text}")
 
 
 def mend(flights: FlightsArgument) -> None:

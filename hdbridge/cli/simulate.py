@@ -88,12 +88,14 @@ def command(
 
 
 def _refuse_another(bus: can.BusABC, clock: Clock, node_id: int) -> None:
-    """Raises `BusInUseError` if the bus has a node of this id: it answers, or sends by itself."""
+    """Raises `BusInUseError` if another node with this id answers a request or sends frames of its own."""
     from hdbridge.drive.link import Link
     from hdbridge.drive.manners import listening_s
+    from hdbridge.drive.objects import COB_SDO_REQUEST
 
     link = Link(bus, clock)
-    link.send(0x600 + node_id, b"\x40\x00\x10\x00\0\0\0\0")  # SDO upload of 1000h, which every node has
+    # SDO upload of 1000h, which every node has
+    link.send(COB_SDO_REQUEST + node_id, b"\x40\x00\x10\x00\0\0\0\0")
     end_s = clock.now() + listening_s()
     while (frame := link.recv(end_s)) is not None:
         if frame.can_id & 0x7F == node_id and frame.can_id >> 7 in (0x1, 0x3, 0x5, 0x7, 0x9, 0xB, 0xE):

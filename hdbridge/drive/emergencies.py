@@ -112,7 +112,7 @@ _GATEWAY: Final[dict[int, str]] = {
     0xFF02: "power was refused, did not come, or was lost",
     0xFF03: "quick stop by a client",
 }
-"""What the gateway means by these codes."""
+"""Causes for which the gateway sends these codes."""
 
 
 def gateway_error(code: int) -> str:

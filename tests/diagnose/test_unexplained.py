@@ -60,7 +60,7 @@ TIME_S = np.arange(60_000) / 1000.0
 
 
 def to_and_fro(motor: FloatArray, every: int, load_count_arcsec: float) -> Record:
-    """Every so many samples of a healthy axis whose load encoder has this count."""
+    """Record of a healthy axis with a load encoder of this count; one sample in ``every`` is kept."""
     rng, step = np.random.default_rng(5), load_count_arcsec / 3600.0
     load = (
         motor / 100.0 + LOOP.predict(Motion(motor)) / 3600.0 + 0.05 * rng.standard_normal(len(motor)) / 3600.0

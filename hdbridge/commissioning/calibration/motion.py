@@ -235,8 +235,8 @@ def motion_test(
     With ``measure`` the response is measured, otherwise the model's own is tested. A filter is kept only if
     at every speed it leaves no more ripple than no correction, and no larger path error. InputError if no
     motor order of the model is large enough to measure, if the travel is too short, or if a response to be
-    tested was measured at another cycle. Without an encoder at
-    the load, the ripple is that of the load angle predicted from the motor encoder, and no path is run.
+    tested was measured at another cycle. Without an encoder at the load, the ripple is that of the load angle
+    predicted from the motor encoder, and no path is run.
     """
     runner = _Runner(drive, model, progress, interrupted)
     if not measure:
