@@ -9,7 +9,6 @@ from typing import Any, Final
 import numpy as np
 
 from hdbridge.analysis.driving import settling
-from hdbridge.analysis.gain import REPEATS
 from hdbridge.analysis.identification import GENTLE_DEG_S2
 from hdbridge.analysis.prepared import Observed, Samples
 from hdbridge.analysis.scales import Scales
@@ -110,7 +109,7 @@ def capability(
     scales: Scales,
 ) -> Capability:
     """Summarises the identifiability of all causes for a record and a model ``base``."""
-    one_way = scales.one_way_repeated if len(data.full.chains) >= REPEATS else scales.one_way
+    one_way = scales.one_way_repeated if data.full.repeated else scales.one_way
     subject = {name: CATALOGUE[name].about.subject or name.replace("_", " ") for name in causes}
     subjects = tuple(dict.fromkeys(subject.values()))
     alike: dict[str, list[set[str]]] = {}

@@ -222,6 +222,10 @@ def _check_turn(path: Path, record: Record, ratio: float) -> None:
         return
     step = np.gradient(motor) if len(motor) > 1 else np.zeros(len(motor))
     shown = (step != 0.0) & (np.abs(step) < math.tau / PLACES)  # a longer one is an alias of another period
+    run = np.cumsum(np.diff(shown, prepend=False))
+    begins = np.flatnonzero(np.diff(run, prepend=-1))
+    spans = np.maximum.reduceat(motor, begins) - np.minimum.reduceat(motor, begins)
+    shown &= np.repeat(spans >= math.tau, np.diff(begins, append=len(motor)))  # slow over a whole period
     places = len(np.unique(np.floor(PLACES / math.tau * motor[shown])))
     if places < PLACES * TURNS_SEEN:
         return  # a few places agree with any period

@@ -17,9 +17,8 @@ import numpy as np
 from scipy.sparse.csgraph import connected_components
 
 from hdbridge.analysis.blocks import Blocks, Design, clusters
-from hdbridge.analysis.gain import RECORDINGS, REPEATS, Gain
+from hdbridge.analysis.gain import RECORDINGS, Gain
 from hdbridge.analysis.identification import (
-    KNOWN,
     FitResult,
     HeldOut,
     NoiseFigures,
@@ -267,7 +266,7 @@ def folds(design: Design) -> tuple[IntArray, IntArray, str]:
     turns = (blocks.motor_deg - np.min(blocks.motor_deg)) / DEG_PER_TURN
     stretch = clusters(blocks, STRETCHES)
     if np.max(turns) < 2 * FOLDS:
-        if blocks.chain[-1] + 1 >= REPEATS and not np.any(design.samples.among(blocks.kind, KNOWN)):
+        if design.samples.repeated:
             return blocks.chain % FOLDS, blocks.chain, RECORDINGS
         return stretch % FOLDS, stretch, "stretches of time"
     begins = np.flatnonzero(np.diff(blocks.leg, prepend=-1))

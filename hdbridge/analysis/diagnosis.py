@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from copy import copy
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -146,6 +147,7 @@ class _Judged:
     """Fit without a free-form loop."""
     findings: list[Finding]
     left: Rest
+    context: Context
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -179,7 +181,9 @@ class _Judge:
         before, _ = self._left_by(given)
         after, start = self._left_by(extended.effects)
         measured = estimator.observed - estimator.level - fitted.zeros[estimator.zero]
-        visible = identifiability(estimator, refitted, given)
+        cleared = copy(estimator)  # the record without what was found in it
+        cleared.observed = estimator.observed + before - after
+        visible = identifiability(cleared, cleared.fit(refitted.hypothesis), given, judged.context)
         return Diagnosis(
             baseline=_figures(before),
             refitted=_figures(refitted.residual / estimator.weight),
@@ -299,10 +303,11 @@ class _Judge:
         fitted = estimator.fit(replace(fitted.hypothesis, nuisances=None))
         left = rest(estimator, fitted)
         unknown = is_unexplained(estimator, left) or many_of_one(findings, estimator.scales) is not None
-        findings = weighed(findings, Context(left.arcsec, excess, unknown), estimator.scales, self.prior)
+        context = Context(left.arcsec, excess, unknown)
+        findings = weighed(findings, context, estimator.scales, self.prior)
         if estimator.data.reversals < 2:  # speed, torque, place and time are correlated
             findings = [self._one_way(each) for each in findings]
-        return _Judged(fitted, findings, left)
+        return _Judged(fitted, findings, left, context)
 
     def _one_way(self, finding: Finding) -> Finding:
         """Limits the probability of a cause seen in one direction only."""

@@ -10,6 +10,7 @@ import numpy as np
 from hdbridge.analysis.hypothesis import Estimator, Fitted
 from hdbridge.analysis.linear import counted, of_number, steps_without
 from hdbridge.analysis.noise import White
+from hdbridge.analysis.prepared import REPEATS
 from hdbridge.axis.effects import FloatArray, IntArray
 from hdbridge.axis.effects.kinematics import direction_of
 
@@ -87,8 +88,6 @@ class Gain:
 
 FOLDS = 8
 STRETCHES = 64
-REPEATS = 3
-"""Minimum number of recordings that count as repetitions."""
 
 
 def repeats(estimator: Estimator) -> tuple[IntArray, str]:
@@ -97,8 +96,8 @@ def repeats(estimator: Estimator) -> tuple[IntArray, str]:
     Errors that a repetition shares are no evidence.
     """
     points = estimator.data.points
-    begins = np.array([each.rows.start for each in estimator.data.full.chains], dtype=np.intp)
-    if len(begins) >= REPEATS:
+    if estimator.data.full.repeated:
+        begins = np.array([each.rows.start for each in estimator.data.full.chains], dtype=np.intp)
         return counted(np.searchsorted(begins, estimator.data.runs[estimator.index], "right")), RECORDINGS
     stretch = of_number(estimator.time_s, STRETCHES)
     moving, direction = points.speed_deg_s != 0.0, direction_of(points.motion)

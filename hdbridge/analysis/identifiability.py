@@ -4,16 +4,20 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import replace
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
+from hdbridge.analysis.acceptance import Gate, gate, gate_of_change
 from hdbridge.analysis.capability import Capability, Identifiability, capability
 from hdbridge.analysis.hypothesis import Estimator, Fitted, Hypothesis, with_memory
 from hdbridge.analysis.linear import Effort, orthonormal, side_by_side
 from hdbridge.analysis.orders import NOT_APART
 from hdbridge.analysis.prepared import gather
+from hdbridge.analysis.probability import Context, features, probability
+from hdbridge.analysis.scales import Scales
 from hdbridge.analysis.screening import SHARE_LEFT, candidates
 from hdbridge.analysis.search import lookalikes, waves_alike
 from hdbridge.axis.effects import CATALOGUE, Effect, FloatArray, Motion, Part, Sought, Start, causes
@@ -30,38 +34,22 @@ ENOUGH = 8_000
 """Maximum number of points used to compare shapes."""
 WORST_ARCSEC = 30.0
 """Detection limit above which a cause counts as not detectable."""
-INFLATION = 2.5
-"""Factor on the limit of white noise and a known shape, for correlated noise and unknown shapes."""
+PEAKS = 80
+"""Number of peaks that are tried, each 5 % larger than the one before."""
+POWER = 2.0
+"""Standard deviations by which the evidence at the limit exceeds the needed: 98 % are found."""
 
 
 def identifiability(
-    estimator: Estimator, fitted: Fitted, base: Sequence[Effect]
+    estimator: Estimator, fitted: Fitted, base: Sequence[Effect], context: Context
 ) -> dict[str, Identifiability]:
-    """Returns detection limit and look-alikes of each cause of the catalogue; ``fitted`` is the model."""
-    best: dict[str, tuple[float, float, FloatArray, Effect]] = {}
-    reasons: dict[str, str] = {}
-    stride = -(-len(estimator.index) // ENOUGH)
-    background = _Background(estimator, fitted, base, stride)
-    start, weight = fitted.hypothesis.start, estimator.weight[::stride, np.newaxis]
-    for candidate in candidates(estimator.data, base, screened=False):
-        reasons[candidate.name] = candidate.unidentifiable(estimator.data)
-        columns = _columns(estimator, candidate, base, start)
-        low, high = np.quantile(columns, [estimator.rare, 1.0 - estimator.rare], axis=0)
-        columns, span = columns[::stride], high - low
-        seen = span > 1e-12
-        if reasons[candidate.name] or not np.any(seen):
-            continue
-        unit = weight * columns[:, seen] / (0.5 * span[seen])  # one arcsec at its peak
-        rest = background.left(candidate, unit)
-        if candidate.tracker().memory_deg > 0.0:
-            before = background.left(candidate, weight * _before(estimator, candidate, base, start)[::stride])
-            before = orthonormal(before)
-            rest = rest - before @ (before.T @ rest)
-        squares = np.sum(rest**2, axis=0)
-        size, share = np.sqrt(stride * np.max(squares)), np.max(squares / np.sum(unit**2, axis=0))
-        if candidate.name not in best or size > best[candidate.name][0]:
-            best[candidate.name] = float(size), float(share), rest, candidate
-    spans = {name: orthonormal(rest) for name, (_, _, rest, _) in best.items()}
+    """Returns detection limit and look-alikes of each cause of the catalogue.
+
+    ``estimator`` holds the record without the causes found in it, ``fitted`` is the model's fit to that, and
+    ``context`` is the evidence against any name.
+    """
+    best, reasons = _examples(estimator, fitted, base)
+    scales, spans = estimator.scales, {name: orthonormal(each.rest) for name, each in best.items()}
     result: dict[str, Identifiability] = {}
     for cause in causes():
         if cause not in best:
@@ -69,22 +57,25 @@ def identifiability(
                 False, None, (), 0.0, reasons.get(cause) or _missing(estimator, cause)
             )
             continue
-        size, share, rest, example = best[cause]
-        if share < SHARE_LEFT or size <= 0.0:
+        example = best[cause]
+        share, strength = example.share, example.strength
+        if share < SHARE_LEFT or strength <= 0.0:
             result[cause] = Identifiability(False, None, (), share, "the model's own parameters take it over")
             continue
         limit = max(
-            INFLATION * math.sqrt(estimator.scales.penalty * rest.shape[1] + estimator.scales.enter) / size,
-            estimator.floor_arcsec,
+            (math.sqrt(scales.penalty * example.rest.shape[1] + scales.enter) + POWER) / strength,
+            estimator.floor_arcsec + POWER / strength,
+            _named_from(_injected(estimator, fitted, example, base), context, scales),
         )
-        own = [*type(example).proposals(estimator.data, ())]  # any of them may be the one
+        own = [*type(example.effect).proposals(estimator.data, ())]  # any of them may be the one
         waves = set(waves_alike(estimator, own, fitted.hypothesis.start))
         alike = [
             name
             for name in best
             if name != cause and (name in waves or _correlation(spans[cause], spans[name]) > NOT_APART)
         ]
-        result[cause] = Identifiability(limit <= WORST_ARCSEC, limit, tuple(alike), share)
+        known = limit if limit < math.inf else None
+        result[cause] = Identifiability(limit <= WORST_ARCSEC, known, tuple(alike), share)
     for cause, each in result.items():
         # A tone looks like a wave over an angle only at its frequency, which is that of no example.
         tones = [name for name in each.aliases if CATALOGUE[name].sought is Sought.TONE]
@@ -97,6 +88,54 @@ def identifiability(
             if kind.channels - estimator.motion.available() and kind.name not in each.aliases:
                 result[candidate.name] = replace(each, aliases=(*each.aliases, kind.name))
     return result
+
+
+class _Example(NamedTuple):
+    """The candidate of a cause that a record shows best."""
+
+    effect: Effect
+    per_arcsec: FloatArray
+    """Coefficients of one arcsec at its peak, shape (p,)."""
+    rest: FloatArray
+    """What the background leaves of its weighted columns, each of one arcsec at its peak, shape (m, k)."""
+    strength: float
+    """Root of the chi square of one arcsec."""
+    share: float
+    """Largest share of a column's square that is left."""
+
+
+def _examples(
+    estimator: Estimator, fitted: Fitted, base: Sequence[Effect]
+) -> tuple[dict[str, _Example], dict[str, str]]:
+    """Returns the best example of each cause that the record can show, and reasons why it cannot."""
+    best: dict[str, _Example] = {}
+    reasons: dict[str, str] = {}
+    stride = -(-len(estimator.index) // ENOUGH)
+    background = _Background(estimator, fitted, base, stride)
+    start, weight = fitted.hypothesis.start, estimator.weight[::stride, np.newaxis]
+    for candidate in candidates(estimator.data, base, screened=False):
+        reasons[candidate.name] = candidate.unidentifiable(estimator.data)
+        columns = _columns(estimator, candidate, base, start)
+        low, high = np.quantile(columns, [estimator.rare, 1.0 - estimator.rare], axis=0)
+        half_span = 0.5 * (high - low)
+        seen = half_span > 1e-12
+        if reasons[candidate.name] or not np.any(seen):
+            continue
+        unit = weight * columns[::stride, seen] / half_span[seen]
+        rest = background.left(candidate, unit)
+        if candidate.tracker().memory_deg > 0.0:
+            before = background.left(candidate, weight * _before(estimator, candidate, base, start)[::stride])
+            before = orthonormal(before)
+            rest = rest - before @ (before.T @ rest)
+        squares = np.sum(rest**2, axis=0)
+        strength = float(np.sqrt(stride * np.max(squares)))
+        if candidate.name not in best or strength > best[candidate.name].strength:
+            per_arcsec = np.zeros(len(seen))
+            column = np.flatnonzero(seen)[np.argmax(squares)]
+            per_arcsec[column] = 1.0 / half_span[column]
+            share = float(np.max(squares / np.sum(unit**2, axis=0)))
+            best[candidate.name] = _Example(candidate, per_arcsec, rest, strength, share)
+    return best, reasons
 
 
 def _columns(estimator: Estimator, candidate: Effect, base: Sequence[Effect], start: Start) -> FloatArray:
@@ -119,6 +158,33 @@ def _before(estimator: Estimator, candidate: Effect, base: Sequence[Effect], sta
     own = _columns(estimator, candidate, base, start)
     others = [_columns(estimator, candidate, base, each) - own for each in Start if each is not start]
     return side_by_side(others, len(estimator.index))
+
+
+def _injected(estimator: Estimator, fitted: Fitted, example: _Example, base: Sequence[Effect]) -> Gate:
+    """Tests a cause of `WORST_ARCSEC` at its peak that is added to the record."""
+    effect, start = example.effect, fitted.hypothesis.start
+    does = WORST_ARCSEC * (_columns(estimator, effect, base, start) @ example.per_arcsec)
+    if effect.changes is not None:
+        given = replace(fitted, residual=fitted.residual + estimator.weight * does)
+        return gate_of_change(estimator, fitted, given)
+    record = copy(estimator)
+    record.observed = estimator.observed + does
+    trial = record.fit(fitted.hypothesis.plus(effect), effort=Effort(steps=1))
+    return gate(record, trial, len(fitted.hypothesis.effects))
+
+
+def _named_from(injected: Gate, context: Context, scales: Scales) -> float:
+    """Returns the peak, arcsec, from which a cause passes its tests and is probable; infinity if none does.
+
+    The square root of the robust chi square grows with the peak, and its standard deviation is one.
+    """
+    per_arcsec = math.sqrt(max(injected.robust, 0.0)) / WORST_ARCSEC
+    for peak_arcsec in np.geomspace(scales.floor_arcsec, WORST_ARCSEC, PEAKS).tolist():
+        robust = max(peak_arcsec * per_arcsec - POWER, 0.0) ** 2
+        terms = features(replace(injected, robust=robust), peak_arcsec, context, scales)
+        if robust >= injected.needed and probability(terms, scales) > 0.5:
+            return float(peak_arcsec)
+    return math.inf
 
 
 class _Background:
@@ -178,7 +244,7 @@ def examined(
     data = gather(record, model.ratio, legs, expected=lambda motion: model.predict(motion, start))
     estimator = Estimator(data)
     fitted = estimator.fit(Hypothesis(model.effects, start), effort=Effort(steps=2))
-    found = identifiability(estimator, fitted, model.effects)
+    found = identifiability(estimator, fitted, model.effects, Context(0.0, 1.0, False))
     return found, capability(data, model.effects, found, estimator.scales)
 
 

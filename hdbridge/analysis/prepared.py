@@ -91,6 +91,10 @@ def between_lines(values: FloatArray, rows: BoolArray, starts: Sequence[int] = (
 # Samples: observed error and motion, shared by calibration and diagnosis.
 
 
+REPEATS = 3
+"""Minimum number of recordings that count as repetitions."""
+ALIKE = 2.0
+"""Maximum ratio of the durations, and of the travels, of recordings that repeat each other."""
 ON_THE_WAY = ("move", "precondition", "step", "settle")
 """Legs that only move the axis to a place. They carry the elastic state, but only their rests are used."""
 
@@ -156,6 +160,15 @@ class Samples:
     def zeros(self) -> int:
         """Number of absolute zeros."""
         return int(self.zero[-1]) + 1
+
+    @property
+    def repeated(self) -> bool:
+        """True for several recordings that are alike in duration and travel; the tasks of a plan are not."""
+        rows = [each.rows for each in self.chains]
+        durations = np.array([np.ptp(self.time_s[each]) for each in rows])
+        travels = np.array([np.sum(np.abs(np.diff(self.motor_deg[each]))) for each in rows])
+        alike = all(np.max(each) <= ALIKE * np.min(each) for each in (durations, travels))
+        return len(rows) >= REPEATS and alike
 
     @property
     def count_deg(self) -> float:

@@ -11,6 +11,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
+from hdbridge.analysis.acceptance import Gate
 from hdbridge.analysis.findings import Finding
 from hdbridge.analysis.scales import Scales
 
@@ -68,15 +69,15 @@ def coefficients(scales: Scales) -> dict[str, float]:
     }
 
 
-def features(finding: Finding, largest: float, context: Context, scales: Scales) -> dict[str, float]:
-    """Returns the terms of the formula by name; ``largest`` is the chi square of the largest finding."""
-    gate = finding.gate
-    assert gate is not None, "only an unexplained residual has no gate"
+def features(
+    gate: Gate, peak_arcsec: float, context: Context, scales: Scales, rank: float = 1.0
+) -> dict[str, float]:
+    """Returns the terms of the formula by name; ``rank`` is the share of the largest finding's chi square."""
     return {
         "constant": 1.0,
         "strength": math.log(min(max(gate.robust, 1e-9) / gate.needed, scales.strong)),
-        "rank": math.log10(max(finding.robust / max(largest, 1e-9), 1e-4)),
-        "size": math.log(max(finding.peak_arcsec, 1e-3) / max(scales.floor_arcsec, context.left_arcsec)),
+        "rank": math.log10(max(rank, 1e-4)),
+        "size": math.log(max(peak_arcsec, 1e-3) / max(scales.floor_arcsec, context.left_arcsec)),
         "excess": math.log(min(max(context.excess, 1.0), scales.large)),
         "unexplained": float(context.unexplained),
     }
@@ -89,7 +90,9 @@ def weighed(
     largest = max((each.robust for each in findings), default=0.0)
     weighed = []
     for each in findings:
-        terms = features(each, largest, context, scales)
+        assert each.gate is not None, "only an unexplained residual has no gate"
+        rank = each.robust / max(largest, 1e-9)
+        terms = features(each.gate, each.peak_arcsec, context, scales, rank)
         more = prior.log_odds(each.cause, scales) if prior else 0.0
         most = 0.0 if each.refuted else 1.0 if each.gains else UNPROVEN
         likely = min(probability(terms, scales, more), most)

@@ -9,11 +9,13 @@ Samples in which more of it remains unknown than matters are left out.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.linalg import solve_banded
 from scipy.ndimage import maximum_filter1d
 from scipy.optimize import minimize
@@ -23,8 +25,8 @@ from hdbridge.analysis.hypothesis import Estimator, Fitted
 from hdbridge.analysis.linear import about_zeros
 from hdbridge.analysis.prepared import Observed, Samples
 from hdbridge.analysis.scales import Scales
-from hdbridge.axis.effects import Effect, FloatArray, Part, Start
-from hdbridge.units import ARCSEC_PER_DEG, DEG_PER_TURN
+from hdbridge.axis.effects import Effect, FloatArray, IntArray, Part, Start
+from hdbridge.units import ARCSEC_PER_DEG
 
 ORDINARY_HZ = 30.0
 """Lowest natural frequency of a load that is ordinary. The demo axis has 42 Hz; of the axes that tools/blind
@@ -33,14 +35,12 @@ HERTZ = np.geomspace(0.4 * ORDINARY_HZ, 16.0 * ORDINARY_HZ, 23)
 DAMPING = (0.05, 0.2, 0.5)
 """Natural frequencies and damping ratios that are tried, before a refinement."""
 MOST_DAMPED = 0.9
-USUALLY_DAMPED = 0.2
-"""Damping ratio of a swing that is too fast for the sampling to show it."""
 LEAST_SEEN = 0.1
 """Share of the squares of a residual that a swing explains: anything that moves explains a little."""
 CALMEST = 0.05
 """Share of a record that is always used."""
 RESOLVED = 4.0
-"""Number of samples in a wave from which a spline follows it."""
+"""Number of samples in a wave above which a spline begins to follow it; from twice that, it does."""
 REFINED = 40
 """Number of trials of the refinement."""
 LONGEST = 20_000
@@ -123,27 +123,68 @@ def seen_swing(full: Samples, effects: Sequence[Effect], scales: Scales) -> Swin
         sum((each.predict(full.motion, start) for each in effects), np.zeros(len(full))) for start in Start
     ]
     error = min(errors, key=lambda each: cost(full.error_arcsec - each, every))
-    bend = bend_of(ARCSEC_PER_DEG / full.ratio * full.motor_deg + error, step_s, parts)
+    fast = [*_fast_waves(full, effects, float(np.median(step_s)))]
+    base = ARCSEC_PER_DEG / full.ratio * full.motor_deg + error
+    for each in fast:
+        base[each.rows] -= each.phasor.real
+    bend = bend_of(base, step_s, parts)
     size = np.concatenate([[0.0], np.cumsum(bend**2)])
     begin = int(np.argmax(size[LONGEST:] - size[:-LONGEST])) if len(full) > LONGEST else 0
     rows = slice(begin, min(begin + LONGEST, len(full)))
     first = [begin, *(each.start for each in parts if rows.start < each.start < rows.stop)]
-    residual = (full.error_arcsec - error)[rows]
+    residual = full.error_arcsec - error
+
+    def swung(hertz: float, damping: float, rows: slice, first: Sequence[int]) -> Swing:
+        damping = min(damping, MOST_DAMPED)
+        one = swing(bend[rows], step_s[rows.start : rows.stop - 1], first, hertz, damping)
+        for each in fast:
+            inside = slice(*np.searchsorted(each.rows, (rows.start, rows.stop)))
+            part = _Fast(each.rows[inside] - rows.start, each.phasor[inside], each.rad_s[inside])
+            one.does_arcsec[part.rows] += part.does(hertz, damping)
+        return one
 
     def tried(hertz: float, damping: float) -> float:
-        begins = [each - begin for each in first]
-        one = swing(bend[rows], step_s[rows.start : rows.stop - 1], begins, hertz, min(damping, MOST_DAMPED))
-        return cost(residual - one.does_arcsec, rows)
+        one = swung(hertz, damping, rows, [each - begin for each in first])
+        return cost(residual[rows] - one.does_arcsec, rows)
 
     start = min(product(HERTZ.tolist(), DAMPING), key=lambda each: tried(*each))
     found = minimize(
         lambda x: tried(*np.exp(x).tolist()), np.log(start), method="Nelder-Mead", options={"maxfev": REFINED}
     )
-    whole = cost(residual, rows)
+    whole = cost(residual[rows], rows)
     if whole - found.fun < max(scales.enter + 2.0 * scales.penalty, LEAST_SEEN * whole):
         return None
     hertz, damping = np.exp(found.x).tolist()
-    return swing(bend, step_s, [each.start for each in parts], hertz, min(damping, MOST_DAMPED))
+    return swung(hertz, damping, every, [each.start for each in parts])
+
+
+class _Fast(NamedTuple):
+    """A wave of the gear's error where it is too fast for a spline; it swings as at constant speed."""
+
+    rows: IntArray
+    """Samples, of which there are fewer than twice `RESOLVED` in a wave, shape (k,)."""
+    phasor: NDArray[np.complex128]
+    """Wave, arcsec, faded in below that number, shape (k,)."""
+    rad_s: FloatArray
+    """Angular frequency, signed, shape (k,)."""
+
+    def does(self, frequency_hz: float, damping: float) -> FloatArray:
+        """Returns the load's motion relative to its base, arcsec, shape (k,)."""
+        ratio = self.rad_s / (math.tau * frequency_hz)
+        return np.asarray((ratio**2 / (1.0 - ratio**2 + 2j * damping * ratio) * self.phasor).real)
+
+
+def _fast_waves(full: Samples, effects: Sequence[Effect], period_s: float) -> Iterator[_Fast]:
+    """Yields the fast parts of the waves of a model's orders."""
+    for turns, amplitude, phase_deg in (
+        wave for each in effects if each.part is Part.ORDERS for wave in each.waves()
+    ):
+        rad_s = turns * np.radians(full.speed_deg_s)
+        share = 2.0 - math.tau / (RESOLVED * period_s) / np.maximum(np.abs(rad_s), 1e-9)
+        rows = np.flatnonzero(share > 0.0)
+        angle = np.radians(turns * full.motor_deg[rows] + phase_deg)
+        phasor = amplitude * np.minimum(share[rows], 1.0) * np.exp(1j * angle)
+        yield _Fast(rows, np.asarray(phasor), rad_s[rows])
 
 
 def without(data: Observed, found: Swing) -> Observed:
@@ -155,8 +196,8 @@ def settled(estimator: Estimator, fitted: Fitted, found: Swing | None) -> Observ
     """Returns the data without the samples in which more of the swing is unknown than matters.
 
     The error of a ``found`` swing scales with the wind-up. Its share is regressed on the squares of the
-    residual in motion. Nothing is known of waves of the gear's error that are too fast for the sampling.
-    The calmest samples always stay. These errors, and those of the turning points, are in their noise.
+    residual in motion. The calmest samples always stay. These errors, and those of the turning points, are
+    in their noise.
     """
     data, weight, unknown = estimator.data, estimator.weight, np.zeros(len(estimator.data.full))
     effects = fitted.hypothesis.effects
@@ -166,7 +207,7 @@ def settled(estimator: Estimator, fitted: Fitted, found: Swing | None) -> Observ
         square, size = (fitted.residual / weight)[moving] ** 2, estimator.at_points(wind_up**2)[moving]
         about = size - np.mean(size) if len(size) else size
         share = min(max(float(about @ square) / max(float(about @ about), 1e-300), 0.0), 1.0)
-        unknown = np.hypot(math.sqrt(share) * wind_up, _aliased(data.full, effects, data.period_s, found))
+        unknown = math.sqrt(share) * wind_up
     most = max(estimator.scales.floor_arcsec, float(np.quantile(unknown[data.full.usable], CALMEST)))
     usable = data.full.usable & (unknown <= most)
     _, turned = estimator.turned(effects, fitted.hypothesis.start)
@@ -185,18 +226,3 @@ def _accelerated(full: Samples, period_s: float) -> FloatArray:
         part = np.abs(size[each.rows]) / full.ratio * ARCSEC_PER_DEG
         result[each.rows] = maximum_filter1d(part, known + 2, origin=known // 2, mode="nearest")
     return result
-
-
-def _aliased(full: Samples, effects: Sequence[Effect], period_s: float, found: Swing) -> FloatArray:
-    """Returns the standard deviation of the swing in waves with less than `RESOLVED` samples each, (n,)."""
-    turns_s, variance = np.abs(full.speed_deg_s) / DEG_PER_TURN, np.zeros(len(full))
-    seen = found.frequency_hz * period_s * RESOLVED < 1.0
-    damping = found.damping if seen else min(found.damping, USUALLY_DAMPED)
-    for turns, amplitude, _ in (
-        each for effect in effects if effect.part is Part.ORDERS for each in effect.waves()
-    ):
-        fast = turns * turns_s * period_s * RESOLVED > 1.0
-        ratio2 = (turns * turns_s[fast] / found.frequency_hz) ** 2
-        gain2 = ratio2**2 / ((1.0 - ratio2) ** 2 + 4.0 * damping**2 * ratio2)
-        variance[fast] += 0.5 * amplitude**2 * gain2
-    return np.sqrt(variance)

@@ -68,8 +68,9 @@ def has_orders(base: Iterable[Effect]) -> bool:
 
 
 def growth_of(base: Iterable[Effect]) -> TorqueGrowth | None:
-    """Returns the growth of a model's orders with torque, or None."""
+    """Returns the growth of a model's orders with torque, or None; a fit may have left its range."""
     for each in base:
         if isinstance(each, TorqueGrowth):
-            return TorqueGrowth(**{name: getattr(each, name) for name in TorqueGrowth.model_fields})
+            values = {name: getattr(each, name) for name in TorqueGrowth.model_fields}
+            return TorqueGrowth.model_construct(**values)
     return None

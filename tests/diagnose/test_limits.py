@@ -1,0 +1,46 @@
+"""Detection limits are what a diagnosis names, and what counts as a repetition."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import pytest
+
+from hdbridge.analysis.diagnosis import diagnose
+from hdbridge.analysis.findings import Diagnosis
+from hdbridge.axis.model import TransmissionModel
+from hdbridge.records.record import Record
+
+Diagnosed = Callable[..., Diagnosis]
+
+
+@pytest.mark.parametrize(
+    ("cause", "of_peak"),
+    [
+        ("backlash", lambda peak: {"gap": 2.0 * peak}),
+        ("creep", lambda peak: {"size": peak, "tau": 5.0}),
+    ],
+)
+def test_a_cause_is_named_above_its_detection_limit_and_not_below(
+    diagnosed: Diagnosed, cause: str, of_peak: Callable[[float], dict[str, Any]]
+) -> None:
+    limit = diagnosed().identifiability[cause].detection_limit_arcsec
+    assert limit is not None
+    below, above = (diagnosed({cause: of_peak(times * limit)}).findings for times in (0.7, 1.4))
+    assert not below
+    assert [each.cause for each in above] == [cause]
+
+
+def test_recordings_of_different_motion_do_not_repeat_each_other(
+    columns: Callable[..., dict[str, Any]], model: TransmissionModel
+) -> None:
+    """Only one of them shows a loop with memory."""
+    whole = columns(law="memory")
+    ends = np.searchsorted(whole["time_s"], [0.0, 9.0, 30.0, 1e9])
+    parts = [Record({name: each[a:b] for name, each in whole.items()}) for a, b in pairwise(ends)]
+    (found,) = diagnose(parts, model).findings
+    assert found.cause == "hysteresis_memory"
+    assert found.probability > 0.9
