@@ -14,6 +14,7 @@ import generated
 from pydantic import BaseModel
 
 from hdbridge.axis.effects import CATALOGUE, Effect, aliases_of
+from hdbridge.twin.translate import TABLE as TRANSLATED
 
 PAGE = generated.DOCS / "causes.md"
 
@@ -21,10 +22,10 @@ _INTRODUCTION = """# Causes of transmission error
 
 <!-- Written by tools/catalogue_docs.py from hdbridge/axis/effects; do not edit. -->
 
-The names are those of findings and of the model file's `effects`. The error is how far the load is ahead of
-motor angle / N, in arcsec at the load. Permitted ranges are in the file of each effect.
+The catalogue of errors that a [diagnosis](diagnosis.md) can name; a model's `effects` have the same names. The
+error is how far the load is ahead of motor angle / N, in arcsec at the load. Each section has the equation and:
 
-- **Separate it**: the measurement that distinguishes a cause from its look-alikes (**taken for**).
+- **Remedy**; **experiment**: the measurement that separates the cause from its look-alikes (**aliases**).
 - **Compensated**: yes, unless stated otherwise. An error of the measurement is not, because that would move
   the load away from its target; neither is what cannot be predicted.
 - **Needs**: columns in addition to `motor_position_deg`. Speed, acceleration and direction are derived from
@@ -33,6 +34,7 @@ motor angle / N, in arcsec at the load. Permitted ranges are in the file of each
   phase_deg}`. A `loop` (or `base`) is a copy of the model's loop: `{offset_arcsec, width_deg, exponent,
   memory}`. `ratio` is N of the model. Beyond a `limit_*` of its input an effect is held, so that a faulty
   sensor cannot move the axis far.
+- **Truth file**: the keys by which the [simulated drive](ci.md#the-truth-file) has this cause.
 """
 
 
@@ -59,10 +61,10 @@ def _section(kind: type[Effect]) -> Iterator[str]:
     yield ""
     yield f"    {about.equation}"
     yield ""
-    yield f"- **What to do**: {about.remedy}."
-    yield f"- **Separate it**: {about.experiment}."
+    yield f"- **Remedy**: {about.remedy}."
+    yield f"- **Experiment**: {about.experiment}."
     if aliases_of(kind.name):
-        yield f"- **Taken for**: {', '.join(f'[`{each}`](#{each})' for each in aliases_of(kind.name))}."
+        yield f"- **Aliases**: {', '.join(f'[`{each}`](#{each})' for each in aliases_of(kind.name))}."
     why = kind.compensable.why.removeprefix("no, ")
     if not kind.compensable.possible:
         yield f"- **Not compensated**: {why}."
@@ -76,6 +78,8 @@ def _section(kind: type[Effect]) -> Iterator[str]:
         yield f"- **Needs**: {needs}."
     yield f"- **Source**: {about.source}."
     yield f"- **Parameters**: {'; '.join(_once(kind))}."
+    if places := TRANSLATED[kind.name].counterpart:
+        yield f"- **Truth file**: {re.sub(r'[a-z_]+[.][a-z0-9_.]+', lambda place: f'`{place[0]}`', places)}."
     yield ""
 
 

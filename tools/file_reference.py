@@ -1,6 +1,5 @@
 """Writes the tables of docs/files.md and of plans (docs/calibration.md) from the models that read the files,
-those of faults (docs/reliability.md, docs/ci.md) from the fault tables, and that of docs/twin.md from the
-translation.
+those of faults (docs/reliability.md, docs/ci.md) from the fault tables.
 
 python tools/file_reference.py           rewrite the tables
 python tools/file_reference.py --check   report if they are up to date (exit status 1 if not)
@@ -21,7 +20,6 @@ from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 
 from hdbridge.axis import AxisConfig
-from hdbridge.axis.effects import CATALOGUE
 from hdbridge.axis.model.file import ModelFile
 from hdbridge.axis.model.store import LogFile
 from hdbridge.daemon.machinefile import MachineFile
@@ -42,10 +40,9 @@ from hdbridge.motion.procedures.plan import (
 from hdbridge.records.record import OPTIONAL, REQUIRED
 from hdbridge.records.recording import RecordingFile
 from hdbridge.testing.faulttable import sentences
-from hdbridge.twin.translate import TABLE as TRANSLATED
 
 PAGES = tuple(
-    generated.DOCS / f"{name}.md" for name in ("files", "calibration", "reliability", "fleet", "twin", "ci")
+    generated.DOCS / f"{name}.md" for name in ("files", "calibration", "reliability", "fleet", "ci")
 )
 _BLOCK = re.compile(r"(<!-- generated: (?P<name>[a-z-]+) -->\n).*?(<!-- end -->)", re.DOTALL)
 
@@ -132,15 +129,6 @@ def fault_table() -> str:
     return "\n".join(lines) + "\n"
 
 
-def translation_table() -> str:
-    """Returns the place of each effect of the catalogue in a truth file."""
-    lines = ["| effect | place in the truth file |", "|---|---|"]
-    for name in CATALOGUE:
-        places = re.sub(r"[a-z_]+\.[a-z0-9_.]+", lambda place: f"`{place[0]}`", TRANSLATED[name].counterpart)
-        lines.append(f"| `{name}` | {places} |")
-    return "\n".join(lines) + "\n"
-
-
 def fleet_list(name: str) -> str:
     """Returns the columns of a data set of a fleet."""
     lines = []
@@ -173,7 +161,6 @@ BLOCKS: Mapping[str, Any] = {
     "faults": fault_table,
     "plan": lambda: key_list(Plan),
     "procedures": procedure_list,
-    "translation": translation_table,
     "fleet-recordings": lambda: fleet_list("recordings"),
     "fleet-findings": lambda: fleet_list("findings"),
     "manifest": manifest_list,
