@@ -9,9 +9,10 @@ from __future__ import annotations
 
 import re
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from enum import Enum
 from functools import cache
+from itertools import groupby
 from typing import Any, get_args
 
 import generated
@@ -120,28 +121,34 @@ SEEN_BY: Mapping[Fault, str] = {
 
 
 def fault_table() -> str:
-    """Returns the reactions to each fault, and the advice."""
-    lines = ["| fault | reaction; in the next cycle | seen by | what to do |", "|---|---|---|---|"]
+    """Returns the reactions to each fault."""
+    lines = ["| fault | reaction; in the next cycle | seen by |", "|---|---|---|"]
     for row in TABLE:
         later = f"; {REACTION_WORDS[row.then]}" if row.then is not row.first else ""
         reaction = REACTION_WORDS[row.first] + later
-        lines.append(f"| {row.fault.value} | {reaction} | {SEEN_BY[row.fault]} | {row.hint} |")
+        lines.append(f"| {row.fault.value} | {reaction} | {SEEN_BY[row.fault]} |")
     return "\n".join(lines) + "\n"
 
 
 def fleet_list(name: str) -> str:
     """Returns the columns of a data set of a fleet."""
-    lines = []
+    rows = []
     for column, (kind, about) in FLEET_COLUMNS[name].items():
         parts = NESTED.get(kind)
         words = f"list of {{{', '.join(parts)}}}" if parts else kind.replace("texts", "list of text")
-        lines.append(_item(f"`{column}`", words, about))
-    return "".join(lines)
+        rows.append((column, words, about))
+    return _grouped(rows)
 
 
 def manifest_list() -> str:
     """Returns the columns of a manifest."""
-    return "".join(_item(f"`{name}`", "", about) for name, about in MANIFEST.items())
+    return _grouped((name, "", about) for name, about in MANIFEST.items())
+
+
+def _grouped(rows: Iterable[tuple[str, str, str]]) -> str:
+    """Returns rows as a list; neighbours of one kind and meaning share a line."""
+    groups = groupby(rows, key=lambda row: row[1:])
+    return "".join(_item(", ".join(f"`{name}`" for name, *_ in same), *of) for of, same in groups)
 
 
 def fault_names() -> str:
@@ -183,6 +190,7 @@ _SHORTER = (
     (r"\bat most\b", "to"),
     (r"\b(text|list), not empty", r"\1"),
     (r"integer 0 to 4294967295", "32-bit integer"),
+    (r"(?<![-\w.])(?<!above )(\d[\d.]*) to (?=\d)", r"\1–"),
     (r" or '", ", '"),
     (r"'([^']*)'", r"`\1`"),
 )

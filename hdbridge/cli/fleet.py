@@ -232,8 +232,8 @@ def watch(
 ) -> None:
     """Diagnose new recordings as they arrive, and update Parquet and page in FOLDER.
 
-    A recording is ready when its size and time are the same in two listings. Ctrl-C ends the command and
-    keeps finished results (exit status 0).
+    A recording is ready when its size and time are the same in two listings. Ctrl-C keeps finished results
+    (exit status 0).
     """
     from hdbridge.fleet.engine import watch as watch_fleet
 
@@ -289,7 +289,7 @@ def simulate(
     """Make recordings of a simulated fleet: known causes that grow over a year, damaged files, exchanged
     joints.
 
-    FOLDER gets the recordings, `manifest.csv`, and `answers.json` with what was hidden.
+    FOLDER gets the recordings, `manifest.csv`, and the truth, `answers.json`.
     """
     from hdbridge.fleet.simulate import simulate as make
 

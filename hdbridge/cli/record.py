@@ -171,8 +171,8 @@ def export(
 ) -> None:
     """Make a record of one axis, as `fit` and `diagnose` read it.
 
-    Nothing is rounded or interpolated. Missing cycles or a disabled axis begin a new part; a recording
-    folder has a file for each part, a CSV file only one.
+    Nothing is rounded or interpolated. Missing cycles or a disabled axis begin a new part, which needs a
+    recording folder.
     """
     out = _checked_out(out)
     recording, used = read_flights(flights, axis, begin, end, all_states=all_states)
