@@ -22,18 +22,18 @@ _INTRODUCTION = """# Causes of transmission error
 
 <!-- Written by tools/catalogue_docs.py from hdbridge/axis/effects; do not edit. -->
 
-The catalogue of errors that a [diagnosis](diagnosis.md) can name; a model's `effects` have the same names. The
-error is how far the load is ahead of motor angle / N, in arcsec at the load. Each section has the equation and:
+The causes that a [diagnosis](diagnosis.md) names and a model's `effects` may have. Errors are how far the
+load is ahead of motor angle / N, in arcsec at the load. Each section has the equation and:
 
-- **Remedy**; **experiment**: the measurement that separates the cause from its look-alikes (**aliases**).
+- **Remedy**; **experiment**, which separates the cause from its look-alikes (**aliases**).
 - **Compensated**: yes, unless stated otherwise. An error of the measurement is not, because that would move
   the load away from its target; neither is what cannot be predicted.
-- **Needs**: columns in addition to `motor_position_deg`. Speed, acceleration and direction are derived from
-  the commanded motor angle; the direction is held at rest. `load_deg` is the predicted load angle.
-- **Parameters**: names end in the unit; = is the default. `orders` are a list of `{order, amplitude_arcsec,
-  phase_deg}`. A `loop` (or `base`) is a copy of the model's loop: `{offset_arcsec, width_deg, exponent,
-  memory}`. `ratio` is N of the model. Beyond a `limit_*` of its input an effect is held, so that a faulty
-  sensor cannot move the axis far.
+- **Needs**: columns in addition to `motor_position_deg`. Speed, acceleration and direction (held at rest) are
+  those of the commanded motor angle; `load_deg` is the predicted load angle.
+- **Parameters**: names end in the unit; = is the default. `orders` are `{order, amplitude_arcsec,
+  phase_deg}`; a `loop` (or `base`) is a copy of the model's: `{offset_arcsec, width_deg, exponent, memory}`.
+  `ratio` is N. Beyond a `limit_*` of its input an effect is held, so that a faulty sensor cannot move the
+  axis far.
 - **Truth file**: the keys by which the [simulated drive](ci.md#the-truth-file) has this cause.
 """
 
