@@ -63,12 +63,12 @@ _MANY = 4
 """Number of commands from which the commands with an option are not listed."""
 
 _SETS = {
-    "daemon options": ("--at", "--force", "--json"),
-    "bus options": ("--interface", "--channel", "--force", "--borrow"),
-    "simulation options": ("--simulate", "--truth", "--seed"),
-    "CSV options": ("--columns", "--units", "--unwrap"),
-    "model options": ("--reason", "--twin"),
-    "homing options": (
+    "*daemon*": ("--at", "--force", "--json"),
+    "*bus*": ("--interface", "--channel", "--force", "--borrow"),
+    "*simulation*": ("--simulate", "--truth", "--seed"),
+    "*CSV*": ("--columns", "--units", "--unwrap"),
+    "*model*": ("--reason", "--twin"),
+    "*homing*": (
         "--method",
         "--switch-velocity",
         "--zero-velocity",
@@ -76,7 +76,7 @@ _SETS = {
         "--offset",
         "--timeout",
     ),
-    "fleet options": (
+    "*fleet*": (
         *("--out", "--manifest", "--model", "--models", "--scheduler", "--workers", "--memory", "--limit"),
         *("--pages", "--timeout"),
     ),
@@ -144,9 +144,11 @@ def page() -> str:
     common = {each: names for each, names in users.items() if len(names) >= _COMMON}
     names = Counter(each.names[0] for each in users)
     shared = sorted(common.items(), key=lambda item: (item[0].is_option, item[0].names[0].lstrip("-")))
-    sets = "; ".join(f"*{name}*: `{'`, `'.join(options)}`" for name, options in _SETS.items())
+    sets = "; ".join(f"{name}: `{'`, `'.join(options)}`" for name, options in _SETS.items())
     parts = [
-        _INTRODUCTION + "\n".join(_common_item(*each, names) for each in shared) + f"\n\nSets: {sets}.\n"
+        _INTRODUCTION
+        + "\n".join(_common_item(*each, names) for each in shared)
+        + f"\n\nSets of options: {sets}.\n"
     ]
     for panel, members in PANELS.items():
         parts.append(f"## {panel}\n")
@@ -161,9 +163,10 @@ def _section(command: Command, common: Container[Parameter]) -> str:
     shared = [each.names[0] for each in command.parameters if each in common and each.is_option]
     also = [name for name, members in _SETS.items() if set(members) <= set(shared)]
     in_sets = {each for name in also for each in _SETS[name]}
+    ending = " options" if also else ""
     also = [*(f"`{each}`" for each in shared if each not in in_sets), *also]
     if also:
-        own.append(f"- {'also ' if own else ''}{', '.join(also)}")
+        own.append(f"- {'also ' if own else ''}{', '.join(also)}{ending}")
     return "\n".join([*lines, *own]) + ("\n" if own else "")
 
 
