@@ -35,6 +35,8 @@ load is ahead of motor angle / N, in arcsec at the load. Each section has the eq
   `ratio` is N. Beyond a `limit_*` of its input an effect is held, so that a faulty sensor cannot move the
   axis far.
 - **Truth file**: the keys by which the [simulated drive](ci.md#the-truth-file) has this cause.
+
+Signatures, with the usual size:
 """
 
 
@@ -45,11 +47,9 @@ def page() -> str:
 
 
 def _overview() -> Iterator[str]:
-    yield "| cause | signature | size |"
-    yield "|---|---|---|"
     for name, kind in CATALOGUE.items():
         about = kind.about
-        yield f"| [`{name}`](#{name}) | {_cell(about.signature)} | {_cell(about.size)} |"
+        yield f"- [`{name}`](#{name}): {about.signature} ({about.size})"
     yield ""
 
 
@@ -132,10 +132,6 @@ def _model(annotation: Any) -> type[BaseModel] | None:
         if isinstance(each, type) and issubclass(each, BaseModel):
             return each
     return None
-
-
-def _cell(text: str) -> str:
-    return text.replace("|", "\\|")
 
 
 if __name__ == "__main__":

@@ -120,14 +120,13 @@ SEEN_BY: Mapping[Fault, str] = {
 }
 
 
-def fault_table() -> str:
+def fault_list() -> str:
     """Returns the reactions to each fault."""
-    lines = ["| fault | reaction; in the next cycle | seen by |", "|---|---|---|"]
+    lines = []
     for row in TABLE:
         later = f"; {REACTION_WORDS[row.then]}" if row.then is not row.first else ""
-        reaction = REACTION_WORDS[row.first] + later
-        lines.append(f"| {row.fault.value} | {reaction} | {SEEN_BY[row.fault]} |")
-    return "\n".join(lines) + "\n"
+        lines.append(f"- **{row.fault.value}** ({REACTION_WORDS[row.first]}{later}): {SEEN_BY[row.fault]}\n")
+    return "".join(lines)
 
 
 def fleet_list(name: str) -> str:
@@ -165,7 +164,7 @@ BLOCKS: Mapping[str, Any] = {
     "recording": lambda: key_list(RecordingFile),
     "firmware": lambda: key_list(Behaviour),
     "history": lambda: key_list(LogFile),
-    "faults": fault_table,
+    "faults": fault_list,
     "plan": lambda: key_list(Plan),
     "procedures": procedure_list,
     "fleet-recordings": lambda: fleet_list("recordings"),

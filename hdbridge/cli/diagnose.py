@@ -95,15 +95,11 @@ def command(
         typer.Option(
             "--plan",
             metavar="PLAN.yaml",
-            help="Without records: causes that this plan could detect and separate.",
+            help="Without records: causes that this plan could detect, from which size, and separate.",
         ),
     ] = None,
 ) -> None:
-    """Compare records with a model; name the causes that it lacks and those that cannot be separated.
-
-    With --plan and no record: the causes that the planned procedures could detect, from which size, and
-    separate.
-    """
+    """Compare records with a model; name the causes that it lacks and those that cannot be separated."""
     from hdbridge.analysis.diagnosis import diagnose
     from hdbridge.analysis.identifiability import plan_report
     from hdbridge.axis.model import TransmissionModel
