@@ -189,7 +189,8 @@ _SHORTER = (
     (r"\bat most\b", "to"),
     (r"\b(text|list), not empty", r"\1"),
     (r"integer 0 to 4294967295", "32-bit integer"),
-    (r"(?<![-\w.])(?<!above )(\d[\d.]*) to (?=\d)", r"\1–"),
+    (r"above (?=\d)", ">"),
+    (r"(?<![-\w.])(\d[\d.]*) to (?=\d)", r"\1–"),
     (r" or '", ", '"),
     (r"'([^']*)'", r"`\1`"),
 )
