@@ -14,7 +14,6 @@ import generated
 from pydantic import BaseModel
 
 from hdbridge.axis.effects import CATALOGUE, Effect, aliases_of
-from hdbridge.twin.translate import TABLE as TRANSLATED
 
 PAGE = generated.DOCS / "causes.md"
 
@@ -34,7 +33,6 @@ load is ahead of motor angle / N, in arcsec at the load. Each section has the eq
   phase_deg}`; a `loop` (or `base`) is a copy of the model's: `{offset_arcsec, width_deg, exponent, memory}`.
   `ratio` is N. Beyond a `limit_*` of its input an effect is held, so that a faulty sensor cannot move the
   axis far.
-- **Truth file**: the keys by which the [simulated drive](ci.md#the-truth-file) has this cause.
 
 Signatures, with the usual size:
 """
@@ -78,8 +76,6 @@ def _section(kind: type[Effect]) -> Iterator[str]:
         yield f"- **Needs**: {needs}."
     yield f"- **Source**: {about.source}."
     yield f"- **Parameters**: {'; '.join(_once(kind))}."
-    if places := TRANSLATED[kind.name].counterpart:
-        yield f"- **Truth file**: {re.sub(r'[a-z_]+[.][a-z0-9_.]+', lambda place: f'`{place[0]}`', places)}."
     yield ""
 
 
