@@ -21,18 +21,20 @@ _INTRODUCTION = """# Causes of transmission error
 
 <!-- Written by tools/catalogue_docs.py from hdbridge/axis/effects; do not edit. -->
 
-The names are those of findings and of the model file's `effects`. The error is how far the load is ahead of
-motor angle / N, in arcsec at the load. Permitted ranges are in the file of each effect.
+The causes that a [diagnosis](diagnosis.md) names and a model's `effects` may have. Errors are how far the
+load is ahead of motor angle / N, in arcsec at the load. Each section has the equation and:
 
-- **Separate it**: the measurement that distinguishes a cause from its look-alikes (**taken for**).
+- **Remedy**; **experiment**, which separates the cause from its look-alikes (**aliases**).
 - **Compensated**: yes, unless stated otherwise. An error of the measurement is not, because that would move
   the load away from its target; neither is what cannot be predicted.
-- **Needs**: columns in addition to `motor_position_deg`. Speed, acceleration and direction are derived from
-  the commanded motor angle; the direction is held at rest. `load_deg` is the predicted load angle.
-- **Parameters**: names end in the unit; = is the default. `orders` are a list of `{order, amplitude_arcsec,
-  phase_deg}`. A `loop` (or `base`) is a copy of the model's loop: `{offset_arcsec, width_deg, exponent,
-  memory}`. `ratio` is N of the model. Beyond a `limit_*` of its input an effect is held, so that a faulty
-  sensor cannot move the axis far.
+- **Needs**: columns in addition to `motor_position_deg`. Speed, acceleration and direction (held at rest) are
+  those of the commanded motor angle; `load_deg` is the predicted load angle.
+- **Parameters**: names end in the unit; = is the default. `orders` are `{order, amplitude_arcsec,
+  phase_deg}`; a `loop` (or `base`) is a copy of the model's: `{offset_arcsec, width_deg, exponent, memory}`.
+  `ratio` is N. Beyond a `limit_*` of its input an effect is held, so that a faulty sensor cannot move the
+  axis far.
+
+Signatures, with the usual size:
 """
 
 
@@ -43,11 +45,9 @@ def page() -> str:
 
 
 def _overview() -> Iterator[str]:
-    yield "| cause | signature | size |"
-    yield "|---|---|---|"
     for name, kind in CATALOGUE.items():
         about = kind.about
-        yield f"| [`{name}`](#{name}) | {_cell(about.signature)} | {_cell(about.size)} |"
+        yield f"- [`{name}`](#{name}): {about.signature} ({about.size})"
     yield ""
 
 
@@ -59,10 +59,10 @@ def _section(kind: type[Effect]) -> Iterator[str]:
     yield ""
     yield f"    {about.equation}"
     yield ""
-    yield f"- **What to do**: {about.remedy}."
-    yield f"- **Separate it**: {about.experiment}."
+    yield f"- **Remedy**: {about.remedy}."
+    yield f"- **Experiment**: {about.experiment}."
     if aliases_of(kind.name):
-        yield f"- **Taken for**: {', '.join(f'[`{each}`](#{each})' for each in aliases_of(kind.name))}."
+        yield f"- **Aliases**: {', '.join(f'[`{each}`](#{each})' for each in aliases_of(kind.name))}."
     why = kind.compensable.why.removeprefix("no, ")
     if not kind.compensable.possible:
         yield f"- **Not compensated**: {why}."
@@ -128,10 +128,6 @@ def _model(annotation: Any) -> type[BaseModel] | None:
         if isinstance(each, type) and issubclass(each, BaseModel):
             return each
     return None
-
-
-def _cell(text: str) -> str:
-    return text.replace("|", "\\|")
 
 
 if __name__ == "__main__":

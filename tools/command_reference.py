@@ -10,7 +10,8 @@ import re
 import shlex
 import sys
 import typing
-from collections.abc import Callable, Container, Iterator
+from collections import Counter
+from collections.abc import Callable, Container, Iterator, Mapping
 from dataclasses import dataclass
 from enum import Enum
 from pathlib import Path
@@ -26,32 +27,30 @@ PAGE = generated.DOCS / "commands.md"
 
 _INTRODUCTION = """# Commands
 
-Made from the command line by `python tools/command_reference.py`; `hdbridge COMMAND --help` adds the ranges.
-Formats: [files](files.md).
+Every command, option and exit status; `hdbridge COMMAND --help` adds the ranges.
 
-Results go to standard output, progress and remarks to standard error. Outputs are checked before anything is
-read or moves: a result replaces only a result of its kind, never an input or a file of a profile or a
-recording; a folder for measurements is new or empty. A proposed model is `PROFILE/pending.yaml` until
-`hdbridge model commit`.
+Results go to standard output, progress and remarks to standard error. A result replaces only a result of its
+kind, never an input or a file of a profile or a recording; a folder for measurements is new or empty. A
+proposed model is `PROFILE/pending.yaml` until `hdbridge model commit`.
 
 Options before the command: `-v` logs the bus traffic to standard error (`-vv`: every SDO transfer), `--log
-FILE` appends the log as JSON lines (`date`, `level`, `where`, `event`, facts; none during the control cycle),
-`--install-completion`, `--version`.
+FILE` appends the log as JSON lines (`date`, `level`, `where`, `event`, facts), `--install-completion`,
+`--version`.
 
 **Ctrl-C** (SIGTERM, SIGQUIT, SIGHUP) stops the axis from the next period on; what was measured is kept, and
 `--resume` continues. The third one ends the program at once.
 
-| exit status | |
-|---|---|
-| 0 | done |
-| 1 | an error in hdbridge itself |
-| 2 | bad input; nothing was written, nothing moved |
-| 3 | the bus: cannot be opened, or went away |
-| 4 | the drive: absent, refuses, not the one expected, reports a fault |
-| 5 | the supervision stopped the axis while it moved |
-| 6 | a result could not be written, for example to a full disk; it is printed |
-| 7 | the daemon: not reached, or refused; nothing moved |
-| 130 | Ctrl-C: the axis was stopped, the record kept |
+**Exit status**
+
+- 0: done
+- 1: an error in hdbridge itself
+- 2: bad input; nothing was written, nothing moved
+- 3: the bus cannot be opened, or went away
+- 4: the drive is absent, refuses, is not the one expected, or reports a fault
+- 5: the supervision stopped the axis while it moved
+- 6: a result could not be written, for example to a full disk; it is printed
+- 7: the daemon was not reached, or refused; nothing moved
+- 130: Ctrl-C; the axis was stopped, the record kept
 
 ## Arguments and options of several commands
 
@@ -64,10 +63,23 @@ _MANY = 4
 """Number of commands from which the commands with an option are not listed."""
 
 _SETS = {
-    "daemon options": ("--at", "--force", "--json"),
-    "bus options": ("--interface", "--channel", "--force", "--borrow"),
-    "simulation options": ("--simulate", "--truth", "--seed"),
-    "CSV options": ("--columns", "--units", "--unwrap"),
+    "*daemon*": ("--at", "--force", "--json"),
+    "*bus*": ("--interface", "--channel", "--force", "--borrow"),
+    "*simulation*": ("--simulate", "--truth", "--seed"),
+    "*CSV*": ("--columns", "--units", "--unwrap"),
+    "*model*": ("--reason", "--twin"),
+    "*homing*": (
+        "--method",
+        "--switch-velocity",
+        "--zero-velocity",
+        "--acceleration",
+        "--offset",
+        "--timeout",
+    ),
+    "*fleet*": (
+        *("--out", "--manifest", "--model", "--models", "--scheduler", "--workers", "--memory", "--limit"),
+        *("--pages", "--timeout"),
+    ),
 }
 """Options that stand together in many commands, by the name of the set."""
 
@@ -130,12 +142,17 @@ def page() -> str:
         for each in command.parameters:
             users.setdefault(each, []).append(command.name)
     common = {each: names for each, names in users.items() if len(names) >= _COMMON}
+    names = Counter(each.names[0] for each in users)
     shared = sorted(common.items(), key=lambda item: (item[0].is_option, item[0].names[0].lstrip("-")))
-    sets = "; ".join(f"*{name}*: `{'`, `'.join(members)}`" for name, members in _SETS.items())
-    parts = [_INTRODUCTION + "\n".join(_common_item(*each) for each in shared) + f"\n\nSets: {sets}.\n"]
-    for panel, names in PANELS.items():
+    sets = "; ".join(f"{name}: `{'`, `'.join(options)}`" for name, options in _SETS.items())
+    parts = [
+        _INTRODUCTION
+        + "\n".join(_common_item(*each, names) for each in shared)
+        + f"\n\nSets of options: {sets}.\n"
+    ]
+    for panel, members in PANELS.items():
         parts.append(f"## {panel}\n")
-        for name in names:
+        for name in members:
             parts += (_section(each, common) for each in known if each.name.split()[0] == name)
     return "\n".join(parts)
 
@@ -146,15 +163,19 @@ def _section(command: Command, common: Container[Parameter]) -> str:
     shared = [each.names[0] for each in command.parameters if each in common and each.is_option]
     also = [name for name, members in _SETS.items() if set(members) <= set(shared)]
     in_sets = {each for name in also for each in _SETS[name]}
+    ending = " options" if also else ""
     also = [*(f"`{each}`" for each in shared if each not in in_sets), *also]
     if also:
-        own.append(f"- {'also ' if own else ''}{', '.join(also)}")
+        own.append(f"- {'also ' if own else ''}{', '.join(also)}{ending}")
     return "\n".join([*lines, *own]) + ("\n" if own else "")
 
 
-def _common_item(parameter: Parameter, names: list[str]) -> str:
+def _common_item(parameter: Parameter, names: list[str], meanings: Mapping[str, int]) -> str:
+    """Returns an item for all its commands; they are named if the option has another meaning elsewhere."""
     groups = {name.split()[0] for name in names}
-    if len(groups) == 1:
+    if meanings[parameter.names[0]] == 1:
+        owner = ""
+    elif len(groups) == 1:
         owner = f" of `{groups.pop()}`"
     else:
         owner = f" of `{'`, `'.join(names)}`" if len(names) < _MANY else ""

@@ -1,6 +1,5 @@
 """Writes the tables of docs/files.md and of plans (docs/calibration.md) from the models that read the files,
-those of faults (docs/reliability.md, docs/ci.md) from the fault tables, and that of docs/twin.md from the
-translation.
+those of faults (docs/reliability.md, docs/ci.md) from the fault tables.
 
 python tools/file_reference.py           rewrite the tables
 python tools/file_reference.py --check   report if they are up to date (exit status 1 if not)
@@ -10,9 +9,10 @@ from __future__ import annotations
 
 import re
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from enum import Enum
 from functools import cache
+from itertools import groupby
 from typing import Any, get_args
 
 import generated
@@ -21,7 +21,6 @@ from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 
 from hdbridge.axis import AxisConfig
-from hdbridge.axis.effects import CATALOGUE
 from hdbridge.axis.model.file import ModelFile
 from hdbridge.axis.model.store import LogFile
 from hdbridge.daemon.machinefile import MachineFile
@@ -42,10 +41,9 @@ from hdbridge.motion.procedures.plan import (
 from hdbridge.records.record import OPTIONAL, REQUIRED
 from hdbridge.records.recording import RecordingFile
 from hdbridge.testing.faulttable import sentences
-from hdbridge.twin.translate import TABLE as TRANSLATED
 
 PAGES = tuple(
-    generated.DOCS / f"{name}.md" for name in ("files", "calibration", "reliability", "fleet", "twin", "ci")
+    generated.DOCS / f"{name}.md" for name in ("files", "calibration", "reliability", "fleet", "ci")
 )
 _BLOCK = re.compile(r"(<!-- generated: (?P<name>[a-z-]+) -->\n).*?(<!-- end -->)", re.DOTALL)
 
@@ -122,38 +120,34 @@ SEEN_BY: Mapping[Fault, str] = {
 }
 
 
-def fault_table() -> str:
-    """Returns the reactions to each fault, and the advice."""
-    lines = ["| fault | reaction; in the next cycle | seen by | what to do |", "|---|---|---|---|"]
+def fault_list() -> str:
+    """Returns the reactions to each fault."""
+    lines = []
     for row in TABLE:
         later = f"; {REACTION_WORDS[row.then]}" if row.then is not row.first else ""
-        reaction = REACTION_WORDS[row.first] + later
-        lines.append(f"| {row.fault.value} | {reaction} | {SEEN_BY[row.fault]} | {row.hint} |")
-    return "\n".join(lines) + "\n"
-
-
-def translation_table() -> str:
-    """Returns the place of each effect of the catalogue in a truth file."""
-    lines = ["| effect | place in the truth file |", "|---|---|"]
-    for name in CATALOGUE:
-        places = re.sub(r"[a-z_]+\.[a-z0-9_.]+", lambda place: f"`{place[0]}`", TRANSLATED[name].counterpart)
-        lines.append(f"| `{name}` | {places} |")
-    return "\n".join(lines) + "\n"
+        lines.append(f"- **{row.fault.value}** ({REACTION_WORDS[row.first]}{later}): {SEEN_BY[row.fault]}\n")
+    return "".join(lines)
 
 
 def fleet_list(name: str) -> str:
     """Returns the columns of a data set of a fleet."""
-    lines = []
+    rows = []
     for column, (kind, about) in FLEET_COLUMNS[name].items():
         parts = NESTED.get(kind)
         words = f"list of {{{', '.join(parts)}}}" if parts else kind.replace("texts", "list of text")
-        lines.append(_item(f"`{column}`", words, about))
-    return "".join(lines)
+        rows.append((column, words, about))
+    return _grouped(rows)
 
 
 def manifest_list() -> str:
     """Returns the columns of a manifest."""
-    return "".join(_item(f"`{name}`", "", about) for name, about in MANIFEST.items())
+    return _grouped((name, "", about) for name, about in MANIFEST.items())
+
+
+def _grouped(rows: Iterable[tuple[str, str, str]]) -> str:
+    """Returns rows as a list; neighbours of one kind and meaning share a line."""
+    groups = groupby(rows, key=lambda row: row[1:])
+    return "".join(_item(", ".join(f"`{name}`" for name, *_ in same), *of) for of, same in groups)
 
 
 def fault_names() -> str:
@@ -170,10 +164,9 @@ BLOCKS: Mapping[str, Any] = {
     "recording": lambda: key_list(RecordingFile),
     "firmware": lambda: key_list(Behaviour),
     "history": lambda: key_list(LogFile),
-    "faults": fault_table,
+    "faults": fault_list,
     "plan": lambda: key_list(Plan),
     "procedures": procedure_list,
-    "translation": translation_table,
     "fleet-recordings": lambda: fleet_list("recordings"),
     "fleet-findings": lambda: fleet_list("findings"),
     "manifest": manifest_list,
@@ -196,6 +189,8 @@ _SHORTER = (
     (r"\bat most\b", "to"),
     (r"\b(text|list), not empty", r"\1"),
     (r"integer 0 to 4294967295", "32-bit integer"),
+    (r"above (?=\d)", ">"),
+    (r"(?<![-\w.])(\d[\d.]*) to (?=\d)", r"\1–"),
     (r" or '", ", '"),
     (r"'([^']*)'", r"`\1`"),
 )

@@ -1,4 +1,4 @@
-"""Prints the figures of docs/real-records.md, from measured records (which are not part of the project).
+"""Prints the figures of docs/how-well.md, from measured records (which are not part of the project).
 
     HDBRIDGE_REAL_RECORDS=FOLDER python tools/real_records.py          # ten minutes of CPU
     HDBRIDGE_REAL_RECORDS=FOLDER python tools/real_records.py twins    # only those

@@ -41,7 +41,6 @@ PAGE = ROOT / "docs" / "reliability.md"
 DAEMON_TESTS = sorted(Path("tests/daemon/loop").glob("test_reliability*.py"))
 SOCKETCAN_TESTS = ("tests/socketcan/test_reliability.py", "tests/socketcan/test_daemon.py")
 _BLOCK = re.compile(r"(<!-- tried: (?P<name>[a-z-]+) -->\n).*?(<!-- end -->)", re.DOTALL)
-HEAD = "| faults | expected | within | cycles |\n|---|---|---|---|\n"
 _BETWEEN = "; "
 PLACES = {VIRTUAL: "bench", VCAN: "vcan", DAEMON: "daemon"}
 """Places of the suite in the order of the page, as the page names them."""
@@ -68,22 +67,21 @@ def rows() -> list[tuple[str, str, str]]:
 def rows_of_page(text: str) -> list[tuple[str, str, str]]:
     """Returns fault, required reaction and allowed cycles of each result on a page."""
     tables = "".join(match[0] for match in _BLOCK.finditer(text))
-    lines = [
-        line for line in tables.splitlines() if line.startswith("| ") and not line.startswith("| faults |")
-    ]
-    cells = [[cell.strip() for cell in line.strip("|").split(" | ")] for line in lines]
+    found = re.findall(r"^- \*(.+?)\* \(.+/(.+?)\): (.+)$", tables, re.MULTILINE)
     return [
-        (fault, expected, within) for faults, expected, within, _ in cells for fault in faults.split(_BETWEEN)
+        (fault, expected, within) for expected, within, faults in found for fault in faults.split(_BETWEEN)
     ]
 
 
 def table(results: Iterable[Result]) -> str:
-    """Returns results as a table; faults with the same reaction, limit and result share a line."""
+    """Returns results as a list; faults with the same reaction, limit and result share a line."""
     groups: dict[tuple[str, str, str], list[str]] = {}
     for each in results:
         groups.setdefault((each.expected, each.within, each.cycles), []).append(each.fault)
-    lines = (f"| {_BETWEEN.join(faults)} | {' | '.join(key)} |\n" for key, faults in groups.items())
-    return HEAD + "".join(lines)
+    return "".join(
+        f"- *{expected}* ({cycles}/{within}): {_BETWEEN.join(faults)}\n"
+        for (expected, within, cycles), faults in groups.items()
+    )
 
 
 def page(seen: list[Seen]) -> str:

@@ -27,8 +27,7 @@ def command(
 ) -> None:
     """Step a simulated axis 240 times each way under four compensation schemes.
 
-    The drive is a simulated CiA-402 drive on python-can's virtual bus. Takes half a minute to two. Table,
-    JSON, records and a page go to FOLDER.
+    Table, JSON, records and a page go to FOLDER.
     """
     from hdbridge.axis.model import TransmissionModel
     from hdbridge.cli.step import print_result, run_comparison, write_page

@@ -79,7 +79,7 @@ def command(
         typer.Option(
             "--prior",
             metavar="FLEET.parquet",
-            help="What a fleet says of the causes: fleet.parquet in the --out of hdbridge fleet run.",
+            help="fleet.parquet of hdbridge fleet run: how often each cause is there.",
         ),
     ] = None,
     group: Annotated[
@@ -95,15 +95,11 @@ def command(
         typer.Option(
             "--plan",
             metavar="PLAN.yaml",
-            help="Without records: causes that this plan could detect and separate.",
+            help="Without records: causes that this plan could detect, from which size, and separate.",
         ),
     ] = None,
 ) -> None:
-    """Compare records with a model; name the causes that it lacks and those that cannot be separated.
-
-    With --plan and no record: the causes that the planned procedures could detect, the detection limit of
-    each in arcseconds, and the causes that they could not separate.
-    """
+    """Compare records with a model; name the causes that it lacks and those that cannot be separated."""
     from hdbridge.analysis.diagnosis import diagnose
     from hdbridge.analysis.identifiability import plan_report
     from hdbridge.axis.model import TransmissionModel

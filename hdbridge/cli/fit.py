@@ -59,10 +59,9 @@ def command(
 ) -> None:
     """Fit a model to recordings; report parameter intervals and what the data cannot determine.
 
-    A CSV file needs a time, a motor angle and a load angle (multi-turn); the commanded motor angle helps.
-    They are called `time_s`, `motor_position_deg`, `load_position_deg` and `motor_target_deg`, or as
-    `--columns` and `--units` say. Nothing is activated: to use a fit, write it to a profile with --out.
-    A model that is worse on held-out data than the one given by --model, or than none, is not written.
+    A CSV file needs `time_s`, `motor_position_deg` and `load_position_deg` (multi-turn), or other names by
+    --columns; `motor_target_deg` helps. Nothing is activated. A model that is worse on held-out data than
+    that of --model, or than none, is not written.
     """
     from hdbridge.axis import AxisConfig
     from hdbridge.axis.model import TransmissionModel

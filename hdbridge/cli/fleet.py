@@ -198,10 +198,8 @@ class Fleet:
 def run(fleet: Fleet) -> None:
     """Diagnose every recording that is not in FOLDER yet, and write Parquet and a page there.
 
-    A joint without a model gets one fitted to its earliest recording. An unusable recording is a row with the
-    reason. Ctrl-C keeps finished results; the same command continues.
-
-    Exit status 2 if no recording could be diagnosed.
+    Ctrl-C keeps finished results; the same command continues. Exit status 2 if no recording could be
+    diagnosed.
     """
     found = fleet.find(fleet.dataset.stored())
     fleet.dataset.create()
@@ -232,8 +230,7 @@ def watch(
 ) -> None:
     """Diagnose new recordings as they arrive, and update Parquet and page in FOLDER.
 
-    A recording is ready when its size and time are the same in two listings. Ctrl-C ends the command and
-    keeps finished results (exit status 0).
+    Ctrl-C keeps finished results (exit status 0).
     """
     from hdbridge.fleet.engine import watch as watch_fleet
 
@@ -289,7 +286,7 @@ def simulate(
     """Make recordings of a simulated fleet: known causes that grow over a year, damaged files, exchanged
     joints.
 
-    FOLDER gets the recordings, `manifest.csv`, and `answers.json` with what was hidden.
+    FOLDER gets the recordings, `manifest.csv`, and the truth, `answers.json`.
     """
     from hdbridge.fleet.simulate import simulate as make
 

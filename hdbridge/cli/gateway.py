@@ -49,7 +49,7 @@ def doctor(
 ) -> None:
     """Listen to the other master; report its configuration, its commands and its mistakes, with reasons.
 
-    Sends nothing, so it may run next to the daemon. A mistake is followed by the correction.
+    Sends nothing, so it may run next to the daemon.
 
     Exit status 4 if the master made a mistake, or nothing of the axis was heard.
     """

@@ -28,8 +28,8 @@ def command(
 ) -> None:
     """Home the drive by one of its own methods (CiA 402, mode HM); print the position of the axis.
 
-    The drive plans the motion. Ctrl-C stops it (exit status 130). A model belongs to the zero of its
-    calibration. An absolute encoder needs no homing.
+    Ctrl-C stops it (exit status 130). A model belongs to the zero of its calibration. An absolute encoder
+    needs no homing.
     """
     from hdbridge.drive.modes import Homing
 

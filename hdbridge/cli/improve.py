@@ -66,8 +66,7 @@ def command(
 ) -> None:
     """Diagnose the active model, extend it, step with both, and keep the better one as pending.
 
-    The axis moves within the limits of its axis file. Ctrl-C stops it and keeps what was measured. No model
-    is proposed if nothing that can be compensated is found, or if positioning does not improve.
+    The axis moves within the limits of its axis file. Ctrl-C stops it and keeps what was measured.
     """
     from hdbridge.cli.measuring import Measurement, phases
     from hdbridge.commissioning.improvement import Source, improve

@@ -28,8 +28,7 @@ def command(
 ) -> None:
     """Show, write or remove the systemd files that run a machine's daemon from the start of the computer.
 
-    They are a unit and, for SocketCAN with a `bitrate_bps`, a file for systemd-networkd. Nothing is started;
-    the commands for that are printed.
+    Nothing is started; the commands for that are printed.
     """
     from hdbridge.daemon.machine import Machine
     from hdbridge.daemon.systemd import service_files

@@ -47,7 +47,7 @@ def command(
 ) -> None:
     """Run the axis at several speeds; print the ripple of the load without and with compensation.
 
-    Measures the response of the axis to a correction in motion, and compensates for it.
+    Measures the response to a correction in motion, and compensates for it.
     """
     from hdbridge.axis.model import TransmissionModel
     from hdbridge.axis.model.store import propose as keep

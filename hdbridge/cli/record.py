@@ -171,8 +171,7 @@ def export(
 ) -> None:
     """Make a record of one axis, as `fit` and `diagnose` read it.
 
-    Nothing is rounded or interpolated. Missing cycles or a disabled axis begin a new part; a recording
-    folder has a file for each part, a CSV file only one.
+    Missing cycles or a disabled axis begin a new part, which needs a recording folder.
     """
     out = _checked_out(out)
     recording, used = read_flights(flights, axis, begin, end, all_states=all_states)
@@ -199,8 +198,7 @@ def import_(
 ) -> None:
     """Make a record of a bus log, as `fit` and `diagnose` read it. Any master may have driven the axis.
 
-    The PDO mapping comes from the SDO traffic in the log (log from the drive's boot-up on), else from the
-    axis file. Nothing is sent or interpolated.
+    Log from the drive's boot-up on: the PDO mapping comes from its SDO traffic, else from the axis file.
     """
     from hdbridge.axis import AxisConfig
     from hdbridge.control.buslog import import_log

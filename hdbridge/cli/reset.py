@@ -11,8 +11,8 @@ def command(
 ) -> None:
     """Reset a fault of the drive when its cause is gone; power stays off.
 
-    Boots the drive, prints the error code and the last emergency, and resets the fault. Nothing moves. A
-    fault that returns at once is an error (exit status 4). With a daemon use `hdbridge ctl reset`.
+    Boots the drive, prints the error code and the last emergency, and resets the fault. Nothing moves. Exit
+    status 4 if the fault returns at once. With a daemon use `hdbridge ctl reset`.
     """
     from hdbridge.drive.states import State
 

@@ -57,9 +57,8 @@ def command(
 ) -> None:
     """Run the daemon: hold the drives of a machine and take load angles from clients.
 
-    Serves `hdbridge ctl`, the page and `hdbridge.client`. Nothing moves until a client enables an axis.
-    SIGTERM, Ctrl-C and SIGHUP stop the axes in order and end the daemon; a second one stops them at the
-    quick-stop ramp. A drive fault is reported to clients and latched.
+    Nothing moves until a client enables an axis. SIGTERM, Ctrl-C and SIGHUP stop the axes in order and end
+    the daemon; a second one stops them at the quick-stop ramp. A drive fault is reported and latched.
 
     Exit status: 0 ended in order, 1 a process died repeatedly, 2 bad input, 3 the bus cannot be opened or has
     another master, 7 another daemon has the API's address.

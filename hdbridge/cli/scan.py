@@ -58,9 +58,8 @@ def command(
 ) -> None:
     """List the nodes on a CAN bus: type, identity, state, and lines for an axis file.
 
-    Listens first, and sends nothing if another master is heard. Then reads a few objects of each node id from
-    1 to 127. Writes no object, sends no NMT command, enables nothing, and leaves a node alone that another
-    SDO client is talking to.
+    Listens first, and sends nothing if another master is heard. Then reads a few objects of each node id.
+    Writes and enables nothing, and leaves a node alone that another SDO client is talking to.
 
     Exit status 4 if no node was found, or PROFILE's drive is missing.
     """

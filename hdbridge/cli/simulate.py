@@ -58,8 +58,6 @@ def command(
         hdbridge simulate article --interface socketcan --channel vcan0 &
 
         hdbridge step article --interface socketcan --channel vcan0
-
-    With --gateway no daemon is needed: for tests of another master's program.
     """
     from hdbridge.device.run import run
     from hdbridge.drive.link import open_bus

@@ -62,10 +62,8 @@ def command(
 ) -> None:
     """Fit the simulated drive to recordings of an axis; report its errors, and keep the twin as pending.
 
-    Replays the recorded commands on the simulated drive and fits friction, inertia, spring, loops and delays,
-    starting from the profile's twin or truth file, else from typical values, with the transmission error of
-    the active model. The first line reports if the values are the axis's. `--simulate` uses the twin after
-    `hdbridge model commit PROFILE --twin`.
+    The fit starts from the profile's twin or truth file. `--simulate` uses the twin after `hdbridge model
+    commit PROFILE --twin`.
     """
     from hdbridge.axis import AxisConfig
     from hdbridge.twin.replay import doubts

@@ -305,14 +305,3 @@ def states_on_the_way(state: State, target: State) -> Iterator[State]:
         assert row is not None  # otherwise controlword_for has raised
         state = row.target
         yield state
-
-
-def mermaid() -> str:
-    """Returns the table as a Mermaid state diagram, which docs/architecture.md contains."""
-    lines = ["stateDiagram-v2"]
-    lines += [f"    {state.name}: {state.value}" for state in State if state is not State.UNKNOWN]
-    lines.append(f"    [*] --> {State.NOT_READY_TO_SWITCH_ON.name}")
-    for row in TRANSITIONS:
-        label = row.command.label if row.command else ("a fault occurs" if row.number == 13 else "automatic")
-        lines.append(f"    {row.source.name} --> {row.target.name}: {row.number} {label}")
-    return "\n".join(lines)

@@ -36,14 +36,14 @@ MANIFEST: Final[Mapping[str, str]] = {
     "ratio": "motor turns per load turn",
     "axis": "axis file, for a bus log; name of the axis, for a flight recording",
     "gear": "gear type; joints of one type are compared; by default the ratio",
-    "batch": "production batch",
-    "cell": "cell",
-    "lubricant": "lubricant",
+    "batch": "group of the joint",
+    "cell": "group of the joint",
+    "lubricant": "group of the joint",
     "hours": "operating hours at the recording",
     "date": "date, ISO 8601",
-    "columns": "`--columns` of a CSV file",
-    "units": "`--units` of a CSV file",
-    "unwrap": "`--unwrap` of a CSV file",
+    "columns": "option of that name for a CSV file",
+    "units": "option of that name for a CSV file",
+    "unwrap": "option of that name for a CSV file",
 }
 """Columns of a manifest. Only ``path`` is required."""
 NUMBERS: Final = ("ratio", "hours")

@@ -38,15 +38,14 @@ def main(interface, channel):
 
 
 def test_the_example_in_real_time(pytester):
-    """And the few lines with which README and page begin."""
+    """And the few lines with which the page begins."""
     pytester.makepyfile(my_program=MY_PROGRAM)
-    for page in (ci_page.PAGE, ci_page.PAGE.parents[1] / "README.md"):
-        (lines,) = re.findall(
-            r"\n\n((?: {4}.*\n)*? {4}def test_my_program.*\n(?: {4}.*\n)*)", page.read_text("utf-8")
-        )
-        pytester.makepyfile(**{f"test_{page.stem}": "import my_program\n" + textwrap.dedent(lines)})
+    (lines,) = re.findall(
+        r"\n\n((?: {4}.*\n)*? {4}def test_my_program.*\n(?: {4}.*\n)*)", ci_page.PAGE.read_text("utf-8")
+    )
+    pytester.makepyfile(test_ci="import my_program\n" + textwrap.dedent(lines))
     done = run(pytester, "--hdbridge-bus", "virtual", NO_CANOPEN, "-k", "goes or encoder_jump or my_program")
-    done.assert_outcomes(passed=4, deselected=11)
+    done.assert_outcomes(passed=3, deselected=11)
 
 
 def test_the_example_in_two_processes(pytester):

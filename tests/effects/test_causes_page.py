@@ -18,7 +18,7 @@ def test_every_cause_has_its_section_with_every_parameter():
     for name, kind in CATALOGUE.items():
         for parameter in kind.model_fields:
             assert f"`{parameter}`" in sections[name]
-        for words in ("What to do", "Separate it", "Source"):
+        for words in ("Remedy", "Experiment", "Source"):
             assert f"**{words}**" in sections[name]
         assert ("**Not compensated**" in sections[name]) is not kind.compensable.possible
         assert kind.about.signature in overview

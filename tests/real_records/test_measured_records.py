@@ -1,6 +1,6 @@
 """Published measurements: causes are named and hold on held-out data.
 
-The records are not part of the project (licences; docs/real-records.md names the sources). They are looked
+The records are not part of the project (licences; docs/how-well.md names the sources). They are looked
 for in the folder that HDBRIDGE_REAL_RECORDS names, else beside the repository; without them these tests are
 skipped.
 """

@@ -151,12 +151,3 @@ def mermaid() -> str:
         for (source, target), words in causes.items()
     ]
     return "\n".join(lines)
-
-
-def table() -> str:
-    """Returns the commands accepted in each state as a Markdown table, for docs/architecture.md."""
-    lines = ["| state | commands that it takes |", "|---|---|"]
-    for state in AxisState:
-        kinds = [kind.name for kind in CommandKind if target_of(state, kind) is not None]
-        lines.append(f"| {state.name} | {', '.join(kinds)} |")
-    return "\n".join(lines)
