@@ -9,7 +9,7 @@ white noise.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import reduce
 from itertools import product
@@ -927,17 +927,6 @@ def delays(truth: Truth) -> list[Truth]:
 def neighbours(truth: Truth) -> list[Truth]:
     """Returns those of `delays` whose dead time is one substep shorter or longer."""
     return [each for each in delays(truth) if abs(_substep(each) - _substep(truth)) == 1]
-
-
-def as_late(truth: Truth, other: Truth, free: Collection[Parameter]) -> Truth:
-    """Returns the truth with the total lag of another one, by the free one of filter and dead time."""
-    lag_ms, own = _lag_ms(other), truth.servo
-    if FILTER in free:
-        return with_values(truth, {FILTER.name: max(0.5 * (lag_ms - own.dead_time_ms), FILTER.least)})
-    if DEAD_TIME in free:
-        dead_time_ms = max(lag_ms - 2.0 * own.command_filter_ms, DEAD_TIME.least)
-        return with_values(truth, {DEAD_TIME.name: dead_time_ms})
-    return truth
 
 
 def inertias(truth: Truth) -> list[Truth]:

@@ -19,7 +19,6 @@ from hdbridge.records.recording import Recording, Segment
 from hdbridge.sim.exercise import Exercise
 from hdbridge.sim.truth import Truth
 from hdbridge.twin.fit import (
-    as_late,
     better_places,
     continued,
     delays,
@@ -240,20 +239,6 @@ def test_position_gain_and_integral_rate_exchanged_are_the_same_loop_while_the_a
     assert np.std((same - own)[moving]) < 0.1 * np.std((wrong - own)[moving])
     assert other.servo.position_gain_per_s < 0.5 * SPRUNG.servo.position_gain_per_s
     assert exchanged(other).servo.position_gain_per_s == pytest.approx(SPRUNG.servo.position_gain_per_s)
-
-
-def test_a_rival_is_as_late_by_filter_or_dead_time_whichever_is_free() -> None:
-    late = with_values(SPRUNG, {"command filter": 0.6, "servo dead time": 0.8})
-    dead_time, command_filter = BY_NAME["servo dead time"], BY_NAME["command filter"]
-    without_dead_time = as_late(with_values(late, {"servo dead time": 0.0}), late, [command_filter])
-    assert without_dead_time.servo.dead_time_ms == 0.0
-    assert without_dead_time.servo.command_filter_ms == pytest.approx(1.0)
-    quick = as_late(with_values(late, {"command filter": 0.2}), late, [dead_time])
-    assert quick.servo.command_filter_ms == pytest.approx(0.2)
-    assert quick.servo.dead_time_ms == pytest.approx(1.6)
-    slow = as_late(with_values(late, {"command filter": 1.5}), late, [dead_time])
-    assert slow.servo.dead_time_ms == 0.0
-    assert as_late(SPRUNG, late, []) == SPRUNG
 
 
 def interrupted_at(least: float) -> Callable[[float], None]:
