@@ -19,7 +19,7 @@ from hdbridge.records.recording import Recording, Segment
 from hdbridge.sim.exercise import Exercise
 from hdbridge.sim.truth import Truth
 from hdbridge.twin.fit import (
-    better_places,
+    by_halving,
     continued,
     delays,
     exchanged,
@@ -160,20 +160,13 @@ def test_a_load_feed_forward_that_was_fitted_at_a_wrong_frequency_is_found_at_th
     with Replays(data(), 1) as replays:
         there = solve(replays, begun, parameters, 3)
         assert free_value(there.truth, parameters[2]) < 40.0, "a minimum of its own"
-        place, *_ = better_places(replays, there, [feedforwards(there.truth, begun)], begun)
+        tried = [(each, parameters) for each in feedforwards(there.truth, begun)]
+        place = by_halving(replays, tried, expected(data())).truth
         found, true = (continued(replays, there, 3, truth=each) for each in (place, SPRUNG))
     assert found.loss < there.loss
     assert free_value(found.truth, parameters[2]) == pytest.approx(
         free_value(true.truth, parameters[2]), rel=0.1
     )
-
-
-def test_a_start_leading_to_the_same_minimum_is_not_another() -> None:
-    late = (BY_NAME["servo dead time"],)
-    begun = with_values(SPRUNG, {"servo dead time": 1.0})
-    with Replays(data(), 1) as replays:
-        best = solve(replays, SPRUNG, late, 3)
-        assert better_places(replays, best, [[begun]], begun) == []
 
 
 LATE = with_values(
