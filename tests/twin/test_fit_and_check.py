@@ -84,18 +84,6 @@ def test_torque_counts_after_the_motor_leaves_its_initial_state() -> None:
     assert counts[(travelled_deg > 61.0) & (travelled_deg < 0.9 * travelled_deg[-1])].any()
 
 
-def test_a_drawn_recording_is_as_rounded_and_noisy_as_a_measured_one() -> None:
-    data = prepare(recorded(), AXIS, TRUTH)
-    with Replays(data, 1) as replays:
-        (smooth,) = replays([TRUTH])
-        one, other = (each["load error"] for each in replays([TRUTH, TRUTH], (1, 2)))
-    counts = counted(data)["load error"] > 0.0
-    noise_arcsec = noise_floor(data)["load error"]
-    assert np.std(smooth["load error"][counts]) == pytest.approx(noise_arcsec, rel=0.2)
-    for each in (one, one - other):  # two draws of noise
-        assert np.std(each[counts]) == pytest.approx(np.sqrt(2.0) * noise_arcsec, rel=0.2)
-
-
 def test_regressions_estimate_inertia_friction_and_lag() -> None:
     found = read_off(prepare(recorded(), AXIS, TRUTH))
     assert found["load inertia"] == pytest.approx(TRUTH.load_.inertia_kg_m2, rel=0.2)
