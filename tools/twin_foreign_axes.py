@@ -37,11 +37,8 @@ from hdbridge.records.recording import Recording
 from hdbridge.sim.truth import Truth
 from hdbridge.twin.check import check
 from hdbridge.twin.compare import compare
-from hdbridge.twin.fit import FIT_S, in_best_structure, start_of
-from hdbridge.twin.misfit import Replays, coarse, prepare
 from hdbridge.twin.parameters import default_truth
 from hdbridge.twin.replay import replay
-from hdbridge.twin.response import with_response
 from hdbridge.twin.twin import fit_twin, judge
 
 
@@ -75,12 +72,6 @@ def start(axis: AxisConfig, foreign: Foreign) -> Truth:
         }
     )
     return Truth.model_validate(truth)
-
-
-def servo_only(recording: Recording, axis: AxisConfig, begun: Truth, workers: int) -> Truth:
-    """Fits servo structures and the fall-back alone, without the usual servo first."""
-    with Replays(coarse(prepare(recording, axis, begun), FIT_S), workers) as replays:
-        return with_response(replays, in_best_structure(replays, start_of(begun, replays.data))).truth
 
 
 def shares(other: Recording, axis: AxisConfig, truth: Truth, seed: int) -> str:
@@ -151,7 +142,6 @@ def main() -> None:
     given = parser(__doc__, axes=2, workers=1)
     given.add_argument("--structures", nargs="+", default=list(STRUCTURES), choices=list(STRUCTURES))
     given.add_argument("--checks", action="store_true", help="change the axes, and check the twins")
-    given.add_argument("--servo-only", action="store_true", help="only the fit of servo structures")
     options = given.parse_args()
     another = Plan.model_validate(yaml.safe_load(ANOTHER))
     for seed in seeds(options):
@@ -169,11 +159,6 @@ def main() -> None:
                 print(f"{structure} {seed}: left out: {stop}", flush=True)
                 continue
             began_s = time.process_time()
-            if options.servo_only:
-                truth = servo_only(recording, axis, start(axis, foreign), options.workers)
-                took_s = time.process_time() - began_s
-                print(f"{structure} {seed}: {shares(other, axis, truth, seed)}; {took_s:.0f} s", flush=True)
-                continue
             twin = fit_twin([recording], axis, start(axis, foreign), workers=options.workers)
             took_s = time.process_time() - began_s
             true = foreign.by_place()

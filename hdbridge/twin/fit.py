@@ -9,9 +9,8 @@ white noise.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import reduce
 from itertools import product
 from typing import Any, Final
 
@@ -31,9 +30,7 @@ from hdbridge.sim.truth.motor import TrueNotch, TrueObserver
 from hdbridge.twin.misfit import (
     CHANNELS,
     FINE,
-    SMOOTH,
     Data,
-    Loops,
     Piece,
     Replays,
     Scales,
@@ -554,7 +551,6 @@ def solve(
     everything: bool = False,
     most: Scales | None = None,
     near: Fitted | None = None,
-    loops: Loops = SMOOTH,
     tempered: bool = False,
     wide: bool = False,
     linear: bool = True,
@@ -565,9 +561,8 @@ def solve(
     default they are estimated from the residuals before each round, at most ``most``, so that a worse channel
     does not lose weight. ``tempered``: known scales grow with the residuals on the way to the minimum.
     Held-out legs count only with ``everything``. ``near`` is a fit of the same parameters that gives the
-    directions of the first differences, ``loops`` the deviation of a drive's quantised loops from smooth
-    ones. ``wide``: the covariance uses wide differences. Without ``linear`` it is the prior's, and the
-    Jacobian that of the last place but one.
+    directions of the first differences. ``wide``: the covariance uses wide differences. Without ``linear`` it
+    is the prior's, and the Jacobian that of the last place but one.
     """
     data = replays.data
     rows = fitted_rows(data, everything=everything)
@@ -578,7 +573,7 @@ def solve(
     idle = done = 0
     while True:
         found = problem.found(place)
-        problem.scale = known if known is not None else scales(data, found, loops, most)
+        problem.scale = known if known is not None else scales(data, found, most)
         if done >= steps or idle == SETTLED:
             break
         if known is not None and tempered:
@@ -607,9 +602,8 @@ def continued(
     truth: Truth | None = None,
     **options: Any,
 ) -> Fitted:
-    """Continues a fit, at ``truth`` if given, with its loops' deviation; ``options`` are those of `solve`."""
-    options = {"loops": best.scales.loops, "most": most, **options}
-    return solve(replays, truth or best.truth, best.parameters, steps, best.prior, **options)
+    """Continues a fit, at ``truth`` if given; ``options`` are those of `solve`."""
+    return solve(replays, truth or best.truth, best.parameters, steps, best.prior, most=most, **options)
 
 
 def fitted_rows(data: Data, *, everything: bool = False) -> NDArray[np.bool_]:
@@ -740,58 +734,41 @@ Start = tuple[Truth, tuple[Parameter, ...]]
 
 
 def in_best_structure(
-    replays: Replays,
-    begun: Truth,
-    keep: Callable[[Fitted], None] = lambda _: None,
-    progress: Progress = lambda _: None,
+    few: Replays, begun: Iterable[Start], keep: Callable[[Fitted], None] = lambda _: None
 ) -> Fitted:
-    """Fits the servo structure that explains a few legs best, on all of them.
-
-    All starts have the mechanics of ``begun``.
-    """
-    few = replays.rough
-    cycle_ms = 1e3 * replays.data.pieces[0].commands.cycle_s
-    best = by_halving(few, starts(begun, cycle_ms), keep)
-    keep(best)
-    progress(0.6)
-    best = with_blocks(few, best)
-    keep(best)
-    progress(0.8)
-    return _in_units(replays, (best.truth, best.parameters), WHOLE_STEPS)
+    """Fits the servo structure that explains a few legs best, and adds blocks that held-out legs confirm."""
+    scale = Scales(units(few.data))
+    best = by_halving(few, begun, scale, keep)
+    while more := list(more_blocks(best)):
+        found = by_halving(few, more, scale)
+        if misfit(few.data, found.residuals) > GAIN * misfit(few.data, best.residuals):
+            break
+        best = found
+        keep(best)
+    return best
 
 
 def by_halving(
-    few: Replays, begun: Iterable[Start], keep: Callable[[Fitted], None] = lambda _: None
+    few: Replays, begun: Iterable[Start], known: Scales, keep: Callable[[Fitted], None] = lambda _: None
 ) -> Fitted:
     """Fits from each start for a few steps, from the better half for as many more, until one is left.
 
-    A structure that takes more steps to a better place is not lost to one that is near its minimum
-    (successive halving; Jamieson and Talwalkar, AISTATS 2016). All legs count, because a few held-out ones
-    do not decide between servos with equally many parameters.
+    A start that takes more steps to a better place is not lost to one that is near its minimum (successive
+    halving; Jamieson and Talwalkar, AISTATS 2016). All legs count, because a few held-out ones do not decide
+    between servos with equally many parameters.
     """
-    tried = [_in_units(few, each, FEW_STEPS) for each in begun]
+
+    def led(start: Start) -> Fitted:
+        return solve(few, *start, FEW_STEPS, known=known, tempered=True, linear=False)
+
+    tried = [led(each) for each in begun]
     while True:
         tried = sorted(tried, key=lambda each: each.cost)[: (len(tried) + 1) // 2]
         tried = [each for each in tried if each.cost <= HOPELESS * tried[0].cost]
         keep(tried[0])
-        tried = [_in_units(few, (each.truth, each.parameters), FEW_STEPS) for each in tried]
+        tried = [led((each.truth, each.parameters)) for each in tried]
         if len(tried) == 1:
             return tried[0]
-
-
-def with_blocks(few: Replays, best: Fitted) -> Fitted:
-    """Adds blocks to a servo one at a time, as long as the best one reduces what held-out legs leave."""
-    while more := list(more_blocks(best)):
-        found = by_halving(few, more)
-        if misfit(few.data, found.residuals) > GAIN * misfit(few.data, best.residuals):
-            break
-        best = found
-    return best
-
-
-def _in_units(replays: Replays, start: Start, steps: int) -> Fitted:
-    """Fits in `units`, far from the noise."""
-    return solve(replays, *start, steps, known=Scales(units(replays.data)), tempered=True, linear=False)
 
 
 def starts(truth: Truth, cycle_ms: float) -> Iterator[Start]:
@@ -890,9 +867,9 @@ INERTIA_FACTORS = (0.25, 0.5, 2.0, 4.0)
 """Factors for start values of the motor's inertia, which shows only just after each new demand."""
 
 
-def elsewhere(truth: Truth, usual: Truth) -> tuple[list[Truth], ...]:
-    """Returns other start values about a truth, by kind; ``usual`` is the start of the fit."""
-    return springs(truth), delays(truth), feedforwards(truth, usual), inertias(truth)
+def elsewhere(truth: Truth, usual: Truth) -> list[Truth]:
+    """Returns other start values about a truth; ``usual`` is the start of the fit."""
+    return [*springs(truth), *delays(truth), *feedforwards(truth, usual), *inertias(truth)]
 
 
 def springs(truth: Truth) -> list[Truth]:
@@ -927,17 +904,6 @@ def delays(truth: Truth) -> list[Truth]:
 def neighbours(truth: Truth) -> list[Truth]:
     """Returns those of `delays` whose dead time is one substep shorter or longer."""
     return [each for each in delays(truth) if abs(_substep(each) - _substep(truth)) == 1]
-
-
-def as_late(truth: Truth, other: Truth, free: Collection[Parameter]) -> Truth:
-    """Returns the truth with the total lag of another one, by the free one of filter and dead time."""
-    lag_ms, own = _lag_ms(other), truth.servo
-    if FILTER in free:
-        return with_values(truth, {FILTER.name: max(0.5 * (lag_ms - own.dead_time_ms), FILTER.least)})
-    if DEAD_TIME in free:
-        dead_time_ms = max(lag_ms - 2.0 * own.command_filter_ms, DEAD_TIME.least)
-        return with_values(truth, {DEAD_TIME.name: dead_time_ms})
-    return truth
 
 
 def inertias(truth: Truth) -> list[Truth]:
@@ -1051,8 +1017,8 @@ def with_loop(replays: Replays, best: Fitted, most: Scales | None = None) -> Fit
         return None
     rest = [number for number, each in enumerate(best.parameters) if each.cause != ELASTIC]
     parameters = (*(best.parameters[number] for number in rest), *nearest.parameters)
-    prior, loops = np.append(best.prior[rest], nearest.prior), best.scales.loops
-    return solve(replays, nearest.truth, parameters, STEPS, prior, most=most, loops=loops)
+    prior = np.append(best.prior[rest], nearest.prior)
+    return solve(replays, nearest.truth, parameters, STEPS, prior, most=most)
 
 
 def with_limit(replays: Replays, best: Fitted, usual: Truth, most: Scales | None = None) -> Fitted:
@@ -1068,7 +1034,7 @@ def with_limit(replays: Replays, best: Fitted, usual: Truth, most: Scales | None
     if _cost(replays, without, best) - best.cost <= EARNED:
         return replace(best, truth=without)
     parameters, prior = (*best.parameters, LIMIT), np.append(best.prior, coordinates(usual, [LIMIT]))
-    return solve(replays, best.truth, parameters, STEPS, prior, most=most, loops=best.scales.loops)
+    return solve(replays, best.truth, parameters, STEPS, prior, most=most)
 
 
 def _cost(replays: Replays, truth: Truth, best: Fitted) -> float:
@@ -1083,32 +1049,14 @@ def _cost(replays: Replays, truth: Truth, best: Fitted) -> float:
 FIT_S = 60.0
 """Duration of the pieces on which a longer recording is fitted, with all kinds of motion if possible: a
 thousand replays of a quarter of an hour would take hours."""
-FIRST_STEPS = 6
-"""Steps from each start; as many again from the first and the best of the others, and from the better of
-these with its gains exchanged."""
 MORE_STEPS = 10
-"""Further steps from the first start and the best of the others."""
-PLACE_STEPS = 4
-"""First steps from each place that is tried as another minimum."""
+"""Steps from another place over the whole recording."""
 NEAR_STEPS = 30
 """Maximum steps over the whole recording with the expected noise."""
 STEPS = 30
 """Maximum steps of the final fit."""
-LOOPS = 6
-"""Number of replays with quantised loops, and of smooth ones, that show the difference."""
-ROUNDS = 3
-"""Maximum number of times that the difference of the loops is estimated again at the new place."""
-SAME = 0.3
-"""Change of the coordinates below which this ends; standard deviations."""
 MORE = 1.1
 """Ratio to the true axis's residuals above which a fit leaves more; a scale is not known better than that."""
-MINIMA = 8
-"""Maximum number of moves to a better minimum. The likelihood uses the loops' deviation at the present one,
-so each of two minima may look better from the other."""
-NEAREST = 2
-"""Number of places of each kind that are followed up."""
-APART = 0.1
-"""Distance below which two fits converge to the same place; spreads of a parameter."""
 OPTIONAL = (
     "velocity feed-forward", "load friction", "temperature", "current limit", "motor encoder delay",
     "encoder coupling", "friction growth", "moving average", *LOOP,
@@ -1128,7 +1076,7 @@ def free_parameters(truth: Truth, more: Sequence[str] = ()) -> tuple[Parameter, 
     return tuple(free)
 
 
-def fit(replays: Replays, progress: Progress = lambda _: None, more: Sequence[str] = ()) -> Fitted:
+def fit(replays: Replays, progress: Progress = lambda _: None) -> Fitted:
     """Fits the parameters, starting from the truth that the recordings were prepared with.
 
     If its servo leaves many times the noise, other servos join the starts; if it leaves a little, blocks are
@@ -1136,40 +1084,56 @@ def fit(replays: Replays, progress: Progress = lambda _: None, more: Sequence[st
     """
     reached: list[Fitted] = []
     try:
-        best = _fit(replays, progress, more, reached.append)
+        best = _fit(replays, progress, reached.append)
     except KeyboardInterrupt:
         if not reached:
             raise
         last = reached[-1]
         best = replace(_linearised(replays, last), interrupted=True)
-    # The loops' deviation belongs to these rows; later callers use others.
-    return replace(best, scales=replace(best.scales, loops=SMOOTH))
+    return best
 
 
-def _fit(replays: Replays, progress: Progress, more: Sequence[str], keep: Callable[[Fitted], None]) -> Fitted:
-    data, roughly = replays.data, replays.rough
-    start = data.base
-    begun = start_of(start, data)
-    parameters = free_parameters(begun, more)
+def _fit(replays: Replays, progress: Progress, keep: Callable[[Fitted], None]) -> Fitted:
+    data, few = replays.data, replays.rough
+    begun, noise = start_of(data.base, data), expected(few.data)
+    parameters = free_parameters(begun)
     progress(0.05)
-    first = _best_of(roughly, begun, parameters)
-    keep(first[-1])
+    usual = [(each, parameters) for each in (begun, *springs(begun), *lags(begun))]
+    best = by_halving(few, usual, noise, keep)
+    best = replace(best, prior=np.array(coordinates(begun, parameters)))
     progress(0.2)
-    (before,) = replays([start])
+    rows = fitted_rows(few.data)
+
+    def near(fitted: Fitted) -> bool:
+        return bool(np.mean(np.square(softened(fitted.residuals, noise, rows))) < SOFT**2)
+
+    if not near(best):
+        others = starts(begun, 1e3 * data.pieces[0].commands.cycle_s)
+        best = in_best_structure(few, [(best.truth, best.parameters), *others], keep)
+    progress(0.5)
+    polished = None
+    if near(best):
+        polished = _polished(replays, best, begun, keep)
+        if values_of(what_is_left(data, polished.residuals, noise_in_motion(data))) is Values.AXIS:
+            return polished
+        best = in_best_structure(few, [(polished.truth, polished.parameters)])
+    progress(0.8)
+    scale = Scales(units(data))
+    whole = solve(replays, best.truth, best.parameters, WHOLE_STEPS, known=scale, tempered=True, linear=False)
+    if polished is not None and misfit(data, polished.residuals) <= misfit(data, whole.residuals):
+        return polished
+    return _linearised(replays, whole)
+
+
+def _polished(replays: Replays, near: Fitted, begun: Truth, keep: Callable[[Fitted], None]) -> Fitted:
+    """Continues a fit near the noise on all legs, and adds the parts that the recording shows."""
+    data = replays.data
+    (before,) = replays([data.base])
     most = scales(data, before)
-    ends = []
-    for number, each in enumerate(first):
-        # The residuals of a wrong simulation are no estimate of the noise: they would reduce the weight of
-        # the very channel that shows the error.
-        if np.mean(np.square(each.vector)) < SOFT**2:
-            noise = replace(expected(data), loops=loops_about(replays, each))
-            near = continued(replays, each, NEAR_STEPS, known=noise, near=each, tempered=True)
-            ends.append(_ended(replays, near, most))
-        progress(0.2 + 0.4 * (number + 1) / len(first))
-    if not ends:
-        found = in_best_structure(replays, begun, keep, lambda share: progress(0.2 + 0.8 * share))
-        return _linearised(replays, found)
-    best = min(ends, key=lambda each: each.loss + (EARNED if each is not ends[0] else 0.0))
+    # The residuals of a wrong simulation are no estimate of the noise: they would reduce the weight of the
+    # very channel that shows the error.
+    best = continued(replays, near, NEAR_STEPS, known=expected(data), near=near, tempered=True)
+    best = _ended(replays, best, most)
     keep(best)
     laws = len(LAWS)  # maximum number of changes
     while True:
@@ -1184,23 +1148,10 @@ def _fit(replays: Replays, progress: Progress, more: Sequence[str], keep: Callab
         if other is None:
             break
         laws, best = laws - 1, other
-    best = with_limit(replays, best, start, most)
+    best = _ended(replays, with_limit(replays, best, data.base, most), most)
     keep(best)
-    progress(0.85)
-    for _ in range(ROUNDS):
-        last, best = best, _ended(replays, best, most)
-        if np.all(np.abs(best.place - last.place) < SAME * np.sqrt(np.diag(best.covariance))):
-            break
-    if values_of(what_is_left(data, best.residuals, noise_in_motion(data))) is Values.REPLAY:
-        wider = with_blocks(roughly, best)
-        if wider is not best:
-            whole = _in_units(replays, (wider.truth, wider.parameters), WHOLE_STEPS)
-            if misfit(data, whole.residuals) < misfit(data, best.residuals):
-                return _linearised(replays, whole)
     # Wide differences only for the covariance: near a minimum the loops may be unstable.
-    best = continued(replays, best, 0, most, near=best, wide=True)
-    progress(1.0)
-    return best
+    return continued(replays, best, 0, most, near=best, wide=True)
 
 
 def _linearised(replays: Replays, found: Fitted) -> Fitted:
@@ -1209,109 +1160,29 @@ def _linearised(replays: Replays, found: Fitted) -> Fitted:
 
 
 def _in_best_minimum(replays: Replays, best: Fitted, begun: Truth, most: Scales) -> Fitted:
-    """Moves the fit to significantly better neighbouring minima until there are none."""
+    """Moves the fit to significantly better minima until there are none.
 
-    def better(best: Fitted, there: Truth) -> Fitted:
-        other = continued(replays, best, MORE_STEPS, most, there)
-        return _ended(replays, other, most) if other.loss + EARNED < best.loss else best
-
-    data = replays.data
-    noise = least_deviation(data) | {LOAD: expected(data).deviation[LOAD]}
-    for _ in range(MINIMA):
-        last = best
-        # If the residuals of any channel exceed those of the true axis.
-        if any(best.scales.deviation[name] > MORE * noise[name] for name in CHANNELS):
-            best = reduce(
-                better, better_places(replays.rough, best, elsewhere(best.truth, begun), begun), best
-            )
+    This comes after the other parameters are known, because at the start of the fit these places were equally
+    good.
+    """
+    few, noise = replays.rough, expected(replays.rough.data)
+    least = least_deviation(replays.data) | {LOAD: noise.deviation[LOAD]}
+    while True:
         # Always tried: exchanged gains differ only at rest, which a few legs hardly show, and a dead time in
         # the next substep increases the residuals too little for any channel to show it.
-        best = reduce(better, (exchanged(best.truth), *neighbours(best.truth)), best)
+        places = [exchanged(best.truth), *neighbours(best.truth)]
+        if any(best.scales.deviation[name] > MORE * least[name] for name in CHANNELS):
+            tried = [(each, best.parameters) for each in elsewhere(best.truth, begun)]
+            places.append(by_halving(few, tried, noise).truth)
+        last = best
+        for place in places:
+            other = continued(replays, best, MORE_STEPS, most, place)
+            if other.loss + EARNED < best.loss:
+                best = _ended(replays, other, most)
         if best is last:
-            break
-    return best
+            return best
 
 
 def _ended(replays: Replays, near: Fitted, most: Scales) -> Fitted:
-    """Continues a fit to its minimum, with the loops' deviation estimated there."""
-    return continued(replays, near, STEPS, most, near=near, loops=loops_about(replays, near))
-
-
-def better_places(
-    roughly: Replays, best: Fitted, kinds: Iterable[Sequence[Truth]], begun: Truth
-) -> list[Truth]:
-    """Fits a few legs from the best places of each kind; returns competitive results, the best first.
-
-    This comes after the other parameters are known, because at the start of the fit these places were equally
-    good. A few legs can rule a minimum out but seldom decide between two.
-    """
-    (before,) = roughly([begun])
-    most = scales(roughly.data, before)
-
-    def led(truth: Truth, steps: int, near: Fitted | None = None) -> Fitted:
-        return continued(roughly, best, steps, most, truth, near=near, loops=SMOOTH, linear=False)
-
-    def loss(fitted: Fitted) -> float:
-        return fitted.loss
-
-    ends = [led(best.truth, STEPS)]
-    for places in kinds:
-        others = [each for each in (led(place, PLACE_STEPS) for place in places) if _apart(each, ends[0])]
-        for near in sorted(others, key=loss)[:NEAREST]:
-            reached = led(near.truth, STEPS, near)
-            if all(_apart(reached, each) for each in ends):
-                ends.append(reached)
-    least = min(map(loss, ends))
-    return [each.truth for each in sorted(ends[1:], key=loss) if each.loss < least + EARNED]
-
-
-def _apart(one: Fitted, other: Fitted) -> bool:
-    """Returns True if two fits of the same parameters have reached different places."""
-    spread = np.array([each.spread for each in one.parameters])
-    return bool(np.any(np.abs(one.place - other.place) > APART * spread))
-
-
-def loops_about(replays: Replays, fitted: Fitted) -> Loops:
-    """Estimates the deviation of quantised loops from smooth ones, by draws from the fit's covariance."""
-    rng = np.random.default_rng(0)
-    low, high = np.array([each.bounds for each in fitted.parameters]).T
-    places = rng.multivariate_normal(fitted.place, fitted.covariance, LOOPS, method="svd")
-    truths = [
-        at_coordinates(fitted.truth, fitted.parameters, np.clip(each, low, high).tolist()) for each in places
-    ]
-    shown = replays([*truths, *truths], [None] * LOOPS + ["loops"] * LOOPS)
-    pairs = list(zip(shown[:LOOPS], shown[LOOPS:], strict=True))
-    apart = {name: np.stack([other[name] - one[name] for one, other in pairs]) for name in CHANNELS}
-    return Loops(
-        {name: np.mean(each, axis=0) for name, each in apart.items()},
-        {name: np.sqrt(1.0 + 1.0 / LOOPS) * np.std(each, axis=0, ddof=1) for name, each in apart.items()},
-    )
-
-
-def _best_of(replays: Replays, begun: Truth, parameters: tuple[Parameter, ...]) -> tuple[Fitted, ...]:
-    """Returns the fit from the start, and the best from another place if it is better so far.
-
-    The start is the present simulation, with the spring that leaves least of the load angle: parameters that
-    the motion does not show keep their values unless another place is significantly better in the end. Worse
-    places are dropped on the way.
-    """
-    prior, noise = np.array(coordinates(begun, parameters)), expected(replays.data)
-
-    def led(truth: Truth, steps: int, near: Fitted | None = None, *, linear: bool = False) -> Fitted:
-        return solve(
-            replays, truth, parameters, steps, prior, known=noise, near=near, tempered=True, linear=linear
-        )
-
-    def cost(fitted: Fitted) -> float:
-        return fitted.cost
-
-    sprung = [begun, *springs(begun)]
-    off = [float(np.mean(np.abs(found[LOAD]))) for found in replays(sprung)]
-    first = sprung[int(np.argmin(off))]
-    own, *others = (led(each, FIRST_STEPS) for each in (first, *lags(first)))
-    own, other = (led(each.truth, FIRST_STEPS, each) for each in (own, min(others, key=cost)))
-    third = led(exchanged(min(own, other, key=cost).truth), FIRST_STEPS)
-    own, other = (
-        led(each.truth, MORE_STEPS, each, linear=True) for each in (own, min(other, third, key=cost))
-    )
-    return (own, other) if other.cost < own.cost else (own,)
+    """Continues a fit to its minimum."""
+    return continued(replays, near, STEPS, most, near=near)

@@ -1,51 +1,76 @@
-"""Names the causes by which a simulation was wrong, with their evidence, and parameters not separable.
+"""Names the causes by which a simulation leaves more of a recording than it should, by forward selection.
 
-A cause is tested on held-out legs: first with its parameters reset in the twin, then with the best rival fit
-that keeps them reset.
+The question is the same after a fit (which values of the start were wrong?) and in a check (what has changed
+since the twin was made?). Also finds parameters that a motion does not separate.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from itertools import compress
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 from scipy.special import ndtri
 
+from hdbridge.analysis.readings import median_deviation
 from hdbridge.axis.effects import FloatArray
 from hdbridge.sim.truth import Truth
-from hdbridge.twin.compare import rms
-from hdbridge.twin.fit import (
-    Fitted,
-    as_late,
-    fitted_rows,
-    legs_of_rows,
-    over_legs,
-    softened,
-    solve,
-)
-from hdbridge.twin.misfit import Replays, judged_rows
+from hdbridge.twin.fit import Fitted, fitted_rows, legs_of_rows, over_legs, solve
+from hdbridge.twin.misfit import CHANNELS, Data, Misfit, Replays, Scales, counted
 from hdbridge.twin.parameters import Parameter, at_coordinates, by_cause, coordinates, free_value
 from hdbridge.units import figure
 
 # ----------------------------------------------------------------
-# Significance of a rival's larger residuals against their scatter between legs.
+# Growth of a misfit, and significance of a rival's larger residuals against their scatter between legs.
 
+STRAY = 4.0
+"""Limit at which residuals are clipped, in rms of their kind of leg: a motor that breaks away at a different
+time is not a change of the axis."""
 FALSE_ALARM = 0.02
-"""Probability that any cause is named in a correct simulation."""
-STEPS = 6
-"""Maximum steps of a rival's fit, which starts at the linear prediction of the twin's fit. A rival that has
-not reached its minimum loses for that reason alone, and a wrong cause is named."""
+"""Probability that two equally good simulations are told apart."""
+
+
+def scales_by_kind(data: Data, known: Misfit, noise: Mapping[str, float]) -> dict[str, Any]:
+    """Returns, by channel and row, the known misfit on this kind of leg, or the noise if larger.
+
+    A kind without a known misfit is compared with the largest of the others.
+    """
+    found = {}
+    for name in CHANNELS:
+        before = known.get(name, {})
+        otherwise = max(before.values(), default=0.0)
+        by_leg = np.array([max(before.get(kind, otherwise), noise[name]) for kind in data.kinds])
+        found[name] = by_leg[data.leg.astype(np.intp)]
+    return found
+
+
+def growth(data: Data, residuals: Mapping[str, FloatArray], was: Mapping[str, Any]) -> dict[str, float]:
+    """Returns, by channel, the rms residual relative to ``was`` (`scales_by_kind`).
+
+    A row counts as no more than `STRAY` times the typical residual of its leg, because single rows may be
+    readings that are wrong, but a whole leg is not.
+    """
+    found = {}
+    for name, counts in counted(data).items():
+        inside = counts > 0.0
+        if inside.any():
+            scale, now, legs = was[name][inside], np.abs(residuals[name][inside]), data.leg[inside]
+            typical = np.zeros_like(now)
+            for leg in np.unique(legs):
+                typical[legs == leg] = median_deviation(now[legs == leg])
+            now = np.minimum(now, STRAY * np.maximum(scale, typical))
+            found[name] = math.sqrt(float(np.sum(now**2)) / float(np.sum(scale**2)))
+    return found
 
 
 def told_apart(left: FloatArray, change: FloatArray, legs: FloatArray) -> bool:
     """Returns True if a rival's residuals are larger than by chance.
 
-    ``left`` are the twin's residuals by row, in units of the noise; ``change`` the rival's residuals minus
-    these; ``legs`` the leg number of each row.
+    ``left`` are the simulation's residuals by row, in units of the noise; ``change`` the rival's residuals
+    minus these; ``legs`` the leg number of each row.
     """
     loss = float(change @ (change + 2.0 * left))
     within = over_legs((left * change)[:, None], legs)
@@ -54,43 +79,117 @@ def told_apart(left: FloatArray, change: FloatArray, legs: FloatArray) -> bool:
     return loss > -float(ndtri(FALSE_ALARM)) * scatter
 
 
-def put_back(start: Truth, truth: Truth, own: Sequence[Parameter]) -> Truth:
-    """Returns a truth with these parameters reset to their start."""
-    return at_coordinates(truth, own, coordinates(start, own))
+# ----------------------------------------------------------------
+# Causes: the ones that bring the misfit back, one after the other.
+
+GROWN = 1.5
+"""Ratio of two misfits above which they differ; smaller ones come from noise and different legs."""
+EXPLAINED = 0.5
+"""Minimum share of the growth that a named cause explains, in squares: most of what the others leave."""
+OF_REPLAY = 0.25
+"""Minimum share of all growth if the values are not the axis's: such a simulation is off by a share of each
+change, so smaller rests are not causes."""
+STEPS = 8
+"""Maximum steps of the fit of one cause."""
+SIZES = (2.5, 6.0)
+"""Changes of each parameter, in both directions, at which a fit may start; in units of its least change. The
+ringing of a load is out of phase already at small changes, where a fit finds no way back."""
 
 
-def without(
-    replays: Replays, start: Truth, fitted: Fitted, own: Sequence[Parameter], moved: Sequence[Parameter]
-) -> Truth:
-    """Fits the best rival that keeps these parameters at their start; all others may compensate.
+@dataclass(frozen=True, slots=True)
+class Explained:
+    """Causes that explain a recording, and the growth of the misfit without and with them."""
 
-    The fit starts at the best of three places: the linear prediction of the twin's fit, the start with only
-    the ``moved`` parameters as in the twin, or an exchange of filter and dead time. Compensating values may
-    be far from the twin, and slopes do not lead from one substep into another.
+    causes: tuple[str, ...]
+    rivals: tuple[str, ...]
+    """Causes that explain as much in place of the last one."""
+    truth: Truth
+    """The simulation with these causes fitted."""
+    growth_before: Mapping[str, float]
+    growth_after: Mapping[str, float]
+
+
+def explain(
+    replays: Replays,
+    base: Truth,
+    parameters: Sequence[Parameter],
+    was: Mapping[str, Any],
+    progress: Callable[[float], None] = lambda _: None,
+    least: float = 0.0,
+) -> Explained:
+    """Names causes until the misfit of ``base`` is what it ``was`` (`scales_by_kind`).
+
+    In each round every other cause is fitted together with the named ones. The best is named if it explains
+    most of the growth, and at least the share ``least`` of all growth. Causes that a later one has made
+    superfluous are dropped. A rival of the last cause does no worse by more than the scatter of the legs.
     """
-    free = [number for number, each in enumerate(fitted.parameters) if each not in own]
-    back = [number for number, each in enumerate(fitted.parameters) if each in own]
-    others = tuple(fitted.parameters[number] for number in free)
-    before = put_back(start, fitted.truth, own)
-    if not others:
-        return before
-    off = np.array(coordinates(before, own)) - fitted.place[back]
-    slopes, spread = fitted.jacobian[:, free], np.array([each.spread for each in others])
-    along = np.linalg.solve(
-        slopes.T @ slopes + np.diag(spread**-2.0), slopes.T @ (fitted.jacobian[:, back] @ off)
-    )
-    low, high = np.array([each.bounds for each in others]).T
-    led = at_coordinates(before, others, np.clip(fitted.place[free] - along, low, high).tolist())
-    kept = [coordinates(fitted.truth if each in moved else start, [each])[0] for each in others]
-    begun = [led, at_coordinates(before, others, kept), as_late(before, fitted.truth, others)]
-    rows = fitted_rows(replays.data)
-    costs = [float(np.sum(np.square(softened(each, fitted.scales, rows)))) for each in replays(begun)]
-    near = replace(fitted, parameters=others, jacobian=slopes)
-    prior, nearest = np.array(coordinates(start, others)), begun[int(np.argmin(costs))]
-    return solve(replays, nearest, others, STEPS, prior, known=fitted.scales, near=near, linear=False).truth
+    data, groups = replays.data, by_cause(parameters)
+    legs = legs_of_rows(data, fitted_rows(data, everything=True))
+    (here,) = replays([base])
+    grown = growth(data, here, was)
+    named, rivals = list[str](), tuple[str, ...]()
+    best, now = base, grown
+
+    def fitted(causes: Sequence[str], start: Truth) -> Fitted:
+        own = tuple(each for name in causes for each in groups[name])
+        return solve(
+            replays, start, own, STEPS, np.array(coordinates(base, own)), known=Scales(was), everything=True,
+            tempered=True, linear=False,
+        )  # fmt: skip
+
+    while max(now.values(), default=0.0) > GROWN and len(named) < len(groups):
+        fits: dict[str, Fitted] = {}
+        for cause in (each for each in groups if each not in named):
+            fits[cause] = fitted([*named, cause], _nearest(replays, best, groups[cause], was))
+            progress((len(named) + len(fits) / len(groups)) / (len(named) + 1))
+        cause, fit = min(fits.items(), key=lambda each: each[1].cost)
+        after = growth(data, fit.residuals, was)
+        if _excess(now) - _excess(after) < max(EXPLAINED * _excess(now), least * _excess(grown)):
+            break
+        rivals = tuple(
+            each
+            for each, other in fits.items()
+            if other is not fit and not told_apart(fit.vector, other.vector - fit.vector, legs)
+        )
+        named, best, now = [*named, cause], fit.truth, after
+    for cause in named[:-1]:
+        rest = [each for each in named if each != cause]
+        back = at_coordinates(best, groups[cause], coordinates(base, groups[cause]))
+        fit = fitted(rest, back)
+        after = growth(data, fit.residuals, was)
+        if max(after.values()) <= max(GROWN, *now.values()):
+            named, best, now = rest, fit.truth, after
+    progress(1.0)
+    return Explained(tuple(named), rivals, best, grown, now)
+
+
+def _nearest(replays: Replays, truth: Truth, own: Sequence[Parameter], was: Mapping[str, Any]) -> Truth:
+    """Returns the truth, or the one with a parameter moved that leaves less."""
+    moved = [
+        shifted(truth, each, sign * size * each.least_change)
+        for each in own
+        for size in SIZES
+        for sign in (-1.0, 1.0)
+    ]
+    places = [truth, *moved]
+    left = [_excess(growth(replays.data, found, was)) for found in replays(places)]
+    return places[int(np.argmin(left))]
+
+
+def shifted(truth: Truth, parameter: Parameter, by: float) -> Truth:
+    """Returns the truth with one coordinate moved, within its bounds."""
+    low, high = parameter.bounds
+    (now,) = coordinates(truth, [parameter])
+    return at_coordinates(truth, [parameter], [min(max(now + by, low), high)])
+
+
+def _excess(grown: Mapping[str, float]) -> float:
+    """Returns the sum of the channels' growth in squares."""
+    return sum(max(each**2 - 1.0, 0.0) for each in grown.values())
 
 
 # ----------------------------------------------------------------
+# Findings.
 
 ALIKE = 0.4
 """Minimum component of a parameter in an unobservable direction for it to belong to the set."""
@@ -125,16 +224,15 @@ class Finding:
     cause: str
     parameters: tuple[Moved, ...]
     aliases: tuple[str, ...] = ()
-    """Other parameters that the motion does not separate from these."""
+    """Other causes that the motion does not separate from this one."""
     move: str = ""
     """Motion that would separate them."""
 
     @property
     def text(self) -> str:
         """The change in words."""
-        telling = [each for each in self.parameters if not each.lower <= each.before <= each.upper]
-        moved = "; ".join(each.sentence for each in telling or self.parameters)
-        rest = f", or {' or '.join(self.aliases)}: {self.move} would tell" if self.aliases else ""
+        moved = "; ".join(each.sentence for each in self.parameters)
+        rest = f", or {' or '.join(self.aliases)}: {self.move} would separate them" if self.aliases else ""
         return f"{moved}{rest}"
 
     def __str__(self) -> str:
@@ -155,77 +253,51 @@ class Alike:
         return f"{', '.join(self.names)}; {'; '.join(self.moves)} would separate them"
 
 
-def name_causes(
-    replays: Replays, start: Truth, fitted: Fitted
-) -> tuple[tuple[Finding, ...], tuple[Alike, ...]]:
-    """Names the causes in which the start was wrong, largest gain first, and sets that are not separable.
-
-    A cause is named if held-out legs get worse without it, however the others compensate. If these causes do
-    not suffice, the others are named with the parameters that may replace them. If they do, the remaining
-    parameters are not separable from their start and form a set. Rivals are fitted to a few of the legs.
-    """
-    # Judged on held-out legs, or on all legs if none was held out.
-    data = replays.data
-    rows = np.concatenate(list(judged_rows(data).values()))
-    legs = legs_of_rows(data, rows)
-
-    def left_by(truths: Iterable[Truth]) -> list[FloatArray]:
-        return [softened(shown, fitted.scales, rows) for shown in replays(truths)]
-
-    (left,) = left_by([fitted.truth])
-
-    def worse(others: Iterable[FloatArray], than: FloatArray = left) -> list[bool]:
-        return [told_apart(than, other - than, legs) for other in others]
-
-    groups = by_cause(fitted.parameters)
-    suspects = {cause: own for cause, own in groups.items() if _further(start, fitted.truth, own)}
-    alone = left_by(put_back(start, fitted.truth, own) for own in suspects.values())
-    matter = list(compress(suspects, worse(alone)))
-    moved = [each for own in suspects.values() for each in own]
-    rivals = {cause: without(replays.rough, start, fitted, groups[cause], moved) for cause in matter}
-    by_rival = dict(zip(rivals, left_by(rivals.values()), strict=True))
-    needed = list(compress(matter, worse(by_rival.values())))
-    aliases: dict[str, list[Parameter]] = {cause: [] for cause in needed}
-    rest = [each for each in fitted.parameters if each.cause not in needed]
-    least = without(replays.rough, start, fitted, rest, moved) if rest else fitted.truth
-    sets: list[Alike] = []
-    if worse(left_by([least]))[0]:
-        for cause in (each for each in matter if each not in needed):
-            others = [each for each in rest if each.cause != cause]
-            # A rival needs a parameter if it gets worse when that one is reset.
-            rival, moved_too = rivals[cause], _further(start, rivals[cause], others)
-            back = left_by(put_back(start, rival, [each]) for each in moved_too)
-            aliases[cause] = list(compress(moved_too, worse(back, by_rival[cause])))
-            sets.append(_set([*groups[cause], *aliases[cause]]))
-    elif apart := _further(fitted.truth, least, rest):
-        sets.append(_set(apart))
-    found: list[Finding] = []
-    intervals = fitted.intervals()
-    distances = {cause: _moved(fitted, start, groups[cause]) for cause in aliases}
-    for cause in sorted(aliases, key=lambda each: -distances[each]):
-        own, instead = groups[cause], aliases[cause]
-        if (instead or cause in needed) and not any(
-            each.name in other.aliases for each in own for other in found
-        ):
-            found.append(finding(own, start, fitted.truth, intervals, instead))
-    found.sort(key=lambda each: -rms(by_rival[each.cause]))
-    return tuple(found), tuple(dict.fromkeys(sets))
-
-
 def finding(
     parameters: Sequence[Parameter],
     before: Truth,
     after: Truth,
-    intervals: Mapping[str, tuple[float, float]],
+    intervals: Mapping[str, tuple[float, float]] | None = None,
     instead: Sequence[Parameter] = (),
+    *,
+    ratio: bool = False,
 ) -> Finding:
-    """Returns the finding of one cause's parameters; those ``instead`` may have changed in their place."""
-    moved = tuple(
-        Moved(each.name, each.unit, free_value(before, each), free_value(after, each), *intervals[each.name])
-        for each in parameters
+    """Returns the finding of one cause: the parameters that have changed by as much as matters, or the most.
+
+    Those ``instead`` may have changed in their place. ``ratio``: by ratios, because neither value is the
+    axis's; by the difference if a parameter may be zero.
+    """
+    off = np.subtract(coordinates(after, parameters), coordinates(before, parameters))
+    sizes = np.abs(off) / [each.least_change for each in parameters]
+    moved = []
+    for each, by in zip(parameters, off.tolist(), strict=True):
+        if not ratio:
+            values = free_value(before, each), free_value(after, each)
+            moved.append(Moved(each.name, each.unit, *values, *(intervals or {}).get(each.name, ())))
+        elif each.linear:
+            moved.append(Moved(each.name, each.unit, 0.0, by))
+        else:
+            moved.append(Moved(each.name, "times what it was", 1.0, math.exp(by)))
+    told = tuple(compress(moved, sizes >= min(1.0, np.max(sizes))))
+    moves = "; ".join(dict.fromkeys(each.move for each in instead))
+    return Finding(parameters[0].cause, told, tuple(dict.fromkeys(each.cause for each in instead)), moves)
+
+
+def findings(
+    found: Explained,
+    groups: Mapping[str, Sequence[Parameter]],
+    before: Truth,
+    intervals: Mapping[str, tuple[float, float]] | None = None,
+    *,
+    ratio: bool = False,
+) -> tuple[Finding, ...]:
+    """Returns the findings of the named causes; options as in `finding`."""
+    rivals = [each for cause in found.rivals for each in groups[cause]]
+    instead = dict.fromkeys(found.causes[-1:], rivals)
+    return tuple(
+        finding(groups[cause], before, found.truth, intervals, instead.get(cause, ()), ratio=ratio)
+        for cause in found.causes
     )
-    names, moves = (each.name for each in instead), dict.fromkeys(each.move for each in instead)
-    return Finding(parameters[0].cause, moved, tuple(names), "; ".join(moves))
 
 
 def alike(fitted: Fitted, legs: FloatArray) -> tuple[Alike, ...]:
@@ -242,22 +314,6 @@ def alike(fitted: Fitted, legs: FloatArray) -> tuple[Alike, ...]:
             continue
         members = [each for each, part in zip(fitted.parameters, direction, strict=True) if abs(part) > ALIKE]
         if members:
-            sets.append(_set(members))
+            moves = dict.fromkeys(each.move for each in members)
+            sets.append(Alike(tuple(each.name for each in members), tuple(moves)))
     return tuple(sets)
-
-
-def _set(members: Sequence[Parameter]) -> Alike:
-    return Alike(tuple(each.name for each in members), tuple(dict.fromkeys(each.move for each in members)))
-
-
-def _moved(fitted: Fitted, start: Truth, own: Sequence[Parameter]) -> float:
-    """Returns the squared Mahalanobis distance of some parameters from their start."""
-    places = [number for number, each in enumerate(fitted.parameters) if each in own]
-    off = fitted.place[places] - np.array(coordinates(start, own))
-    return float(off @ np.linalg.solve(fitted.covariance[np.ix_(places, places)], off))
-
-
-def _further(one: Truth, other: Truth, parameters: Sequence[Parameter]) -> list[Parameter]:
-    """Returns the parameters that differ by more than their least change."""
-    apart = np.subtract(coordinates(one, parameters), coordinates(other, parameters))
-    return [each for each, off in zip(parameters, apart, strict=True) if abs(off) > each.least_change]

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final, Self
 
@@ -49,14 +49,15 @@ from hdbridge.twin.misfit import (
     coarse,
     held_out_legs,
     misfit_of,
+    noise_floor,
     noise_in_motion,
     prepare,
     values_of,
     what_is_left,
     with_load_noise,
 )
-from hdbridge.twin.naming import Alike, Finding, alike, name_causes
-from hdbridge.twin.parameters import LOAD, default_truth, with_sections
+from hdbridge.twin.naming import Alike, Finding, alike, explain, findings, scales_by_kind
+from hdbridge.twin.parameters import LOAD, by_cause, default_truth, with_sections
 from hdbridge.twin.replay import legs_of, replay
 from hdbridge.twin.response import with_response
 from hdbridge.twin.thermal import with_warmth
@@ -302,13 +303,11 @@ class KeptTwin:
         """Returns the file's text, which reads back exactly; default values are omitted."""
         data = self.truth.model_dump(by_alias=True, mode="json", exclude_defaults=True)
         provenance = data.get("provenance", {})
-        drive, about = provenance.get("drive"), provenance.get("fit")
+        drive = provenance.get("drive")
         if isinstance(drive, dict):
             provenance["drive"] = {
                 name: Hex(value) if isinstance(value, int) else value for name, value in drive.items()
             }
-        if isinstance(about, dict) and "covariance" in about:
-            provenance["fit"] = {**about, "covariance": [Line(row) for row in about["covariance"]]}
         if "intervals" in data:
             data["intervals"] = {place: Line(pair) for place, pair in data["intervals"].items()}
         return HEADER + dump_yaml(data)
@@ -364,13 +363,11 @@ def fit_twin(
             fitted = with_response(replays, fitted)
             left = what_is_left(data, fitted.residuals, noise)
         findings: tuple[Finding, ...] = ()
-        sets: dict[Alike, None] = {}
+        sets: tuple[Alike, ...] = ()
         if values is Values.AXIS:
             if Values.of(start) in {None, Values.AXIS}:
-                like = by_law_of(with_sections(start, fitted.parameters), fitted.truth)
-                findings, rivals = name_causes(replays, like, fitted)
-                sets = dict.fromkeys(rivals)
-            sets |= dict.fromkeys(alike(fitted, legs_of_rows(data, fitted_rows(data))))
+                findings = _wrong(replays, start, fitted)
+            sets = alike(fitted, legs_of_rows(data, fitted_rows(data)))
     truth, warmth = with_warmth(whole, axis, fitted, with_knowledge(fitted, data, values))
     if values is Values.REPLAY:
         truth = truth.model_copy(update={"intervals": {}})
@@ -382,12 +379,21 @@ def fit_twin(
     return Twin(
         truth,
         findings,
-        tuple(sets),
+        sets,
         left,
         before,
         after,
         impossible(truth, axis, cycle_s) if values is Values.REPLAY else (),
     )
+
+
+def _wrong(replays: Replays, start: Truth, fitted: Fitted) -> tuple[Finding, ...]:
+    """Names the values of the start that were wrong, on a few legs; the values after are the fit's."""
+    few, like = replays.rough, by_law_of(with_sections(start, fitted.parameters), fitted.truth)
+    was = scales_by_kind(few.data, misfit_of(replays.data, fitted.residuals), noise_floor(few.data))
+    groups = by_cause(fitted.parameters)
+    found = explain(few, like, fitted.parameters, was)
+    return findings(replace(found, truth=fitted.truth), groups, like, fitted.intervals())
 
 
 def _compared(whole: Recording, axis: AxisConfig, truth: Truth) -> Comparison:
@@ -402,7 +408,6 @@ def with_knowledge(fitted: Fitted, data: Data, values: Values = Values.AXIS) -> 
     intervals = fitted.intervals()
     about: dict[str, Any] = {
         "parameters": [each.name for each in fitted.parameters],
-        "covariance": [[float(f"{value:.6g}") for value in row] for row in fitted.covariance.tolist()],
         "noise": {name: float(f"{fitted.scales.noise[name]:.6g}") for name in CHANNELS},
         "misfit": misfit_of(data, fitted.residuals),
     }

@@ -54,14 +54,13 @@ def test_a_twin_is_pending_until_it_is_committed_and_activations_are_undone(prof
 
 
 def test_twins_read_back_exactly(profile: Path) -> None:
-    """With a line for each interval and for each row of the covariance."""
-    rows = [[1e-05, -2.5e-07], [-2.5e-07, 0.0400001]]
-    fit = {"parameters": ["Coulomb friction", "load inertia"], "covariance": rows, "noise": {}}
+    """With a line for each interval."""
+    fit = {"parameters": ["Coulomb friction", "load inertia"], "noise": {"motor torque": 1e-05}}
     twin = twin_of(profile).with_provenance(fit=fit).bound_to(AxisConfig.load(profile), SERIAL)
     twin.save(profile / "pending-twin.yaml")
     assert KeptTwin.load(profile / "pending-twin.yaml") == twin
     lines = [each.strip() for each in (profile / "pending-twin.yaml").read_text().splitlines()]
-    assert {"serial: 0x11", "- [1.0e-05, -2.5e-07]"} <= {*lines}
+    assert "serial: 0x11" in lines
     assert sum(each.startswith("motor.coulomb_nm: [0.045") for each in lines) == 1
 
 

@@ -16,7 +16,7 @@ from hdbridge.motion.procedures.plan import Plan
 from hdbridge.records.recording import Recording
 from hdbridge.sim.truth import Truth
 from hdbridge.twin.compare import compare
-from hdbridge.twin.fit import MOST_DEAD_CYCLES, Fitted, in_best_structure, start_of, starts
+from hdbridge.twin.fit import MOST_DEAD_CYCLES, fit, start_of, starts
 from hdbridge.twin.misfit import (
     CHANNELS,
     Data,
@@ -116,7 +116,7 @@ def test_a_twin_follows_a_foreign_servo_and_is_never_worse_than_a_plain_fit(stru
     fitted, other = (bench(foreign, each) for each in motions)
     data = prepare(fitted, axis, start(axis, foreign))
     with Replays(data, 1) as replays:
-        found: Fitted = in_best_structure(replays, start_of(data.base, data))
+        found = fit(replays)
     plain = plain_fit(data, start_of(data.base, data))
     assert misfit(data, found.residuals) < 1.02 * misfit(data, residuals(data, plain))
     twin, reference = (shares(other, axis, each) for each in (found.truth, plain))
