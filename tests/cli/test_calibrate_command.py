@@ -80,31 +80,6 @@ def test_a_record_without_reversals_reports_its_limits(hdbridge, tmp_path):
     assert [each.name for each in model.effects] == ["synchronous"]
 
 
-def test_a_second_fit_is_compared_with_the_active_model(hdbridge, tmp_path):
-    name = write(tmp_path / "theirs.csv", motor_path(*BOTH_WAYS))
-    GEAR.save(tmp_path / "active.yaml")
-    done = hdbridge("fit", name, "--ratio", 50, "--model", "active.yaml", "--json", "fit.json")
-    assert done.returncode == 0, done.stderr
-    result = json.loads((tmp_path / "fit.json").read_text())
-    assert result["held_out"]["improves"] is False
-    assert {each["parameter"] for each in result["changes"]} >= {"offset_arcsec", "width_deg"}
-
-
-def test_a_closed_output_pipe_still_yields_every_file(unread, tmp_path):
-    name = write(tmp_path / "theirs.csv", motor_path(*BOTH_WAYS))
-    files = ("--json", "out.json", "--html", "page.html")
-    assert "Traceback" not in unread("fit", name, "--ratio", 50, "--out", "model.yaml", *files)
-    assert json.loads((tmp_path / "out.json").read_text())["schema"] == "hdbridge.calibration/1"
-    assert "</html>" in (tmp_path / "page.html").read_text()
-    for each in ("out.json", "page.html"):
-        (tmp_path / each).unlink()
-    errors = unread("diagnose", name, "--model", "model.yaml", "--extend", "extended.yaml", *files)
-    assert "Traceback" not in errors
-    assert "findings" in json.loads((tmp_path / "out.json").read_text())
-    assert "</html>" in (tmp_path / "page.html").read_text()
-    assert TransmissionModel.load(tmp_path / "extended.yaml").ratio == RATIO
-
-
 def refused(done, *texts: str) -> None:
     lines = [line for line in done.stderr.splitlines() if line.startswith("hdbridge: ")]
     assert done.returncode == 2, done.stderr

@@ -31,12 +31,6 @@ def test_scan_of_an_empty_bus_says_what_to_check(hdbridge):
     assert "no node answers; check power, wiring" in done.stderr
 
 
-def test_scan_without_a_bus_is_refused(hdbridge):
-    done = hdbridge("scan", "--interface", "socketcan")
-    assert done.returncode == 2
-    assert "--channel" in done.stderr
-
-
 def test_scan_of_a_bus_that_does_not_open(hdbridge):
     done = hdbridge("scan", "--interface", "socketcan", "--channel", "absent0")
     assert done.returncode == 3

@@ -83,18 +83,6 @@ def test_a_changed_axis_file_is_checked_again(finished, tmp_path):
     assert "resume: hdbridge setup arm" in again.stderr
 
 
-def test_resumes_with_the_missing_steps(finished, tmp_path):
-    folder, _ = finished
-    shutil.copytree(folder / "arm", tmp_path / "arm")
-    path = tmp_path / "arm" / "setup.json"
-    state = json.loads(path.read_text())
-    state["done"] = {step: digest for step, digest in state["done"].items() if step not in ("doctor", "move")}
-    path.write_text(json.dumps(state))
-    again = run_here(tmp_path, "setup", "arm", "--yes")
-    assert again.returncode == 0, again.stderr
-    assert steps(again.stdout) == ["check", "doctor", "move"]
-
-
 def test_an_interrupted_calibration_is_resumed(tmp_path):
     (tmp_path / "short.yaml").write_text(PLAN)
     command = ("setup", "arm", "--simulate", "--yes", "--plan", "short.yaml")

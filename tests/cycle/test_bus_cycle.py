@@ -7,12 +7,11 @@ from collections.abc import Iterator
 from itertools import pairwise
 
 import pytest
-from support.twoaxes import RelayBus, TwoAxes, axis_of, two_axes
+from support.twoaxes import TwoAxes, axis_of, two_axes
 
 from hdbridge.axis.encoders import Source
 from hdbridge.control.axiscycle import AxisCycle
 from hdbridge.drive.busload import bus_load, frame_bits
-from hdbridge.drive.drive import Drive
 from hdbridge.drive.image import ProcessImage
 from hdbridge.drive.states import State
 from hdbridge.drive.supervision import Supervision
@@ -111,38 +110,7 @@ def test_frames_of_a_silent_axis_cause_no_fault_and_reach_the_hook() -> None:
         assert pair.follows(0)
 
 
-def test_a_lent_axis_returns_without_a_fault(pair: TwoAxes) -> None:
-    pair.moving[1] = False
-    pair.axes[1].image.power.go(State.SWITCH_ON_DISABLED)
-    pair.turn(20)
-    pair.axes[1].silence()
-    pair.turn(100)
-    pair.axes[1].begin()
-    pair.turn(20)
-    assert not pair.axes[1].supervision.events
-    assert pair.axes[1].feedback.fresh
-    assert pair.follows(0)
-
-
 # ------------------------------------------------------------------ joining and leaving
-
-
-def test_an_axis_is_booted_through_the_hooks_and_joins_while_another_moves() -> None:
-    with two_axes(boot=(0,)) as pair:
-        pair.enable(0)
-        pair.turn(30)
-        relay = RelayBus(pair.cycle)
-        axis = pair.axes[1]
-        # The commissioning of the second drive runs over the relay; the first axis turns on meanwhile.
-        with relay:
-            drive = Drive(relay, axis.image.axis, relay)
-            drive.boot()
-            drive.enable()
-            axis.image.seed(drive.image.motor_counts, drive.image.load_counts, drive.image.statusword or 0)
-            assert not pair.axes[0].supervision.events
-            pair.enable(1)
-            assert pair.follows(0)
-            assert pair.follows(1)
 
 
 def test_frames_of_an_axis_that_left_are_ignored(pair: TwoAxes) -> None:

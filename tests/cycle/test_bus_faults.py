@@ -101,18 +101,6 @@ def test_after_a_latch_nothing_enables_the_axis_by_itself(pair: TwoAxes) -> None
     assert pair.follows(1)
 
 
-def test_a_stopped_axis_is_reset_and_moves_again_while_the_other_never_stopped(pair: TwoAxes) -> None:
-    pair.interfere(0x601, bytes(8))
-    pair.turn(100)
-    assert pair.axes[0].stopped is not None
-    pair.axes[0].reset()
-    pair.axes[0].image.power.go(State.SWITCH_ON_DISABLED)
-    pair.turn(20)
-    pair.enable(0)
-    assert pair.follows(0)
-    assert pair.follows(1)
-
-
 def test_a_stopped_axis_gets_no_commands(pair: TwoAxes) -> None:
     pair.interfere(0x601, bytes(8))
     pair.turn()

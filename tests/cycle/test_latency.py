@@ -62,10 +62,6 @@ def test_merging_is_recording_both(first: list[int], second: list[int]) -> None:
     assert merged.as_dict() == histogram_of(first + second).as_dict()
 
 
-def test_late_wake_ups_are_counted() -> None:
-    assert histogram_of([10, 1900, 2500, 9000]).later_than_us(2000) == 2
-
-
 def test_early_and_extremely_late_wake_ups_are_recorded() -> None:
     histogram = Histogram()
     histogram.record(-0.001)

@@ -174,13 +174,6 @@ def test_the_token_file_must_be_private(folder: Path) -> None:
     assert "expected a token of 16 to 200" in refused(folder, text)
 
 
-def test_tcp_listens_on_this_machine_only(folder: Path) -> None:
-    text = GOOD + "api: {tcp: {host: 0.0.0.0, token_file: token}}\n"
-    assert "machine.yaml:6:13: api.tcp.host: unknown key; expected port, names, token_file" in refused(
-        folder, text
-    )
-
-
 def test_a_machine_is_found_by_folder_file_or_name(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     load(folder)
     monkeypatch.chdir(folder)

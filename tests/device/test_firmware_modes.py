@@ -247,41 +247,7 @@ def test_a_halt_in_the_word_that_enables_holds_the_axis(motor, behaviour):
         assert master.read(0x6064) == 2000
 
 
-def test_pp_is_limited_in_speed(master, motor):
-    master.put(0x6080, 0, 60, 4)
-    master.enable(1)
-    set_point(master, 20_000)
-    speeds = []
-    for _ in range(700):
-        master.wait(0.004)
-        speeds.append(motor.velocity_counts_s)
-    assert max(speeds) == pytest.approx(8000.0)
-    assert motor.position == 20_000
-
-
 # homing
-
-
-@pytest.mark.parametrize("method", [35, 37])
-def test_homing_declares_the_present_position(master, motor, method):
-    motor.position = 4321.0
-    master.put(0x6098, 0, method, 1)
-    master.put(0x607C, 0, -50, 4)
-    master.wait(0.01)
-    master.enable(6)
-    status = master.statusword
-    assert status & (REACHED | BIT_12 | BIT_13 | REFERENCED) == REACHED
-    master.control(0x1F)
-    status = master.statusword
-    assert status & (REACHED | BIT_12 | BIT_13 | REFERENCED) == REACHED | BIT_12 | REFERENCED
-    assert master.read(0x6064) == master.read(0x6062) == master.read(0x607A) == -50
-    master.put(0x6060, 0, 8, 1)
-    master.nmt(1)
-    master.control(0x0F)
-    for _ in range(3):
-        row = master.cycle(0x0F, -40)
-    assert row[1] == -40
-    assert motor.position == 4331.0
 
 
 def test_homing_in_motion_is_an_error(master, motor):

@@ -73,25 +73,6 @@ def test_enabling_again_waits_for_rest(master, motor):
     assert master.state == "enabled"
 
 
-@pytest.mark.parametrize(
-    ("object_", "word", "state"), [(0x605B, 0x06, "ready"), (0x605C, 0x07, "switched on")]
-)
-@pytest.mark.parametrize("option", [0, 1])
-def test_disabling_by_605b_and_605c(master, motor, object_, word, state, option):
-    master.put(0x6084, 0, 50_000, 4)
-    master.put(object_, 0, option, 2)
-    master.enable_csp()
-    master.cruise(40, 10)
-    start = motor.position
-    master.control(word)
-    assert master.state == ("enabled" if option else state)
-    master.wait(0.3)
-    assert master.state == state
-    assert motor.powered is False
-    if option:
-        assert motor.position - start == pytest.approx(1000.0, abs=1.0)
-
-
 def test_disabling_on_a_ramp_can_still_be_cut_short(master):
     master.put(0x6084, 0, 20_000, 4)
     master.enable_csp()
@@ -125,17 +106,6 @@ def test_fault_reaction_by_605e(master, motor, option, decel):
     master.control(0x80)
     assert master.emergencies()[-1] == 0x0000
     assert (master.read(0x603F), master.read(0x1001)) == (0, 0)
-
-
-def test_the_history_keeps_the_last_eight_newest_first(master):
-    codes = [0x2310 + k for k in range(10)]
-    for code in codes:
-        master.node.faults.raise_error(code)
-        master.wait(0.01)
-    assert master.read(0x1003, 0) == 8
-    assert [master.read(0x1003, sub) for sub in range(1, 9)] == codes[:1:-1]
-    master.put(0x1003, 0, 0, 1)
-    assert [master.read(0x1003, sub) for sub in range(3)] == [0, 0, 0]
 
 
 def test_the_brake_closes_only_at_rest(master, motor):

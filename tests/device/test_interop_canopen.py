@@ -84,16 +84,6 @@ def test_sdo_numbers_and_strings(remote):
     assert remote.sdo[0x60E4][1].raw == 0
 
 
-def test_emergencies_arrive(remote, drive):
-    codes = []
-    remote.emcy.add_callback(lambda error: codes.append(error.code))
-    drive.faults.raise_error(0x2310)
-    until(lambda: codes == [0x2310])
-    remote.sdo[0x6040].raw = 0x80
-    until(lambda: codes == [0x2310, 0])
-    assert remote.sdo[0x1003][1].raw == 0x2310
-
-
 def test_pdo_configuration_by_canopen(network, remote):
     remote.tpdo.read()
     remote.tpdo[1].clear()

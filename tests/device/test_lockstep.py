@@ -12,11 +12,8 @@ from hdbridge.sim.lockstep import (
     SimulatedAxis,
     VirtualClock,
     lockstep_bench,
-    nameplate_of,
-    simulated_bench,
     simulated_benches,
 )
-from hdbridge.sim.truth import Truth
 
 ROOT = Path(__file__).parents[2]
 EDS = ROOT / "eds" / "hdbridge-402.eds"
@@ -94,40 +91,6 @@ def test_every_kind_of_frame_passes_unchanged(motor):
             assert other.recv(0).equals(
                 frame, timestamp_delta=None, check_channel=False, check_direction=False
             )
-
-
-def test_further_nodes_run_too(motor):
-    class Beacon:
-        def __init__(self) -> None:
-            self.bus = can.Bus(interface="virtual", channel="beacon", ignore_config=True)
-            self.due_s = 0.5
-
-        def poll(self, now_s: float) -> None:
-            while now_s >= self.due_s:
-                self.bus.send(message(0x1F0, struct.pack("<d", self.due_s)))
-                self.due_s += 0.5
-
-        def next_event_s(self) -> float:
-            return self.due_s
-
-    beacon = Beacon()
-    with beacon.bus, lockstep_bench(motor, EDS, channel="beacon", others=[beacon]) as (bus, clock, _):
-        assert struct.unpack("<d", bus.recv(10.0).data) == (0.5,)
-        clock.sleep_until(2.2)
-        assert [struct.unpack("<d", bus.recv(0).data)[0] for _ in range(3)] == [1.0, 1.5, 2.0]
-
-
-def test_the_nameplate_is_that_of_the_axis():
-    truth = Truth.load(ARTICLE)
-    plate = nameplate_of(truth, serial=9)
-    assert plate.serial == 9
-    assert plate.motor_counts_per_turn == truth.motor.encoder.counts_per_turn
-    assert plate.load_counts_per_turn == truth.load_.encoder.counts_per_turn
-    assert plate.gear_motor_turns == truth.gear.ratio * plate.gear_load_turns
-    with simulated_bench(truth, EDS, node_id=3) as (bus, _, node):
-        assert node.node_id == 3
-        bus.send(message(0x603, bytes.fromhex("4091600100000000")))
-        assert bus.recv(0).data[4:] == struct.pack("<I", plate.gear_motor_turns)
 
 
 def test_two_benches_are_isolated(motor):

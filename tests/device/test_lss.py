@@ -48,60 +48,12 @@ def heartbeats(frames):
     return [(can_id - 0x700, data[0]) for can_id, data in frames if 0x700 <= can_id < 0x780]
 
 
-def test_a_node_is_selected_by_its_exact_identity(master, lss):
-    known = identity(master)
-    for place in range(4):
-        wrong = [part + (place == index) for index, part in enumerate(known)]
-        with pytest.raises(LssError, match="No LSS response"):
-            lss.send_switch_state_selective(*wrong)
-        with pytest.raises(LssError, match="No LSS response"):
-            lss.inquire_node_id()
-    assert lss.send_switch_state_selective(*known)
-    assert lss.inquire_node_id() == 1
-    commands = (
-        canopen.lss.CS_INQUIRE_VENDOR_ID,
-        canopen.lss.CS_INQUIRE_PRODUCT_CODE,
-        canopen.lss.CS_INQUIRE_REVISION_NUMBER,
-        canopen.lss.CS_INQUIRE_SERIAL_NUMBER,
-    )
-    assert tuple(map(lss.inquire_lss_address, commands)) == known
-    lss.send_switch_state_global(lss.WAITING_STATE)
-    with pytest.raises(LssError):
-        lss.inquire_node_id()
-
-
-def test_a_node_id_is_pending_until_the_communication_is_reset(master, lss):
-    master.put(0x1017, 0, 20, 2)
-    lss.send_switch_state_global(lss.CONFIGURATION_STATE)
-    lss.configure_node_id(PENDING_ID)
-    assert lss.inquire_node_id() == 1
-    assert {node for node, _ in heartbeats(master.wait(0.1))} == {1}
-    master.nmt(130)
-    assert heartbeats(master.take()) == [(PENDING_ID, 0)]
-    assert lss.inquire_node_id() == PENDING_ID
-    master.send(0x601, struct.pack("<BHB4x", 0x40, 0x1000, 0))
-    master.send(0x600 + PENDING_ID, struct.pack("<BHB4x", 0x40, 0x1400, 1))
-    ((can_id, answer),) = master.take()
-    assert (can_id, answer[4:]) == (0x580 + PENDING_ID, struct.pack("<I", 0x200 + PENDING_ID))
-    master.nmt(129, PENDING_ID)  # it was not stored
-    assert heartbeats(master.take()) == [(1, 0)]
-
-
 def test_a_stored_node_id_survives_a_node_reset(master, lss):
     lss.send_switch_state_global(lss.CONFIGURATION_STATE)
     lss.configure_node_id(PENDING_ID)
     lss.store_configuration()
     master.nmt(129)
     assert heartbeats(master.take()) == [(PENDING_ID, 0)]
-
-
-@pytest.mark.parametrize("node_id", [0, 128, 254])
-def test_a_node_id_out_of_range_is_refused(master, lss, node_id):
-    lss.send_switch_state_global(lss.CONFIGURATION_STATE)
-    with pytest.raises(LssError, match="LSS Error: 1"):
-        lss.configure_node_id(node_id)
-    master.nmt(130)
-    assert heartbeats(master.take()) == [(1, 0)]
 
 
 def test_a_node_without_id_is_silent_until_a_fast_scan(master, lss):
@@ -119,20 +71,6 @@ def test_a_node_without_id_is_silent_until_a_fast_scan(master, lss):
     lss.configure_node_id(PENDING_ID)
     lss.send_switch_state_global(lss.WAITING_STATE)
     assert heartbeats(master.seen)[-1] == (PENDING_ID, 0)
-
-
-def test_a_node_answers_to_identity_ranges(master, lss):
-    vendor, product, revision, serial = identity(master)
-    for span, answered in (
-        ((vendor, product, revision, revision, serial, serial), True),
-        ((vendor, product, 0, 0xFFFF_FFFF, 0, 0xFFFF_FFFF), True),
-        ((vendor, product, revision + 1, 0xFFFF_FFFF, 0, 0xFFFF_FFFF), False),
-        ((vendor, product, 0, 0xFFFF_FFFF, 0, serial - 1), False),
-        ((vendor + 1, product, 0, 0xFFFF_FFFF, 0, 0xFFFF_FFFF), False),
-    ):
-        lss.responses.queue.clear()
-        lss.send_identify_remote_slave(*span)
-        assert [each[0] for each in lss.responses.queue] == ([0x4F] if answered else [])
 
 
 @pytest.mark.parametrize(("rate_bps", "known"), [(500_000, 2), (1_000_000, 0), (None, None)])

@@ -357,17 +357,6 @@ def test_the_bit_that_forbids_rtr_is_left_to_the_drive(drive: Drive, tiny: Any) 
     assert tiny.values[0x1800, 1] == 0x4000_0181
 
 
-def test_a_vendor_object_as_load_encoder(
-    bus: Any, clock: Any, tiny: Any, build_axis: Callable[..., AxisConfig]
-) -> None:
-    axis = build_axis(load_encoder__source={"index": 0x2100, "subindex": 0, "type": "int16"})
-    tiny.values[0x2100, 0] = -3
-    drive = Drive(bus, axis, clock, tiny.od, sdo_timeout_s=0.1)
-    drive.boot()
-    assert tiny.values[0x1A01, 1] == 0x21000010
-    assert drive.read_positions().load_counts == -3
-
-
 def test_load_encoder_on_a_separate_node(
     bus: Any, clock: Any, tiny: Any, channel: str, build_axis: Callable[..., AxisConfig]
 ) -> None:

@@ -13,7 +13,7 @@ from hdbridge.axis.channels import LoadTorque, Temperature
 from hdbridge.drive import Drive, ProcessImage, load_eds, plan
 from hdbridge.drive.channels import ChannelFollower
 from hdbridge.drive.supervision import Fault
-from hdbridge.errors import InputError, SdoError
+from hdbridge.errors import SdoError
 from hdbridge.files.bundled import bundled_folder
 
 TORQUE = {"source": {"index": 0x2101, "type": "int32"}, "newton_metres_per_count": 0.001, "maximum_nm": 50}
@@ -34,13 +34,6 @@ def test_both_channels_are_scaled(build_axis: Build) -> None:
     assert image.readings == pytest.approx((-1.5, -3.5))
 
 
-def test_channels_of_equal_rate_share_a_pdo(build_axis: Build) -> None:
-    image = ProcessImage(build_axis(load_torque=TORQUE, temperature=TEMPERATURE | {"every_cycles": 1}))
-    assert image.accept(0x381, struct.pack("<ih", 1500, 215))
-    image.step_channels()
-    assert image.readings == pytest.approx((1.5, 21.5))
-
-
 def test_a_temperature_may_be_in_kelvin() -> None:
     channel = Temperature.model_validate(
         TEMPERATURE | {"celsius_per_count": 0.01, "celsius_at_zero": -273.15}
@@ -58,24 +51,6 @@ def test_the_plan_maps_channels_and_names_their_key(build_axis: Build) -> None:
     assert (rows[0x1802, 2].value, rows[0x1803, 2].value) == (1, 25)
     assert rows[0x1803, 2].field == "temperature.every_cycles"
     assert (rows[0x1802, 1].value, rows[0x1803, 1].value) == (0x381, 0x481)
-
-
-@pytest.mark.parametrize(
-    ("source", "complaint"),
-    [
-        ({"index": 0x2155, "type": "int32"}, r"load_torque\.source\.index: .* has no object 2155h:00"),
-        ({"index": 0x2101, "subindex": 1, "type": "int32"}, r"load_torque\.source\.index: .* has no object"),
-        ({"index": 0x60E4, "subindex": 9, "type": "int32"}, r"load_torque\.source\.index: .* has no object"),
-        ({"index": 0x2101, "type": "int16"}, r"load_torque\.source\.type: .* says that 2101h:00 is int32"),
-        ({"index": 0x6065, "type": "uint32"}, r"load_torque\.source\.index: .* 6065h:00 cannot be mapped"),
-    ],
-)
-def test_contradictions_to_the_eds_are_refused(
-    build_axis: Build, source: dict[str, Any], complaint: str
-) -> None:
-    od = load_eds(bundled_folder("eds") / "hdbridge-402.eds", 1)
-    with pytest.raises(InputError, match=complaint):
-        plan(build_axis(load_torque=TORQUE | {"source": source}), od)
 
 
 def test_a_drive_refusing_the_mapping_is_refused(bus: Any, clock: Any, tiny: Any, build_axis: Build) -> None:

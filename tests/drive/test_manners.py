@@ -3,8 +3,6 @@
 import os
 import pwd
 import re
-import subprocess
-import sys
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
@@ -146,24 +144,6 @@ def test_holders_of_all_interfaces_are_listed(tmp_path):
 def test_the_virtual_bus_needs_no_lock(tmp_path: Path) -> None:
     with InterfaceLock("virtual", "x", tmp_path), InterfaceLock("virtual", "x", tmp_path):
         assert not list(tmp_path.iterdir())
-
-
-def test_the_lock_ends_with_its_process(tmp_path: Path) -> None:
-    program = (
-        "import sys, time; from pathlib import Path\n"
-        "from hdbridge.drive.interfacelock import InterfaceLock\n"
-        "with InterfaceLock('socketcan', 'can0', Path(sys.argv[1])):\n"
-        "    print('held', flush=True); time.sleep(60)"
-    )
-    with subprocess.Popen([sys.executable, "-c", program, tmp_path], stdout=subprocess.PIPE) as holder:
-        assert holder.stdout is not None
-        assert holder.stdout.readline() == b"held\n"
-        with pytest.raises(BusInUseError), InterfaceLock("socketcan", "can0", tmp_path):
-            pass
-        holder.kill()
-        holder.wait()
-        with InterfaceLock("socketcan", "can0", tmp_path):
-            pass
 
 
 def test_an_unusable_lock_is_reported(tmp_path: Path) -> None:

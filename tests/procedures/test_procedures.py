@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hdbridge.errors import InputError
-from hdbridge.motion.procedures.moves import AxisView, Dwell, MotionLimits, MoveTo, Sample, Settle, Sine
+from hdbridge.motion.procedures.moves import AxisView, MotionLimits, MoveTo, Sample, Settle, Sine
 from hdbridge.motion.procedures.rehearsal import rehearse
 from hdbridge.motion.procedures.reversals import Reversals
 from hdbridge.motion.procedures.sine import Sines
@@ -147,8 +147,3 @@ def test_the_rehearsal_predicts_the_bench_run(procedure):
 def test_leaving_the_limits_is_refused_before_anything_moves(procedure):
     with pytest.raises(InputError, match=r"the axis file allows -400 to 400|no trajectory"):
         rehearse(procedure, AXIS)
-
-
-def test_dwell_stands_still():
-    path = Dwell(1.5).path(7.0, LIMITS)
-    assert (path.duration_s, path.at(0.7)) == (1.5, 7.0)

@@ -14,7 +14,7 @@ from hdbridge.control.axiscycle import AxisCycle
 from hdbridge.control.buscycle import BusCycle
 from hdbridge.device.node import DriveNode
 from hdbridge.drive.drive import Drive
-from hdbridge.drive.link import Frame, Link
+from hdbridge.drive.link import Link
 from hdbridge.drive.states import State
 from hdbridge.drive.supervision import Fault, Reaction, Supervision
 from hdbridge.sim.lockstep import LockstepBus, SimulatedAxis, VirtualClock, simulated_benches
@@ -29,42 +29,6 @@ def axis_of(node_id: int, name: str = "", profile: Path = PROFILE, **drive: obje
     axis = AxisConfig.load(profile)
     changed = axis.drive.model_copy(update={"node_id": node_id, **drive})
     return axis.model_copy(update={"drive": changed, "name": name or f"axis {node_id}"})
-
-
-class RelayBus(can.BusABC):
-    """Bus for commissioning while the cycle runs; its frames are sent between those of the cycle."""
-
-    def __init__(self, cycle: BusCycle) -> None:
-        super().__init__("relay")
-        self.cycle = cycle
-        self.came: list[Frame] = []
-        self.to_send: list[tuple[int, bytes]] = []
-        self.private = True
-        cycle.on_frame = self.came.append
-        cycle.outgoing = lambda: self.to_send.pop(0) if self.to_send else None
-
-    def now(self) -> float:
-        return self.cycle.clock.now()
-
-    def sleep_until(self, deadline_s: float) -> None:
-        """Runs turns of the cycle until the deadline."""
-        while self.now() < deadline_s:
-            self.cycle.exchange()
-
-    def send(self, msg: can.Message, timeout: float | None = None) -> None:
-        self.to_send.append((msg.arbitration_id, bytes(msg.data)))
-
-    def recv(self, timeout: float | None = None) -> can.Message | None:
-        deadline_s = self.now() + (timeout or 0.0)
-        while not self.came:
-            if self.now() >= deadline_s:
-                return None
-            self.cycle.exchange()
-        frame = self.came.pop(0)
-        return can.Message(arbitration_id=frame.can_id, data=frame.data, is_extended_id=False)
-
-    def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
-        return self.recv(timeout), True
 
 
 @dataclass

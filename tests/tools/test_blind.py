@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import yaml
 from blind import axes, generate, score, work
 from blind import case as blindcase
 from blind.case import Case, cases, make, record_of, unsealed
@@ -168,40 +167,6 @@ def test_the_fresh_record_has_the_same_motion_and_other_noise(lost: Path) -> Non
     assert noise < 3.0 * unsealed(folder)["noise_arcsec"]
 
 
-def test_axes_of_a_pair_differ_in_the_motor_encoder_only() -> None:
-    fine, coarse = (blindcase.axis_of(each, 3) for each in cases({"flicker": 1}, 3))
-    assert (fine.truth.motor.encoder.counts_per_turn, coarse.truth.motor.encoder.counts_per_turn) == (
-        2**20,
-        2**16,
-    )
-    assert fine.flicker_counts > 0.0 == coarse.flicker_counts
-    assert fine.truth.gear == coarse.truth.gear
-    assert fine.truth.load_ == coarse.truth.load_
-    assert fine.config.limits == coarse.config.limits
-
-
-@pytest.mark.parametrize("kind", work.KINDS)
-@pytest.mark.parametrize("seed", range(3))
-def test_work_stays_within_the_limits_of_its_axis(kind: str, seed: int) -> None:
-    import random
-
-    from hdbridge.control.bench import axis_view
-    from hdbridge.motion.procedures.rehearsal import rehearse
-
-    rng = random.Random(f"{kind} {seed}")
-    view = axis_view(AxisConfig.load(bundled_profile("article")))
-    place, recorded_s = 0.0, 0.0
-    way, *bursts = work.drawn_work(rng, view, kind)
-    for burst in (way, *bursts):
-        walked = rehearse(burst, view, place)  # refuses what leaves the limits
-        recorded_s += walked.duration_s if burst is not way else 0.0
-        for leg in burst.legs:
-            path = leg.path(place, view.limits)
-            place = path.at(path.duration_s)
-    longest_s = work.LONGEST_DAY_S + 3 * 160.0 if kind == "daemon" else work.LONGEST_S + 200.0
-    assert 1.0 < recorded_s < longest_s
-
-
 def test_a_suite_is_continued_and_belongs_to_one_seed(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -224,20 +189,6 @@ def test_a_suite_is_continued_and_belongs_to_one_seed(
     generate.claim(tmp_path, 1)
     with pytest.raises(ValueError, match="seed 1"):
         generate.claim(tmp_path, 2)
-
-
-@pytest.mark.parametrize("law", ["maxwell_slip", "bouc_wen", "dahl", "rolling_friction"])
-def test_the_models_loop_is_near_the_plants_for_any_law(law: str) -> None:
-    import random
-
-    axis = axes.drawn_axis(random.Random(4), "x", law)
-    offset, width, exponent = axes.nearest_loop(axis.truth)
-    model = yaml.safe_load(axis.model_yaml)
-    believed = model["effects"][1]["parameters"]
-    assert believed["offset_arcsec"] == pytest.approx(offset, rel=0.12)
-    assert believed["width_deg"] == pytest.approx(width, rel=0.15)
-    assert believed["exponent"] == pytest.approx(exponent, abs=0.08)
-    assert believed["offset_arcsec"] != offset
 
 
 def secret(*causes: str, also: tuple[str, ...] = (), kind: str = "single", **parameters: float) -> Any:

@@ -7,20 +7,6 @@ import pytest
 from hdbridge.client import messages
 
 
-def test_state_describes_the_machine(leased):
-    state = messages.MachineState.model_validate_json(leased.get("/state").content)
-    assert [each.name for each in state.axes] == ["joint-1", "joint-2"]
-    assert state.axes[0].state is messages.ControlState.ENABLED
-    assert state.lease.client == "the tests"
-
-
-def test_a_move_waits_and_returns_the_position(leased, api):
-    answer = leased.post("/axes/joint-1/move", json={"target_deg": 30, "velocity_deg_s": 20.0})
-    state = messages.AxisState.model_validate_json(answer.content)
-    assert state.load_target_deg == 30.0
-    assert api.bridge.moved == [("joint-1", "move", 30.0, 20.0)]
-
-
 @pytest.mark.parametrize(
     ("method", "path", "body", "asked"),
     [
@@ -53,21 +39,6 @@ def test_motion_requests_need_the_lease(api, leased, method, path, body, asked):
     done = leased.request(method, url, json=body)
     assert done.status_code in {200, 201}, done.text
     assert api.bridge.moved == [("joint-1", *asked)]
-
-
-@pytest.mark.parametrize(
-    ("path", "stopped"),
-    [
-        ("/axes/joint-2/stop", [("joint-2", "stop")]),
-        ("/axes/joint-2/quick-stop", [("joint-2", "quick-stop")]),
-        ("/stop", [("joint-1", "stop"), ("joint-2", "stop")]),
-        ("/quick-stop", [("joint-1", "quick-stop"), ("joint-2", "quick-stop")]),
-    ],
-)
-def test_anyone_may_stop(api, leased, path, stopped):
-    with api.over_socket() as stranger:
-        assert stranger.post(path).status_code == 200
-    assert api.bridge.stopped == stopped
 
 
 def test_a_coordinated_move_starts_every_axis_or_none(api, leased):
@@ -104,16 +75,6 @@ def test_the_lease_is_taken_renewed_and_given_back(api):
         assert taken.json()["token"] != grant.token
 
 
-def test_an_expired_lease_moves_nothing(api):
-    bridge = api.bridge
-    bridge.now_s = 0.0
-    token = bridge.lease.take("sleeper")
-    bridge.now_s = bridge.lease.timeout_s
-    with api.over_socket(**{"X-Lease": token}) as client:
-        assert client.post("/axes/joint-1/enable").status_code == 423
-    assert bridge.moved == []
-
-
 def test_a_lease_without_a_name_gets_the_peer_process(api):
     with api.over_socket() as client:
         assert "process" in client.post("/lease", json={}).json()["client"]
@@ -129,22 +90,6 @@ def test_waiting_for_a_move_renews_the_lease(api):
         client.post("/axes/joint-1/enable").raise_for_status()
         assert client.post("/axes/joint-1/move", json={"target_deg": 5}).status_code == 200
         assert bridge.lease.ended() == ()
-
-
-def test_an_object_is_read_without_a_lease(api):
-    with api.over_socket() as client:
-        read = client.get("/axes/joint-1/objects/6041h").json()
-        assert (read["index"], read["value"], read["type"]) == (0x6041, 0x1237, "uint16")
-        assert client.get("/axes/joint-1/objects/9999h").status_code == 422
-
-
-def test_marks_are_events_and_events_are_listed_since_a_number(api):
-    with api.over_socket() as client:
-        for text in ("first", "second"):
-            told = client.post("/mark", json={"text": text}).json()
-        assert [each["text"] for each in told["events"]] == ["second"]
-        assert [each["text"] for each in client.get("/events").json()["events"]] == ["first", "second"]
-        assert client.get("/events", params={"since": 2}).json()["events"] == []
 
 
 def test_an_unknown_axis_lists_the_known_ones(leased):

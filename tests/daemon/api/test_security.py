@@ -3,9 +3,7 @@
 import grp
 import logging
 import os
-import socket
 import stat
-import struct
 
 import httpx
 import pytest
@@ -95,14 +93,6 @@ def test_tcp_requests_need_the_token(api, authorization):
 def client_schema(api):
     with api.over_socket() as client:
         return client.get("/openapi.json").json()
-
-
-def test_motion_needs_token_and_lease(api):
-    with api.over_tcp() as client:
-        assert client.get("/state").status_code == 200
-        assert client.post("/axes/joint-1/enable").status_code == 423
-        lease = client.post("/lease", json={"client": "over tcp"}).json()["token"]
-        assert client.post("/axes/joint-1/enable", headers={"X-Lease": lease}).status_code == 200
 
 
 @pytest.mark.parametrize(
@@ -202,29 +192,7 @@ def test_peers_on_the_unix_socket_are_logged(api, caplog):
     assert about["status"] == 200
 
 
-def test_an_invalid_length_and_an_endless_body_are_refused(api):
-    def chunks():
-        for _ in range(40):
-            yield b" " * 16384
-
-    with api.over_socket() as client:
-        answer = client.post("/axes/joint-1/move", content=chunks())
-        assert answer.status_code == 413
-
-
 @given(st.integers(min_value=1, max_value=60), st.sampled_from([b"[", b'{"a":', b'{"]":[', b'["[[[",']))
 def test_nesting_is_counted_outside_strings(depth, opening):
     levels = depth * {b"[": 1, b'{"a":': 1, b'{"]":[': 2, b'["[[[",': 1}[opening]
     assert too_deep(opening * depth) == (levels > DEPTH_MAXIMUM)
-
-
-def test_an_aborted_request_is_harmless(api):
-    """Reset in the middle of a body; the next one is served."""
-    with socket.create_connection(("127.0.0.1", api.port)) as raw:
-        raw.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
-        raw.sendall(
-            f"POST /api/v1/mark HTTP/1.1\r\nHost: localhost\r\nAuthorization: Bearer {TOKEN}\r\n"
-            "Content-Length: 100\r\n\r\nhalf".encode()
-        )
-    with api.over_socket() as client:
-        assert client.get("/state").status_code == 200

@@ -11,7 +11,7 @@ from support.adapting import AXIS, MODEL, PERIOD_S, packed, wandering, work, wor
 
 from hdbridge.client import messages
 from hdbridge.daemon.following.follower import Follower
-from hdbridge.daemon.following.health import EncoderFault, EncoderStatus
+from hdbridge.daemon.following.health import EncoderStatus
 from hdbridge.daemon.following.settings import AdaptationSettings
 from hdbridge.daemon.following.statefile import AdaptationFiles
 
@@ -104,23 +104,6 @@ def test_reverting_takes_one_call_and_survives_a_restart(tmp_path):
     assert machine.follower.state().mode == messages.AdaptationMode.OBSERVE
     assert on(tmp_path).adaptation.model == MODEL
     assert history(tmp_path)[-2]["event"] == "back"
-
-
-def test_state_is_reported_to_clients(tmp_path):
-    machine = Machine(on(tmp_path))
-    assert machine.follower.state().frozen == "the axis has not yet turned past its loop"
-    for seed in range(3):
-        machine.works(worn(4.0), seed=seed)
-    state = machine.follower.state()
-    assert state.mode == messages.AdaptationMode.ON
-    assert state.frozen is None
-    assert state.updated == NOON
-    assert state.parameters["hysteresis.offset_arcsec"] == pytest.approx(4.0, abs=0.3)
-    machine.status = EncoderStatus(EncoderFault.FROZEN, "load encoder frozen: it reads 3 deg")
-    machine.works(worn(4.0), seed=9)
-    assert machine.follower.state().frozen == "load encoder frozen: it reads 3 deg"
-    machine.follower.adapt("off")
-    assert machine.follower.state().frozen is None
 
 
 def test_lost_samples_lose_the_path(tmp_path):

@@ -11,7 +11,7 @@ from hdbridge.axis import AxisConfig
 from hdbridge.axis.effects import CATALOGUE
 from hdbridge.axis.model import TransmissionModel
 from hdbridge.daemon.following.follower import Follower
-from hdbridge.daemon.following.judging import Debounced, Verdict
+from hdbridge.daemon.following.judging import Verdict
 
 DEMO = Path("profiles/demo/axis.yaml")
 AXIS = AxisConfig.from_text(DEMO.read_text().replace("cycle_ms: 4", "cycle_ms: 20"), DEMO)
@@ -161,12 +161,3 @@ def test_lost_cycles_leave_the_path_unknown_until_it_is_known_again():
     samples = samples[kept]
     assert raised_over(follower, samples, 50) == []
     assert follower.watch.evidence is not None
-
-
-def test_verdicts_are_debounced():
-    steady = Debounced()
-    assert not any(steady.take(Verdict.RECALIBRATE, 10.0) for _ in range(5))
-    assert not steady.take(Verdict.HOLDS, 10.0)
-    assert [steady.take(Verdict.RECALIBRATE, 10.0) for _ in range(7)] == [False] * 5 + [True, False]
-    assert [steady.take(Verdict.HOLDS, 10.0) for _ in range(30)] == [False] * 29 + [True]
-    assert steady.verdict is Verdict.HOLDS

@@ -32,12 +32,6 @@ def test_a_missing_bus_is_reported_in_one_line() -> None:
     assert said.count("\n") == 1
 
 
-def test_starting_by_hand_is_refused() -> None:
-    done = subprocess.run(CONTROL, capture_output=True, text=True, check=False)
-    assert done.returncode == 2
-    assert "use 'hdbridge run'" in done.stderr
-
-
 def test_the_control_process_ends_with_its_keeper() -> None:
     machine = Machine.of_profile("article")
     simulation = Simulation(tuple(axis.profile.truth for axis in machine.axes))

@@ -70,14 +70,6 @@ def test_gaps_start_a_new_part_and_few_missing_cycles_are_counted(tmp_path, gap,
     assert len(recording.record) == 500
 
 
-def test_parts_survive_saving(tmp_path):
-    recording = exported(flown(tmp_path, samples(250), samples(250, 1251)))
-    recording.save(tmp_path / "out")
-    again = Recording.load(tmp_path / "out")
-    assert again.record == recording.record
-    assert again.record.starts == recording.record.starts == (0, 250)
-
-
 def test_disabled_stretches_are_omitted_by_default(tmp_path):
     made = samples(750)
     made["axes"]["state"][200:400] = 1

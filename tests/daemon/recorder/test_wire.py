@@ -60,7 +60,3 @@ def test_messages_of_another_layout_are_refused():
     for wrong in (data[0][:-1], b"\x12" + data[0][1:]):
         with pytest.raises(InputError, match="another release"):
             AXIS.decode([data[1], wrong])
-
-
-def test_no_messages_give_no_rows():
-    assert len(AXIS.decode([])["cycle"]) == 0

@@ -103,34 +103,6 @@ async def test_the_model_in_the_loop_is_adapted_and_reverted(service: Service) -
         assert bridge.axis_state("axis1").adaptation.mode == messages.AdaptationMode.OBSERVE
 
 
-async def test_a_restarted_service_keeps_the_adaptation(service: Service) -> None:
-    async with adapting(service) as (bridge, token, _):
-        await work(bridge, token, 50)
-        learnt = offset_arcsec(bridge)
-        assert learnt > 42.0
-    folder = service.machine.axes[0].profile.folder / "adaptation"
-    assert (folder / "axis1.json").exists()
-    assert len((folder / "axis1.log.jsonl").read_text().splitlines()) >= 1
-    async with service.bridge() as bridge:
-        assert offset_arcsec(bridge) == learnt  # what the control process still uses
-        made = begin(service, bridge)
-        await until(bridge, lambda: bridge.axis_state("axis1").adaptation.frozen is not None)
-        await made.apply()
-        assert offset_arcsec(bridge) == pytest.approx(learnt)
-        made.close()
-
-
-async def test_a_frozen_load_encoder_freezes_the_adaptation(service: Service) -> None:
-    async with adapting(service) as (bridge, token, _):
-        await work(bridge, token, 6)
-        stuck = service.daemon.nodes[0].firmware.motion.load_counts
-        service.daemon.nodes[0].faults.load_reading = lambda _: stuck
-        await work(bridge, token, 6, seed=1)
-        frozen = bridge.axis_state("axis1").adaptation.frozen
-        assert frozen is not None
-        assert frozen.startswith("load encoder frozen: it reads")
-
-
 async def test_the_adaptation_survives_another_scheme_and_a_new_loop(service: Service) -> None:
     async with adapting(service) as (bridge, token, made):
         await work(bridge, token, 50)
