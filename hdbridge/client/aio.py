@@ -14,33 +14,35 @@ holds it already. Every error is one of `hdbridge.errors`.
 
 from __future__ import annotations
 
-import asyncio  # async only
-
-# sync: import threading
-# sync: import weakref
-from collections.abc import AsyncIterator, Mapping, Sequence
-from contextlib import AsyncExitStack, asynccontextmanager, suppress
+import asyncio
+import time
+from collections.abc import AsyncGenerator, AsyncIterator, Iterable, Mapping, Sequence
+from contextlib import AsyncExitStack, asynccontextmanager, nullcontext, suppress
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, Final, Self
+from urllib.parse import quote
 
 import httpx
 from pydantic import BaseModel
 from websockets.asyncio.client import ClientConnection, connect, unix_connect
 
-from hdbridge.client import sockets, transport
+from hdbridge.client import messages, transport
 from hdbridge.client.address import Address, find
-from hdbridge.client.aioaxis import AsyncAxis
-from hdbridge.client.calls import RENEWALS, A, Call, M, MachineCalls
-from hdbridge.client.messages import (
-    Event,
-    Events,
-    LeaseGrant,
-    LeaseState,
-    LiveOptions,
-    MachineState,
-    Samples,
-)
-from hdbridge.errors import DaemonError, LeaseError
+from hdbridge.client.messages import AxisState, LeaseGrant, LeaseState, MachineState, SdoValue
+from hdbridge.client.transport import M
+from hdbridge.errors import DaemonError, LeaseError, SafetyStop
+
+POLL_S: Final = 0.1
+JOG_S: Final = 0.5
+"""Time-out of a jog after the last request of its client."""
+RENEWALS: Final = 3
+"""Renewals of a lease per time-out."""
+MESSAGE_MAXIMUM: Final = 32 << 20
+"""Maximum size of a WebSocket message in bytes, enough for the largest batch of samples of many axes."""
+CLOSE_S: Final = 1.0
+POINTS_AT_A_TIME: Final = 200
+Point = messages.StreamPoint | tuple[float, float] | tuple[float, float, float]
+"""Time in seconds, load angle in degrees, and optionally speed in deg/s."""
 
 
 class AsyncClient:
@@ -61,14 +63,20 @@ class AsyncClient:
     ) -> None:
         self.address: Address = find(address, token)
         self.name = name
-        self._tls = transport.tls_context(self.address)
         self._timeout_s = timeout_s
         self._lock = asyncio.Lock()
         self._holding = 0
         self._grant: LeaseGrant | None = None
-        under = httpx.AsyncHTTPTransport(**transport.under(self.address, self._tls))
-        self._http = httpx.AsyncClient(transport=under, **transport.settings(self.address))
-        # sync: weakref.finalize(self, self._http.close)  # of a client that lives for one line only
+        self._uds = None if self.address.socket is None else str(self.address.socket)
+        self._tls = transport.tls_context(self.address)
+        # Without TLS it loads no certificates.
+        under = httpx.AsyncHTTPTransport(uds=self._uds, verify=False if self._tls is None else self._tls)
+        self._http = httpx.AsyncClient(
+            transport=under,
+            base_url=self.address.url + transport.PREFIX,
+            headers=self.address.headers,
+            trust_env=False,
+        )
 
     async def __aenter__(self) -> Self:
         return self
@@ -84,47 +92,47 @@ class AsyncClient:
         """Returns an axis. Its name is checked by the first request."""
         return AsyncAxis(self, name)
 
-    # sync: @property
     async def axes(self) -> dict[str, AsyncAxis]:
         """Returns all axes of the machine by name."""
         return {each.name: AsyncAxis(self, each.name) for each in (await self.state()).axes}
 
     async def state(self) -> MachineState:
         """Returns the state of the machine and its axes."""
-        return await self.do(MachineCalls.state())
+        return await self.ask("GET", "/state", MachineState)
 
-    async def events(self, since: int = 0) -> Events:
+    async def events(self, since: int = 0) -> messages.Events:
         """Returns the events after number ``since``."""
-        return await self.do(MachineCalls.events(since))
+        return await self.ask("GET", "/events", messages.Events, query={"since": since})
 
-    async def mark(self, text: str) -> list[Event]:
+    async def mark(self, text: str) -> list[messages.Event]:
         """Adds a remark to the event log and the flight recorder."""
-        return (await self.do(MachineCalls.mark(text))).events
+        return (await self.ask("POST", "/mark", messages.Events, messages.Mark.given(text=text))).events
 
     async def stop(self) -> MachineState:
         """Brakes all axes to rest. Requires no lease."""
-        return await self.do(MachineCalls.stop_all())
+        return await self.ask("POST", "/stop", MachineState)
 
     async def quick_stop(self) -> MachineState:
         """Quick-stops all axes and latches the stops until a reset. Requires no lease."""
-        return await self.do(MachineCalls.quick_stop_all())
+        return await self.ask("POST", "/quick-stop", MachineState)
 
     async def lend_bus(self) -> MachineState:
         """Stops all axes and makes the daemon release its bus to another program of its computer.
 
         That program has ten seconds to open the bus. The daemon takes the bus back when it is closed.
         """
-        return await self.do(MachineCalls.lend_bus())
+        return await self.ask("POST", "/bus/lend", MachineState, moving=True, waits=True)
 
     async def coordinated(
         self, targets_deg: Mapping[str, float], *, speed: float = 1.0, wait: bool = True
     ) -> MachineState:
         """Moves axes so that all begin and end together; ``speed`` is a share of their limits."""
-        return await self.do(MachineCalls.coordinated(targets_deg, speed, wait))
+        body = messages.Coordinated.given(targets_deg=dict(targets_deg), speed=speed, wait=wait)
+        return await self.ask("POST", "/coordinated", MachineState, body, moving=True, waits=True)
 
     async def lease_state(self) -> LeaseState:
         """Returns the state of the lease."""
-        return await self.do(MachineCalls.lease())
+        return await self.ask("GET", "/lease", LeaseState)
 
     @asynccontextmanager
     async def lease(self, *, force: bool = False) -> AsyncIterator[LeaseGrant]:
@@ -133,57 +141,92 @@ class AsyncClient:
         A nested block reuses the lease. Raises LeaseError if another client holds it.
         """
         async with self._held(force) as grant:
-            ended = asyncio.Event()
-            renewing = asyncio.ensure_future(self._renew(grant, ended))  # async only
-            # sync: renewing = threading.Thread(target=self._renew, args=(grant, ended), daemon=True)
-            # sync: renewing.start()
+            renewing = asyncio.ensure_future(self._renew(grant))
             try:
                 yield grant
             finally:
-                ended.set()
-                await asyncio.wait([renewing])  # async only
-                # sync: renewing.join()
+                renewing.cancel()
+                await asyncio.wait([renewing])
 
     @property
     def holds_lease(self) -> bool:
         """True if this client holds the lease."""
         return self._grant is not None
 
-    async def live(self, *, every: int = 1, axes: Sequence[str] | None = None) -> AsyncIterator[Samples]:
+    async def live(
+        self, *, every: int = 1, axes: Sequence[str] | None = None
+    ) -> AsyncGenerator[messages.Samples]:
         """Yields batches of samples of one cycle in ``every``; each has the number lost by a slow reader."""
-        wanted = LiveOptions(every=every, axes=None if axes is None else list(axes))
+        wanted = messages.LiveOptions(every=every, axes=None if axes is None else list(axes))
         async with self.connected("/live") as link:
             await link.send(wanted)
             while True:
-                yield await link.receive(Samples)
+                yield await link.receive(messages.Samples)
 
     @asynccontextmanager
     async def connected(self, path: str) -> AsyncIterator[AsyncLink]:
         """Opens a WebSocket of the API."""
-        url, options = sockets.url(self.address, path), sockets.options(self.address, self._tls)
-        uds = transport.socket_of(self.address)
+        address = self.address
+        options: dict[str, Any] = {
+            "additional_headers": address.headers,
+            "max_size": MESSAGE_MAXIMUM,
+            "close_timeout": CLOSE_S,
+            "compression": None,
+        }
+        url = f"{address.websocket_url}{transport.PREFIX}{path}"
         async with AsyncExitStack() as stack:
+            transport.check(address)
+            try:
+                connection: ClientConnection = await stack.enter_async_context(
+                    connect(url, **options, ssl=self._tls, proxy=None)
+                    if self._uds is None
+                    else unix_connect(self._uds, url, **options)
+                )
+            except transport.FAILURES as problem:
+                raise transport.disconnected(address, problem) from None
+            yield AsyncLink(connection, address)
+
+    async def ask(
+        self,
+        method: str,
+        path: str,
+        answer: type[M],
+        body: BaseModel | None = None,
+        *,
+        moving: bool = False,
+        waits: bool = False,
+        query: Mapping[str, int] | None = None,
+    ) -> M:
+        """Sends a request and returns its answer. Takes the lease if the request moves an axis.
+
+        One that ``waits`` is answered when a motion has ended, so it has no time-out: the daemon's
+        supervision bounds it.
+        """
+        headers = {} if body is None else {"Content-Type": "application/json"}
+        content = None if body is None else body.model_dump_json(exclude_none=True)
+        timeout = httpx.Timeout(self._timeout_s, read=None if waits else self._timeout_s)
+        async with self._held() if moving else nullcontext():
+            if self._grant is not None:
+                headers["X-Lease"] = self._grant.token
             transport.check(self.address)
             try:
-                opened = connect(url, **options) if uds is None else unix_connect(uds, url, **options)
-                connection: Any = await stack.enter_async_context(opened)
-            except sockets.FAILURES as problem:
-                raise sockets.error_of(problem, self.address) from None
-            yield AsyncLink(connection, self.address)
-
-    async def do(self, call: Call[A]) -> A:
-        """Sends a request, with the lease if it requires one."""
-        if not call.moving:
-            return await self._send(call)
-        async with self._held():
-            return await self._send(call)
+                response = await self._http.request(
+                    method, path, content=content, headers=headers, params=query, timeout=timeout
+                )
+            except httpx.TransportError as problem:
+                raise transport.unreachable(self.address, problem) from None
+        if response.is_error:
+            kind = response.headers.get("content-type", "")
+            raise transport.refused(response.status_code, kind, response.content)
+        return transport.read(answer, response.content, f"{method} {path}")
 
     @asynccontextmanager
     async def _held(self, force: bool = False) -> AsyncIterator[LeaseGrant]:
         """Holds the lease, taken by the first user and released by the last."""
         async with self._lock:
             if self._grant is None:
-                self._grant = await self._send(MachineCalls.take_lease(self.name, force))
+                wanted = messages.LeaseRequest.given(client=self.name, force=force)
+                self._grant = await self.ask("POST", "/lease", LeaseGrant, wanted)
             self._holding += 1
             grant = self._grant
         try:
@@ -193,26 +236,213 @@ class AsyncClient:
                 self._holding -= 1
                 if self._holding == 0:
                     with suppress(DaemonError):  # lost, or the daemon is: it is not held any more
-                        await self._send(MachineCalls.release_lease())
+                        await self.ask("DELETE", "/lease", LeaseState)
                     self._grant = None
 
-    async def _send(self, call: Call[A]) -> A:
-        wanted = transport.request(call, self._grant, self._timeout_s)
-        transport.check(self.address)
-        try:
-            response = await self._http.request(**wanted)
-        except httpx.TransportError as problem:
-            raise transport.unreachable(self.address, problem) from None
-        return transport.answer(call, response)
-
-    async def _renew(self, grant: LeaseGrant, ended: asyncio.Event) -> None:
-        while not await transport.waited(ended, grant.timeout_s / RENEWALS):
+    async def _renew(self, grant: LeaseGrant) -> None:
+        while True:
+            await asyncio.sleep(grant.timeout_s / RENEWALS)
             try:
-                await self._send(MachineCalls.renew_lease())
+                await self.ask("PUT", "/lease", LeaseState)
             except LeaseError:
                 return
             except DaemonError:
                 continue
+
+
+class AsyncAxis:
+    """An axis. Methods that move it return when it is at rest again, unless ``wait`` is False."""
+
+    def __init__(self, client: AsyncClient, name: str) -> None:
+        self.client = client
+        self.name = name
+        self._path = f"/axes/{quote(name, safe='')}"
+
+    async def _post(
+        self, what: str, body: BaseModel | None = None, *, waits: bool = False, moving: bool = True
+    ) -> AxisState:
+        path = f"{self._path}/{what}"
+        return await self.client.ask("POST", path, AxisState, body, moving=moving, waits=waits)
+
+    async def _delete(self, what: str) -> AxisState:
+        return await self.client.ask("DELETE", f"{self._path}/{what}", AxisState, moving=True)
+
+    async def state(self) -> AxisState:
+        """Returns the state of the axis."""
+        return await self.client.ask("GET", self._path, AxisState)
+
+    async def enable(self) -> AxisState:
+        """Switches power on at rest; boots and verifies the drive first if that was not done."""
+        return await self._post("enable", waits=True)
+
+    async def disable(self) -> AxisState:
+        """Brakes to rest, then switches power off."""
+        return await self._post("disable", waits=True)
+
+    async def reset(self) -> AxisState:
+        """Releases a latched stop; the axis stays disabled."""
+        return await self._post("reset", waits=True)
+
+    async def stop(self) -> AxisState:
+        """Brakes to rest and stays enabled. Requires no lease."""
+        return await self._post("stop", moving=False)
+
+    async def quick_stop(self) -> AxisState:
+        """Quick-stops the axis and latches the stop until a reset. Requires no lease."""
+        return await self._post("quick-stop", moving=False)
+
+    async def home(self, /, method: int, **values: float | None) -> AxisState:
+        """Homes by a method of the drive; ``values`` are the other fields of `messages.Home`."""
+        return await self._post("home", messages.Home.given(method=method, **values), waits=True)
+
+    async def move(
+        self,
+        target_deg: float,
+        *,
+        velocity_deg_s: float | None = None,
+        acceleration_deg_s2: float | None = None,
+        wait: bool = True,
+    ) -> AxisState:
+        """Moves to a load angle in degrees; a present motion is redirected without a stop."""
+        body = messages.Move.given(
+            target_deg=target_deg,
+            velocity_deg_s=velocity_deg_s,
+            acceleration_deg_s2=acceleration_deg_s2,
+            wait=wait,
+        )
+        return await self._post("move", body, waits=True)
+
+    async def jog(self, velocity_deg_s: float, duration_s: float | None = None) -> AxisState:
+        """Turns at a speed for a time, then brakes; without a time, call it again within `JOG_S`.
+
+        Raises LeaseError without a time if the lease is not held, because it would end with this call.
+        """
+        body = messages.Jog.given(velocity_deg_s=velocity_deg_s, timeout_s=JOG_S)
+        if duration_s is None:
+            self._need_lease("jog without a duration")
+            return await self._post("jog", body)
+        until = time.monotonic() + duration_s
+        async with self.client.lease():
+            while (left_s := until - time.monotonic()) > 0:
+                await self._post("jog", body)
+                await asyncio.sleep(min(left_s, JOG_S / 3))
+            return await self.stop()
+
+    async def queue(self, points: Sequence[messages.QueueItem | float], *, wait: bool = True) -> AxisState:
+        """Appends way points (load angles, or with their own limits) and waits until the last is reached."""
+        items = [
+            each.model_dump() if isinstance(each, messages.QueueItem) else {"target_deg": each}
+            for each in points
+        ]
+        body = messages.Queue.given(points=items)
+        if not wait:
+            self._need_lease("a queue that is not waited for")
+            return await self._post("queue", body)
+        async with self.client.lease():
+            await self._post("queue", body)
+            return await self.rest()
+
+    async def clear_queue(self) -> AxisState:
+        """Discards the waiting way points."""
+        return await self._delete("queue")
+
+    async def rest(self) -> AxisState:
+        """Waits until the axis is at rest and no way points wait; raises SafetyStop if it was stopped."""
+        while True:
+            found = await self.state()
+            if found.fault is not None:
+                raise SafetyStop(f"axis '{self.name}': {found.fault}")
+            if found.at_rest and found.queued == 0 and found.mode == "hold":
+                return found
+            await asyncio.sleep(POLL_S)
+
+    @asynccontextmanager
+    async def stream(self, timeout_s: float = JOG_S) -> AsyncIterator[AsyncStream]:
+        """Follows set-points that are put within the block; the axis rests at the last one when it ends.
+
+        The first set-point is the axis's position. The axis brakes if no point is left for ``timeout_s``, or
+        if an error leaves the block.
+        """
+        begin = messages.StreamBegin.given(lease="", timeout_s=timeout_s)
+        async with self.client.lease() as grant, self.client.connected(f"{self._path}/stream") as link:
+            stream = AsyncStream(link)
+            await stream.exchange(begin.model_copy(update={"lease": grant.token}))
+            yield stream
+            await stream.end()
+
+    async def compensate(self, scheme: messages.Scheme | str) -> AxisState:
+        """Selects the part of the model that compensates; ``none`` switches compensation off."""
+        return await self._post("compensate", messages.Compensate.given(scheme=scheme))
+
+    async def activate_model(self, version: int | str) -> AxisState:
+        """Activates a model: its number in the history, ``pending`` or ``active``."""
+        return await self._post("model", messages.ActivateModel.given(version=version), waits=True)
+
+    async def load_loop(self, on: bool) -> AxisState:
+        """Switches the load loop (integral of the measured error) on or off."""
+        return await self._post("load-loop", messages.SwitchLoadLoop.given(on=on))
+
+    async def adapt(self, mode: messages.AdaptationMode | str) -> AxisState:
+        """Sets the adaptation mode: ``off``, ``observe`` or ``on``."""
+        return await self._post("adaptation", messages.Adapt.given(mode=mode))
+
+    async def adaptation_back(self) -> AxisState:
+        """Discards the changes by the adaptation."""
+        return await self._delete("adaptation")
+
+    async def read(self, object_: str) -> SdoValue:
+        """Reads an object of the drive by its number (6064h, 0x1018:4) or EDS name."""
+        return await self.client.ask("GET", f"{self._path}/objects/{quote(object_, safe='')}", SdoValue)
+
+    async def write(self, object_: str, value: int | float | str) -> SdoValue:
+        """Writes an object of the drive; refused while the axis is enabled."""
+        path, body = (
+            f"{self._path}/objects/{quote(object_, safe='')}",
+            messages.SdoWrite.given(value=str(value)),
+        )
+        return await self.client.ask("PUT", path, SdoValue, body, moving=True)
+
+    def _need_lease(self, what: str) -> None:
+        if not self.client.holds_lease:
+            raise LeaseError(f"{what} ends with the lease: use it within 'with client.lease():'")
+
+
+class AsyncStream:
+    """An open stream of set-points."""
+
+    def __init__(self, link: AsyncLink) -> None:
+        self._link = link
+        self._ended = False
+
+    async def put(self, points: Iterable[Point]) -> None:
+        """Sends points: (time s, load angle deg) or (time, angle, speed deg/s), time since the start.
+
+        Waits while the daemon's buffer is full. Raises InputError if a point is refused; the axis then
+        brakes.
+        """
+        names = ("time_s", "position_deg", "velocity_deg_s")
+        items = [
+            each
+            if isinstance(each, messages.StreamPoint)
+            else messages.StreamPoint.given(**dict(zip(names, each, strict=False)))
+            for each in points
+        ]
+        for first in range(0, len(items), POINTS_AT_A_TIME):
+            await self.exchange(messages.StreamPoints(points=items[first : first + POINTS_AT_A_TIME]))
+
+    async def end(self) -> None:
+        """Ends the stream; returns when the axis is at rest at the last point."""
+        if not self._ended:
+            self._ended = True
+            await self.exchange(messages.StreamPoints(points=[], end=True))
+
+    async def exchange(self, message: BaseModel) -> None:
+        """Sends a message and receives its answer."""
+        await self._link.send(message)
+        answer = await self._link.receive(messages.StreamAnswer)
+        if answer.problem is not None:
+            self._ended = True
+            raise answer.problem.error()
 
 
 class AsyncLink:
@@ -226,13 +456,13 @@ class AsyncLink:
         """Sends a message."""
         try:
             await self._connection.send(message.model_dump_json())
-        except sockets.FAILURES as problem:
-            raise sockets.error_of(problem, self._address) from None
+        except transport.FAILURES as problem:
+            raise transport.disconnected(self._address, problem) from None
 
     async def receive(self, kind: type[M]) -> M:
         """Receives the next message."""
         try:
             text = await self._connection.recv()
-        except sockets.FAILURES as problem:
-            raise sockets.error_of(problem, self._address) from None
-        return sockets.read(kind, text)
+        except transport.FAILURES as problem:
+            raise transport.disconnected(self._address, problem) from None
+        return transport.read(kind, text, kind.__name__)

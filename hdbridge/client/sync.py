@@ -1,5 +1,4 @@
-# Made by tools/synchronous_client.py from aio.py: edit that file.
-"""The synchronous client.
+"""The synchronous client: the asyncio client, run by an event loop in a thread of its own.
 
     from hdbridge import Client
 
@@ -9,46 +8,134 @@
         for target_deg in (10, 20, 30):
             print(axis.move(target_deg).error_arcsec)
 
-Motion requires the lease. A method that moves an axis takes it while it runs, unless `Client.lease`
-holds it already. Every error is one of `hdbridge.errors`.
+Each method is that of `hdbridge.client.aio` and returns when it has ended. It may be called from any thread.
 """
 
 from __future__ import annotations
 
+import asyncio
 import threading
 import weakref
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager, suppress
+from collections.abc import Callable, Coroutine, Iterator, Sequence
+from concurrent.futures import Future
+from contextlib import AbstractAsyncContextManager, AsyncExitStack, contextmanager
+from functools import wraps
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, Concatenate, ParamSpec, Self, TypeVar
 
-import httpx
-from pydantic import BaseModel
-from websockets.sync.client import ClientConnection, connect, unix_connect
+from hdbridge.client.address import Address
+from hdbridge.client.aio import JOG_S, AsyncAxis, AsyncClient, AsyncStream
+from hdbridge.client.messages import LeaseGrant, Samples
 
-from hdbridge.client import sockets, transport
-from hdbridge.client.address import Address, find
-from hdbridge.client.axis import Axis
-from hdbridge.client.calls import RENEWALS, A, Call, M, MachineCalls
-from hdbridge.client.messages import (
-    Event,
-    Events,
-    LeaseGrant,
-    LeaseState,
-    LiveOptions,
-    MachineState,
-    Samples,
-)
-from hdbridge.errors import DaemonError, LeaseError
+P = ParamSpec("P")
+T = TypeVar("T")
+
+
+class _Thread:
+    """A thread that runs coroutines until `end`, and closes the client then."""
+
+    def __init__(self, client: AsyncClient) -> None:
+        begun: Future[asyncio.AbstractEventLoop] = Future()
+        self._ended = ended = asyncio.Event()
+
+        async def serve() -> None:
+            begun.set_result(asyncio.get_running_loop())
+            async with client:
+                await ended.wait()
+
+        self._thread = threading.Thread(target=lambda: asyncio.run(serve()), name="hdbridge", daemon=True)
+        self._thread.start()
+        self._loop = begun.result()
+
+    def end(self) -> None:
+        """Ends the thread soon. Does not wait, because the garbage collector may call it in this thread."""
+        if self._thread.is_alive():
+            self._loop.call_soon_threadsafe(self._ended.set)
+
+    def join(self) -> None:
+        """Ends the thread and waits for it."""
+        self.end()
+        self._thread.join()
+
+    def run(self, work: Coroutine[Any, Any, T]) -> T:
+        """Returns the result of a coroutine; cancels it if the wait is interrupted (Ctrl-C)."""
+        future = asyncio.run_coroutine_threadsafe(work, self._loop)
+        try:
+            return future.result()
+        except BaseException:
+            future.cancel()
+            raise
+
+    @contextmanager
+    def within(self, context: AbstractAsyncContextManager[T]) -> Iterator[T]:
+        """Enters an asynchronous context for the block."""
+        stack = AsyncExitStack()
+        value = self.run(stack.enter_async_context(context))
+        try:
+            yield value
+        except BaseException as error:
+            self.run(stack.__aexit__(type(error), error, error.__traceback__))
+            raise
+        self.run(stack.aclose())
+
+
+def _waits(method: Callable[Concatenate[Any, P], Coroutine[Any, Any, T]]) -> Callable[Concatenate[Any, P], T]:
+    """Returns the synchronous form of a method of the asyncio client."""
+
+    @wraps(method)
+    def call(self: Any, /, *args: P.args, **kwargs: P.kwargs) -> T:
+        thread: _Thread = self._thread
+        return thread.run(method(self._own, *args, **kwargs))
+
+    return call
+
+
+class Stream:
+    """An open stream of set-points."""
+
+    def __init__(self, thread: _Thread, own: AsyncStream) -> None:
+        self._thread, self._own = thread, own
+
+    put = _waits(AsyncStream.put)
+    end = _waits(AsyncStream.end)
+
+
+class Axis:
+    """An axis. Methods that move it return when it is at rest again, unless ``wait`` is False."""
+
+    def __init__(self, client: Client, name: str) -> None:
+        self.client, self.name = client, name
+        self._thread, self._own = client._thread, AsyncAxis(client._own, name)
+
+    state = _waits(AsyncAxis.state)
+    enable = _waits(AsyncAxis.enable)
+    disable = _waits(AsyncAxis.disable)
+    reset = _waits(AsyncAxis.reset)
+    stop = _waits(AsyncAxis.stop)
+    quick_stop = _waits(AsyncAxis.quick_stop)
+    home = _waits(AsyncAxis.home)
+    move = _waits(AsyncAxis.move)
+    jog = _waits(AsyncAxis.jog)
+    queue = _waits(AsyncAxis.queue)
+    clear_queue = _waits(AsyncAxis.clear_queue)
+    rest = _waits(AsyncAxis.rest)
+    compensate = _waits(AsyncAxis.compensate)
+    activate_model = _waits(AsyncAxis.activate_model)
+    load_loop = _waits(AsyncAxis.load_loop)
+    adapt = _waits(AsyncAxis.adapt)
+    adaptation_back = _waits(AsyncAxis.adaptation_back)
+    read = _waits(AsyncAxis.read)
+    write = _waits(AsyncAxis.write)
+
+    @contextmanager
+    def stream(self, timeout_s: float = JOG_S) -> Iterator[Stream]:
+        """Follows set-points that are put within the block, as `AsyncAxis.stream` does."""
+        with self._thread.within(self._own.stream(timeout_s)) as stream:
+            yield Stream(self._thread, stream)
 
 
 class Client:
-    """Client of a daemon. Close it, or use it as a context manager.
-
-    ``address`` is a Unix socket, a URL or a machine's name; `hdbridge.client.address.find` finds the daemon
-    without it. ``token`` is required over TCP; others see ``name`` while the client holds the lease. Safe
-    for concurrent use.
-    """
+    """Client of a daemon, with the arguments of `AsyncClient`. Close it, or use it as a context manager."""
 
     def __init__(
         self,
@@ -58,16 +145,24 @@ class Client:
         name: str = "",
         timeout_s: float = 10.0,
     ) -> None:
-        self.address: Address = find(address, token)
-        self.name = name
-        self._tls = transport.tls_context(self.address)
-        self._timeout_s = timeout_s
-        self._lock = threading.Lock()
-        self._holding = 0
-        self._grant: LeaseGrant | None = None
-        under = httpx.HTTPTransport(**transport.under(self.address, self._tls))
-        self._http = httpx.Client(transport=under, **transport.settings(self.address))
-        weakref.finalize(self, self._http.close)  # of a client that lives for one line only
+        self._own = AsyncClient(address, token=token, name=name, timeout_s=timeout_s)
+        self._thread = _Thread(self._own)
+        weakref.finalize(self, self._thread.end)  # a client may live for one line only
+
+    @property
+    def address(self) -> Address:
+        """Address of the daemon."""
+        return self._own.address
+
+    @property
+    def name(self) -> str:
+        """Name that other clients see while this one holds the lease."""
+        return self._own.name
+
+    @property
+    def holds_lease(self) -> bool:
+        """True if this client holds the lease."""
+        return self._own.holds_lease
 
     def __enter__(self) -> Self:
         return self
@@ -77,7 +172,16 @@ class Client:
 
     def close(self) -> None:
         """Closes the connections."""
-        self._http.close()
+        self._thread.join()
+
+    state = _waits(AsyncClient.state)
+    events = _waits(AsyncClient.events)
+    mark = _waits(AsyncClient.mark)
+    stop = _waits(AsyncClient.stop)
+    quick_stop = _waits(AsyncClient.quick_stop)
+    lend_bus = _waits(AsyncClient.lend_bus)
+    coordinated = _waits(AsyncClient.coordinated)
+    lease_state = _waits(AsyncClient.lease_state)
 
     def axis(self, name: str) -> Axis:
         """Returns an axis. Its name is checked by the first request."""
@@ -85,45 +189,8 @@ class Client:
 
     @property
     def axes(self) -> dict[str, Axis]:
-        """Returns all axes of the machine by name."""
+        """All axes of the machine by name."""
         return {each.name: Axis(self, each.name) for each in self.state().axes}
-
-    def state(self) -> MachineState:
-        """Returns the state of the machine and its axes."""
-        return self.do(MachineCalls.state())
-
-    def events(self, since: int = 0) -> Events:
-        """Returns the events after number ``since``."""
-        return self.do(MachineCalls.events(since))
-
-    def mark(self, text: str) -> list[Event]:
-        """Adds a remark to the event log and the flight recorder."""
-        return self.do(MachineCalls.mark(text)).events
-
-    def stop(self) -> MachineState:
-        """Brakes all axes to rest. Requires no lease."""
-        return self.do(MachineCalls.stop_all())
-
-    def quick_stop(self) -> MachineState:
-        """Quick-stops all axes and latches the stops until a reset. Requires no lease."""
-        return self.do(MachineCalls.quick_stop_all())
-
-    def lend_bus(self) -> MachineState:
-        """Stops all axes and makes the daemon release its bus to another program of its computer.
-
-        That program has ten seconds to open the bus. The daemon takes the bus back when it is closed.
-        """
-        return self.do(MachineCalls.lend_bus())
-
-    def coordinated(
-        self, targets_deg: Mapping[str, float], *, speed: float = 1.0, wait: bool = True
-    ) -> MachineState:
-        """Moves axes so that all begin and end together; ``speed`` is a share of their limits."""
-        return self.do(MachineCalls.coordinated(targets_deg, speed, wait))
-
-    def lease_state(self) -> LeaseState:
-        """Returns the state of the lease."""
-        return self.do(MachineCalls.lease())
 
     @contextmanager
     def lease(self, *, force: bool = False) -> Iterator[LeaseGrant]:
@@ -131,105 +198,18 @@ class Client:
 
         A nested block reuses the lease. Raises LeaseError if another client holds it.
         """
-        with self._held(force) as grant:
-            ended = threading.Event()
-            renewing = threading.Thread(target=self._renew, args=(grant, ended), daemon=True)
-            renewing.start()
-            try:
-                yield grant
-            finally:
-                ended.set()
-                renewing.join()
-
-    @property
-    def holds_lease(self) -> bool:
-        """True if this client holds the lease."""
-        return self._grant is not None
+        with self._thread.within(self._own.lease(force=force)) as grant:
+            yield grant
 
     def live(self, *, every: int = 1, axes: Sequence[str] | None = None) -> Iterator[Samples]:
         """Yields batches of samples of one cycle in ``every``; each has the number lost by a slow reader."""
-        wanted = LiveOptions(every=every, axes=None if axes is None else list(axes))
-        with self.connected("/live") as link:
-            link.send(wanted)
+        batches = self._own.live(every=every, axes=axes)
+
+        async def following() -> Samples:
+            return await anext(batches)
+
+        try:
             while True:
-                yield link.receive(Samples)
-
-    @contextmanager
-    def connected(self, path: str) -> Iterator[Link]:
-        """Opens a WebSocket of the API."""
-        url, options = sockets.url(self.address, path), sockets.options(self.address, self._tls)
-        uds = transport.socket_of(self.address)
-        with ExitStack() as stack:
-            transport.check(self.address)
-            try:
-                opened = connect(url, **options) if uds is None else unix_connect(uds, url, **options)
-                connection: Any = stack.enter_context(opened)
-            except sockets.FAILURES as problem:
-                raise sockets.error_of(problem, self.address) from None
-            yield Link(connection, self.address)
-
-    def do(self, call: Call[A]) -> A:
-        """Sends a request, with the lease if it requires one."""
-        if not call.moving:
-            return self._send(call)
-        with self._held():
-            return self._send(call)
-
-    @contextmanager
-    def _held(self, force: bool = False) -> Iterator[LeaseGrant]:
-        """Holds the lease, taken by the first user and released by the last."""
-        with self._lock:
-            if self._grant is None:
-                self._grant = self._send(MachineCalls.take_lease(self.name, force))
-            self._holding += 1
-            grant = self._grant
-        try:
-            yield grant
+                yield self._thread.run(following())
         finally:
-            with self._lock:
-                self._holding -= 1
-                if self._holding == 0:
-                    with suppress(DaemonError):  # lost, or the daemon is: it is not held any more
-                        self._send(MachineCalls.release_lease())
-                    self._grant = None
-
-    def _send(self, call: Call[A]) -> A:
-        wanted = transport.request(call, self._grant, self._timeout_s)
-        transport.check(self.address)
-        try:
-            response = self._http.request(**wanted)
-        except httpx.TransportError as problem:
-            raise transport.unreachable(self.address, problem) from None
-        return transport.answer(call, response)
-
-    def _renew(self, grant: LeaseGrant, ended: threading.Event) -> None:
-        while not ended.wait(grant.timeout_s / RENEWALS):
-            try:
-                self._send(MachineCalls.renew_lease())
-            except LeaseError:
-                return
-            except DaemonError:
-                continue
-
-
-class Link:
-    """A WebSocket that raises errors of hdbridge."""
-
-    def __init__(self, connection: ClientConnection, address: Address) -> None:
-        self._connection = connection
-        self._address = address
-
-    def send(self, message: BaseModel) -> None:
-        """Sends a message."""
-        try:
-            self._connection.send(message.model_dump_json())
-        except sockets.FAILURES as problem:
-            raise sockets.error_of(problem, self._address) from None
-
-    def receive(self, kind: type[M]) -> M:
-        """Receives the next message."""
-        try:
-            text = self._connection.recv()
-        except sockets.FAILURES as problem:
-            raise sockets.error_of(problem, self._address) from None
-        return sockets.read(kind, text)
+            self._thread.run(batches.aclose())

@@ -2,6 +2,7 @@
 
 import os
 import pwd
+import signal
 import subprocess
 import sys
 import threading
@@ -9,6 +10,7 @@ import time
 
 import pytest
 from support.api import TOKEN
+from support.patience import until
 
 from hdbridge import Client, DaemonError, InputError, LeaseError, RefusedError, SafetyStop
 from hdbridge.client import messages
@@ -101,6 +103,21 @@ def test_refusals_raise_the_library_errors(client, api, call, error, words):
         call(client)
     assert api.bridge.moved == []
     assert not api.bridge.state().lease.held
+
+
+def test_an_interrupted_call_is_given_up_and_the_lease_released(api):
+    api.bridge.axes["joint-1"].moving_s = 30.0
+
+    def interrupt():
+        until(lambda: api.bridge.moved)
+        signal.pthread_kill(threading.main_thread().ident, signal.SIGINT)
+
+    interrupting = threading.Thread(target=interrupt)
+    interrupting.start()
+    with Client(api.socket) as client, pytest.raises(KeyboardInterrupt):
+        client.axis("joint-1").move(7)
+    interrupting.join()
+    until(lambda: not api.bridge.state().lease.held)
 
 
 def test_a_timed_jog_is_renewed_and_ends_in_a_stop(client, api):

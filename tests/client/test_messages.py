@@ -6,16 +6,15 @@ import math
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from pydantic import BaseModel, ValidationError
+from pydantic import ValidationError
 
 from hdbridge import errors
 from hdbridge.client import messages
-from hdbridge.client.messages.problem import STATUS
-from hdbridge.client.messages.values import Request
+from hdbridge.client.messages import STATUS, Request
 from hdbridge.commissioning.evaluation.stepping import Scheme
 from hdbridge.drive.states import State
 
-REQUESTS = [each for each in vars(messages).values() if isinstance(each, type) and issubclass(each, Request)]
+REQUESTS = Request.__subclasses__()
 RAISED = [
     each
     for each in vars(errors).values()
@@ -145,9 +144,9 @@ def test_nan_becomes_null_in_json():
     assert json.loads(batch.model_dump_json())["axes"]["a"]["weight"] == [None]
 
 
-@pytest.mark.parametrize("name", messages.__all__)
-def test_every_message_is_documented(name):
-    found = getattr(messages, name)
-    assert found.__doc__
-    if isinstance(found, type) and issubclass(found, BaseModel):
-        assert found.model_json_schema()["title"] == name
+@pytest.mark.parametrize(
+    "message", [*REQUESTS, *messages.Report.__subclasses__()], ids=lambda each: each.__name__
+)
+def test_every_message_is_documented(message):
+    assert message.__doc__
+    assert message.model_json_schema()["title"] == message.__name__

@@ -22,7 +22,7 @@ import pytest
 from hdbridge import TransmissionModel
 from hdbridge.axis import AxisConfig
 from hdbridge.client import Client
-from hdbridge.client.axis import Axis
+from hdbridge.client.sync import Axis
 from hdbridge.commissioning.calibration.path import path_errors
 from hdbridge.control.bench import axis_view
 from hdbridge.errors import HdbridgeError

@@ -26,7 +26,7 @@ from contextlib import asynccontextmanager
 from typing import Any, Final
 
 from hdbridge.client import AsyncClient
-from hdbridge.client.aioaxis import AsyncAxis
+from hdbridge.client.aio import AsyncAxis
 from hdbridge.errors import HdbridgeError
 
 POLL_S: Final = 0.2

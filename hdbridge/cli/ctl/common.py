@@ -21,8 +21,8 @@ if TYPE_CHECKING:
     from types import FrameType
 
     from hdbridge.client import Client
-    from hdbridge.client.axis import Axis
     from hdbridge.client.messages import AxisState
+    from hdbridge.client.sync import Axis
 
 STOP_S: Final = 3.0
 """Time-out of a stop command; s."""

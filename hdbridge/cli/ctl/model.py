@@ -6,7 +6,7 @@ import typer
 
 from hdbridge.cli.ctl.common import AtOption, AxisArgument, TakeOption, moving, tell
 from hdbridge.cli.options import JsonOption
-from hdbridge.client.messages.values import AdaptationMode, Scheme
+from hdbridge.client.messages import AdaptationMode, Scheme
 from hdbridge.errors import InputError
 
 

@@ -168,7 +168,6 @@ def queue(
     json_file: JsonOption = None,
 ) -> None:
     """Append way points, and wait until the last one is reached. Ctrl-C stops the axis."""
-    from hdbridge.client.calls import given
     from hdbridge.client.messages import QueueItem
 
     if clear == bool(angles_deg):
@@ -178,7 +177,7 @@ def queue(
             tell(client.axis(axis).clear_queue(), json_file)
         return
     limits = {"velocity_deg_s": velocity_deg_s, "acceleration_deg_s2": acceleration_deg_s2}
-    points = [given(QueueItem, target_deg=each, dwell_s=dwell_s, **limits) for each in angles_deg or ()]
+    points = [QueueItem.given(target_deg=each, dwell_s=dwell_s, **limits) for each in angles_deg or ()]
     with connected(at) as client, client.lease(force=force), stopped_by_signals(client, axis):
         note_clamped(client.axis(axis).state().limits, **limits)
         tell(client.axis(axis).queue(points), json_file)

@@ -10,7 +10,7 @@ from fastapi.routing import APIRoute
 from prometheus_client import CONTENT_TYPE_LATEST
 
 from hdbridge import __version__
-from hdbridge.client.messages.problem import CONTENT_TYPE
+from hdbridge.client.messages import CONTENT_TYPE
 from hdbridge.daemon.api import problems
 from hdbridge.daemon.api.metrics import Metrics, exposition
 from hdbridge.daemon.api.routes.axis import axis_routes

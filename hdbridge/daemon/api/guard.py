@@ -16,7 +16,7 @@ from typing import Any, Final
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from starlette.websockets import WebSocketDisconnect
 
-from hdbridge.client.messages.problem import CONTENT_TYPE, Problem
+from hdbridge.client.messages import CONTENT_TYPE, Problem
 from hdbridge.daemon.api.policy import BODY_MAXIMUM, DEPTH_MAXIMUM, Policy, too_deep
 from hdbridge.daemon.api.problems import refusal
 from hdbridge.daemon.api.traffic import Traffic

@@ -7,7 +7,7 @@ from fastapi import FastAPI, Request, Response
 from fastapi.exceptions import RequestValidationError
 from starlette.exceptions import HTTPException
 
-from hdbridge.client.messages.problem import CONTENT_TYPE, TYPE_PREFIX, Problem
+from hdbridge.client.messages import CONTENT_TYPE, TYPE_PREFIX, Problem
 from hdbridge.errors import HdbridgeError, InputError
 
 COMPLAINTS_MAXIMUM = 20

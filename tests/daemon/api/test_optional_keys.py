@@ -18,7 +18,7 @@ from support.two_channels import CHANNELS
 
 from hdbridge import Client
 from hdbridge.axis import AxisConfig
-from hdbridge.client.axis import Axis
+from hdbridge.client.sync import Axis
 from hdbridge.daemon.machine import Machine
 from hdbridge.daemon.serve import follow
 from hdbridge.errors import DaemonError, HdbridgeError, InputError
@@ -53,9 +53,9 @@ OF_THE_MACHINE = {
     "lease": lambda c: c.lease().__enter__(),
     "holds_lease": lambda c: c.holds_lease,
     "live": lambda c: next(iter(c.live(every=2, axes=["axis1"]))),
-    "connected": lambda c: c.connected("/live").__enter__(),
     "coordinated": lambda c: c.coordinated({"axis1": 0.02}),
-    "do": lambda c: c.state(),
+    "name": lambda c: c.name,
+    "address": lambda c: c.address,
     "stop": lambda c: c.stop(),
     "quick_stop": lambda c: c.quick_stop(),
     "lend_bus": lambda c: c.lend_bus(),

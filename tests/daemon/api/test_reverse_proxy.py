@@ -179,55 +179,6 @@ def test_clients_work_through_the_proxy(url, api, certificate, monkeypatch):
     assert len(api.bridge.stopped) == 2
 
 
-class Watched:
-    """TLS connection that counts calls made while another one is under way."""
-
-    overlaps = 0
-
-    def __init__(self, connection):
-        self.connection = connection
-        self.free = threading.Lock()
-
-    def __getattr__(self, name):
-        return getattr(self.connection, name)
-
-    def read(self, *arguments):
-        return self._alone(self.connection.read, *arguments)
-
-    def write(self, *arguments):
-        return self._alone(self.connection.write, *arguments)
-
-    def _alone(self, call, *arguments):
-        if not self.free.acquire(blocking=False):
-            Watched.overlaps += 1
-            return call(*arguments)
-        try:
-            time.sleep(0.001)
-            return call(*arguments)
-        finally:
-            self.free.release()
-
-
-def test_the_threads_of_a_client_call_openssl_one_at_a_time(url, api, certificate, monkeypatch):
-    """Two calls at once lose data: one handshake of a WebSocket in 300 was never answered."""
-    handshake = ssl.SSLSocket.do_handshake
-
-    def watched(self, block=False):
-        handshake(self, block)
-        self._sslobj = Watched(self._sslobj)
-
-    monkeypatch.setenv("SSL_CERT_FILE", str(certificate / "cell.pem"))
-    monkeypatch.setattr(ssl.SSLSocket, "do_handshake", watched)
-    monkeypatch.setattr(Watched, "overlaps", 0)
-    with Client(url, token=TOKEN) as client, client.lease():
-        axis = client.axis("joint-1")
-        axis.enable()
-        with axis.stream() as stream:
-            for number in range(20):
-                stream.put([(0.01 * number, 3.0)])
-    assert Watched.overlaps == 0
-
-
 def test_no_token_is_sent_over_an_untrusted_certificate(url):
     with Client(url, token=TOKEN) as client, pytest.raises(DaemonError, match="certificate"):
         client.state()
