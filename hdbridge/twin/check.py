@@ -161,7 +161,7 @@ blunt because the likelihood of a rounded reading is steep and gives no directio
 LOST = 0.25
 """Clipped mean square, in units of `SOFT` squared, above which a channel that has grown is worse."""
 ROUNDS = 3
-"""Maximum rounds of setting causes free. The first round nearly always finds all of them."""
+"""Maximum rounds of setting causes free. The first round nearly always finds all causes."""
 DRAWS = 8
 """Number of rounded and noisy replays about a place, drawn from the twin's posterior. The recording is
 compared with their mean, and their scatter weights each sample: the moment at which a stuck motor breaks away
@@ -185,7 +185,7 @@ EXPLAINED = 0.25
 """Minimum share of the growth, in squares, that a cause named by ratio explains. A servo that is not the
 axis's is off by a share of every change, so the cause is not required to explain all of it."""
 REST = 0.5
-"""Minimum share that a second cause explains of what the first has left: most of it."""
+"""Minimum share of the misfit left by the first cause that a second cause must explain."""
 MOST_NAMED = 2
 """Maximum number of causes named by ratio."""
 NOTICEABLE = 2.5
@@ -200,7 +200,7 @@ class Check:
     growth_before: Mapping[str, float]
     """Ratio, by channel, of the twin's misfit to this recording and to its own recordings."""
     growth_after: Mapping[str, float]
-    """The same with the changes."""
+    """`growth_before` after the changes."""
     unseen: tuple[str, ...] = ()
     """Causes of which even a large change would not show, in this motion or with this twin."""
     blind: bool = False

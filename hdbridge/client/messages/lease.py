@@ -21,7 +21,7 @@ class LeaseGrant(Report):
 
     token: str = Field(description="secret that permits motion", examples=["mZ3sWJx0b0lq"])
     client: str = Field(description="who holds it")
-    timeout_s: Seconds = Field(description="it ends when it was not used for so long", examples=[5.0])
+    timeout_s: Seconds = Field(description="time without use after which it ends", examples=[5.0])
 
 
 class LeaseState(Report):
@@ -33,4 +33,4 @@ class LeaseState(Report):
     remaining_s: float | None = Field(
         None, description="time until it expires; each use extends it", examples=[4.2]
     )
-    timeout_s: float = Field(description="it ends when it was not used for so long", examples=[5.0])
+    timeout_s: float = Field(description="time without use after which it ends", examples=[5.0])
