@@ -46,7 +46,7 @@ class RatioError(Linear):
         experiment="a long sweep both ways, then rest: a ratio error grows with the angle, a drift with time",
         aliases=("load_order", "zero_drift", "wear"),
         source="kinematics",
-        size="784 arcsec per step of 43.56 motor degrees between ratios 40 and 50",
+        size="784 arcsec per 43.56 motor degrees between ratios 40 and 50",
     )
     compensable: ClassVar[Compensable] = Compensable(
         True,
