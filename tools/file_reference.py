@@ -189,6 +189,7 @@ _SHORTER = (
     (r"\bat most\b", "to"),
     (r"\b(text|list), not empty", r"\1"),
     (r"integer 0 to 4294967295", "32-bit integer"),
+    (r"^true or false$", ""),
     (r"above (?=\d)", ">"),
     (r"(?<![-\w.])(\d[\d.]*) to (?=\d)", r"\1–"),
     (r" or '", ", '"),
@@ -250,12 +251,12 @@ def _default(key: str, info: FieldInfo) -> str:
     if isinstance(value, Enum):
         value = value.value
     if key == "index":
-        return f"= `{value:#x}`"
+        return f"=`{value:#x}`"
     if isinstance(value, bool):
-        return f"= `{value}`".lower()
+        return f"=`{value}`".lower()
     if isinstance(value, tuple):
-        return f"= `{[*value]}`".replace(".0", "")
-    return f"= `{value:g}`" if isinstance(value, float) else f"= `{value}`"
+        return f"=`{[*value]}`".replace(".0", "")
+    return f"=`{value:g}`" if isinstance(value, float) else f"=`{value}`"
 
 
 if __name__ == "__main__":
