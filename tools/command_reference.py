@@ -37,8 +37,8 @@ Options before the command: `-v` logs the bus traffic to standard error (`-vv`: 
 FILE` appends the log as JSON lines (`date`, `level`, `where`, `event`, facts), `--install-completion`,
 `--version`.
 
-**Ctrl-C** (SIGTERM, SIGQUIT, SIGHUP) stops the axis from the next period on; what was measured is kept, and
-`--resume` continues. The third one ends the program at once.
+**Ctrl-C** (SIGTERM, SIGQUIT, SIGHUP) stops the axis from the next period on, and keeps what was measured. The
+third one ends the program at once.
 
 **Exit status**
 
