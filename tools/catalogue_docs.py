@@ -117,7 +117,7 @@ def _parameters(kind: type[Effect], model: type[BaseModel], within: str = "") ->
             )
             if not field.is_required():
                 default = field.default
-                values.append(f"= {f'{default:g}' if isinstance(default, float) else str(default).lower()}")
+                values.append(f"={f'{default:g}' if isinstance(default, float) else str(default).lower()}")
             shown = f" ({', '.join(values)})" if values else ""
             about = "" if name.startswith("limit_") else f": {field.description or ''}"
             yield f"`{within}{name}`{shown}{about}"

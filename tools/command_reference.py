@@ -37,8 +37,8 @@ Options before the command: `-v` logs the bus traffic to standard error (`-vv`: 
 FILE` appends the log as JSON lines (`date`, `level`, `where`, `event`, facts), `--install-completion`,
 `--version`.
 
-**Ctrl-C** (SIGTERM, SIGQUIT, SIGHUP) stops the axis from the next period on; what was measured is kept, and
-`--resume` continues. The third one ends the program at once.
+**Ctrl-C** (SIGTERM, SIGQUIT, SIGHUP) stops the axis from the next period on, and keeps what was measured. The
+third one ends the program at once.
 
 **Exit status**
 
@@ -63,18 +63,10 @@ _MANY = 4
 """Number of commands from which the commands with an option are not listed."""
 
 _SETS = {
-    "*daemon*": ("--at", "--force", "--json"),
-    "*bus*": ("--interface", "--channel", "--force", "--borrow"),
-    "*simulation*": ("--simulate", "--truth", "--seed"),
+    "*axis*": ("--interface", "--channel", "--force", "--borrow", "--simulate", "--truth", "--seed"),
     "*CSV*": ("--columns", "--units", "--unwrap"),
-    "*model*": ("--reason", "--twin"),
     "*homing*": (
-        "--method",
-        "--switch-velocity",
-        "--zero-velocity",
-        "--acceleration",
-        "--offset",
-        "--timeout",
+        *("--method", "--switch-velocity", "--zero-velocity", "--acceleration", "--offset", "--timeout"),
     ),
     "*fleet*": (
         *("--out", "--manifest", "--model", "--models", "--scheduler", "--workers", "--memory", "--limit"),
@@ -148,19 +140,27 @@ def page() -> str:
     parts = [
         _INTRODUCTION
         + "\n".join(_common_item(*each, names) for each in shared)
-        + f"\n\nSets of options: {sets}.\n"
+        + f"\n\nEvery `ctl` command has `--at`, every `model` command `--twin`. Sets of options: {sets}.\n"
     ]
     for panel, members in PANELS.items():
         parts.append(f"## {panel}\n")
         for name in members:
-            parts += (_section(each, common) for each in known if each.name.split()[0] == name)
+            group = [each for each in known if each.name.split()[0] == name]
+            general = frozenset.intersection(*(frozenset(each.parameters) for each in group))
+            general = general if len(group) >= _MANY else frozenset()
+            parts += (_section(each, common, general) for each in group)
     return "\n".join(parts)
 
 
-def _section(command: Command, common: Container[Parameter]) -> str:
+def _section(command: Command, common: Container[Parameter], general: Container[Parameter]) -> str:
+    """Returns the section of a command, without the ``general`` options of its group."""
     lines = [f"### `{command.usage}`", "", command.text, ""]
     own = [_item(each) for each in command.parameters if each not in common]
-    shared = [each.names[0] for each in command.parameters if each in common and each.is_option]
+    shared = [
+        each.names[0]
+        for each in command.parameters
+        if each in common and each not in general and each.is_option
+    ]
     also = [name for name, members in _SETS.items() if set(members) <= set(shared)]
     in_sets = {each for name in also for each in _SETS[name]}
     ending = " options" if also else ""

@@ -104,7 +104,7 @@ SEEN_BY: Mapping[Fault, str] = {
     Fault.EMERGENCY: "EMCY; the statusword decides. The newest 64 are kept",
     Fault.MASTER_LOST: "EMCY 8130h or 8250h while enabled; before the next SYNC",
     Fault.DRIVE_FAULT: "statusword, also if the state ended before the next SYNC",
-    Fault.DROPPED_OUT: "statusword, also if the state ended before the next SYNC",
+    Fault.DROPPED_OUT: "the same",
     Fault.BOOT_UP: "boot-up message of a node of the cycle",
     Fault.NMT_CHANGE: "heartbeat of a node of the cycle",
     Fault.HEARTBEAT_LOST: "heartbeat older than twice heartbeat_ms",
@@ -189,6 +189,7 @@ _SHORTER = (
     (r"\bat most\b", "to"),
     (r"\b(text|list), not empty", r"\1"),
     (r"integer 0 to 4294967295", "32-bit integer"),
+    (r"^(true or false|text)$", ""),
     (r"above (?=\d)", ">"),
     (r"(?<![-\w.])(\d[\d.]*) to (?=\d)", r"\1–"),
     (r" or '", ", '"),
@@ -250,12 +251,12 @@ def _default(key: str, info: FieldInfo) -> str:
     if isinstance(value, Enum):
         value = value.value
     if key == "index":
-        return f"= `{value:#x}`"
+        return f"=`{value:#x}`"
     if isinstance(value, bool):
-        return f"= `{value}`".lower()
+        return f"=`{value}`".lower()
     if isinstance(value, tuple):
-        return f"= `{[*value]}`".replace(".0", "")
-    return f"= `{value:g}`" if isinstance(value, float) else f"= `{value}`"
+        return f"=`{[*value]}`".replace(".0", "")
+    return f"=`{value:g}`" if isinstance(value, float) else f"=`{value}`"
 
 
 if __name__ == "__main__":

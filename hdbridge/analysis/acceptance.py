@@ -16,7 +16,7 @@ from hdbridge.analysis.linear import Linearised, of_length, sandwich, side_by_si
 from hdbridge.axis.effects import BoolArray, Effect, FloatArray
 
 BLOCKS_S = (1.0, 5.0, 20.0)
-"""Block lengths; wandering noise and warming are correlated over less than one of them."""
+"""Block lengths; wandering noise and warming are correlated over less than one block."""
 LEAST_BLOCKS = 30
 """Minimum number of blocks; in a short record they become shorter, because fewer give no reliable
 variance."""

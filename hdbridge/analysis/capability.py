@@ -24,7 +24,9 @@ CERTAINTY: Final = ((0.9, ""), (0.6, "probably "), (0.0, "perhaps "))
 
 
 def certainty(probability: float) -> str:
-    """Returns the word before a name of this probability, with a space; empty if it is certain enough."""
+    """Returns the qualifier in front of a name with this probability, with a trailing space; empty for a
+    certain name.
+    """
     return next((word for least, word in CERTAINTY if probability > least), CERTAINTY[-1][1])
 
 

@@ -31,7 +31,7 @@ REPEATS_SHARE = 0.5
 over more turns, chance explains less.
 """
 LEAST_REPEATS_SHARE = 0.1
-"""The same over any number of turns."""
+"""Lower bound of that share for records of more turns."""
 FOLLOWS_SHARE = 0.1
 """Maximum share of its distance from the motor that a command keeps when it is unwrapped."""
 
@@ -206,7 +206,7 @@ def _check_speed(path: Path, record: Record) -> None:
     fastest = float(np.quantile(speed, 0.99))
     if fastest < SLOWEST_DEG_S and "motor" not in origin.stated:
         raise InputError(
-            f"{path}: the motor turns by {fastest:.3g} deg/s at most, slower than a bench moves it: if the "
+            f"{path}: the motor turns at no more than {fastest:.3g} deg/s, slower than on any bench: if the "
             f"angles are in radians pass {option('--units', {'motor': 'rad', 'load': 'rad'})}, if the time "
             f"is in milliseconds {option('--units', {'time': 'ms'})}, and "
             f"{option('--units', {'time': 's', 'motor': 'deg'})} if they are degrees and seconds"

@@ -93,8 +93,9 @@ class Driven(NamedTuple):
     speed_deg_s: FloatArray
     acceleration_deg_s2: FloatArray
     rested_deg: FloatArray
-    """Angle under the assumption that the resting motor stood in the middle of its counts, and not as
-    close to the command as they allow; the same angle without a command."""
+    """Motor angle if the resting motor stood in the middle of its counts, not as close to the command as the
+    counts allow; without a command, the plain angle.
+    """
 
 
 def reading_of_all(angle_deg: FloatArray, parts: Sequence[slice]) -> Reading:

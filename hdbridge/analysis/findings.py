@@ -130,7 +130,7 @@ class Finding:
     experiment: str
     """Next measurement, in words."""
     peak_arcsec: float
-    """Half the span of its contribution in this record."""
+    """Half the span of the finding's contribution in this record."""
     robust: float = 0.0
     """Fall in chi square due to it; for a change within the model, due to the change."""
     left_arcsec: float = 0.0

@@ -17,7 +17,7 @@ from hdbridge.axis.effects.kinematics import direction_of
 SURE = 2.0
 """Minimum significance of a gain, standard errors."""
 NEARLY_ALL = 0.75
-"""Share of recordings that a cause must predict better: of three or four all, of five four."""
+"""Minimum share of recordings that a cause must predict better: all of three or four, four of five."""
 RECORDINGS = "recordings"
 
 

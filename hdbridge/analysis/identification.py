@@ -70,7 +70,7 @@ class Outliers:
 
     samples: int
     swinging: int
-    """Number of them in or just after a high acceleration, where the load swings on its spring."""
+    """Number of samples in or just after a high acceleration, in which the load swings on its spring."""
     longest_run: int
     """Longest run of the others, samples."""
 

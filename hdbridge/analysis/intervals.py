@@ -128,7 +128,7 @@ def joined(path: str, key: str) -> str:
 
 
 def labelled(parameters: Any, path: Iterable[str | int]) -> str:
-    """Returns the path (`leaves`) to which keys and numbers lead."""
+    """Returns the dotted path, as `leaves` yields it, of nested keys and list indices."""
     said = ""
     for key in path:
         parameters = parameters[key]

@@ -130,7 +130,7 @@ def about_zeros(left_arcsec: FloatArray, zero: IntArray, weight: FloatArray) -> 
 LOCAL = frozenset({Moves.ANYWHERE})
 """Shapes that local steps can improve from any start."""
 FOUND = LOCAL | {Moves.NEARBY}
-"""The same, and shapes that a search has brought close to their best value."""
+"""`LOCAL` shapes, and shapes that a search has brought close to their best value."""
 
 Columns = Callable[[Effect], FloatArray]
 
@@ -174,7 +174,7 @@ class Effort:
     converged: float = 1e-4
     """Predicted or actual fall in chi square below which the fit ends."""
     roughly: float = 0.0
-    """The same as a share of chi square: with a large residual, accuracy is of no use."""
+    """Tolerance as a share of chi square, because a large residual needs no accuracy."""
 
     def enough(self, chi_square: float) -> float:
         """Returns the fall in chi square below which the fit ends."""

@@ -37,7 +37,7 @@ UNITS = {DELAY: "ms", ROUNDING: "counts", SWING: "ms\N{SUPERSCRIPT TWO}"}
 SWING_MS2 = 25.0
 """Prior standard deviation of the swing: 1 / (2 pi f)^2 of a load with natural frequency f = 32 Hz."""
 SWING_MS3 = 50.0
-"""Prior standard deviation of its damping part, for a damping ratio z: 2 z / (2 pi f)^3."""
+"""Prior standard deviation of the swing's damping part, for a damping ratio z: 2 z / (2 pi f)^3."""
 SWING_COUNT_ARCSEC = 2.0
 """Largest motor count for which swing is fitted. The sawtooth of a coarser encoder also depends on speed
 and looks like swing."""

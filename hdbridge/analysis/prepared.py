@@ -126,7 +126,7 @@ class Chain:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Samples:
-    """Samples, or means over runs of them; arrays of shape (n,)."""
+    """Samples, or means over runs of samples; arrays of shape (n,)."""
 
     ratio: float
     motion: Motion
@@ -317,7 +317,7 @@ class Observed:
 
     ratio: float
     points: Samples
-    """Points to fit: samples, or means over runs of them."""
+    """Points to fit: samples, or means over runs of samples."""
     full: Samples
     """Every sample."""
     runs: IntArray

@@ -37,7 +37,7 @@ class Prior:
     right: Mapping[str, float]
     """Probability, by cause, that a name of it is right in a joint of this group."""
     words: Mapping[str, str]
-    """The same in words, for the output."""
+    """Verdict in words, for the output."""
     ranges: Mapping[tuple[str, str], tuple[float, float]] = field(default_factory=dict)
     """Median and standard deviation between joints, by cause and parameter."""
 

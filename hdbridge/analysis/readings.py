@@ -46,7 +46,7 @@ class Reading:
 
     @property
     def resolution_deg(self) -> float:
-        """The count; if none is visible, the count with equal jitter."""
+        """Encoder count; if it is not visible in the readings, the count whose rounding has their jitter."""
         if self.count_deg >= FINEST_COUNT_DEG:
             return self.count_deg
         return max(self.count_deg, self._alike_deg)
@@ -61,7 +61,7 @@ class Reading:
 
     @property
     def _alike_deg(self) -> float:
-        """The count with equal jitter."""
+        """Encoder count whose rounding would have the jitter of the readings."""
         return float(_UNIFORM * self.jitter_deg)
 
 
@@ -69,7 +69,7 @@ def reading_of(angle_deg: FloatArray) -> Reading:
     """Returns the resolution of an angle, shape (n,).
 
     The jitter is that of readings within a few counts of each other, if counts are visible and there are
-    enough of these: a motion that bends within a few samples is no noise.
+    enough of these: a motion that bends within a few samples is not noise.
     """
     count, jitter = quantum_deg(angle_deg), jitter_deg(angle_deg)
     if count and len(angle_deg) > 3:

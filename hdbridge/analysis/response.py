@@ -135,7 +135,7 @@ class Harmonics(NamedTuple):
     amplitudes: ComplexArray
     """The error is the real part of their sum over exp(i k motor angle), shape (orders,)."""
     deviations: FloatArray
-    """Standard deviation of each part of them."""
+    """Standard deviation of each component."""
     mean_arcsec: float
     """Mean of load minus target."""
     ripple_arcsec: float

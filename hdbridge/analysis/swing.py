@@ -36,9 +36,10 @@ DAMPING = (0.05, 0.2, 0.5)
 """Natural frequencies and damping ratios that are tried, before a refinement."""
 MOST_DAMPED = 0.9
 LEAST_SEEN = 0.1
-"""Share of the squares of a residual that a swing explains: anything that moves explains a little."""
+"""Minimum share of a residual's sum of squares that a swing must explain; any oscillation explains a little.
+"""
 CALMEST = 0.05
-"""Share of a record that is always used."""
+"""Minimum share of a record that is used; the calmest samples."""
 RESOLVED = 4.0
 """Number of samples in a wave above which a spline begins to follow it; from twice that, it does."""
 REFINED = 40
@@ -54,7 +55,7 @@ class Swing:
     frequency_hz: float
     damping: float
     does_arcsec: FloatArray
-    """Its share of the error in each sample, shape (n,)."""
+    """Error caused by the swing in each sample, shape (n,)."""
 
     def remark(self) -> str:
         """Describes it for the report."""

@@ -27,8 +27,9 @@ from hdbridge.axis.effects.coordinate import since_reversal
 from hdbridge.axis.effects.kinematics import direction_of
 
 BINS = {"load angle": (72, 360, 1800), "position": (72, 360, 1800), "time": (25,)}
-"""Number of bins per coordinate. Those of angles suit a wide bump, a narrow one and waves of the motor
-orders; bins of time are so long that each has several stretches."""
+"""Number of bins per coordinate. Bins of angles suit a wide bump, a narrow bump and waves of the motor
+orders; each bin of time has several stretches.
+"""
 BLOCK_S = 0.2
 FEW = 50
 """Minimum number of points for a statement about a record."""

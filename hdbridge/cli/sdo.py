@@ -31,7 +31,7 @@ def get(
         drive.listen()
         wanted = find_object(object_, drive.sdo.od)
         if not wanted.readable:
-            raise InputError(f"{wanted}: can only be written, by the EDS")
+            raise InputError(f"{wanted}: is write-only by the EDS")
         value = wanted.decode(drive.sdo.read_bytes(wanted.index, wanted.sub))
     write_json(json_file, _document(wanted, value))
     print_object(str(wanted), value, wanted.type_name)

@@ -180,7 +180,7 @@ def _check(
     from hdbridge.twin.twin import KeptTwin
 
     if html_file is not None:
-        raise InputError("--check has no page: leave out --html, or compare with the twin by --compare")
+        raise InputError("--check writes no page: leave out --html, or use --compare")
     twin = KeptTwin.load(files.twin) if files.twin.is_file() else None
     if twin is None:
         raise InputError(

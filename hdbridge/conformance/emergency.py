@@ -148,7 +148,7 @@ def _(t: NodeTester) -> None:
     t.aborts(expedited(0x1000, 0, value), READ_ONLY, "download to 1000h")
 
 
-@check("identity.entries", "1018h:00 is 1 to 4, and so many entries exist", _IDENTITY)
+@check("identity.entries", "1018h:00 is 1 to 4, and that number of entries exists", _IDENTITY)
 def _(t: NodeTester) -> None:
     count = t.read(0x1018, 0)
     t.true(1 <= count <= 4, f"1018h:00 = {count}", "1 to 4")

@@ -157,7 +157,7 @@ class Timing:
     power_s: float = 10.0
     """Longest time to a transition of the power state machine, brakes and ramps included."""
     jitter_s: float = 0.02
-    """Tolerance of a period, in addition to a tenth of it."""
+    """Tolerance of a period, in addition to a tenth of the period."""
 
 
 class NodeTester:

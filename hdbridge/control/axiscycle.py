@@ -96,7 +96,8 @@ class AxisCycle:
         self.rested = True
         """True until its first turn; frames that were queued before that do not count."""
         self.changed: Callable[[], None] = _nobody
-        """Callback for a change of its identifiers or state that takes effect with the next turn."""
+        """Called when the axis changes its identifiers or state; the change takes effect with the next turn.
+        """
 
         self._traffic = Traffic(image, self.monitor, 0.0)
         self._plausibility = plausibility if plausibility is not None else Plausibility.of(axis)

@@ -398,7 +398,7 @@ class _Bus:
         long = [_from_first_target(each) for each in long]
         if not long:
             raise InputError(
-                f"{path}: {self.samples} samples, no {PART_SAMPLES} of them together; expected a longer log"
+                f"{path}: {self.samples} samples, fewer than {PART_SAMPLES} in a row; expected a longer log"
             )
         record = concatenate([record_of(each, self._axis) for each in long])
         target = record.columns["motor_target_deg"]

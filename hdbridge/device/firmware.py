@@ -351,7 +351,7 @@ class Firmware:
         self._brake(option, State.FAULT)
 
     def power_cut(self) -> None:
-        """Switches the power stage off, as an opening enable input does; a fault remains one."""
+        """Switches the power stage off, as an opening enable input does. An active fault stays active."""
         in_fault = self.state in (State.FAULT, State.FAULT_REACTION_ACTIVE)
         self._power_off(State.FAULT if in_fault else State.SWITCH_ON_DISABLED)
 

@@ -77,7 +77,7 @@ class LssSlave:
         return number <= own if command % 2 == 0 else own <= number
 
     def _agrees(self, command: int, span: tuple[int, int], part_agrees: bool) -> bool:
-        """Takes a request of a span that together give an identity; True once all of them agreed in order."""
+        """Takes one of the requests that together select an identity; True once all have matched in order."""
         agrees = part_agrees and command in (span[0], self._next)
         self._next = command + 1 if agrees else 0
         return agrees and command == span[1]

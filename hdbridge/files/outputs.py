@@ -102,7 +102,7 @@ def _check_file(
         for name, status in redirected:
             if os.path.samestat(found, status):
                 raise InputError(
-                    f"{path}: {name} goes there already; expected another file, or {output.option} - for the "
+                    f"{path}: {name} already goes there; expected another file, or {output.option} - for the "
                     "standard output"
                 )
     else:

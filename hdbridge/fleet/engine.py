@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from distributed import Client
 
 INCREMENT_S: Final = 1.0
-"""Minimum time between two increments: `kill -9` loses the finished recordings of so long at most."""
+"""Minimum time between two increments: `kill -9` loses at most the recordings finished in that time."""
 POLL_S: Final = 0.25
 AHEAD: Final = 2000
 """Maximum number of tasks submitted to the scheduler at a time."""

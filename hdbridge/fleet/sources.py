@@ -76,7 +76,7 @@ class Source:
     units: str | None = None
     unwrap: str | None = None
     stamp: str | None = None
-    """Equal to that of its row in the data set if neither its files nor its row in the manifest changed."""
+    """Fingerprint of files and manifest row; equal to that in the data set if neither has changed."""
     axes: int | None = None
     """Number of axes in a flight recording."""
 
@@ -356,7 +356,7 @@ def _described(row: Mapping[str, Any], manifest: Path, number: int) -> Source:
 
 
 def with_axes(path: str, axes: Iterable[str | None], described: Iterable[Source]) -> list[Source]:
-    """Returns one source for each axis of a flight recording; rows of the manifest describe some of them."""
+    """Returns one source for each axis of a flight recording, with the manifest rows that describe it."""
     rows = {each.axis: each for each in described}
     common = rows.get(None) or Source(path, stamp=next(iter(rows.values())).stamp)
     found = [rows.get(name) or replace(common, axis=name, joint=common.joint or name) for name in axes]

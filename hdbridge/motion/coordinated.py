@@ -74,7 +74,7 @@ def coordinated(
         raise InputError("a coordinated move of no axis; expected a target for at least one")
     here = np.array([starts_deg[each] for each in names])
     if not np.isfinite(here).all():
-        raise InputError(f"a coordinated move that begins at {here.tolist()} deg; expected finite angles")
+        raise InputError(f"the coordinated move begins at {here.tolist()} deg; expected finite angles")
     corners = [here]
     for point in points_deg:
         here = np.array([point.get(name, at) for name, at in zip(names, here.tolist(), strict=True)])

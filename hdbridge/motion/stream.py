@@ -146,7 +146,7 @@ class Stream:
                 "finite numbers"
             )
         if not self.room:
-            raise InputError(f"{MOST_KNOTS} knots are waiting: send no more than the axis has run")
+            raise InputError(f"{MOST_KNOTS} knots are waiting; send the next ones as the axis runs them")
         if abs(velocity_deg_s) < _REST_DEG_S:
             velocity_deg_s = 0.0
         if self._last is None:

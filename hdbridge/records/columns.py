@@ -45,7 +45,7 @@ CHANNELS: Final[Mapping[str, str]] = MappingProxyType(
 )
 """Column of a record for each channel that the options name."""
 Said = str | Sequence[str] | Mapping[str, object] | None
-"""``channel=value,channel=value``, several of them, or a mapping."""
+"""``channel=value,channel=value``, a sequence of such texts, or a mapping."""
 ROW: Final = "row"
 """Placeholder for a column: the number of the row, for a file without a time."""
 
@@ -259,7 +259,7 @@ class Origin:
     columns: Mapping[str, str]
     """Column of the file for each channel that the record has."""
     units: Mapping[str, Unit]
-    """Unit in which each of them was read."""
+    """Unit in which each column was read."""
     stated: frozenset[str]
     """Channels whose unit the user has stated."""
     unwrapped: frozenset[str]

@@ -40,7 +40,7 @@ class Record:
     source: str = ""
     """Source of the record, for messages."""
     starts: tuple[int, ...] = field(default=(0,))
-    """First row of each of its records; nothing is known of the axis between two of them."""
+    """First row of each joined record; the motion of the axis between two records is unknown."""
     origin: Origin | None = None
     """CSV file that it was read from, and how; None for any other record."""
 

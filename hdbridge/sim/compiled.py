@@ -44,7 +44,7 @@ class Kinds(NamedTuple):
 
     classes: tuple[type, ...]
     room: int
-    """Capacity of a tuple of them."""
+    """Capacity of the tuple of elements."""
     neutral: float
     """Value of an empty place in such a tuple."""
 
@@ -352,7 +352,7 @@ def _register() -> None:
                 overload_method(types.Record, name, **_METHOD)(_chooser(name, parameters))
             # numba distinguishes the members of a record by name alone.
             if _KNOWN[name] != len(parameters) or name in declared:
-                raise TypeError(f"{cls.__name__}.{name}: another class has it otherwise; rename one")
+                raise TypeError(f"{cls.__name__}.{name}: another class defines it differently; rename one")
     # Numba's own template for record attributes comes last, because it claims every name.
     context = cpu_target.typing_context
     context.refresh()

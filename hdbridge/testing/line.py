@@ -143,8 +143,8 @@ def _turn(choice: BusChoice) -> Iterator[None]:
     name = str(choice)
     if _IN_USE.get(name) == threading.get_ident():
         raise InputError(
-            f"{name}: this test has a drive on it already, which would be waited for; put the second one "
-            "beside it: simulated_drive(..., beside=drive)"
+            f"{name}: this test already has a drive on this bus; put the second one beside it: "
+            "simulated_drive(..., beside=drive)"
         )
     folder = Path(tempfile.gettempdir())
     end_s = time.monotonic() + LONGEST_TURN_S

@@ -93,7 +93,7 @@ def spectrum_of(trace: Trace, parts: Sequence[slice]) -> Spectrum | None:
 SETTLED_ARCSEC: Final = 10.0
 """Amplitude about the rest position below which a load has settled: three motor counts (8000, ratio 50)."""
 SETTLED_NOISE: Final = 5.0
-"""The same in units of the load reading's noise, if that is larger."""
+"""Minimum of that amplitude, in units of the noise of the load reading."""
 OVER_S: Final = 0.04
 """Window of the rms amplitude: half a period of the slowest ringing, 15 Hz."""
 SHORTEST_SWING: Final = 4

@@ -244,7 +244,7 @@ def _slope(
 # law, whose shape may differ from the gear's.
 
 LOOP: Final = ("loop offset", "loop width", "loop yield", "loop exponent")
-"""Parameters of the laws; no law has all of them."""
+"""Parameters of the hysteresis laws; no law has all parameters."""
 LAWS: Final[tuple[dict[str, Any], ...]] = (
     {"law": "rolling_friction", "offset_arcsec": 1.0, "width_deg": 1.0, "exponent": 1.6},
     {"law": "bouc_wen", "offset_arcsec": 1.0, "yield_deg": 1.0},
@@ -329,8 +329,8 @@ def over_legs(rows: FloatArray, legs: FloatArray) -> FloatArray:
 def principal(slopes: FloatArray, spread: FloatArray) -> FloatArray:
     """Returns principal directions of the coordinates as columns, shape (p, p), scaled to unit information.
 
-    A long valley is one of them. The covariance may inflate each direction separately; inflating each
-    *coordinate* would lose the well-known combinations of two coordinates.
+    A long valley of the misfit is one of these directions. The covariance may inflate each direction
+    separately; inflating each *coordinate* would lose the well-known combinations of two coordinates.
     """
     worth, directions = eigen(slopes, spread)
     return np.asarray(spread[:, None] * directions / np.sqrt(worth), dtype=np.float64)
@@ -504,7 +504,9 @@ class _Problem:
         return np.concatenate([self.along * self.spread, np.eye(len(self.spread))])
 
     def stepped(self, place: FloatArray, steps: int) -> FloatArray:
-        """Returns the best place after at most so many trust-region steps, the first as long as a spread."""
+        """Returns the best place after at most ``steps`` trust-region steps; the first has the length of a
+        spread.
+        """
         left, latest = 1 + steps, np.empty(0)
 
         def at(move: FloatArray) -> FloatArray:

@@ -79,7 +79,7 @@ class Piece:
     leg: FloatArray
     """Leg number of each row, from zero."""
     kind: tuple[str, ...]
-    """Kind of each of its legs."""
+    """Kind of each leg."""
     out: FloatArray
     """1 for each row of a held-out leg, else 0."""
     rest: FloatArray

@@ -34,7 +34,7 @@ RIDGES: Final = (1e-1, 1e-2, 1e-3, 1e-4)
 ROUNDS: Final = 2
 """Number of times that the demand's response is fitted: the second corrects what friction changed."""
 GAIN: Final = 0.97
-"""Maximum ratio of the misfits with and without a response for keeping it."""
+"""Share of the misfit without a response below which the misfit with it must be for keeping the response."""
 
 
 def with_response(replays: Replays, fitted: Fitted) -> Fitted:

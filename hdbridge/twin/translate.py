@@ -373,7 +373,7 @@ def count_loss(effect: effects.CountLoss, draft: Draft) -> None:
         draft.refuse("it was before the record's time zero, and is in the encoders' zero by now")
         return
     draft.part("load", "encoder")["losses"] = losses
-    draft.note("each time again, so long after the axis is switched on; whole counts")
+    draft.note("repeats at this time after each switching on; whole counts")
 
 
 # ----------------------------------------------------------------

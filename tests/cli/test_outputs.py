@@ -163,7 +163,7 @@ def test_a_file_already_open_in_the_shell_is_refused(tmp_path):
             cwd=tmp_path, stdout=out, stderr=subprocess.PIPE, text=True, check=False,
         )  # fmt: skip
     assert done.returncode == 2
-    assert "standard output goes there already" in done.stderr
+    assert "standard output already goes there" in done.stderr
 
 
 def test_dangling_output_names_give_one_line(hdbridge, tmp_path):

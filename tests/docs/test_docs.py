@@ -91,9 +91,9 @@ def test_every_command_has_a_heading_and_every_option_a_description():
 
 def test_the_readme_names_every_command():
     text = (ROOT / "README.md").read_text(encoding="utf-8")
-    rows = re.findall(r"^\| `hdbridge [^|]*(?:\\\|[^|]*)*", text, re.MULTILINE)
-    table = {name for row in rows for name in re.findall(r"`hdbridge ([\w-]+)", row)}
-    assert table == {each.name.split()[0] for each in command_reference.commands()}
+    rows = re.findall(r"^- `hdbridge [^:]*:", text, re.MULTILINE)
+    listed = {name for row in rows for name in re.findall(r"`hdbridge ([\w-]+)", row)}
+    assert listed == {each.name.split()[0] for each in command_reference.commands()}
 
 
 def test_every_page_is_in_the_index():

@@ -99,7 +99,7 @@ class AmplitudeDrift(Linear, Warmed):
     def retold(
         self, now: Sequence[Effect], given: Sequence[Effect], observations: Observations
     ) -> tuple[Effect, ...] | None:
-        """Re-expresses the drift at the reference temperature that brings the rest of the model nearest to
+        """Re-expresses the drift with the reference temperature for which the rest of the model is nearest to
         ``given``.
         """
         temperature = observations.motion.measured.get(Channel.TEMPERATURE)

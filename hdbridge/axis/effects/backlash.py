@@ -39,8 +39,8 @@ class Backlash(Linear):
     about: ClassVar[Cause] = Cause(
         title="backlash behind the gear",
         equation="-(gap / 2) s, s = clip(s_before + 2 d theta_M / crossing, -1, 1)",
-        signature="after each reversal the load rests for a fraction of a motor degree, then follows: a loop "
-        "opposite in sense to the elastic one",
+        signature="after each reversal the load rests, then follows: a loop opposite in sense to the "
+        "elastic one",
         consequence="the load lags by half the gap on either side, and is free within the gap",
         remedy="tighten the coupling or key; preload the axis; compensate the rest",
         experiment="reversals under a torque to one side: the torque closes the play, hysteresis stays",

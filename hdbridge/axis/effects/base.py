@@ -121,8 +121,8 @@ class Effect(Strict, ABC):
     incidental: ClassVar[frozenset[str]] = frozenset()
     """Names of coefficients that are no evidence for the cause, because they are also non-zero without it."""
     inexact: ClassVar[float] = 0.0
-    """Tolerance for deviations from the law here: share of its power that may appear as a smaller instance of
-    its kind.
+    """Tolerance for deviations from this effect's law: share of its power that may appear as a smaller
+    instance.
     """
     shape: ClassVar[tuple[Shape, ...]] = ()
     """Non-linear parameters; `columns` covers all others."""

@@ -55,7 +55,7 @@ class CountLoss(Angleless):
         experiment="pass an index pulse or a reference mark before and after",
         aliases=("zero_drift", "wear"),
         source="kinematics",
-        size="3 arcsec (one motor count) and up; a tooth is 360/z degrees",
+        size="from one motor count (3 arcsec)",
     )
     compensable: ClassVar[Compensable] = Compensable(
         False,

@@ -50,7 +50,7 @@ class DirectionPhase(Linear):
         "synchronous part's, d the direction held at rest",
         signature="the ripple is displaced between the two directions by one motor angle for all orders",
         consequence="the compensation leaves a ripple with opposite signs in the two directions",
-        remedy="compensate it; it comes from the change of tooth flanks and grows with preload and load",
+        remedy="compensate it; it grows with preload and load",
         experiment="slow sweeps over the same motor turns both ways",
         aliases=("hysteresis_parameters",),
         source="phase of the kinematic error differs between the tooth flanks that carry",

@@ -22,7 +22,7 @@ class FlexsplineOrders(OrderSeries):
         signature="nearly a motor order, but its phase advances by k turns per load turn",
         consequence="a model of motor orders compensates the ripple at one load angle and doubles it at "
         "another",
-        remedy="add it to the model; the flexspline's stiffness or pitch is uneven around its circumference",
+        remedy="add it to the model",
         experiment="a slow sweep over one load turn, better two: over less it looks like a motor order",
         aliases=("motor_order", "synchronous"),
         source="kinematics of a strain wave gear: the flexspline turns by -theta_M / N under the wave "

@@ -42,7 +42,7 @@ class InertialWindup(Angleless, Linear):
         "frequency",
         aliases=("channel_skew", "compliance"),
         source="spring and inertia far below the resonance: J / K = 1 / (2 pi f)^2",
-        size="7 arcsec at 200 deg/s^2 of the load with a resonance at 50 Hz",
+        size="7 arcsec at 200 deg/s^2 with a resonance at 50 Hz",
     )
     compensable: ClassVar[Compensable] = Compensable(
         True, "the load really moves so and the acceleration is commanded; at rest it is nothing"

@@ -35,8 +35,8 @@ class LoadOrders(OrderSeries):
         consequence="from the pitch of the spline, the load is wrong; from the load encoder, only the "
         "measurement is",
         remedy="centre the load encoder; then compensate the rest (set origin: gear)",
-        experiment="two load turns both ways, again with the load encoder re-clocked by 90 deg: the "
-        "encoder's error turns with it; with a mass off centre, again without the mass",
+        experiment="two load turns both ways, again with the load encoder re-clocked by 90 deg: its error "
+        "turns with it; again without a mass off centre",
         aliases=("compliance", "ratio_error", "zero_drift"),
         source="geometry of an eccentric disc; pitch error of the splines",
         size="5-60 arcsec",

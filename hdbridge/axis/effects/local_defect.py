@@ -50,8 +50,8 @@ class LocalDefect(Linear):
         "half_width",
         signature="the same bump on every pass over one load angle, in both directions",
         consequence="the load is off at one place, and the tooth wears further",
-        remedy="inspect the tooth; compensate it meanwhile; clean the load encoder's disc, because a mark on "
-        "it looks the same",
+        remedy="inspect the tooth, and clean the load encoder's disc, on which a mark looks the same; "
+        "compensate it meanwhile",
         experiment="several slow passes over the place, both ways, and again with the load encoder "
         "re-clocked",
         aliases=("load_order",),

@@ -17,8 +17,7 @@ class MotorOrders(OrderSeries):
         equation="sum over k of A_k cos(k theta_M + phi_k), k not among the synchronous part's orders",
         signature="repeats with every motor turn; the same in both directions, at every load angle and speed",
         consequence="the compensation leaves a ripple within each motor turn",
-        remedy="add the order to the model; a new order after months suggests wear of the wave generator's "
-        "bearing",
+        remedy="add the order to the model; a new one suggests wear of the wave generator's bearing",
         experiment="steps of another size, or a slow sweep: an order aliased by the step moves",
         aliases=("motor_encoder_eccentricity", "synchronous"),
         source="Fourier series over the wave generator's angle",

@@ -29,7 +29,7 @@ SCALE = 1e-3
 """Largest scale error of an encoder that was mounted as intended: a tape on a drum of 100 mm whose radius is
 0.1 mm off. A disc has none, because its lines are whole per turn."""
 SAME_TEETH = 1e-4
-"""Share of a ratio to which a ramp shows it next to other causes: a tenth of `SCALE`."""
+"""Accuracy of a ratio found from a ramp next to other causes, as a share of the ratio: a tenth of `SCALE`."""
 
 
 class RatioError(Linear):
@@ -46,7 +46,7 @@ class RatioError(Linear):
         experiment="a long sweep both ways, then rest: a ratio error grows with the angle, a drift with time",
         aliases=("load_order", "zero_drift", "wear"),
         source="kinematics",
-        size="784 arcsec per step of 43.56 motor degrees between ratios 40 and 50",
+        size="784 arcsec per 43.56 motor degrees between ratios 40 and 50",
     )
     compensable: ClassVar[Compensable] = Compensable(
         True,

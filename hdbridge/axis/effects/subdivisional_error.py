@@ -104,7 +104,7 @@ class SubdivisionalError(Angleless):
 
     @classmethod
     def at_lines(cls, lines_per_turn: int) -> Iterator[Self]:
-        """Yields the effects of which this many periods per load turn can be a spectral line."""
+        """Yields the effects that have a spectral line at this number of periods per load turn."""
         for numbers in ((1,), _HARMONICS):
             yield cls(lines_per_turn=lines_per_turn, orders=orders_from(numbers))
         for part in (2, 4):

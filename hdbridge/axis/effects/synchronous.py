@@ -25,7 +25,7 @@ class Synchronous(OrderSeries):
         equation="sum over k of A_k cos(k theta_M + phi_k)",
         signature="repeats with every motor turn, the same in both directions and at every load angle",
         consequence="the load runs ahead and behind within each motor turn",
-        remedy="compensate it; its size depends on the teeth and the run-out of the wave generator",
+        remedy="compensate it",
         experiment="a slow sweep over whole motor turns, both ways",
         aliases=("motor_encoder_eccentricity",),
         source="Fourier series over the wave generator's angle, the usual kinematic error model",

@@ -40,8 +40,8 @@ class Vibration(Angleless):
         signature="the same frequency in hertz at every speed, and at rest",
         consequence="the load, or only the reading head, vibrates",
         remedy="find the source by its frequency; decouple it; lower the loop gain if the axis resonates",
-        experiment="a standstill and sweeps at two speeds: the frequency of an order changes with speed, "
-        "that of a vibration does not",
+        experiment="a standstill and sweeps at two speeds: an order changes its frequency, a vibration does "
+        "not",
         aliases=("motor_order", "load_order", "flexspline_order", "subdivisional_error"),
         source="a sinusoid in time",
         size="0.1-5 arcsec",

@@ -46,7 +46,7 @@ class Wear(Linear):
         experiment="the same stepping test, cold, some hours of running apart",
         aliases=("amplitude_drift", "zero_drift", "ratio_error", "backlash"),
         source="lost motion proportional to sliding distance (Archard's law), slowing down while it runs in",
-        size="grows by 0.1-10 arcsec per thousand motor turns in a fast test",
+        size="0.1-10 arcsec per 1000 motor turns in a fast test",
     )
     compensable: ClassVar[Compensable] = Compensable(
         True, "the turns run must be carried over in turns_before"

@@ -35,8 +35,7 @@ class ZeroDrift(Angleless, Linear, Warmed):
         equation="drift w, w = u - reference, tau du/dt = temperature - u "
         "(or w = warm_up (1 - exp(-t / tau)))",
         signature="a slow shift, the same in both directions, with a time constant of minutes to an hour",
-        consequence="all positions are off by the same amount until the axis is as warm as in its "
-        "calibration",
+        consequence="all positions are off alike until the axis is as warm as in its calibration",
         remedy="warm up before work; home warm; a temperature sensor at the gear makes it predictable",
         experiment="return to a reference pose repeatedly while the axis warms and cools; record the "
         "temperature",

@@ -55,7 +55,7 @@ class Node:
 
     node_id: int
     nmt_state: int | None = None
-    """Byte of its last heartbeat; None if it sends none."""
+    """State byte of the node's last heartbeat; None without a heartbeat."""
     answers: bool = False
     """True if it answered an SDO request."""
     busy: bool = False

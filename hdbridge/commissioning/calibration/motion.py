@@ -338,7 +338,7 @@ class ServoCheck:
 
     @property
     def remark(self) -> str | None:
-        """Reason why the stored response is not valid any more; None if it is."""
+        """Reason why the stored response is no longer valid; None for a valid one."""
         if self.agrees:
             return None
         return RETUNED.format(self.stored_lag_ms, self.lag_ms, 100.0 * self.difference)

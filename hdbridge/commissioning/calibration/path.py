@@ -22,7 +22,7 @@ from hdbridge.units import ARCSEC_PER_DEG
 FloatArray = NDArray[np.float64]
 
 SETTLED_ARCSEC = 3.0
-"""The load has settled once it stays this close to where it comes to rest."""
+"""Distance from the rest position within which the load counts as settled."""
 AT_REST_S = 0.2
 """Length of the final part of the rest over which the rest error is taken."""
 

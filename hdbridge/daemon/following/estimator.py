@@ -29,7 +29,7 @@ from hdbridge.daemon.following.settings import AdaptationSettings
 EXCITED = 1.0
 """Information of a batch along a direction, in units of 1 / scale^2, above which the direction is excited."""
 NOTHING = 1e-12
-"""Share of the largest eigenvalue below which a direction has no information."""
+"""Eigenvalue, as a share of the largest, below which a direction counts as without information."""
 DISC_ARCSEC = 10.0
 """Expected size of the load encoder's own errors per turn."""
 ZERO_ARCSEC = 1000.0

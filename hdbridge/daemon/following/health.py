@@ -94,7 +94,7 @@ SIGMAS = 8.0
 NOISE_RATIO = 4.0
 """Ratio of jitter to its usual value; normal is 1, a damaged track gives 10."""
 SPIKES = 3
-"""Readings that jump there and back within ten seconds; so many are not chance."""
+"""Number of readings that jump there and back within ten seconds from which they are not chance."""
 FROZEN_ARCSEC = 120.0
 """Load travel within which the reading must change; more than any backlash."""
 FROZEN_COUNTS = 20.0

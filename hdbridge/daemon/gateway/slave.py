@@ -45,7 +45,7 @@ BEHAVIOUR: Final = Behaviour.model_validate(
 Its node id is that of the machine file.
 """
 DEAD_S: Final = 0.3
-"""A loop that has not turned for so long hangs or is gone."""
+"""Time without a turn of the control loop after which it counts as hung or dead."""
 POWER_S: Final = 5.0
 """Longest time for the service and the inner drive to switch power on."""
 VELOCITY_S: Final = 0.02

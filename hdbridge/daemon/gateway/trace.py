@@ -29,7 +29,9 @@ _CYCLIC: Final = (7, 8)
 _READY: Final = (State.READY_TO_SWITCH_ON, State.SWITCHED_ON)
 _INVALID: Final = 1 << 31
 _LATE: Final = 1.5
-"""A SYNC interval of more than so many periods is a missing SYNC; the gateway stops the axis after four."""
+"""Number of periods from which a SYNC interval counts as a missing SYNC; the gateway stops the axis after
+four.
+"""
 _QUIET_S: Final = 1.0
 """Time without SYNC or heartbeat after which a master that should send them is at fault."""
 _PDO_ADVICE: Final = (

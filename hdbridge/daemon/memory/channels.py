@@ -162,7 +162,7 @@ class RingReader(_Slots[T]):
 
 
 class Queue(_Slots[T]):
-    """Bounded queue with both ends; each process uses one of them."""
+    """Bounded queue with both ends; each process uses one end."""
 
     def __init__(self, region: Region, place: Place, form: Format[T]) -> None:
         super().__init__(region, place, form)

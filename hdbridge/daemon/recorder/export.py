@@ -82,7 +82,7 @@ def exported(
         state = "" if all_states else " while it was enabled (--all-states takes the rest, too)"
         raise InputError(
             f"{flights[0].path}: nothing of axis '{known[0].name}' to export{state}: "
-            f"{len(rows['cycle'])} such cycles, no {PART_SAMPLES} of them together"
+            f"{len(rows['cycle'])} such cycles, fewer than {PART_SAMPLES} in a row"
         )
     return Recording(
         concatenate(parts),

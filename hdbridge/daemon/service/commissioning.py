@@ -102,7 +102,7 @@ class Commissioning:
         """Reads an object by its number or its EDS name."""
         wanted = find_object(object_, self._drive.sdo.od)
         if not wanted.readable:
-            raise InputError(f"{wanted}: can only be written, by the EDS")
+            raise InputError(f"{wanted}: is write-only by the EDS")
         with self._asked(f"{object_} is being read"):
             return wanted, wanted.decode(self._drive.sdo.read_bytes(wanted.index, wanted.sub))
 

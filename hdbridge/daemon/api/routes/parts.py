@@ -14,7 +14,7 @@ from hdbridge.errors import LeaseError
 
 T = TypeVar("T")
 RENEWALS: Final = 3
-"""Renewals per time-out of the lease while a request of its holder is waited for."""
+"""Lease renewals per time-out while a request of the lease holder is in progress."""
 
 STOP_LOOKS: Final = 25
 STOP_LOOK_S: Final = 0.01
