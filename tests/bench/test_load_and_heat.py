@@ -16,7 +16,7 @@ from hdbridge.commissioning.evaluation.stepping import SchemeResult, quantisatio
 from hdbridge.control.bench import Bench, compensation_for
 from hdbridge.drive.drive import Drive
 from hdbridge.drive.supervision import Fault
-from hdbridge.errors import DriveError, InputError, SdoError
+from hdbridge.errors import DriveError, InputError
 from hdbridge.motion.procedures.moves import Dwell, MoveTo
 from hdbridge.motion.procedures.stepping import Stepping
 from hdbridge.sim.lockstep import simulated_bench
@@ -227,23 +227,6 @@ def test_a_model_with_missing_channels_is_refused_for_compensation():
     with pytest.raises(InputError, match=r"'amplitude_drift' needs temperature_c, .*add 'temperature' to"):
         compensation_for(without, model_with(drift))
     compensation_for(without, model_with(compliance(torque="motor_torque_nm")))
-
-
-def test_a_drive_without_the_object_is_refused_with_the_line_of_the_axis_file(tmp_path):
-    eds = axis_with("").eds_path.read_text()
-    eds = eds.replace("3=0x2101", "3=0x2102").replace("[2101]", "[2102]")
-    (tmp_path / "hdbridge-402.eds").write_text(eds)
-    text = (PROFILE / "axis.yaml").read_text() + CHANNELS.replace("0x2101", "0x2102")
-    (tmp_path / "axis.yaml").write_text(text)
-    axis = AxisConfig.load(tmp_path)
-    line = next(n for n, each in enumerate(text.splitlines(), 1) if "0x2102" in each)
-    with (
-        simulated_bench(PROFILE / "truth.yaml", axis_with("").eds_path, 1, 1) as (bus, clock, node),
-        Drive(bus, axis, clock) as drive,
-        pytest.raises(SdoError, match=rf"axis\.yaml:{line}:3: load_torque\.source decides it"),
-    ):
-        drive.boot()
-    assert node.firmware.statusword() & 0x6F == 0x40
 
 
 def test_the_torque_of_the_motor_has_the_sense_of_the_axis():

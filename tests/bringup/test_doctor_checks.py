@@ -288,12 +288,6 @@ def test_a_drive_that_ignores_a_lost_heartbeat(case: Callable[..., Any]) -> None
     assert decode(examined.node.firmware.statusword()) is State.SWITCH_ON_DISABLED
 
 
-def test_a_drive_without_a_torque_limit(case: Callable[..., Any]) -> None:
-    verdicts = case(eds={"[6072]": "[no object]"}).run(until="nudge")
-    assert failures(verdicts) == []
-    assert "left to the drive, see `hdbridge check`: 6072h:00" in verdicts["files"].measured
-
-
 HOLDING = {"quick_stop_option: 2": "quick_stop_option: 6"}
 
 

@@ -137,14 +137,6 @@ def test_scan_sends_nothing_while_another_master_runs(can_id: int) -> None:
     assert not [each for each in seen if 0x600 < each.arbitration_id < 0x680]
 
 
-def test_an_empty_bus() -> None:
-    with can.Bus(interface="virtual", channel=str(uuid4()), ignore_config=True) as bus:
-        from hdbridge.clock import MonotonicClock
-
-        found = scan_bus(Link(bus, MonotonicClock()), listen_s=0.0, timeout_s=0.0005, force=True)
-    assert found.nodes == ()
-
-
 def drive_node(node_id: int = 1, **identity: int) -> Node:
     node = Node(node_id, 127, answers=True, device_type=0x0002_0192, modes=0xA1)
     node.identity = {"vendor_id": 0x4844, "product_code": 0x402, "revision": 0x10000, "serial": 7, **identity}

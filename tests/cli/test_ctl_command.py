@@ -91,13 +91,6 @@ def test_the_only_axis_needs_no_name(ctl, machine):
     assert machine.moved == [("joint-1", "disable"), ("joint-1", "home", 37)]
 
 
-def test_several_angles_are_reached_in_order(ctl, machine, tmp_path):
-    ctl("move", "joint-1", 10, 20, "--json", "stands.json")
-    assert json.loads((tmp_path / "stands.json").read_text())["load_target_deg"] == 20.0
-    ctl("move", "joint-1", 5, -1, "--relative")
-    assert [each[2] for each in machine.moved] == [10.0, 20.0, 25.0, 24.0]
-
-
 def test_stops_go_to_all_or_named_axes_without_the_lease(ctl, machine):
     machine.lease.take("another")
     ctl("stop")
@@ -222,10 +215,6 @@ def test_tables_are_complete_at_any_width(ctl, process, machine, monkeypatch, li
     }  # fmt: skip
     assert whole <= cells
     assert "…" not in "".join(lines)
-
-
-def test_an_object_is_read(ctl):
-    assert "6041h:00 'Statusword': 4663 (0x1237)  uint16" in ctl("get", "joint-1", "Statusword")
 
 
 @pytest.mark.usefixtures("at_a_terminal")

@@ -42,15 +42,6 @@ def test_a_termination_signal_stops_in_order_and_keeps_the_measurement(tmp_path,
     assert len(Recording.load(kept).record)
 
 
-def test_loss_of_data_without_a_folder_is_reported(tmp_path):
-    process = started(tmp_path, *LONG)
-    time.sleep(1.0)
-    process.send_signal(signal.SIGINT)
-    _, errors = process.communicate()
-    assert process.returncode == 130
-    assert "not kept: it takes --record FOLDER" in errors
-
-
 def test_results_of_finished_schemes_are_printed_and_written(tmp_path):
     outputs = ("--record", "kept", "--json", "figures.json", "--html", "page.html")
     process = started(tmp_path, "step", "article", "--simulate", "--count", 40, *outputs)

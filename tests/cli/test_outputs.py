@@ -80,14 +80,6 @@ def test_destructive_outputs_are_refused_before_anything_is_read(hdbridge, bench
     assert bench()
 
 
-def test_a_second_result_replaces_the_first(hdbridge, tmp_path):
-    for _ in range(2):
-        assert hdbridge("check", "article", "--json", "out.json").returncode == 0
-    (tmp_path / "empty").touch()  # as mktemp makes it
-    assert hdbridge("check", "article", "--json", "empty").returncode == 0
-    assert json.loads((tmp_path / "empty").read_text())["axis"] == "article"
-
-
 def test_a_pending_model_may_be_written_to_a_profile(tmp_path, bench):
     for name in ("pending.yaml", "first/model.yaml"):
         (tmp_path / "p" / "first").mkdir(exist_ok=True)

@@ -246,15 +246,6 @@ def test_check_knows_python_can_and_local_interfaces(place):
     assert "bus.channel: this computer has no network interface 'cann0'" in done.stderr
 
 
-def test_a_velocity_above_the_limit_is_reported(place):
-    done = run_here(place, "move", "axis", 0.01, "--simulate", "--velocity", 500)
-    assert done.returncode == 0, done.stderr
-    assert (
-        "velocity: 500 deg/s is above the axis's limit; 20 deg/s is used (limits.velocity_deg_s)"
-        in done.stderr
-    )
-
-
 @pytest.mark.parametrize("name", ["mine", "cells/left/mine"])
 def test_a_new_profile_on_a_full_disk_leaves_no_files(tmp_path, name):
     done = subprocess.run(

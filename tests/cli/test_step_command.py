@@ -28,17 +28,6 @@ def test_step_prints_a_table_and_writes_the_contract(hdbridge, tmp_path):
         assert file.readline().strip().split(",")[0] == "time_s"
 
 
-def test_the_same_seed_gives_the_same_record_bit_for_bit(hdbridge, tmp_path):
-    (tmp_path / "none.yaml").write_text("schema: hdbridge.model/1\nratio: 50\neffects: []\n")
-    options = ("--simulate", "--model", "none.yaml", "--scheme", "none", "--count", 2)
-    for name, seed in (("a", 7), ("b", 7), ("c", 8)):
-        done = hdbridge("step", "demo", *options, "--seed", seed, "--record", name)
-        assert done.returncode == 0, done.stderr
-    a, b, c = ((tmp_path / each / "stepping-none.csv.gz").read_bytes() for each in "abc")
-    assert a == b
-    assert a != c
-
-
 def test_demo_writes_every_file_it_names(hdbridge, tmp_path):
     done = hdbridge("demo", "--count", 4)
     assert done.returncode == 0, done.stderr

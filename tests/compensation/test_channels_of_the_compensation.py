@@ -112,15 +112,6 @@ def test_an_effect_fades_out_without_its_channel_and_in_again_with_it():
     assert abs(error) < 1e-6
 
 
-def test_losing_an_unused_channel_changes_nothing():
-    compensation, moment = engaged(5.0)
-    before = compensation.correction_arcsec
-    compensation.know(LOSABLE - {Channel.TEMPERATURE})
-    for _ in range(200):
-        compensation.command(5.0, moment)
-    assert compensation.correction_arcsec == before
-
-
 def test_without_a_channel_at_the_start_its_effect_starts_faded_out():
     compensation = Compensation(LOADED, CompensationLimits(ramp_s=0.5), PERIOD)
     compensation.know(frozenset())

@@ -284,14 +284,3 @@ def test_invalid_settings_are_refused(numbers, message):
         LoadLoop(*first, counts_arcsec=counts)
     with pytest.raises(InputError, match="finite"):
         loop().reset(math.nan)
-
-
-def test_a_reset_starts_at_zero_without_doubt():
-    its = loop()
-    plant = Plant(its, lag=20.0)
-    for _ in range(2000):
-        plant.step()
-    assert its.value_arcsec > 5.0
-    its.reset()
-    assert its.value_arcsec == 0.0
-    assert not its.doubt

@@ -233,16 +233,6 @@ def test_a_new_model_with_memory_of_time_starts_now():
     assert -20.0 * 0.2 < correction.correction_arcsec < -20.0 * 0.1
 
 
-def test_prediction_is_independent_of_the_weight():
-    its = model(amplitude=0.0)
-    off = Compensation(its, LIMITS, PERIOD)
-    off.reset(0.0)
-    for load in places([(2.0, 100)]):
-        off.command(load)
-    assert off.correction_arcsec == 0.0
-    assert off.predicted_arcsec == pytest.approx(30.0)
-
-
 def test_gently_crossed_backlash_keeps_its_memory():
     gap = Backlash(gap_arcsec=20.0, crossing_deg=0.01)
     its = Compensation(TransmissionModel(RATIO, (gap,)), LIMITS, PERIOD)
@@ -273,7 +263,3 @@ def test_compensation_can_be_pickled(folder):
         for load in places([(3.0, 50), (-2.0, 80)]):
             assert sent.command(load) == compensation.command(load)
         assert (sent.needs, sent.model.ratio) == (compensation.needs, compensation.model.ratio)
-
-
-def test_bundled_models_are_found():
-    assert len(bundled()) >= 2

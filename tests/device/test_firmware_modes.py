@@ -54,11 +54,6 @@ def test_ip_starts_at_the_actual_position(ip, master, motor):
     assert master.read(0x60C1, 1) == 12_345  # of the RPDO; interpolation is not enabled
 
 
-def test_ip_supports_linear_interpolation_only(master):
-    assert master.write(0x60C0, 0, -1, 2) == 0x06090030
-    master.put(0x60C0, 0, 0, 2)
-
-
 def test_a_lost_master_stops_an_axis_in_ip(ip, master):
     master.put(0x6007, 0, 3, 2)
     ip(0x1F, 10)
@@ -193,25 +188,6 @@ def test_the_torque_limit_reaches_the_loops(master, motor):
 
 
 # profile position
-
-
-def test_pp_moves_on_a_trapezoid(master, motor):
-    for index, value in ((0x6081, 10_000), (0x6083, 50_000), (0x6084, 100_000)):
-        master.put(index, 0, value, 4)
-    master.enable(1)
-    assert master.statusword & REACHED
-    set_point(master, 8000)
-    assert not master.statusword & REACHED
-    master.wait(0.1)
-    assert master.read(0x606C) == pytest.approx(5000, abs=2 * 50_000 * 0.004)
-    master.wait(0.3)
-    assert master.read(0x606C) == pytest.approx(10_000, rel=1e-6)
-    duration_s = 8000 / 10_000 + 0.5 * (10_000 / 50_000 + 10_000 / 100_000)
-    master.wait(duration_s - 0.4 - 0.012)
-    assert motor.position < 8000
-    master.wait(0.05)
-    assert motor.position == 8000
-    assert master.statusword & REACHED
 
 
 def test_pp_target_reached_needs_the_window_for_its_time(master, motor):

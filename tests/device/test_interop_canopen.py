@@ -60,30 +60,6 @@ def remote(network: canopen.Network, drive: DriveNode) -> canopen.RemoteNode:
     return remote
 
 
-def test_boot_up_and_nmt(remote):
-    remote.nmt.state = "RESET"
-    remote.nmt.wait_for_bootup(PATIENCE_S)
-    remote.sdo[0x1017].raw = 20
-    remote.nmt.state = "OPERATIONAL"
-    assert remote.nmt.wait_for_heartbeat(PATIENCE_S) == "OPERATIONAL"
-    remote.nmt.state = "PRE-OPERATIONAL"
-    until(lambda: remote.nmt.wait_for_heartbeat(PATIENCE_S) == "PRE-OPERATIONAL")
-
-
-def test_sdo_numbers_and_strings(remote):
-    assert remote.sdo[0x1018]["Vendor-ID"].raw == 0x4844
-    assert remote.sdo["Manufacturer device name"].raw == "hdbridge simulated CiA-402 servo drive"
-    remote.sdo["Device label"].raw = "axis on the left, behind the pillar"
-    assert remote.sdo["Device label"].raw == "axis on the left, behind the pillar"
-    with remote.sdo["Device label"].open("wb", size=30, block_transfer=True) as file:
-        file.write(b"thirty characters, as a block!")
-    with remote.sdo["Device label"].open("rb", block_transfer=True) as file:
-        assert file.read() == b"thirty characters, as a block!"
-    remote.sdo[0x607D][1].raw = -123456
-    assert remote.sdo[0x607D][1].raw == -123456
-    assert remote.sdo[0x60E4][1].raw == 0
-
-
 def test_pdo_configuration_by_canopen(network, remote):
     remote.tpdo.read()
     remote.tpdo[1].clear()

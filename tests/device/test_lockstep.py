@@ -6,7 +6,6 @@ from pathlib import Path
 import can
 import pytest
 
-from hdbridge.errors import InputError
 from hdbridge.sim.lockstep import (
     LockstepBus,
     SimulatedAxis,
@@ -93,17 +92,6 @@ def test_every_kind_of_frame_passes_unchanged(motor):
             )
 
 
-def test_two_benches_are_isolated(motor):
-    with (
-        lockstep_bench(motor, EDS) as (bus_a, _, node_a),
-        lockstep_bench(type(motor)(), EDS) as (bus_b, _, _),
-    ):
-        bus_a.send(message(0x000, b"\x01\x00"))
-        bus_b.send(message(0x080))
-        assert bus_b.recv(0) is None
-        assert node_a.nmt == 5
-
-
 def run_several(node_ids: list[int]) -> dict[int, list[bytes]]:
     """Two hundred SYNCs for several axes on one bus: each one's TPDO1, by its node id."""
     frames: dict[int, list[bytes]] = {node_id: [] for node_id in node_ids}
@@ -128,9 +116,3 @@ def test_axes_on_one_bus_do_not_disturb_each_other():
     assert all(len(frames) == 200 for frames in together.values())
     for node_id in (1, 2, 5):
         assert together[node_id] == run_several([node_id])[node_id]
-
-
-def test_two_simulated_drives_need_different_node_ids():
-    twice = [SimulatedAxis(ARTICLE, EDS, 4), SimulatedAxis(ARTICLE, EDS, 4)]
-    with pytest.raises(InputError, match="node 4"), simulated_benches(twice):
-        pass

@@ -48,14 +48,6 @@ def heartbeats(frames):
     return [(can_id - 0x700, data[0]) for can_id, data in frames if 0x700 <= can_id < 0x780]
 
 
-def test_a_stored_node_id_survives_a_node_reset(master, lss):
-    lss.send_switch_state_global(lss.CONFIGURATION_STATE)
-    lss.configure_node_id(PENDING_ID)
-    lss.store_configuration()
-    master.nmt(129)
-    assert heartbeats(master.take()) == [(PENDING_ID, 0)]
-
-
 def test_a_node_without_id_is_silent_until_a_fast_scan(master, lss):
     known = identity(master)
     assert lss.fast_scan() == (False, None)

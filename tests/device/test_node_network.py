@@ -3,16 +3,6 @@
 import pytest
 
 
-def test_the_sync_identifier_can_be_changed_but_not_produced(master):
-    assert master.write(0x1005, 0, 0x40000080, 4) == 0x06090030
-    master.put(0x1005, 0, 0x90, 4)
-    master.nmt(1)
-    master.send(0x080)
-    assert master.take() == []
-    master.send(0x090)
-    assert [can_id for can_id, _ in master.take()] == [0x181, 0x281]
-
-
 def test_pre_operational_leaves_a_profile_move_alone(master):
     master.nmt(1)
     master.enable(1)

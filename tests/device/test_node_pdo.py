@@ -26,23 +26,12 @@ def remap(master, number: int, words: list[int], *, receive: bool = False, kind:
     return 0
 
 
-def sync(master) -> list[tuple[int, bytes]]:
-    master.take()
-    master.send(0x080)
-    return master.take()
-
-
 def test_only_the_refused_values_of_a_pdo_are_dropped(master):
     assert remap(master, 2, [0x60600008, 0x60810020], receive=True) == 0
     master.nmt(1)
     master.send(0x301, struct.pack("<bI", 3, 777))
     master.send(0x080)
     assert (master.read(0x6060), master.read(0x6081)) == (0, 777)
-
-
-def test_a_count_that_covers_an_empty_entry_is_refused(master):
-    master.put(0x1802, 1, 0x80000381, 4)
-    assert master.write(0x1A02, 0, 1, 1) == 0x06020000
 
 
 @pytest.mark.parametrize("value", [0x20000181, 0x080, 0x701, 0x601])
@@ -88,12 +77,3 @@ def test_a_late_rpdo_is_harmless_without_power(master):
     master.cycle(0x06)
     master.wait(0.1)
     assert master.emergencies() == []
-
-
-def test_the_target_stays_when_an_rpdo_is_lost(master):
-    master.enable_csp()
-    target = master.cruise(10, 5)
-    for _ in range(2):
-        frames = dict(sync(master))
-        master.wait(0.004)
-    assert struct.unpack_from("<i", frames[0x181], 2)[0] == target

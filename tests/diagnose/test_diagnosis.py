@@ -48,13 +48,6 @@ def test_a_finding_improves_held_out_data_and_is_offered(
     assert result.extended.rms_arcsec < 1.5 * diagnosed().extended.rms_arcsec + 0.1
 
 
-def test_intervals_contain_the_true_parameters(diagnosed: Diagnosed) -> None:
-    found = diagnosed({"vibration": {"size": 3.0, "hz": 3.3}}).findings[0].parameters
-    assert found["frequency_hz"].value == pytest.approx(3.3, abs=1e-3)
-    assert found["amplitude_arcsec"].low < 3.0 < found["amplitude_arcsec"].high
-    assert found["amplitude_arcsec"].unit == "arcsec"
-
-
 def test_once_per_load_turn_without_a_torque_channel_may_be_gravity(diagnosed: Diagnosed) -> None:
     found = diagnosed({"load_order": {"orders": [(1, 8.0, 30.0)]}}).findings[0]
     assert found.cause == "load_order"
@@ -66,12 +59,6 @@ def test_motor_encoder_eccentricity_is_an_alias_of_the_first_motor_order(diagnos
     found = diagnosed({"motor_encoder_eccentricity": {"orders": [(1, 4.0, 100.0)]}}).findings[0]
     assert {found.cause, *found.aliases} == {"motor_encoder_eccentricity", "motor_order"}
     assert "re-clock" in found.experiment
-
-
-def test_unknown_causes_are_unexplained_with_their_location(diagnosed: Diagnosed) -> None:
-    first = diagnosed({"unknown": {"kind": "one_way", "size": 6.0}}).findings[0]
-    assert first.cause == "unexplained"
-    assert "direction" in first.lives_in
 
 
 def test_two_effects_at_once(diagnosed: Diagnosed) -> None:

@@ -40,11 +40,6 @@ def drifting(columns: Callable[..., dict[str, Any]], model: TransmissionModel) -
     return run
 
 
-def test_ripple_is_reported_at_a_recorded_temperature(drifting: Callable[..., Diagnosis]) -> None:
-    """At 20 degrees, far below the coldest that was measured, this one would be next to nothing."""
-    assert names(drifting(0.08, rise_k=14.0, warmer_k=12.0)) == ["amplitude_drift"]
-
-
 def test_drift_is_reported_from_the_model_temperature(drifting: Callable[..., Diagnosis]) -> None:
     """From any other the amplitudes of the model would have changed beside it."""
     result = drifting(0.025, rise_k=10.0, warmer_k=14.0)

@@ -9,7 +9,6 @@ from canopen.objectdictionary import ObjectDictionary
 
 from hdbridge.axis import AxisConfig
 from hdbridge.drive import Drive, Mode, State
-from hdbridge.drive.bootplan import left_to_drive
 from hdbridge.errors import DriveError, IdentityError, InputError, SdoError
 
 
@@ -168,17 +167,6 @@ def test_a_feed_that_does_not_scale(bus: Any, tiny: Any, clock: Any, build_axis:
         Drive(bus, build_axis(drive__feed_scales=False), clock, tiny.od).boot()
 
 
-def test_objects_missing_in_the_eds_are_not_written(
-    drive: Drive, tiny: Any, bus: Any, axis: Any, clock: Any
-) -> None:
-    for index in (0x6072, 0x1029):
-        del tiny.od[index]
-        del tiny.values[index, 0 if index == 0x6072 else 1]
-    report = Drive(bus, axis, clock, tiny.od).boot()
-    assert not {0x6072, 0x1029} & {row.index for row in report.held}
-    assert [row.index for row in left_to_drive(axis, tiny.od)] == [0x1029, 0x6072]
-
-
 def test_missing_mandatory_objects_are_refused_before_anything_is_sent(
     tiny: Any, bus: Any, axis: Any, clock: Any
 ) -> None:
@@ -279,16 +267,6 @@ def test_a_drive_that_refuses_its_cycle_is_refused(drive: Drive, tiny: Any) -> N
     tiny.scripts[0x60C2, 1] = refusing(0x06010002, held=1)
     with pytest.raises(SdoError, match=r"60C2h:01 .*read-only.*drive\.cycle_ms decides it"):
         drive.boot()
-
-
-def test_values_already_held_are_not_written(drive: Drive, tiny: Any) -> None:
-    first = drive.boot()
-    assert first.written
-    tiny.sdo_order.clear()
-    second = drive.boot()
-    assert second.written == ()
-    assert second.held == first.held
-    assert tiny.sdo_order == []
 
 
 def test_a_write_only_object_is_written(drive: Drive, tiny: Any) -> None:

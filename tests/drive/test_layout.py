@@ -66,23 +66,6 @@ def test_the_drives_own_types_decide_what_fits(laid_out: Any) -> None:
     }
 
 
-def test_fixed_mappings_are_used_in_any_order_and_split(laid_out: Any) -> None:
-    eds = mapped(OWN, 0x1800, STATUS, kind=255)
-    eds = mapped(eds, 0x1801, LOAD, STATUS, can_id=0x191, kind=1)
-    eds = mapped(eds, 0x1802, 0x60610008, TORQUE, POSITION)
-    eds = mapped(eds, 0x1400, CONTROL, kind=1)
-    eds = mapped(eds, 0x1402, 0x00050008, TARGET, 0x60FF0010)
-    found = laid_out(eds)
-    assert told(found) == {
-        0x191: [LOAD, STATUS],
-        0x381: [0x60610008, TORQUE, POSITION],
-        0x481: [DEMAND],
-        0x201: [CONTROL],
-        0x401: [0x00050008, TARGET, 0x60FF0010],
-    }
-    assert [each.is_fixed for each in found.cyclic] == [True, True, False]
-
-
 def test_as_few_fixed_mappings_as_possible_are_used(laid_out: Any) -> None:
     eds = mapped(mapped(OWN, 0x1400, CONTROL), 0x1401, CONTROL, TARGET)
     assert [each.number for each in laid_out(eds).rpdos] == [2]

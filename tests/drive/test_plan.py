@@ -76,19 +76,6 @@ def test_a_pdo_is_off_and_empty_while_it_is_changed(axis: AxisConfig) -> None:
     ]
 
 
-def test_other_pdos_are_disabled_and_absent_objects_left_out(axis: AxisConfig, tiny: Any) -> None:
-    od = tiny.od
-    unused = [row.index for row in plan(axis, od) if row.why.endswith("is not used")]
-    assert unused == [0x1802, 0x1803, 0x1401, 0x1402, 0x1403]
-    for index in (0x6080, 0x1016, 0x605B):
-        assert (1, index, 0) in values(axis, od) or (1, index, 1) in values(axis, od)
-        del od[index]
-    del od.indices[0x1400].subindices[5]
-    written = values(axis, od)
-    assert not any(key in written for key in ((1, 0x6080, 0), (1, 0x1016, 1), (1, 0x605B, 0), (1, 0x1400, 5)))
-    assert (1, 0x607D, 1) in written
-
-
 def test_a_row_reads_like_a_sentence(axis: AxisConfig) -> None:
     rows = [str(row) for row in plan(axis)]
     assert "605Ah:00 = 2 (2h): what a quick stop does [drive.quick_stop_option]" in rows

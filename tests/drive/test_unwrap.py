@@ -21,20 +21,6 @@ def test_any_path_of_moves_below_half_the_range_is_followed(start: int, moves: l
     assert unwrap.value == position
 
 
-@given(
-    modulus=st.integers(2, 2**33),
-    start=st.integers(0, 2**33),
-    steps=st.lists(st.floats(-0.499, 0.499), max_size=20),
-)
-def test_a_counter_may_wrap_anywhere(modulus: int, start: int, steps: list[float]) -> None:
-    unwrap = Unwrap(modulus)
-    position = start % modulus
-    unwrap.update(position)
-    for step in steps:
-        position += int(step * modulus)
-        assert unwrap.update(position % modulus) == position
-
-
 @given(st.integers())
 def test_wrapping_stays_in_int32_and_is_modular(value: int) -> None:
     assert -HALF <= wrap_int32(value) < HALF

@@ -20,14 +20,6 @@ from hdbridge.axis.effects import (
 )
 from hdbridge.axis.effects.orders import waves
 
-ARTICLE_ORDERS = [
-    (1, 4.9, -126.8),
-    (2, 9.33, -132.1),
-    (3, 2.09, -96.2),
-    (4, 12.21, 105.7),
-    (6, 3.18, -127.0),
-    (8, 1.87, 124.3),
-]
 loops = st.builds(
     Hysteresis,
     offset_arcsec=st.floats(0, 80),
@@ -41,13 +33,6 @@ steps = st.lists(
 )
 paths = st.builds(lambda first, rest: np.cumsum(np.array([first, *rest])), st.floats(-2000, 2000), steps)
 starts = st.sampled_from(list(Start))
-
-
-def test_article_synchronous_part_has_the_peak_to_peak_of_its_table():
-    effect = Synchronous(
-        orders=tuple(MotorOrder(order=k, amplitude_arcsec=a, phase_deg=p) for k, a, p in ARTICLE_ORDERS)
-    )
-    assert np.ptp(effect.predict(Motion(np.linspace(0, 360, 200_001)))) == pytest.approx(42.93, abs=0.01)
 
 
 @given(st.lists(st.one_of(st.integers(0, 200), st.floats(0.01, 10.0)), max_size=8), st.floats(-1e4, 1e4))
@@ -65,15 +50,6 @@ def test_an_order_may_stand_only_once():
 
 
 ARTICLE = Hysteresis(offset_arcsec=40, width_deg=20, exponent=1.6)
-
-
-@pytest.mark.parametrize("amplitude_deg", [180, 45, 5])
-def test_lissajous_loops_close(amplitude_deg):
-    time = np.linspace(0, 3, 3 * 2000 + 1)
-    angle = amplitude_deg * np.cos(2 * np.pi * time)
-    error = ARTICLE.predict(Motion(angle))
-    np.testing.assert_allclose(error[4000:], error[2000:4001], atol=1e-9)
-    assert np.ptp(error[4000:]) > 1.0
 
 
 def test_loops_wider_than_the_width_reach_the_offset_and_narrow_ones_have_the_height_of_the_law():
@@ -143,20 +119,6 @@ def test_the_start_value_is_used():
     backward = ARTICLE.predict(Motion(ahead), Start.BACKWARD)
     assert backward[0] == -40
     assert all(b > a for a, b in pairwise(backward))
-
-
-def test_back_and_forth_returns_to_the_start():
-    """Any excursion within the loop, out and back by the same angle, closes."""
-    for depth in (0.01, 0.5, 3.0, 9.0):
-        path = np.array([0.0, 50.0, 50.0 - depth, 50.0])
-        assert ARTICLE.predict(Motion(path))[-1] == pytest.approx(40.0)
-
-
-def test_return_points_are_not_remembered():
-    """The law has no return-point memory: that is its known weakness, and an effect of its own."""
-    back_step = np.array([0.0, -50.0, -45.0, -47.0, -45.0, -40.0])
-    straight = np.array([0.0, -50.0, -40.0])
-    assert ARTICLE.predict(Motion(back_step))[-1] - ARTICLE.predict(Motion(straight))[-1] > 8.0
 
 
 @pytest.mark.parametrize("law", [Hysteresis, HysteresisMemory])

@@ -153,13 +153,6 @@ def test_the_lower_torque_comes_first():
         Compliance(c1_arcsec_per_nm=1, c2_arcsec_per_nm=1, c3_arcsec_per_nm=1, torque1_nm=9, torque2_nm=3)
 
 
-def test_half_a_millisecond_of_skew_is_103_arcsec_at_one_radian_per_second():
-    effect = ChannelSkew.of_delay(0.5, 50.0)
-    time_s = np.arange(5) * 0.004
-    motion = Motion(math.degrees(1.0) * 50 * time_s, time_s)
-    np.testing.assert_allclose(effect.predict(motion)[2:], 103.13, atol=0.01)
-
-
 def test_skew_is_what_a_late_sample_shows_also_while_it_accelerates():
     """Against positions sampled late, with the true speed given: what is left is of third order."""
     time_s = np.linspace(0, 1, 400)
@@ -289,19 +282,6 @@ def test_play_for_an_inverse_is_crossed_no_steeper_than_asked_and_is_the_same_be
     assert soft[-1] == pytest.approx(exact.peek(715.0, Moment()), rel=1e-12)
 
 
-@pytest.mark.parametrize(
-    "effect",
-    [
-        Synchronous(orders=(ORDER_4,)),
-        Wear(growth_arcsec_per_kiloturn=4, width_deg=1),
-        Hysteresis(offset_arcsec=20, width_deg=20, exponent=1.6),
-    ],
-    ids=lambda each: each.name,
-)
-def test_only_backlash_has_a_gentle_form(effect):
-    assert effect.gentle_tracker(Start.FORWARD, 50.0) is None
-
-
 def test_the_load_relaxes_exponentially_at_any_sampling():
     effect = Creep(parts=(Relaxation(amplitude_arcsec=6, tau_s=2),), build_up=0.01)
     for rest in ([2.0, 4.0, 10.0], [0.3, 1.9, 2.0, 3.0, 4.0, 7.7, 10.0]):
@@ -386,20 +366,6 @@ def test_the_slope_bound_is_tight(effect):
     falls = falls[1:]  # in the first step the direction changes, which is the command's doing
     bound = effect.slope_bound_arcsec_per_deg()
     assert 0.99 * bound <= falls.max() <= bound * (1 + 1e-6)
-
-
-def test_the_title_of_a_channel_is_its_name_without_the_unit():
-    """Units of several words, or of one letter, too; a name without one stays whole."""
-    assert {each.value: each.title for each in Channel} == {
-        "load_torque_nm": "load torque",
-        "motor_torque_nm": "motor torque",
-        "temperature_c": "temperature",
-        "time_s": "time",
-        "motor_speed_deg_s": "motor speed",
-        "motor_acceleration_deg_s2": "motor acceleration",
-        "direction": "direction",
-        "load_deg": "load",
-    }
 
 
 # ---- what a mutation run showed that no other test notices --------------------------------------

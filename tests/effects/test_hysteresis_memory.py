@@ -26,20 +26,6 @@ def test_one_small_back_step_sets_the_laws_ten_arcsec_apart():
     assert apart.max() == pytest.approx(10.1, abs=0.05)
 
 
-def test_a_staircase_sets_them_nearly_twenty_seven_apart():
-    turns = [-50.0]
-    for _ in range(60):
-        turns += [turns[-1] + 1.0, turns[-1] + 0.5]
-    path = finely(*turns)
-    apart = np.abs(MEMORY.predict(path, Start.BACKWARD) - PLAIN.predict(path, Start.BACKWARD))
-    assert apart.max() == pytest.approx(26.9, abs=0.05)
-
-
-def test_without_a_loop_within_a_loop_the_laws_are_one():
-    path = finely(0.0, 50.0, 10.0, 60.0, -100.0)
-    np.testing.assert_allclose(MEMORY.predict(path), PLAIN.predict(path), atol=1e-9)
-
-
 @given(
     shares=st.lists(st.floats(0.01, 0.99), min_size=1, max_size=6),
     first=st.floats(0.5, 15.0),
@@ -77,14 +63,6 @@ def test_the_law_is_a_sum_of_stop_operators(path, start):
         expected.append(GEAR["offset_arcsec"] * float(weights @ stops))
     angles = 2 * grid * np.cumsum([0, *path])
     np.testing.assert_allclose(MEMORY.predict(Motion(angles), start)[1:], expected, atol=1e-8)
-
-
-def test_the_first_reversal_is_forgotten_on_the_virgin_curve():
-    """Out, back, out past the first reversal, and then far back: as if it had gone out straight."""
-    tail = [6.0, -4.0, -8.0]
-    looped = MEMORY.predict(Motion(np.array([0.0, 3.0, 1.0, *tail])))
-    straight = MEMORY.predict(Motion(np.array([0.0, *tail])))
-    np.testing.assert_allclose(looped[-3:], straight[-3:], atol=1e-9)
 
 
 def test_hundreds_of_nested_loops_are_followed_without_a_jump():

@@ -65,15 +65,6 @@ def test_a_valid_file_gives_nested_values_and_defaults(folder):
     assert AxisConfig.load(folder) == axis
 
 
-def test_the_configuration_is_immutable(folder):
-    axis = load(folder, GOOD)
-    with pytest.raises(ValueError, match="frozen"):
-        axis.gear.ratio = 40  # type: ignore[misc]
-
-
-TEETH = GOOD + "gear:\n  ratio: {}\n  teeth: {{flexspline: {}, circular_spline: {}, output: {}}}\n"
-
-
 @pytest.mark.parametrize(
     ("wanted", "given", "expected"),
     [

@@ -42,18 +42,6 @@ def test_recordings_read_back_unchanged(tmp_path):
     assert "vendor_id: 0x4844" in (tmp_path / "one" / "recording.yaml").read_text()
 
 
-def test_the_same_recording_gives_the_same_bytes(tmp_path):
-    for name in ("one", "two"):
-        FULL.save(tmp_path / name)
-    for file in ("record.csv.gz", "recording.yaml"):
-        assert (tmp_path / "one" / file).read_bytes() == (tmp_path / "two" / file).read_bytes()
-
-
-def test_empty_records_are_kept(tmp_path):
-    Recording(record(samples=0)).save(tmp_path / "one")
-    assert len(Recording.load(tmp_path / "one").record) == 0
-
-
 def test_a_recording_is_never_overwritten(tmp_path):
     FULL.save(tmp_path / "one")
     with pytest.raises(InputError, match=r"/one: there is a recording already; expected a new folder$"):
@@ -114,13 +102,6 @@ def test_bare_csv_files_and_folders_make_one_recording_in_the_order_given(tmp_pa
     assert (both.axis, both.ratio, both.notes) == (None, None, {})
     same = Recording.load(tmp_path / "one", tmp_path / "one")
     assert (same.axis, same.ratio, same.drive) == ("article", 50.0, FULL.drive)
-
-
-def test_segments_of_a_kind_return_their_samples():
-    pieces = list(FULL.pieces("step"))
-    assert [segment.notes["scheme"] for segment, _ in pieces] == ["both"]
-    assert pieces[0][1].time_s == pytest.approx([0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9], abs=0.06)
-    assert [segment.kind for segment, _ in FULL.pieces()] == ["precondition", "step"]
 
 
 def test_the_versions_name_hdbridge_itself():

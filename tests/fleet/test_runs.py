@@ -5,11 +5,10 @@ import os
 import signal
 from pathlib import Path
 
-import pyarrow.parquet as pq
 import pytest
 from distributed import Client
 
-from hdbridge.fleet.dataset import COLUMNS, Dataset
+from hdbridge.fleet.dataset import Dataset
 from hdbridge.fleet.diagnosing import diagnosed, fitted, local_model
 from hdbridge.fleet.engine import Cluster, run
 from hdbridge.fleet.sources import Source, find_sources
@@ -45,13 +44,6 @@ def test_every_recording_is_a_row_and_bad_ones_give_the_reason(fleet, whole):
     found = summarise([*rows.values()], 10.0)
     assert (found.joints, len(found.failed), len(found.duplicates)) == (3, 2, 1)
     assert found.as_dict()["schema"] == "hdbridge.fleet-summary/1"
-
-
-def test_the_columns_are_those_of_the_contract(whole):
-    out, _ = whole
-    for name, columns in COLUMNS.items():
-        for part in (out / name).glob("*.parquet"):
-            assert pq.read_schema(part).names == list(columns)
 
 
 def test_an_interrupted_run_resumes_and_ends_with_the_same_bytes(

@@ -123,26 +123,3 @@ def test_coulomb_friction_stops_the_axis_by_energy_balance():
     rows = advance(plant, 2.0 * stop_s + 0.5)
     assert rows[-1, 0] == pytest.approx(0.5 * speed * stop_s, rel=0.01)
     assert rows[-1, 1] == 0.0
-
-
-def test_viscous_friction_and_stribeck_set_the_speed_at_which_a_torque_drives():
-    mechanics = replace(
-        AXES[0].mechanics, stribeck_rise=0.3, stribeck_speed_rad_s=10.0, damping_nm_s_per_rad=30.0
-    )
-    mechanics = replace(mechanics, load_viscous_nm_s_per_rad=0.0, motor_orders=(), hysteresis=MaxwellSlip(()))
-    torque_nm = mechanics.coulomb_nm + 100.0 * mechanics.viscous_nm_s_per_rad
-    assert not np.any(advance(plant_of(mechanics), 0.2, mechanics.coulomb_nm * 1.29)[:, 0])
-    plant = plant_of(mechanics)
-    plant.state[0]["motor_speed"], plant.state[0]["load_speed"] = 90.0, 90.0 / mechanics.ratio
-    settle_s = mechanics.inertia_kg_m2 / mechanics.viscous_nm_s_per_rad
-    assert advance(plant, 8.0 * settle_s, torque_nm, every=100)[-1, 1] == pytest.approx(100.0, rel=1e-3)
-
-
-def test_gravity_winds_the_spring_up_by_its_torque():
-    mechanics = replace(AXES[0].mechanics, gravity_nm=5.0, hysteresis=MaxwellSlip(()))
-    plant = plant_of(mechanics)
-    motor_deg = 90.0 * mechanics.ratio
-    plant.state[0]["motor"], plant.state[0]["load"] = math.radians(motor_deg), 0.5 * math.pi
-    error_arcsec = (advance(plant, 4.0, brake_nm=1e3)[-1, 2] - 0.5 * math.pi) / ARCSEC
-    wound_arcsec = error_arcsec - static_error_arcsec(mechanics, np.array([motor_deg]))[0]
-    assert wound_arcsec * ARCSEC == pytest.approx(-5.0 / mechanics.stiffness_nm_per_rad, rel=1e-3)

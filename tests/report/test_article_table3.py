@@ -29,24 +29,6 @@ def test_without_quantisation_only_the_exact_inverse_is_perfect(tool):
     assert printed > 3 * load_count
 
 
-@pytest.mark.parametrize(
-    ("name", "value"),
-    [
-        ("root_sum_square_of_the_single_schemes_arcsec", 75.0),
-        ("ramp_per_step_between_ratios_40_and_50_arcsec", 784.1),
-        ("synchronous_peak_to_peak_arcsec", 42.9),
-        ("samples_per_motor_turn", 8.26),
-        ("load_turns_spanned", 0.58),
-        ("relay_jump_arcsec", 80.0),
-        ("first_count_after_reversal_arcsec", 4.9),
-        ("same_in_counts_after_the_ratio", 1.5),
-        ("floor_arcsec", 2.8),
-    ],
-)
-def test_single_figures(figures, name, value):
-    assert figures[name] == pytest.approx(value, abs=0.06)
-
-
 def test_aliased_orders_appear_as_documented(figures):
     assert figures["aliases"]["6"] == pytest.approx(2.26, abs=0.005)
     assert figures["aliases"]["8"] == pytest.approx(0.26, abs=0.005)

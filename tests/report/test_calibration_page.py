@@ -130,13 +130,6 @@ def test_error_is_shown_over_both_angles_in_both_directions(plain):
     assert mean["mean, backward"]["y"][5] == pytest.approx(-30.0, abs=0.6)
 
 
-def test_a_loop_is_interrupted_at_gaps(plain):
-    _, charts = plain
-    measured, predicted = charts["Sine of ±45 deg"]["series"]
-    assert None not in measured["y"]
-    assert [i for i, y in enumerate(predicted["y"]) if y is None] == [200]
-
-
 def test_the_spectrum_shows_the_threshold_over_candidate_orders(plain):
     _, charts = plain
     (chart,) = (each for each in charts.values() if each["y_log"])
@@ -159,20 +152,6 @@ def test_the_line_of_each_order_peaks_at_its_amplitude(order):
     )
     assert alone["x"][np.argmax(alone["y"])] == pytest.approx(order)
     assert max(alone["y"]) == pytest.approx(5.0, rel=0.01)
-
-
-def test_figures_have_the_digits_that_their_interval_allows(plain):
-    text, _ = plain
-    row = re.search(r"synchronous, order 2: amplitude.*?</tr>", text).group(0)
-    assert re.findall(r">([^<>]+)</td>", row) == ["5.000", "0.031", "arcsec"]
-
-
-def test_unknown_values_are_in_brackets(plain):
-    text, _ = plain
-    row = re.search(r"hysteresis: width.*?</tr>", text).group(0)
-    assert "(20)" in row
-    assert "not known" in row
-    assert "In brackets: not determined by these data." in text
 
 
 def test_notes_are_announced_at_the_top_and_escaped(plain):

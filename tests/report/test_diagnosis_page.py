@@ -20,7 +20,6 @@ from hdbridge.axis.effects import (
     Hysteresis,
     Motion,
     MotorOrder,
-    MotorOrders,
     Start,
     Step,
     Synchronous,
@@ -194,11 +193,6 @@ def test_the_page_shows_remedy_and_next_measurement(plain):
     assert "hdbridge diagnose RECORD... --model MODEL.yaml --extend NEW_MODEL.yaml" in text
 
 
-def test_parameters_stand_with_their_interval(plain):
-    row = re.search(r"order 1 amplitude</th>(.*?)</tr>", plain).group(1)
-    assert re.findall(r">([^<>]+)</td>", row) == ["4.031", "0.031", "4.000", "4.062", "arcsec"]
-
-
 def test_examined_and_detectable_causes_are_listed(plain):
     text = words(plain)
     assert "no command (motor_target_deg)" in text
@@ -220,27 +214,6 @@ def test_a_finding_is_drawn_over_its_coordinate_with_its_own_curve(plain):
     assert np.median(bars) == pytest.approx(0.5, rel=0.2)
 
 
-def test_backlash_is_plotted_over_travel_since_the_reversal():
-    chart = charts(page(finding("backlash")))[
-        "Residual without it, over the motor angle since the last reversal"
-    ]
-    assert chart["x_log"] is True
-    way, forward = series(chart, "the finding, forward")
-    backward = series(chart, "the finding, backward")[1]
-    far = way > 100.0
-    assert np.mean(backward[-3:]) - np.mean(forward[far]) == pytest.approx(10.0, rel=0.02)
-
-
-def test_a_cause_that_scales_the_ripple_is_drawn_as_a_scale():
-    found = finding("torque_modulation")
-    chart = charts(page(found))["Change of the ripple, over the load torque, either direction"]
-    torque, percent = series(chart, "the finding")
-    assert percent == pytest.approx(found.effect.growth_percent_per_nm * torque, abs=0.05)
-    measured = series(chart, "measured")[1]
-    spread = np.array(chart["series"][0]["spread"])
-    assert np.all(np.abs(measured - percent) < 5.0 * spread + 0.2)
-
-
 @pytest.mark.parametrize("cause", causes())
 def test_every_cause_has_a_chart(cause):
     text = page(finding(cause))
@@ -248,13 +221,6 @@ def test_every_cause_has_a_chart(cause):
     chart = next(iter(charts(text).values()))
     curves = [each["y"] for each in chart["series"] if each["label"].startswith("the finding")]
     assert max(abs(value) for curve in curves for value in curve) > 0.01
-
-
-def test_changed_orders_are_plotted_as_found():
-    change = MotorOrders(orders=(MotorOrder(order=2, amplitude_arcsec=3.0, phase_deg=90.0),))
-    text = page(finding("motor_order", effect=change))
-    angle, curve = series(charts(text)["Residual without it, over the motor angle"], "the finding, forward")
-    assert curve == pytest.approx(-3.0 * np.sin(np.radians(2.0 * angle)), abs=0.05)
 
 
 def test_unexplained_findings_have_no_name_or_curve():
@@ -283,10 +249,6 @@ def test_no_findings_need_no_action():
     assert "What to do Nothing." in said
     assert "What was found" not in said
     assert "What this record could show" in said
-
-
-def test_a_large_size_has_no_exponent():
-    assert "load_order, 140 arcsec" in diagnosis(finding(peak_arcsec=140.2)).verdict()
 
 
 def test_guesses_are_labelled():

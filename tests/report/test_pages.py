@@ -17,7 +17,6 @@ from hdbridge.report.page import (
     Chart,
     Facts,
     Grid,
-    Level,
     Mark,
     Page,
     Section,
@@ -91,13 +90,6 @@ def test_gaps_do_not_hide_peaks_from_thinning():
     assert np.nanmax(thinned(np.arange(10_000.0), y, 100)[1]) == 7.0
 
 
-def test_a_thinned_cloud_is_about_as_wide_as_the_whole():
-    y = np.random.default_rng(1).normal(size=100_000)
-    x = np.arange(100_000.0)
-    assert np.std(sampled(x, y, 4000)[1]) < 1.8
-    assert np.std(thinned(x, y, 4000)[1]) > 2.0
-
-
 def test_thinned_charts_are_labelled():
     time = np.arange(20_000.0)
     short, long = charts_in(
@@ -121,14 +113,6 @@ def test_charts_keep_the_page_order():
     assert [each["aria-label"][0] for each in holders] == ["a", "b", "c"]
 
 
-def test_levels_and_scales_go_with_their_chart():
-    chart = Chart("c", "x", "y", [Series("s", [0, 1], [0, 5e-7])], levels=[Level("limit", 2.5)], y_log=True)
-    (data,) = charts_in(render(page_of(chart)))
-    assert data["levels"] == [{"label": "limit", "value": 2.5}]
-    assert data["y_log"] is True
-    assert data["series"][0]["y"] == [None, 5e-7]
-
-
 @given(
     st.lists(st.floats(-1e6, 1e6), min_size=1, max_size=300),
     st.lists(st.floats(-1e6, 1e6), max_size=300),
@@ -137,21 +121,6 @@ def test_a_histogram_counts_every_value_once(one, two):
     chart = histogram("c", "x", {"one": [*one, np.nan, np.inf], "two": two})
     assert [sum(each.y) for each in chart.series] == [len(one), len(two)]
     assert {tuple(each.x) for each in chart.series} == {tuple(chart.series[0].x)}
-
-
-def test_a_histogram_of_nothing_is_empty():
-    chart = histogram("c", "x", {"one": []})
-    assert sum(chart.series[0].y) == 0
-    assert render(page_of(chart))
-
-
-def test_columns_of_words_are_not_set_like_figures():
-    table = Table(
-        ["name", "figure", "text"], [["a", 1.5, "passed"], ["b", "(\N{MINUS SIGN}2.5)", "40 of 50"]]
-    )
-    cells = [(tag, attributes.get("class")) for tag, attributes in Reader(render(page_of(table))).tags]
-    body = [kind for tag, kind in cells if tag == "td"]
-    assert body == [None, "words", None, "words"]
 
 
 def test_a_rounded_zero_has_no_sign():
@@ -208,10 +177,3 @@ def test_the_pooled_figures_come_first_and_every_column_of_figures_has_its_unit(
     assert len(columns) == header.count("<th") - 1
     row = re.search(r"<tbody>(.*?)</tbody>", text, re.DOTALL)[1]
     assert re.findall(r"<td>(.*?)</td>", row)[0] == "120.15"
-
-
-def test_without_compensation_the_verdict_mentions_none():
-    results = {Scheme.NONE: SchemeResult.of(outcome([40, 44], [-40, -36]))}
-    text = render(stepping_page("a", results, 2.8, {}))
-    assert "With no compensation, the load's error at rest is 120.15 arcsec" in " ".join(Reader(text).text)
-    assert "article" not in " ".join(Reader(text).text)

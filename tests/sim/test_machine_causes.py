@@ -1,6 +1,5 @@
 """The causes in the simulated axis, each by its physics; the sizes are tested in test_hidden."""
 
-import itertools
 import math
 from pathlib import Path
 from typing import Any
@@ -10,14 +9,13 @@ import pytest
 from support.hidden.elastic import remembering
 from support.keys import with_keys
 
-from hdbridge.sim.encoder import Disc, Late, Losses, Signals
+from hdbridge.sim.encoder import Late
 from hdbridge.sim.exercise import Exercise
 from hdbridge.sim.hysteresis_laws import law_of
 from hdbridge.sim.loaded_plant import LoadedPlant, Spring
 from hdbridge.sim.machine import Machine
 from hdbridge.sim.plant import Plant
 from hdbridge.sim.truth import Dahl, RollingFriction, Truth
-from hdbridge.sim.truth.encoder import TrueDisc, TrueLoss, TrueSignals
 from hdbridge.sim.truth.gear import TrueStiffening
 
 ARTICLE = Path(__file__).parents[2] / "profiles" / "article"
@@ -156,20 +154,6 @@ def test_drag_only_takes_energy_away() -> None:
     assert peaks[-1] < 0.1 * peaks[0]
 
 
-@pytest.mark.parametrize("speed_deg_s", [50.0, 200.0, 700.0])
-def test_viscous_drag_winds_up_by_its_thinned_torque(speed_deg_s: float) -> None:
-    thinning = {"speed_rad_s": 0.05, "exponent": 0.5}
-    truth = axis(load__viscous_nm_s_per_rad=8.0, load__thinning=thinning)
-    machine = Machine(truth, 1)
-    exercise = Exercise(machine)
-    exercise.move(speed_deg_s, speed_deg_s, 3000.0)
-    exercise.hold(0.3)
-    exercise.lead(lambda seconds: speed_deg_s * seconds, 1.0)
-    speed = math.radians(speed_deg_s / 50.0)
-    torque = 8.0 * speed / math.sqrt(1.0 + speed / 0.05)
-    assert error_arcsec(machine) == pytest.approx(-torque / 16_000 * ARCSEC_PER_RAD, rel=0.02)
-
-
 def test_friction_at_rest_holds_more_than_in_motion() -> None:
     held = {}
     for breakaway_nm in (0.5, 2.0):
@@ -221,38 +205,6 @@ def test_an_axis_with_nothing_on_its_load_moves_alike_in_both_plants() -> None:
 # Encoders
 
 
-def test_an_eccentric_disc_reads_e_over_r_once_per_turn() -> None:
-    disc = Disc(TrueDisc(radius_mm=20.0, eccentricity_um=50.0, eccentric_at_deg=30.0, ovality_um=10.0))
-    angles = np.arange(720) / 2.0
-    spectrum = np.fft.rfft([disc.error_deg(each) for each in angles]) / 360.0
-    assert abs(spectrum[1]) == pytest.approx(math.degrees(0.050 / 20.0), rel=1e-3)
-    assert abs(spectrum[2]) == pytest.approx(math.degrees(0.010 / 20.0), rel=1e-2)
-    assert np.max(np.abs(spectrum[3:])) < 1e-5
-    assert disc.error_deg(30.0) == pytest.approx(
-        math.degrees(0.0005) * math.sin(math.radians(60.0)), rel=1e-3
-    )
-
-
-def test_motor_encoder_eccentricity_displaces_the_servo() -> None:
-    truth = axis(motor__encoder__disc={"radius_mm": 20.0, "eccentricity_um": 50.0})
-    machine, _ = moved(truth, 90.0)
-    assert machine.motor_counts == pytest.approx(90.0 * 512_000 / 360.0, abs=2)
-    assert machine.true_motor_deg == pytest.approx(90.0 - math.degrees(0.0025), abs=0.002)
-
-
-def test_signals_err_once_twice_and_four_times_per_line() -> None:
-    for key, order, size in (
-        ("sine_offset", 1, 0.02),
-        ("gain_mismatch", 2, 0.01),
-        ("third_harmonic", 4, 0.02),
-    ):
-        signals = Signals(TrueSignals(lines_per_turn=1000, **{key: 0.02}))
-        angles = np.arange(256) / 256.0 * 0.36
-        spectrum = np.abs(np.fft.rfft([signals.error_deg(each) for each in angles])) / 128.0
-        assert int(np.argmax(spectrum[1:])) + 1 == order
-        assert spectrum[order] == pytest.approx(math.degrees(size) / 1000.0, rel=0.05)
-
-
 @pytest.mark.parametrize("late_s", [0.0002, 0.0005, 0.0013, 0.02])
 def test_a_late_sample_is_the_angle_of_that_time(late_s: float) -> None:
     late = Late(late_s, 0.0005, 0.0)
@@ -268,11 +220,6 @@ def test_a_late_motor_sample_affects_the_bus_but_not_the_loops() -> None:
     assert machines[0].true_motor_deg == machines[1].true_motor_deg
     behind = (machines[0].motor_counts - machines[1].motor_counts) / 512_000 * 360.0
     assert behind == pytest.approx(400.0 * 0.003, rel=0.02)
-
-
-def test_lost_counts_stay_lost() -> None:
-    losses = Losses([TrueLoss(time_s=2.0, counts=-7), TrueLoss(time_s=1.0, counts=3)])
-    assert [losses.counts(each) for each in (0.5, 1.0, 1.5, 2.5, 9.0)] == [0, 3, 3, -4, -4]
 
 
 def test_counts_lost_on_the_motor_move_the_load() -> None:
@@ -294,39 +241,12 @@ def test_a_jumped_tooth_is_a_tooth() -> None:
     assert machine.true_motor_deg == pytest.approx(60.0, abs=0.01)
 
 
-def test_the_gear_creeps_on_after_a_stop_while_the_motor_stands() -> None:
-    elements = [{"time_constant_s": 2.0, "amplitude_arcsec": 8.0}]
-    machine = Machine(axis(gear__creep=elements), 1)
-    exercise = Exercise(machine)
-    exercise.move(7000.0, 700.0, 3000.0)
-    exercise.hold(0.3)
-    motor_deg, errors = machine.true_motor_deg, []
-    for _ in range(4):
-        errors.append(error_arcsec(machine))
-        exercise.hold(2.0)
-    assert errors[0] == pytest.approx(-8.0 * math.exp(-0.3 / 2.0), rel=0.1)
-    for early, late in itertools.pairwise(errors):
-        assert late / early == pytest.approx(math.exp(-1.0), rel=0.05)
-    assert machine.true_motor_deg == pytest.approx(motor_deg, abs=2e-3)
-
-
 def test_the_gear_yields_in_time_to_a_load() -> None:
     elements = [{"time_constant_s": 1.0, "arcsec_per_nm": 2.0}]
     machine, exercise = moved(axis(load__gravity=mass(5.0, 90.0), gear__creep=elements), 1.0)
     exercise.hold(8.0)
     expected = 5.0 * (2.0 + ARCSEC_PER_RAD / 16_000)
     assert error_arcsec(machine) == pytest.approx(expected, rel=0.02)
-
-
-def test_wear_is_lost_motion_and_grows_with_travel() -> None:
-    wear = {"arcsec_per_1000_turns": 1000.0, "exponent": 1.0}
-    machine, exercise = moved(axis(gear__wear=wear), 3600.0)
-    forth = error_arcsec(machine)
-    exercise.move(-360.0, 700.0, 3000.0)
-    exercise.hold(0.5)
-    back = error_arcsec(machine)
-    assert forth == pytest.approx(-10.0, abs=0.2)
-    assert back == pytest.approx(11.0, abs=0.2)
 
 
 def test_hours_of_work_change_loop_and_tooth_error_up_to_a_limit() -> None:
@@ -346,35 +266,6 @@ def test_hours_of_work_change_loop_and_tooth_error_up_to_a_limit() -> None:
     assert error_arcsec(machine) == pytest.approx(-60.0, abs=0.2)
 
 
-def test_a_damaged_tooth_is_met_at_one_load_angle_in_every_turn() -> None:
-    damage = [{"at_deg": 100.0, "width_deg": 4.0, "height_arcsec": 15.0}]
-    _, exercise = moved(axis(gear__damage=damage), 800.0 * 50.0, speed_deg_s=2000.0)
-    readings = exercise.readings()
-    error = (readings.load_deg - readings.motor_deg / 50.0) * 3600.0
-    high = readings.load_deg[error > 10.0]
-    assert {round(each) // 180 for each in high} == {0, 2}
-    assert np.all(np.abs(np.mod(high, 360.0) - 100.0) < 1.5)
-
-
-def test_warmth_changes_tooth_error_friction_and_the_zero() -> None:
-    order = [{"order": 2, "amplitude_arcsec": 10.0, "phase_deg": 0.0}]
-    torques, errors = [], []
-    for start_c in (22.0, 32.0):
-        heat = {
-            "ambient_c": start_c,
-            "reference_c": 22.0,
-            "tooth_growth_per_k": 0.02,
-            "friction_growth_per_k": -0.01,
-        }
-        machine, exercise = moved(axis(gear__motor_orders=order, temperature=heat), 180.0)
-        errors.append(error_arcsec(machine))
-        exercise.lead(lambda seconds: 300.0 * seconds, 0.8)
-        torques.append(float(np.mean(exercise.readings().motor_torque_nm[-100:])))
-    assert errors[0] == pytest.approx(10.0, abs=0.1)
-    assert errors[1] == pytest.approx(12.0, abs=0.1)
-    assert torques[1] == pytest.approx(0.9 * torques[0], rel=0.01)
-
-
 def test_the_surroundings_warm_the_axis_and_the_housing_follows_late() -> None:
     heat = {
         "time_constant_s": 0.5,
@@ -388,18 +279,6 @@ def test_the_surroundings_warm_the_axis_and_the_housing_follows_late() -> None:
         machine.coast(8, braked=True)
     assert machine.temperature_c == pytest.approx(20.0 + 10.0 - 0.5, abs=0.02)
     assert error_arcsec(machine) == pytest.approx(2.0 * (10.0 - 0.5 - 1.0), abs=0.1)
-
-
-def test_the_loop_grows_with_speed_and_settles_back_at_rest() -> None:
-    law = {"law": "maxwell_slip", "elements": [{"limit_arcsec": 20.0, "yield_deg": 2.0}]}
-    rate = {"growth_per_decade": 0.1, "from_deg_s": 1.0, "time_constant_s": 0.1}
-    machine = Machine(axis(gear__hysteresis=law, gear__rate_dependence=rate), 1)
-    exercise = Exercise(machine)
-    exercise.move(90.0, 300.0, 3000.0)
-    exercise.hold(1.0)
-    assert error_arcsec(machine) == pytest.approx(20.0, abs=0.1)
-    exercise.lead(lambda seconds: 99.0 * seconds, 2.0)
-    assert error_arcsec(machine) == pytest.approx(20.0 * 1.2, abs=0.2)
 
 
 @pytest.mark.parametrize("exponent", [0.5, 0.8, 1.0, 1.7])

@@ -66,12 +66,6 @@ def test_the_article_s_law_crosses_from_side_to_side_within_its_width() -> None:
     assert law.advance(-200.0) == -40.0
 
 
-def test_one_motor_count_after_a_reversal_costs_about_5_arcsec() -> None:
-    law = rolling()
-    law.advance(100.0)
-    assert 40.0 - law.advance(100.0 - 0.045) == pytest.approx(4.9, abs=0.05)
-
-
 def test_the_article_s_law_at_exponent_2_is_the_limit_of_its_neighbours() -> None:
     values = []
     for exponent in (1.9999, 2.0, 2.0001):
@@ -86,12 +80,6 @@ def test_the_article_s_law_is_continuous_at_every_reversal() -> None:
     law = rolling()
     trace = along(law, [30, 25, 27, 26.5, 40, 39, 39.5, -30], step_deg=1e-5 * 37)
     assert max(abs(e1 - e0) for (_, e0), (_, e1) in itertools.pairwise(trace)) < 0.3
-
-
-def test_it_starts_where_the_truth_says_and_stays_there_at_rest() -> None:
-    law = rolling(start_arcsec=-12.5)
-    assert law.advance(0.0) == -12.5
-    assert law.advance(0.0) == -12.5
 
 
 @every_law
@@ -156,12 +144,6 @@ def test_maxwell_slip_forgets_closed_excursions(back_deg: float) -> None:
     assert after_an_excursion(maxwell(), back_deg) == pytest.approx(
         after_an_excursion(maxwell(), 0.0), abs=1e-9
     )
-
-
-def test_the_article_s_law_and_bouc_wen_have_no_such_memory() -> None:
-    for make, least_arcsec in ((rolling, 1.0), (bouc_wen, 0.1)):
-        missed = after_an_excursion(make(), 2.0) - after_an_excursion(make(), 0.0)
-        assert abs(missed) > least_arcsec, make.__name__
 
 
 def test_the_article_s_law_forgets_all_but_the_last_reversal() -> None:

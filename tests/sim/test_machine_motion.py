@@ -104,15 +104,6 @@ def test_a_settled_step_stands_at_the_static_law(profile: str) -> None:
             assert axis.machine.motor_counts == axis.target
 
 
-def test_the_load_has_settled_a_tenth_of_a_second_after_the_move() -> None:
-    axis = Axis(truth())
-    for _ in range(6):
-        axis.move(STEP_COUNTS, settle_s=0.1)
-        early = axis.machine.load_counts
-        axis.hold(1.0)
-        assert abs(axis.machine.load_counts - early) <= 1
-
-
 def test_the_time_step_does_not_matter_once_settled() -> None:
     errors = []
     for substep_ms in (1.0, 0.5, 0.25):
@@ -122,25 +113,6 @@ def test_the_time_step_does_not_matter_once_settled() -> None:
         axis.move(STEP_COUNTS)
         errors.append(axis.error_arcsec)
     assert max(errors) - min(errors) < 0.15
-
-
-def test_a_small_reversal_stands_at_the_static_law() -> None:
-    axis = Axis(truth())
-    axis.move(STEP_COUNTS)
-    axis.move(STEP_COUNTS)
-    axis.move(-100)
-    crossed = (100 * DEG_PER_COUNT / 20.0) ** 0.6 - 0.6 * (100 * DEG_PER_COUNT / 20.0)
-    expected = static_arcsec(truth(), axis.target * DEG_PER_COUNT, 1) - 80.0 * crossed / 0.4
-    assert axis.error_arcsec == pytest.approx(expected, abs=0.3)
-
-
-@pytest.mark.parametrize("profile", ["article", "demo"])
-def test_small_alternating_steps_stay_within_half_a_count(profile: str) -> None:
-    axis = Axis(truth(profile))
-    for counts in (300, 7, 1, 1, -1, -2, 9, -30, 60, 2, -5, 13, -100, -4):
-        axis.move(counts, settle_s=0.5)
-        assert axis.overshoot_deg < DEG_PER_COUNT / 2
-        assert axis.machine.motor_counts == axis.target
 
 
 @pytest.mark.parametrize("profile", ["article", "demo"])
@@ -257,15 +229,6 @@ def test_the_encoders_count_whole_counts_in_their_direction_from_their_zero(dire
     assert machine.load_counts == math.floor(direction * machine.true_load_deg * 8000 - 77 + 0.5)
 
 
-def test_the_torque_has_the_sign_of_the_counts() -> None:
-    for direction in (1, -1):
-        machine = Machine(truth(motor__encoder__direction=direction), 1)
-        for cycle in range(50):
-            machine.follow(20 * cycle, 20 * (cycle + 1), 8)
-        assert machine.torque_permille > 80
-        assert machine.velocity_counts_s == pytest.approx(5000.0, rel=0.05)
-
-
 def record(seed: int) -> list[tuple[int, int, int, float, float]]:
     axis = Axis(truth("demo"), seed)
     rows = []
@@ -286,17 +249,6 @@ def test_the_seed_affects_only_load_encoder_noise() -> None:
     assert [row[:1] + row[2:] for row in one] == [row[:1] + row[2:] for row in other]
 
 
-def test_the_noise_of_the_load_encoder_is_as_stated() -> None:
-    axis = Axis(truth("demo", load__encoder__noise_arcsec=2.0))
-    axis.move(STEP_COUNTS, settle_s=0.5)
-    readings = []
-    for _ in range(1000):
-        axis.hold(CYCLE_S)
-        assert axis.machine.load_counts == axis.machine.load_counts
-        readings.append(axis.machine.load_counts * 0.45)
-    assert statistics.pstdev(readings) == pytest.approx(2.0, rel=0.1)
-
-
 def test_friction_warms_the_axis_and_rest_lets_it_cool() -> None:
     known = truth(
         temperature={"ambient_c": 20.0, "resistance_k_per_w": 10.0, "time_constant_s": 0.5},
@@ -308,33 +260,6 @@ def test_friction_warms_the_axis_and_rest_lets_it_cool() -> None:
     assert machine.temperature_c == pytest.approx(20.0 + 10.0 * loss_w, rel=0.01)
     machine.coast(10_000, braked=False)
     assert machine.temperature_c == pytest.approx(20.0, abs=0.01)
-
-
-def test_the_zero_drifts_with_the_temperature_where_the_truth_says_so() -> None:
-    loads = []
-    for drift in (0.0, 3.0):
-        known = truth(
-            temperature__ambient_c=20.0, temperature__start_c=30.0, temperature__zero_drift_arcsec_per_k=drift
-        )
-        machine = Machine(known, 1)
-        start_deg = machine.true_load_deg
-        for _ in range(1500):
-            machine.coast(8, braked=True)
-        loads.append((start_deg, machine.true_load_deg, machine.temperature_c))
-    (plain, _, _), (start, end, end_c) = loads
-    assert (start - plain) * 3600.0 == pytest.approx(30.0)
-    assert 29.0 < end_c < 30.0
-    assert (end - plain) * 3600.0 == pytest.approx(3.0 * (end_c - 20.0), abs=0.01)
-
-
-def test_load_and_flexspline_orders_are_seen_at_their_own_angles() -> None:
-    one = [{"order": 1, "amplitude_arcsec": 30.0, "phase_deg": 0.0}]
-    for key, angle in (("load_orders", 1 / 50), ("flexspline_orders", 1 + 1 / 50)):
-        known = truth(gear__motor_orders=[], gear__hysteresis=None, **{f"gear__{key}": one})
-        axis = Axis(known)
-        axis.move(50 * 8000 // 3, settle_s=0.3)
-        expected = 30.0 * math.cos(math.radians(axis.target * DEG_PER_COUNT * angle))
-        assert axis.error_arcsec == pytest.approx(expected, abs=0.2)
 
 
 @pytest.mark.parametrize(

@@ -57,15 +57,6 @@ def test_marker_before_command_line_before_ini_file(session, pytester):
     done.stdout.fnmatch_lines(["*got True*'article', on lockstep*"])
 
 
-def test_a_module_marker_gives_defaults(session):
-    text = (
-        "import pytest\n"
-        "pytestmark = pytest.mark.hdbridge_drive(profile='article', bus='lockstep')\n"
-        "@pytest.mark.hdbridge_drive(profile='demo')\n"
-    )
-    session(text + show("ratio"), "-s").stdout.fnmatch_lines(["*'demo', on lockstep*"])
-
-
 def test_two_tests_have_two_drives(session):
     text = """
         import pytest
@@ -148,14 +139,6 @@ def test_a_wrong_call_is_reported_at_the_line_of_the_test(session):
     done = session("def test_it(hdbridge_drive):\n    hdbridge_drive.fault('encoder_jmp')\n")
     done.stdout.fnmatch_lines([">*hdbridge_drive.fault('encoder_jmp')", "E *did you mean 'encoder_jump'*"])
     assert "def find" not in done.stdout.str()
-
-
-def test_pytest_lists_fixture_marker_and_options(session):
-    session(PASSES, "--fixtures").stdout.fnmatch_lines(
-        ["hdbridge_drive*", "*A simulated CiA-402 drive on a bus*"]
-    )
-    session(PASSES, "--markers").stdout.fnmatch_lines(["@pytest.mark.hdbridge_drive(*"])
-    session(PASSES, "--help").stdout.fnmatch_lines(["*--hdbridge-bus=BUS*"])
 
 
 def test_a_bus_left_open_is_harmless(session):

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from support.api import TOKEN
 
 from hdbridge.daemon.api.policy import DEPTH_MAXIMUM, Policy, too_deep
-from hdbridge.daemon.api.sockets import tcp_socket, unix_socket
+from hdbridge.daemon.api.sockets import unix_socket
 from hdbridge.errors import DaemonError, InputError
 
 
@@ -55,11 +55,6 @@ def test_an_unknown_group_is_refused_and_a_known_one_owns_the_socket(tmp_path):
     own = grp.getgrgid(os.getgid())
     with unix_socket(path, group=own.gr_name):
         assert path.stat().st_gid == own.gr_gid
-
-
-def test_a_port_in_use_is_reported(api):
-    with pytest.raises(DaemonError, match="another process"):
-        tcp_socket(api.port)
 
 
 @pytest.mark.parametrize(

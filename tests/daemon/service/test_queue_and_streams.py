@@ -216,16 +216,3 @@ def test_coordinated_axes_arrive_together(tmp_path: Path) -> None:
 
     with stepped_service(tmp_path, axes=2) as service:
         play(story(service))
-
-
-def test_one_axis_stopped_stops_the_coordinated_move(tmp_path: Path) -> None:
-    async def story(service: Service) -> None:
-        async with service.enabled() as (bridge, token):
-            await bridge.coordinated(token, {"axis1": 80.0, "axis2": -80.0}, wait=False)
-            await bridge.core.timing.sleep(0.5)
-            await bridge.axes["axis2"].stop()
-            await until(bridge, lambda: all(each.state().at_rest for each in bridge.axes.values()), 3.0)
-            assert bridge.axes["axis1"].state().load_target_deg < 75.0
-
-    with stepped_service(tmp_path, axes=2) as service:
-        play(story(service))

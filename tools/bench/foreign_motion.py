@@ -1,7 +1,7 @@
 """Figures of the compensation in motion.
 
-    PYTHONPATH=tests python -m foreign.motion FILE [--kinds KIND...] [--seeds 0-4] [--exact]
-    PYTHONPATH=tests python -m foreign.motion FILE --retuned [--seeds 0-4]
+    PYTHONPATH=tests python tools/bench/foreign_motion.py FILE [--kinds KIND...] [--seeds 0-4] [--exact]
+    PYTHONPATH=tests python tools/bench/foreign_motion.py FILE --retuned [--seeds 0-4]
 
 Each axis is calibrated by `PLAN` with a motion test, and nothing is known beforehand. With ``--exact`` its
 model is the exact correction of rest, and only the response is measured. Then the error of the load is
