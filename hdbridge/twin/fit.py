@@ -30,13 +30,13 @@ from hdbridge.sim.truth.motor import TrueNotch, TrueObserver
 from hdbridge.twin.misfit import (
     CHANNELS,
     FINE,
+    NOISE_LEVEL,
     Data,
     Replays,
     Scales,
     Values,
     counted,
     expected,
-    least_deviation,
     misfit,
     noise_in_motion,
     rooted,
@@ -919,8 +919,6 @@ NEAR_STEPS = 30
 """Maximum steps over the whole recording with the expected noise."""
 STEPS = 30
 """Maximum steps of the final fit."""
-MORE = 1.1
-"""Ratio to the true axis's residuals above which a fit leaves more; a scale is not known better than that."""
 OPTIONAL = (
     "velocity feed-forward", "load friction", "temperature", "current limit", "motor encoder delay",
     "encoder coupling", "friction growth", "moving average", *LOOP,
@@ -1029,15 +1027,15 @@ def _in_best_minimum(replays: Replays, best: Fitted, begun: Truth, most: Scales)
     This comes after the other parameters are known, because at the start of the fit these places were equally
     good.
     """
-    few, noise = replays.rough, expected(replays.rough.data)
-    least = least_deviation(replays.data) | {LOAD: noise.deviation[LOAD]}
+    data, few = replays.data, replays.rough
+    noise = noise_in_motion(data)
     while True:
         # Always tried: exchanged gains differ only at rest, which a few legs hardly show, and a dead time in
         # the next substep increases the residuals too little for any channel to show it.
         places = [exchanged(best.truth), *neighbours(best.truth)]
-        if any(best.scales.deviation[name] > MORE * least[name] for name in CHANNELS):
+        if any(each.times_noise > NOISE_LEVEL for each in what_is_left(data, best.residuals, noise)):
             tried = [(each, best.parameters) for each in elsewhere(best.truth, begun)]
-            places.append(by_halving(few, tried, noise).truth)
+            places.append(by_halving(few, tried, expected(few.data)).truth)
         last = best
         for place in places:
             other = continued(replays, best, MORE_STEPS, most, place)
