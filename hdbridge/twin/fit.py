@@ -30,14 +30,13 @@ from hdbridge.sim.truth.motor import TrueNotch, TrueObserver
 from hdbridge.twin.misfit import (
     CHANNELS,
     FINE,
+    NOISE_LEVEL,
     Data,
-    Piece,
     Replays,
     Scales,
     Values,
     counted,
     expected,
-    least_deviation,
     misfit,
     noise_in_motion,
     rooted,
@@ -65,119 +64,33 @@ from hdbridge.twin.parameters import (
     with_values,
 )
 from hdbridge.twin.replay import MOVING_DEG_S, demand_deg
-from hdbridge.units import ARCSEC_PER_DEG
 
 # ----------------------------------------------------------------
-# Start values: linear regressions on the recordings, without replays.
-#
-# For any spring and loops, the motor's torque is the sum of its inertia times its acceleration, the load's
-# divided by the ratio, Coulomb friction times the sign of the speed, and viscous friction times the speed.
-# The load's acceleration comes from its own encoder, because it does not follow the command near its
-# resonance. The motor inertia is in the regression but not used: the motor accelerates in the first
-# milliseconds after a new demand, and the torque is recorded at the end of the cycle. The following error
-# at constant speed is the speed times the age of the demand. The highest torque, if held for several rows,
-# may be the drive's limit.
+# Start values that the recordings show without replays.
 
-SMOOTHED_S = 0.03
-"""Averaging time of all signals: without it, quantised angles give no usable acceleration."""
+FILTER, DEAD_TIME = BY_NAME["command filter"], BY_NAME["servo dead time"]
+LIMIT: Final = BY_NAME["current limit"]
 HELD_ROWS = 3
 """Minimum rows at the highest torque for a limit; a mere peak lasts one or two."""
-LEAST_ROWS = 50
-LEAST_SHARE = 0.15
-"""Maximum relative standard error of a coefficient that is used: a fifth of the prior's width."""
-
-
-def read_off(data: Data) -> dict[str, float]:
-    """Returns the values that the regressions over all pieces show, by name.
-
-    ``lag_s`` is the age of the demand, following error over speed; ``held_nm`` the highest motor torque if it
-    is held while the motor moves.
-    """
-    found = _mechanics(data) | {"lag_s": _lag_s(data), "held_nm": _held_nm(data)}
-    return {name: value for name, value in found.items() if value is not None}
+LATEST_S = 0.1
+"""Maximum age of the demand."""
 
 
 def start_of(truth: Truth, data: Data) -> Truth:
-    """Returns the truth with the values that the regressions give."""
-    found = read_off(data)
-    values: dict[str, float] = {
-        name: found[name] for name in ("Coulomb friction", "viscous friction") if name in found
-    }
-    load, servo = truth.load_, truth.servo
-    if "load inertia" in found:
-        # Spring and damping are scaled to keep the resonance frequency of the start.
-        scale = found["load inertia"] / load.whole_inertia_kg_m2
-        values["load inertia"] = load.inertia_kg_m2 * scale
-        values["gear stiffness"] = truth.gear.stiffness_nm_per_rad * scale
-        values["gear damping"] = truth.gear.damping_nm_s_per_rad * scale
-    held_percent = 100.0 * found.get("held_nm", math.inf) / truth.motor.rated_torque_nm
+    """Returns the truth with the age of the demand, and with the highest torque as its limit if held."""
+    servo, values = truth.servo, dict[str, float]()
+    held_percent = 100.0 * _held_nm(data) / truth.motor.rated_torque_nm
     if held_percent < min(servo.torque_limit_percent, data.axis.limits.torque_percent):
-        values["current limit"] = held_percent
-    if "lag_s" in found:
-        dead_ms = 1e3 * found["lag_s"] - 2.0 * servo.command_filter_ms
-        values["servo dead time"] = max(dead_ms, 0.0)
-        if dead_ms < 0.0:
-            values["command filter"] = max(500.0 * found["lag_s"], 0.1)
+        values[LIMIT.name] = held_percent
+    lag_ms = 1e3 * lag_s(data)
+    if lag_ms > 0.0:
+        filter_ms = min(servo.command_filter_ms, max(0.5 * lag_ms, FILTER.least))
+        values |= {FILTER.name: filter_ms, DEAD_TIME.name: max(lag_ms - 2.0 * filter_ms, 0.0)}
     return with_values(truth, values)
 
 
-def _mechanics(data: Data) -> dict[str, float | None]:
-    """Returns those of load inertia, Coulomb and viscous friction that the motion shows."""
-    tables, torques = zip(*(_torques(piece, data) for piece in data.pieces), strict=True)
-    table, torque = np.concatenate(tables), np.concatenate(torques)
-    if not table[:, -1].any():
-        table = table[:, :-1]
-    if len(torque) <= LEAST_ROWS:
-        return {}
-    columns = list(table.T)
-    found = _slope(torque, columns, LEAST_SHARE)
-    if found and (found[0] is None or found[0] <= 0.0):
-        # The motor inertia is not visible: estimate the load's without it.
-        found = [None, *(_slope(torque, columns[1:], LEAST_SHARE) or ())]
-    names = ("load inertia", "Coulomb friction", "viscous friction")
-    return {
-        name: value
-        for name, value in zip(names, (found or [])[1:4], strict=False)
-        if value is not None and value > 0.0
-    }
-
-
-def _torques(piece: Piece, data: Data) -> tuple[FloatArray, FloatArray]:
-    """Returns the regressors of the motor's torque, shape (n, 5), and the torque, shape (n,).
-
-    The regressors are the accelerations of motor and load (the latter seen by the motor), direction, speed,
-    and a constant for the weight, which is unknown unless the torque on the load is recorded.
-    """
-    commands, truth = piece.commands, data.base
-    cycle_s, ratio = commands.cycle_s, truth.gear.ratio
-    width = _width(cycle_s)
-    motor = np.radians(demand_deg(commands, data.axis) - piece.measured[FOLLOWING])
-    load = np.radians(piece.measured[LOAD] / ARCSEC_PER_DEG)
-    torque = piece.measured[TORQUE]
-    weighs = np.ones(len(motor))
-    if commands.told_nm is not None:
-        weighs = np.zeros(len(motor))
-        cycles = np.arange(len(commands.told_nm) - commands.lead)
-        told = np.interp(commands.row_cycles, cycles, commands.told_nm[commands.lead :])
-        torque = torque + truth.load_.torque_sense * told / ratio
-    speed = _smoothed(np.gradient(motor, cycle_s), 3)
-    direction = np.sign(speed) * (np.abs(speed) > math.radians(MOVING_DEG_S))
-    # A linear law holds between signals that passed the same filter.
-    accelerations = [
-        np.gradient(np.gradient(_smoothed(each, width), cycle_s), cycle_s) for each in (motor, load)
-    ]
-    columns = [
-        accelerations[0], accelerations[1] / ratio, _smoothed(direction, width), _smoothed(speed, width),
-        weighs,
-    ]  # fmt: skip
-    counts = (piece.counts[TORQUE] > 0.0).astype(np.float64)
-    counts[:width] = counts[-width:] = 0.0
-    whole = _smoothed(counts, width + 2) > 1.0 - 1e-9
-    return np.stack(columns, axis=1)[whole], _smoothed(torque, width)[whole]
-
-
-def _held_nm(data: Data) -> float | None:
-    """Returns the highest torque if it is held for `HELD_ROWS`; rows at standstill do not count."""
+def _held_nm(data: Data) -> float:
+    """Returns the highest torque if it is held for `HELD_ROWS`, else infinity; without rows at standstill."""
     told = [np.abs(piece.measured[TORQUE]) * (piece.counts[TORQUE] > 0.0) for piece in data.pieces]
     highest = max(float(np.max(each)) for each in told)
     for each in told:
@@ -185,58 +98,25 @@ def _held_nm(data: Data) -> float | None:
         first, end = np.flatnonzero(np.diff(there) > 0.0), np.flatnonzero(np.diff(there) < 0.0)
         if highest > 0.0 and np.any(end - first >= HELD_ROWS):
             return highest
-    return None
+    return math.inf
 
 
-def _lag_s(data: Data) -> float | None:
-    """Returns the ratio of following error and speed of the command."""
-    lag: list[float | None] | None = None
+def lag_s(data: Data) -> float:
+    """Returns the age of the demand: the ratio of following error and speed of the delayed command."""
+    lag = 0.0
     for _ in range(2):  # the second time with the command delayed by the lag
-        late_s = min(max((lag and lag[0]) or 0.0, 0.0), 0.1)
-        speeds, followings = [], []
+        products = squares = 0.0
         for piece in data.pieces:
             commands = piece.commands
-            demand, width = demand_deg(commands, data.axis), _width(commands.cycle_s)
-            late = np.interp(commands.row_cycles - late_s / commands.cycle_s, commands.row_cycles, demand)
-            speeds.append(np.gradient(_smoothed(late, width), commands.cycle_s))
-            followings.append(_smoothed(piece.measured[FOLLOWING], width))
-        speed, following = np.concatenate(speeds), np.concatenate(followings)
-        moving = np.abs(speed) > MOVING_DEG_S
-        lag = _slope(following[moving], [speed[moving]])
-    return lag[0] if lag else None
-
-
-def _width(cycle_s: float) -> int:
-    """Returns the number of rows to average."""
-    return max(3, round(SMOOTHED_S / cycle_s))
-
-
-def _smoothed(column: FloatArray, width: int) -> FloatArray:
-    """Smooths a column with a Hann window; the ends are held."""
-    window = np.hanning(width + 2)[1:-1]
-    window /= window.sum()
-    left, right = (width - 1) // 2, width // 2
-    return np.convolve(np.pad(column, (left, right), mode="edge"), window, mode="valid")
-
-
-def _slope(
-    wanted: FloatArray, columns: list[FloatArray], least_share: float = math.inf
-) -> list[float | None] | None:
-    """Fits coefficients by least squares; None for one whose relative standard error is too large."""
-    if len(wanted) <= 2 * len(columns):
-        return None
-    table = np.stack(columns, axis=1)
-    size = np.linalg.norm(table, axis=0)
-    if not np.all(size > 0.0):
-        return None
-    scaled = table / size
-    values, *_ = np.linalg.lstsq(scaled, wanted, rcond=None)
-    left = wanted - scaled @ values
-    spread = math.sqrt(float(left @ left) / (len(wanted) - len(columns)))
-    covariance = np.linalg.pinv(scaled.T @ scaled)
-    errors = spread * np.sqrt(np.maximum(np.diag(covariance), 0.0))
-    known = errors <= least_share * np.abs(values)
-    return [float(value) if sure else None for value, sure in zip(values / size, known, strict=True)]
+            demand, late = demand_deg(commands, data.axis), commands.row_cycles - lag / commands.cycle_s
+            speed = np.gradient(np.interp(late, commands.row_cycles, demand), commands.cycle_s)
+            speed = np.where(np.abs(speed) > MOVING_DEG_S, speed, 0.0)
+            products, squares = (
+                products + float(speed @ piece.measured[FOLLOWING]),
+                squares + float(speed @ speed),
+            )
+        lag = min(max(products / squares, 0.0), LATEST_S) if squares else 0.0
+    return lag
 
 
 # ----------------------------------------------------------------
@@ -388,13 +268,10 @@ NEARER = 0.1
 """Factor by which such a difference is shortened."""
 ROUND = 4
 """Steps between two estimates of the residuals' scales."""
-SETTLED = 3
-"""Number of successive rounds without a gain that ends a fit. After each, the differences become `WIDE` times
-as long, because short ones mislead if a motor sticks (implicit filtering; Kelley, SIAM 2011)."""
 EDGE = 1e-6
 """Distance to the bounds, in spreads, that `scipy.optimize.least_squares` needs about a place."""
 WORTH = 1.0
-"""Minimum drop of half the sum of squares that counts as a gain."""
+"""Drop of half the sum of squares in a round below which a fit ends."""
 SOFT = 4.0
 """Residual, in scales, above which it counts less: a motor that slips elsewhere is not evidence."""
 
@@ -474,8 +351,6 @@ class _Problem:
         self.low, self.high = np.array([each.bounds for each in parameters]).T
         self.along: FloatArray | None = None
         """Latest slopes, which give the directions of the next differences."""
-        self.longer = 1.0
-        """Factor of the differences' length."""
         self.scale = Scales({})
         self._found: dict[bytes, dict[str, FloatArray]] = {}
 
@@ -493,11 +368,7 @@ class _Problem:
 
     def slopes(self, place: FloatArray, *, wide: bool = False) -> FloatArray:
         """Returns the derivatives of `residuals` by the coordinates in spreads, shape (n + p, p)."""
-        moves = (
-            np.diag(STEP * self.spread)
-            if self.along is None
-            else _moves(self.along, self.spread, self.longer)
-        )
+        moves = np.diag(STEP * self.spread) if self.along is None else _moves(self.along, self.spread)
         now = self.scale.scaled(self.found(place))[self._rows]
         slopes = slopes_at(self._scaled, now, place, moves, (self.low, self.high), wide=wide)
         self.along = slopes * counting(now, self.scale, self._rows)[1][:, None]
@@ -572,24 +443,22 @@ def solve(
     prior = place if prior is None else prior
     problem = _Problem(replays, start, parameters, prior, rows)
     problem.along = None if near is None else near.jacobian
-    idle = done = 0
+    done = 0
     while True:
         found = problem.found(place)
         problem.scale = known if known is not None else scales(data, found, most)
-        if done >= steps or idle == SETTLED:
+        if done >= steps:
             break
         if known is not None and tempered:
             problem.scale = _tempered(known, found, rows)
-        before, problem.longer = problem.residuals(place), WIDE**idle
+        before = problem.residuals(place)
         taken = min(ROUND, steps - done)
         place = problem.stepped(place, taken)
         after = problem.residuals(place)
-        idle = idle + 1 if 0.5 * float(before @ before - after @ after) < WORTH else 0
-        done += taken
+        done = done + taken if 0.5 * float(before @ before - after @ after) >= WORTH else steps
     left = softened(found, problem.scale, rows)
     slopes, covariance = problem.along, np.diag(problem.spread**2)
     if linear or slopes is None:
-        problem.longer = 1.0
         slopes = problem.slopes(place, wide=wide)[: -len(parameters)] / problem.spread
         covariance = sandwich(slopes, left, legs_of_rows(data, rows), problem.spread)
     truth = at_coordinates(start, parameters, place.tolist())
@@ -677,13 +546,10 @@ def slopes_at(
     return np.asarray((np.linalg.pinv(np.stack(ends) - place) @ changes).T, dtype=np.float64)
 
 
-def _moves(slopes: FloatArray, spread: FloatArray, times: float = 1.0) -> FloatArray:
-    """Returns difference steps along the principal directions that change the residuals by `RESPONSE`.
-
-    ``times`` multiplies their length.
-    """
+def _moves(slopes: FloatArray, spread: FloatArray) -> FloatArray:
+    """Returns difference steps along the principal directions that change the residuals by `RESPONSE`."""
     worth, directions = eigen(slopes, spread)
-    far = np.minimum(times * RESPONSE / np.sqrt(worth), FARTHEST)
+    far = np.minimum(RESPONSE / np.sqrt(worth), FARTHEST)
     moves: FloatArray = (directions * far).T * spread
     return moves
 
@@ -860,7 +726,6 @@ def more_blocks(best: Fitted) -> Iterator[Start]:
 # ----------------------------------------------------------------
 # Places at which a fit may have another minimum.
 
-FILTER, DEAD_TIME = BY_NAME["command filter"], BY_NAME["servo dead time"]
 FREQUENCIES_HZ = (11.0, 16.0, 23.0, 33.0, 48.0, 70.0, 100.0)
 """Start values of the load's resonance frequency, because a fit finds only the nearest minimum."""
 FILTER_SHARES = (0.25, 0.5, 0.75, 0.9)
@@ -966,7 +831,6 @@ LAST: Final = (
     ("friction's rise at rest", "Stribeck speed"),
 )
 """Groups of optional parameters; each is added as a whole or not at all."""
-LIMIT: Final = BY_NAME["current limit"]
 EARNED = 8.0
 """Minimum log likelihood ratio for adding parameters or for leaving the start's minimum: exp(8) to one."""
 SURE = 4.0
@@ -1057,8 +921,6 @@ NEAR_STEPS = 30
 """Maximum steps over the whole recording with the expected noise."""
 STEPS = 30
 """Maximum steps of the final fit."""
-MORE = 1.1
-"""Ratio to the true axis's residuals above which a fit leaves more; a scale is not known better than that."""
 OPTIONAL = (
     "velocity feed-forward", "load friction", "temperature", "current limit", "motor encoder delay",
     "encoder coupling", "friction growth", "moving average", *LOOP,
@@ -1167,15 +1029,15 @@ def _in_best_minimum(replays: Replays, best: Fitted, begun: Truth, most: Scales)
     This comes after the other parameters are known, because at the start of the fit these places were equally
     good.
     """
-    few, noise = replays.rough, expected(replays.rough.data)
-    least = least_deviation(replays.data) | {LOAD: noise.deviation[LOAD]}
+    data, few = replays.data, replays.rough
+    noise = noise_in_motion(data)
     while True:
         # Always tried: exchanged gains differ only at rest, which a few legs hardly show, and a dead time in
         # the next substep increases the residuals too little for any channel to show it.
         places = [exchanged(best.truth), *neighbours(best.truth)]
-        if any(best.scales.deviation[name] > MORE * least[name] for name in CHANNELS):
+        if any(each.times_noise > NOISE_LEVEL for each in what_is_left(data, best.residuals, noise)):
             tried = [(each, best.parameters) for each in elsewhere(best.truth, begun)]
-            places.append(by_halving(few, tried, noise).truth)
+            places.append(by_halving(few, tried, expected(few.data)).truth)
         last = best
         for place in places:
             other = continued(replays, best, MORE_STEPS, most, place)

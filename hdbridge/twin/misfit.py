@@ -152,30 +152,19 @@ def coarse(data: Data, wanted_s: float = COARSE_S) -> Data:
     """Selects pieces of about ``wanted_s`` in total with as many kinds of motion as possible, and then with
     different temperatures.
     """
-    pieces = data.pieces
-    lengths_s, left = [_replayed_s(each) for each in pieces], list(range(len(pieces)))
-    left.sort(key=lambda each: lengths_s[each])
-    taken: list[int] = []
+    pieces, left, taken = data.pieces, [*range(len(data.pieces))], list[int]()
+    begun = [each.commands.start_c for each in pieces]
+    warm_c = [0.0 if None in begun or each is None else each for each in begun]
 
-    def fits(place: int) -> bool:
-        return sum(lengths_s[each] for each in (*taken, place)) <= wanted_s
-
-    while left:
+    def worth(place: int) -> tuple[int, float, float]:
         seen = WITHOUT_MOTION.union(*(pieces[each].kind for each in taken))
-        place = max(left, key=lambda each: (len({*pieces[each].kind} - seen), -lengths_s[each]))
-        if taken and seen.issuperset(pieces[place].kind):
-            break
-        left.remove(place)
-        if not taken or fits(place):
-            taken.append(place)
-    warm_c = np.array([each.commands.start_c for each in pieces], dtype=np.float64)
-    left = sorted({*range(len(pieces))} - {*taken}, key=lambda each: lengths_s[each])
-    near_k = np.min(np.abs(warm_c[:, None] - warm_c[taken]), axis=1)
+        apart_k = min((abs(warm_c[place] - warm_c[each]) for each in taken), default=0.0)
+        return len({*pieces[place].kind} - seen), apart_k, -_replayed_s(pieces[place])
+
     while left:
-        # The piece that differs most in temperature from those before it, or the shortest.
-        place = left.pop(0 if np.isnan(warm_c).any() else int(np.argmax(near_k[left])))
-        near_k = np.minimum(near_k, np.abs(warm_c - warm_c[place]))
-        if fits(place):
+        place = max(left, key=worth)
+        left.remove(place)
+        if not taken or sum(_replayed_s(pieces[each]) for each in (*taken, place)) <= wanted_s:
             taken.append(place)
     return replace(data, pieces=tuple(pieces[each] for each in sorted(taken)))
 
@@ -280,14 +269,9 @@ def smooth(truth: Truth) -> Truth:
         }
     )
     encoder = motor.model_copy(update={"interpolation": steps})
-    return silent(truth).model_copy(
+    return with_load_encoder(truth, noise_arcsec=0.0).model_copy(
         update={"motor": truth.motor.model_copy(update={"encoder": encoder}), "servo": loops}
     )
-
-
-def silent(truth: Truth) -> Truth:
-    """Returns the truth without noise."""
-    return with_load_encoder(truth, noise_arcsec=0.0)
 
 
 def _piece(

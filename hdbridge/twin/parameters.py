@@ -72,7 +72,8 @@ _LOOPS = "slow sines of several amplitudes, some smaller than the width"
 
 FRICTION: Final = "friction"
 SERVO: Final = "servo gains"
-FEEDFORWARD: Final = "feed-forward"
+INERTIA_FEEDFORWARD: Final = "inertia feed-forward"
+FRICTION_FEEDFORWARD: Final = "friction feed-forward"
 ELASTIC: Final = "elastic loop"
 
 PARAMETERS: Final[tuple[Parameter, ...]] = (
@@ -110,18 +111,18 @@ PARAMETERS: Final[tuple[Parameter, ...]] = (
         linear=True),
     Parameter("observer inertia", "servo.observer.inertia_kg_m2", "kg m2", 1e-9, 10.0, 0.7, 0.3, SERVO,
         _STEPS),
-    Parameter("velocity feed-forward", "servo.velocity_feedforward", "", 0.0, 1.5, 0.1, 0.03, FEEDFORWARD,
-        _SPEEDS, linear=True),
+    Parameter("velocity feed-forward", "servo.velocity_feedforward", "", 0.0, 1.5, 0.1, 0.03,
+        "velocity feed-forward", _SPEEDS, linear=True),
     Parameter("inertia feed-forward", "servo.inertia_feedforward_kg_m2", "kg m2", 1e-9, 10.0, 0.7, 0.2,
-        FEEDFORWARD, _STEPS),
+        INERTIA_FEEDFORWARD, _STEPS),
     Parameter("load feed-forward", "servo.load_feedforward.inertia_kg_m2", "kg m2", 1e-9, 10.0, 0.7, 0.2,
-        FEEDFORWARD, _STEPS),
+        INERTIA_FEEDFORWARD, _STEPS),
     Parameter("load feed-forward frequency", "servo.load_feedforward.frequency_hz", "Hz", 1.0, 500.0, 0.7,
-        0.2, FEEDFORWARD, _STEPS),
+        0.2, INERTIA_FEEDFORWARD, _STEPS),
     Parameter("viscous feed-forward", "servo.viscous_feedforward_nm_s_per_rad", "Nm s/rad", 1e-9, 100.0, 0.7,
-        0.5, FEEDFORWARD, _SPEEDS),
+        0.5, FRICTION_FEEDFORWARD, _SPEEDS),
     Parameter("friction feed-forward", "servo.friction_feedforward_nm", "Nm", 1e-6, 1e3, 0.7, 0.2,
-        FEEDFORWARD, _REVERSALS),
+        FRICTION_FEEDFORWARD, _REVERSALS),
     Parameter("servo dead time", "servo.dead_time_ms", "ms", 0.0, 20.0, 2.0, 0.3, "servo dead time", _SINES,
         linear=True),
     Parameter("load encoder delay", "load.encoder.late_ms", "ms", 0.0, 20.0, 2.0, 0.3, "load encoder delay",

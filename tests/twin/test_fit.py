@@ -29,7 +29,6 @@ from hdbridge.twin.fit import (
     lags,
     neighbours,
     principal,
-    read_off,
     sandwich,
     slopes_at,
     solve,
@@ -80,19 +79,6 @@ def test_a_nearly_unstable_simulation_informs_one_direction_only() -> None:
 
 DEMO = Path(__file__).parents[2] / "profiles" / "demo"
 AXIS = AxisConfig.load(DEMO)
-VISCOUS = with_values(Truth.load(DEMO), {"viscous friction": 5e-4})
-
-
-def test_with_known_weight_one_direction_suffices_for_friction() -> None:
-    """Friction has one sense there; a weight of which nobody knows would be as good a reason for it."""
-
-    def one_way(bench: Exercise) -> None:
-        bench.hold(0.6)
-        bench.move(900.0, 1200.0, 6000.0)
-
-    found = read_off(prepare(Recording(record_of(VISCOUS, one_way), axis="demo", ratio=50.0), AXIS, VISCOUS))
-    assert found["Coulomb friction"] == pytest.approx(VISCOUS.motor.coulomb_nm, rel=0.1)
-    assert found["viscous friction"] == pytest.approx(VISCOUS.motor.viscous_nm_s_per_rad, rel=0.2)
 
 
 Rows = NDArray[np.float64]

@@ -20,7 +20,7 @@ from hdbridge.motion.procedures.stepping import Stepping
 from hdbridge.records.recording import Recording
 from hdbridge.sim.truth import Truth
 from hdbridge.twin.check import Check, check
-from hdbridge.twin.fit import read_off, solve
+from hdbridge.twin.fit import lag_s, solve
 from hdbridge.twin.misfit import (
     CHANNELS,
     Replays,
@@ -84,11 +84,9 @@ def test_torque_counts_after_the_motor_leaves_its_initial_state() -> None:
     assert counts[(travelled_deg > 61.0) & (travelled_deg < 0.9 * travelled_deg[-1])].any()
 
 
-def test_regressions_estimate_inertia_friction_and_lag() -> None:
-    found = read_off(prepare(recorded(), AXIS, TRUTH))
-    assert found["load inertia"] == pytest.approx(TRUTH.load_.inertia_kg_m2, rel=0.2)
-    assert found["Coulomb friction"] == pytest.approx(TRUTH.motor.coulomb_nm, rel=0.02)
-    assert found["lag_s"] == pytest.approx(2e-3 * TRUTH.servo.command_filter_ms, rel=0.1)
+def test_the_age_of_the_demand_is_read_from_the_recording() -> None:
+    found = lag_s(prepare(recorded(), AXIS, TRUTH))
+    assert found == pytest.approx(2e-3 * TRUTH.servo.command_filter_ms, rel=0.1)
 
 
 def test_least_squares_lead_from_wrong_values_to_the_true_ones() -> None:
