@@ -56,6 +56,8 @@ class Swing:
     damping: float
     does_arcsec: FloatArray
     """Error caused by the swing in each sample, shape (n,)."""
+    waves_arcsec2: FloatArray
+    """Squared amplitudes of the part in waves too fast for the sampling, shape (n,)."""
 
     def remark(self) -> str:
         """Describes it for the report."""
@@ -95,7 +97,7 @@ def swing(
     band[2, 0:-2:2], band[1, 1:-1:2] = -own, -cross
     band[3, 0:-2:2], band[2, 1:-1:2] = cross, -other
     state = solve_banded((3, 0), band, right, overwrite_ab=True, overwrite_b=True, check_finite=False)
-    return Swing(frequency_hz, damping, state[::2])
+    return Swing(frequency_hz, damping, state[::2], np.zeros(len(bend)))
 
 
 def bend_of(base_arcsec: FloatArray, step_s: FloatArray, parts: Sequence[slice]) -> FloatArray:
@@ -141,7 +143,9 @@ def seen_swing(full: Samples, effects: Sequence[Effect], scales: Scales) -> Swin
         for each in fast:
             inside = slice(*np.searchsorted(each.rows, (rows.start, rows.stop)))
             part = _Fast(each.rows[inside] - rows.start, each.phasor[inside], each.rad_s[inside])
-            one.does_arcsec[part.rows] += part.does(hertz, damping)
+            does = part.does(hertz, damping)
+            one.does_arcsec[part.rows] += does.real
+            one.waves_arcsec2[part.rows] += np.abs(does) ** 2
         return one
 
     def tried(hertz: float, damping: float) -> float:
@@ -169,10 +173,10 @@ class _Fast(NamedTuple):
     rad_s: FloatArray
     """Angular frequency, signed, shape (k,)."""
 
-    def does(self, frequency_hz: float, damping: float) -> FloatArray:
-        """Returns the load's motion relative to its base, arcsec, shape (k,)."""
+    def does(self, frequency_hz: float, damping: float) -> NDArray[np.complex128]:
+        """Returns the load's motion relative to its base as a phasor, arcsec, shape (k,)."""
         ratio = self.rad_s / (math.tau * frequency_hz)
-        return np.asarray((ratio**2 / (1.0 - ratio**2 + 2j * damping * ratio) * self.phasor).real)
+        return np.asarray(ratio**2 / (1.0 - ratio**2 + 2j * damping * ratio) * self.phasor)
 
 
 def _fast_waves(full: Samples, effects: Sequence[Effect], period_s: float) -> Iterator[_Fast]:
@@ -196,8 +200,8 @@ def without(data: Observed, found: Swing) -> Observed:
 def settled(estimator: Estimator, fitted: Fitted, found: Swing | None) -> Observed:
     """Returns the data without the samples in which more of the swing is unknown than matters.
 
-    The error of a ``found`` swing scales with the wind-up. Its share is regressed on the squares of the
-    residual in motion. The calmest samples always stay. These errors, and those of the turning points, are
+    The error of a ``found`` swing scales with the wind-up and with waves too fast for the sampling. Its share
+    is regressed on the squares of the residual in motion. The calmest samples always stay. These errors, and those of the turning points, are
     in their noise.
     """
     data, weight, unknown = estimator.data, estimator.weight, np.zeros(len(estimator.data.full))
@@ -205,10 +209,11 @@ def settled(estimator: Estimator, fitted: Fitted, found: Swing | None) -> Observ
     if found is not None:
         wind_up = _accelerated(data.full, data.period_s) / (math.tau * found.frequency_hz) ** 2
         moving = (data.points.speed_deg_s != 0.0)[estimator.index]
-        square, size = (fitted.residual / weight)[moving] ** 2, estimator.at_points(wind_up**2)[moving]
+        swung = wind_up**2 + found.waves_arcsec2
+        square, size = (fitted.residual / weight)[moving] ** 2, estimator.at_points(swung)[moving]
         about = size - np.mean(size) if len(size) else size
         share = min(max(float(about @ square) / max(float(about @ about), 1e-300), 0.0), 1.0)
-        unknown = math.sqrt(share) * wind_up
+        unknown = np.sqrt(share * swung)
     most = max(estimator.scales.floor_arcsec, float(np.quantile(unknown[data.full.usable], CALMEST)))
     usable = data.full.usable & (unknown <= most)
     _, turned = estimator.turned(effects, fitted.hypothesis.start)
