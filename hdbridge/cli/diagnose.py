@@ -56,7 +56,7 @@ def command(
         typer.Option(
             "--model",
             metavar="MODEL.yaml|PROFILE",
-            help="Model to test, or its profile. Flight recordings: by default the model that the axis used last.",
+            help="Model to test, or its profile. Flight recordings: else the model used last.",
         ),
     ] = None,
     axis: AxisOption = None,

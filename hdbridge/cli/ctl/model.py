@@ -31,7 +31,7 @@ def model(
         str,
         typer.Argument(
             metavar="VERSION",
-            help="Number in `hdbridge model log`; `pending` commits that one, `active` reads the active one again.",
+            help="Number in `hdbridge model log`; `pending` commits that one, `active` reads it again.",
         ),
     ],
     at: AtOption = None,
