@@ -56,8 +56,7 @@ def command(
         typer.Option(
             "--model",
             metavar="MODEL.yaml|PROFILE",
-            help="Model to test, or the profile whose active model is tested. Default for flight recordings: "
-            "the model that the axis used at their end.",
+            help="Model to test, or its profile. Flight recordings: else the model used last.",
         ),
     ] = None,
     axis: AxisOption = None,

@@ -55,9 +55,7 @@ def command(
         bool,
         typer.Option(
             "--servo",
-            help="Also run at up to 64 % of the speed limit and compare the servo with the model's response "
-            "in "
-            "motion.",
+            help="Also run at up to 64 % of the speed limit and compare the servo with the model's response.",
         ),
     ] = False,
     json_file: JsonOption = None,

@@ -58,9 +58,7 @@ MachineArgument = Annotated[
     str,
     typer.Argument(
         metavar="MACHINE",
-        help="Machine file, its folder, profile (a machine of that one axis), or a bundled one: cell, "
-        "article, "
-        "demo.",
+        help="Machine file, its folder, the profile of a single axis, or a bundled one: cell, article, demo.",
     ),
 ]
 ModelOption = Annotated[

@@ -42,7 +42,7 @@ def command(
         bool,
         typer.Option(
             "--gateway",
-            help="PROFILE is a machine with a gateway: an ideal drive with the bus and objects of that.",
+            help="PROFILE is a machine: an ideal drive with the bus and objects of its gateway.",
         ),
     ] = False,
     axis: GatewayAxisOption = None,

@@ -17,7 +17,7 @@ def leaves(menu):
             yield each
         else:
             for below in each.values():
-                yield from leaves(below)
+                yield from leaves([below] if isinstance(below, str) else below)
 
 
 def test_every_page_is_in_the_menu():

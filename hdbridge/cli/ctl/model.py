@@ -31,8 +31,7 @@ def model(
         str,
         typer.Argument(
             metavar="VERSION",
-            help="Its number in `hdbridge model log`; `pending` commits the one that waits, `active` reads "
-            "the active one again.",
+            help="Number in `hdbridge model log`; `pending` commits that one, `active` reads it again.",
         ),
     ],
     at: AtOption = None,
