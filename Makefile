@@ -56,9 +56,10 @@ compiled: $(READY)
 
 test-slow: compiled  ## what is too slow for every run (HIDDEN_SEEDS="1 2 3" draws it more often)
 	$(UNIT) -m slow
+	@$(MAKE) --no-print-directory test-socketcan MARKED=slow
 
 test-socketcan: $(READY)  ## the tests on a real Linux CAN stack (user-mode-linux where the kernel has none)
-	@tools/socketcan.sh --slowed 50 $(BIN)/python -m pytest -q -rs --disable-plugin-autoload -p pytest_timeout -p hdbridge.pytest_plugin -m "not slow" tests/socketcan; status=$$?; \
+	@tools/socketcan.sh --slowed 50 $(BIN)/python -m pytest -q -rs --disable-plugin-autoload -p pytest_timeout -p hdbridge.pytest_plugin -m "$(or $(MARKED),not slow)" tests/socketcan; status=$$?; \
 	if [ $$status -eq 69 ]; then echo "SocketCAN tests SKIPPED, for the reason above: this machine has no vcan"; \
 	else exit $$status; fi
 

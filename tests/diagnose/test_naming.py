@@ -155,10 +155,9 @@ def test_a_wider_loop_of_the_same_height_has_changed(diagnosed: Diagnosed) -> No
     assert names(diagnosed(width=26.0)) == ["hysteresis_parameters"]
 
 
-@pytest.mark.parametrize("seed", [2, 3])
-def test_a_sticking_loop_is_not_count_loss(plant: ModuleType, seed: int) -> None:
+def test_a_sticking_loop_is_not_count_loss(plant: ModuleType) -> None:
     """A friction that is higher at rest, shaken to and fro within its own width."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(2)
     time_s = np.arange(0.0, 28.0, 1.0 / 256.0)
     shaken = rng.normal(size=len(time_s))
     for _ in range(3):

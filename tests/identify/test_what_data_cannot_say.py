@@ -7,7 +7,7 @@ import pytest
 from support.legs import Leg, fit
 
 from hdbridge.analysis.identification import FitOptions
-from hdbridge.axis.effects import Hysteresis
+from hdbridge.axis.effects import Compliance, Hysteresis
 from hdbridge.errors import InputError
 
 
@@ -52,6 +52,13 @@ def test_a_short_record_reports_the_missing_load_turn(bench):
     axis = bench.axis()
     result = fit(axis.record(bench.plan(turns=8.0)), axis.ratio, bench.options)
     assert any("0.4" in each and "load turns" in each for each in result.warnings)
+
+
+def test_an_effect_without_its_channel_is_omitted_with_a_note(bench):
+    axis = bench.axis()
+    effects = (*bench.options.effects, Compliance.candidate(axis.ratio))
+    result = fit(axis.record(bench.plan(turns=8.0)), axis.ratio, replace(bench.options, effects=effects))
+    assert any("compliance: not fitted, the record has no load_torque_nm" in each for each in result.warnings)
 
 
 def test_noise_alone_brings_no_order(bench):

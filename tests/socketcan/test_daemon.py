@@ -82,7 +82,10 @@ def benches(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Benches]:
     made.end()
 
 
-@pytest.mark.parametrize("row", DAEMON_ROWS, ids=lambda row: row.name)
+@pytest.mark.parametrize(
+    "row",
+    [pytest.param(row, id=row.name, marks=[pytest.mark.slow] if row.slow else []) for row in DAEMON_ROWS],
+)
 def test_the_daemon_survives(benches: Benches, row: DaemonRow) -> None:
     ended = True
     try:

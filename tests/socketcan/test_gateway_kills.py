@@ -70,9 +70,8 @@ class Plc(threading.Thread):
             self.boots += 1
 
 
-@contextmanager
-def master(folder: Path, machine: Machine) -> Iterator[Plc]:
-    """Maps its PDOs by python-canopen, then cycles."""
+def map_pdos(folder: Path, machine: Machine) -> None:
+    """Configures and starts the gateway's node by python-canopen."""
     assert machine.gateway is not None
     path = write_eds(folder, machine.axes[0].config, machine.gateway)
     network = canopen.Network()
@@ -89,6 +88,12 @@ def master(folder: Path, machine: Machine) -> Iterator[Plc]:
     node.sdo[0x6060].raw = 8
     node.nmt.state = "OPERATIONAL"
     network.disconnect()
+
+
+@contextmanager
+def master(folder: Path, machine: Machine) -> Iterator[Plc]:
+    """Maps its PDOs, then cycles."""
+    map_pdos(folder, machine)
     plc = Plc()
     plc.start()
     try:
@@ -156,22 +161,12 @@ def killed(witness: Witness, pid: int) -> int:
 
 
 @pytest.mark.usefixtures("interface")
-def test_without_its_gateway_process_the_axis_stops_and_waits_for_the_master(tmp_path: Path) -> None:
-    with under_way(tmp_path) as (daemon, plc, witness):
-        (gateway,), controls = daemon.pids("gateway"), daemon.pids("control")
-        killed(witness, gateway)
-        daemon.until(lambda: plc.boots and daemon.axis()["outer"]["alive"], "another gateway process")
-        stays_without_power(plc, witness)
-        assert daemon.pids("control") == controls
-
-
-@pytest.mark.usefixtures("interface")
-def test_without_its_control_process_the_drive_stops_on_its_own(tmp_path: Path) -> None:
+def test_a_killed_process_leads_to_no_motion_without_a_request(tmp_path: Path) -> None:
     with under_way(tmp_path) as (daemon, plc, witness):
         gateways, (control,) = daemon.pids("gateway"), daemon.pids("control")
         witness.begin()
         os.kill(control, signal.SIGKILL)
-        witness.cycles_until(lambda each: each.arbitration_id == 0x081, IN_ORDER)
+        witness.cycles_until(lambda each: each.arbitration_id == 0x081, IN_ORDER)  # the drive on its own
         daemon.until(lambda: plc.status & 0x4F == 0x08, "FAULT")
         assert set(plc.codes) <= {0x6010, 0x7500}
         daemon.until(lambda: len(daemon.pids("control")) == 2, "another control process")
@@ -179,11 +174,21 @@ def test_without_its_control_process_the_drive_stops_on_its_own(tmp_path: Path) 
         stays_without_power(plc, witness)
         assert daemon.pids("gateway") == gateways
 
+        plc.word = plc.step = 0
+        time.sleep(5 * PERIOD_S)
+        plc.word = 0x80
+        daemon.until(lambda: plc.status & 0x4F == 0x40, "the fault is reset")
+        enable(daemon, plc)
+        plc.boots, controls = 0, daemon.pids("control")
+        killed(witness, gateways[0])
+        daemon.until(lambda: plc.boots and daemon.axis()["outer"]["alive"], "another gateway process")
+        stays_without_power(plc, witness)
+        assert daemon.pids("control") == controls
 
-@pytest.mark.usefixtures("interface")
-def test_without_its_keeper_the_daemon_stops_in_order_and_ends(tmp_path: Path) -> None:
-    with under_way(tmp_path) as (daemon, plc, witness):
-        killed(witness, daemon.process.pid)
+        plc.word = plc.step = 0
+        map_pdos(tmp_path, Machine.load(tmp_path / "machine.yaml"))
+        enable(daemon, plc)
+        killed(witness, daemon.process.pid)  # the keeper
         daemon.process.wait()
         children = [pid for name in ("control", "service", "gateway") for pid in daemon.pids(name)]
         while not all(gone(pid) for pid in children):

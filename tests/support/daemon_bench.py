@@ -236,6 +236,8 @@ class DaemonRow:
     """Makes the fault and checks its effect; returns it in words, the cycles it took, and those allowed."""
     last: bool = False
     """True if it ends the daemon."""
+    slow: bool = False
+    """True if neither kernel nor clock has a part in it: in every run it is made on the virtual bus only."""
 
 
 def try_out(row: DaemonRow, bench: DaemonBench) -> None:
