@@ -31,7 +31,7 @@ def following(bridge: ServiceBridge, settings: AdaptationSettings, folder: Path)
     (axis,) = bridge.axes.values()
     made = Following(0, axis, settings, folder, ThreadPoolExecutor(1))
     bridge.core.observer.add(made)
-    axis.following = made
+    bridge.following[axis.name] = made
     return made
 
 
@@ -99,7 +99,7 @@ def test_each_axis_is_watched_in_its_own_thread_that_ends(
                 for each in follow(service.machine, bridge, None, stack):
                     bridge.core.observer.add(each)
                 first, second = bridge.axes.values()
-                await first.move(token, 5.0)
+                await first.motion.move(token, 5.0)
                 await second.compensate(token, Scheme.SYNCHRONOUS)
                 begun = bridge.core.observer.cycle
                 await until(bridge, lambda: bridge.core.observer.cycle > begun + 500)
