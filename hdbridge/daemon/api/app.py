@@ -12,9 +12,9 @@ from prometheus_client import CONTENT_TYPE_LATEST
 from hdbridge import __version__
 from hdbridge.client.messages import CONTENT_TYPE
 from hdbridge.daemon.api import problems
+from hdbridge.daemon.api.guard import Traffic
 from hdbridge.daemon.api.metrics import Metrics, exposition
 from hdbridge.daemon.api.routes import axis, machine, sockets
-from hdbridge.daemon.api.traffic import Traffic
 from hdbridge.daemon.page import PAGE, POLICY, page_file
 from hdbridge.daemon.service.bridge import ServiceBridge
 

@@ -8,8 +8,10 @@ waited for. A refusal closes the connection, so that the rest of a refused body 
 import asyncio
 import logging
 import time
-from collections.abc import Callable
-from contextlib import suppress
+from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
 from typing import Any, Final
 
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
@@ -18,7 +20,6 @@ from starlette.websockets import WebSocketDisconnect
 from hdbridge.client.messages import Problem
 from hdbridge.daemon.api.policy import BODY_MAXIMUM, DEPTH_MAXIMUM, Policy, too_deep
 from hdbridge.daemon.api.problems import answer, refusal
-from hdbridge.daemon.api.traffic import Traffic
 
 BODY_S: Final = 10.0
 """Time-out for receiving a body."""
@@ -34,6 +35,30 @@ _HEADERS: Final = {
 _CLOSE: Final = (b"connection", b"close")
 _PATH_LOGGED: Final = 200
 _log = logging.getLogger(__name__)
+
+
+@dataclass(slots=True)
+class Traffic:
+    """Answered requests and open connections."""
+
+    answered: Counter[tuple[str, int]] = field(default_factory=Counter)
+    """Number of answers by method and status."""
+    open: Counter[str] = field(default_factory=Counter)
+    """Number of requests under way (``http``) and of WebSockets (``websocket``)."""
+
+    @contextmanager
+    def under_way(self, kind: str) -> Iterator[None]:
+        """Counts a request or WebSocket as open within the block."""
+        self.open[kind] += 1
+        try:
+            yield
+        finally:
+            self.open[kind] -= 1
+
+    def count(self, method: str, status: int) -> None:
+        """Counts an answer. Unknown methods count as OTHER, which bounds the number of counters."""
+        known = method in {"GET", "HEAD", "POST", "PUT", "DELETE", "OPTIONS", "PATCH"}
+        self.answered[method if known else "OTHER", status] += 1
 
 
 class Guard:

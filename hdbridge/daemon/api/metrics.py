@@ -14,7 +14,7 @@ from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Histo
 from prometheus_client.registry import Collector
 
 from hdbridge.client.messages import ControlState, MachineState
-from hdbridge.daemon.api.traffic import Traffic
+from hdbridge.daemon.api.guard import Traffic
 from hdbridge.daemon.loop.faultlog import fault_of
 from hdbridge.daemon.memory import EventKind
 from hdbridge.daemon.service.bridge import ServiceBridge
@@ -175,14 +175,14 @@ _Rows = Iterable[tuple[tuple[str, ...], float]]
 
 
 def _gauge(name: str, about: str, rows: _Rows, labels: Sequence[str] = ()) -> Metric:
-    family = GaugeMetricFamily(_PREFIX + name, about, labels=labels)
-    for values, value in rows:
-        family.add_metric(values, float(value))
-    return family
+    return _filled(GaugeMetricFamily(_PREFIX + name, about, labels=labels), rows)
 
 
 def _counter(name: str, about: str, rows: _Rows, labels: Sequence[str] = ()) -> Metric:
-    family = CounterMetricFamily(_PREFIX + name, about, labels=labels)
+    return _filled(CounterMetricFamily(_PREFIX + name, about, labels=labels), rows)
+
+
+def _filled(family: GaugeMetricFamily | CounterMetricFamily, rows: _Rows) -> Metric:
     for values, value in rows:
         family.add_metric(values, float(value))
     return family

@@ -20,6 +20,7 @@ from hdbridge.client.messages import AdaptationMode
 from hdbridge.commissioning.evaluation.stepping import Scheme
 from hdbridge.daemon.following.settings import AdaptationSettings
 from hdbridge.daemon.memory import EventKind
+from hdbridge.daemon.recorder.flightlog import Note
 from hdbridge.daemon.serve import follow
 from hdbridge.daemon.service.bridge import ServiceBridge
 from hdbridge.daemon.service.following import Following
@@ -126,7 +127,7 @@ def test_a_verdict_gives_advice_note_and_diagnosis_until_a_new_model(tmp_path: P
         made.close()
         (advice,) = made.advice
         assert advice.startswith("recalibrate: hysteresis.offset_arcsec ")
-        recorder.note.assert_called_once_with("WATCH", f"demo: {advice}")
+        recorder.put.assert_called_once_with(Note("WATCH", f"demo: {advice}"))
         axis.core.log.note.assert_called_once_with(advice, 0)
         assert diagnosis.start.call_args.args[:4] == ("demo", model.dump(), 15.0, advice)
 
