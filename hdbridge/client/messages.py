@@ -582,6 +582,7 @@ class OuterState(Report):
     nmt: int = Field(description="NMT state of the node as in a heartbeat", examples=[5])
     statusword: int = Field(description="6041h as that master sees it", examples=[0x1237])
     error_code: int = Field(0, description="603Fh as that master sees it; 0: no error", examples=[0x8700])
+    error: str | None = Field(None, description="that error with its cause", examples=["8700h: SYNC is late"])
     period_s: float | None = Field(None, description="period of that master's SYNC", examples=[0.004])
     jitter_s: float | None = Field(
         None, description="mean deviation of that SYNC from its regular time", examples=[2e-5]

@@ -29,7 +29,7 @@ from typing import Final
 
 from hdbridge.clock import Clock
 from hdbridge.control.axiscycle import AxisCycle
-from hdbridge.control.busroutes import Slot, check_members, routes
+from hdbridge.control.busroutes import Slot, conflict, routes
 from hdbridge.control.latency import Histogram
 from hdbridge.drive.busload import FRAME_BITS
 from hdbridge.drive.fastlink import fast_link
@@ -38,7 +38,7 @@ from hdbridge.drive.objects import COB_NMT, COB_SYNC, NmtCommand, NmtState
 from hdbridge.drive.pdo import PdoLengthError
 from hdbridge.drive.supervision import Fault
 from hdbridge.drive.traffic import bus_faults
-from hdbridge.errors import BusError
+from hdbridge.errors import BusError, InputError
 
 WINDOW: Final = 0.8
 """Share of the period after SYNC in which the TPDOs must arrive; the rest is for sending the RPDOs."""
@@ -178,7 +178,14 @@ class BusCycle:
 
         InputError if another axis uses one of its identifiers, or if it needs another cycle or master.
         """
-        check_members((*self.axes, axis), self.period_s)
+        config = axis.image.axis
+        if config.drive.cycle_s != self.period_s:
+            raise InputError(
+                f"{config.where('drive.cycle_ms')}: {config.drive.cycle_ms:g} ms, but the bus runs at "
+                f"{1e3 * self.period_s:g} ms; all axes on one bus have one cycle"
+            )
+        if (found := conflict([each.image.axis for each in (*self.axes, axis)])) is not None:
+            raise InputError(found[1])
         self._take_axes((*self.axes, axis))
 
     def leave(self, axis: AxisCycle) -> None:

@@ -10,9 +10,10 @@ from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 from hdbridge.drive.busload import FRAME_BITS
-from hdbridge.errors import InputError
+from hdbridge.drive.layout import layouts
 
 if TYPE_CHECKING:
+    from hdbridge.axis import AxisConfig
     from hdbridge.control.axiscycle import AxisCycle
 
 
@@ -68,67 +69,38 @@ def routes(axes: Sequence[AxisCycle]) -> Routes:
     )
 
 
-def check_members(axes: Sequence[AxisCycle], period_s: float) -> None:
-    """Raises InputError, naming both axes, if these cannot share one cycle of ``period_s``."""
-    for axis in axes:
-        config = axis.image.axis
-        if config.drive.cycle_s != period_s:
-            raise InputError(
-                f"{config.where('drive.cycle_ms')}: {config.drive.cycle_ms:g} ms, but the bus runs at "
-                f"{1e3 * period_s:g} ms; all axes on one bus have one cycle"
-            )
-        first = axes[0].image.axis
-        if config.drive.master_node_id != first.drive.master_node_id:
-            raise InputError(
-                f"{config.where('drive.master_node_id')}: {config.drive.master_node_id}, but "
-                f"{first.where('drive.master_node_id')} has {first.drive.master_node_id}; "
-                "a bus has one master with one heartbeat"
-            )
-    _check_nodes(axes)
-    _check_identifiers(axes)
-
-
-def _check_identifiers(axes: Sequence[AxisCycle]) -> None:
-    """Checks that no identifier is used twice; fixed identifiers need not derive from the node id."""
-    owners: dict[int, AxisCycle] = {}
-    for axis in axes:
-        image = axis.image
-        for layout in (*image.tpdos, *image.channel_tpdos, *image.rpdos):
-            other = owners.setdefault(layout.can_id, axis)
-            if other is not axis:
-                raise InputError(
-                    f"{image.axis.where('drive.eds')} of '{axis.name}' and "
-                    f"{other.image.axis.where('drive.eds')} of '{other.name}' both have a PDO with the "
-                    f"identifier {layout.can_id:03X}h; put one of the drives on another bus"
+def conflict(axes: Sequence[AxisConfig]) -> tuple[int, str] | None:
+    """Returns the first axis that cannot share a bus with those before it, and the reason."""
+    first = axes[0]
+    nodes: dict[int, tuple[AxisConfig, str]] = {first.drive.master_node_id: (first, "drive.master_node_id")}
+    owners: dict[int, AxisConfig] = {}
+    for place, axis in enumerate(axes):
+        for key in ("cycle_ms", "master_node_id"):
+            found, expected = getattr(axis.drive, key), getattr(first.drive, key)
+            if found != expected:
+                return place, (
+                    f"{axis.where(f'drive.{key}')}: found {found:g}; expected {expected:g}, as of "
+                    f"'{first.name}': one master sends one SYNC to all axes"
                 )
-
-
-def _check_nodes(axes: Sequence[AxisCycle]) -> None:
-    """Checks that node ids differ, because nearly all identifiers derive from them."""
-    owners: dict[int, tuple[AxisCycle, str]] = {}
-    for axis in axes:
-        config = axis.image.axis
-        nodes = {config.drive.node_id: "drive.node_id"}
-        encoder = config.load_encoder.source.node
-        if encoder is not None:
-            nodes.setdefault(encoder, "load_encoder.source.node")
-        for node_id, field in nodes.items():
-            taken = owners.get(node_id)
-            if taken is not None:
-                other, others_field = taken
-                raise InputError(
-                    f"{config.where(field)} of '{axis.name}' and {other.image.axis.where(others_field)} of "
-                    f"'{other.name}' are both node {node_id}: their frames would have the same identifiers; "
-                    "give each node of the bus an id of its own"
+        for node, key in ((axis.drive.node_id, "drive.node_id"), *_encoder_node(axis)):
+            other, other_key = nodes.setdefault(node, (axis, key))
+            if other is not axis or other_key == "drive.master_node_id":
+                return place, (
+                    f"{axis.where(key)} of '{axis.name}': node {node} is {other.where(other_key)} of "
+                    f"'{other.name}' already; expected another node id"
                 )
-            owners[node_id] = axis, field
-    for axis in axes:
-        drive = axis.image.axis.drive
-        taken = owners.get(drive.master_node_id)
-        if taken is not None:
-            other, others_field = taken
-            raise InputError(
-                f"{axis.image.axis.where('drive.master_node_id')} of '{axis.name}' and "
-                f"{other.image.axis.where(others_field)} of '{other.name}' are both node "
-                f"{drive.master_node_id}; give the master an id of its own"
-            )
+        pdos = layouts(axis)
+        for layout in (*pdos.cyclic, *pdos.channels, *pdos.rpdos):
+            owner = owners.setdefault(layout.can_id, axis)
+            if owner is not axis:
+                return place, (
+                    f"{axis.where('drive.eds')} of '{axis.name}' and {owner.where('drive.eds')} of "
+                    f"'{owner.name}' both have a PDO with the identifier {layout.can_id:03X}h; put one of "
+                    "the drives on another bus"
+                )
+    return None
+
+
+def _encoder_node(axis: AxisConfig) -> tuple[tuple[int, str], ...]:
+    node = axis.load_encoder.source.node
+    return () if node in {None, axis.drive.node_id} else ((node, "load_encoder.source.node"),)

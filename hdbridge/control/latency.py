@@ -9,12 +9,9 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 from hdbridge.clock import Clock
-
-if TYPE_CHECKING:
-    pass
 
 _EXACT_BITS: Final = 6
 _EXACT: Final = 1 << _EXACT_BITS

@@ -7,34 +7,12 @@ drive, and benches to run procedures on.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Protocol, TypeVar
+from typing import Protocol
 
 from hdbridge.axis import AxisConfig, Identity
-from hdbridge.control.bench import Bench, Run
+from hdbridge.control.bench import Bench
 from hdbridge.control.compensation import Compensation
-from hdbridge.control.survived import Survived
 from hdbridge.drive.drive import Drive
-from hdbridge.motion.procedures.moves import Procedure
-from hdbridge.records.record import Record
-from hdbridge.records.recording import Segment
-
-Outcome = TypeVar("Outcome")
-
-
-class ProcedureBench(Protocol):
-    """Interface for running procedures; `Bench` implements and documents it."""
-
-    @property
-    def legs(self) -> tuple[Segment, ...]: ...
-
-    @property
-    def survived(self) -> tuple[Survived, ...]: ...
-
-    def record(self) -> Record: ...
-
-    def run(
-        self, procedure: Procedure[Outcome], progress: Callable[[float], None] = ..., /
-    ) -> Run[Outcome]: ...
 
 
 class Rig(Protocol):
@@ -50,7 +28,7 @@ class Rig(Protocol):
 
     def bench(
         self, compensation: Compensation | None = None, *, interrupted: Callable[[], bool] = ...
-    ) -> ProcedureBench:
+    ) -> Bench:
         """Returns a bench; ``interrupted`` is called in each cycle of a run, as in `Bench`."""
         ...
 
@@ -60,7 +38,7 @@ def bench_on(
     compensation: Compensation | None = None,
     *,
     interrupted: Callable[[], bool] = lambda: False,
-) -> ProcedureBench:
+) -> Bench:
     """Returns a bench for a booted drive, or for an axis that another process holds."""
     if isinstance(place, Drive):
         return Bench(place, compensation, interrupted=interrupted)

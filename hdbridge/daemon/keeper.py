@@ -353,7 +353,7 @@ class Keeper:
         return self._status
 
     def _turn(self, now_s: float) -> None:
-        self._memory.status.set(Cell.KEEPER_TIME_NS, time.monotonic_ns())
+        self._memory.status[Cell.KEEPER_TIME_NS] = time.monotonic_ns()
         self._heed_signals(now_s)
         if self._control is not None and self._control.ended is not None:
             self._control_ended(self._control, now_s)
@@ -378,7 +378,7 @@ class Keeper:
 
     def _start_helper(self, helper: _Helper, now_s: float) -> None:
         helper.due_s = None
-        self._memory.status.set(helper.alive, 0)
+        self._memory.status[helper.alive] = 0
         helper.child = self._started(helper.program, helper.name, helper.listening, now_s)
         helper.heartbeat.restart(0)
 
@@ -401,13 +401,13 @@ class Keeper:
         assert status is not None
         self._forget(child)
         self._control = None
-        self._memory.status.set(Cell.LOOP_PID, 0)
+        self._memory.status[Cell.LOOP_PID] = 0
         if self._stopping_since_s is not None:
             self._status = self._status or max(status, 0)
             return
         if self._loan is not None and self._loan.asked_s is not None:
             self._loan.begin(now_s)
-            self._memory.status.set(Cell.BUS_LENT, time.monotonic_ns())
+            self._memory.status[Cell.BUS_LENT] = time.monotonic_ns()
             _log.info("the bus is lent", {"how": how})
             return
         _log.error("control process died", {"how": how, "lived_s": round(now_s - child.started_s, 1)})
@@ -442,9 +442,9 @@ class Keeper:
         """Ends the control process if the bus is wanted; starts another one when the bus is free again."""
         status = self._memory.status
         if loan.asked_s is None:
-            if status.get(Cell.BUS_WANTED) and self._control is not None:
+            if status[Cell.BUS_WANTED] and self._control is not None:
                 loan.asked_s = now_s
-                status.set(Cell.STOP_ASKED, 1)
+                status[Cell.STOP_ASKED] = 1
         elif self._control is not None:
             if now_s - loan.asked_s > self._times.stop_s:
                 _log.error("the axes do not come to rest", {"after_s": self._times.stop_s})
@@ -452,7 +452,7 @@ class Keeper:
         elif loan.is_over(now_s):
             _log.info("the bus is taken back")
             for cell in (Cell.BUS_LENT, Cell.STOP_ASKED):
-                status.set(cell, 0)
+                status[cell] = 0
             self._start_control(now_s)
 
     def _look_after(self, now_s: float) -> None:
@@ -462,14 +462,14 @@ class Keeper:
         self._kill_hung(self._control, self._turns, self._times.hung_s)
         serving = True
         for helper in self._helpers:
-            helper.heartbeat.look(status.get(helper.alive))
+            helper.heartbeat.look(status[helper.alive])
             self._kill_hung(helper.child, helper.heartbeat, helper.hung_s)
-            serving &= helper.child is not None and status.get(helper.begun) == helper.child.pid
+            serving &= helper.child is not None and status[helper.begun] == helper.child.pid
         if not self._ready and self._turns.begun and serving:
             self._ready = True
             self._notifier.ready()
             _log.info("ready", self._facts())
-        running |= bool(status.get(Cell.BUS_LENT))
+        running |= bool(status[Cell.BUS_LENT])
         if running and now_s - self._fed_s >= (self._notifier.watchdog_s or 0.0) / 4.0:
             self._fed_s = now_s
             self._notifier.alive()
@@ -502,7 +502,7 @@ class Keeper:
             if self._heeded == 1:
                 self._stop(now_s, 0, "asked to")
             elif self._heeded == 2:
-                self._memory.status.set(Cell.STOP_ASKED, 2)
+                self._memory.status[Cell.STOP_ASKED] = 2
             else:
                 self._end_all()
 
@@ -515,7 +515,7 @@ class Keeper:
             helper.due_s = None
         _log.info("stopping", {"why": why})
         self._notifier.stopping()
-        self._memory.status.set(Cell.STOP_ASKED, 1)
+        self._memory.status[Cell.STOP_ASKED] = 1
 
     def _go_on_stopping(self, now_s: float) -> None:
         assert self._stopping_since_s is not None

@@ -4,26 +4,20 @@
 once and passes it to the other processes, so edits of a file take effect at the next start.
 """
 
+from __future__ import annotations
+
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Self
+from typing import Self, TypeVar
 
 from hdbridge.axis import AxisConfig, BusConfig, RealtimeConfig
 from hdbridge.axis.model import TransmissionModel
 from hdbridge.commissioning.evaluation.stepping import Scheme
 from hdbridge.control.bench import compensation_for
+from hdbridge.control.busroutes import conflict
 from hdbridge.daemon.following.settings import AdaptationSettings
-from hdbridge.daemon.machinechecks import (
-    Places,
-    agreed,
-    check_gateway,
-    check_interfaces,
-    check_load,
-    check_tcp,
-    check_together,
-)
 from hdbridge.daemon.machinefile import (
     ApiSettings,
     AxisEntry,
@@ -31,13 +25,18 @@ from hdbridge.daemon.machinefile import (
     LimitSettings,
     LoadLoopSettings,
     MachineFile,
+    token_complaint,
 )
 from hdbridge.daemon.recorder.settings import RecorderSettings
 from hdbridge.drive import plan
+from hdbridge.drive.busload import check_bus_load
+from hdbridge.drive.link import unknown_interface
 from hdbridge.errors import InputError
 from hdbridge.files.bundled import bundled_folder
 from hdbridge.files.profile import Profile
-from hdbridge.files.yamlfile import Document, read_yaml
+from hdbridge.files.yamlfile import Document, Location, read_yaml
+
+T = TypeVar("T")
 
 
 def machine_file(text: str) -> Path | None:
@@ -167,19 +166,19 @@ class Machine:
 
     @classmethod
     def _of(cls, file: MachineFile, path: Path, document: Document | None) -> Self:
-        places = Places(path, document)
+        places = _Places(path, document)
         axes = [_axis(file, number, places) for number in range(len(file.axes))]
-        bus = file.bus or agreed(axes, lambda axis: axis.bus, places, "bus")
-        realtime = file.realtime or agreed(axes, lambda axis: axis.realtime, places, "realtime")
+        bus = file.bus or _agreed(axes, lambda axis: axis.bus, places, "bus")
+        realtime = file.realtime or _agreed(axes, lambda axis: axis.realtime, places, "realtime")
         axes = [
             replace(axis, config=axis.config.model_copy(update={"bus": bus, "realtime": realtime}))
             for axis in axes
         ]
-        check_together(axes, places)
-        check_load([axis.config for axis in axes], bus, places)
-        check_tcp(file, places)
-        check_interfaces(file, places)
-        check_gateway(file, axes, bus, places)
+        _check_together(axes, places)
+        _check_load([axis.config for axis in axes], bus, places)
+        _check_tcp(file, places)
+        _check_interfaces(file, places)
+        _check_gateway(file, axes, bus, places)
         return cls(
             file.name, path.absolute(), tuple(axes), bus, realtime,
             file.api, file.lease_s, file.limits, file.recorder, file.gateway,
@@ -199,7 +198,7 @@ class Machine:
         raise InputError(f"{self.path}: no axis '{name}'; expected one of: {names}")
 
 
-def _axis(file: MachineFile, number: int, places: Places) -> Axis:
+def _axis(file: MachineFile, number: int, places: _Places) -> Axis:
     """Loads one axis and all its files, so that errors appear at the start."""
     entry = file.axes[number]
     try:
@@ -236,3 +235,105 @@ def _writable(folder: Path) -> bool:
 def _absolute(profile: Profile) -> Profile:
     """Returns the profile with absolute paths, as the daemon's processes may have other working folders."""
     return Profile(profile.axis.absolute(), profile.model.absolute(), profile.truth.absolute())
+
+
+# ---------------------------------------------------------------- checks of the axes together
+
+
+class _Places:
+    """Source of error messages about a machine file, or about the axis file that replaces it."""
+
+    def __init__(self, path: Path, document: Document | None) -> None:
+        self._path, self._document = path, document
+        self.folder = path.parent
+
+    def error(self, at: Location, message: str) -> InputError:
+        if self._document is None:
+            return InputError(f"{self._path}: {message}")
+        return self._document.error(at, message)
+
+    def where(self, at: Location) -> str:
+        """Returns ``line 5`` of the file, for reference in another message."""
+        return f"line {self._document.position(at)[0]}" if self._document is not None else str(self._path)
+
+
+def _agreed(axes: Sequence[Axis], ask: Callable[[AxisConfig], T], places: _Places, key: str) -> T:
+    """Returns the common value of all axis files; raises InputError if they differ."""
+    first = ask(axes[0].config)
+    for number, axis in enumerate(axes[1:], start=1):
+        if ask(axis.config) != first:
+            raise places.error(
+                ("axes", number, "profile"),
+                f"{axis.config.where(key)}: differs from that of '{axes[0].name}' "
+                f"({axes[0].config.where(key)}); expected the same in both, or '{key}' in the machine file",
+            )
+    return first
+
+
+def _check_together(axes: Sequence[Axis], places: _Places) -> None:
+    """Checks that the names are unique, and that the axes can share a bus."""
+    names: dict[str, int] = {}
+    for number, axis in enumerate(axes):
+        if (other := names.setdefault(axis.name, number)) != number:
+            raise places.error(
+                ("axes", number, "profile"),
+                f"an axis '{axis.name}' stands in {places.where(('axes', other))} already; expected another "
+                f"name in {axis.config.where('name')}",
+            )
+    if (found := conflict([axis.config for axis in axes])) is not None:
+        raise places.error(("axes", found[0], "profile"), found[1])
+
+
+def _check_load(axes: Sequence[AxisConfig], bus: BusConfig, places: _Places) -> None:
+    """Checks that the frames of a cycle fit into it."""
+    try:
+        check_bus_load(axes, bus.bitrate_bps)
+    except InputError as problem:
+        raise places.error(("axes",), str(problem)) from None
+
+
+def _check_gateway(file: MachineFile, axes: Sequence[Axis], bus: BusConfig, places: _Places) -> None:
+    """Known axes, one node id each, a bus of its own, and positions that fit into an int32."""
+    gateway = file.gateway
+    if gateway is None:
+        return
+    outer = gateway.bus
+    if (outer.interface, str(outer.channel)) == (bus.interface, str(bus.channel)):
+        raise places.error(
+            ("gateway", "bus"),
+            f"{outer.interface}:{outer.channel} is the bus of the drives; expected another one, on which the "
+            "other master is",
+        )
+    known = {axis.name: axis.config for axis in axes}
+    nodes: dict[int, str] = {}
+    for name, node in gateway.nodes.items():
+        at = ("gateway", "nodes", name)
+        if name not in known:
+            raise places.error(at, f"no axis '{name}'; expected one of: {', '.join(known)}")
+        if (owner := nodes.setdefault(node, name)) != name:
+            raise places.error(at, f"node {node} is '{owner}' already; expected another node id")
+        limits = known[name].limits
+        farthest = max(abs(limits.position_min_deg), abs(limits.position_max_deg)) / 360.0
+        if farthest * gateway.counts_per_turn >= 1 << 31:
+            raise places.error(
+                ("gateway",),
+                f"{gateway.counts_per_turn} counts_per_turn: the limits of '{name}' do not fit into 32 bits; "
+                f"expected at most {int((1 << 31) / farthest) - 1}",
+            )
+
+
+def _check_interfaces(file: MachineFile, places: _Places) -> None:
+    """Checks that python-can has the interfaces of the file."""
+    gateway = file.gateway
+    for at, bus in ((("bus",), file.bus), (("gateway", "bus"), gateway.bus if gateway else None)):
+        if bus is not None and (unknown := unknown_interface(bus.interface)):
+            raise places.error((*at, "interface"), unknown)
+
+
+def _check_tcp(file: MachineFile, places: _Places) -> None:
+    """Checks that the token file exists and only its owner can read it."""
+    tcp = file.api.tcp
+    if tcp is None:
+        return
+    if complaint := token_complaint(places.folder / tcp.token_file):
+        raise places.error(("api", "tcp", "token_file"), complaint)

@@ -28,8 +28,8 @@ from hdbridge.daemon.service.following import Following
 from hdbridge.daemon.service.journal import Journal
 from hdbridge.daemon.service.observer import Sink
 from hdbridge.daemon.service.recording import Recording
-from hdbridge.daemon.service.timing import RealTiming, SimulatedClock
-from hdbridge.daemon.start import Start, begin_child, runtime_folder
+from hdbridge.daemon.service.timing import SimulatedClock, Timing
+from hdbridge.daemon.start import Start, run_child, runtime_folder
 from hdbridge.errors import HdbridgeError
 
 THREADS_PER_AXIS: Final = 2
@@ -43,18 +43,11 @@ LAST_WORDS_S: Final = 35.0
 """Maximum wait for the control process to bring its axes to rest, so that this is recorded."""
 
 
-def main(arguments: list[str]) -> int:
-    """Serves until SIGTERM; returns the exit status."""
-    try:
-        start = Start.inherited(arguments)
-        begin_child(start, "hdbridge-serve")
-        begin_log(start.log)
-        with Memory.attach(start.memory_fd) as memory:
-            asyncio.run(serve(start, memory))
-    except HdbridgeError as error:
-        print(f"hdbridge: {error}", file=sys.stderr)
-        return error.exit_status
-    return 0
+def run(start: Start) -> None:
+    """Serves until SIGTERM."""
+    begin_log(start.log)
+    with Memory.attach(start.memory_fd) as memory:
+        asyncio.run(serve(start, memory))
 
 
 async def serve(start: Start, memory: Memory) -> None:
@@ -65,7 +58,7 @@ async def serve(start: Start, memory: Memory) -> None:
     async with AsyncExitStack() as stack:
         simulated = start.simulation is not None
         clock = SimulatedClock(lambda: memory.status.loop_count, machine.cycle_s) if simulated else None
-        timing = RealTiming(THREADS_PER_AXIS * len(machine.axes) + SPARE_THREADS, clock)
+        timing = Timing(THREADS_PER_AXIS * len(machine.axes) + SPARE_THREADS, clock)
         stack.callback(timing.close)
         bridge = ServiceBridge(machine, memory, timing, simulated=simulated, forced=start.force)
         metrics = Metrics()
@@ -104,7 +97,7 @@ def follow(
         folder = machine.beside(given) if given is not None else machine.axis_folder(axis, "adaptation")
         worker = stack.enter_context(ThreadPoolExecutor(1, thread_name_prefix=f"following-{axis.name}"))
         made = Following(index, port, axis.adaptation, folder, worker, recorder, diagnosis)
-        port.following = made
+        bridge.following[axis.name] = made
         following.append(made)
         stack.callback(made.close)
     return following
@@ -160,7 +153,7 @@ async def _say_when_served(server: ApiServer, memory: Memory) -> None:
     """Writes this process's id to the shared memory once the server has started; the keeper waits for it."""
     while not server.started:
         await asyncio.sleep(0.01)
-    memory.status.set(Cell.SERVICE_PID, os.getpid())
+    memory.status[Cell.SERVICE_PID] = os.getpid()
 
 
 async def _last_words(bridge: ServiceBridge, memory: Memory) -> None:
@@ -173,4 +166,4 @@ async def _last_words(bridge: ServiceBridge, memory: Memory) -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    sys.exit(run_child(sys.argv[1:], "hdbridge-serve", run))

@@ -13,14 +13,14 @@ import pickle
 import signal
 import stat
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, Self
 
 from hdbridge.client.address import session_folder
 from hdbridge.daemon.logs import LogSettings
-from hdbridge.errors import InputError
+from hdbridge.errors import HdbridgeError, InputError
 
 if TYPE_CHECKING:
     from hdbridge.daemon.machine import Machine
@@ -86,6 +86,25 @@ class Start:
         if not isinstance(told, cls):
             raise InputError("this is a process of the daemon and not started by hand: use 'hdbridge run'")
         return told
+
+
+def run_child(arguments: list[str], name: str, run: Callable[[Start], None]) -> int:
+    """Runs a child on the keeper's data; reports an error of hdbridge and returns the exit status."""
+    try:
+        start = Start.inherited(arguments)
+        begin_child(start, name)
+        run(start)
+    except HdbridgeError as error:
+        print(f"hdbridge: {error}", file=sys.stderr)
+        return error.exit_status
+    return 0
+
+
+def when_terminated() -> Callable[[], bool]:
+    """Returns a function that is True once this process has received SIGTERM, which no longer ends it."""
+    received: list[int] = []
+    signal.signal(signal.SIGTERM, lambda number, _: received.append(number))
+    return lambda: bool(received)
 
 
 def begin_child(start: Start, name: str) -> None:

@@ -127,7 +127,7 @@ def test_errors_state_their_location(folder: Path, wanted: str, given: str, expe
 @pytest.mark.parametrize(
     ("changes", "expected"),
     [
-        ({"node_id: 1": "node_id: 1"}, "node 1 is of 'one' already; expected another node id"),
+        ({"node_id: 1": "node_id: 1"}, "drive.node_id of 'one' already; expected another node id"),
         ({"cycle_ms: 4": "cycle_ms: 2"}, "drive.cycle_ms: found 2; expected 4, as of 'one'"),
         ({"master_node_id: 127": "master_node_id: 126"}, "drive.master_node_id: found 126; expected 127"),
         ({"channel: hdbridge": "channel: other"}, "bus: differs from that of 'one'"),

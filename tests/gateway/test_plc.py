@@ -247,6 +247,7 @@ def test_a_lost_sync_is_the_cause_even_if_the_set_points_end_before_it_is_overdu
         nodes.append(process)
         assert await bench.read(0x603F) == 0x8700
         assert bench.plc.emergencies == [0x8700]
+        assert bench.bridge.axes["axis1"].state().outer.error.startswith("8700h: SYNC ")
 
     scene(tmp_path, scenario, period_s=0.01)
 
@@ -260,9 +261,9 @@ def test_a_fault_of_the_gateway_is_reported_once_with_its_cause_and_recorded(tmp
         await bench.wait(0.6)
         status = bench.daemon.memory.status
         pid = status.loop_pid
-        status.set(Cell.LOOP_PID, 0)  # as the keeper does when the control process has died
+        status[Cell.LOOP_PID] = 0  # as the keeper does when the control process has died
         await faulted(bench, 0x6010)
-        status.set(Cell.LOOP_PID, pid)
+        status[Cell.LOOP_PID] = pid
         await bench.wait(0.2)
         notes = [each.text for each in bench.bridge.events().events if each.kind == "note"]
         assert notes[1:] == kept == ["gateway fault 6010h: the control process is dead, hung or late"]
@@ -278,7 +279,7 @@ def test_a_client_takes_the_axis_by_force_and_returns_it(tmp_path):
         await bench.wait(0.6)
         token = bridge.lease.take("a person", force=True)
         await faulted_by_a_client(bench)
-        await bridge.axes["axis1"].move(token, 1.0)
+        await bridge.axes["axis1"].motion.move(token, 1.0)
         await stands(bench)
         assert bench.load_deg == pytest.approx(1.0, abs=0.01)
         plc.controlword = 0

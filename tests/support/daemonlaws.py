@@ -6,8 +6,7 @@ import math
 import struct
 from typing import TYPE_CHECKING
 
-from hdbridge.daemon.loop.relay import MAY_MOVE
-from hdbridge.daemon.loop.states import AxisState
+from hdbridge.daemon.loop.states import MAY_MOVE, AxisState
 from hdbridge.daemon.memory import CommandKind, Event, EventKind
 from hdbridge.drive.image import position_limits_counts
 from hdbridge.units import ARCSEC_PER_DEG

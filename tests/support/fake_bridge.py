@@ -18,9 +18,7 @@ from hdbridge.client import messages
 from hdbridge.commissioning.evaluation.stepping import Scheme
 from hdbridge.daemon.memory import sample_dtype
 from hdbridge.daemon.service.lease import Lease
-from hdbridge.daemon.service.moves import WayPoint
 from hdbridge.daemon.service.observer import Batch
-from hdbridge.daemon.service.streams import StreamPoint
 from hdbridge.drive.objects import IntegerType
 from hdbridge.drive.values import Object, Value
 from hdbridge.errors import InputError, RefusedError
@@ -38,13 +36,14 @@ class FakeAxis:
     def __init__(self, bridge: FakeBridge, name: str) -> None:
         self._bridge = bridge
         self.name = name
+        self.motion = self
         self.at = messages.ControlState.DISABLED
         self.target_deg = 0.0
         self.scheme = messages.Scheme.NONE
         self.model: messages.ModelInUse | None = None
         self.load_loop = messages.LoadLoopState(configured=True)
         self.outer: messages.OuterState | None = None
-        self.queued: list[WayPoint] = []
+        self.queued: list[messages.QueueItem] = []
         self.moving_s = 0.0
         """Duration of a move."""
 
@@ -79,11 +78,11 @@ class FakeAxis:
     async def switch_load_loop(self, holder: str, *, on: bool) -> None:
         self._moved(holder, "load loop", on)
 
-    async def adapt(self, holder: str, mode: messages.AdaptationMode) -> None:
-        self._moved(holder, "adapt", mode.value)
+    async def set_mode(self, mode: messages.AdaptationMode) -> None:
+        self._bridge.moved.append((self.name, "adapt", mode.value))
 
-    async def revert_adaptation(self, holder: str) -> None:
-        self._moved(holder, "adaptation back")
+    async def revert(self) -> None:
+        self._bridge.moved.append((self.name, "adaptation back"))
 
     async def enable(self, holder: str) -> None:
         self._moved(holder, "enable")
@@ -129,7 +128,7 @@ class FakeAxis:
         self._enabled()
         self._moved(holder, "jog", velocity_deg_s, timeout_s)
 
-    async def queue(self, holder: str, points: Sequence[WayPoint]) -> int:
+    async def queue(self, holder: str, points: Sequence[messages.QueueItem]) -> int:
         self._bridge.lease.check(holder)
         self._enabled()
         for each in points:
@@ -175,7 +174,7 @@ class FakeStream:
 
     def __init__(self, axis: FakeAxis) -> None:
         self._axis = axis
-        self.points: list[StreamPoint] = []
+        self.points: list[messages.StreamPoint] = []
         self.ended = False
         axis._bridge.streams.append(self)
 
@@ -185,17 +184,13 @@ class FakeStream:
     async def __aexit__(self, *error: object) -> None:
         self.ended = True
 
-    async def put(self, points: Sequence[StreamPoint]) -> None:
+    async def put(self, points: Sequence[messages.StreamPoint]) -> None:
         for each in points:
             self._axis._within(each.position_deg)
             self.points.append(each)
 
     async def end(self) -> None:
         self._axis.target_deg = self.points[-1].position_deg
-
-    @property
-    def buffered_s(self) -> float:
-        return 0.0
 
 
 class FakeBridge:
@@ -232,6 +227,10 @@ class FakeBridge:
     def events(self, since: int = 0) -> messages.Events:
         newest = self.told[-1].sequence if self.told else 0
         return messages.Events(events=[each for each in self.told if each.sequence > since], newest=newest)
+
+    def followed(self, holder: str, name: str) -> FakeAxis:
+        self.lease.check(holder)
+        return self.axes[name]
 
     async def lend_bus(self, holder: str) -> None:
         self.lease.check(holder)
@@ -273,7 +272,7 @@ class FakeBridge:
         try:
             while True:
                 await queue.get()
-                batch = Batch(self.samples(waiting), (), lost)
+                batch = Batch(self.samples(waiting), lost)
                 waiting.clear()
                 lost = 0
                 yield batch

@@ -155,7 +155,7 @@ class DaemonBench:
                     assert axis.state().state == "disabled"
                     await axis.enable(token)
                     assert abs(self.motor_counts(place) - places[place]) <= 2
-                    await axis.move(token, axis.state().load_target_deg + 1.0)
+                    await axis.motion.move(token, axis.state().load_target_deg + 1.0)
 
         play(story())
 

@@ -70,7 +70,7 @@ async def direct(bench: GatewayBench, steps: int) -> Errors:
     await axis.enable(token)
     errors = Errors()
     for direction, target_deg in targets(steps):
-        await axis.move(token, target_deg)
+        await axis.motion.move(token, target_deg)
         await bench.wait(SETTLE_S)
         await errors.take(bench, direction, target_deg)
     return errors

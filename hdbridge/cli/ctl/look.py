@@ -127,13 +127,12 @@ def _concerns(state: MachineState) -> list[str]:
 
 
 def _outer(outer: OuterState) -> str:
-    from hdbridge.drive.emergencies import gateway_error
     from hdbridge.drive.states import decode
 
     if not outer.alive:
         return "the gateway process does not run; if it does not come back, start 'hdbridge run' again"
     sync = "no SYNC" if outer.period_s is None else f"SYNC every {1e3 * outer.period_s:.3f} ms"
-    error = f", error {gateway_error(outer.error_code)}" if outer.error_code else ""
+    error = f", error {outer.error}" if outer.error else ""
     state = decode(outer.statusword).value
     return (
         f"node {outer.node_id} of another master, '{state}' (6041h = {outer.statusword:04X}h){error}, {sync}"

@@ -9,8 +9,8 @@ from typing import Any
 
 from hdbridge.axis import AxisConfig, Identity
 from hdbridge.commissioning.calibration.journal import Journal
-from hdbridge.control.bench import axis_view, lost_channels
-from hdbridge.control.rig import ProcedureBench, Rig, bench_on
+from hdbridge.control.bench import Bench, axis_view, lost_channels
+from hdbridge.control.rig import Rig, bench_on
 from hdbridge.drive.drive import Drive
 from hdbridge.errors import HdbridgeError, InputError, OutputError
 from hdbridge.files.atomic import make_folder
@@ -137,7 +137,7 @@ def measure(
         _add(journal, drive.axis, task, bench, complete=True)
 
 
-def _add(journal: Journal, axis: AxisConfig, task: Task, bench: ProcedureBench, *, complete: bool) -> None:
+def _add(journal: Journal, axis: AxisConfig, task: Task, bench: Bench, *, complete: bool) -> None:
     record = bench.record()
     lost = lost_channels(axis, record)
     journal.add(task.name, record, bench.legs, complete=complete, lost=lost, survived=bench.survived)

@@ -18,8 +18,8 @@ from hdbridge.commissioning.calibration.identification import resting
 from hdbridge.commissioning.calibration.measure import Pace
 from hdbridge.commissioning.evaluation.accuracy import AxisAccuracy, axis_accuracy
 from hdbridge.commissioning.evaluation.stepping import Scatter, quantisation_floor_arcsec
-from hdbridge.control.bench import axis_view, compensation_for
-from hdbridge.control.rig import ProcedureBench, Rig, bench_on
+from hdbridge.control.bench import Bench, axis_view, compensation_for
+from hdbridge.control.rig import Rig, bench_on
 from hdbridge.control.survived import Survived, lines
 from hdbridge.drive.drive import Drive
 from hdbridge.files.outputs import writing
@@ -250,7 +250,7 @@ def validate(
 
 
 @contextmanager
-def record_kept(bench: ProcedureBench, path: Path) -> Iterator[None]:
+def record_kept(bench: Bench, path: Path) -> Iterator[None]:
     """Writes the bench's record to ``path`` on exit, even if the run is stopped."""
     try:
         yield

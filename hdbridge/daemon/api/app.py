@@ -12,11 +12,9 @@ from prometheus_client import CONTENT_TYPE_LATEST
 from hdbridge import __version__
 from hdbridge.client.messages import CONTENT_TYPE
 from hdbridge.daemon.api import problems
+from hdbridge.daemon.api.guard import Traffic
 from hdbridge.daemon.api.metrics import Metrics, exposition
-from hdbridge.daemon.api.routes.axis import axis_routes
-from hdbridge.daemon.api.routes.machine import machine_routes
-from hdbridge.daemon.api.routes.sockets import socket_routes
-from hdbridge.daemon.api.traffic import Traffic
+from hdbridge.daemon.api.routes import axis, machine, sockets
 from hdbridge.daemon.page import PAGE, POLICY, page_file
 from hdbridge.daemon.service.bridge import ServiceBridge
 
@@ -55,8 +53,9 @@ def create_app(bridge: ServiceBridge, metrics: Metrics, traffic: Traffic) -> Fas
         redirect_slashes=False,
     )
     problems.register(app)
-    for each in (machine_routes(bridge), axis_routes(bridge), socket_routes(bridge)):
-        app.include_router(each, prefix=PREFIX)
+    app.state.bridge = bridge
+    for each in (machine, axis, sockets):
+        app.include_router(each.routes, prefix=PREFIX)
     _add_pages(app, bridge, metrics, traffic)
     app.openapi = lambda: _schema(app)  # type: ignore[method-assign]
     return app

@@ -6,20 +6,20 @@ waited for. A refusal closes the connection, so that the rest of a refused body 
 """
 
 import asyncio
-import json
 import logging
 import time
-from collections.abc import Callable
-from contextlib import suppress
+from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
 from typing import Any, Final
 
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from starlette.websockets import WebSocketDisconnect
 
-from hdbridge.client.messages import CONTENT_TYPE, Problem
+from hdbridge.client.messages import Problem
 from hdbridge.daemon.api.policy import BODY_MAXIMUM, DEPTH_MAXIMUM, Policy, too_deep
-from hdbridge.daemon.api.problems import refusal
-from hdbridge.daemon.api.traffic import Traffic
+from hdbridge.daemon.api.problems import answer, refusal
 
 BODY_S: Final = 10.0
 """Time-out for receiving a body."""
@@ -35,6 +35,30 @@ _HEADERS: Final = {
 _CLOSE: Final = (b"connection", b"close")
 _PATH_LOGGED: Final = 200
 _log = logging.getLogger(__name__)
+
+
+@dataclass(slots=True)
+class Traffic:
+    """Answered requests and open connections."""
+
+    answered: Counter[tuple[str, int]] = field(default_factory=Counter)
+    """Number of answers by method and status."""
+    open: Counter[str] = field(default_factory=Counter)
+    """Number of requests under way (``http``) and of WebSockets (``websocket``)."""
+
+    @contextmanager
+    def under_way(self, kind: str) -> Iterator[None]:
+        """Counts a request or WebSocket as open within the block."""
+        self.open[kind] += 1
+        try:
+            yield
+        finally:
+            self.open[kind] -= 1
+
+    def count(self, method: str, status: int) -> None:
+        """Counts an answer. Unknown methods count as OTHER, which bounds the number of counters."""
+        known = method in {"GET", "HEAD", "POST", "PUT", "DELETE", "OPTIONS", "PATCH"}
+        self.answered[method if known else "OTHER", status] += 1
 
 
 class Guard:
@@ -79,7 +103,7 @@ class Guard:
             body, problem = await _read(scope, receive)
         try:
             if problem is not None:
-                await _answer(problem, sending, "http.response")
+                await _answer(problem, scope, receive, sending)
             else:
                 with self._traffic.under_way("http"):
                     await self._app(scope, receive if stops else _replayed(body, receive), sending)
@@ -101,7 +125,7 @@ class Guard:
         _log.info("websocket", {**_about(scope), "status": problem.status})
         self._traffic.count("GET", problem.status)
         await receive()  # websocket.connect
-        await _answer(problem, send, "websocket.http.response")
+        await _answer(problem, scope, receive, send)
 
     def _refused(self, scope: Scope) -> Problem | None:
         """Returns the reason for refusing a request or WebSocket; None if it is accepted."""
@@ -168,15 +192,11 @@ def _replayed(body: bytes, receive: Receive) -> Receive:
     return replay
 
 
-async def _answer(problem: Problem, send: Send, kind: str) -> None:
-    content = json.dumps(problem.model_dump(exclude_none=True, exclude_defaults=True)).encode()
-    headers = [
-        (b"content-type", CONTENT_TYPE.encode()), (b"content-length", str(len(content)).encode()), _CLOSE,
-    ]  # fmt: skip
-    if problem.status == 401:
-        headers.append((b"www-authenticate", b"Bearer"))
-    await send({"type": f"{kind}.start", "status": problem.status, "headers": headers})
-    await send({"type": f"{kind}.body", "body": content})
+async def _answer(problem: Problem, scope: Scope, receive: Receive, send: Send) -> None:
+    """Sends a refusal and closes the connection."""
+    response = answer(problem)
+    response.headers["connection"] = "close"
+    await response(scope, receive, send)
 
 
 def _headers(scope: Scope) -> dict[str, str]:

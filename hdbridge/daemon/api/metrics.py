@@ -14,14 +14,13 @@ from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Histo
 from prometheus_client.registry import Collector
 
 from hdbridge.client.messages import ControlState, MachineState
-from hdbridge.daemon.api.traffic import Traffic
+from hdbridge.daemon.api.guard import Traffic
+from hdbridge.daemon.loop.faultlog import fault_of
 from hdbridge.daemon.memory import EventKind
 from hdbridge.daemon.service.bridge import ServiceBridge
-from hdbridge.drive.supervision import Fault
 
 BOUNDS_US: Final = (10, 20, 50, 100, 200, 500, 1000, 2000, 5000, 10_000, 50_000, 100_000)
 """Upper bounds of the histogram buckets in microseconds; the last bucket is unbounded."""
-_FAULTS: Final = list(Fault)
 _PREFIX: Final = "hdbridge_"
 
 
@@ -42,8 +41,8 @@ class Metrics:
             self.late.add(samples["late_us"])
             self.busy.add(samples["busy_us"])
         for each in events:
-            if each.kind == EventKind.FAULT and 0 <= each.code < len(_FAULTS):
-                self.faults[each.axis, _FAULTS[each.code].name] += 1
+            if each.kind == EventKind.FAULT and (fault := fault_of(each.code)) is not None:
+                self.faults[each.axis, fault.name] += 1
         self.lost += lost
 
 
@@ -176,14 +175,14 @@ _Rows = Iterable[tuple[tuple[str, ...], float]]
 
 
 def _gauge(name: str, about: str, rows: _Rows, labels: Sequence[str] = ()) -> Metric:
-    family = GaugeMetricFamily(_PREFIX + name, about, labels=labels)
-    for values, value in rows:
-        family.add_metric(values, float(value))
-    return family
+    return _filled(GaugeMetricFamily(_PREFIX + name, about, labels=labels), rows)
 
 
 def _counter(name: str, about: str, rows: _Rows, labels: Sequence[str] = ()) -> Metric:
-    family = CounterMetricFamily(_PREFIX + name, about, labels=labels)
+    return _filled(CounterMetricFamily(_PREFIX + name, about, labels=labels), rows)
+
+
+def _filled(family: GaugeMetricFamily | CounterMetricFamily, rows: _Rows) -> Metric:
     for values, value in rows:
         family.add_metric(values, float(value))
     return family

@@ -8,13 +8,11 @@ from __future__ import annotations
 
 import logging
 import os
-import signal
 import sys
 import time
 from contextlib import nullcontext
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from types import FrameType
 from typing import TYPE_CHECKING, Final
 
 from hdbridge.clock import Clock, MonotonicClock
@@ -22,7 +20,7 @@ from hdbridge.control.realtime import prepare_realtime
 from hdbridge.daemon.gateway.slave import Gateway
 from hdbridge.daemon.logs import begin_log
 from hdbridge.daemon.memory import Cell, Memory
-from hdbridge.daemon.start import Start, begin_child
+from hdbridge.daemon.start import Start, run_child, when_terminated
 from hdbridge.device.run import run
 from hdbridge.drive.link import open_bus
 from hdbridge.errors import HdbridgeError
@@ -33,19 +31,6 @@ if TYPE_CHECKING:
 
 _LOG: Final = logging.getLogger(__name__)
 ALIVE_S: Final = 0.1
-
-
-def main(arguments: list[str]) -> int:
-    """Serve until SIGTERM; the exit status."""
-    try:
-        start = Start.inherited(arguments)
-        begin_child(start, "hdbridge-outer")
-        begin_log(start.log)
-        serve(start)
-    except HdbridgeError as error:
-        print(f"hdbridge: {error}", file=sys.stderr)
-        return error.exit_status
-    return 0
 
 
 class SimulatedClock:
@@ -80,15 +65,10 @@ class SimulatedClock:
 
 def serve(start: Start) -> None:
     """Be the drives of the outer bus until SIGTERM. Raises `BusError` if the bus cannot be opened or read."""
-    machine, terminated = start.machine, False
+    begin_log(start.log)
+    machine, terminated = start.machine, when_terminated()
     settings = machine.gateway
     assert settings is not None
-
-    def terminate(_: int, __: FrameType | None) -> None:
-        nonlocal terminated
-        terminated = True
-
-    signal.signal(signal.SIGTERM, terminate)
     with (
         Memory.attach(start.memory_fd) as memory,
         open_bus(settings.bus, shared=True) as bus,
@@ -115,7 +95,7 @@ def serve(start: Start) -> None:
             store_of,
         )
         status = memory.status
-        status.set(Cell.GATEWAY_PID, os.getpid())
+        status[Cell.GATEWAY_PID] = os.getpid()
         told_s = 0.0
 
         def should_stop() -> bool:
@@ -123,8 +103,8 @@ def serve(start: Start) -> None:
             now_s = time.monotonic()
             if now_s - told_s > ALIVE_S:
                 told_s = now_s
-                status.set(Cell.GATEWAY_TIME_NS, time.monotonic_ns())
-            return terminated
+                status[Cell.GATEWAY_TIME_NS] = time.monotonic_ns()
+            return terminated()
 
         # One below the control loop, which is not to wait for it on a shared processor.
         priority, cpus = max(machine.realtime.priority - 1, 0), machine.realtime.cpus
@@ -134,4 +114,4 @@ def serve(start: Start) -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    sys.exit(run_child(sys.argv[1:], "hdbridge-outer", serve))

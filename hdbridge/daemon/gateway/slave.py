@@ -15,9 +15,10 @@ import can
 
 from hdbridge.clock import Clock
 from hdbridge.daemon.gateway.objects import BRIDGE, nameplate, write_eds
-from hdbridge.daemon.loop.faultlog import FAULT_INDEX
+from hdbridge.daemon.loop.faultlog import fault_of
+from hdbridge.daemon.loop.states import STOPPED as STOPPED_STATES
 from hdbridge.daemon.loop.states import AxisState
-from hdbridge.daemon.memory import NO_FAULT, Memory, OuterCell, OuterKnot, OuterView, SampleArray, SampleFlag
+from hdbridge.daemon.memory import Memory, OuterCell, OuterKnot, OuterView, SampleArray, SampleFlag
 from hdbridge.device.behaviour import Behaviour, Controlword
 from hdbridge.device.emergency import ErrorCode
 from hdbridge.device.modes import InterpolatedPosition
@@ -85,8 +86,6 @@ ERROR_CODES: Final[Mapping[Fault, int]] = {
     ),
 }
 """Error codes of CiA 402, or manufacturer-specific ones, for stops by the supervision of the loop."""
-_FAULTS: Final = {index: fault for fault, index in FAULT_INDEX.items()}
-_STOPPED_STATES: Final = frozenset({AxisState.QUICK_STOPPED, AxisState.LATCHED})
 
 
 class LoadAxis(PowerStage):
@@ -156,9 +155,9 @@ class LoadAxis(PowerStage):
         """Error code of a condition that prevents operation, or 0."""
         if not alive:
             return ERROR_CODES[Fault.HANG] if self._wanted else 0
-        if sample["state"] in _STOPPED_STATES:
-            fault = int(sample["fault"])
-            return STOPPED if fault == NO_FAULT else ERROR_CODES.get(_FAULTS[fault], STOPPED)
+        if sample["state"] in STOPPED_STATES:
+            fault = fault_of(int(sample["fault"]))
+            return STOPPED if fault is None else ERROR_CODES.get(fault, STOPPED)
         if not self._wanted:
             return 0
         if self._cells[OuterCell.REFUSED] == self._wanted:

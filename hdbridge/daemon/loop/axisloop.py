@@ -15,11 +15,10 @@ from hdbridge.daemon.loop.faultlog import FAULT_INDEX, FaultLog, Tell
 from hdbridge.daemon.loop.follower import AxisSetup, Follower
 from hdbridge.daemon.loop.knotfeed import KnotFeed
 from hdbridge.daemon.loop.outerfeed import OuterFeed
-from hdbridge.daemon.loop.states import AxisState, Cause, Happening, refusal, target_of
+from hdbridge.daemon.loop.states import MAY_MOVE, STOPPED, AxisState, Cause, Happening, refusal, target_of
+from hdbridge.daemon.memory.cells import OuterCells, SettingSlot
 from hdbridge.daemon.memory.channels import Queue
 from hdbridge.daemon.memory.layout import NO_FAULT, Command, CommandKind, EventKind, Knot, OuterKnot
-from hdbridge.daemon.memory.setting import SettingSlot
-from hdbridge.daemon.memory.status import OuterCells
 from hdbridge.daemon.setting import CompensationSetting
 from hdbridge.drive.feedback import Feedback
 from hdbridge.drive.image import ProcessImage
@@ -30,7 +29,6 @@ from hdbridge.errors import RESET, HdbridgeError, InputError, TransitionError
 from hdbridge.motion import MotionMode
 
 _OFF: Final = (State.SWITCH_ON_DISABLED, State.FAULT, State.NOT_READY_TO_SWITCH_ON)
-_UNDER_COMMAND: Final = (AxisState.ENABLING, AxisState.ENABLED, AxisState.STOPPING)
 
 
 class AxisLoop:
@@ -68,7 +66,7 @@ class AxisLoop:
         slot.use(0)
         self._feed = KnotFeed(knots, self.set_point)
         self._outer, self._due_s = OuterFeed(followed), due_s
-        self._faults = FaultLog(index, self.supervision, tell, config.drive.cycle_s)
+        self._faults = FaultLog(self.supervision, tell, config.drive.cycle_s)
         self._period_s = config.drive.cycle_s
         self._follow = self.follower.follow
         self._sampler = AxisSampler(self.cycle, self.follower, self._outer, outer)
@@ -113,7 +111,7 @@ class AxisLoop:
             self.check(kind)
             self._handlers[kind](command)
         except HdbridgeError as error:
-            self._tell(self.index, EventKind.REFUSED, command.id, command.kind, str(error))
+            self._tell(EventKind.REFUSED, command.id, command.kind, str(error))
             return
         target = target_of(self.state, kind)
         assert target is not None
@@ -149,7 +147,7 @@ class AxisLoop:
 
     def _done(self, id_: int) -> None:
         if id_:
-            self._tell(self.index, EventKind.DONE, id_, 0)
+            self._tell(EventKind.DONE, id_, 0)
 
     def _happened(self, cause: Cause) -> bool:
         """Makes the transition for ``cause``; returns True if the state changed."""
@@ -167,14 +165,14 @@ class AxisLoop:
         self.state = state
         if state is AxisState.STOPPING and before is not AxisState.ENABLED:
             self._power_off()
-        if state not in _UNDER_COMMAND:
+        if state not in MAY_MOVE:
             self._stand()
-        if state in (AxisState.QUICK_STOPPED, AxisState.LATCHED):
+        if state in STOPPED:
             self.image.power.quick_stop()  # overrides any power target: only ENABLE leads back to power
             self.stands = False
             self._still = 0
             self._left = self._turns(STOP_TIMEOUT_S)
-        self._tell(self.index, EventKind.STATE, 0, state)
+        self._tell(EventKind.STATE, 0, state)
         self._answer_waiting(state)
 
     def _answer_waiting(self, state: AxisState) -> None:
@@ -197,7 +195,7 @@ class AxisLoop:
         else:
             id_, self._disable_id = self._disable_id, 0
         if id_:
-            self._tell(self.index, EventKind.REFUSED, id_, kind, why)
+            self._tell(EventKind.REFUSED, id_, kind, why)
 
     def _stand(self) -> None:
         """Ends all following of set-points."""
@@ -258,7 +256,7 @@ class AxisLoop:
             self._why = "it was disabled before it was enabled"
 
     def _quick_stop(self, _: Command) -> None:
-        if self.state in (*_UNDER_COMMAND, AxisState.LENT):
+        if self.state in (*MAY_MOVE, AxisState.LENT):
             self._why = "quick stop by command: latched"
         if self.state is AxisState.LENT:
             # The next RPDO overrides what the service does by SDO.
@@ -315,7 +313,7 @@ class AxisLoop:
         self._slot.use(command.i)
         self._changing = self.follower.correction.changing
         if not self._changing:
-            self._tell(self.index, EventKind.CHANGED, command.id, 0)
+            self._tell(EventKind.CHANGED, command.id, 0)
 
     # ---------------------------------------------------------------- power
 
@@ -353,7 +351,7 @@ class AxisLoop:
         """Prepares the turn: feeds the next knots of a stream to the set-point."""
         refusal_ = self._feed.feed()
         if refusal_ is not None:
-            self._tell(self.index, EventKind.STREAM_REFUSED, self._motion_id, 0, refusal_)
+            self._tell(EventKind.STREAM_REFUSED, self._motion_id, 0, refusal_)
             self._break_group()
 
     def after(self) -> None:
@@ -381,7 +379,7 @@ class AxisLoop:
         mode = set_point.mode
         if mode is not self._mode:
             if mode is MotionMode.HOLD:
-                self._tell(self.index, EventKind.MOTION_ENDED, self._motion_id, self._mode)
+                self._tell(EventKind.MOTION_ENDED, self._motion_id, self._mode)
             if self._mode is MotionMode.FOLLOW:
                 self.cycle.command = self._follow
             if mode is not MotionMode.STREAM:
@@ -394,20 +392,20 @@ class AxisLoop:
             self._unfed = False
             if not set_point.at_rest:
                 words = "the set-points of the gateway ended in motion; it loses its power"
-                self._tell(self.index, EventKind.UNDERRUN, self._motion_id, 0, words)
+                self._tell(EventKind.UNDERRUN, self._motion_id, 0, words)
             self._happened(Happening.UNFED)
         if set_point.underrun is not self._underrun:
             self._underrun = set_point.underrun
             if self._underrun:
-                self._tell(self.index, EventKind.UNDERRUN, self._motion_id, 0)
+                self._tell(EventKind.UNDERRUN, self._motion_id, 0)
         doubt = self.follower.loop_doubt
         if doubt != self._doubt:
             self._doubt = doubt
-            self._tell(self.index, EventKind.LOAD_LOOP, 0, int(bool(doubt)), doubt or "it acts again")
+            self._tell(EventKind.LOAD_LOOP, 0, int(bool(doubt)), doubt or "it acts again")
         if self._changing and not self.follower.correction.changing:
             self._changing = False
             self.follower.changed()
-            self._tell(self.index, EventKind.CHANGED, 0, 0)
+            self._tell(EventKind.CHANGED, 0, 0)
 
     def _after_stopping(self) -> None:
         if not self._powering_off:
@@ -444,7 +442,7 @@ class AxisLoop:
         error = self.cycle.stopped
         explained = error is not None and error.hint == EXPLAINED_HINT
         text = error.text if error is not None else self._why
-        self._tell(self.index, EventKind.STOPPED, int(explained), code, text)
+        self._tell(EventKind.STOPPED, int(explained), code, text)
 
     def _obeyed(self) -> bool:
         """Returns True if a commanded quick stop is over: the motor stands, or the time-out has passed."""

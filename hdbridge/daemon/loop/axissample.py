@@ -8,8 +8,8 @@ from hdbridge.daemon.loop.faultlog import FAULT_INDEX
 from hdbridge.daemon.loop.follower import Follower
 from hdbridge.daemon.loop.outerfeed import OuterFeed
 from hdbridge.daemon.loop.states import AxisState
+from hdbridge.daemon.memory.cells import OuterCells
 from hdbridge.daemon.memory.layout import NO_FAULT, SampleFlag
-from hdbridge.daemon.memory.status import OuterCells
 from hdbridge.drive.states import State
 from hdbridge.motion import MotionMode
 

@@ -9,6 +9,7 @@ compensation, runs after the RPDOs of one cycle and before the wait for the next
 import os
 import time
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Final
 
 from hdbridge.control.buscycle import BusCycle
@@ -59,7 +60,7 @@ class Controller:
                 setup,
                 memory.knots[index],
                 memory.settings[index],
-                self._tell,
+                partial(self._tell, index),
                 memory.followed[index],
                 memory.outer[index],
                 lambda: cycle.due_s,
@@ -94,7 +95,7 @@ class Controller:
         for knots, followed in zip(memory.knots, memory.followed, strict=True):
             knots.clear()
             followed.clear()
-        memory.status.set(Cell.LOOP_PID, os.getpid())
+        memory.status[Cell.LOOP_PID] = os.getpid()
 
     # ---------------------------------------------------------------- a turn
 
@@ -121,29 +122,22 @@ class Controller:
         for axis in self.axes:
             values += axis.sample()
         woke_s = cycle.woke_s
-        self.memory.samples.write(
+        self.memory.samples.append((
             cycle.count,
             round(1e9 * woke_s),
             1e6 * cycle.late_s,
             1e6 * (cycle.clock.now() - woke_s),
             cycle.bus_load,
             cycle.skipped & 0xFFFF_FFFF,
-            values,
-        )
+            *values,
+        ))  # fmt: skip
         self._turns += 1
         self.memory.status.turned(self._turns, self._monotonic_ns())
 
-    def _tell(
-        self,
-        axis: int,
-        kind: EventKind,
-        id: int = 0,  # noqa: A002
-        code: int = 0,
-        text: str = "",
-    ) -> None:
+    def _tell(self, axis: int, kind: EventKind, id_: int = 0, code: int = 0, text: str = "") -> None:
         cycle = self.cycle
         time_ns = round(1e9 * cycle.woke_s)
-        self.memory.events.append(Event(0, cycle.count, time_ns, axis, kind, id, code, text))
+        self.memory.events.append(Event(0, cycle.count, time_ns, axis, kind, id_, code, text))
 
     # ---------------------------------------------------------------- commands
 

@@ -11,27 +11,25 @@ OVER_S: Final = 1.0
 CODES_KEPT: Final = 64
 FAULT_INDEX: Final = {fault: place for place, fault in enumerate(Fault)}
 """Number of each fault in events and samples."""
+_FAULTS: Final = dict(enumerate(Fault))
+
+
+def fault_of(code: int) -> Fault | None:
+    """Returns the fault with this number in events and samples; None if there is none."""
+    return _FAULTS.get(code)
 
 
 class Tell(Protocol):
-    """Callback that reports an event of an axis to the service; axis -1 is the machine."""
+    """Reports an event of one axis to the service."""
 
-    def __call__(
-        self,
-        axis: int,
-        kind: EventKind,
-        id: int = 0,  # noqa: A002
-        code: int = 0,
-        text: str = "",
-    ) -> None:
-        """Adds an event to the ring."""
+    def __call__(self, kind: EventKind, id_: int = 0, code: int = 0, text: str = "") -> None: ...
 
 
 class FaultLog:
     """Reports the faults of one axis without repeating those that persist."""
 
-    def __init__(self, axis: int, supervision: Supervision, tell: Tell, period_s: float) -> None:
-        self._axis, self._supervision, self._tell = axis, supervision, tell
+    def __init__(self, supervision: Supervision, tell: Tell, period_s: float) -> None:
+        self._supervision, self._tell = supervision, tell
         self._over = math.ceil(OVER_S / period_s)
         self._noted = supervision.noted
         self._seen: dict[tuple[Fault, str], tuple[int, Reaction]] = {}
@@ -49,7 +47,7 @@ class FaultLog:
             stops = event is supervision.stop or event is supervision.gravest
             if stops or told is None or event.reaction > told or event.cycle - last >= self._over:
                 told = event.reaction
-                self._tell(self._axis, EventKind.FAULT, told, FAULT_INDEX[event.fault], event.detail)
+                self._tell(EventKind.FAULT, told, FAULT_INDEX[event.fault], event.detail)
             self._seen[event.fault, code] = event.cycle, told
             if len(self._seen) > CODES_KEPT:
                 del self._seen[next(iter(self._seen))]

@@ -4,12 +4,10 @@ It has one thread, one bus and the shared memory. All memory is allocated before
 loop runs, the process opens no files, writes no log and makes no SDO transfers of its own.
 """
 
-import signal
 import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
-from types import FrameType
 from typing import Final
 
 from hdbridge.axis.model import TransmissionModel
@@ -22,26 +20,13 @@ from hdbridge.daemon.loop.controller import Controller
 from hdbridge.daemon.loop.follower import AxisSetup
 from hdbridge.daemon.loop.interface import Interface, listen
 from hdbridge.daemon.machine import Axis, Machine
-from hdbridge.daemon.memory import Memory
-from hdbridge.daemon.start import Simulation, Start, begin_child
+from hdbridge.daemon.memory import Cell, Memory
+from hdbridge.daemon.start import Simulation, Start, run_child, when_terminated
 from hdbridge.drive.link import Link
-from hdbridge.errors import HdbridgeError
 
 AT_ONCE: Final = 2
 """Value of ``STOP_ASKED`` that requests an end by quick stop."""
 SIMULATED_BITRATE_BPS: Final = 1_000_000
-
-
-def main(arguments: list[str]) -> int:
-    """Runs until asked to end; returns the exit status."""
-    try:
-        start = Start.inherited(arguments)
-        begin_child(start, "hdbridge-loop")
-        run(start)
-    except HdbridgeError as error:
-        print(f"hdbridge: {error}", file=sys.stderr)
-        return error.exit_status
-    return 0
 
 
 def run(start: Start) -> None:
@@ -50,13 +35,7 @@ def run(start: Start) -> None:
     Raises `BusError` if the bus cannot be opened, `BusInUseError` if another master is active on it.
     """
     machine = start.machine
-    terminated = False
-
-    def terminate(_: int, __: FrameType | None) -> None:
-        nonlocal terminated
-        terminated = True
-
-    signal.signal(signal.SIGTERM, terminate)
+    terminated = when_terminated()
     setups = [setup_of(axis) for axis in machine.axes]
     realtime = machine.realtime
     with Memory.attach(start.memory_fd) as memory, _bus(start) as (link, clock, interface):
@@ -74,8 +53,8 @@ def run(start: Start) -> None:
                 {"conditions": str(conditions or "simulated")},
             )
             while not controller.ended:
-                if terminated or status.stop_asked:
-                    controller.end(at_once=status.stop_asked >= AT_ONCE)
+                if terminated() or status[Cell.STOP_ASKED]:
+                    controller.end(at_once=status[Cell.STOP_ASKED] >= AT_ONCE)
                 controller.turn()
 
 
@@ -127,4 +106,4 @@ def _simulated(machine: Machine, simulation: Simulation) -> Iterator[tuple[Link,
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    sys.exit(run_child(sys.argv[1:], "hdbridge-loop", run))

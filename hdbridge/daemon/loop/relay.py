@@ -8,15 +8,13 @@ or restarted.
 from collections.abc import Iterable
 from typing import Final
 
-from hdbridge.daemon.loop.states import AxisState
+from hdbridge.daemon.loop.states import MAY_MOVE, AxisState
 from hdbridge.drive.objects import COB_EMCY, COB_HEARTBEAT, COB_NMT, COB_SDO_ANSWER, COB_SDO_REQUEST
 
 _NODE: Final = 0x7F
 _ABORT, _UPLOAD, _UPLOAD_SEGMENT, _BLOCK_UPLOAD = 4, 2, 3, 5
 READING: Final = frozenset({_UPLOAD, _UPLOAD_SEGMENT, _ABORT, _BLOCK_UPLOAD})
 """Command specifiers (CiA 301) of SDO requests that change nothing in the node."""
-MAY_MOVE: Final = frozenset({AxisState.ENABLING, AxisState.ENABLED, AxisState.STOPPING})
-"""States in which an axis's nodes must not be written or restarted."""
 
 
 def nodes_of(drive: int, load_encoder: int | None) -> tuple[int, ...]:

@@ -36,6 +36,14 @@ class AxisState(IntEnum):
     """The drive must be verified again. No RPDO is sent."""
 
 
+MAY_MOVE: Final = frozenset({AxisState.ENABLING, AxisState.ENABLED, AxisState.STOPPING})
+"""States in which the drive may have power by the loop's command."""
+STOPPED: Final = frozenset({AxisState.QUICK_STOPPED, AxisState.LATCHED})
+"""States of a latched stop."""
+UNKNOWN: Final = frozenset({AxisState.UNVERIFIED, AxisState.LATCHED})
+"""States in which the drive must be verified before any other request."""
+
+
 class Happening(Enum):
     """Events other than commands that cause a transition."""
 

@@ -1,6 +1,7 @@
 """Shared memory of control and service process: rings, mailbox, relay. Lock-free."""
 
-from hdbridge.daemon.memory.channels import MailboxFullError, RingReader
+from hdbridge.daemon.memory.cells import Cell, OuterCells
+from hdbridge.daemon.memory.channels import MailboxFullError, RingReader, SampleArray, joined_samples
 from hdbridge.daemon.memory.layout import (
     AXIS_SAMPLE,
     NO_FAULT,
@@ -18,8 +19,6 @@ from hdbridge.daemon.memory.layout import (
     sample_dtype,
 )
 from hdbridge.daemon.memory.memory import Memory
-from hdbridge.daemon.memory.samples import SampleArray, joined_samples
-from hdbridge.daemon.memory.status import Cell, OuterCells
 
 __all__ = [
     "AXIS_SAMPLE",

@@ -15,6 +15,7 @@ All numbers are in native byte order, because both ends run on one computer. A s
 sequence number, counted from 1. Any change here requires a new `VERSION`.
 """
 
+import logging
 import math
 import struct
 from enum import IntEnum, IntFlag
@@ -129,6 +130,20 @@ class EventKind(IntEnum):
     ENDING = 12
     LOAD_LOOP = 13
     """The load loop no longer acts (``code`` 1, ``text`` is the reason) or acts again (``code`` 0)."""
+
+
+LEVELS: Final = {
+    EventKind.STOPPED: logging.ERROR,
+    EventKind.BUS_DOWN: logging.ERROR,
+    EventKind.FAULT: logging.WARNING,
+    EventKind.REFUSED: logging.WARNING,
+    EventKind.UNDERRUN: logging.WARNING,
+    EventKind.LOAD_LOOP: logging.WARNING,
+    EventKind.STREAM_REFUSED: logging.WARNING,
+    EventKind.DONE: logging.DEBUG,
+    EventKind.MOTION_ENDED: logging.DEBUG,
+}
+"""Severity by kind of event, as of log records; all others are INFO."""
 
 
 class Event(NamedTuple):
@@ -299,26 +314,13 @@ def sample_struct(axes: int) -> struct.Struct:
     return struct.Struct(f"@{_HEAD_CODE}{_AXIS_CODE * axes}{TAIL_CODE}")
 
 
-def slot_dtype(axes: int) -> np.dtype[Any]:
-    """Returns the dtype of a sample's slot in the memory."""
-    return np.dtype([*_HEAD, ("axes", AXIS_SAMPLE, (axes,)), *_TAIL])
-
-
 def sample_dtype(axes: int) -> np.dtype[Any]:
     """Returns the dtype of samples: ``sequence, cycle, time_ns, late_us, busy_us, bus_load, skipped, axes``.
 
     ``time_ns`` is the monotonic clock at SYNC (virtual time on a virtual clock), ``bus_load`` a share,
-    ``axes`` an array of `AXIS_SAMPLE`, shape (axes,).
+    ``axes`` an array of `AXIS_SAMPLE`, shape (axes,). The fields after it belong to the slot.
     """
-    slot = slot_dtype(axes)
-    names = [*(name for name, _ in _HEAD), "axes"]
-    assert slot.fields is not None
-    return np.dtype({
-        "names": names,
-        "formats": [slot.fields[name][0] for name in names],
-        "offsets": [slot.fields[name][1] for name in names],
-        "itemsize": slot.itemsize,
-    })  # fmt: skip
+    return np.dtype([*_HEAD, ("axes", AXIS_SAMPLE, (axes,)), *_TAIL])
 
 
 EVENT: Final = struct.Struct(f"@QqqiiqiI{TEXT_BYTES}s{TAIL_CODE}")

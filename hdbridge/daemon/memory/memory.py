@@ -1,7 +1,11 @@
-"""The shared memory, as used by both processes."""
+"""Shared memory of the daemon's processes: created by one, passed to others as a descriptor."""
 
-from typing import Self
+import os
+import platform
+import zlib
+from typing import Final, Self
 
+from hdbridge.daemon.memory.cells import OuterCells, SettingSlot, Status
 from hdbridge.daemon.memory.channels import (
     COMMANDS,
     EVENTS,
@@ -12,13 +16,25 @@ from hdbridge.daemon.memory.channels import (
     Queue,
     Ring,
     RingReader,
+    SampleReader,
+    samples_of,
 )
-from hdbridge.daemon.memory.layout import AXES_AT_MOST, NO_OUTER, Event, Layout, RelayedFrame
-from hdbridge.daemon.memory.region import ORDERED, Region
-from hdbridge.daemon.memory.samples import SampleReader, SampleWriter
-from hdbridge.daemon.memory.setting import SettingSlot
-from hdbridge.daemon.memory.status import OuterCells, Status
+from hdbridge.daemon.memory.layout import (
+    AXES_AT_MOST,
+    HEADER,
+    MAGIC,
+    NO_OUTER,
+    VERSION,
+    Event,
+    Layout,
+    RelayedFrame,
+)
+from hdbridge.daemon.memory.region import Region
 from hdbridge.errors import InputError
+
+_STRONGLY_ORDERED: Final = frozenset({"x86_64", "amd64", "i386", "i586", "i686"})
+ORDERED: Final = platform.machine().lower() in _STRONGLY_ORDERED
+"""True if other processors see the stores of one in program order."""
 
 
 class Memory:
@@ -36,7 +52,7 @@ class Memory:
         self._layout = layout
         self.axes = layout.axes
         self.period_ns = period_ns
-        self.samples = SampleWriter(region, layout)
+        self.samples = Ring(region, layout.samples, samples_of(layout.axes))
         self.events = Ring(region, layout.events, EVENTS)
         self.incoming = Ring(region, layout.incoming, FRAMES)
         self.outgoing = Queue(region, layout.outgoing, FRAMES)
@@ -56,14 +72,13 @@ class Memory:
                 f"{axes} axes at {period_s} s: expected 1 to {AXES_AT_MOST} axes, a period above 0"
             )
         layout = Layout.of(axes)
-        memory = cls(Region.create(layout, period_ns, checked=checked), layout, period_ns)
+        region = Region.create(layout.total, checked=checked)
+        HEADER.pack_into(
+            region.view, 0, MAGIC, VERSION, axes, period_ns, layout.total, _sizes(layout), checked
+        )
+        memory = cls(region, layout, period_ns)
         memory.forget_gateway()
         return memory
-
-    def forget_gateway(self) -> None:
-        """No gateway process shows the axes to another master."""
-        for cells in self.outer:
-            cells.show(NO_OUTER)
 
     @classmethod
     def attach(cls, fd: int) -> Self:
@@ -71,7 +86,36 @@ class Memory:
 
         Raises InputError if it is not shared memory of this version of hdbridge.
         """
-        return cls(*Region.attach(fd))
+        try:
+            size = os.fstat(fd).st_size
+            head = os.pread(fd, HEADER.size, 0)
+        except OSError as error:
+            raise InputError(
+                f"descriptor {fd}: cannot be read as shared memory: {error.strerror}; it is handed down by "
+                "'hdbridge run', not given by hand"
+            ) from error
+        if len(head) < HEADER.size or head[: len(MAGIC)] != MAGIC:
+            raise InputError(f"descriptor {fd}: is not the shared memory of hdbridge; start 'hdbridge run'")
+        _, version, axes, period_ns, total, sizes, checked = HEADER.unpack(head)
+        if version != VERSION:
+            raise InputError(
+                f"descriptor {fd}: shared memory of version {version}, expected {VERSION}: the processes are "
+                "of different releases of hdbridge; restart the whole daemon"
+            )
+        if not 1 <= axes <= AXES_AT_MOST or not period_ns:
+            raise InputError(f"descriptor {fd}: shared memory of {axes} axes and {period_ns} ns: damaged")
+        layout = Layout.of(axes)
+        if total != layout.total or size != total or sizes != _sizes(layout):
+            raise InputError(
+                f"descriptor {fd}: shared memory of {size} bytes, expected {layout.total} for {axes} axes: "
+                "another release of hdbridge has made it; restart the whole daemon"
+            )
+        return cls(Region(fd, size, checked=bool(checked)), layout, period_ns)
+
+    def forget_gateway(self) -> None:
+        """No gateway process shows the axes to another master."""
+        for cells in self.outer:
+            cells.show(NO_OUTER)
 
     @property
     def fd(self) -> int:
@@ -85,7 +129,7 @@ class Memory:
 
     def reader(self) -> SampleReader:
         """Returns a reader of the samples from now on."""
-        return SampleReader(self._region, self._layout)
+        return SampleReader(self._region, self._layout.samples, self.axes)
 
     def event_reader(self) -> RingReader[Event]:
         """Returns a reader of the events from now on."""
@@ -106,3 +150,7 @@ class Memory:
     def __exit__(self, *_: object) -> None:
         """Calls `close`."""
         self.close()
+
+
+def _sizes(layout: Layout) -> int:
+    return zlib.crc32(repr(layout).encode())

@@ -24,18 +24,18 @@ class AxisAbout:
     text: str = ""
     """Text of its axis file."""
     identity: Identity | None = None
-    """Identity reported by the drive, else the one that the axis file expects."""
+    """Identity that the axis file expects."""
     channels: tuple[str, ...] = ()
     """Record columns of ``reading0`` and ``reading1``."""
 
     @classmethod
-    def of(cls, axis: AxisConfig, identity: Identity | None = None) -> Self:
-        """Returns the description from an axis file and the drive's identity."""
+    def of(cls, axis: AxisConfig) -> Self:
+        """Returns the description from an axis file."""
         text = ""
         with suppress(OSError):  # the axis file is included for people only
             text = axis.path.read_text(encoding="utf-8")
         channels = tuple(BY_KEY[key].value for key in axis.channels)
-        return cls(axis.name, axis.gear.ratio, text, identity or axis.drive.identity, channels)
+        return cls(axis.name, axis.gear.ratio, text, axis.drive.identity, channels)
 
     def metadata(self, place: int) -> dict[str, str]:
         """Returns the description as an MCAP metadata record, whose values are text."""

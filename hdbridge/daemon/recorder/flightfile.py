@@ -7,6 +7,7 @@ has all its chunks but no index: `mend` rewrites it as a finished one. Until it 
 
 import fcntl
 import json
+import logging
 import os
 from collections.abc import Sequence
 from pathlib import Path
@@ -15,6 +16,7 @@ from typing import Any, Final
 from mcap.writer import CompressionType, Writer
 
 from hdbridge.daemon.memory import Event, EventKind, SampleArray
+from hdbridge.daemon.memory.layout import LEVELS
 from hdbridge.daemon.recorder.about import About
 from hdbridge.daemon.recorder.wire import AXIS, MACHINE, Message, axis_messages, machine_messages
 
@@ -26,16 +28,6 @@ CHUNK_BYTES: Final = 64 << 20
 EVENTS: Final = "/events"
 MODEL: Final = "/model"
 MACHINE_TOPIC: Final = "/machine"
-_LEVELS: Final = {"info": 2, "warning": 3, "error": 4}
-_BAD: Final = {
-    EventKind.STOPPED: "error",
-    EventKind.BUS_DOWN: "error",
-    EventKind.FAULT: "warning",
-    EventKind.REFUSED: "warning",
-    EventKind.STREAM_REFUSED: "warning",
-    EventKind.UNDERRUN: "warning",
-    EventKind.LOAD_LOOP: "warning",
-}
 _TEXT: Final = {"type": "string"}
 _NUMBER: Final = {"type": "integer"}
 _EVENT_SCHEMA: Final = {
@@ -155,10 +147,17 @@ class FlightFile:
         axes = self._about.axes
         name = axes[event.axis].name if 0 <= event.axis < len(axes) else self._about.machine
         kind = EventKind(event.kind)
-        self._tell(event.time_ns, name, kind.name, event.text, _BAD.get(kind, "info"), event)
+        self._tell(
+            event.time_ns,
+            name,
+            kind.name,
+            event.text,
+            max(LEVELS.get(kind, logging.INFO), logging.INFO),
+            event,
+        )
 
-    def note(self, time_ns: int, kind: str, text: str, level: str = "info") -> None:
-        """Adds a note of the recorder or a client."""
+    def note(self, time_ns: int, kind: str, text: str, level: int = logging.INFO) -> None:
+        """Adds a note of the recorder or a client; ``level`` is that of a log record."""
         self._tell(time_ns, self._about.machine, kind, text, level)
 
     def add_model(self, time_ns: int, axis: str, version: str, text: str) -> None:
@@ -186,12 +185,12 @@ class FlightFile:
             self._stream.descriptor = -1
 
     def _tell(
-        self, time_ns: int, name: str, kind: str, text: str, level: str, event: Event | None = None
+        self, time_ns: int, name: str, kind: str, text: str, level: int, event: Event | None = None
     ) -> None:
         seconds, rest = divmod(time_ns + self._about.offset_ns, 1_000_000_000)
         content = {
             "timestamp": {"sec": seconds, "nsec": rest},
-            "level": _LEVELS[level],
+            "level": level // 10,  # Foxglove counts from DEBUG, 1
             "message": text or kind,
             "name": name,
             "file": "",

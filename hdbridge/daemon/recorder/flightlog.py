@@ -6,6 +6,7 @@ are reported. A fault or a client's mark moves the files around its time aside, 
 remove them.
 """
 
+import logging
 import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
@@ -191,7 +192,7 @@ class FlightLog:
                         self._newest_ns,
                         "LOST",
                         f"{item.lost} cycles were lost before they were read",
-                        "warning",
+                        logging.WARNING,
                     )
                 if item.samples is not None and len(item.samples):
                     file.add_samples(item.samples)
@@ -215,7 +216,10 @@ class FlightLog:
         )
         if self._file is not None:
             self._file.note(
-                self._newest_ns, "REFUSED_BY_DISK", f"{self._refused_now} cycles were not recorded", "warning"
+                self._newest_ns,
+                "REFUSED_BY_DISK",
+                f"{self._refused_now} cycles were not recorded",
+                logging.WARNING,
             )
         self._trouble, self._refused_now = "", 0
 

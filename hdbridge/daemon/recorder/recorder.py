@@ -8,7 +8,6 @@ import logging
 import queue
 import threading
 import time
-from collections import deque
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import replace
@@ -23,7 +22,7 @@ from hdbridge.daemon.recorder.store import Store, free_bytes
 
 FLUSH_S: Final = 1.0
 QUEUE_BATCHES: Final = 500
-"""Capacity of the queue: ten seconds of batches."""
+"""Maximum number of waiting items: ten seconds of batches."""
 _log = logging.getLogger(__name__)
 
 
@@ -44,11 +43,9 @@ class FlightRecorder:
         self._flight = FlightLog(
             Store(folder, settings or RecorderSettings(), free), about, tell=tell, wall_ns=wall_ns
         )
-        self._queue: queue.Queue[Item | None] = queue.Queue(QUEUE_BATCHES)
+        self._queue: queue.SimpleQueue[Item | None] = queue.SimpleQueue()
         self._tell = tell
         self._dropped = 0
-        self._said: deque[Item] = deque(maxlen=1000)
-        """Models and notes from other sources than the observer; they are rare."""
         self._thread = threading.Thread(target=self._run, name="recorder", daemon=True)
         self._thread.start()
         # Its duration does not matter: each file is mended completely or not at all.
@@ -67,25 +64,20 @@ class FlightRecorder:
 
     def take(self, samples: SampleArray, events: Sequence[Event], lost: int) -> None:
         """Takes samples and events from the observer; never waits."""
-        batch = Batch(samples if len(samples) else None, tuple(events), lost)
-        try:
-            self._queue.put_nowait(batch)
-        except queue.Full:
-            if not self._dropped:
-                self._tell("the recorder is too slow: cycles are dropped")
-            self._dropped += len(samples)
+        if self._queue.qsize() < QUEUE_BATCHES:
+            self._queue.put(Batch(samples if len(samples) else None, tuple(events), lost))
+            return
+        if not self._dropped:
+            self._tell("the recorder is too slow: cycles are dropped")
+        self._dropped += len(samples)
 
-    def use_model(self, axis: str, text: str, version: str = "") -> None:
-        """Records a change of model; ``text`` is the model file's content."""
-        self._said.append(ModelUse(axis, version, text))
-
-    def note(self, kind: str, text: str) -> None:
-        """Records a note of another part of the daemon."""
-        self._said.append(Note(kind, text))
+    def put(self, item: ModelUse | Note) -> None:
+        """Records a change of model or a note. They are rare, and never dropped."""
+        self._queue.put(item)
 
     def mark(self, text: str = "") -> None:
         """Records a mark and keeps the time around it, as around a fault."""
-        self._said.append(Note(MARK, text))
+        self.put(Note(MARK, text))
 
     def close(self) -> None:
         """Finishes the file; returns when it is on the disk."""
@@ -119,8 +111,6 @@ class FlightRecorder:
             if time.monotonic() < due_s and going:
                 continue
             due_s = time.monotonic() + FLUSH_S
-            while self._said:
-                flight.put(self._said.popleft())
             try:
                 flight.flush() if going else flight.close()
             except Exception:

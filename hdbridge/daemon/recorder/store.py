@@ -72,10 +72,6 @@ class Store:
         _trim(self.folder, limits.size_mb * _MB - writing, now_ns / _NS - limits.age_days * _DAY_S)
         return _trim(self.folder / KEPT, limits.kept_mb * _MB, -1.0)
 
-    def finished(self) -> list[Path]:
-        """Returns the files of the ring, oldest first."""
-        return sorted(self.folder.glob(f"*{SUFFIX}"))
-
 
 def _trim(folder: Path, most: float, oldest_s: float) -> list[Path]:
     """Removes files beyond ``most`` bytes in all or older than ``oldest_s``; returns them."""

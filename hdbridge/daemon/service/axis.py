@@ -8,32 +8,28 @@ never enabled automatically.
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncIterator, Callable, Sequence
+from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager, suppress
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Final, Literal
 
 from hdbridge.client import messages
 from hdbridge.commissioning.evaluation.stepping import Scheme
-from hdbridge.daemon.loop.states import AxisState
+from hdbridge.daemon.loop.states import MAY_MOVE, UNKNOWN, AxisState
 from hdbridge.daemon.memory import CommandKind, EventKind
-from hdbridge.daemon.service.activity import Kind
 from hdbridge.daemon.service.axislink import AxisLink
 from hdbridge.daemon.service.commissioning import Commissioning
 from hdbridge.daemon.service.core import ANSWER_S
 from hdbridge.daemon.service.models import AxisModels
-from hdbridge.daemon.service.moves import AxisMotion, WayPoint
-from hdbridge.daemon.service.streams import ServiceStream
+from hdbridge.daemon.service.moves import AxisMotion
 from hdbridge.drive.states import State
 from hdbridge.drive.values import Object, Value
-from hdbridge.errors import DriveError, HdbridgeError, InputError, RefusedError
-from hdbridge.motion import MotionMode
+from hdbridge.errors import DriveError, HdbridgeError, RefusedError
 
 if TYPE_CHECKING:
     from hdbridge.axis.model import TransmissionModel
     from hdbridge.daemon.machine import Axis
     from hdbridge.daemon.service.core import Core
-    from hdbridge.daemon.service.following import Following
     from hdbridge.daemon.setting import CompensationSetting
 
 CHANGE_S: Final = 120.0
@@ -41,13 +37,10 @@ CHANGE_S: Final = 120.0
 POWER_S: Final = 20.0
 """Time-out for ENABLE and DISABLE, braking included."""
 FAULT_RESET_S: Final = 2.0
-UNKNOWN: Final = frozenset({AxisState.UNVERIFIED, AxisState.LATCHED})
-"""States in which the drive must be verified before any other request."""
-_POWERED: Final = frozenset({AxisState.ENABLING, AxisState.ENABLED, AxisState.STOPPING})
 
 
 class ServiceAxis:
-    """One axis of the machine. Every method that moves it requires the lease; stopping and reading do not."""
+    """One axis of the machine. Methods that change it require the lease; stopping and reading do not."""
 
     def __init__(
         self,
@@ -65,9 +58,7 @@ class ServiceAxis:
         self.models = AxisModels(axis, core.memory.settings[index])
         self.is_prepared = False
         """True if all SDO work that precedes power is done, and no SDO transfer has followed."""
-        self.motion = AxisMotion(self.link, axis.config.limits)
-        self.following: Following | None = None
-        """Watch and adaptation."""
+        self.motion = AxisMotion(self.link, self.check_may)
         self._report = report
         self._work = core.timing.work
         self._changing = asyncio.Lock()
@@ -240,65 +231,6 @@ class ServiceAxis:
             with suppress(HdbridgeError):  # monitoring is set up again each time power is switched on
                 await self._work(self.commissioning.rest)
 
-    # ---------------------------------------------------------------- motion
-
-    async def move(
-        self,
-        holder: str,
-        target_deg: float,
-        velocity_deg_s: float | None = None,
-        acceleration_deg_s2: float | None = None,
-        wait: bool = True,
-    ) -> None:
-        """Moves to ``target_deg``, or redirects a present motion there; with ``wait`` returns at rest there.
-
-        Raises RefusedError if another command replaced this one before its end.
-        """
-        self.check_may(holder)
-        activity = await self.motion.move(holder, WayPoint(target_deg, velocity_deg_s, acceleration_deg_s2))
-        if wait:
-            await self.link.arrival(activity)
-
-    async def jog(self, holder: str, velocity_deg_s: float, timeout_s: float = 0.5) -> None:
-        """Turns at a speed; brakes to rest unless called again within ``timeout_s``."""
-        self.check_may(holder)
-        await self.motion.jog(holder, velocity_deg_s, timeout_s)
-
-    async def queue(self, holder: str, points: Sequence[WayPoint]) -> int:
-        """Appends moves, each begun when the one before has ended; returns the number of waiting moves."""
-        self.check_may(holder)
-        return await self.motion.queue(holder, points)
-
-    async def clear_queue(self, holder: str) -> int:
-        """Discards the waiting moves and returns their number. The present move continues."""
-        self.check_may(holder)
-        return self.motion.clear_queue()
-
-    async def stream(self, holder: str, timeout_s: float = 0.5) -> ServiceStream:
-        """Opens a stream of set-points. It begins at rest, with the first set-points that are put.
-
-        If none come for ``timeout_s`` and all are used up, the axis brakes to rest.
-        """
-        self.check_may(holder)
-        return await self.motion.stream(holder, timeout_s)
-
-    async def end_without_lease(self) -> None:
-        """Stops an activity that must end with its lease, if that lease has ended."""
-        if not self.motion.without_lease():
-            return
-        async with self.motion.commanding:
-            # Another client's motion may have replaced it meanwhile; that one continues.
-            activity = self.motion.activity
-            if activity is None or not self.motion.without_lease():
-                return
-            self.motion.replace(None, "the lease has ended")
-            if activity.kind is Kind.JOG and self.link.value("mode") == MotionMode.HOLD:
-                return  # its time-out has stopped it already
-            self.core.log.note(
-                f"{activity.kind.value} was stopped: the lease of its client has ended", self.link.index
-            )
-            await self.link.do(CommandKind.STOP)
-
     # ---------------------------------------------------------------- compensation
 
     async def compensate(self, holder: str, scheme: Scheme) -> None:
@@ -342,22 +274,6 @@ class ServiceAxis:
         async with self._changing:
             await self._use(self.models.with_load_loop(on))
 
-    async def adapt(self, holder: str, mode: messages.AdaptationMode) -> None:
-        """Sets how the model's parameters follow the load encoder."""
-        await self._followed(holder).set_mode(mode)
-
-    async def revert_adaptation(self, holder: str) -> None:
-        """Discards the adapted parameters and restores the model as it was activated."""
-        await self._followed(holder).revert()
-
-    def _followed(self, holder: str) -> Following:
-        self.core.lease.check(holder)
-        if self.following is None:
-            raise InputError(
-                f"{self.name}: nothing adapts on this axis; give it an adaptation in the machine file"
-            )
-        return self.following
-
     async def _use(self, setting: CompensationSetting) -> None:
         """Sends a setting to the control process and waits until it is in effect."""
         log, index = self.core.log, self.link.index
@@ -377,7 +293,7 @@ class ServiceAxis:
     async def sdo_write(self, holder: str, object_: str, value: str) -> Object:
         """Writes an object of the drive, given as text; refused while the axis is enabled."""
         self.check_may(holder)
-        if self.link.state in _POWERED:
+        if self.link.state in MAY_MOVE:
             raise RefusedError(
                 f"{self.name}: no object is written while the axis is enabled; disable it first"
             )

@@ -1,21 +1,55 @@
-"""Connection to one axis of the control process: commands with their answers, and its newest sample."""
+"""Connection to one axis of the control process: its newest sample, commands, and the end of motions."""
 
 from collections.abc import Callable
+from dataclasses import dataclass
+from enum import Enum
 from typing import Final, Unpack
 
 from hdbridge.axis import AxisConfig
-from hdbridge.daemon.loop.states import AxisState
+from hdbridge.daemon.loop.faultlog import fault_of
+from hdbridge.daemon.loop.states import STOPPED, AxisState
 from hdbridge.daemon.memory import CommandKind, Event, EventKind, SampleFlag
-from hdbridge.daemon.service.activity import Activity
 from hdbridge.daemon.service.core import ANSWER_S, Arguments, Core
-from hdbridge.daemon.service.reports import stop_hint
 from hdbridge.daemon.service.timing import POLL_S
 from hdbridge.drive.states import State
+from hdbridge.drive.supervision import EXPLAINED_HINT, ROWS
 from hdbridge.errors import DaemonError, InputError, RefusedError, SafetyStop
 from hdbridge.motion import MotionMode
 
-_STOPPED: Final = frozenset({AxisState.QUICK_STOPPED, AxisState.LATCHED})
 _POWER: Final = tuple(State)
+
+
+class Kind(Enum):
+    """Kind of an activity."""
+
+    MOVE = "a move"
+    JOG = "a jog"
+    QUEUE = "a queue of moves"
+    STREAM = "a stream"
+    COORDINATED = "a coordinated move"
+
+
+ENDS_WITH_LEASE = frozenset({Kind.JOG, Kind.QUEUE, Kind.STREAM})
+"""Activities that are stopped when the lease under which they began ends. Moves end on their own."""
+
+
+@dataclass(slots=True, eq=False)
+class Activity:
+    """One activity; it is over when another replaces it or when it has completed."""
+
+    kind: Kind
+    holder: str
+    """Token of the lease under which it began."""
+    command_id: int = 0
+    """Id of the command to the control process that began this motion."""
+    since: int = 0
+    """Number of the newest log entry before it began; later entries report its outcome."""
+    over: str = ""
+    """Reason for its end; empty while it lasts."""
+
+    def end(self, why: str) -> None:
+        """Ends the activity; only the first reason counts."""
+        self.over = self.over or why
 
 
 class AxisLink:
@@ -124,7 +158,7 @@ class AxisLink:
                 activity.end("the supervision stopped it")
                 raise SafetyStop(f"{self.name}: {event.text}", stop_hint(event, self.name))
             if event.kind is EventKind.STATE:
-                stopping = AxisState(event.code) in _STOPPED
+                stopping = AxisState(event.code) in STOPPED
                 if not stopping and event.code != AxisState.ENABLED:
                     activity.end(f"the axis became {AxisState(event.code).name.lower()}")
             elif event.id == activity.command_id and self._ended(event, activity):
@@ -147,3 +181,16 @@ class AxisLink:
             raise RefusedError(f"{self.name}: {why}")
         activity.end("it came to its end")
         return True
+
+
+def stop_hint(stopped: Event, axis: str) -> str:
+    """Returns the advice for a stop."""
+    fault = fault_of(stopped.code)
+    if stopped.id:
+        return EXPLAINED_HINT
+    return ROWS[fault].hint if fault is not None else reset_hint(axis)
+
+
+def reset_hint(axis: str) -> str:
+    """Returns the advice for a stop by command."""
+    return f"reset it when the axis may move again: hdbridge ctl reset {axis}"

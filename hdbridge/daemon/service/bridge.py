@@ -28,22 +28,23 @@ from importlib.metadata import version
 from typing import TYPE_CHECKING, Any, Final, Self
 
 from hdbridge.client import messages
+from hdbridge.daemon.loop.states import STOPPED, UNKNOWN
 from hdbridge.daemon.memory import Cell, CommandKind, EventKind
 from hdbridge.daemon.service import reports
-from hdbridge.daemon.service.axis import UNKNOWN, ServiceAxis
+from hdbridge.daemon.service.axis import ServiceAxis
 from hdbridge.daemon.service.coordination import run_together
 from hdbridge.daemon.service.core import ANSWER_S, Core
 from hdbridge.daemon.service.eventlog import Entry
 from hdbridge.daemon.service.lending import Lending
 from hdbridge.daemon.service.observer import PERIOD_S, Subscription
 from hdbridge.daemon.service.outermaster import Latency, OuterMaster
-from hdbridge.daemon.service.reports import LATCHED
 from hdbridge.daemon.service.timing import Timing
 from hdbridge.errors import HdbridgeError, InputError
 
 if TYPE_CHECKING:
     from hdbridge.daemon.machine import Machine
     from hdbridge.daemon.memory import Memory
+    from hdbridge.daemon.service.following import Following
     from hdbridge.daemon.service.lease import Lease
 
 VERIFY_AGAIN_S: Final = (0.0, 1.0, 2.0, 5.0, 10.0)
@@ -80,6 +81,8 @@ class ServiceBridge:
         self.recorder: Callable[[], messages.RecorderState] = lambda: messages.RecorderState(on=False)
         self.marks: list[Callable[[str], None]] = []
         """Receivers of remarks, such as the recorder."""
+        self.following: dict[str, Following] = {}
+        """Watch and adaptation of each axis."""
         self._names = tuple(self.axes)
         self._simulated = simulated
         self._started = datetime.now(UTC)
@@ -146,11 +149,11 @@ class ServiceBridge:
         core = self.core
         while True:
             core.observer.poll()
-            core.memory.status.set(Cell.SERVICE_TIME_NS, time.monotonic_ns())
+            core.memory.status[Cell.SERVICE_TIME_NS] = time.monotonic_ns()
             self._look()
             for axis in self.axes.values():
                 try:
-                    await axis.end_without_lease()
+                    await axis.motion.end_without_lease()
                 except HdbridgeError as error:
                     core.log.note(f"could not be stopped: {error}", axis.link.index)
                 if axis.unsettled and axis.name not in self._settling:
@@ -171,7 +174,7 @@ class ServiceBridge:
             name = self._names[event.axis] if event.axis >= 0 else ""
             if event.kind is EventKind.STOPPED:
                 self._stopped[name] = entry
-            elif event.kind is EventKind.STATE and event.code in LATCHED:
+            elif event.kind is EventKind.STATE and event.code in STOPPED:
                 self._stopped.pop(name, None)  # the reason is reported once it stands
             elif event.kind is EventKind.LOAD_LOOP:
                 self._loop_doubts[name] = event.text
@@ -271,6 +274,7 @@ class ServiceBridge:
             self._axis(name),
             self._stopped.get(name),
             self._loop_doubts.get(name, "the reason is in the log of an earlier service"),
+            self.following.get(name),
             self._outer(name),
         )
 
@@ -279,7 +283,7 @@ class ServiceBridge:
         node_id = gateway.nodes.get(name) if gateway is not None else None
         if node_id is None:
             return None
-        alive_ns = memory.status.get(Cell.GATEWAY_TIME_NS)
+        alive_ns = memory.status[Cell.GATEWAY_TIME_NS]
         place = self._axis(name).link.index
         return reports.outer_state(memory.outer[place], node_id, alive_ns, self._latency.of(place))
 
@@ -314,13 +318,8 @@ class ServiceBridge:
         )
 
     def subscribe(self, most: int = 512) -> Subscription:
-        """Subscribes to samples and events; at most the newest ``most`` samples wait to be fetched."""
-        return Subscription(self.core.observer, self._messages_since, most)
-
-    def _messages_since(self, number: int) -> tuple[list[messages.Event], int]:
-        entries = self.core.log.told(number)
-        newest = entries[-1].number if entries else self.core.log.newest_told
-        return [reports.event_message(each, self._names) for each in entries], newest
+        """Subscribes to samples; at most the newest ``most`` wait to be fetched."""
+        return Subscription(self.core.observer, most)
 
     # ---------------------------------------------------------------- requests
 
@@ -343,6 +342,15 @@ class ServiceBridge:
             raise InputError("a coordinated move of no axis; expected a target for at least one")
         axes = [self._axis(name) for name in moves]
         await run_together(holder, axes, moves, speed, wait=wait)
+
+    def followed(self, holder: str, name: str) -> Following:
+        """Returns the adaptation of an axis, to change it."""
+        self.core.lease.check(holder)
+        if name not in self.following:
+            raise InputError(
+                f"{name}: nothing adapts on this axis; give it an adaptation in the machine file"
+            )
+        return self.following[name]
 
     def mark(self, text: str, axis: int = -1) -> None:
         """Adds a remark to the event log and the flight recorder, which keeps the time around it."""

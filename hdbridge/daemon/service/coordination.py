@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Final
 
 from hdbridge.control.bench import axis_view
 from hdbridge.daemon.memory import CommandKind, Knot
-from hdbridge.daemon.service.activity import Activity, Kind
+from hdbridge.daemon.service.axislink import Activity, Kind
 from hdbridge.errors import HdbridgeError
 from hdbridge.motion import coordinated
 

@@ -65,26 +65,22 @@ class Core:
             )
         command_id = self.memory.commands.post(kind, axis, **arguments)
         deadline_s = self.timing.clock.now() + within_s
-        while (answer := self._answer(command_id)) is None:
-            self._check(kind, loop_pid, deadline_s, within_s)
+        while True:
+            self.log.poll()
+            answer = self.log.answer(command_id)
+            if answer is not None:
+                break
+            if self.memory.status.loop_pid != loop_pid:
+                raise DaemonError(
+                    f"the control process died before it answered {kind.name}; another one has taken its "
+                    "place, with every axis disabled"
+                )
+            if self.timing.clock.now() >= deadline_s:
+                raise DaemonError(
+                    f"the control process did not answer {kind.name} within {within_s:g} s: it hangs or is "
+                    "gone; it is started again by itself, with every axis disabled"
+                )
             await self.timing.sleep(POLL_S)
-        return answer
-
-    def _answer(self, command_id: int) -> Event | None:
-        self.log.poll()
-        answer = self.log.answer(command_id)
-        if answer is not None and answer.kind is EventKind.REFUSED:
+        if answer.kind is EventKind.REFUSED:
             raise RefusedError(answer.text)
         return answer
-
-    def _check(self, kind: CommandKind, loop_pid: int, deadline_s: float, within_s: float) -> None:
-        if self.memory.status.loop_pid != loop_pid:
-            raise DaemonError(
-                f"the control process died before it answered {kind.name}; another one has taken its place, "
-                "with every axis disabled"
-            )
-        if self.timing.clock.now() >= deadline_s:
-            raise DaemonError(
-                f"the control process did not answer {kind.name} within {within_s:g} s: it hangs or is gone; "
-                "it is started again by itself, with every axis disabled"
-            )

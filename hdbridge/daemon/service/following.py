@@ -19,6 +19,7 @@ from hdbridge.daemon.following.settings import AdaptationSettings
 from hdbridge.daemon.following.statefile import AdaptationFiles
 from hdbridge.daemon.memory import Event, SampleArray
 from hdbridge.daemon.recorder.autodiagnosis import AutoDiagnosis
+from hdbridge.daemon.recorder.flightlog import Note
 from hdbridge.daemon.recorder.recorder import FlightRecorder
 from hdbridge.daemon.service.axis import ServiceAxis
 from hdbridge.errors import HdbridgeError
@@ -198,7 +199,7 @@ class Following:
 
     def _note(self, kind: str, text: str) -> None:
         if self._recorder is not None:
-            self._recorder.note(kind, f"{self._axis.name}: {text}")
+            self._recorder.put(Note(kind, f"{self._axis.name}: {text}"))
         self._axis.core.log.note(text, self._index)
         _log.warning("watch", {"axis": self._axis.name, "text": text})
 

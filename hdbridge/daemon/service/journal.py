@@ -2,26 +2,14 @@
 
 import logging
 from collections.abc import Sequence
-from typing import Final
 
+from hdbridge.daemon.loop.faultlog import fault_of
 from hdbridge.daemon.loop.states import AxisState
 from hdbridge.daemon.memory import Event, EventKind, SampleArray
-from hdbridge.drive.supervision import Fault, Reaction
+from hdbridge.daemon.memory.layout import LEVELS
+from hdbridge.drive.supervision import Reaction
 
 _log = logging.getLogger(__name__)
-_FAULTS: Final = list(Fault)
-_LEVELS: Final = {
-    EventKind.STOPPED: logging.ERROR,
-    EventKind.BUS_DOWN: logging.ERROR,
-    EventKind.FAULT: logging.WARNING,
-    EventKind.REFUSED: logging.WARNING,
-    EventKind.UNDERRUN: logging.WARNING,
-    EventKind.LOAD_LOOP: logging.WARNING,
-    EventKind.STREAM_REFUSED: logging.WARNING,
-    EventKind.DONE: logging.DEBUG,
-    EventKind.MOTION_ENDED: logging.DEBUG,
-}
-"""Log levels by kind of event; all others are INFO."""
 
 
 class Journal:
@@ -35,7 +23,7 @@ class Journal:
         if lost:
             _log.warning("cycles lost", {"cycles": lost})
         for event in events:
-            level = _LEVELS.get(event.kind, logging.INFO)
+            level = LEVELS.get(event.kind, logging.INFO)
             if _log.isEnabledFor(level):
                 _log.log(level, event.kind.name.lower().replace("_", " "), self._facts(event))
 
@@ -45,8 +33,8 @@ class Journal:
             facts["axis"] = self._names[event.axis]
         if event.kind is EventKind.STATE:
             facts["state"] = AxisState(event.code).name.lower().replace("_", "-")
-        if event.kind is EventKind.FAULT:
-            facts["fault"] = _FAULTS[event.code].name
+        if event.kind is EventKind.FAULT and (fault := fault_of(event.code)) is not None:
+            facts["fault"] = fault.name
             facts["reaction"] = Reaction(event.id).name.lower()
         if event.text:
             facts["text"] = event.text

@@ -36,13 +36,13 @@ class Lending:
         self._status = core.memory.status
         self._lock = InterfaceLock(bus.interface, bus.channel)
         self._signalled_s = 0.0
-        self._status.set(Cell.BUS_WANTED, 0)
+        self._status[Cell.BUS_WANTED] = 0
         core.refuse = self.refuse
 
     @property
     def borrower(self) -> str | None:
         """Description of the program that has the bus; None if the bus is not lent."""
-        if not self._status.get(Cell.BUS_LENT):
+        if not self._status[Cell.BUS_LENT]:
             return None
         number = self._lock.holder
         return process_words(number) if number else "the program that asked for it"
@@ -50,7 +50,7 @@ class Lending:
     @property
     def lent_s(self) -> float | None:
         """Seconds since the bus was lent; None if it is not."""
-        since_ns = self._status.get(Cell.BUS_LENT)
+        since_ns = self._status[Cell.BUS_LENT]
         return 1e-9 * (time.monotonic_ns() - since_ns) if since_ns else None
 
     async def lend(self) -> None:
@@ -63,14 +63,14 @@ class Lending:
             raise RefusedError(f"the bus cannot be lent: {self._reason_against}")
         timing = self._core.timing
         deadline_s = timing.clock.now() + LEND_S
-        self._status.set(Cell.BUS_WANTED, 1)
+        self._status[Cell.BUS_WANTED] = 1
         try:
-            while not self._status.get(Cell.BUS_LENT):
+            while not self._status[Cell.BUS_LENT]:
                 if timing.clock.now() > deadline_s:
                     raise DaemonError(f"the axes did not come to rest within {LEND_S:g} s: nothing was lent")
                 await timing.sleep(POLL_S)
         finally:
-            self._status.set(Cell.BUS_WANTED, 0)
+            self._status[Cell.BUS_WANTED] = 0
 
     def refuse(self, kind: CommandKind | None = None) -> None:
         """Raises RefusedError while the bus is lent. A stop is passed on to the borrower as SIGTERM."""

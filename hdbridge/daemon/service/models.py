@@ -20,7 +20,7 @@ from hdbridge.errors import InputError
 
 if TYPE_CHECKING:
     from hdbridge.daemon.machine import Axis
-    from hdbridge.daemon.memory.setting import SettingSlot
+    from hdbridge.daemon.memory.cells import SettingSlot
 
 
 class AxisModels:

@@ -3,12 +3,11 @@
 import asyncio
 import logging
 from collections import deque
-from collections.abc import AsyncIterator, Callable, Sequence
+from collections.abc import AsyncIterator, Sequence
 from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from hdbridge.client import messages
 from hdbridge.clock import Clock
 from hdbridge.daemon.memory import Event, Memory, SampleArray, joined_samples, sample_dtype
 from hdbridge.daemon.service.eventlog import EventLog
@@ -90,11 +89,10 @@ class Observer:
 
 
 class Batch(NamedTuple):
-    """Samples and events delivered to a subscriber at once."""
+    """Samples delivered to a subscriber at once."""
 
     samples: SampleArray
     """One row per cycle, with the fields of `hdbridge.daemon.memory.sample_dtype`."""
-    events: Sequence[messages.Event]
     lost: int
     """Cycles lost because the subscriber was too slow."""
 
@@ -105,21 +103,12 @@ class Subscription:
     A client that is too slow loses samples; each batch contains the number lost.
     """
 
-    def __init__(
-        self,
-        observer: Observer,
-        events_since: Callable[[int], tuple[list[messages.Event], int]],
-        most: int,
-    ) -> None:
-        """Keeps at most ``most`` samples; ``events_since`` returns the events after a number, and the newest
-        number.
-        """
+    def __init__(self, observer: Observer, most: int) -> None:
+        """Keeps at most ``most`` samples."""
         self._observer = observer
         self._most = most
         self._samples: deque[SampleArray] = deque()
         self._waiting = 0
-        self._events_since = events_since
-        _, self._seen = events_since(1 << 62)
         self._lost = 0
         self._came = asyncio.Event()
         observer.add(self)
@@ -147,9 +136,8 @@ class Subscription:
         """Returns the next batch; waits until there is one."""
         await self._came.wait()
         self._came.clear()
-        events, self._seen = self._events_since(self._seen)
         samples = list(self._samples)
-        batch = Batch(joined_samples(samples) if samples else self._observer.none, events, self._lost)
+        batch = Batch(joined_samples(samples) if samples else self._observer.none, self._lost)
         self._samples.clear()
         self._waiting = self._lost = 0
         return batch

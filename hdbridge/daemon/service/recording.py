@@ -7,6 +7,7 @@ from hdbridge.client import messages
 from hdbridge.daemon.machine import Machine
 from hdbridge.daemon.memory import Event, SampleArray
 from hdbridge.daemon.recorder.about import About, AxisAbout
+from hdbridge.daemon.recorder.flightlog import ModelUse
 from hdbridge.daemon.recorder.recorder import FlightRecorder
 from hdbridge.daemon.service.bridge import ServiceBridge
 from hdbridge.daemon.setting import CompensationSetting
@@ -45,7 +46,7 @@ class Recording:
             if self._told.get(name) is not in_use:
                 self._told[name] = in_use
                 version = str(in_use.version) if in_use.version is not None else ""
-                self.recorder.use_model(name, in_use.compensating.dump(), version)
+                self.recorder.put(ModelUse(name, version, in_use.compensating.dump()))
         self.recorder.take(samples, events, lost)
 
     def state(self) -> messages.RecorderState:

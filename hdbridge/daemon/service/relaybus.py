@@ -10,7 +10,7 @@ from __future__ import annotations
 import threading
 from collections import deque
 from collections.abc import Container
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
 import can
 
@@ -101,16 +101,3 @@ class RelayBus(can.BusABC):
             if frame.can_id & _FUNCTION in _FROM_NODES and frame.can_id & _NODE in self._nodes:
                 return frame
         return None
-
-    def shutdown(self) -> None:
-        """Closes the bus."""
-        super().shutdown()
-
-    @property
-    def state(self) -> can.BusState:
-        """Always active; only the control process knows the state of the real bus."""
-        return can.BusState.ACTIVE
-
-    @state.setter
-    def state(self, new_state: Any) -> None:
-        raise NotImplementedError("the control process has the bus")

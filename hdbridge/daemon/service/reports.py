@@ -9,34 +9,41 @@ from typing import TYPE_CHECKING, Final
 
 from hdbridge.axis.channels import BY_KEY
 from hdbridge.client import messages
-from hdbridge.daemon.loop.states import AxisState
+from hdbridge.daemon.loop.faultlog import fault_of
+from hdbridge.daemon.loop.states import STOPPED, AxisState
 from hdbridge.daemon.memory import NO_FAULT, Event, EventKind, OuterCell, SampleFlag
+from hdbridge.daemon.service.axislink import reset_hint, stop_hint
 from hdbridge.daemon.service.eventlog import Entry
+from hdbridge.drive.emergencies import gateway_error
 from hdbridge.drive.states import State
-from hdbridge.drive.supervision import EXPLAINED_HINT, ROWS, Fault, Reaction
+from hdbridge.drive.supervision import ROWS, Fault, Reaction
 from hdbridge.motion import MotionMode
 from hdbridge.units import ARCSEC_PER_DEG
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from hdbridge.axis import AxisConfig
     from hdbridge.daemon.memory import OuterCells
     from hdbridge.daemon.service.axis import ServiceAxis
+    from hdbridge.daemon.service.following import Following
     from hdbridge.daemon.service.lease import Lease
     from hdbridge.daemon.setting import CompensationSetting
 
-FAULTS: Final = tuple(Fault)
 STATES: Final = tuple(messages.ControlState)
 MODES: Final = tuple(messages.MotionMode)
-LATCHED: Final = frozenset({AxisState.QUICK_STOPPED, AxisState.LATCHED})
 GATEWAY_GONE_NS: Final = 2_000_000_000
+_NUMBERS: Final = (
+    "velocity_deg_s", "motor_target_deg", "motor_position_deg", "motor_torque_nm", "correction_arcsec",
+    "predicted_arcsec", "weight",
+)  # fmt: skip
+"""Numbers of a sample that a state has under the same name."""
+_FLAGS: Final = {
+    str(each.name).lower(): each
+    for each in SampleFlag
+    if each.name in {"AT_REST", "COMPENSATING", "LIMITED", "MEMORY_KNOWN", "CHANGING", "UNDERRUN"}
+}
+"""Flags of a sample that a state has under the same name."""
 _KINDS: Final = {kind: messages.EventKind[kind.name] for kind in EventKind}
-
-
-def fault_of(code: int) -> Fault | None:
-    """Returns the fault with this number in samples and events; None if there is none."""
-    return FAULTS[code] if 0 <= code < len(FAULTS) else None
 
 
 def event_message(entry: Entry, names: Sequence[str]) -> messages.Event:
@@ -65,18 +72,6 @@ def event_message(entry: Entry, names: Sequence[str]) -> messages.Event:
         text=_words(event, fault),
         hint=hint,
     )
-
-
-def stop_hint(stopped: Event, axis: str) -> str:
-    """Returns the advice for a stop."""
-    fault = fault_of(stopped.code)
-    if stopped.id:
-        return EXPLAINED_HINT
-    return ROWS[fault].hint if fault is not None else _reset_hint(axis)
-
-
-def _reset_hint(axis: str) -> str:
-    return f"reset it when the axis may move again: hdbridge ctl reset {axis}"
 
 
 def _words(event: Event, fault: Fault | None) -> str:
@@ -124,18 +119,6 @@ def model_in_use(in_use: CompensationSetting) -> messages.ModelInUse | None:
     )
 
 
-def limits(config: AxisConfig) -> messages.Limits:
-    """Returns the limits of an axis."""
-    own = config.limits
-    return messages.Limits(
-        position_min_deg=own.position_min_deg,
-        position_max_deg=own.position_max_deg,
-        velocity_deg_s=own.velocity_deg_s,
-        acceleration_deg_s2=own.acceleration_deg_s2,
-        jerk_deg_s3=own.jerk_deg_s3,
-    )
-
-
 def outer_state(
     cells: OuterCells, node_id: int, alive_ns: int, latency_s: tuple[float, float] | None
 ) -> messages.OuterState:
@@ -151,6 +134,7 @@ def outer_state(
         nmt=view.nmt,
         statusword=view.statusword,
         error_code=view.error_code,
+        error=gateway_error(view.error_code) if view.error_code else None,
         period_s=period_s or None,
         jitter_s=1e-9 * cells[OuterCell.JITTER_NS] if period_s else None,
         latency_s=median_s,
@@ -162,6 +146,7 @@ def axis_state(
     axis: ServiceAxis,
     stopped: Entry | None,
     loop_doubt: str,
+    following: Following | None = None,
     outer: messages.OuterState | None = None,
 ) -> messages.AxisState:
     """Returns the state of an axis.
@@ -169,7 +154,7 @@ def axis_state(
     ``stopped`` is the entry of its last stop, ``loop_doubt`` the text of its load loop's last event.
     """
     link, config = axis.link, axis.axis.config
-    flags = SampleFlag(int(link.value("flags")))
+    flags = int(link.value("flags"))
     known = link.core.observer.newest is not None
     in_use = axis.models.in_use
 
@@ -188,25 +173,14 @@ def axis_state(
         state=STATES[link.state],
         power=messages.PowerState(link.power.value),
         mode=MODES[int(link.value("mode"))],
-        at_rest=bool(flags & SampleFlag.AT_REST),
         load_target_deg=target,
-        velocity_deg_s=number("velocity_deg_s"),
-        motor_target_deg=number("motor_target_deg"),
-        motor_position_deg=number("motor_position_deg"),
         load_position_deg=load,
+        **{name: number(name) for name in _NUMBERS},
+        **{name: bool(flags & flag) for name, flag in _FLAGS.items()},
         error_arcsec=error,
-        motor_torque_nm=number("motor_torque_nm"),
         readings=readings,
         scheme=messages.Scheme(in_use.scheme.value),
-        compensating=bool(flags & SampleFlag.COMPENSATING),
-        correction_arcsec=number("correction_arcsec"),
-        predicted_arcsec=number("predicted_arcsec"),
-        weight=number("weight"),
-        limited=bool(flags & SampleFlag.LIMITED),
-        changing=bool(flags & SampleFlag.CHANGING),
-        memory_known=bool(flags & SampleFlag.MEMORY_KNOWN),
-        underrun=bool(flags & SampleFlag.UNDERRUN),
-        limits=limits(config),
+        limits=messages.Limits.model_validate(config.limits, from_attributes=True),
         fault=_fault(axis, stopped),
         model=model_in_use(in_use),
         load_loop=messages.LoadLoopState(
@@ -215,9 +189,9 @@ def axis_state(
             correction_arcsec=link.value("loop_arcsec"),
             doubt=loop_doubt if flags & SampleFlag.LOOP_DOUBTED else None,
         ),
-        adaptation=axis.following.state if axis.following else messages.AdaptationState(),
+        adaptation=following.state if following is not None else messages.AdaptationState(),
         outer=outer,
-        advice=list(axis.following.advice) if axis.following else [],
+        advice=list(following.advice) if following is not None else [],
         queued=axis.motion.queued,
     )
 
@@ -227,7 +201,7 @@ def _fault(axis: ServiceAxis, stopped: Entry | None) -> messages.Fault | None:
     link = axis.link
     code = int(link.value("fault")) if link.core.observer.newest is not None else NO_FAULT
     fault = fault_of(code)
-    latched = link.state in LATCHED
+    latched = link.state in STOPPED
     if not latched and link.power is not State.FAULT:
         return None
     event = stopped.event if stopped is not None else None
@@ -240,7 +214,7 @@ def _fault(axis: ServiceAxis, stopped: Entry | None) -> messages.Fault | None:
     elif fault is not None:
         text, hint = fault.value, ROWS[fault].hint
     else:
-        text, hint = "quick stop by command", _reset_hint(axis.name)
+        text, hint = "quick stop by command", reset_hint(axis.name)
     return messages.Fault(
         name=fault.name if fault is not None else "COMMAND",
         text=text,

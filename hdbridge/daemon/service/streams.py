@@ -5,15 +5,14 @@ point of a stream is at rest. The stream begins once it has `LEAD_S` of path or 
 may lag by that time.
 """
 
-import math
 from collections.abc import Sequence
 from itertools import pairwise
 from types import TracebackType
-from typing import Final, NamedTuple, Self
+from typing import Final, Self
 
+from hdbridge.client.messages import StreamPoint
 from hdbridge.daemon.memory import CommandKind, Knot
-from hdbridge.daemon.service.activity import Activity
-from hdbridge.daemon.service.axislink import AxisLink
+from hdbridge.daemon.service.axislink import Activity, AxisLink
 from hdbridge.errors import InputError, RefusedError
 
 LEAD_S: Final = 0.1
@@ -21,16 +20,6 @@ LEAD_S: Final = 0.1
 ROOM_POLL_S: Final = 0.02
 BEGIN_DEG: Final = 1e-6
 """Maximum distance between the first point of a stream and the axis's position."""
-
-
-class StreamPoint(NamedTuple):
-    """One set-point of a stream."""
-
-    time_s: float
-    """Time since the stream began; later than that of the point before."""
-    position_deg: float
-    velocity_deg_s: float | None = None
-    """Velocity of the path at this point; None for the slope between its neighbours, or rest at the last."""
 
 
 class Knots:
@@ -57,7 +46,7 @@ class Knots:
         for point in points:
             if before is None and held is None:
                 knots.append(Knot(self._stream, 0.0, self._begin_deg, 0.0))
-                before = StreamPoint(0.0, self._begin_deg, 0.0)
+                before = StreamPoint(time_s=0.0, position_deg=self._begin_deg, velocity_deg_s=0.0)
                 if point.time_s == 0.0:
                     continue
             if held is not None:
@@ -84,14 +73,8 @@ class Knots:
         return Knot(self._stream, float(point.time_s), float(point.position_deg), float(velocity_deg_s))
 
     def _check(self, points: Sequence[StreamPoint], chain: Sequence[StreamPoint]) -> None:
-        for point in points:
-            velocity = point.velocity_deg_s
-            if not all(map(math.isfinite, (point.time_s, point.position_deg, velocity or 0.0))):
-                raise InputError(f"a set-point of {tuple(point)}; expected finite numbers")
         if points and self._before is None and self._held is None:
             first = points[0]
-            if first.time_s < 0.0:
-                raise InputError(f"a set-point at {first.time_s:g} s; a stream's time begins at 0")
             if first.time_s == 0.0 and abs(first.position_deg - self._begin_deg) > BEGIN_DEG:
                 raise InputError(
                     f"a stream begins at {first.position_deg:.9g} deg, but the axis stands at "
@@ -128,15 +111,6 @@ class ServiceStream:
         self._last_s = 0.0
         """Time of the last knot that was sent."""
         self._ended = False
-
-    @property
-    def buffered_s(self) -> float:
-        """Duration of the path that was sent and not followed yet."""
-        if self._begun_cycle is None:
-            return self._last_s
-        core = self._link.core
-        run_s = (core.observer.cycle - self._begun_cycle) * core.memory.period_s
-        return max(self._last_s - run_s, 0.0)
 
     async def put(self, points: Sequence[StreamPoint]) -> None:
         """Hands over set-points; waits while the buffer is full. Raises if the stream has ended."""

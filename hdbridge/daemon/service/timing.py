@@ -5,7 +5,7 @@ import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from typing import Final, ParamSpec, Protocol, TypeVar
+from typing import Final, ParamSpec, TypeVar
 
 from hdbridge.clock import Clock, MonotonicClock
 
@@ -14,25 +14,6 @@ Result = TypeVar("Result")
 
 POLL_S = 0.005
 """Interval between checks for an answer of the control process."""
-
-
-class Timing(Protocol):
-    """Time, as seen by coroutines and blocking code."""
-
-    @property
-    def clock(self) -> Clock:
-        """Clock for blocking code, which calls `Clock.sleep_until` in its own thread."""
-        ...
-
-    async def sleep(self, duration_s: float) -> None:
-        """Sleeps and lets other coroutines run."""
-        ...
-
-    async def work(
-        self, function: Callable[Params, Result], *args: Params.args, **kwargs: Params.kwargs
-    ) -> Result:
-        """Runs blocking code, such as SDO transfers, outside the event loop."""
-        ...
 
 
 CREDIT_S: Final = 0.25
@@ -87,7 +68,7 @@ class SimulatedClock:
             time.sleep(min(max(left_s, SHORTEST_WAIT_S), STEP_S))
 
 
-class RealTiming:
+class Timing:
     """Clock that runs in real time, and a pool of threads. Close it when the service ends."""
 
     def __init__(self, threads: int, clock: Clock | None = None) -> None:

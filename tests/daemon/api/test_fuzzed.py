@@ -18,8 +18,8 @@ from support.fake_bridge import FakeBridge
 
 from hdbridge.client import messages
 from hdbridge.daemon.api.app import create_app
+from hdbridge.daemon.api.guard import Traffic
 from hdbridge.daemon.api.metrics import Metrics
-from hdbridge.daemon.api.traffic import Traffic
 
 BRIDGE = FakeBridge()
 LIMIT_DEG = 180.0

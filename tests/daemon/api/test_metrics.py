@@ -6,8 +6,8 @@ from prometheus_client.parser import text_string_to_metric_families
 from support.fake_bridge import FakeBridge
 
 from hdbridge.client.messages import ControlState, OuterState
+from hdbridge.daemon.api.guard import Traffic
 from hdbridge.daemon.api.metrics import BOUNDS_US, Metrics, exposition
-from hdbridge.daemon.api.traffic import Traffic
 from hdbridge.daemon.memory import Event, EventKind
 from hdbridge.drive.supervision import Fault
 

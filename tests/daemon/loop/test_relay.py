@@ -3,8 +3,8 @@
 import pytest
 from support.daemon import SteppedDaemon
 
-from hdbridge.daemon.loop.relay import MAY_MOVE, incoming_ids, why_refused
-from hdbridge.daemon.loop.states import AxisState
+from hdbridge.daemon.loop.relay import incoming_ids, why_refused
+from hdbridge.daemon.loop.states import MAY_MOVE, AxisState
 from hdbridge.daemon.memory import RelayedFrame
 
 UPLOAD, DOWNLOAD = bytes([0x40, 0x64, 0x60, 0, 0, 0, 0, 0]), bytes([0x2B, 0x40, 0x60, 0, 0x0F, 0, 0, 0])

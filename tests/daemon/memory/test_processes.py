@@ -21,7 +21,7 @@ cycle = 0
 while True:
     cycle += 1
     # Every number of a sample is the same: a torn one shows.
-    memory.samples.write(cycle, cycle, 0.0, 0.0, 0.0, 0, (0,) * 6 + (float(cycle),) * 15 + (0,) * 5)
+    memory.samples.append((cycle, cycle, 0.0, 0.0, 0.0, 0, *(0,) * 6, *(float(cycle),) * 15, *(0,) * 5))
     memory.outer[0].show(OuterView(*(1 + cycle % 2,) * 6))
     if cycle % 16 == 0:
         memory.events.append(Event(0, cycle, cycle, 0, EventKind.DONE, cycle, 0, str(cycle)))
@@ -30,7 +30,7 @@ OTHER_END = """
 import os, signal, sys
 from hdbridge.daemon.memory import Cell, CommandKind, Knot, Memory
 memory = Memory.attach(int(sys.argv[1]))
-memory.status.set(Cell.SERVICE_PID, os.getpid())
+memory.status[Cell.SERVICE_PID] = os.getpid()
 ids = [memory.commands.post(CommandKind.MOVE, 0, float(each)) for each in range(100)]
 memory.knots[0].put(Knot(1, float(each), 0.0, 0.0) for each in range(50))
 os.kill(os.getpid(), signal.SIGKILL)
@@ -81,7 +81,7 @@ def test_commands_of_a_killed_service_are_whole_and_a_new_one_continues() -> Non
     with Memory.create(1, 0.001) as memory:
         process = start(OTHER_END, memory)
         assert process.wait() == -signal.SIGKILL
-        assert memory.status.get(Cell.SERVICE_PID) == process.pid
+        assert memory.status[Cell.SERVICE_PID] == process.pid
         taken = [memory.commands.take() for _ in range(101)]
         assert [each.a for each in taken[:100] if each] == list(map(float, range(100)))
         assert taken[100] is None
@@ -107,7 +107,7 @@ def test_a_replacement_loop_continues_the_numbering() -> None:
         samples, lost = reader.read()
         events.read()
         with Memory.attach(os.dup(memory.fd)) as successor:
-            successor.samples.write(-1, 0, 0.0, 0.0, 0.0, 0, (0,) * 6 + (0.0,) * 15 + (0,) * 5)
+            successor.samples.append((-1, *(0,) * 11, *(0.0,) * 15, *(0,) * 5))
             successor.events.append(Event(0, 0, 0, -1, EventKind.BUS_UP))
         after, lost = reader.read()
         assert lost == 0
@@ -123,17 +123,17 @@ def test_status_cells_are_shared(memory: Memory) -> None:
         assert other.axes == 2
         assert other.period_s == 0.004
         for value, cell in enumerate(Cell, 1 << 40):
-            memory.status.set(cell, value)
+            memory.status[cell] = value
         status = other.status
         assert [
             status.loop_count,
-            status.get(Cell.LOOP_TIME_NS),
-            status.get(Cell.SERVICE_TIME_NS),
-            status.get(Cell.KEEPER_TIME_NS),
+            status[Cell.LOOP_TIME_NS],
+            status[Cell.SERVICE_TIME_NS],
+            status[Cell.KEEPER_TIME_NS],
             status.loop_pid,
-            status.get(Cell.SERVICE_PID),
+            status[Cell.SERVICE_PID],
         ] == [(1 << 40) + place for place in range(6)]
-        assert status.stop_asked
+        assert status[Cell.STOP_ASKED]
 
 
 def foreign(data: bytes, size: int) -> int:

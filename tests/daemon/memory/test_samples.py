@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hdbridge.daemon.memory import AXIS_SAMPLE, NO_FAULT, SAMPLES_KEPT, Memory, SampleFlag
+from hdbridge.daemon.memory import AXIS_SAMPLE, NO_FAULT, SAMPLES_KEPT, Memory, SampleFlag, sample_dtype
 from hdbridge.daemon.memory.layout import Axis
 
 
@@ -16,7 +16,7 @@ def axis(value: float) -> Axis:
 
 def write(memory: Memory, cycle: int) -> None:
     values = [number for place in range(memory.axes) for number in axis(cycle + 100.0 * place)]
-    memory.samples.write(cycle, 4_000_000 * cycle, 1.5, 250.0, 0.25, 7, values)
+    memory.samples.append((cycle, 4_000_000 * cycle, 1.5, 250.0, 0.25, 7, *values))
 
 
 def test_a_sample_arrives_as_it_was_written(memory: Memory) -> None:
@@ -60,7 +60,7 @@ def test_every_sample_is_read_once_or_counted_as_lost(bursts: list[int]) -> None
         written, seen, lost = 0, [], 0
         for burst in bursts:
             for _ in range(burst):
-                memory.samples.write(written, written, 0.0, 0.0, 0.0, 0, values)
+                memory.samples.append((written, written, 0.0, 0.0, 0.0, 0, *values))
                 written += 1
             samples, missed = reader.read()
             lost += missed
@@ -76,7 +76,8 @@ def test_a_slot_being_written_is_not_read(memory: Memory, field: str) -> None:
     reader = memory.reader()
     for cycle in range(3):
         write(memory, cycle)
-    reader._slots[2][field] = 77  # as a writer leaves it in the middle of a store
+    # As a writer leaves it in the middle of a store.
+    reader._rows[2].view(sample_dtype(memory.axes))[field] = 77
     samples, lost = reader.read()
     assert samples["cycle"].tolist() == [0, 2]
     assert lost == 1
@@ -85,6 +86,6 @@ def test_a_slot_being_written_is_not_read(memory: Memory, field: str) -> None:
 def test_a_checksum_detects_reordered_writes() -> None:
     with Memory.create(1, 0.001, checked=True) as memory:
         reader = memory.reader()
-        memory.samples.write(5, 0, 0.0, 0.0, 0.0, 0, axis(0.0))
-        reader._slots[1]["cycle"] = 6
+        memory.samples.append((5, 0, 0.0, 0.0, 0.0, 0, *axis(0.0)))
+        reader._rows[1].view(sample_dtype(1))["cycle"] = 6
         assert reader.read()[1] == 1

@@ -210,8 +210,9 @@ def test_the_page_shows_the_axis_as_the_other_master_sees_it(place, bridge, page
     page.until("document.querySelector('#model').innerText.includes('jitter 20 \u00b5s')")
     assert "node 5, operational, 6041h = 1237h, SYNC every 4.000 ms" in page.text("#model")
     assert "target to frame 6.0 ms, 99 % within 8.0 ms" in page.text("#model")
-    axis.outer = messages.OuterState(**outer, alive=True)
+    axis.outer = messages.OuterState(**outer, alive=True, error_code=0x8700, error="8700h: SYNC is late")
     page.until("document.querySelector('#model').innerText.includes('no SYNC')")
+    assert "error 8700h: SYNC is late, no SYNC" in page.text("#model")
     axis.outer = messages.OuterState(**outer, alive=False)
     page.until("document.querySelector('#model').innerText.includes('the gateway process does not run')")
 

@@ -31,20 +31,20 @@ def main(kind: str, *arguments: str) -> int:
         status = memory.status
         time.sleep(0.05)
         own = {"control": Cell.LOOP_PID, "service": Cell.SERVICE_PID, "gateway": Cell.GATEWAY_PID}
-        status.set(own[kind], os.getpid())
+        status[own[kind]] = os.getpid()
         say(f"{kind} {os.getpid()} {start.restarts}")
-        while not told and not (kind == "control" and status.stop_asked):
+        while not told and not (kind == "control" and status[Cell.STOP_ASKED]):
             if kind == "control":
-                status.set(Cell.LOOP_COUNT, status.loop_count + 1)
+                status[Cell.LOOP_COUNT] = status.loop_count + 1
             else:
                 if wanted:
-                    status.set(Cell.BUS_WANTED, 1)
-                    if status.get(Cell.BUS_LENT):
+                    status[Cell.BUS_WANTED] = 1
+                    if status[Cell.BUS_LENT]:
                         wanted.clear()
-                        status.set(Cell.BUS_WANTED, 0)
+                        status[Cell.BUS_WANTED] = 0
                         say("bus is lent")
                 alive = Cell.SERVICE_TIME_NS if kind == "service" else Cell.GATEWAY_TIME_NS
-                status.set(alive, time.monotonic_ns())
+                status[alive] = time.monotonic_ns()
             time.sleep(0.02)
         say(f"{kind} ends")
     return 0

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from support.flight import about, event, flight_log, samples
 
-from hdbridge.daemon.recorder.flightlog import Batch
+from hdbridge.daemon.recorder.flightlog import Batch, ModelUse
 from hdbridge.daemon.recorder.mend import mend, mend_folder
 from hdbridge.daemon.recorder.reading import flight_files, read
 from hdbridge.daemon.recorder.recorder import FlightRecorder
@@ -19,7 +19,7 @@ import sys
 from pathlib import Path
 sys.path.insert(0, "tests")
 from support.flight import flight_log, event, samples
-from hdbridge.daemon.recorder.flightlog import Batch
+from hdbridge.daemon.recorder.flightlog import Batch, ModelUse
 log, clock = flight_log(Path(sys.argv[1]))
 second = 0
 while True:
@@ -134,7 +134,7 @@ def test_the_next_start_mends_files_and_keeps_those_with_faults(killed, tmp_path
     said = []
     recorder = FlightRecorder(tmp_path, about(), tell=said.append)
     recorder.take(samples(100), [event(0.1)], 0)
-    recorder.use_model("demo", "text", "3")
+    recorder.put(ModelUse("demo", "3", "text"))
     recorder.close()
     assert not list(tmp_path.glob("*.part"))
     assert any("was not finished" in each for each in said)

@@ -53,7 +53,7 @@ async def adapting(service: Service) -> AsyncIterator[tuple[ServiceBridge, str, 
 def begin(service: Service, bridge: ServiceBridge) -> Following:
     axis = service.machine.axes[0]
     made = Following(0, bridge.axes["axis1"], axis.adaptation, axis.profile.folder / "adaptation", AtOnce())
-    bridge.axes["axis1"].following = made
+    bridge.following["axis1"] = made
     bridge.core.observer.add(made)
     return made
 
@@ -69,7 +69,7 @@ async def work(bridge: ServiceBridge, token: str, stands: int, seed: int = 0) ->
     for step in np.random.default_rng(seed).normal(0.0, 3.0, stands).tolist():
         place = abs(place + step)
         bridge.lease.renew(token)
-        await axis.move(token, place)
+        await axis.motion.move(token, place)
         await bridge.core.timing.sleep(0.2)
 
 
@@ -96,7 +96,7 @@ async def test_the_model_in_the_loop_is_adapted_and_reverted(service: Service) -
         assert state.updated is not None
         assert state.parameters["hysteresis.offset_arcsec"] == pytest.approx(4.0, abs=1.0)
 
-        await bridge.axes["axis1"].revert_adaptation(token)
+        await bridge.followed(token, "axis1").revert()
         assert offset_arcsec(bridge) == 40.0
         await work(bridge, token, 20, seed=1)
         assert offset_arcsec(bridge) == 40.0

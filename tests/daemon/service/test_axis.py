@@ -15,14 +15,14 @@ async def test_nothing_moves_without_the_lease(service: Service) -> None:
             with pytest.raises(LeaseError):
                 await attempt("guessed")
         with pytest.raises(LeaseError):
-            await axis.move("guessed", 5.0)
+            await axis.motion.move("guessed", 5.0)
         with pytest.raises(LeaseError):
-            await axis.jog("guessed", 5.0)
+            await axis.motion.jog("guessed", 5.0)
         with pytest.raises(LeaseError):
-            await axis.stream("guessed")
+            await axis.motion.stream("guessed")
         bridge.lease.release(token)
         with pytest.raises(LeaseError):
-            await axis.move(token, 5.0)
+            await axis.motion.move(token, 5.0)
         await bridge.core.timing.sleep(0.5)
         assert axis.state().load_target_deg == before
 
@@ -32,10 +32,10 @@ async def test_impossible_requests_are_refused_with_the_loops_text(service: Serv
         axis = bridge.axes["axis1"]
         token = bridge.lease.take("test")
         with pytest.raises(RefusedError, match="enable it first"):
-            await axis.move(token, 5.0)
+            await axis.motion.move(token, 5.0)
         await axis.enable(token)
         with pytest.raises(InputError, match="position limits"):
-            await axis.move(token, 1e6)
+            await axis.motion.move(token, 1e6)
         with pytest.raises(RefusedError, match="disable it first"):
             await axis.home(token, messages.Home(method=35))
         with pytest.raises(RefusedError, match="disable it first"):

@@ -8,12 +8,12 @@ import yaml
 from support.raised import measured_profile, ripple_arcsec
 from support.service import AtOnce, Service, play, stepped_service, until
 
+from hdbridge.client.messages import StreamPoint
 from hdbridge.commissioning.evaluation.stepping import Scheme
 from hdbridge.control.bench import axis_view
 from hdbridge.daemon.following.settings import AdaptationSettings
 from hdbridge.daemon.service.bridge import ServiceBridge
 from hdbridge.daemon.service.following import Following
-from hdbridge.daemon.service.streams import StreamPoint
 from hdbridge.motion.procedures.moves import MoveTo
 from hdbridge.sim.truth import Truth
 
@@ -28,12 +28,12 @@ def profile(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 async def goto(bridge: ServiceBridge, token: str) -> None:
-    await bridge.axes["axis1"].move(token, FAR_DEG, SPEED_DEG_S)
+    await bridge.axes["axis1"].motion.move(token, FAR_DEG, SPEED_DEG_S)
 
 
 async def jog(bridge: ServiceBridge, token: str) -> None:
     axis = bridge.axes["axis1"]
-    await axis.jog(token, SPEED_DEG_S, timeout_s=1.8)
+    await axis.motion.jog(token, SPEED_DEG_S, timeout_s=1.8)
     await until(bridge, lambda: axis.state().at_rest)
 
 
@@ -44,9 +44,9 @@ async def stream(bridge: ServiceBridge, token: str) -> None:
         begin_deg, axis_view(axis.axis.config).limits
     )
     times = [0.02 * number for number in range(int(path.duration_s / 0.02) + 2)]
-    async with await axis.stream(token) as port:
+    async with await axis.motion.stream(token) as port:
         for time_s in times:
-            await port.put([StreamPoint(time_s, path.at(time_s))])
+            await port.put([StreamPoint(time_s=time_s, position_deg=path.at(time_s))])
 
 
 async def coordinated(bridge: ServiceBridge, token: str) -> None:
@@ -72,7 +72,7 @@ def test_every_kind_of_motion_removes_the_ripple(motion, profile: Path, tmp_path
         async with service.enabled() as (bridge, token):
             left = await ripple(service, bridge, token, motion)
             await bridge.axes["axis1"].compensate(token, Scheme.NONE)
-            await bridge.axes["axis1"].move(token, 0.0)
+            await bridge.axes["axis1"].motion.move(token, 0.0)
             return await ripple(service, bridge, token, goto), left
 
     with stepped_service(tmp_path, axes=1 + (motion is coordinated), profile=profile) as service:
@@ -85,16 +85,16 @@ def test_adaptation_removes_the_ripple_of_a_retuned_servo(profile: Path, tmp_pat
         async with service.enabled() as (bridge, token):
             axis = bridge.axes["axis1"]
             settings = AdaptationSettings(mode="on", interval_s=1.0)
-            following = axis.following = Following(0, axis, settings, tmp_path / "state", AtOnce())
+            following = Following(0, axis, settings, tmp_path / "state", AtOnce())
             bridge.core.observer.add(following)
-            await axis.move(token, -FAR_DEG)
+            await axis.motion.move(token, -FAR_DEG)
             before = await ripple(service, bridge, token, goto)
             for speed in (60.0, 45.0) * 2:
                 for target in (0.0, FAR_DEG):
                     bridge.lease.renew(token)
-                    await axis.move(token, target, speed)
+                    await axis.motion.move(token, target, speed)
                     await following.apply()
-            await axis.move(token, -FAR_DEG)
+            await axis.motion.move(token, -FAR_DEG)
             return before, await ripple(service, bridge, token, goto)
 
     truth = Truth.load(profile / "truth.yaml")

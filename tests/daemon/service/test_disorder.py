@@ -14,9 +14,8 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
 from support.service import stepped_service, until
 
+from hdbridge.client.messages import QueueItem, StreamPoint
 from hdbridge.daemon.loop.states import AxisState
-from hdbridge.daemon.service.moves import WayPoint
-from hdbridge.daemon.service.streams import StreamPoint
 from hdbridge.errors import HdbridgeError, LeaseError
 
 LEASE_S = 2.0
@@ -113,27 +112,29 @@ class Disorder(RuleBasedStateMachine):
 
     @rule(which=token, place=TARGETS, wait=st.booleans())
     def move(self, which: int, place: float, wait: bool) -> None:
-        self.ask(self.of(which), lambda token: self.axis.move(token, place, wait=wait))
+        self.ask(self.of(which), lambda token: self.axis.motion.move(token, place, wait=wait))
 
     @rule(which=token, velocity=st.sampled_from([-10.0, 5.0, 0.0, float("inf")]))
     def jog(self, which: int, velocity: float) -> None:
-        self.ask(self.of(which), lambda token: self.axis.jog(token, velocity, 4.0))
+        self.ask(self.of(which), lambda token: self.axis.motion.jog(token, velocity, 4.0))
 
     @rule(which=token, places=st.lists(TARGETS, min_size=1, max_size=3))
     def queue(self, which: int, places: list[float]) -> None:
-        points = [WayPoint(each, dwell_s=0.1) for each in places]
-        self.ask(self.of(which), lambda token: self.axis.queue(token, points))
+        points = [QueueItem.model_construct(target_deg=each, dwell_s=0.1) for each in places]
+        self.ask(self.of(which), lambda token: self.axis.motion.queue(token, points))
 
     @rule(which=token)
     def clear(self, which: int) -> None:
-        self.ask(self.of(which), self.axis.clear_queue)
+        self.ask(self.of(which), self.axis.motion.clear_queue)
 
     @rule(which=token, step=st.sampled_from([0.05, 0.3, 50.0]), end=st.booleans())
     def stream(self, which: int, step: float, end: bool) -> None:
         async def streamed(token: str) -> None:
-            stream = await self.axis.stream(token)
+            stream = await self.axis.motion.stream(token)
             here = self.axis.state().load_target_deg
-            await stream.put([StreamPoint(0.1 * n, here + step * min(n, 8 - n)) for n in range(1, 9)])
+            await stream.put(
+                [StreamPoint(time_s=0.1 * n, position_deg=here + step * min(n, 8 - n)) for n in range(1, 9)]
+            )
             if end:
                 await stream.end()
 

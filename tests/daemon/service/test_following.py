@@ -20,6 +20,7 @@ from hdbridge.client.messages import AdaptationMode
 from hdbridge.commissioning.evaluation.stepping import Scheme
 from hdbridge.daemon.following.settings import AdaptationSettings
 from hdbridge.daemon.memory import EventKind
+from hdbridge.daemon.recorder.flightlog import Note
 from hdbridge.daemon.serve import follow
 from hdbridge.daemon.service.bridge import ServiceBridge
 from hdbridge.daemon.service.following import Following
@@ -31,7 +32,7 @@ def following(bridge: ServiceBridge, settings: AdaptationSettings, folder: Path)
     (axis,) = bridge.axes.values()
     made = Following(0, axis, settings, folder, ThreadPoolExecutor(1))
     bridge.core.observer.add(made)
-    axis.following = made
+    bridge.following[axis.name] = made
     return made
 
 
@@ -99,7 +100,7 @@ def test_each_axis_is_watched_in_its_own_thread_that_ends(
                 for each in follow(service.machine, bridge, None, stack):
                     bridge.core.observer.add(each)
                 first, second = bridge.axes.values()
-                await first.move(token, 5.0)
+                await first.motion.move(token, 5.0)
                 await second.compensate(token, Scheme.SYNCHRONOUS)
                 begun = bridge.core.observer.cycle
                 await until(bridge, lambda: bridge.core.observer.cycle > begun + 500)
@@ -126,7 +127,7 @@ def test_a_verdict_gives_advice_note_and_diagnosis_until_a_new_model(tmp_path: P
         made.close()
         (advice,) = made.advice
         assert advice.startswith("recalibrate: hysteresis.offset_arcsec ")
-        recorder.note.assert_called_once_with("WATCH", f"demo: {advice}")
+        recorder.put.assert_called_once_with(Note("WATCH", f"demo: {advice}"))
         axis.core.log.note.assert_called_once_with(advice, 0)
         assert diagnosis.start.call_args.args[:4] == ("demo", model.dump(), 15.0, advice)
 

@@ -51,8 +51,8 @@ async def test_schemes_are_cross_faded_in_motion(service: Service) -> None:
     async with service.enabled() as (bridge, token):
         axis = bridge.axes["axis1"]
         assert axis.state().scheme == "extended"
-        await axis.move(token, 2.0)
-        await axis.move(token, 200.0, velocity_deg_s=0.5, wait=False)
+        await axis.motion.move(token, 2.0)
+        await axis.motion.move(token, 200.0, velocity_deg_s=0.5, wait=False)
         await bridge.core.timing.sleep(1.0)
         reader = service.daemon.memory.reader()
         for scheme in (Scheme.SYNCHRONOUS, Scheme.NONE, Scheme.HYSTERESIS, Scheme.EXTENDED):
@@ -74,7 +74,7 @@ async def test_a_new_model_is_committed_and_used_in_motion(service: Service) -> 
         axis = bridge.axes["axis1"]
         first = axis.state().model
         commit(service, wider(axis.models.in_use.model))
-        await axis.move(token, 200.0, velocity_deg_s=0.5, wait=False)
+        await axis.motion.move(token, 200.0, velocity_deg_s=0.5, wait=False)
         await bridge.core.timing.sleep(1.0)
         reader = service.daemon.memory.reader()
         await axis.activate_model(token, "pending")
@@ -115,7 +115,7 @@ def test_an_axis_without_a_model_runs_uncompensated(tmp_path: Path) -> None:
         async with service.enabled() as (bridge, token):
             axis = bridge.axes["axis1"]
             assert axis.state().model is None
-            await axis.move(token, 5.0)
+            await axis.motion.move(token, 5.0)
             with pytest.raises(InputError, match="calibrate"):
                 await axis.compensate(token, Scheme.EXTENDED)
             await axis.compensate(token, Scheme.NONE)
@@ -168,7 +168,7 @@ def begin_uncompensated(service: Service) -> None:
             compensation_for(axis.config, TransmissionModel(axis.config.gear.ratio))
         )
     status = service.daemon.memory.status
-    status.set(Cell.LOOP_PID, status.loop_pid + 1)
+    status[Cell.LOOP_PID] = status.loop_pid + 1
 
 
 async def choose(bridge: ServiceBridge, token: str) -> None:

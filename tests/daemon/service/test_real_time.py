@@ -11,10 +11,9 @@ from pathlib import Path
 import pytest
 from support.service import Service, stepped_service
 
+from hdbridge.client.messages import QueueItem, StreamPoint
 from hdbridge.daemon.service.bridge import ServiceBridge
-from hdbridge.daemon.service.moves import WayPoint
-from hdbridge.daemon.service.streams import StreamPoint
-from hdbridge.daemon.service.timing import RealTiming, SimulatedClock
+from hdbridge.daemon.service.timing import SimulatedClock, Timing
 from hdbridge.errors import RefusedError
 
 
@@ -50,14 +49,14 @@ def test_many_concurrent_requests(tmp_path: Path, slower: int) -> None:
         clock = SimulatedClock(
             lambda: memory.status.loop_count, memory.period_s, lambda: slower * time.monotonic(), math.inf
         )
-        timing = RealTiming(8, clock)
+        timing = Timing(8, clock)
         async with ServiceBridge(service.machine, memory, timing) as bridge:
             await verified(bridge)
             token = bridge.lease.take("test")
             await asyncio.gather(*(each.enable(token) for each in bridge.axes.values()))
             first, second = bridge.axes.values()
             feed = bridge.subscribe(most=20)
-            await asyncio.gather(first.move(token, 3.0), second.move(token, -2.0))
+            await asyncio.gather(first.motion.move(token, 3.0), second.motion.move(token, -2.0))
             assert first.state().load_target_deg == pytest.approx(3.0)
             assert second.state().load_target_deg == pytest.approx(-2.0)
             batch = await anext(feed)
@@ -66,19 +65,19 @@ def test_many_concurrent_requests(tmp_path: Path, slower: int) -> None:
             feed.close()
 
             # One client waits for a move, others look, read, and take its place.
-            waiting = asyncio.create_task(first.move(token, 60.0))
+            waiting = asyncio.create_task(first.motion.move(token, 60.0))
             await asyncio.sleep(0.05)
             read = await asyncio.gather(
                 *(first.sdo_read("6064h") for _ in range(5)), second.sdo_read("1018h:01")
             )
             assert len(read) == 6
-            await first.move(token, 0.0)
+            await first.motion.move(token, 0.0)
             with pytest.raises(RefusedError, match="another move"):
                 await waiting
-            await first.queue(token, [WayPoint(1.0), WayPoint(0.0)])
-            async with await second.stream(token) as stream:
+            await first.motion.queue(token, [QueueItem(target_deg=1.0), QueueItem(target_deg=0.0)])
+            async with await second.motion.stream(token) as stream:
                 for number in range(1, 40):
-                    await stream.put([StreamPoint(0.02 * number, -2.0 + 0.001 * number)])
+                    await stream.put([StreamPoint(time_s=0.02 * number, position_deg=-2.0 + 0.001 * number)])
             await bridge.coordinated(token, {"axis1": 2.0, "axis2": 0.0})
 
             await second.disable(token)

@@ -14,7 +14,7 @@ def test_a_new_service_finds_the_axis_where_it_is(service: Service) -> None:
         async with service.enabled() as (bridge, token):
             axis = bridge.axes["axis1"]
             await axis.compensate(token, Scheme.SYNCHRONOUS)
-            await axis.move(token, 30.0, wait=False)
+            await axis.motion.move(token, 30.0, wait=False)
             await bridge.core.timing.sleep(0.3)
             return token
 
@@ -31,9 +31,9 @@ def test_a_new_service_finds_the_axis_where_it_is(service: Service) -> None:
             assert state.load_target_deg == pytest.approx(30.0)
             assert state.scheme == "synchronous"
             with pytest.raises(LeaseError):
-                await axis.move(token, 0.0)
+                await axis.motion.move(token, 0.0)
             own = bridge.lease.take("another")
-            await axis.move(own, 31.0)
+            await axis.motion.move(own, 31.0)
             await axis.disable(own)
 
     play(second())
@@ -69,10 +69,10 @@ async def test_without_a_control_process_nothing_is_sent(service: Service) -> No
         axis, token = bridge.axes["axis1"], bridge.lease.take("test")
         status = service.daemon.memory.status
         pid = status.loop_pid
-        status.set(Cell.LOOP_PID, 0)
+        status[Cell.LOOP_PID] = 0
         with pytest.raises(RefusedError, match="there is no control process"):
             await axis.enable(token)
-        status.set(Cell.LOOP_PID, pid)
+        status[Cell.LOOP_PID] = pid
         assert axis.state().state == "disabled"
         await axis.enable(token)
 
@@ -85,4 +85,4 @@ async def test_a_lent_axis_is_taken_back(service: Service) -> None:
         await until(bridge, lambda: axis.state().state == "disabled")
         token = bridge.lease.take("test")
         await axis.enable(token)
-        await axis.move(token, 1.0)
+        await axis.motion.move(token, 1.0)

@@ -58,11 +58,11 @@ async def test_a_quick_stop_is_latched_until_a_reset(
 ) -> None:
     async with service.enabled() as (bridge, token):
         axis = bridge.axes["axis1"]
-        await axis.move(token, 100.0, wait=False)
+        await axis.motion.move(token, 100.0, wait=False)
         await bridge.core.timing.sleep(1.0)
         spoil(service.daemon)
         with pytest.raises(SafetyStop, match=fault.value) as raised:
-            await axis.move(token, 150.0)
+            await axis.motion.move(token, 150.0)
         state = axis.state()
         assert state.state == "quick-stopped"
         said_once(bridge, state.fault, str(raised.value))
@@ -71,7 +71,7 @@ async def test_a_quick_stop_is_latched_until_a_reset(
         assert state.fault.hint
         assert not state.fault.needs_verification
         with pytest.raises(RefusedError, match="reset"):
-            await axis.move(token, 0.0)
+            await axis.motion.move(token, 0.0)
         with pytest.raises(RefusedError, match="reset"):
             await axis.enable(token)
         await axis.reset(token)
@@ -82,7 +82,7 @@ async def test_a_quick_stop_is_latched_until_a_reset(
         await bridge.core.timing.sleep(1.0)
         assert axis.state().load_position_deg == pytest.approx(place_deg, abs=0.01)
         await axis.enable(token)
-        await axis.move(token, place_deg + 1.0)
+        await axis.motion.move(token, place_deg + 1.0)
 
 
 def boot_up(daemon: SteppedDaemon) -> None:
@@ -99,20 +99,20 @@ async def test_a_drive_that_restarts_is_verified_again_and_stays_disabled(
 ) -> None:
     async with service.enabled() as (bridge, token):
         axis = bridge.axes["axis1"]
-        await axis.move(token, 100.0, wait=False)
+        await axis.motion.move(token, 100.0, wait=False)
         await bridge.core.timing.sleep(1.0)
         spoil(service.daemon)
         with pytest.raises(SafetyStop):
-            await axis.move(token, 150.0)
+            await axis.motion.move(token, 150.0)
         await until(bridge, lambda: axis.state().state == "disabled")
         told = [each.text for each in bridge.events().events if each.kind == "note"]
         assert "the drive was verified; the axis is disabled" in told
         await bridge.core.timing.sleep(1.0)
         assert axis.state().power == "switch on disabled"
         with pytest.raises(RefusedError, match="enable it first"):
-            await axis.move(token, 0.0)
+            await axis.motion.move(token, 0.0)
         await axis.enable(token)
-        await axis.move(token, axis.state().load_target_deg + 1.0)
+        await axis.motion.move(token, axis.state().load_target_deg + 1.0)
 
 
 async def test_an_absent_drive_is_awaited(service: Service) -> None:
@@ -130,10 +130,10 @@ async def test_an_expired_jog_does_not_affect_the_next_client(service: Service) 
         axis = bridge.axes["axis1"]
         token = bridge.lease.take("first")
         await axis.enable(token)
-        await axis.jog(token, 5.0, 0.2)
+        await axis.motion.jog(token, 5.0, 0.2)
         await bridge.core.timing.sleep(1.0)
         token = bridge.lease.take("second", force=True)
-        await axis.move(token, 8.0)
+        await axis.motion.move(token, 8.0)
         assert axis.state().load_target_deg == 8.0
         notes = [each.text for each in bridge.events(0).events if each.kind == "note"]
         assert not [each for each in notes if "lease of its client has ended" in each]
@@ -144,14 +144,14 @@ async def test_homes_and_stays_disabled(service: Service) -> None:
         axis = bridge.axes["axis1"]
         token = bridge.lease.take("test")
         await axis.enable(token)
-        await axis.move(token, 5.0)
+        await axis.motion.move(token, 5.0)
         await axis.disable(token)
         await axis.home(token, messages.Home(method=35))
         assert axis.state().state == "disabled"
         await bridge.core.timing.sleep(0.1)
         assert axis.state().motor_position_deg == pytest.approx(0.0, abs=1.0)
         await axis.enable(token)
-        await axis.move(token, 1.0)
+        await axis.motion.move(token, 1.0)
         with pytest.raises(RefusedError):
             await axis.home(token, messages.Home(method=35))
 
@@ -165,14 +165,14 @@ async def test_a_homing_that_fails_leaves_the_axis_disabled(service: Service) ->
         await until(bridge, lambda: axis.state().state == "disabled")
         assert axis.state().power == "switch on disabled"
         await axis.enable(token)
-        await axis.move(token, 1.0)
+        await axis.motion.move(token, 1.0)
 
 
 @pytest.mark.parametrize("obeys", [True, False])
 async def test_a_quick_stop_by_a_client_says_once_how_to_release_it(service: Service, obeys: bool) -> None:
     async with service.enabled() as (bridge, token):
         axis = bridge.axes["axis1"]
-        await axis.move(token, 100.0, wait=False)
+        await axis.motion.move(token, 100.0, wait=False)
         await bridge.core.timing.sleep(1.0)
         if not obeys:
             service.daemon.nodes[0].dictionary[0x605A, 0].put(0)  # a quick stop does nothing

@@ -31,11 +31,12 @@ def at_work(blind: Path, folder: Path, **servo: float) -> tuple[messages.AxisSta
     async def story(service: Service) -> tuple[messages.AxisState, list[str]]:
         async with service.enabled() as (bridge, token):
             axis = bridge.axes["axis1"]
-            axis.following = Following(0, axis, AdaptationSettings(mode="on"), folder / "state", AtOnce())
-            bridge.core.observer.add(axis.following)
+            made = Following(0, axis, AdaptationSettings(mode="on"), folder / "state", AtOnce())
+            bridge.following["axis1"] = made
+            bridge.core.observer.add(made)
             for target in (FAR_DEG, -FAR_DEG, FAR_DEG):
                 bridge.lease.renew(token)
-                await axis.move(token, target, SPEED_DEG_S)
+                await axis.motion.move(token, target, SPEED_DEG_S)
             await axis.disable(token)
             return axis.state(), [each.text for each in bridge.events().events]
 

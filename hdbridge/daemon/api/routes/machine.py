@@ -8,115 +8,105 @@ from hdbridge.client import messages
 from hdbridge.daemon.api.routes.parts import (
     MOVING,
     STOPPING,
+    Bridge,
+    Caller,
     Holder,
-    kept,
     port,
     refusals,
     stopped,
 )
-from hdbridge.daemon.service.bridge import ServiceBridge
 from hdbridge.drive.interfacelock import user_name
 
-
-def machine_routes(bridge: ServiceBridge) -> APIRouter:
-    """Returns the routes that concern no single axis."""
-    routes = APIRouter()
-    _add_looking(routes, bridge)
-    _add_lease(routes, bridge)
-    _add_motion(routes, bridge)
-    _add_loan(routes, bridge)
-    return routes
+routes = APIRouter()
 
 
-def _add_looking(routes: APIRouter, bridge: ServiceBridge) -> None:
-    @routes.get("/state", tags=["Look"])
-    async def get_state() -> messages.MachineState:
-        """Report the state of the machine and its axes in the newest cycle."""
-        return bridge.state()
-
-    @routes.get("/events", tags=["Look"], responses=refusals((422,)))
-    async def get_events(
-        since: Annotated[
-            int, Query(ge=0, le=2**53, description="number of the newest event that is known already")
-        ] = 0,
-    ) -> messages.Events:
-        """Report the events after a number; 0 for all that are kept."""
-        return bridge.events(since)
-
-    @routes.post("/mark", tags=["Look"], responses=refusals((400, 422)))
-    async def mark(mark: messages.Mark) -> messages.Events:
-        """Add a remark to the flight recorder at the present cycle. Needs no lease."""
-        before = bridge.events(0).newest
-        bridge.mark(mark.text)
-        return bridge.events(before)
+@routes.get("/state", tags=["Look"])
+async def get_state(bridge: Bridge) -> messages.MachineState:
+    """Report the state of the machine and its axes in the newest cycle."""
+    return bridge.state()
 
 
-def _add_lease(routes: APIRouter, bridge: ServiceBridge) -> None:
-    def state() -> messages.LeaseState:
-        return bridge.state().lease
-
-    @routes.get("/lease", tags=["Lease"])
-    async def get_lease() -> messages.LeaseState:
-        """Report the state of the lease."""
-        return state()
-
-    @routes.post("/lease", tags=["Lease"], status_code=201, responses=refusals((400, 422, 423)))
-    async def take_lease(wanted: messages.LeaseRequest, request: Request) -> messages.LeaseGrant:
-        """Take the lease. It lasts while it is used or renewed; 423 names its present holder."""
-        client = _who(request, wanted.client.strip())
-        token = bridge.lease.take(client, force=wanted.force)
-        return messages.LeaseGrant(token=token, client=client, timeout_s=bridge.lease.timeout_s)
-
-    @routes.put("/lease", tags=["Lease"], responses=refusals((422, 423)))
-    async def renew_lease(holder: Holder = "") -> messages.LeaseState:
-        """Renew the lease without a motion."""
-        bridge.lease.renew(holder)
-        return state()
-
-    @routes.delete("/lease", tags=["Lease"], responses=refusals((422, 423)))
-    async def release_lease(holder: Holder = "") -> messages.LeaseState:
-        """Release the lease. Jog, stream and queue are stopped; a move is completed."""
-        bridge.lease.release(holder)
-        return state()
+@routes.get("/events", tags=["Look"], responses=refusals((422,)))
+async def get_events(
+    bridge: Bridge,
+    since: Annotated[
+        int, Query(ge=0, le=2**53, description="number of the newest event that is known already")
+    ] = 0,
+) -> messages.Events:
+    """Report the events after a number; 0 for all that are kept."""
+    return bridge.events(since)
 
 
-def _add_motion(routes: APIRouter, bridge: ServiceBridge) -> None:
-    @routes.post("/quick-stop", tags=["Stop"], responses=refusals((409, 502, 503)))
-    async def quick_stop_all() -> messages.MachineState:
-        """Stop every axis as fast as its drive can, latched until a reset. Needs no lease."""
-        await bridge.quick_stop()
-        await stopped(*bridge.axes.values())
-        return bridge.state()
-
-    @routes.post("/stop", tags=["Stop"], responses=refusals(tuple(each for each in STOPPING if each != 404)))
-    async def stop_all() -> messages.MachineState:
-        """Brake every axis to rest within its limits; they stay enabled. Needs no lease."""
-        for each in bridge.axes.values():
-            await each.stop()
-        return bridge.state()
-
-    @routes.post("/coordinated", tags=["Move"], responses=refusals(MOVING))
-    async def coordinated(
-        moves: messages.Coordinated, request: Request, holder: Holder = ""
-    ) -> messages.MachineState:
-        """Move several axes so that all begin and end together."""
-        for name in moves.targets_deg:
-            port(bridge, name)
-        motion = bridge.coordinated(holder, moves.targets_deg, moves.speed, moves.wait)
-        await kept(bridge, holder, request, motion)
-        return bridge.state()
+@routes.post("/mark", tags=["Look"], responses=refusals((400, 422)))
+async def mark(bridge: Bridge, mark: messages.Mark) -> messages.Events:
+    """Add a remark to the flight recorder at the present cycle. Needs no lease."""
+    before = bridge.events(0).newest
+    bridge.mark(mark.text)
+    return bridge.events(before)
 
 
-def _add_loan(routes: APIRouter, bridge: ServiceBridge) -> None:
-    @routes.post("/bus/lend", tags=["Move"], responses=refusals(MOVING))
-    async def lend_bus(request: Request, holder: Holder = "") -> messages.MachineState:
-        """Stop all axes, switch them off, and release the bus to another program of the daemon's computer.
+@routes.get("/lease", tags=["Lease"])
+async def get_lease(bridge: Bridge) -> messages.LeaseState:
+    """Report the state of the lease."""
+    return bridge.state().lease
 
-        Answers when the interface is free. The program has ten seconds to open it, and the daemon takes the
-        bus back when the program has closed it or ended. The axes come back disabled.
-        """
-        await kept(bridge, holder, request, bridge.lend_bus(holder))
-        return bridge.state()
+
+@routes.post("/lease", tags=["Lease"], status_code=201, responses=refusals((400, 422, 423)))
+async def take_lease(bridge: Bridge, wanted: messages.LeaseRequest, request: Request) -> messages.LeaseGrant:
+    """Take the lease. It lasts while it is used or renewed; 423 names its present holder."""
+    client = _who(request, wanted.client.strip())
+    token = bridge.lease.take(client, force=wanted.force)
+    return messages.LeaseGrant(token=token, client=client, timeout_s=bridge.lease.timeout_s)
+
+
+@routes.put("/lease", tags=["Lease"], responses=refusals((422, 423)))
+async def renew_lease(bridge: Bridge, holder: Holder = "") -> messages.LeaseState:
+    """Renew the lease without a motion."""
+    bridge.lease.renew(holder)
+    return bridge.state().lease
+
+
+@routes.delete("/lease", tags=["Lease"], responses=refusals((422, 423)))
+async def release_lease(bridge: Bridge, holder: Holder = "") -> messages.LeaseState:
+    """Release the lease. Jog, stream and queue are stopped; a move is completed."""
+    bridge.lease.release(holder)
+    return bridge.state().lease
+
+
+@routes.post("/quick-stop", tags=["Stop"], responses=refusals((409, 502, 503)))
+async def quick_stop_all(bridge: Bridge) -> messages.MachineState:
+    """Stop every axis as fast as its drive can, latched until a reset. Needs no lease."""
+    await bridge.quick_stop()
+    await stopped(*bridge.axes.values())
+    return bridge.state()
+
+
+@routes.post("/stop", tags=["Stop"], responses=refusals(tuple(each for each in STOPPING if each != 404)))
+async def stop_all(bridge: Bridge) -> messages.MachineState:
+    """Brake every axis to rest within its limits; they stay enabled. Needs no lease."""
+    for each in bridge.axes.values():
+        await each.stop()
+    return bridge.state()
+
+
+@routes.post("/coordinated", tags=["Move"], responses=refusals(MOVING))
+async def coordinated(bridge: Bridge, moves: messages.Coordinated, caller: Caller) -> messages.MachineState:
+    """Move several axes so that all begin and end together."""
+    for name in moves.targets_deg:
+        port(bridge, name)
+    await caller.waits(bridge.coordinated(caller.holder, moves.targets_deg, moves.speed, moves.wait))
+    return bridge.state()
+
+
+@routes.post("/bus/lend", tags=["Move"], responses=refusals(MOVING))
+async def lend_bus(bridge: Bridge, caller: Caller) -> messages.MachineState:
+    """Stop all axes, switch them off, and release the bus to another program of the daemon's computer.
+
+    Answers when the interface is free. The program has ten seconds to open it, and the daemon takes the
+    bus back when the program has closed it or ended. The axes come back disabled.
+    """
+    await caller.waits(bridge.lend_bus(caller.holder))
+    return bridge.state()
 
 
 def _who(request: Request, name: str) -> str:

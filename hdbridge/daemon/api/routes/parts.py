@@ -1,10 +1,11 @@
-"""Shared parts of the routes: the lease header, descriptions of errors, waiting for a motion."""
+"""Shared parts of the routes: machine, axis and lease of a request, descriptions of errors."""
 
 import asyncio
 from collections.abc import Awaitable
 from typing import Annotated, Any, Final, TypeVar
 
-from fastapi import Header, Path, Request
+from fastapi import Depends, Header, Path, Request
+from starlette.requests import HTTPConnection
 
 from hdbridge.client.messages import ControlState, Problem
 from hdbridge.daemon.api.problems import UnknownError
@@ -20,6 +21,14 @@ STOP_LOOKS: Final = 25
 STOP_LOOK_S: Final = 0.01
 _ON: Final = frozenset({ControlState.ENABLING, ControlState.ENABLED, ControlState.STOPPING})
 
+
+async def _bridge(connection: HTTPConnection) -> ServiceBridge:
+    bridge: ServiceBridge = connection.app.state.bridge
+    return bridge
+
+
+Bridge = Annotated[ServiceBridge, Depends(_bridge)]
+"""Machine of the application."""
 Holder = Annotated[
     str,
     Header(
@@ -67,24 +76,44 @@ async def stopped(*axes: ServiceAxis) -> None:
         await asyncio.sleep(STOP_LOOK_S)
 
 
-async def kept(bridge: ServiceBridge, holder: str, request: Request, motion: Awaitable[T]) -> T:
-    """Waits for a motion and renews its holder's lease meanwhile, unless the client disconnects.
+async def _found(bridge: Bridge, axis: AxisName) -> ServiceAxis:
+    return port(bridge, axis)
 
-    The motion itself completes in any case.
-    """
 
-    async def renew() -> None:
+FoundAxis = Annotated[ServiceAxis, Depends(_found)]
+"""Axis that the path names."""
+
+
+class _Caller:
+    """The lease of a request, which is kept while the request waits for a motion."""
+
+    def __init__(self, bridge: ServiceBridge, request: Request, holder: str) -> None:
+        self._lease, self._request, self.holder = bridge.lease, request, holder
+
+    async def waits(self, motion: Awaitable[T]) -> T:
+        """Waits for a motion and renews the lease meanwhile, unless the client disconnects.
+
+        The motion itself completes in any case.
+        """
+        renewing = asyncio.ensure_future(self._renew())
+        try:
+            return await motion
+        finally:
+            renewing.cancel()
+
+    async def _renew(self) -> None:
         while True:
-            await asyncio.sleep(bridge.lease.timeout_s / RENEWALS)
-            if await request.is_disconnected():
+            await asyncio.sleep(self._lease.timeout_s / RENEWALS)
+            if await self._request.is_disconnected():
                 return
             try:
-                bridge.lease.renew(holder)
+                self._lease.renew(self.holder)
             except LeaseError:
                 return
 
-    renewing = asyncio.ensure_future(renew())
-    try:
-        return await motion
-    finally:
-        renewing.cancel()
+
+async def _caller(bridge: Bridge, request: Request, holder: Holder = "") -> _Caller:
+    return _Caller(bridge, request, holder)
+
+
+Caller = Annotated[_Caller, Depends(_caller)]

@@ -13,9 +13,8 @@ from pydantic import BaseModel, ValidationError
 from hdbridge.client.messages import LiveOptions, Problem, StreamAnswer, StreamBegin, StreamPoints
 from hdbridge.daemon.api.columns import columns
 from hdbridge.daemon.api.policy import SUBPROTOCOL
-from hdbridge.daemon.api.routes.parts import port
+from hdbridge.daemon.api.routes.parts import Bridge, port
 from hdbridge.daemon.service.bridge import ServiceBridge
-from hdbridge.daemon.service.streams import StreamPoint
 from hdbridge.errors import HdbridgeError, InputError
 
 M = TypeVar("M", bound=BaseModel)
@@ -33,37 +32,35 @@ _NORMAL: Final = 1000
 _GONE: Final = 1006
 
 
-def socket_routes(bridge: ServiceBridge) -> APIRouter:
-    """Returns the routes ``/live`` and ``/axes/{axis}/stream``."""
-    routes = APIRouter()
+routes = APIRouter()
 
-    @routes.websocket("/live")
-    async def live(websocket: WebSocket) -> None:
-        """Sends samples in batches; the client may change its `LiveOptions` at any time."""
-        await _accept(websocket)
-        feed = _Feed(bridge, websocket)
-        sides = asyncio.ensure_future(feed.listen()), asyncio.ensure_future(feed.tell())
-        await asyncio.wait(sides, return_when=asyncio.FIRST_COMPLETED)
-        for each in sides:
-            each.cancel()
-        # Close only after both sides have ended.
-        for ended in await asyncio.gather(*sides, return_exceptions=True):
-            if isinstance(ended, InputError):
-                await _close(websocket, str(ended))
-            elif isinstance(ended, Exception):
-                raise ended
 
-    @routes.websocket("/axes/{axis}/stream")
-    async def stream(websocket: WebSocket, axis: str) -> None:
-        """Receives set-points: `StreamBegin`, then `StreamPoints`; each is answered by a `StreamAnswer`."""
-        await _accept(websocket)
-        try:
-            await _stream(bridge, websocket, axis)
-        except HdbridgeError as error:
-            await _send(websocket, StreamAnswer(accepted=0, problem=Problem.of(error, axis)))
-            await _close(websocket, str(error))
+@routes.websocket("/live")
+async def live(bridge: Bridge, websocket: WebSocket) -> None:
+    """Sends samples in batches; the client may change its `LiveOptions` at any time."""
+    await _accept(websocket)
+    feed = _Feed(bridge, websocket)
+    sides = asyncio.ensure_future(feed.listen()), asyncio.ensure_future(feed.tell())
+    await asyncio.wait(sides, return_when=asyncio.FIRST_COMPLETED)
+    for each in sides:
+        each.cancel()
+    # Close only after both sides have ended.
+    for ended in await asyncio.gather(*sides, return_exceptions=True):
+        if isinstance(ended, InputError):
+            await _close(websocket, str(ended))
+        elif isinstance(ended, Exception):
+            raise ended
 
-    return routes
+
+@routes.websocket("/axes/{axis}/stream")
+async def stream(bridge: Bridge, websocket: WebSocket, axis: str) -> None:
+    """Receives set-points: `StreamBegin`, then `StreamPoints`; each is answered by a `StreamAnswer`."""
+    await _accept(websocket)
+    try:
+        await _stream(bridge, websocket, axis)
+    except HdbridgeError as error:
+        await _send(websocket, StreamAnswer(accepted=0, problem=Problem.of(error, axis)))
+        await _close(websocket, str(error))
 
 
 class _Feed:
@@ -111,16 +108,14 @@ async def _stream(bridge: ServiceBridge, websocket: WebSocket, axis: str) -> Non
             begin = await _receive(websocket, StreamBegin)
     except TimeoutError:
         raise InputError(f"nothing came within {BEGIN_S:g} s; expected StreamBegin") from None
-    stream = await port(bridge, axis).stream(begin.lease, begin.timeout_s)
+    stream = await port(bridge, axis).motion.stream(begin.lease, begin.timeout_s)
     async with stream:
         await _send(websocket, StreamAnswer(accepted=0))
         while True:
             given = await _receive(websocket, StreamPoints)
             bridge.lease.renew(begin.lease)
             if given.points:
-                await stream.put([
-                    StreamPoint(each.time_s, each.position_deg, each.velocity_deg_s) for each in given.points
-                ])  # fmt: skip
+                await stream.put(given.points)
             if given.end:
                 await stream.end()
             await _send(websocket, StreamAnswer(accepted=len(given.points)))

@@ -150,7 +150,7 @@ function otherMaster(outer) {
   const word = outer.statusword.toString(16).toUpperCase().padStart(4, "0");
   const sync = outer.period_s === null ? "no SYNC" : `SYNC every ${number(1e3 * outer.period_s, 3)} ms, jitter ${number(1e6 * outer.jitter_s, 0)} \u00b5s`;
   const late = outer.latency_s === null ? "" : `, target to frame ${number(1e3 * outer.latency_s, 1)} ms, 99 % within ${number(1e3 * outer.latency_99_s, 1)} ms`;
-  const code = outer.error_code ? `, error ${outer.error_code.toString(16).toUpperCase().padStart(4, "0")}h` : "";
+  const code = outer.error ? `, error ${outer.error}` : "";
   return `node ${outer.node_id}, ${NMT[outer.nmt] || "starting"}, 6041h = ${word}h${code}, ${sync}${late}`;
 }
 

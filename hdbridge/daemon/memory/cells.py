@@ -1,0 +1,146 @@
+"""Numbers that one process writes and others monitor, and the compensation setting of an axis."""
+
+import threading
+import zlib
+from enum import IntEnum
+from typing import Final
+
+from hdbridge.daemon.memory.layout import LINE, OUTER_VIEW, STATUS_OFFSET, OuterCell, OuterView, Place
+from hdbridge.daemon.memory.region import Region
+from hdbridge.errors import InputError
+
+_STRIDE: Final = LINE // 8
+
+
+class Cell(IntEnum):
+    """Status cells, each in its own cache line."""
+
+    LOOP_COUNT = 0
+    LOOP_TIME_NS = 1
+    SERVICE_TIME_NS = 2
+    KEEPER_TIME_NS = 3
+    LOOP_PID = 4
+    SERVICE_PID = 5
+    STOP_ASKED = 6
+    GATEWAY_TIME_NS = 7
+    GATEWAY_PID = 8
+    BUS_WANTED = 9
+    """Service: 1 while it waits for the bus to be released to another program."""
+    BUS_LENT = 10
+    """Keeper: when it released the interface to another program (``time.monotonic_ns``); 0 if it did not."""
+
+
+class Cells:
+    """Integers by the members of an enumeration, each in its own cache line; access to one is atomic.
+
+    Each has one writer, except ``STOP_ASKED``, which any process may raise.
+    """
+
+    def __init__(self, region: Region, offset: int, kind: type[IntEnum]) -> None:
+        self._cells = region.cells(offset, len(kind) * _STRIDE)
+
+    def __getitem__(self, cell: IntEnum) -> int:
+        return int(self._cells[cell * _STRIDE])
+
+    def __setitem__(self, cell: IntEnum, value: int) -> None:
+        self._cells[cell * _STRIDE] = value
+
+
+class Status(Cells):
+    """State of the daemon's processes, by `Cell`."""
+
+    def __init__(self, region: Region) -> None:
+        super().__init__(region, STATUS_OFFSET, Cell)
+
+    @property
+    def loop_count(self) -> int:
+        """Turns of the loop, over all control processes so far."""
+        return self[Cell.LOOP_COUNT]
+
+    @property
+    def loop_pid(self) -> int:
+        """Process id of the control process; 0 if there is none."""
+        return self[Cell.LOOP_PID]
+
+    def turned(self, count: int, time_ns: int) -> None:
+        """Records the end of a turn."""
+        cells = self._cells
+        cells[_LOOP_COUNT] = count
+        cells[_LOOP_TIME] = time_ns
+
+
+_LOOP_COUNT: Final = Cell.LOOP_COUNT * _STRIDE
+_LOOP_TIME: Final = Cell.LOOP_TIME_NS * _STRIDE
+
+
+class OuterCells(Cells):
+    """Cells of one axis that gateway process and service share, by `OuterCell`."""
+
+    def __init__(self, region: Region, place: Place) -> None:
+        super().__init__(region, place.offset, OuterCell)
+        self._buffer, self._at = region.view, place.offset + OuterCell.VIEW * LINE
+
+    def show(self, view: OuterView) -> None:
+        """Writes the view of the outer master in one copy, unlike `pack_into`, which begins with zeros."""
+        self._buffer[self._at : self._at + OUTER_VIEW.size] = OUTER_VIEW.pack(*view)
+
+    def values(self) -> tuple[float, ...]:
+        """Returns the fields of `OuterView`; in the cycle of the control process, so as a plain tuple."""
+        return OUTER_VIEW.unpack_from(self._buffer, self._at)
+
+    @property
+    def view(self) -> OuterView:
+        """The view of the outer master."""
+        return OuterView._make(self.values())
+
+
+class SettingSlot:
+    """Slot of one axis with both ends. It contains the last setting sent, under its number.
+
+    It outlives both processes: a starting service reads the setting that an earlier one sent.
+    """
+
+    def __init__(self, region: Region, place: Place) -> None:
+        self._view = region.view
+        self._offset, _, self._capacity = place
+        self._sent = region.cells(self._offset - 2 * LINE, 3)  # number, length, crc
+        self._used = region.cells(self._offset - LINE, 1)
+        self._putting = threading.Lock()  # between threads of the service; the loop does not use it
+
+    @property
+    def number(self) -> int:
+        """Number of the setting in the slot; 0 before the first, negative while one is being written."""
+        return int(self._sent[0])
+
+    @property
+    def in_use(self) -> int:
+        """Number of the setting that the loop uses; 0 if it has taken none since it started."""
+        return int(self._used[0])
+
+    def put(self, data: bytes) -> int:
+        """Store a setting; returns its number, which is the argument of CHANGE. InputError if too large."""
+        if len(data) > self._capacity:
+            raise InputError(
+                f"the compensation takes {len(data)} bytes, the control process takes at most "
+                f"{self._capacity}: use a model with fewer effects"
+            )
+        with self._putting:
+            number: int = abs(self._sent[0]) + 1
+            self._sent[0] = -number
+            self._view[self._offset : self._offset + len(data)] = data
+            self._sent[1], self._sent[2] = len(data), zlib.crc32(data)
+            self._sent[0] = number
+        return number
+
+    def get(self, number: int) -> bytes:
+        """Returns the setting with this number. Raises InputError if the slot does not contain all of it."""
+        length: int = self._sent[1]
+        data = bytes(self._view[self._offset : self._offset + min(max(length, 0), self._capacity)])
+        whole = len(data) == length and zlib.crc32(data) == self._sent[2]
+        if number <= 0 or self._sent[0] != number or not whole:
+            raise InputError(f"the compensation setting number {number} is not in the slot; send it again")
+        return data
+
+    def use(self, number: int) -> None:
+        """Acknowledges, at the loop's end, that this setting is in use from now on."""
+        self._used[0] = number
