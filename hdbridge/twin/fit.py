@@ -30,7 +30,6 @@ from hdbridge.sim.truth.motor import TrueNotch, TrueObserver
 from hdbridge.twin.misfit import (
     CHANNELS,
     FINE,
-    NOISE_LEVEL,
     SMOOTH,
     Data,
     Loops,
@@ -39,6 +38,7 @@ from hdbridge.twin.misfit import (
     Values,
     counted,
     expected,
+    least_deviation,
     misfit,
     noise_in_motion,
     rooted,
@@ -940,6 +940,8 @@ STEPS = 30
 """Maximum steps of the final fit."""
 LOOPS = 6
 """Number of replays with quantised loops, and of smooth ones, that show the difference."""
+MORE = 1.1
+"""Ratio to the true axis's residuals above which a fit leaves more; a scale is not known better than that."""
 MINIMA = 8
 """Maximum number of moves to a better minimum. The likelihood uses the loops' deviation at the present one,
 so each of two minima may look better from the other."""
@@ -1053,15 +1055,15 @@ def _in_best_minimum(replays: Replays, best: Fitted, begun: Truth, most: Scales)
     This comes after the other parameters are known, because at the start of the fit these places were equally
     good.
     """
-    data, few = replays.data, replays.rough
-    noise = noise_in_motion(data)
+    few, noise = replays.rough, expected(replays.rough.data)
+    least = least_deviation(replays.data) | {LOAD: noise.deviation[LOAD]}
     for _ in range(MINIMA):
         # Always tried: exchanged gains differ only at rest, which a few legs hardly show, and a dead time in
         # the next substep increases the residuals too little for any channel to show it.
         places = [exchanged(best.truth), *neighbours(best.truth)]
-        if any(each.times_noise > NOISE_LEVEL for each in what_is_left(data, best.residuals, noise)):
+        if any(best.scales.deviation[name] > MORE * least[name] for name in CHANNELS):
             tried = [(each, best.parameters) for each in elsewhere(best.truth, begun)]
-            places.append(by_halving(few, tried, expected(few.data)).truth)
+            places.append(by_halving(few, tried, noise).truth)
         last = best
         for place in places:
             other = continued(replays, best, MORE_STEPS, most, place)
