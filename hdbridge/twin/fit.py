@@ -30,13 +30,15 @@ from hdbridge.sim.truth.motor import TrueNotch, TrueObserver
 from hdbridge.twin.misfit import (
     CHANNELS,
     FINE,
-    NOISE_LEVEL,
+    SMOOTH,
     Data,
+    Loops,
     Replays,
     Scales,
     Values,
     counted,
     expected,
+    least_deviation,
     misfit,
     noise_in_motion,
     rooted,
@@ -268,10 +270,13 @@ NEARER = 0.1
 """Factor by which such a difference is shortened."""
 ROUND = 4
 """Steps between two estimates of the residuals' scales."""
+SETTLED = 3
+"""Number of successive rounds without a gain that ends a fit. After each, the differences become `WIDE` times
+as long, because short ones mislead if a motor sticks (implicit filtering; Kelley, SIAM 2011)."""
 EDGE = 1e-6
 """Distance to the bounds, in spreads, that `scipy.optimize.least_squares` needs about a place."""
 WORTH = 1.0
-"""Drop of half the sum of squares in a round below which a fit ends."""
+"""Minimum drop of half the sum of squares that counts as a gain."""
 SOFT = 4.0
 """Residual, in scales, above which it counts less: a motor that slips elsewhere is not evidence."""
 
@@ -351,6 +356,8 @@ class _Problem:
         self.low, self.high = np.array([each.bounds for each in parameters]).T
         self.along: FloatArray | None = None
         """Latest slopes, which give the directions of the next differences."""
+        self.longer = 1.0
+        """Factor of the differences' length."""
         self.scale = Scales({})
         self._found: dict[bytes, dict[str, FloatArray]] = {}
 
@@ -368,7 +375,11 @@ class _Problem:
 
     def slopes(self, place: FloatArray, *, wide: bool = False) -> FloatArray:
         """Returns the derivatives of `residuals` by the coordinates in spreads, shape (n + p, p)."""
-        moves = np.diag(STEP * self.spread) if self.along is None else _moves(self.along, self.spread)
+        moves = (
+            np.diag(STEP * self.spread)
+            if self.along is None
+            else _moves(self.along, self.spread, self.longer)
+        )
         now = self.scale.scaled(self.found(place))[self._rows]
         slopes = slopes_at(self._scaled, now, place, moves, (self.low, self.high), wide=wide)
         self.along = slopes * counting(now, self.scale, self._rows)[1][:, None]
@@ -424,6 +435,7 @@ def solve(
     everything: bool = False,
     most: Scales | None = None,
     near: Fitted | None = None,
+    loops: Loops = SMOOTH,
     tempered: bool = False,
     wide: bool = False,
     linear: bool = True,
@@ -434,8 +446,9 @@ def solve(
     default they are estimated from the residuals before each round, at most ``most``, so that a worse channel
     does not lose weight. ``tempered``: known scales grow with the residuals on the way to the minimum.
     Held-out legs count only with ``everything``. ``near`` is a fit of the same parameters that gives the
-    directions of the first differences. ``wide``: the covariance uses wide differences. Without ``linear`` it
-    is the prior's, and the Jacobian that of the last place but one.
+    directions of the first differences, ``loops`` the deviation of a drive's quantised loops from smooth
+    ones. ``wide``: the covariance uses wide differences. Without ``linear`` it is the prior's, and the
+    Jacobian that of the last place but one.
     """
     data = replays.data
     rows = fitted_rows(data, everything=everything)
@@ -443,22 +456,24 @@ def solve(
     prior = place if prior is None else prior
     problem = _Problem(replays, start, parameters, prior, rows)
     problem.along = None if near is None else near.jacobian
-    done = 0
+    idle = done = 0
     while True:
         found = problem.found(place)
-        problem.scale = known if known is not None else scales(data, found, most)
-        if done >= steps:
+        problem.scale = known if known is not None else scales(data, found, loops, most)
+        if done >= steps or idle == SETTLED:
             break
         if known is not None and tempered:
             problem.scale = _tempered(known, found, rows)
-        before = problem.residuals(place)
+        before, problem.longer = problem.residuals(place), WIDE**idle
         taken = min(ROUND, steps - done)
         place = problem.stepped(place, taken)
         after = problem.residuals(place)
-        done = done + taken if 0.5 * float(before @ before - after @ after) >= WORTH else steps
+        idle = idle + 1 if 0.5 * float(before @ before - after @ after) < WORTH else 0
+        done += taken
     left = softened(found, problem.scale, rows)
     slopes, covariance = problem.along, np.diag(problem.spread**2)
     if linear or slopes is None:
+        problem.longer = 1.0
         slopes = problem.slopes(place, wide=wide)[: -len(parameters)] / problem.spread
         covariance = sandwich(slopes, left, legs_of_rows(data, rows), problem.spread)
     truth = at_coordinates(start, parameters, place.tolist())
@@ -473,8 +488,9 @@ def continued(
     truth: Truth | None = None,
     **options: Any,
 ) -> Fitted:
-    """Continues a fit, at ``truth`` if given; ``options`` are those of `solve`."""
-    return solve(replays, truth or best.truth, best.parameters, steps, best.prior, most=most, **options)
+    """Continues a fit, at ``truth`` if given, with its loops' deviation; ``options`` are those of `solve`."""
+    options = {"loops": best.scales.loops, "most": most, **options}
+    return solve(replays, truth or best.truth, best.parameters, steps, best.prior, **options)
 
 
 def fitted_rows(data: Data, *, everything: bool = False) -> NDArray[np.bool_]:
@@ -546,10 +562,13 @@ def slopes_at(
     return np.asarray((np.linalg.pinv(np.stack(ends) - place) @ changes).T, dtype=np.float64)
 
 
-def _moves(slopes: FloatArray, spread: FloatArray) -> FloatArray:
-    """Returns difference steps along the principal directions that change the residuals by `RESPONSE`."""
+def _moves(slopes: FloatArray, spread: FloatArray, times: float = 1.0) -> FloatArray:
+    """Returns difference steps along the principal directions that change the residuals by `RESPONSE`.
+
+    ``times`` multiplies their length.
+    """
     worth, directions = eigen(slopes, spread)
-    far = np.minimum(RESPONSE / np.sqrt(worth), FARTHEST)
+    far = np.minimum(times * RESPONSE / np.sqrt(worth), FARTHEST)
     moves: FloatArray = (directions * far).T * spread
     return moves
 
@@ -883,8 +902,8 @@ def with_loop(replays: Replays, best: Fitted, most: Scales | None = None) -> Fit
         return None
     rest = [number for number, each in enumerate(best.parameters) if each.cause != ELASTIC]
     parameters = (*(best.parameters[number] for number in rest), *nearest.parameters)
-    prior = np.append(best.prior[rest], nearest.prior)
-    return solve(replays, nearest.truth, parameters, STEPS, prior, most=most)
+    prior, loops = np.append(best.prior[rest], nearest.prior), best.scales.loops
+    return solve(replays, nearest.truth, parameters, STEPS, prior, most=most, loops=loops)
 
 
 def with_limit(replays: Replays, best: Fitted, usual: Truth, most: Scales | None = None) -> Fitted:
@@ -900,7 +919,7 @@ def with_limit(replays: Replays, best: Fitted, usual: Truth, most: Scales | None
     if _cost(replays, without, best) - best.cost <= EARNED:
         return replace(best, truth=without)
     parameters, prior = (*best.parameters, LIMIT), np.append(best.prior, coordinates(usual, [LIMIT]))
-    return solve(replays, best.truth, parameters, STEPS, prior, most=most)
+    return solve(replays, best.truth, parameters, STEPS, prior, most=most, loops=best.scales.loops)
 
 
 def _cost(replays: Replays, truth: Truth, best: Fitted) -> float:
@@ -921,6 +940,13 @@ NEAR_STEPS = 30
 """Maximum steps over the whole recording with the expected noise."""
 STEPS = 30
 """Maximum steps of the final fit."""
+LOOPS = 6
+"""Number of replays with quantised loops, and of smooth ones, that show the difference."""
+MORE = 1.1
+"""Ratio to the true axis's residuals above which a fit leaves more; a scale is not known better than that."""
+MINIMA = 8
+"""Maximum number of moves to a better minimum. The likelihood uses the loops' deviation at the present one,
+so each of two minima may look better from the other."""
 OPTIONAL = (
     "velocity feed-forward", "load friction", "temperature", "current limit", "motor encoder delay",
     "encoder coupling", "friction growth", "moving average", *LOOP,
@@ -954,7 +980,8 @@ def fit(replays: Replays, progress: Progress = lambda _: None) -> Fitted:
             raise
         last = reached[-1]
         best = replace(_linearised(replays, last), interrupted=True)
-    return best
+    # The loops' deviation belongs to these rows; later callers use others.
+    return replace(best, scales=replace(best.scales, loops=SMOOTH))
 
 
 def _fit(replays: Replays, progress: Progress, keep: Callable[[Fitted], None]) -> Fitted:
@@ -996,7 +1023,8 @@ def _polished(replays: Replays, near: Fitted, begun: Truth, keep: Callable[[Fitt
     most = scales(data, before)
     # The residuals of a wrong simulation are no estimate of the noise: they would reduce the weight of the
     # very channel that shows the error.
-    best = continued(replays, near, NEAR_STEPS, known=expected(data), near=near, tempered=True)
+    noise = replace(expected(data), loops=loops_about(replays, near))
+    best = continued(replays, near, NEAR_STEPS, known=noise, near=near, tempered=True)
     best = _ended(replays, best, most)
     keep(best)
     laws = len(LAWS)  # maximum number of changes
@@ -1029,24 +1057,42 @@ def _in_best_minimum(replays: Replays, best: Fitted, begun: Truth, most: Scales)
     This comes after the other parameters are known, because at the start of the fit these places were equally
     good.
     """
-    data, few = replays.data, replays.rough
-    noise = noise_in_motion(data)
-    while True:
+    few, noise = replays.rough, expected(replays.rough.data)
+    least = least_deviation(replays.data) | {LOAD: noise.deviation[LOAD]}
+    for _ in range(MINIMA):
         # Always tried: exchanged gains differ only at rest, which a few legs hardly show, and a dead time in
         # the next substep increases the residuals too little for any channel to show it.
         places = [exchanged(best.truth), *neighbours(best.truth)]
-        if any(each.times_noise > NOISE_LEVEL for each in what_is_left(data, best.residuals, noise)):
+        if any(best.scales.deviation[name] > MORE * least[name] for name in CHANNELS):
             tried = [(each, best.parameters) for each in elsewhere(best.truth, begun)]
-            places.append(by_halving(few, tried, expected(few.data)).truth)
+            places.append(by_halving(few, tried, noise).truth)
         last = best
         for place in places:
             other = continued(replays, best, MORE_STEPS, most, place)
             if other.loss + EARNED < best.loss:
                 best = _ended(replays, other, most)
         if best is last:
-            return best
+            break
+    return best
 
 
 def _ended(replays: Replays, near: Fitted, most: Scales) -> Fitted:
-    """Continues a fit to its minimum."""
-    return continued(replays, near, STEPS, most, near=near)
+    """Continues a fit to its minimum, with the loops' deviation estimated there."""
+    return continued(replays, near, STEPS, most, near=near, loops=loops_about(replays, near))
+
+
+def loops_about(replays: Replays, fitted: Fitted) -> Loops:
+    """Estimates the deviation of quantised loops from smooth ones, by draws from the fit's covariance."""
+    rng = np.random.default_rng(0)
+    low, high = np.array([each.bounds for each in fitted.parameters]).T
+    places = rng.multivariate_normal(fitted.place, fitted.covariance, LOOPS, method="svd")
+    truths = [
+        at_coordinates(fitted.truth, fitted.parameters, np.clip(each, low, high).tolist()) for each in places
+    ]
+    shown = replays([*truths, *truths], [False] * LOOPS + [True] * LOOPS)
+    pairs = list(zip(shown[:LOOPS], shown[LOOPS:], strict=True))
+    apart = {name: np.stack([other[name] - one[name] for one, other in pairs]) for name in CHANNELS}
+    return Loops(
+        {name: np.mean(each, axis=0) for name, each in apart.items()},
+        {name: np.sqrt(1.0 + 1.0 / LOOPS) * np.std(each, axis=0, ddof=1) for name, each in apart.items()},
+    )
