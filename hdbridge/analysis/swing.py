@@ -201,8 +201,8 @@ def settled(estimator: Estimator, fitted: Fitted, found: Swing | None) -> Observ
     """Returns the data without the samples in which more of the swing is unknown than matters.
 
     The error of a ``found`` swing scales with the wind-up and with waves too fast for the sampling. Its share
-    is regressed on the squares of the residual in motion. The calmest samples always stay. These errors, and those of the turning points, are
-    in their noise.
+    is regressed on the squares of the residual in motion. The noise of a sample contains this error and that
+    of the turning points. The calmest samples always stay.
     """
     data, weight, unknown = estimator.data, estimator.weight, np.zeros(len(estimator.data.full))
     effects = fitted.hypothesis.effects
