@@ -94,7 +94,7 @@ _MODULES: Final = MappingProxyType(
         "simulated": "simulated",
     }
 )
-"""Modules of the names, except the errors."""
+"""Module of each public name, except the errors."""
 
 
 def __getattr__(name: str) -> Any:

@@ -457,7 +457,7 @@ class BusCycle:
     # ---------------------------------------------------------------- faults of the bus
 
     def _everybody(self, fault: Fault, detail: str) -> None:
-        """Notes a bus fault, for all axes, before they are answered."""
+        """Notes a bus fault for every axis, before the axes react."""
         self.faults.append((fault, detail))
         for axis in self._speaking:
             if not axis.rested:

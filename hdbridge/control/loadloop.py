@@ -159,8 +159,8 @@ class LoadLoop:
     def use_models(self, whole: TransmissionModel, predicting: TransmissionModel) -> None:
         """Sets the models: ``whole`` has the full hysteresis, ``predicting`` gives ``motor`` of `step`.
 
-        The load may lag the motor by the hysteresis that is not predicted, and by a share of the one that
-        is. If the hysteresis is not known, only the loop's own bound limits the lag.
+        The load may lag the motor by the part of the hysteresis that is not predicted, and by a share of the
+        predicted part. If the hysteresis is not known, only the loop's own bound limits the lag.
         """
         width = loop_width_arcsec(whole)
         known = (1.0 - _MODEL_ERROR) * loop_width_arcsec(predicting)

@@ -77,9 +77,9 @@ class _Offer(NamedTuple):
     fixed: tuple[PdoEntry, ...] | None
     """Entries of a read-only mapping; None if the mapping can be written."""
     can_id: int | None
-    """Identifier, if it is read-only."""
+    """Identifier of the PDO, if the drive does not let it be changed."""
     every: int | None
-    """Transmission type, if it is read-only."""
+    """Transmission type, if the drive does not let it be changed."""
 
 
 def cyclic_mode(axis: AxisConfig) -> CyclicMode:

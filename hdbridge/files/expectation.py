@@ -22,7 +22,7 @@ class Field:
     description: str = ""
 
     def types(self) -> Iterator[Any]:
-        """Yields the members of its type, with unions and annotations resolved and None left out."""
+        """Yields the member types of the annotation: unions and aliases resolved, without None."""
         for member in _members(self.annotation):
             if member is not type(None):
                 yield member

@@ -155,7 +155,7 @@ def _over(
 
 
 def _both_ways(traces: Traces, x: FloatArray, y: FloatArray, chosen: BoolArray) -> list[Series]:
-    """Returns the chosen samples of each direction that occurs."""
+    """Returns the chosen samples by direction, without a direction that does not occur."""
     ways = (("forward", chosen & (traces.direction > 0.0)), ("backward", chosen & (traces.direction < 0.0)))
     return [Series(name, x[rows], y[rows], Mark.POINTS) for name, rows in ways if np.any(rows)]
 

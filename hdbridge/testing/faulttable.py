@@ -95,7 +95,7 @@ class Row:
     arguments: Mapping[str, Value] = field(default_factory=dict)
     """Arguments with their defaults."""
     answers: str = ""
-    """Row of the fault table that it produces, by its first words."""
+    """First words of the row of the fault table that this fault produces."""
     needs: Needs = Needs.NOTHING
     touches: Callable[[Mapping[str, Any]], tuple[int, int]] | None = None
     """Returns the object that the drive must have, given the arguments."""

@@ -326,8 +326,8 @@ def _approach(
     trajectory = Trajectory(1)
     if Ruckig(1).calculate(demand, trajectory) not in {Result.Working, Result.Finished}:
         raise InputError(
-            f"no way from where the simulated drive is switched on, {start_deg:g} deg, to where the "
-            f"recording begins, {demand_deg[0] / ratio:g} deg, within the limits of {axis.path}"
+            f"no move from the start of the simulated drive, {start_deg:g} deg, to that of the recording, "
+            f"{demand_deg[0] / ratio:g} deg, is within the limits of {axis.path}"
         )
     moving = math.ceil(trajectory.duration / cycle_s)
     standing = math.ceil(standing_s / cycle_s)

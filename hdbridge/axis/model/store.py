@@ -214,7 +214,7 @@ class Store(Generic[K]):
             return self._activate(profile, path.read_bytes(), "activate", reason, date)
 
     def rollback(self, profile: Path, reason: str, date: datetime, identity: Identity | None = None) -> int:
-        """Undoes the last activation that is not undone yet; returns the number of the version now active."""
+        """Undoes the last activation not undone yet; returns the number of the version now active."""
         with _locked(profile):
             active = _bytes(profile / self.active)
             earlier = undone(

@@ -99,7 +99,7 @@ class Trace:
         self._heartbeat_s: dict[int, float] = {}
         self._told: set[str] = set()
         self.mistakes: Counter[str] = Counter()
-        """Counts of each advice."""
+        """Number of occurrences of each piece of advice."""
         self._begun_s: float | None = None
         self._lines: list[Line] = []
 
