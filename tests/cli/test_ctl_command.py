@@ -179,8 +179,7 @@ def test_the_machine_is_named_if_not_given(hdbridge, machine, place, monkeypatch
     assert done.stderr == f"machine 'cell' at {found}\n"
 
 
-@pytest.mark.parametrize("width", [60, 120])
-@pytest.mark.parametrize("line", ["status", "watch --count 1"])
+@pytest.mark.parametrize(("line", "width"), [("status", 120), ("status", 60), ("watch --count 1", 60)])
 def test_tables_are_complete_at_any_width(ctl, process, machine, monkeypatch, line, width):
     shown = (
         machine.axes["joint-2"]

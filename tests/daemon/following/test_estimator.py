@@ -57,15 +57,6 @@ def test_unexcited_parameters_are_neither_learnt_nor_forgotten(seed, keep, corre
 
 
 @given(seed=seeds, keep=st.floats(0.3, 1.0))
-def test_without_excitation_nothing_changes(seed, keep):
-    estimator = fresh(4, seed)
-    estimate, covariance = estimator.estimate.copy(), estimator.covariance.copy()
-    assert estimator.update(np.zeros((8, 4)), np.ones(8), SIGMA, retention=keep) == 0
-    assert np.array_equal(estimator.estimate, estimate)
-    assert np.array_equal(estimator.covariance, covariance)
-
-
-@given(seed=seeds, keep=st.floats(0.3, 1.0))
 def test_held_parameters_keep_value_and_variance(seed, keep):
     estimator = fresh(5, seed)
     before = estimator.covariance.copy()

@@ -106,16 +106,6 @@ def test_reverting_takes_one_call_and_survives_a_restart(tmp_path):
     assert history(tmp_path)[-2]["event"] == "back"
 
 
-def test_lost_samples_lose_the_path(tmp_path):
-    machine = Machine(on(tmp_path))
-    machine.works()
-    assert machine.follower.state().frozen is None
-    machine.works(by_deg=5.0, lost=7)
-    assert "turned past its loop" in machine.follower.state().frozen
-    machine.works(seed=2)
-    assert machine.follower.state().frozen is None
-
-
 def test_a_full_disk_loses_only_the_history(tmp_path, monkeypatch):
     machine = Machine(on(tmp_path))
 
