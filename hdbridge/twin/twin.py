@@ -106,6 +106,8 @@ class Twin:
 SIGNALS: Final = (LOAD_ERROR, FOLLOWING_ERROR, MOTOR_TORQUE, TEMPERATURE)
 LEAST_GAIN: Final = 0.01
 """Minimum reduction of the mean ratio of the differences; smaller ones are due to noise."""
+EQUAL: Final = 0.01
+"""Share of the noise below which differences are equal; a few held-out readings may all agree."""
 WORSE: Final = 1.1
 """Ratio of the differences after and before above which a signal is worse, if it exceeds its noise."""
 DECADE: Final = 10.0
@@ -201,8 +203,11 @@ def better(before: Comparison, after: Comparison) -> Verdict:
         for name, (was, now) in pairs.items()
         if now.difference > WORSE * was.difference and now.difference > max(now.noise, 1e-12)
     ]
-    # Noise is in both differences. Differences below these limits are rounding errors.
-    least = {name: step_k if name == TEMPERATURE else 1e-12 for name in pairs}
+    # Noise is in both differences. Differences below these limits are equal.
+    least = {
+        name: step_k if name == TEMPERATURE else max(EQUAL * now.noise, 1e-12)
+        for name, (_, now) in pairs.items()
+    }
     ratios = [
         math.log(max(now.difference, least[name]) / max(was.difference, least[name]))
         for name, (was, now) in pairs.items()
