@@ -6,6 +6,7 @@ from pathlib import Path
 import can
 import pytest
 
+from hdbridge.errors import InputError
 from hdbridge.sim.lockstep import (
     LockstepBus,
     SimulatedAxis,
@@ -116,3 +117,9 @@ def test_axes_on_one_bus_do_not_disturb_each_other():
     assert all(len(frames) == 200 for frames in together.values())
     for node_id in (1, 2, 5):
         assert together[node_id] == run_several([node_id])[node_id]
+
+
+def test_two_simulated_drives_need_different_node_ids():
+    twice = [SimulatedAxis(ARTICLE, EDS, 4), SimulatedAxis(ARTICLE, EDS, 4)]
+    with pytest.raises(InputError, match="node 4"), simulated_benches(twice):
+        pass

@@ -9,13 +9,14 @@ import pytest
 from support.hidden.elastic import remembering
 from support.keys import with_keys
 
-from hdbridge.sim.encoder import Late
+from hdbridge.sim.encoder import Late, Signals
 from hdbridge.sim.exercise import Exercise
 from hdbridge.sim.hysteresis_laws import law_of
 from hdbridge.sim.loaded_plant import LoadedPlant, Spring
 from hdbridge.sim.machine import Machine
 from hdbridge.sim.plant import Plant
 from hdbridge.sim.truth import Dahl, RollingFriction, Truth
+from hdbridge.sim.truth.encoder import TrueSignals
 from hdbridge.sim.truth.gear import TrueStiffening
 
 ARTICLE = Path(__file__).parents[2] / "profiles" / "article"
@@ -154,6 +155,20 @@ def test_drag_only_takes_energy_away() -> None:
     assert peaks[-1] < 0.1 * peaks[0]
 
 
+@pytest.mark.parametrize("speed_deg_s", [50.0, 200.0, 700.0])
+def test_viscous_drag_winds_up_by_its_thinned_torque(speed_deg_s: float) -> None:
+    thinning = {"speed_rad_s": 0.05, "exponent": 0.5}
+    truth = axis(load__viscous_nm_s_per_rad=8.0, load__thinning=thinning)
+    machine = Machine(truth, 1)
+    exercise = Exercise(machine)
+    exercise.move(speed_deg_s, speed_deg_s, 3000.0)
+    exercise.hold(0.3)
+    exercise.lead(lambda seconds: speed_deg_s * seconds, 1.0)
+    speed = math.radians(speed_deg_s / 50.0)
+    torque = 8.0 * speed / math.sqrt(1.0 + speed / 0.05)
+    assert error_arcsec(machine) == pytest.approx(-torque / 16_000 * ARCSEC_PER_RAD, rel=0.02)
+
+
 def test_friction_at_rest_holds_more_than_in_motion() -> None:
     held = {}
     for breakaway_nm in (0.5, 2.0):
@@ -203,6 +218,19 @@ def test_an_axis_with_nothing_on_its_load_moves_alike_in_both_plants() -> None:
 
 
 # Encoders
+
+
+def test_signals_err_once_twice_and_four_times_per_line() -> None:
+    for key, order, size in (
+        ("sine_offset", 1, 0.02),
+        ("gain_mismatch", 2, 0.01),
+        ("third_harmonic", 4, 0.02),
+    ):
+        signals = Signals(TrueSignals(lines_per_turn=1000, **{key: 0.02}))
+        angles = np.arange(256) / 256.0 * 0.36
+        spectrum = np.abs(np.fft.rfft([signals.error_deg(each) for each in angles])) / 128.0
+        assert int(np.argmax(spectrum[1:])) + 1 == order
+        assert spectrum[order] == pytest.approx(math.degrees(size) / 1000.0, rel=0.05)
 
 
 @pytest.mark.parametrize("late_s", [0.0002, 0.0005, 0.0013, 0.02])
@@ -264,6 +292,25 @@ def test_hours_of_work_change_loop_and_tooth_error_up_to_a_limit() -> None:
     exercise.move(-90.0, 700.0, 3000.0)
     exercise.hold(0.5)
     assert error_arcsec(machine) == pytest.approx(-60.0, abs=0.2)
+
+
+def test_warmth_changes_tooth_error_friction_and_the_zero() -> None:
+    order = [{"order": 2, "amplitude_arcsec": 10.0, "phase_deg": 0.0}]
+    torques, errors = [], []
+    for start_c in (22.0, 32.0):
+        heat = {
+            "ambient_c": start_c,
+            "reference_c": 22.0,
+            "tooth_growth_per_k": 0.02,
+            "friction_growth_per_k": -0.01,
+        }
+        machine, exercise = moved(axis(gear__motor_orders=order, temperature=heat), 180.0)
+        errors.append(error_arcsec(machine))
+        exercise.lead(lambda seconds: 300.0 * seconds, 0.8)
+        torques.append(float(np.mean(exercise.readings().motor_torque_nm[-100:])))
+    assert errors[0] == pytest.approx(10.0, abs=0.1)
+    assert errors[1] == pytest.approx(12.0, abs=0.1)
+    assert torques[1] == pytest.approx(0.9 * torques[0], rel=0.01)
 
 
 def test_the_surroundings_warm_the_axis_and_the_housing_follows_late() -> None:

@@ -229,6 +229,15 @@ def test_the_encoders_count_whole_counts_in_their_direction_from_their_zero(dire
     assert machine.load_counts == math.floor(direction * machine.true_load_deg * 8000 - 77 + 0.5)
 
 
+def test_the_torque_has_the_sign_of_the_counts() -> None:
+    for direction in (1, -1):
+        machine = Machine(truth(motor__encoder__direction=direction), 1)
+        for cycle in range(50):
+            machine.follow(20 * cycle, 20 * (cycle + 1), 8)
+        assert machine.torque_permille > 80
+        assert machine.velocity_counts_s == pytest.approx(5000.0, rel=0.05)
+
+
 def record(seed: int) -> list[tuple[int, int, int, float, float]]:
     axis = Axis(truth("demo"), seed)
     rows = []
@@ -249,6 +258,17 @@ def test_the_seed_affects_only_load_encoder_noise() -> None:
     assert [row[:1] + row[2:] for row in one] == [row[:1] + row[2:] for row in other]
 
 
+def test_the_noise_of_the_load_encoder_is_as_stated() -> None:
+    axis = Axis(truth("demo", load__encoder__noise_arcsec=2.0))
+    axis.move(STEP_COUNTS, settle_s=0.5)
+    readings = []
+    for _ in range(1000):
+        axis.hold(CYCLE_S)
+        assert axis.machine.load_counts == axis.machine.load_counts
+        readings.append(axis.machine.load_counts * 0.45)
+    assert statistics.pstdev(readings) == pytest.approx(2.0, rel=0.1)
+
+
 def test_friction_warms_the_axis_and_rest_lets_it_cool() -> None:
     known = truth(
         temperature={"ambient_c": 20.0, "resistance_k_per_w": 10.0, "time_constant_s": 0.5},
@@ -260,6 +280,16 @@ def test_friction_warms_the_axis_and_rest_lets_it_cool() -> None:
     assert machine.temperature_c == pytest.approx(20.0 + 10.0 * loss_w, rel=0.01)
     machine.coast(10_000, braked=False)
     assert machine.temperature_c == pytest.approx(20.0, abs=0.01)
+
+
+def test_load_and_flexspline_orders_are_seen_at_their_own_angles() -> None:
+    one = [{"order": 1, "amplitude_arcsec": 30.0, "phase_deg": 0.0}]
+    for key, angle in (("load_orders", 1 / 50), ("flexspline_orders", 1 + 1 / 50)):
+        known = truth(gear__motor_orders=[], gear__hysteresis=None, **{f"gear__{key}": one})
+        axis = Axis(known)
+        axis.move(50 * 8000 // 3, settle_s=0.3)
+        expected = 30.0 * math.cos(math.radians(axis.target * DEG_PER_COUNT * angle))
+        assert axis.error_arcsec == pytest.approx(expected, abs=0.2)
 
 
 @pytest.mark.parametrize(
