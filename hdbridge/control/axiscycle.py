@@ -42,9 +42,9 @@ class AxisCycle:
     """One axis on a `BusCycle`; silent until `begin`.
 
     ``image`` gives the controlword (``image.power.go``) and the scaling; ``supervision`` holds the latch and
-    the list of faults; ``monitor`` may be shared with the boot-up. ``plausibility`` defaults to the limits
-    of the axis file. Errors of a command that are in ``refused`` stop this axis, as a bad target does; any
-    others pass through the whole cycle and so affect the other axes.
+    the list of faults; ``monitor`` may be shared with the boot-up. Errors of a command that are in
+    ``refused`` stop this axis, as a bad target does; any others pass through the whole cycle and so affect
+    the other axes.
     """
 
     __slots__ = (
@@ -61,7 +61,6 @@ class AxisCycle:
         *,
         name: str = "",
         monitor: NetworkMonitor | None = None,
-        plausibility: Plausibility | None = None,
         stop_timeout_s: float = 1.0,
         refused: tuple[type[Exception], ...] = (Exception,),
     ) -> None:
@@ -100,7 +99,7 @@ class AxisCycle:
         """
 
         self._traffic = Traffic(image, self.monitor, 0.0)
-        self._plausibility = plausibility if plausibility is not None else Plausibility.of(axis)
+        self._plausibility = Plausibility.of(axis)
         self._refused = refused
         self._channels = bool(image.channels)
         self._awaited_channels: list[int] = []

@@ -114,13 +114,11 @@ class BusCycle:
         period_s: float,
         *,
         bitrate_bps: int | None = None,
-        on_frame: Callable[[Frame], None] | None = None,
-        outgoing: Callable[[], tuple[int, bytes] | None] | None = None,
     ) -> None:
         self.clock = clock
         self.period_s = period_s
-        self.on_frame = on_frame
-        self.outgoing = outgoing
+        self.on_frame: Callable[[Frame], None] | None = None
+        self.outgoing: Callable[[], tuple[int, bytes] | None] | None = None
         self.axes: tuple[AxisCycle, ...] = ()
         """Axes in the order in which they are answered."""
         self.histogram = Histogram()

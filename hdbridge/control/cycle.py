@@ -12,7 +12,6 @@ from hdbridge.drive.feedback import Feedback
 from hdbridge.drive.image import ProcessImage
 from hdbridge.drive.link import Link
 from hdbridge.drive.monitor import NetworkMonitor
-from hdbridge.drive.plausibility import Plausibility
 from hdbridge.drive.supervision import Supervision
 from hdbridge.errors import InputError
 
@@ -23,8 +22,7 @@ class Cycle:
     """Runs the process image over a link, one `tick` per period.
 
     ``image`` gives the controlword (``image.power.go``) and the scaling; ``supervision`` holds the latch and
-    the list of faults; ``monitor`` may be shared with the boot-up. ``plausibility`` defaults to the limits of
-    the axis file.
+    the list of faults; ``monitor`` may be shared with the boot-up.
     """
 
     __slots__ = (
@@ -48,7 +46,6 @@ class Cycle:
         period_s: float,
         *,
         monitor: NetworkMonitor | None = None,
-        plausibility: Plausibility | None = None,
         stop_timeout_s: float = 1.0,
     ) -> None:
         self.clock = clock
@@ -58,7 +55,6 @@ class Cycle:
             image,
             supervision,
             monitor=monitor,
-            plausibility=plausibility,
             stop_timeout_s=stop_timeout_s,
             refused=(InputError,),
         )

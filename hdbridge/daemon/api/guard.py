@@ -9,7 +9,7 @@ import asyncio
 import logging
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from typing import Any, Final
@@ -62,15 +62,12 @@ class Traffic:
 
 
 class Guard:
-    """ASGI middleware that applies a policy. ``now`` is a monotonic clock in seconds."""
+    """ASGI middleware that applies a policy."""
 
-    def __init__(
-        self, app: ASGIApp, policy: Policy, traffic: Traffic, now: Callable[[], float] = time.monotonic
-    ) -> None:
+    def __init__(self, app: ASGIApp, policy: Policy, traffic: Traffic) -> None:
         self._app = app
         self._policy = policy
         self._traffic = traffic
-        self._now = now
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Handles a request, a WebSocket, or the application's start and end."""
@@ -82,7 +79,7 @@ class Guard:
             await self._app(scope, receive, send)
 
     async def _http(self, scope: Scope, receive: Receive, send: Send) -> None:
-        began = self._now()
+        began = time.monotonic()
         status = 0
         stops = scope["path"].endswith(STOPS)
 
@@ -110,7 +107,7 @@ class Guard:
         finally:
             self._traffic.count(scope["method"], status)
             looks = scope["method"] in {"GET", "HEAD"} and status < 400
-            about = {**_about(scope), "status": status, "ms": round(1e3 * (self._now() - began), 1)}
+            about = {**_about(scope), "status": status, "ms": round(1e3 * (time.monotonic() - began), 1)}
             _log.log(logging.DEBUG if looks else logging.INFO, "request", about)
 
     async def _websocket(self, scope: Scope, receive: Receive, send: Send) -> None:

@@ -43,12 +43,11 @@ class Controller:
         setups: Sequence[AxisSetup],
         memory: Memory,
         reopen: Callable[[], Link | None] = lambda: None,
-        monotonic_ns: Callable[[], int] = time.monotonic_ns,
     ) -> None:
         """``reopen`` reopens the interface after a failure; it returns None while the interface is down.
 
-        ``monotonic_ns`` is the clock by which other processes monitor this one. Raises InputError if the axes
-        cannot share one bus, or if the shared memory was made for another number of axes.
+        Raises InputError if the axes cannot share one bus, or if the shared memory was made for another
+        number of axes.
         """
         if memory.axes != len(setups):
             raise InputError(f"shared memory for {memory.axes} axes, but the machine has {len(setups)}")
@@ -73,7 +72,6 @@ class Controller:
         """True once `end` has switched off power of all axes; no more turns are due."""
 
         self._reopen = reopen
-        self._monotonic_ns = monotonic_ns
         self._axis_of_node = {
             node: axis
             for axis in self.axes
@@ -132,7 +130,7 @@ class Controller:
             *values,
         ))  # fmt: skip
         self._turns += 1
-        self.memory.status.turned(self._turns, self._monotonic_ns())
+        self.memory.status.turned(self._turns, time.monotonic_ns())
 
     def _tell(self, axis: int, kind: EventKind, id_: int = 0, code: int = 0, text: str = "") -> None:
         cycle = self.cycle

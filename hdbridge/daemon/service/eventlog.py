@@ -7,7 +7,6 @@ its own numbering.
 
 import threading
 from collections import deque
-from collections.abc import Callable
 from datetime import UTC, datetime
 from typing import NamedTuple
 
@@ -36,12 +35,8 @@ class Entry(NamedTuple):
 class EventLog:
     """The newest `KEPT` entries, and the answers to the newest commands."""
 
-    def __init__(
-        self, reader: RingReader[Event], now: Callable[[], datetime] = lambda: datetime.now(UTC)
-    ) -> None:
-        """``now`` returns the date of an entry."""
+    def __init__(self, reader: RingReader[Event]) -> None:
         self._reader = reader
-        self._date = now
         self._lock = threading.Lock()
         self._entries: deque[Entry] = deque(maxlen=KEPT)
         self._told: deque[Entry] = deque(maxlen=KEPT)
@@ -97,7 +92,7 @@ class EventLog:
         return [each.event for each in entries if each.event is not None and each.axis in {axis, -1}]
 
     def _add(self, axis: int, event: Event | None, text: str, hint: str = "") -> None:
-        date = self._date()
+        date = datetime.now(UTC)
         self._number += 1
         self._entries.append(Entry(self._number, date, axis, event, text, hint))
         if event is None or not _routine(event):
