@@ -270,13 +270,10 @@ NEARER = 0.1
 """Factor by which such a difference is shortened."""
 ROUND = 4
 """Steps between two estimates of the residuals' scales."""
-SETTLED = 3
-"""Number of successive rounds without a gain that ends a fit. After each, the differences become `WIDE` times
-as long, because short ones mislead if a motor sticks (implicit filtering; Kelley, SIAM 2011)."""
 EDGE = 1e-6
 """Distance to the bounds, in spreads, that `scipy.optimize.least_squares` needs about a place."""
 WORTH = 1.0
-"""Minimum drop of half the sum of squares that counts as a gain."""
+"""Drop of half the sum of squares in a round below which a fit ends."""
 SOFT = 4.0
 """Residual, in scales, above which it counts less: a motor that slips elsewhere is not evidence."""
 
@@ -356,8 +353,6 @@ class _Problem:
         self.low, self.high = np.array([each.bounds for each in parameters]).T
         self.along: FloatArray | None = None
         """Latest slopes, which give the directions of the next differences."""
-        self.longer = 1.0
-        """Factor of the differences' length."""
         self.scale = Scales({})
         self._found: dict[bytes, dict[str, FloatArray]] = {}
 
@@ -375,11 +370,7 @@ class _Problem:
 
     def slopes(self, place: FloatArray, *, wide: bool = False) -> FloatArray:
         """Returns the derivatives of `residuals` by the coordinates in spreads, shape (n + p, p)."""
-        moves = (
-            np.diag(STEP * self.spread)
-            if self.along is None
-            else _moves(self.along, self.spread, self.longer)
-        )
+        moves = np.diag(STEP * self.spread) if self.along is None else _moves(self.along, self.spread)
         now = self.scale.scaled(self.found(place))[self._rows]
         slopes = slopes_at(self._scaled, now, place, moves, (self.low, self.high), wide=wide)
         self.along = slopes * counting(now, self.scale, self._rows)[1][:, None]
@@ -456,24 +447,22 @@ def solve(
     prior = place if prior is None else prior
     problem = _Problem(replays, start, parameters, prior, rows)
     problem.along = None if near is None else near.jacobian
-    idle = done = 0
+    done = 0
     while True:
         found = problem.found(place)
         problem.scale = known if known is not None else scales(data, found, loops, most)
-        if done >= steps or idle == SETTLED:
+        if done >= steps:
             break
         if known is not None and tempered:
             problem.scale = _tempered(known, found, rows)
-        before, problem.longer = problem.residuals(place), WIDE**idle
+        before = problem.residuals(place)
         taken = min(ROUND, steps - done)
         place = problem.stepped(place, taken)
         after = problem.residuals(place)
-        idle = idle + 1 if 0.5 * float(before @ before - after @ after) < WORTH else 0
-        done += taken
+        done = done + taken if 0.5 * float(before @ before - after @ after) >= WORTH else steps
     left = softened(found, problem.scale, rows)
     slopes, covariance = problem.along, np.diag(problem.spread**2)
     if linear or slopes is None:
-        problem.longer = 1.0
         slopes = problem.slopes(place, wide=wide)[: -len(parameters)] / problem.spread
         covariance = sandwich(slopes, left, legs_of_rows(data, rows), problem.spread)
     truth = at_coordinates(start, parameters, place.tolist())
@@ -562,13 +551,10 @@ def slopes_at(
     return np.asarray((np.linalg.pinv(np.stack(ends) - place) @ changes).T, dtype=np.float64)
 
 
-def _moves(slopes: FloatArray, spread: FloatArray, times: float = 1.0) -> FloatArray:
-    """Returns difference steps along the principal directions that change the residuals by `RESPONSE`.
-
-    ``times`` multiplies their length.
-    """
+def _moves(slopes: FloatArray, spread: FloatArray) -> FloatArray:
+    """Returns difference steps along the principal directions that change the residuals by `RESPONSE`."""
     worth, directions = eigen(slopes, spread)
-    far = np.minimum(times * RESPONSE / np.sqrt(worth), FARTHEST)
+    far = np.minimum(RESPONSE / np.sqrt(worth), FARTHEST)
     moves: FloatArray = (directions * far).T * spread
     return moves
 
