@@ -30,9 +30,7 @@ from hdbridge.sim.truth.motor import TrueNotch, TrueObserver
 from hdbridge.twin.misfit import (
     CHANNELS,
     FINE,
-    SMOOTH,
     Data,
-    Loops,
     Replays,
     Scales,
     Values,
@@ -426,7 +424,6 @@ def solve(
     everything: bool = False,
     most: Scales | None = None,
     near: Fitted | None = None,
-    loops: Loops = SMOOTH,
     tempered: bool = False,
     wide: bool = False,
     linear: bool = True,
@@ -437,9 +434,8 @@ def solve(
     default they are estimated from the residuals before each round, at most ``most``, so that a worse channel
     does not lose weight. ``tempered``: known scales grow with the residuals on the way to the minimum.
     Held-out legs count only with ``everything``. ``near`` is a fit of the same parameters that gives the
-    directions of the first differences, ``loops`` the deviation of a drive's quantised loops from smooth
-    ones. ``wide``: the covariance uses wide differences. Without ``linear`` it is the prior's, and the
-    Jacobian that of the last place but one.
+    directions of the first differences. ``wide``: the covariance uses wide differences. Without ``linear`` it
+    is the prior's, and the Jacobian that of the last place but one.
     """
     data = replays.data
     rows = fitted_rows(data, everything=everything)
@@ -450,7 +446,7 @@ def solve(
     done = 0
     while True:
         found = problem.found(place)
-        problem.scale = known if known is not None else scales(data, found, loops, most)
+        problem.scale = known if known is not None else scales(data, found, most)
         if done >= steps:
             break
         if known is not None and tempered:
@@ -477,9 +473,8 @@ def continued(
     truth: Truth | None = None,
     **options: Any,
 ) -> Fitted:
-    """Continues a fit, at ``truth`` if given, with its loops' deviation; ``options`` are those of `solve`."""
-    options = {"loops": best.scales.loops, "most": most, **options}
-    return solve(replays, truth or best.truth, best.parameters, steps, best.prior, **options)
+    """Continues a fit, at ``truth`` if given; ``options`` are those of `solve`."""
+    return solve(replays, truth or best.truth, best.parameters, steps, best.prior, most=most, **options)
 
 
 def fitted_rows(data: Data, *, everything: bool = False) -> NDArray[np.bool_]:
@@ -888,8 +883,8 @@ def with_loop(replays: Replays, best: Fitted, most: Scales | None = None) -> Fit
         return None
     rest = [number for number, each in enumerate(best.parameters) if each.cause != ELASTIC]
     parameters = (*(best.parameters[number] for number in rest), *nearest.parameters)
-    prior, loops = np.append(best.prior[rest], nearest.prior), best.scales.loops
-    return solve(replays, nearest.truth, parameters, STEPS, prior, most=most, loops=loops)
+    prior = np.append(best.prior[rest], nearest.prior)
+    return solve(replays, nearest.truth, parameters, STEPS, prior, most=most)
 
 
 def with_limit(replays: Replays, best: Fitted, usual: Truth, most: Scales | None = None) -> Fitted:
@@ -905,7 +900,7 @@ def with_limit(replays: Replays, best: Fitted, usual: Truth, most: Scales | None
     if _cost(replays, without, best) - best.cost <= EARNED:
         return replace(best, truth=without)
     parameters, prior = (*best.parameters, LIMIT), np.append(best.prior, coordinates(usual, [LIMIT]))
-    return solve(replays, best.truth, parameters, STEPS, prior, most=most, loops=best.scales.loops)
+    return solve(replays, best.truth, parameters, STEPS, prior, most=most)
 
 
 def _cost(replays: Replays, truth: Truth, best: Fitted) -> float:
@@ -926,13 +921,8 @@ NEAR_STEPS = 30
 """Maximum steps over the whole recording with the expected noise."""
 STEPS = 30
 """Maximum steps of the final fit."""
-LOOPS = 6
-"""Number of replays with quantised loops, and of smooth ones, that show the difference."""
 MORE = 1.1
 """Ratio to the true axis's residuals above which a fit leaves more; a scale is not known better than that."""
-MINIMA = 8
-"""Maximum number of moves to a better minimum. The likelihood uses the loops' deviation at the present one,
-so each of two minima may look better from the other."""
 OPTIONAL = (
     "velocity feed-forward", "load friction", "temperature", "current limit", "motor encoder delay",
     "encoder coupling", "friction growth", "moving average", *LOOP,
@@ -966,8 +956,7 @@ def fit(replays: Replays, progress: Progress = lambda _: None) -> Fitted:
             raise
         last = reached[-1]
         best = replace(_linearised(replays, last), interrupted=True)
-    # The loops' deviation belongs to these rows; later callers use others.
-    return replace(best, scales=replace(best.scales, loops=SMOOTH))
+    return best
 
 
 def _fit(replays: Replays, progress: Progress, keep: Callable[[Fitted], None]) -> Fitted:
@@ -1009,8 +998,7 @@ def _polished(replays: Replays, near: Fitted, begun: Truth, keep: Callable[[Fitt
     most = scales(data, before)
     # The residuals of a wrong simulation are no estimate of the noise: they would reduce the weight of the
     # very channel that shows the error.
-    noise = replace(expected(data), loops=loops_about(replays, near))
-    best = continued(replays, near, NEAR_STEPS, known=noise, near=near, tempered=True)
+    best = continued(replays, near, NEAR_STEPS, known=expected(data), near=near, tempered=True)
     best = _ended(replays, best, most)
     keep(best)
     laws = len(LAWS)  # maximum number of changes
@@ -1045,7 +1033,7 @@ def _in_best_minimum(replays: Replays, best: Fitted, begun: Truth, most: Scales)
     """
     few, noise = replays.rough, expected(replays.rough.data)
     least = least_deviation(replays.data) | {LOAD: noise.deviation[LOAD]}
-    for _ in range(MINIMA):
+    while True:
         # Always tried: exchanged gains differ only at rest, which a few legs hardly show, and a dead time in
         # the next substep increases the residuals too little for any channel to show it.
         places = [exchanged(best.truth), *neighbours(best.truth)]
@@ -1058,27 +1046,9 @@ def _in_best_minimum(replays: Replays, best: Fitted, begun: Truth, most: Scales)
             if other.loss + EARNED < best.loss:
                 best = _ended(replays, other, most)
         if best is last:
-            break
-    return best
+            return best
 
 
 def _ended(replays: Replays, near: Fitted, most: Scales) -> Fitted:
-    """Continues a fit to its minimum, with the loops' deviation estimated there."""
-    return continued(replays, near, STEPS, most, near=near, loops=loops_about(replays, near))
-
-
-def loops_about(replays: Replays, fitted: Fitted) -> Loops:
-    """Estimates the deviation of quantised loops from smooth ones, by draws from the fit's covariance."""
-    rng = np.random.default_rng(0)
-    low, high = np.array([each.bounds for each in fitted.parameters]).T
-    places = rng.multivariate_normal(fitted.place, fitted.covariance, LOOPS, method="svd")
-    truths = [
-        at_coordinates(fitted.truth, fitted.parameters, np.clip(each, low, high).tolist()) for each in places
-    ]
-    shown = replays([*truths, *truths], [False] * LOOPS + [True] * LOOPS)
-    pairs = list(zip(shown[:LOOPS], shown[LOOPS:], strict=True))
-    apart = {name: np.stack([other[name] - one[name] for one, other in pairs]) for name in CHANNELS}
-    return Loops(
-        {name: np.mean(each, axis=0) for name, each in apart.items()},
-        {name: np.sqrt(1.0 + 1.0 / LOOPS) * np.std(each, axis=0, ddof=1) for name, each in apart.items()},
-    )
+    """Continues a fit to its minimum."""
+    return continued(replays, near, STEPS, most, near=near)

@@ -174,13 +174,9 @@ def _replayed_s(piece: Piece) -> float:
     return len(piece.commands.counts) * piece.commands.cycle_s
 
 
-def traces_of(data: Data, truth: Truth, stepped: bool = False) -> list[dict[str, FloatArray]]:
-    """Replays a truth; returns its traces by piece and channel, as in `Piece.measured`.
-
-    They are smooth, except for the encoder steps of the loops if ``stepped``.
-    """
-    simulated = with_load_encoder(truth, noise_arcsec=0.0) if stepped else smooth(truth)
-    shown = []
+def traces_of(data: Data, truth: Truth) -> list[dict[str, FloatArray]]:
+    """Replays a truth smoothly; returns its traces by piece and channel, as in `Piece.measured`."""
+    simulated, shown = smooth(truth), []
     for piece in data.pieces:
         commands = piece.commands
         traces = run(commands, data.axis, simulated, smooth=True)
@@ -194,17 +190,16 @@ def traces_of(data: Data, truth: Truth, stepped: bool = False) -> list[dict[str,
     return shown
 
 
-def residuals(data: Data, truth: Truth, stepped: bool = False) -> dict[str, FloatArray]:
+def residuals(data: Data, truth: Truth) -> dict[str, FloatArray]:
     """Returns measured minus simulated by channel over all rows, shape (n,); zero if a row does not count.
 
     Zero offsets are removed in each piece: the load angle's zero is independent of the motor's, and a
     constant following error of more than a count at rest means that the command has another zero. The part of
     the load residual that follows from the motor's is removed, because a late motor makes the load late.
-    ``stepped`` is as in `traces_of`.
     """
     found: dict[str, list[FloatArray]] = {name: [] for name in CHANNELS}
     step_deg = rounding(data.axis)[FOLLOWING]
-    for piece, shown in zip(data.pieces, traces_of(data, truth, stepped), strict=True):
+    for piece, shown in zip(data.pieces, traces_of(data, truth), strict=True):
         for name in CHANNELS:
             off = piece.measured[name] - shown[name]
             if name == FOLLOWING and piece.rest.any():
@@ -381,13 +376,11 @@ class Replays:
         if self._pool is not None:
             self._pool.shutdown(cancel_futures=True)
 
-    def __call__(
-        self, truths: Iterable[Truth], stepped: Iterable[bool] = repeat(False)
-    ) -> list[dict[str, FloatArray]]:
-        """Returns the residuals of each truth, in order; ``stepped`` as in `misfit.traces_of`."""
+    def __call__(self, truths: Iterable[Truth]) -> list[dict[str, FloatArray]]:
+        """Returns the residuals of each truth, in order."""
         if self._pool is None or self.data.duration_s <= WORTH_S:
-            return [residuals(self.data, each, steps) for each, steps in zip(truths, stepped, strict=False)]
-        return list(self._pool.map(_residuals, truths, stepped, repeat(self._place)))
+            return [residuals(self.data, each) for each in truths]
+        return list(self._pool.map(_residuals, truths, repeat(self._place)))
 
 
 def _begin(data: tuple[Data, Data]) -> None:
@@ -406,9 +399,9 @@ def _end_with_parent() -> None:
     os._exit(1)
 
 
-def _residuals(truth: Truth, stepped: bool, place: int) -> dict[str, FloatArray]:
+def _residuals(truth: Truth, place: int) -> dict[str, FloatArray]:
     assert _data is not None
-    return residuals(_data[place], truth, stepped)
+    return residuals(_data[place], truth)
 
 
 # ----------------------------------------------------------------
@@ -453,22 +446,21 @@ def surprise(size: FloatArray, half: FloatArray, stray: FloatArray) -> FloatArra
     return np.asarray(-np.logaddexp(np.where(inner < -1.0, near, beyond), anyhow), dtype=np.float64)
 
 
-def deviation(off: FloatArray, step: float, least: float, spread: FloatArray) -> tuple[float, float]:
+def deviation(off: FloatArray, step: float, least: float) -> tuple[float, float]:
     """Estimates a simulation's standard deviation from rounded readings (maximum likelihood, >= ``least``).
 
-    ``spread`` is the additional known deviation of each reading. Also returns the probability of an outlier.
+    Also returns the probability of an outlier.
     """
     size = np.abs(off)
     farthest = max(float(np.max(size)), least)
     stray = STRAY / (1.0 - STRAY) * step / (2.0 * farthest + step)
 
     def cost(log_deviation: float) -> float:
-        each = np.hypot(np.exp(log_deviation), spread)
+        each = math.exp(log_deviation)
         half = 0.5 * step / each
-        times = np.minimum(1.0, half / FINE)
-        return float(
-            np.sum(surprise(size / each, np.maximum(half, FINE), stray / times)) - np.sum(np.log(times))
-        )
+        times = min(1.0, half / FINE)
+        lost = surprise(size / each, np.array(max(half, FINE)), np.array(stray / times))
+        return float(np.sum(lost)) - len(size) * math.log(times)
 
     bounds = (np.log(least), np.log(2.0 * farthest))
     found = minimize_scalar(cost, bounds=bounds, method="bounded", options={"xatol": 0.02})
@@ -483,24 +475,6 @@ MOST_ANSWERED = 1.5
 
 
 @dataclass(frozen=True, eq=False)
-class Loops:
-    """Deviation of quantised loops from smooth ones, by channel, for each row of a recording.
-
-    The break-away of a stuck motor depends on the value of the integral within an encoder step.
-    """
-
-    mean: Mapping[str, FloatArray | float]
-    spread: Mapping[str, FloatArray | float]
-
-    def taken_off(self, found: Mapping[str, FloatArray]) -> dict[str, FloatArray]:
-        """Returns the residuals of a smooth replay corrected by the mean deviation."""
-        return {name: found[name] + self.mean[name] for name in CHANNELS}
-
-
-SMOOTH: Final = Loops(dict.fromkeys(CHANNELS, 0.0), dict.fromkeys(CHANNELS, 0.0))
-
-
-@dataclass(frozen=True, eq=False)
 class Scales:
     """Standard deviation of a simulation's error and resolution of the readings, by channel.
 
@@ -511,21 +485,18 @@ class Scales:
     step: Mapping[str, float] = field(default_factory=lambda: dict.fromkeys(CHANNELS, 0.0))
     stray: Mapping[str, float] = field(default_factory=lambda: dict.fromkeys(CHANNELS, 0.0))
     """Probability of an outlier."""
-    loops: Loops = SMOOTH
 
     def scaled(self, found: Mapping[str, FloatArray]) -> FloatArray:
         """Returns the residuals of all channels, one after the other, in standard deviations."""
-        corrected = self.loops.taken_off(found)
-        return np.concatenate([corrected[name] / self._rows(name) for name in CHANNELS])
+        return np.concatenate([found[name] / self.deviation[name] for name in CHANNELS])
 
     def halves(self, length: int) -> tuple[FloatArray, FloatArray]:
         """Returns half the resolution in standard deviations and `stray`, for ``length`` rows per channel."""
-        by_channel = [np.broadcast_to(0.5 * self.step[name] / self._rows(name), length) for name in CHANNELS]
+        by_channel = [
+            np.broadcast_to(0.5 * self.step[name] / self.deviation[name], length) for name in CHANNELS
+        ]
         strays = [self.stray[name] if self.step[name] else 0.0 for name in CHANNELS]
         return np.concatenate(by_channel), np.repeat(strays, length)
-
-    def _rows(self, name: str) -> FloatArray | np.float64:
-        return np.hypot(self.deviation[name], self.loops.spread[name])
 
     @property
     def noise(self) -> dict[str, float]:
@@ -568,15 +539,12 @@ def _shaken_nm(truth: Truth, off_rad: float) -> float:
     return gain * off_rad / step_s * norm
 
 
-def scales(
-    data: Data, found: Mapping[str, FloatArray], loops: Loops = SMOOTH, most: Scales | None = None
-) -> Scales:
+def scales(data: Data, found: Mapping[str, FloatArray], most: Scales | None = None) -> Scales:
     """Estimates the scales of the residuals in motion; from the error of a smooth replay up to ``most``.
 
     Residuals at rest are excluded, because they would dominate a recording that rests half of the time.
     """
     least, counts, steps = least_deviation(data), counted(data), rounding(data.axis)
-    found = loops.taken_off(found)
     moving = np.concatenate([each.rest for each in data.pieces]) == 0.0
     given, stray = dict(least), dict.fromkeys(CHANNELS, 0.0)
     for name in CHANNELS:
@@ -585,11 +553,10 @@ def scales(
         if len(inside):
             # At least half of the readings in motion are not outliers.
             typical = median_deviation(beyond(inside, 0.5 * steps[name]))
-            spread = np.broadcast_to(loops.spread[name], len(rows))[rows]
-            given[name], stray[name] = deviation(inside, steps[name], max(least[name], typical), spread)
+            given[name], stray[name] = deviation(inside, steps[name], max(least[name], typical))
     if most is not None:
         given = {name: min(each, most.deviation[name]) for name, each in given.items()}
-    return Scales(given, steps, stray, loops)
+    return Scales(given, steps, stray)
 
 
 # ----------------------------------------------------------------

@@ -28,11 +28,10 @@ from hdbridge.twin.misfit import (
     remembers,
     residuals,
     scales,
-    traces_of,
     what_is_left,
 )
 from hdbridge.twin.parameters import BY_NAME, FOLLOWING, LOAD, TORQUE, free_value, with_values
-from hdbridge.twin.replay import demand_deg, replay
+from hdbridge.twin.replay import replay
 
 DEMO = Path(__file__).parents[2] / "profiles" / "demo"
 AXIS = AxisConfig.load(DEMO)
@@ -208,20 +207,6 @@ def noisy(where: str) -> Data:
         }
         pieces.append(replace(piece, measured=measured))
     return replace(as_measured(), pieces=tuple(pieces))
-
-
-def test_a_smooth_replay_is_off_by_as_much_as_is_expected_of_a_drives_steps() -> None:
-    """The torque by more than the gain alone would have it, for the motor answers."""
-    data = as_measured()
-    (piece,), (even,), (steps,) = data.pieces, traces_of(data, data.base), traces_of(data, data.base, True)
-    moving = np.abs(np.gradient(demand_deg(piece.commands, data.axis))) > 0.5
-    assert float(np.std((steps[TORQUE] - even[TORQUE])[moving])) == pytest.approx(
-        noise_floor(data)[TORQUE], rel=0.1
-    )
-    # By a whole step, a motor within a step of a count's edge would count against the true values.
-    off_deg = float(np.std((steps[FOLLOWING] - even[FOLLOWING])[moving]))
-    least = scales(data, {name: np.zeros(len(data.leg)) for name in CHANNELS})
-    assert off_deg < least.deviation[FOLLOWING] < 4.0 * off_deg
 
 
 def test_noise_in_motion_is_estimated_for_any_motion() -> None:
