@@ -182,7 +182,7 @@ class _Judge:
         after, start = self._left_by(extended.effects)
         measured = estimator.observed - estimator.level - fitted.zeros[estimator.zero]
         cleared = copy(estimator)  # the record without what was found in it
-        cleared.observed = estimator.observed + before - after
+        cleared.observed = estimator.observed - before + after
         visible = identifiability(cleared, cleared.fit(refitted.hypothesis), given, judged.context)
         return Diagnosis(
             baseline=_figures(before),

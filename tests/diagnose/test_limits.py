@@ -34,6 +34,16 @@ def test_a_cause_is_named_above_its_detection_limit_and_not_below(
     assert [each.cause for each in above] == [cause]
 
 
+def test_a_cause_that_is_found_hides_no_other(diagnosed: Diagnosed) -> None:
+    found = diagnosed({"load_order": {"orders": [(2, 20.0, 40.0)]}})
+    assert [each.cause for each in found.findings] == ["load_order"]
+    limits, healthy = (
+        {cause: each.detection_limit_arcsec for cause, each in one.identifiability.items() if each.detectable}
+        for one in (found, diagnosed())
+    )
+    assert limits == pytest.approx(healthy, rel=0.3)
+
+
 def test_recordings_of_different_motion_do_not_repeat_each_other(
     columns: Callable[..., dict[str, Any]], model: TransmissionModel
 ) -> None:
