@@ -155,7 +155,7 @@ def _twins(folder: Path) -> None:
             for rest in twin.unexplained:
                 print(f"  unexplained: {rest.channel}, {rest.times_noise:.3g} times its noise")
             for alike in twin.alike:
-                print(f"  not told apart: {', '.join(alike.names)}")
+                print(f"  not separable: {', '.join(alike.names)}")
         for (signal, name), values in left.items():
             print(f"  {signal}, {name}: {np.sqrt(np.mean(np.square(values))):.4g}")
 

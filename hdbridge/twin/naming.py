@@ -30,7 +30,7 @@ STRAY = 4.0
 """Limit at which residuals are clipped, in rms of their kind of leg: a motor that breaks away at a different
 time is not a change of the axis."""
 FALSE_ALARM = 0.02
-"""Probability that two equally good simulations are told apart."""
+"""Probability that one of two equally good simulations counts as worse."""
 
 
 def scales_by_kind(data: Data, known: Misfit, noise: Mapping[str, float]) -> dict[str, Any]:
@@ -66,7 +66,7 @@ def growth(data: Data, residuals: Mapping[str, FloatArray], was: Mapping[str, An
     return found
 
 
-def told_apart(left: FloatArray, change: FloatArray, legs: FloatArray) -> bool:
+def worse_than_chance(left: FloatArray, change: FloatArray, legs: FloatArray) -> bool:
     """Returns True if a rival's residuals are larger than by chance.
 
     ``left`` are the simulation's residuals by row, in units of the noise; ``change`` the rival's residuals
@@ -149,7 +149,7 @@ def explain(
         rivals = tuple(
             each
             for each, other in fits.items()
-            if other is not fit and not told_apart(fit.vector, other.vector - fit.vector, legs)
+            if other is not fit and not worse_than_chance(fit.vector, other.vector - fit.vector, legs)
         )
         named, best, now = [*named, cause], fit.truth, after
     for cause in named[:-1]:
@@ -310,7 +310,7 @@ def alike(fitted: Fitted, legs: FloatArray) -> tuple[Alike, ...]:
     _, directions = np.linalg.eigh(scaled.T @ scaled)
     sets: list[Alike] = []
     for direction in directions.T:
-        if told_apart(fitted.vector, scaled @ direction, legs):
+        if worse_than_chance(fitted.vector, scaled @ direction, legs):
             continue
         members = [each for each, part in zip(fitted.parameters, direction, strict=True) if abs(part) > ALIKE]
         if members:

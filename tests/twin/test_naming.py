@@ -14,7 +14,7 @@ from hdbridge.axis.effects import FloatArray
 from hdbridge.sim.truth import Truth
 from hdbridge.twin.fit import fitted_rows, legs_of_rows, solve
 from hdbridge.twin.misfit import Scales
-from hdbridge.twin.naming import Alike, Explained, alike, explain, told_apart
+from hdbridge.twin.naming import Alike, Explained, alike, explain, worse_than_chance
 from hdbridge.twin.parameters import BY_NAME, FOLLOWING, LOAD, TORQUE, with_values
 
 TRUTH = Truth.load(Path(__file__).parents[2] / "profiles" / "demo")
@@ -94,7 +94,7 @@ def noise(seed: int) -> np.ndarray:
 
 @pytest.mark.parametrize(("size", "least", "most"), [(0.01, 0.005, 0.05), (0.5, 1.0, 1.0)])
 def test_changes_below_the_noise_keep_the_false_alarm_rate(size: float, least: float, most: float) -> None:
-    told = [told_apart(noise(seed), size * CHANGE, LEG_OF_ROW) for seed in range(400)]
+    told = [worse_than_chance(noise(seed), size * CHANGE, LEG_OF_ROW) for seed in range(400)]
     assert least <= np.mean(told) <= most
 
 
@@ -104,9 +104,9 @@ def test_correlated_residuals_hide_changes_that_white_noise_would_show() -> None
     signs = np.random.default_rng(3).choice([-1.0, 1.0], 12)
     together = (2.0 * change * signs[LEG_OF_ROW.astype(int)]) - change * (2.0 * np.mean(signs))
     white = np.random.default_rng(4).permutation(together)
-    assert not told_apart(together, change, LEG_OF_ROW)
-    assert told_apart(white, change, LEG_OF_ROW)
+    assert not worse_than_chance(together, change, LEG_OF_ROW)
+    assert worse_than_chance(white, change, LEG_OF_ROW)
 
 
 def test_a_better_rival_is_reported_as_inseparable() -> None:
-    assert not told_apart(CHANGE, -CHANGE, LEG_OF_ROW)
+    assert not worse_than_chance(CHANGE, -CHANGE, LEG_OF_ROW)
