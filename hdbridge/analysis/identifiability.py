@@ -97,7 +97,7 @@ class _Example(NamedTuple):
     per_arcsec: FloatArray
     """Coefficients of one arcsec at its peak, shape (p,)."""
     rest: FloatArray
-    """What the background leaves of its weighted columns, each of one arcsec at its peak, shape (m, k)."""
+    """Weighted columns of one arcsec at their peaks, less the parts that the background explains, (m, k)."""
     strength: float
     """Root of the chi square of one arcsec."""
     share: float

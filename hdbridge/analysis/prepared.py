@@ -10,7 +10,7 @@ statistics over blocks of seconds.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from itertools import pairwise
 from typing import Any
@@ -194,11 +194,7 @@ class Samples:
 
     def of_kind(self, *names: str) -> BoolArray:
         """Returns a mask of the samples in legs of these names."""
-        return self.among(self.kind, names)
-
-    def among(self, kind: IntArray, names: Collection[str]) -> BoolArray:
-        """Returns a mask of the entries of ``kind`` that have one of these names."""
-        return np.isin(kind, [at for at, each in enumerate(self.kinds) if each in names])
+        return np.isin(self.kind, [at for at, each in enumerate(self.kinds) if each in names])
 
     def along(self, chain: Chain) -> Motion:
         """Returns the motion of one chain."""

@@ -134,22 +134,15 @@ def seen_swing(full: Samples, effects: Sequence[Effect], scales: Scales) -> Swin
     size = np.concatenate([[0.0], np.cumsum(bend**2)])
     begin = int(np.argmax(size[LONGEST:] - size[:-LONGEST])) if len(full) > LONGEST else 0
     rows = slice(begin, min(begin + LONGEST, len(full)))
-    first = [begin, *(each.start for each in parts if rows.start < each.start < rows.stop)]
+    first = [0, *(each.start - begin for each in parts if rows.start < each.start < rows.stop)]
+    inside = [each.within(rows) for each in fast]
     residual = full.error_arcsec - error
 
-    def swung(hertz: float, damping: float, rows: slice, first: Sequence[int]) -> Swing:
+    def tried(hertz: float, damping: float) -> float:
         damping = min(damping, MOST_DAMPED)
         one = swing(bend[rows], step_s[rows.start : rows.stop - 1], first, hertz, damping)
-        for each in fast:
-            inside = slice(*np.searchsorted(each.rows, (rows.start, rows.stop)))
-            part = _Fast(each.rows[inside] - rows.start, each.phasor[inside], each.rad_s[inside])
-            does = part.does(hertz, damping)
-            one.does_arcsec[part.rows] += does.real
-            one.waves_arcsec2[part.rows] += np.abs(does) ** 2
-        return one
-
-    def tried(hertz: float, damping: float) -> float:
-        one = swung(hertz, damping, rows, [each - begin for each in first])
+        for each in inside:
+            one.does_arcsec[each.rows] += each.does(hertz, damping).real
         return cost(residual[rows] - one.does_arcsec, rows)
 
     start = min(product(HERTZ.tolist(), DAMPING), key=lambda each: tried(*each))
@@ -160,7 +153,13 @@ def seen_swing(full: Samples, effects: Sequence[Effect], scales: Scales) -> Swin
     if whole - found.fun < max(scales.enter + 2.0 * scales.penalty, LEAST_SEEN * whole):
         return None
     hertz, damping = np.exp(found.x).tolist()
-    return swung(hertz, damping, every, [each.start for each in parts])
+    damping = min(damping, MOST_DAMPED)
+    seen = swing(bend, step_s, [each.start for each in parts], hertz, damping)
+    for each in fast:
+        does = each.does(hertz, damping)
+        seen.does_arcsec[each.rows] += does.real
+        seen.waves_arcsec2[each.rows] += np.abs(does) ** 2
+    return seen
 
 
 class _Fast(NamedTuple):
@@ -172,6 +171,11 @@ class _Fast(NamedTuple):
     """Wave, arcsec, faded in below that number, shape (k,)."""
     rad_s: FloatArray
     """Angular frequency, signed, shape (k,)."""
+
+    def within(self, rows: slice) -> _Fast:
+        """Returns the part in some rows, numbered from the first of them."""
+        part = slice(*np.searchsorted(self.rows, (rows.start, rows.stop)))
+        return _Fast(self.rows[part] - rows.start, self.phasor[part], self.rad_s[part])
 
     def does(self, frequency_hz: float, damping: float) -> NDArray[np.complex128]:
         """Returns the load's motion relative to its base as a phasor, arcsec, shape (k,)."""

@@ -1026,7 +1026,7 @@ def _linearised(replays: Replays, found: Fitted) -> Fitted:
 
 
 def _in_best_minimum(replays: Replays, best: Fitted, begun: Truth, most: Scales) -> Fitted:
-    """Moves the fit to significantly better minima until there are none.
+    """Moves the fit to significantly better minima until it finds no other.
 
     This comes after the other parameters are known, because at the start of the fit these places were equally
     good.

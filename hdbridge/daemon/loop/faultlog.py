@@ -15,7 +15,7 @@ _FAULTS: Final = dict(enumerate(Fault))
 
 
 def fault_of(code: int) -> Fault | None:
-    """Returns the fault with this number in events and samples; None if there is none."""
+    """Returns the fault with this number in events and samples; None for any other number."""
     return _FAULTS.get(code)
 
 

@@ -59,7 +59,7 @@ class Status(Cells):
 
     @property
     def loop_pid(self) -> int:
-        """Process id of the control process; 0 if there is none."""
+        """Process id of the control process; 0 if none runs."""
         return self[Cell.LOOP_PID]
 
     def turned(self, count: int, time_ns: int) -> None:
