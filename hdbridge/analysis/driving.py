@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter1d
 
-from hdbridge.analysis.readings import Reading, quantum_deg, reading_of, third_deviation
+from hdbridge.analysis.readings import MOST_JITTER_DEG, Reading, quantum_deg, reading_of, third_deviation
 from hdbridge.axis.effects import FloatArray
 
 REVERSAL_DEG = 0.3
@@ -174,18 +174,19 @@ def _driving(
 def _noise(lag: FloatArray, target: FloatArray, count: float) -> float:
     """Returns the noise of the motor reading in addition to quantisation, degrees.
 
-    In a fast move the lag itself bends within a few samples, which is no noise. So if counts are visible, it
-    is at most what the reading shows while the command rests, and nothing if the command never rests.
+    In a fast move the lag itself bends within a few samples, which is no noise. So it is at most what the
+    reading shows while the command rests. If counts are visible and the command never rests, it is zero.
     """
     third = np.diff(lag, 3)
     if not len(third):
         return 0.0
-    noise = third_deviation(third)
-    if count:
-        moved = np.abs(np.diff(target)) > 0.0
-        still = ~(moved[2:] | moved[1:-1] | moved[:-2])
-        enough = np.count_nonzero(still) >= LEAST_STILL
-        noise = min(noise, third_deviation(third[still]) if enough else 0.0)
+    moved = np.abs(np.diff(target)) > 0.0
+    still = ~(moved[2:] | moved[1:-1] | moved[:-2])
+    noise = min(third_deviation(third), MOST_JITTER_DEG)
+    if np.count_nonzero(still) >= LEAST_STILL:
+        noise = min(noise, third_deviation(third[still]))
+    elif count:
+        noise = 0.0
     return math.sqrt(max(noise**2 - count**2 / 12.0, 0.0))
 
 

@@ -18,6 +18,8 @@ ROUNDED_DEG = 1e-6
 """Tolerance for changes in whole counts, because of floating-point rounding."""
 WHOLE_SHARE = 0.99
 """Minimum share of the changes that are whole counts."""
+NEAREST = 200
+"""Number of smallest differences between changes that show the count."""
 DIGITS = 9
 """Number of decimals from which a file counts as unrounded."""
 FINEST_COUNT_DEG = 360.0 / 2**20 - ROUNDED_DEG
@@ -28,6 +30,9 @@ NEAR_COUNTS = 6
 """Span of four readings that show jitter, counts: twice what flickers by a count."""
 LEAST_NEAR = 20
 """Minimum number of such readings."""
+MOST_JITTER_DEG = 0.1
+"""Largest plausible standard deviation of a motor reading: the rounding of 1,000 counts a turn. Third
+differences above it are fast motion."""
 _THIRD = np.sqrt(20.0)
 """Amplification of white noise by third differences: the root of 1 + 9 + 9 + 1."""
 _MAD = 1.4826
@@ -68,18 +73,17 @@ class Reading:
 def reading_of(angle_deg: FloatArray) -> Reading:
     """Returns the resolution of an angle, shape (n,).
 
-    The jitter is that of readings within a few counts of each other, if counts are visible and there are
-    enough of these: a motion that bends within a few samples is not noise.
+    A motion that bends within a few samples is not noise. If counts are visible, the jitter is therefore that
+    of readings within a few counts of each other, or without these that of rounding.
     """
-    count, jitter = quantum_deg(angle_deg), jitter_deg(angle_deg)
-    if count and len(angle_deg) > 3:
-        four = sliding_window_view(angle_deg, 4)
-        span = np.ptp(four, axis=1)
-        near = np.diff(four[(span > 0.5 * count) & (span < (NEAR_COUNTS + 0.5) * count)], 3, axis=1)
-        if len(near) >= LEAST_NEAR:
-            size = float(np.sqrt(np.mean(near**2)) / _THIRD)
-            jitter = min(jitter, max(size, float(count / _UNIFORM)))
-    return Reading(count, jitter)
+    count, jitter = quantum_deg(angle_deg), min(jitter_deg(angle_deg), MOST_JITTER_DEG)
+    if not count or len(angle_deg) <= 3:
+        return Reading(count, jitter)
+    four = sliding_window_view(angle_deg, 4)
+    span = np.ptp(four, axis=1)
+    near = np.diff(four[(span > 0.5 * count) & (span < (NEAR_COUNTS + 0.5) * count)], 3, axis=1)
+    size = float(np.sqrt(np.mean(near**2)) / _THIRD) if len(near) >= LEAST_NEAR else 0.0
+    return Reading(count, min(jitter, max(size, float(count / _UNIFORM))))
 
 
 def jitter_deg(angle_deg: FloatArray) -> float:
@@ -147,17 +151,23 @@ def last_digit(angle_deg: FloatArray) -> float:
 
 
 def _exact(angle_deg: FloatArray) -> float:
-    steps = np.abs(np.diff(angle_deg))
-    values = np.unique(np.round(steps, 9))
-    gaps = np.diff(values)
-    gaps = gaps[gaps > SMALLEST_COUNT_DEG]
-    if len(gaps) < 1:
+    """Returns the common divisor of the changes, from the smallest differences between them (Euclid)."""
+    steps = np.sort(np.abs(np.diff(angle_deg)))
+    gaps = np.diff(steps)
+    gaps = np.sort(gaps[gaps > SMALLEST_COUNT_DEG])[:NEAREST]
+    count = float(gaps[0]) if len(gaps) else 0.0
+    while count > SMALLEST_COUNT_DEG:
+        left = np.abs(gaps - np.round(gaps / count) * count)
+        if np.mean(left < ROUNDED_DEG) > WHOLE_SHARE:
+            break
+        count = float(np.min(left[left >= ROUNDED_DEG]))
+    else:
         return 0.0
-    smallest = float(np.min(gaps))
-    whole = np.round(values / smallest)
-    sharp = float(np.median((values / np.maximum(whole, 1.0))[whole > 0])) if np.any(whole > 0) else smallest
-    off = np.abs(steps - np.round(steps / sharp) * sharp)
-    return sharp if np.mean(off < ROUNDED_DEG) > WHOLE_SHARE else 0.0
+    for values in (gaps, steps):  # many counts determine one more accurately
+        whole = np.round(values / count)
+        count = float(values @ whole / (whole @ whole))
+    off = np.abs(steps - np.round(steps / count) * count)
+    return count if np.mean(off < ROUNDED_DEG) > WHOLE_SHARE else 0.0
 
 
 def _through_rounding(angle_deg: FloatArray, digit_deg: float) -> float:

@@ -17,14 +17,33 @@ def turns(path):
     return np.count_nonzero(np.diff(steps))
 
 
-@given(st.sampled_from([1000, 4096, 8000, 65536, 1_000_000]), st.integers(0, 100))
-def test_the_count_is_found_at_any_speed(counts, seed):
+@given(
+    st.sampled_from([1000, 4096, 8000, 65536, 2**20]),
+    st.sampled_from([1.0, 20.0, 300.0]),
+    st.sampled_from([150, 3000]),
+    st.integers(0, 100),
+)
+def test_the_count_is_found_at_any_speed(counts, fastest_deg, samples, seed):
     count = 360.0 / counts
     rng = np.random.default_rng(seed)
-    path = np.cumsum(rng.uniform(0.0, 40.0 * count, 3000))
+    path = np.cumsum(rng.uniform(0.0, max(fastest_deg, 40.0 * count), samples))
     assert quantum_deg(np.round(path / count) * count) == pytest.approx(count, rel=1e-6)
     even = np.arange(3000) * 2.37 * count
     assert quantum_deg(np.round(even / count) * count) == pytest.approx(count, rel=1e-6)
+
+
+@pytest.mark.parametrize("noise_deg", [1e-5, 1e-3, 0.02])
+@pytest.mark.parametrize("commanded", [True, False])
+def test_fast_moves_between_rare_samples_are_not_noise(noise_deg, commanded):
+    """At 13 Hz a move takes a few samples, and counts below the noise cannot be seen."""
+    rng = np.random.default_rng(6)
+    goals = np.repeat(np.cumsum(rng.choice([-700.0, 700.0], 60)), 12)
+    motor = np.convolve(goals, np.array([1.0, 3.0, 5.0, 3.0, 1.0]) / 13.0, "same")[6:-6]
+    command = np.convolve(goals, np.array([3.0, 5.0, 3.0, 1.0, 1.0]) / 13.0, "same")[6:-6]
+    measured = motor + noise_deg * rng.normal(size=len(motor))
+    time = np.arange(len(motor)) / 13.0
+    path = kinematics(measured, command if commanded else None, time, reading_of(measured)).motor_deg
+    assert np.max(np.abs(path - motor)) < 1.0
 
 
 def test_a_signal_without_counts_has_no_count():
