@@ -50,8 +50,6 @@ class Score:
     """Predicted fall in chi square, linearised."""
     freedom: int
     """Number of directions that the hypothesis does not span."""
-    share: float
-    """Largest share of a column's square outside the hypothesis."""
 
 
 class Screen:
@@ -88,16 +86,15 @@ def _score(effect: Effect, size: FloatArray, gram: FloatArray, moment: FloatArra
     """Scores from the squares of the columns, and the remaining Gram matrix and moment."""
     seen = size > 0.0
     if not np.any(seen):
-        return Score(effect, 0.0, 0, 0.0)
+        return Score(effect, 0.0, 0)
     scale = np.sqrt(size[seen])
     left = gram[np.ix_(seen, seen)] / np.outer(scale, scale)
-    share = float(np.max(np.diag(left)))
     values, vectors = np.linalg.eigh(left)
     kept = values > SHARE_LEFT
     if not np.any(kept):
-        return Score(effect, 0.0, 0, share)
+        return Score(effect, 0.0, 0)
     inner = vectors[:, kept].T @ (moment[seen] / scale)
-    return Score(effect, float(np.sum(inner**2 / values[kept])), int(np.count_nonzero(kept)), share)
+    return Score(effect, float(np.sum(inner**2 / values[kept])), int(np.count_nonzero(kept)))
 
 
 # Matched filters for shapes whose place no grid covers, evaluated at all places at once (`Sought`).

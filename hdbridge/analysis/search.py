@@ -284,19 +284,27 @@ class Search:
         A candidate with more parameters may gain more only after its shapes are fitted.
         """
         passed = {each.name for each in fitted.hypothesis.effects if each.usual == 1} | {left_out}
-        scores = [
-            each
-            for each in scores
-            if each.effect.name not in passed
-            and not (each.effect.waves() and each.share < self.scales.wave_share_left)
-        ]
         net = {id(each): each.gain - self.scales.penalty * each.freedom for each in scores}
         best: dict[tuple[str, int], Score] = {}
         for each in sorted(scores, key=lambda each: -net[id(each)]):
-            if net[id(each)] > self.scales.enter:
+            enough = net[id(each)] > self.scales.enter and each.effect.name not in passed
+            if enough and not self._is_of_others(fitted, each.effect):
                 best.setdefault((each.effect.name, each.freedom), each)
         causes = list(dict.fromkeys(cause for cause, _ in best))[:BEST]
         return [each for (cause, _), each in best.items() if cause in causes]
+
+    def _is_of_others(self, fitted: Fitted, effect: Effect) -> bool:
+        """Returns True for a wave that the causes of the hypothesis explain.
+
+        The model's own parts do not count, because their calibration says how large they are.
+        """
+        if not effect.waves():
+            return False
+        own = [at for at, each in enumerate(fitted.parameters) if not 0 <= each.effect < self.base]
+        columns = self.estimator.weighted(self.estimator.columns(effect, fitted.hypothesis.start))
+        left, _ = fitted.linearised.of(np.array(own, dtype=np.intp)).left(columns)
+        share = np.max(np.diag(left) / np.maximum(np.sum(columns**2, axis=0), 1e-300))
+        return bool(share < self.scales.wave_share_left)
 
     def _scores(self, fitted: Fitted) -> list[Score]:
         screen = self._screen(fitted)

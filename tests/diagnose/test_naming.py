@@ -66,6 +66,17 @@ def test_a_ripple_that_is_loaded_and_warm_has_grown_by_both(diagnosed: Diagnosed
     assert drift.value == pytest.approx(-4.0, rel=0.12)  # the gear follows the sensor with a lag
 
 
+def test_a_wave_close_to_a_calibrated_order_is_not_a_change_of_it(
+    plant: ModuleType, model: TransmissionModel
+) -> None:
+    """On a quarter of a load turn the waves differ by half a period, and a free order explains most of it."""
+    truth = plant.Truth(effects={"flexspline_order": {"orders": [(2, 16.0, 30.0)]}})
+    plan = plant.Plan(rate_hz=16.0, scale=0.2, load_turns=0.25, steps=16)
+    found = diagnose(Record(plant.record(truth, plan, 1, True)), model).findings[0]
+    assert found.cause == "flexspline_order"
+    assert found.parameters["order_2_amplitude_arcsec"].value == pytest.approx(16.0, rel=0.05)
+
+
 def test_residuals_of_one_episode_do_not_hide_global_causes(
     columns: Callable[..., dict[str, Any]], model: TransmissionModel
 ) -> None:
