@@ -90,7 +90,7 @@ def _finding(
         return None
     without = as_given(fitted)
     return Finding(
-        name, UNWEIGHED, change.aliases, change.parameters, held_out(estimator, fitted, without),
+        name, UNWEIGHED, change.aliases, change.parameters, held_out(estimator, without, fitted),
         next_experiment(name, change.aliases), change.peak_arcsec,
         robust=as_it_was.chi_square - loose.chi_square, left_alone=change.left_alone,
         within=True, note=change.note, effect=change.effect, gate=gate,

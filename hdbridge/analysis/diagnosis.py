@@ -24,10 +24,9 @@ from hdbridge.analysis.findings import (
     for_unexplained,
     next_experiment,
 )
-from hdbridge.analysis.gain import held_out
+from hdbridge.analysis.gain import Gain, held_out, of_written
 from hdbridge.analysis.hypothesis import Estimator, Fitted, Hypothesis
 from hdbridge.analysis.identifiability import identifiability
-from hdbridge.analysis.linear import about_zeros
 from hdbridge.analysis.parameters import confounded, covariance, parameters_of, precisely
 from hdbridge.analysis.prepared import Observed, gather
 from hdbridge.analysis.probability import Context, Prior, weighed
@@ -39,7 +38,7 @@ from hdbridge.analysis.search import (
     waves_alike,
     with_measured,
 )
-from hdbridge.analysis.swing import ORDINARY_HZ, seen_swing, settled, without
+from hdbridge.analysis.swing import Swing, seen_swing, settled, without
 from hdbridge.analysis.unexplained import (
     Rest,
     is_unexplained,
@@ -100,13 +99,28 @@ def diagnose(
         record, model.ratio, legs, independent_zeros, lambda motion: model.predict(motion, Start.VIRGIN)
     )
     scales = scales or Scales()
+    progress("searching for causes")
     swing = seen_swing(data.full, model.effects, scales)
-    soft = swing is not None and swing.frequency_hz <= ORDINARY_HZ  # a cause to be found
-    ordinary = None if soft else swing
+    search, found = _searched(data, model, scales, swing)
+    if swing is None:  # a larger cause may hide it; wind-up in acceleration is its slow part
+        others = [each for each in found.hypothesis.effects if each.channels != {Channel.ACCELERATION}]
+        swing = seen_swing(data.full, others, scales)
+        if swing is not None and not swing.soft:
+            search, found = _searched(data, model, scales, swing)
+    progress("judging what was found")
+    diagnosis = _Judge(search, model, prior).of(found)
+    return replace(diagnosis, remarks=(*remarks, *diagnosis.remarks))
+
+
+def _searched(
+    data: Observed, model: TransmissionModel, scales: Scales, swing: Swing | None
+) -> tuple[Search, Fitted]:
+    """Returns the search and its result on the data less the swing; a soft one is a cause to be found."""
+    ordinary = None if swing is None or swing.soft else swing
     if ordinary is not None:
         data = without(data, ordinary)
     search = _search(data, model, scales)
-    if not soft:
+    if swing is None or ordinary is not None:
         search = _search(settled(search.estimator, search.begun(), ordinary), model, scales)
     estimator = search.estimator
     first = unfitted(estimator, model.effects)
@@ -114,11 +128,7 @@ def diagnose(
     dynamics = () if ordinary is None else (ordinary.remark(),)
     of_record = (*((first,) if first else ()), *held, *data.remarks, *dynamics)
     estimator.data = replace(estimator.data, remarks=of_record)
-    progress("searching for causes")
-    found = search.run()
-    progress("judging what was found")
-    diagnosis = _Judge(search, model, bool(first), prior).of(found)
-    return replace(diagnosis, remarks=(*remarks, *diagnosis.remarks))
+    return search, search.run()
 
 
 def _search(data: Observed, model: TransmissionModel, scales: Scales) -> Search:
@@ -154,8 +164,6 @@ class _Judged:
 class _Judge:
     search: Search
     model: TransmissionModel
-    unfitted: bool
-    """True if the model lacks a loop that makes up most of its residual."""
     prior: Prior | None = None
     considered: list[str] = field(default_factory=list)
     """Causes that were considered but not reported, with the reason."""
@@ -178,8 +186,8 @@ class _Judge:
         findings = self._with_unexplained(findings, judged.left)
         refitted = estimator.fit(Hypothesis(given, fitted.hypothesis.start))
         fitted, findings, extended = self._written(fitted, findings)
-        before, _ = self._left_by(given)
-        after, start = self._left_by(extended.effects)
+        before, _ = estimator.left_by(given)
+        after, start = estimator.left_by(extended.effects)
         measured = estimator.observed - estimator.level - fitted.zeros[estimator.zero]
         cleared = copy(estimator)  # the record without what was found in it
         cleared.observed = estimator.observed - before + after
@@ -234,9 +242,31 @@ class _Judge:
             changed = [new for new in extended.effects if new not in given]
             missing = [each for each in findings if not (each.left_alone or _is_in(each, changed))]
             if not missing:
-                return as_reported, findings, extended
+                return as_reported, self._with_gains(as_reported, findings, chosen), extended
             self.considered.extend(f"{each.cause}: it cannot be written into the model" for each in missing)
             findings = [each for each in findings if each not in missing]
+
+    def _with_gains(self, fitted: Fitted, findings: list[Finding], added: list[int]) -> list[Finding]:
+        """Returns the findings with the gain of the written model, in which ``added`` are the new effects."""
+        effects, given = fitted.hypothesis.effects, self.model.effects
+        written = [place for place, old in enumerate(given) if effects[place] != old] + added
+        own = [
+            [
+                at
+                for at in written
+                if each.effect and each.within == (at < len(given)) and _is_in(each, [effects[at]])
+            ]
+            for each in findings
+        ]
+
+        def gain(number: int) -> Gain | None:
+            others = {place for at, places in enumerate(own) for place in places if at != number}
+            return of_written(self.estimator, fitted, given, others, written)
+
+        return [
+            replace(each, gain=gain(number)) if each.gain and own[number] else each
+            for number, each in enumerate(findings)
+        ]
 
     def _uncalibrated(self, findings: Sequence[Finding]) -> str:
         """Returns a remark if the probabilities of the findings were fitted to other records; else empty."""
@@ -324,7 +354,7 @@ class _Judge:
             probability=UNWEIGHED,
             aliases=aliases,
             parameters={},
-            gain=held_out(self.estimator, fitted, without),
+            gain=held_out(self.estimator, without, fitted),
             experiment=next_experiment(effect.name, aliases),
             peak_arcsec=self.search.peak(fitted, place),
             robust=without.chi_square - fitted.chi_square,
@@ -363,7 +393,7 @@ class _Judge:
             parameters={},
             gain=None,
             left_arcsec=left.arcsec,
-            experiment=FIT_FIRST if self.unfitted else for_unexplained(lives),
+            experiment=FIT_FIRST if unfitted(self.estimator, self.model.effects) else for_unexplained(lives),
             peak_arcsec=size,
             lives_in=lives,
             note=f"{figure(left.arcsec, 3)} arcsec rms beyond the noise are left",
@@ -378,21 +408,6 @@ class _Judge:
             return findings
         largest = max((each.peak_arcsec for each in findings), default=0.0)
         return [*findings, unknown] if largest > size else [unknown, *findings]
-
-    def _left_by(self, effects: Sequence[Effect]) -> tuple[FloatArray, Start]:
-        """Returns observed minus predicted at the usable points from the best elastic start, which it names.
-
-        It is about the best-fitting zeros.
-        """
-        estimator = self.estimator
-        left = {
-            start: about_zeros(
-                estimator.observed - estimator.predict(effects, start), estimator.zero, estimator.weight**2
-            )
-            for start in Start
-        }
-        best = min(left, key=lambda start: float(left[start] @ left[start]))
-        return left[best], best
 
     def _by_kind(self, given: FloatArray, after: FloatArray) -> dict[str, tuple[Figures, Figures]]:
         estimator = self.estimator

@@ -126,7 +126,8 @@ class Finding:
     """Other causes that these data cannot separate from it."""
     parameters: Mapping[str, Parameter]
     gain: Gain | None
-    """Gain on held-out data with everything else refitted; None without held-out data."""
+    """Gain on held-out data; None without held-out data. During the search everything else is refitted. Of a
+    result, it is that of the written model over the given one with the other findings."""
     experiment: str
     """Next measurement, in words."""
     peak_arcsec: float
@@ -181,7 +182,7 @@ class Finding:
         return self.gain is not None and not (self.within or self.gain.predicts)
 
     def refusal(self) -> str:
-        """Returns the reason not to offer it as an improvement of the model; empty if there is none."""
+        """Returns the reason not to offer it as an improvement of the model; empty without a reason."""
         if self.cause == "unexplained":
             return "there is no law that could be held out or compensated"
         if self.left_alone:

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from hdbridge.analysis.hypothesis import Estimator, Fitted
-from hdbridge.analysis.linear import counted, of_number, steps_without
+from hdbridge.analysis.linear import Linearised, counted, of_number, steps_without
 from hdbridge.analysis.noise import White
 from hdbridge.analysis.prepared import REPEATS
-from hdbridge.axis.effects import FloatArray, IntArray
+from hdbridge.axis.effects import Effect, FloatArray, IntArray
 from hdbridge.axis.effects.kinematics import direction_of
 
 SURE = 2.0
@@ -108,12 +109,46 @@ def repeats(estimator: Estimator) -> tuple[IntArray, str]:
     return counted(move * STRETCHES + stretch), "moves"  # a long one in several parts
 
 
-def held_out(estimator: Estimator, fitted: Fitted, without: Fitted) -> Gain | None:
-    """Leaves out repetitions in turn; ``without`` is the fit without the effect or the change in question.
+def held_out(estimator: Estimator, before: Fitted, after: Fitted) -> Gain | None:
+    """Leaves out repetitions in turn, and compares two fits by what they leave there.
 
     None if the record is too short.
     """
-    before, after = without.linearised, fitted.linearised
+    return _compared(estimator, before.linearised, after.linearised)
+
+
+def of_written(
+    estimator: Estimator,
+    fitted: Fitted,
+    given: Sequence[Effect],
+    others: Collection[int],
+    written: Collection[int],
+) -> Gain | None:
+    """Compares the ``given`` model with the ``others`` of its findings to the written model.
+
+    Both are places of effects in the fit. Nothing else of the given model is refitted, so a fresh record can
+    repeat the comparison.
+    """
+    before, after = (_as_written(estimator, fitted, given, places) for places in (others, written))
+    return _compared(estimator, before, after)
+
+
+def _as_written(
+    estimator: Estimator, fitted: Fitted, given: Sequence[Effect], places: Collection[int]
+) -> Linearised:
+    """Returns the fit of the zeros and of the effects at ``places``; the others are as given, or absent."""
+    effects, full = fitted.hypothesis.effects, fitted.linearised
+    used = [
+        effects[at] if at in places else given[at]
+        for at in range(len(effects))
+        if at in places or at < len(given)
+    ]
+    columns = np.concatenate([np.arange(len(fitted.zeros)), *(fitted.places(at) for at in sorted(places))])
+    left, _ = estimator.left_by(used)
+    return Linearised(full.columns[:, columns], left * estimator.weight, full.known[columns])
+
+
+def _compared(estimator: Estimator, before: Linearised, after: Linearised) -> Gain | None:
     stretch, over = repeats(estimator)
     fold = stretch % FOLDS
     samples = np.bincount(stretch).astype(np.float64)

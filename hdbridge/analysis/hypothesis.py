@@ -15,7 +15,17 @@ import numpy as np
 from hdbridge.analysis.blocks import missed_deg
 from hdbridge.analysis.calibrated import CalibratedPart, priors
 from hdbridge.analysis.driving import CHATTER_COUNTS
-from hdbridge.analysis.linear import LOCAL, Column, Effort, Linearised, Nuisances, Prior, Terms, unknown
+from hdbridge.analysis.linear import (
+    LOCAL,
+    Column,
+    Effort,
+    Linearised,
+    Nuisances,
+    Prior,
+    Terms,
+    about_zeros,
+    unknown,
+)
 from hdbridge.analysis.noise import White
 from hdbridge.analysis.nuisances import COUNTS, zeros
 from hdbridge.analysis.prepared import Observed
@@ -381,6 +391,18 @@ class Estimator:
     def predict(self, effects: Sequence[Effect], start: Start) -> FloatArray:
         """Returns the sum of the effects at the usable points, arcsec, shape (m,)."""
         return self._regressors.predict(effects, (start,))
+
+    def left_by(self, effects: Sequence[Effect]) -> tuple[FloatArray, Start]:
+        """Returns observed minus predicted at the usable points, arcsec, (m,), and the elastic start used.
+
+        It is about the zeros and from the start that fit best.
+        """
+        left = {
+            start: about_zeros(self.observed - self.predict(effects, start), self.zero, self.weight**2)
+            for start in Start
+        }
+        best = min(left, key=lambda start: float(left[start] @ left[start]))
+        return left[best], best
 
     def with_load_angle(self, load_deg: FloatArray) -> None:
         """Sets the load angle (n,) on which effects of the load encoder's lines depend."""

@@ -59,6 +59,11 @@ class Swing:
     waves_arcsec2: FloatArray
     """Squared amplitudes of the part in waves too fast for the sampling, shape (n,)."""
 
+    @property
+    def soft(self) -> bool:
+        """True for a load that is softer than an ordinary one, which is a cause to be found."""
+        return self.frequency_hz <= ORDINARY_HZ
+
     def remark(self) -> str:
         """Describes it for the report."""
         return (

@@ -171,9 +171,10 @@ def _found(diagnosis: Diagnosis) -> Section:
     ]
     return Section(
         "What was found",
-        "Size: half the span of its contribution to this record. Held out: residual (rms) on stretches of "
-        "time left out of the fit, everything else refitted. Gain: the share of the mean square removed. "
-        "Offered: whether an improvement of the model may hold it, and if not, why.",
+        "Size: half the span of its contribution to this record. Held out: residual (rms) of the given model "
+        "with the other findings, and of the written model, on stretches of time left out of the fit. "
+        "Gain: the share of the mean square removed. "
+        "Offered: an improvement of the model may contain it; if not, the reason.",
         [Table(header, rows)],
     )
 

@@ -42,7 +42,7 @@ def test_a_spurious_change_worsens_held_out_data(
     nothing = Synchronous(orders=orders_from(range(3, 24), 0.0))
     fitted = estimator.fit(Hypothesis((nothing,), Start.VIRGIN))
     without = estimator.fit(Hypothesis((), Start.VIRGIN))
-    gain = held_out(estimator, fitted, without)
+    gain = held_out(estimator, without, fitted)
     assert gain is not None
     assert without.chi_square > fitted.chi_square
     assert gain.after_arcsec > gain.before_arcsec
@@ -55,6 +55,34 @@ def test_a_changed_loop_is_validated_on_held_out_data(wider: Diagnosis, model: T
     assert wider.extended.rms_arcsec < found.gain.after_arcsec < found.gain.before_arcsec
     assert not found.refusal()
     assert extension_of(wider, model).improves
+
+
+@pytest.mark.parametrize(
+    "effects",
+    [
+        {"velocity_windup": {"coulomb": 2.0, "viscous": 0.03, "shear": 400.0}},
+        {"creep": {"size": 6.0, "tau": 5.0}},
+        {"load_order": {"orders": [(2, 8.0, 40.0)]}, "channel_skew": {"ms": 0.7}},
+    ],
+    ids=" and ".join,
+)
+def test_a_gain_is_that_of_the_written_model_on_a_fresh_record(
+    diagnosed: Diagnosed,
+    columns: Callable[..., dict[str, Any]],
+    model: TransmissionModel,
+    effects: dict[str, Any],
+) -> None:
+    """The given model, refitted, would hide a part of the gain."""
+    found = diagnosed(effects)
+    assert {each.cause for each in found.findings} == set(effects)
+    fresh = Record(columns(effects, seed=2))
+    after = diagnose(fresh, found.model).baseline.rms_arcsec
+    for each in found.findings:
+        others = [one for one in found.model.effects if one.name != each.cause and one.name in effects]
+        before = diagnose(fresh, replace(model, effects=(*model.effects, *others))).baseline.rms_arcsec
+        assert each.gain is not None
+        stated = np.sqrt(each.gain.before_arcsec**2 - each.gain.after_arcsec**2)
+        assert stated == pytest.approx(np.sqrt(before**2 - after**2), rel=0.1)  # its speeds differ by 5 %
 
 
 @pytest.mark.parametrize("gain", [WORSE, None], ids=["worse", "none made"])
