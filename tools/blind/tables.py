@@ -197,43 +197,6 @@ def calibration(pairs: Sequence[Pair]) -> list[tuple[str, str, str]]:
     return rows
 
 
-def _speed(verdict: Verdict) -> str:
-    edges = ((30.0, "to 30 Hz"), (100.0, "30 to 100 Hz"), (300.0, "100 to 300 Hz"))
-    return next((words for edge, words in edges if verdict.rate_hz <= edge), "above 300 Hz")
-
-
-def _encoder(verdict: Verdict) -> str:
-    size = "up to 20,000 counts" if verdict.counts_per_turn <= 20_000 else "65,536 counts and more"
-    return f"{size}, flickering" if verdict.flicker_counts else size
-
-
-CATEGORIES: tuple[tuple[str, Callable[[Verdict], str]], ...] = (
-    ("motion", lambda each: each.motion),
-    ("rate", _speed),
-    ("motor encoder", _encoder),
-)
-
-
-def by_category(verdicts: Sequence[Verdict]) -> list[list[str]]:
-    """Tabulates everyday records by category: healthy, and with one fault."""
-    rows = []
-    for category, of in CATEGORIES:
-        for value in sorted({of(each) for each in verdicts}):
-            mine = [each for each in verdicts if of(each) == value]
-            healthy = [each for each in mine if each.sort == "healthy"]
-            faults = [each for each in mine if each.sort == "fault"]
-            rows.append(
-                [
-                    f"{category}: {value}",
-                    rate(map(false_name, healthy)),
-                    rate(map(unexplained_first, healthy)),
-                    rate(right_first(each) for each in faults if each.detectable),
-                    rate(map(wrong_first, faults)),
-                ]
-            )
-    return rows
-
-
 def by_effect(verdicts: Sequence[Verdict]) -> list[list[str]]:
     """Tabulates everyday faults by their rms in the record over the noise of a reading."""
     rows = []
@@ -275,13 +238,6 @@ def page(verdicts: Sequence[Verdict], seed: int, cases: bool = False) -> str:
         if chances := calibration(probabilities(mine)):
             parts.append(table(CALIBRATION, chances))
         if family == "everyday":
-            head = (
-                "healthy: false name",
-                "unexplained leads",
-                "fault, detectable: right first",
-                "wrong first",
-            )
-            parts.append(table(("category", *head), by_category(mine)))
             head = ("reported detectable", "right first", "wrong first")
             parts.append(table(("fault's rms over noise", *head), by_effect(mine)))
         elif powers := power(mine):
