@@ -13,15 +13,25 @@ from __future__ import annotations
 import argparse
 import json
 import sys
+from collections.abc import Iterable, Iterator, Sequence
 from itertools import chain
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from reliability import Row, diagram, from_suite, from_trials, kept
 from scipy.optimize import minimize
 
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+from blind.case import record_of, unsealed
+from blind.tables import CALIBRATION, Pair, brier, calibration, table
+from support.trials import CAUSES, LOOPS, NONE, PAIRS, SHORT, SPECIAL, SYNONYMS, UNKNOWN, planted
+
+from hdbridge.analysis.diagnosis import diagnose
+from hdbridge.analysis.findings import Diagnosis
 from hdbridge.analysis.probability import coefficients
 from hdbridge.analysis.scales import Scales
+from hdbridge.axis.model import TransmissionModel
+from hdbridge.records.recording import Recording
 
 RIDGE = 1.0
 FOLDS = 10
@@ -29,6 +39,7 @@ FREE = frozenset({"constant"})
 AGAINST = frozenset({"excess", "unexplained"})
 PRIOR = {"unexplained": -1.0}
 """Coefficients that the ridge draws towards where these records say little; 0 for all others."""
+Row = dict[str, Any]
 
 
 def fitted(terms: np.ndarray, right: np.ndarray, names: list[str]) -> np.ndarray:
@@ -51,6 +62,61 @@ def fitted(terms: np.ndarray, right: np.ndarray, names: list[str]) -> np.ndarray
 
 def probabilities(terms: np.ndarray, values: np.ndarray) -> np.ndarray:
     return np.asarray(np.minimum(1.0 / (1.0 + np.exp(-terms @ values)), Scales().surest))
+
+
+def judged(
+    source: str, name: str, result: Diagnosis, there: set[str], also: set[str], loop: bool
+) -> Iterator[Row]:
+    """Yields one row for each reported cause; those in ``also`` count neither right nor wrong."""
+    met: set[str] = set()
+    for each in result.findings:
+        names = {each.cause, *each.aliases}
+        hits = {one for one in there if names & {one, *SYNONYMS.get(one, ())}} - met
+        if each.cause == "unexplained" or (each.cause in also and not hits):
+            continue
+        met |= set(sorted(hits)[:1])
+        right = bool(hits) or (loop and bool(names & LOOPS))
+        yield {
+            "source": source, "record": name, "cause": each.cause, "right": right,
+            "terms": dict(each.terms), "given": each.probability,
+        }  # fmt: skip
+
+
+def from_suite(folder: Path) -> Iterator[Row]:
+    """Yields the findings in the cases of a blind suite."""
+    for case in sorted(each.parent for each in folder.glob("[!.]*/sealed.json")):
+        hidden = unsealed(case)
+        recording = Recording.load(*record_of(case))
+        model = TransmissionModel.load(case / "model.yaml")
+        result = diagnose(recording, model, scales=Scales(named_from=0.0))
+        there = {each["cause"] for each in hidden["hidden"]} - {"unexplained"}
+        loop = hidden["kind"] in {"law", "other_law"}
+        yield from judged(folder.name, f"{folder.name}/{case.name}", result, there, set(hidden["also"]), loop)
+
+
+def from_trials(seeds: int, first: int) -> Iterator[Row]:
+    """Yields the findings in short records from formulas."""
+    for seed in range(first, first + seeds):
+        for name in (*CAUSES, *SPECIAL, *NONE, *UNKNOWN, *PAIRS):
+            there, record, model = planted(name, seed, SHORT)
+            loop = name.startswith("none:") or bool(there & LOOPS)
+            result = diagnose(record, model, scales=Scales(named_from=0.0))
+            yield from judged("trials", f"{name} {seed}", result, there - {"unexplained"}, set(), loop)
+
+
+def kept(rows: Iterable[Row], file: Path | None) -> list[Row]:
+    """Collects the findings, and writes them as they come."""
+    found: list[Row] = []
+    for row in rows:
+        found.append(row)
+        if file:
+            file.write_text(json.dumps(found, indent=1), encoding="utf-8")
+    return found
+
+
+def report(title: str, pairs: Sequence[Pair]) -> None:
+    """Prints probabilities by bin, with the share that was right, and the Brier score."""
+    print(f"{title}\n\n{table(CALIBRATION, calibration(pairs))}\n\n{': '.join(brier(pairs))}\n")
 
 
 def main() -> int:
@@ -78,11 +144,11 @@ def main() -> int:
     for number in range(FOLDS):
         held = fold == number
         left_out[held] = probabilities(terms[held], fitted(terms[~held], right[~held], names))
-    print(f"as given\n\n{diagram(rows)}")
+    report("as given", [(row["given"], row["right"]) for row in rows])
     for source in [*dict.fromkeys(row["source"] for row in rows), ""]:
         chosen = np.array([source in ("", row["source"]) for row in rows])
-        held_out = [{"given": p, "right": r} for p, r in zip(left_out[chosen], right[chosen], strict=True)]
-        print(f"\ncross-validated {source or 'all'}\n\n{diagram(held_out)}")
+        pairs = zip(left_out[chosen].tolist(), right[chosen].tolist(), strict=True)
+        report(f"cross-validated {source or 'all'}", list(pairs))
     for name, value in zip(names, fitted(terms, right, names), strict=True):
         print(f'    "{name}": {value:.2f},')
     return 0

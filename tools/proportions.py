@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from scipy.stats import beta
+from scipy.stats import binomtest
 
 
 def proportion(hits: int, number: int) -> str:
-    """Formats a count with its share's 95 % interval (Clopper-Pearson)."""
+    """Formats ``hits / all (per cent; Wilson's 95 % interval)``; a dash for none."""
     if not number:
-        return "none tried"
-    low = float(beta.ppf(0.025, hits, number - hits + 1)) if hits else 0.0
-    high = float(beta.ppf(0.975, hits + 1, number - hits)) if hits < number else 1.0
-    return f"{hits} of {number} ({100 * low:.0f} to {100 * high:.0f} %)"
+        return "-"
+    interval = binomtest(hits, number).proportion_ci(method="wilson")
+    low, high = 100.0 * interval.low, 100.0 * interval.high
+    return f"{hits} / {number} ({100.0 * hits / number:.1f} %; {low:.1f} to {high:.1f})"

@@ -4,7 +4,6 @@ from hdbridge.axis.model import TransmissionModel
 
 
 def test_response_is_measured_stored_reported_and_carried_over(cell):
-    cell.edit("axis.yaml", "cycle_ms: 10", "cycle_ms: 4")
     short = (cell.folder / "short.yaml").read_text()
     (cell.folder / "moving.yaml").write_text(short.replace("validation: {", "validation: {motion: true, "))
     done = cell.calibrate("--plan", "moving.yaml", "--out", "rec", "--json", "result.json")

@@ -24,8 +24,8 @@ PLAN = """schema: hdbridge.plan/1
 name: short
 procedures:
   - {procedure: standstill, duration_s: 1}
-  - {procedure: sweep, motor_turns: 12, motor_turns_per_s: 0.5}
-  - {procedure: sines, amplitudes_deg: [60, 8], frequency_hz: 0.2, periods: 2}
+  - {procedure: sweep, motor_turns: 5, motor_turns_per_s: 1.0}
+  - {procedure: sines, amplitudes_deg: [60, 8], frequency_hz: 0.2, periods: 1}
 validation: {count: 8, cycles: 2, travel_deg: 10}
 """
 STEPS = ("new", "check", "doctor", "calibrate", "model diff", "model commit", "move")

@@ -24,7 +24,6 @@ from numba import njit
 DT_S = 5e-5
 """Length of a substep."""
 ARCSEC = math.radians(1.0 / 3600.0)
-GRAVITY = 9.81
 
 
 class Order(NamedTuple):

@@ -32,12 +32,6 @@ def motor_response(
     )
 
 
-def load_response(mechanics: Mechanics, frequency_hz: np.ndarray) -> np.ndarray:
-    """Load angle per angle of the gear's output, complex, shape of ``frequency_hz``."""
-    load, spring = _load_and_spring(mechanics, 2j * math.pi * np.asarray(frequency_hz, dtype=float))
-    return spring / (spring + load)
-
-
 def tooth_response(
     mechanics: Mechanics, servo: Servo, frequency_hz: np.ndarray, cycle_s: float
 ) -> np.ndarray:

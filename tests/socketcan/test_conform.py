@@ -4,6 +4,8 @@ import json
 import subprocess
 import sys
 
+from tests.support.command import run_here
+
 MACHINE = """
 schema: hdbridge.machine/1
 name: between
@@ -19,15 +21,12 @@ CHECKS = ("nmt.ignores", "sdo.abort", "sdo.block", "tpdo.sync", "rpdo", "guardin
 def test_conform_checks_a_drive_in_another_process(interface, tmp_path):
     machine, result = tmp_path / "machine.yaml", tmp_path / "result.json"
     machine.write_text(MACHINE.format(channel=interface), encoding="utf-8")
-    hdbridge = [sys.executable, "-m", "hdbridge"]
     only = [each for name in CHECKS for each in ("--only", name)]
-    conform = [*hdbridge, "conform", str(machine), "--motion", "--json", str(result), *only]
-    with subprocess.Popen(
-        [*hdbridge, "simulate", str(machine), "--gateway"], stderr=subprocess.PIPE, text=True
-    ) as drive:
+    simulate = [sys.executable, "-m", "hdbridge", "simulate", str(machine), "--gateway"]
+    with subprocess.Popen(simulate, stderr=subprocess.PIPE, text=True) as drive:
         try:
             assert "ideal drive: node 5" in drive.stderr.readline()
-            done = subprocess.run(conform, capture_output=True, text=True, check=False)
+            done = run_here(tmp_path, "conform", machine, "--motion", "--json", result, *only)
         finally:
             drive.terminate()
     found = {each["id"]: each for each in json.loads(result.read_text())["checks"]}

@@ -82,23 +82,6 @@ def benches(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Benches]:
     made.end()
 
 
-@pytest.mark.parametrize(
-    "row",
-    [pytest.param(row, id=row.name, marks=[pytest.mark.slow] if row.slow else []) for row in DAEMON_ROWS],
-)
-def test_the_daemon_survives(benches: Benches, row: DaemonRow) -> None:
-    ended = True
-    try:
-        try_out(row, benches.bench())
-        ended = row.last
-    except pytest.skip.Exception:
-        ended = False
-        raise
-    finally:
-        if ended:
-            benches.end()
-
-
 def test_a_borrowed_step_completes_and_the_axis_moves_again_when_enabled(benches: Benches) -> None:
     daemon = benches.bench().daemon
     command = ("step", unhurried_profile(), "--interface", "socketcan", "--channel", OURS, "--count", 3)
@@ -115,3 +98,20 @@ def test_a_borrowed_step_completes_and_the_axis_moves_again_when_enabled(benches
         "the axis is back, disabled",
     )  # fmt: skip
     benches.bench().under_way()
+
+
+@pytest.mark.parametrize(
+    "row",
+    [pytest.param(row, id=row.name, marks=[pytest.mark.slow] if row.slow else []) for row in DAEMON_ROWS],
+)
+def test_the_daemon_survives(benches: Benches, row: DaemonRow) -> None:
+    ended = True
+    try:
+        try_out(row, benches.bench())
+        ended = row.last
+    except pytest.skip.Exception:
+        ended = False
+        raise
+    finally:
+        if ended:
+            benches.end()

@@ -1,10 +1,11 @@
-"""The stepping test as a person runs it: two commands, two processes, one real CAN interface."""
+"""The stepping test as a person runs it: two processes, one real CAN interface."""
 
 import json
 import subprocess
 import sys
 
 from hdbridge.errors import SafetyStop
+from tests.support.command import run_here
 
 ATTEMPTS = 3
 """A machine that stalls for two periods stops the axis, as it should; then the test begins anew."""
@@ -14,17 +15,12 @@ def test_step_masters_the_simulated_drive_in_another_process(interface, profile,
     bus = ("--interface", "socketcan", "--channel", interface)
     result = tmp_path / "stepping.json"
     simulate = [sys.executable, "-m", "hdbridge", "simulate", str(profile), *bus]
-    step = [sys.executable, "-m", "hdbridge", "step", str(profile), *bus, "--json", str(result)]
+    step = ("step", profile, *bus, "--json", result, "--count", 4, "--scheme", "none", "--scheme", "both")
     for _ in range(ATTEMPTS):
         with subprocess.Popen(simulate, stderr=subprocess.PIPE, text=True) as drive:
             try:
                 assert "simulated drive: node 1" in drive.stderr.readline()
-                done = subprocess.run(
-                    [*step, "--count", "4", "--scheme", "none", "--scheme", "both"],
-                    capture_output=True,
-                    text=True,
-                    check=False,
-                )
+                done = run_here(tmp_path, *step)
             finally:
                 drive.terminate()
         if done.returncode != SafetyStop.exit_status:

@@ -237,7 +237,9 @@ class DaemonRow:
     last: bool = False
     """True if it ends the daemon."""
     slow: bool = False
-    """True if neither kernel nor clock has a part in it: in every run it is made on the virtual bus only."""
+    """True if neither kernel nor clock has a part in it. In every run it is made without them: on the virtual
+    bus, or to the processes of a daemon of simulated drives.
+    """
 
 
 def try_out(row: DaemonRow, bench: DaemonBench) -> None:

@@ -8,11 +8,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from blind import axes, generate, score, work
+from blind import axes, generate, score, tables, work
 from blind import case as blindcase
 from blind.case import Case, cases, make, record_of, unsealed
 from blind.plant import PlantRig
 from blind.verdict import Answer, Verdict, judged
+from hypothesis import given
+from hypothesis import strategies as st
 
 from hdbridge import AxisConfig, Bench, Recording, Stepping, TransmissionModel, simulated
 from hdbridge.files.bundled import bundled_profile
@@ -172,7 +174,7 @@ def test_a_suite_is_continued_and_belongs_to_one_seed(
 ) -> None:
     made: list[str] = []
 
-    def fake(case: Case, seed: int, out: Path, means: bool) -> None:
+    def fake(case: Case, seed: int, out: Path) -> None:
         if case.name == "none-002":
             raise RuntimeError("no such axis")
         made.append(case.name)
@@ -180,8 +182,8 @@ def test_a_suite_is_continued_and_belongs_to_one_seed(
 
     monkeypatch.setattr(generate, "make", fake)
     group = list(cases({"none": 4}, 1))
-    generate.made(group[:2], 1, tmp_path, False)
-    done = generate.made(group, 1, tmp_path, False)
+    generate.made(group[:2], 1, tmp_path)
+    done = generate.made(group, 1, tmp_path)
     assert made == ["none-000", "none-001", "none-003"]
     assert [name for name, seconds in done if np.isnan(seconds)] == ["none-002"]
     assert "no such axis" in capsys.readouterr().err
@@ -196,10 +198,6 @@ def secret(*causes: str, also: tuple[str, ...] = (), kind: str = "single", **par
         "case": "a case",
         "kind": kind,
         "family": blindcase.KINDS[kind],
-        "motion": "moves",
-        "rate_hz": 50.0,
-        "counts_per_turn": 8000,
-        "law": "rolling_friction",
         "noise_arcsec": 1.0,
         "samples": 50_000,
         "hidden": [{"cause": each, "size_arcsec": 3.0, "parameters": parameters} for each in causes],
@@ -462,3 +460,14 @@ def test_the_cases_of_a_held_out_suite_are_not_listed(
     assert not said.out
     assert score.main([str(folder), "--command", command]) == 0
     assert "| single: wrong first | 1 / 1 (100.0 %; 20.7 to 100.0) |" in capsys.readouterr().out
+
+
+@given(st.lists(st.tuples(st.floats(0.0, 1.0), st.booleans()), min_size=1, max_size=40))
+def test_every_name_is_counted_once_and_the_brier_score_is_right(pairs: list[tuple[float, bool]]) -> None:
+    counts = [row[2].split(" (")[0].split(" / ") for row in tables.calibration(pairs)]
+    assert sum(int(every) for _, every in counts) == len(pairs)
+    assert sum(int(right) for right, _ in counts) == sum(right for _, right in pairs)
+    score, number = tables.brier(pairs)[1].split(" of ")
+    squares = [(chance - right) ** 2 for chance, right in pairs]
+    assert float(score) == pytest.approx(sum(squares) / len(squares), abs=6e-4)
+    assert int(number) == len(pairs)

@@ -1,6 +1,6 @@
 """CPU time of one control cycle, beside a bare exchange of the same frames and beside canopen.
 
-    python tools/bench/cycle.py [--interface virtual|loopback|socketcan]... [--channel vcan0] [--json FILE]
+    python tools/bench/cycle.py [--interface virtual|socketcan]... [--channel vcan0] [--json FILE]
 
 One run measures, in interleaved blocks, the CPU time of the thread (`time.thread_time`) per cycle of
 
@@ -17,8 +17,7 @@ and prints medians over the blocks, and their ratios to the bare exchange.
 Nobody sleeps. On the virtual bus the answering node runs in the same thread; what it costs is measured in
 the same blocks and subtracted from each alike. On SocketCAN the kernel's own gateway (can-gw, set up with
 cangw, as root) turns each SYNC into the two TPDOs, which costs no process any time; there wall time is
-measured, because the CPU clock of user-mode-linux counts in steps of 4 ms. `loopback` tells what the
-SocketCAN code costs on a kernel without CAN: python-can's SocketCAN back end on a pair of UDP sockets.
+measured, because the CPU clock of user-mode-linux counts in steps of 4 ms.
 Without --interface all are measured that this machine has.
 """
 
@@ -26,7 +25,6 @@ from __future__ import annotations
 
 import argparse
 import math
-import socket
 import struct
 import subprocess
 import time
@@ -39,9 +37,6 @@ from pathlib import Path
 
 import can
 import canopen
-from can.interfaces.socketcan import SocketcanBus
-from can.interfaces.socketcan.constants import SO_TIMESTAMPNS
-from can.interfaces.socketcan.socketcan import build_can_frame
 from can.interfaces.virtual import VirtualBus
 from harness import PROFILE, Busy, block_us, in_turn, keep, medians, parser, undisturbed
 
@@ -122,60 +117,6 @@ class AnsweringBus(VirtualBus):
     def shutdown(self) -> None:
         self.listener.shutdown()
         super().shutdown()
-
-
-class LoopbackSocket:
-    """Stand-in for the CAN socket of a master; a second UDP socket answers its SYNC at once."""
-
-    def __init__(self, *node_ids: int) -> None:
-        self.master = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self.drive = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        for each in (self.master, self.drive):
-            each.bind(("127.0.0.1", 0))
-        self.master.connect(self.drive.getsockname())
-        self.drive.connect(self.master.getsockname())
-        self.master.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
-        self.recv, self.recvmsg, self.fileno = self.master.recv, self.master.recvmsg, self.master.fileno
-        self.replies = [build_can_frame(reply) for reply in answers(*node_ids)]
-        self.heartbeats = [build_can_frame(alive) for alive in heartbeats(*node_ids)]
-        self.count = 0
-
-    def send(self, frame: bytes, flags: int = 0) -> int:
-        sent = self.master.send(frame, flags)
-        if frame[:2] == b"\x80\x00":
-            self.answer()
-        return sent
-
-    def answer(self) -> None:
-        self.count += 1
-        if self.count % 12 == 0:
-            for heartbeat in self.heartbeats:
-                self.drive.send(heartbeat)
-        for reply in self.replies:
-            self.drive.send(reply)
-        with suppress(BlockingIOError):
-            while True:
-                self.drive.recv(100, socket.MSG_DONTWAIT)
-
-    def answer_nobody(self) -> None:
-        """Returns the CPU time of the answering side alone."""
-        self.answer()
-        with suppress(BlockingIOError):
-            while True:
-                self.master.recv(100, socket.MSG_DONTWAIT)
-
-    def close(self) -> None:
-        self.master.close()
-        self.drive.close()
-
-
-def loopback_bus(sock: LoopbackSocket) -> SocketcanBus:
-    """Returns python-can's SocketCAN bus, without opening an interface."""
-    bus = SocketcanBus.__new__(SocketcanBus)
-    bus.socket, bus.channel, bus.channel_info = sock, "loopback", "SocketCAN code on UDP sockets"
-    bus._is_filtered, bus._filters, bus._tasks, bus._task_id = True, None, {}, 0
-    bus._periodic_tasks, bus._is_shutdown = [], True
-    return bus
 
 
 @contextmanager
@@ -484,12 +425,6 @@ def measure(
             result = run(Variants(bus, axis, model), blocks, cycles, bus.answer, time.thread_time)
             bus.queue.queue.clear()
         return "the virtual bus", result
-    if interface == "loopback":
-        sock = LoopbackSocket(node_id)
-        variants = Variants(loopback_bus(sock), axis, model)
-        result = run(variants, blocks, cycles, sock.answer_nobody, time.thread_time)
-        sock.close()
-        return "SocketCAN's code over UDP loopback", result
     channel = options.channel
     with (
         answering_kernel(channel, node_id),
@@ -501,14 +436,14 @@ def measure(
 
 def main() -> int:
     given = parser(__doc__, blocks=21, cycles=500)
-    given.add_argument("--interface", choices=("virtual", "loopback", "socketcan"), action="append")
+    given.add_argument("--interface", choices=("virtual", "socketcan"), action="append")
     given.add_argument("--channel", default="vcan0", help="of socketcan")
     given.add_argument("--profile", type=Path, default=PROFILE)
     options = given.parse_args()
     warnings.simplefilter("ignore")
     axis = AxisConfig.load(options.profile)
     model = TransmissionModel.load(options.profile / "model.yaml")
-    interfaces = options.interface or ["virtual", "loopback"]
+    interfaces = options.interface or ["virtual"]
     if not options.interface and Path(f"/sys/class/net/{options.channel}").exists():
         interfaces.append("socketcan")
     results = []

@@ -1,44 +1,29 @@
-"""Figures of a fleet: accuracy, gain by the prior, cost of the engine.
+"""Figures of a fleet: accuracy, gain by the prior.
 
 .venv/bin/python tools/bench/fleet.py score FLEET OUT [--limit ARCSEC]
 .venv/bin/python tools/bench/fleet.py prior FLEET OUT
-.venv/bin/python tools/bench/fleet.py ratios [--samples 32000] [--tasks 6]
 
-FLEET is a folder of `hdbridge fleet simulate`, OUT the result of a run over it. The ratios are of
-processor time, so they hold on a computer that others use too.
+FLEET is a folder of `hdbridge fleet simulate`, OUT the result of a run over it.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-import os
-import sys
-import tempfile
-import time
 from collections import Counter
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import psutil
 from scipy.special import logit
-
-sys.path.insert(0, str(Path(__file__).parent))
-sys.path.insert(0, str(Path(__file__).parents[2] / "tests"))
-from diagnose import record
-from support import plant
 
 from hdbridge.analysis.findings import Parameter
 from hdbridge.analysis.probability import Prior, updated
 from hdbridge.analysis.scales import Scales
-from hdbridge.fleet import engine
 from hdbridge.fleet.dataset import Dataset
 from hdbridge.fleet.prior import joint_prior, prior_rows
 from hdbridge.fleet.simulate import YEAR_HOURS, peak_at_0_hours_arcsec
-from hdbridge.fleet.sources import Source
 from hdbridge.fleet.summary import own_recordings, summarise
-from hdbridge.records.record import Record
 
 FOLDS = 5
 DETECTABLE = 2
@@ -172,70 +157,6 @@ def _count(
         counts[kind]["missed"] += bool(true) and not hit
 
 
-def ratios(samples: int, tasks: int) -> None:
-    """Measures the engine against the diagnosis itself, with one process and with two."""
-
-    inner = engine.diagnosed
-    with tempfile.TemporaryDirectory() as place:
-        folder = Path(place)
-        (folder / "model.yaml").write_text(plant.model_text(1))
-        whole = record(samples)
-        rng = np.random.default_rng(2)
-        for number in range(tasks):
-            load = whole.load_position_deg + rng.normal(0.0, 0.05 / 3600.0, samples)
-            Record({**whole.columns, "load_position_deg": load}).write_csv(folder / f"{number}.csv")
-
-        def timed(*arguments: Any) -> Any:
-            begun, cpu = time.time(), time.process_time()
-            row = inner(*arguments)
-            own = {"pid": os.getpid(), "begun": begun, "end": time.time(), "cpu": time.process_time() - cpu}
-            own |= {"all": time.process_time(), "rss": _rss_mb()}
-            path = folder / f"{arguments[0].joint}-{time.time_ns()}.json"
-            path.write_text(json.dumps(own))
-            return row
-
-        engine.diagnosed = timed
-        for workers in (1, 2):
-            sources = [Source(str(folder / f"{n}.csv"), joint=f"J{n}", ratio=50.0) for n in range(tasks)]
-            cpu = time.process_time()
-            end = engine.run(sources, Dataset(folder / f"out{workers}"), engine.Cluster(None, workers),
-                             model=folder / "model.yaml")  # fmt: skip
-            main = time.process_time() - cpu
-            lines = [json.loads(each.read_text()) for each in folder.glob("*.json")]
-            for each in folder.glob("*.json"):
-                each.unlink()
-            _print_ratios(workers, lines, main, end.failed)
-
-
-def _print_ratios(workers: int, lines: list[dict[str, Any]], main_s: float, failed: int) -> None:
-    by_worker: dict[int, list[dict[str, Any]]] = {}
-    for each in sorted(lines, key=lambda each: each["end"]):
-        by_worker.setdefault(each["pid"], []).append(each)
-    inside = sum(each["cpu"] for each in lines)
-    # Between the end of a worker's first task and the end of its last: no start-up, no imports.
-    later = [own[1:] for own in by_worker.values()]
-    between = sum(own[-1]["all"] - own[0]["all"] for own in by_worker.values())
-    within = sum(each["cpu"] for own in later for each in own)
-    busy = sum(each["end"] - each["begun"] for own in later for each in own) / sum(
-        own[-1]["end"] - own[0]["end"] for own in by_worker.values()
-    )
-    count = sum(map(len, later))
-    memory = [(own[0]["rss"], own[-1]["rss"]) for own in by_worker.values()]
-    print(
-        f"{workers} processes: {len(lines)} tasks, {failed} failed, {within / count:.2f} s of a processor\n"
-        f"  engine in the workers: {100.0 * (between - within) / within:.2f} %\n"
-        f"  main process, with start and end: {main_s:.1f} s, {100.0 * main_s / inside:.1f} %\n"
-        f"  workers busy: {100.0 * busy:.1f} % of the time between their first and last task\n"
-        f"  memory after the first and the last task, MB: "
-        f"{', '.join(f'{one:.0f} to {other:.0f}' for one, other in memory)}",
-        flush=True,
-    )
-
-
-def _rss_mb() -> float:
-    return float(psutil.Process().memory_info().rss / 1e6)
-
-
 def main() -> None:
     """Prints the figures that were asked for."""
     parser = argparse.ArgumentParser(
@@ -247,16 +168,11 @@ def main() -> None:
         each.add_argument("fleet", type=Path)
         each.add_argument("out", type=Path)
     kinds.choices["score"].add_argument("--limit", type=float, default=10.0)
-    engine = kinds.add_parser("ratios")
-    engine.add_argument("--samples", type=int, default=32_000)
-    engine.add_argument("--tasks", type=int, default=6)
     given = parser.parse_args()
     if given.kind == "score":
         score(given.fleet, given.out, given.limit)
-    elif given.kind == "prior":
-        prior(given.fleet, given.out)
     else:
-        ratios(given.samples, given.tasks)
+        prior(given.fleet, given.out)
 
 
 if __name__ == "__main__":

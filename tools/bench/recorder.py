@@ -4,13 +4,11 @@
 
 For each number of axes a machine at work is recorded, second by second as the daemon does it, onto the disk
 of the temporary folder. The axes move and rest in turn; angles are in whole counts, the load encoder is
-noisy. The same samples are written as JSON for comparison: the other encoding that Foxglove and PlotJuggler
-open without more. Processor time is that of the thread, without the disk's.
+noisy. Processor time is that of the thread, without the disk's.
 """
 
 from __future__ import annotations
 
-import json
 import tempfile
 import time
 from pathlib import Path
@@ -18,9 +16,8 @@ from typing import Any
 
 import numpy as np
 from harness import keep, parser
-from mcap.writer import CompressionType, Writer
 
-from hdbridge.daemon.memory import AXIS_SAMPLE, sample_dtype
+from hdbridge.daemon.memory import sample_dtype
 from hdbridge.daemon.recorder.about import About, AxisAbout
 from hdbridge.daemon.recorder.flightlog import Batch, FlightLog
 from hdbridge.daemon.recorder.reading import read
@@ -85,56 +82,24 @@ def as_recorded(samples: Any, rate: int, folder: Path) -> tuple[float, int]:
     return taken, sum(each.stat().st_size for each in folder.iterdir())
 
 
-def as_json(samples: Any, rate: int, path: Path) -> tuple[float, int]:
-    """Returns processor time and bytes of a recorder with JSON messages."""
-    axes = samples["axes"].shape[1]
-    names = AXIS_SAMPLE.names or ()
-    begun = time.thread_time()
-    with path.open("wb") as file:
-        writer = Writer(file, chunk_size=1 << 26, compression=CompressionType.ZSTD)
-        writer.start()
-        schema = writer.register_schema("axis", "jsonschema", b'{"type": "object"}')
-        channels = [writer.register_channel(f"/{each}", "json", schema) for each in range(axes + 1)]
-        for first in range(0, len(samples), rate):
-            rows = samples[first : first + rate]
-            times = rows["time_ns"].tolist()
-            heads = zip(*(rows[each].tolist() for each in rows.dtype.names if each != "axes"), strict=True)
-            head_names = [each for each in rows.dtype.names if each != "axes"]
-            for at, head in zip(times, heads, strict=True):
-                data = json.dumps(dict(zip(head_names, head, strict=True))).encode()
-                writer.add_message(channels[0], at, data, at)
-            for place in range(axes):
-                for at, cycle, row in zip(
-                    times, rows["cycle"].tolist(), rows["axes"][:, place].tolist(), strict=True
-                ):
-                    data = json.dumps({"cycle": cycle, **dict(zip(names, row, strict=True))}).encode()
-                    writer.add_message(channels[1 + place], at, data, at)
-            writer.flush()
-        writer.finish()
-    return time.thread_time() - begun, path.stat().st_size
-
-
-def measured(axes: int, seconds: int, rate: int) -> dict[str, Any]:
+def measured(axes: int, seconds: int, rate: int) -> dict[str, float]:
     """Returns all figures for ``axes`` axes."""
     samples = at_work(seconds, rate, axes)
     messages = len(samples) * (1 + axes)
-    result: dict[str, Any] = {"axes": axes, "rate_hz": rate}
     with tempfile.TemporaryDirectory() as folder:
-        for name, write in (("recorder", as_recorded), ("json", as_json)):
-            place = Path(folder) / name
-            if name == "recorder":
-                place.mkdir()
-            taken_s, size = write(samples, rate, place)
-            result[name] = {
-                "us_per_message": 1e6 * taken_s / messages,
-                "share_of_core": taken_s / seconds,
-                "mb_per_hour": 3600.0 * size / seconds / 1e6,
-            }
-        (path,) = (Path(folder) / "recorder").iterdir()
+        taken_s, size = as_recorded(samples, rate, Path(folder))
+        (path,) = Path(folder).iterdir()
         begun = time.thread_time()
         read(path)
-        result["reading_us_per_message"] = 1e6 * (time.thread_time() - begun) / messages
-    return result
+        reading_s = time.thread_time() - begun
+    return {
+        "axes": axes,
+        "rate_hz": rate,
+        "us_per_message": 1e6 * taken_s / messages,
+        "percent_of_core": 100.0 * taken_s / seconds,
+        "mb_per_hour": 3600.0 * size / seconds / 1e6,
+        "reading_us_per_message": 1e6 * reading_s / messages,
+    }
 
 
 def main() -> None:
@@ -145,16 +110,8 @@ def main() -> None:
     given.add_argument("--rate", type=int, default=250)
     options = given.parse_args()
     results = [measured(axes, options.seconds, options.rate) for axes in options.axes]
-    print(f"{'axes':>4} {'encoding':>9} {'us/message':>11} {'% of a core':>12} {'MB/hour':>8}")
     for each in results:
-        for name in ("recorder", "json"):
-            row = each[name]
-            print(
-                f"{each['axes']:4d} {name:>9} {row['us_per_message']:11.1f} "
-                f"{100 * row['share_of_core']:12.2f} "
-                f"{row['mb_per_hour']:8.0f}"
-            )
-        print(f"     reading back: {each['reading_us_per_message']:.1f} us a message")
+        print(", ".join(f"{name} {value:.3g}" for name, value in each.items()))
     keep(results, options.json)
 
 

@@ -153,7 +153,7 @@ def _together(rng: random.Random, number: int) -> tuple[str, ...]:
             return causes
 
 
-def make(case: Case, seed: int, suite: Path, means: bool = False) -> Path:
+def make(case: Case, seed: int, suite: Path) -> Path:
     """Draws, runs and writes a case atomically; returns its folder.
 
     The folder holds the record (CSV files, or a recording in ``record``), ``model.yaml``, ``sealed.json``
@@ -166,7 +166,7 @@ def make(case: Case, seed: int, suite: Path, means: bool = False) -> Path:
     if KINDS[case.kind] == "everyday":
         secret = _everyday(case, seed, draft, suite / "axes")
     else:
-        secret = _full_bench(case, seed, draft, means)
+        secret = _full_bench(case, seed, draft)
     secret = {"case": case.name, "kind": case.kind, "family": KINDS[case.kind], "pair": case.pair, **secret}
     seal(draft, seed, secret)
     shutil.rmtree(target, ignore_errors=True)
@@ -187,7 +187,7 @@ def unsealed(folder: Path) -> dict[str, Any]:
     return dict(json.loads(zlib.decompress(base64.b64decode(packed))))
 
 
-def _full_bench(case: Case, seed: int, folder: Path, means: bool) -> dict[str, Any]:
+def _full_bench(case: Case, seed: int, folder: Path) -> dict[str, Any]:
     """Makes a case of the bench suite: one long record that shows everything, and a model a few per cent
     wrong.
     """
@@ -198,7 +198,7 @@ def _full_bench(case: Case, seed: int, folder: Path, means: bool) -> dict[str, A
     run = run_of(plan, axis.truth)
     sizes = [(cause, _size_arcsec(rng, cause, case.over_noise, axis.noise_arcsec)) for cause in case.causes]
     truth, hidden = hide_all(axis.truth, sizes, rng, run)
-    readings = Bench(truth, rng.randrange(2**31), plan, means).record()
+    readings = Bench(truth, rng.randrange(2**31), plan).record()
     columns = _columns(readings, rng, with_torque=case.kind != "no_torque")
     write_csv(folder / "record.csv", columns)
     (folder / "model.yaml").write_text(axis.model_yaml, encoding="utf-8")

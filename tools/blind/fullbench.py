@@ -1,8 +1,7 @@
 """A full bench on the simulated axis, without a bus: standstill, sweeps, sines, reversals, steps, holds.
 
 Readings are taken 250 times a second and every fifth is kept, as a bench on a bus with a slower recorder
-does. Means over the five are possible too, but they smooth the higher orders of the motor in fast sweeps
-(order 8 at one turn per second by 4 %), which is an error of the record and not of the axis.
+does. Means over the five would smooth the higher orders of the motor in fast sweeps.
 """
 
 from __future__ import annotations
@@ -10,7 +9,6 @@ from __future__ import annotations
 import random
 from dataclasses import dataclass
 
-import numpy as np
 from support.hidden import Run
 
 from hdbridge.sim.exercise import Exercise, Readings
@@ -68,12 +66,9 @@ def drawn_plan(rng: random.Random, ratio: float) -> Plan:
 class Bench:
     """Runs a plan."""
 
-    def __init__(self, truth: Truth, seed: int, plan: Plan, means: bool = False) -> None:
+    def __init__(self, truth: Truth, seed: int, plan: Plan) -> None:
         self._plan = plan
-        self._means = means
-        self._exercise = Exercise(
-            Machine(truth, seed, may_compile=True), CYCLE_S, 1 if means else CYCLES_PER_SAMPLE
-        )
+        self._exercise = Exercise(Machine(truth, seed, may_compile=True), CYCLE_S, CYCLES_PER_SAMPLE)
 
     def record(self) -> Readings:
         """Returns the whole record."""
@@ -102,7 +97,7 @@ class Bench:
         self._sweep(plan.fast_deg_s, plan.sweep_turns)
         self._pose()
         exercise.hold(plan.still_s)
-        return _decimated(exercise.readings()) if self._means else exercise.readings()
+        return exercise.readings()
 
     def _to(self, goal_deg: float, speed_deg_s: float | None = None) -> None:
         plan, exercise = self._plan, self._exercise
@@ -159,9 +154,3 @@ def run_of(plan: Plan, truth: Truth) -> Run:
         motor_turns=turns,
         load_reach_deg=(0.0, 360.0 * plan.sweep_turns / ratio),
     )
-
-
-def _decimated(readings: Readings) -> Readings:
-    """Returns means over `CYCLES_PER_SAMPLE` readings."""
-    whole = len(readings.time_s) // CYCLES_PER_SAMPLE * CYCLES_PER_SAMPLE
-    return Readings(*(np.mean(each[:whole].reshape(-1, CYCLES_PER_SAMPLE), axis=1) for each in readings))

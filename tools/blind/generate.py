@@ -44,14 +44,14 @@ def wanted(text: str) -> dict[str, int]:
     return {kind.strip(): int(number or 1) for kind, _, number in pairs}
 
 
-def made(group: Sequence[Case], seed: int, out: Path, means: bool) -> list[tuple[str, float]]:
+def made(group: Sequence[Case], seed: int, out: Path) -> list[tuple[str, float]]:
     """Makes the missing cases of one axis; returns their names and durations, NaN after a failure."""
     done = []
     for case in group:
         began_s, folder = time.perf_counter(), case.folder(out, seed)
         if not folder.exists():
             try:
-                make(case, seed, out, means)
+                make(case, seed, out)
             except Exception:
                 traceback.print_exc()
         done.append((folder.name, time.perf_counter() - began_s if folder.exists() else math.nan))
@@ -71,9 +71,6 @@ def main(arguments: list[str] | None = None) -> int:
         help=f"{', '.join(SUITES)}, or a list of kind=number ({', '.join(KINDS)})",
     )
     parser.add_argument("--jobs", type=int, default=2, help="processes")
-    parser.add_argument(
-        "--means", action="store_true", help="bench suite: block means in place of every fifth reading"
-    )
     parser.add_argument("--only", default="", help="only cases whose name contains this")
     options = parser.parse_args(arguments)
     try:
@@ -87,7 +84,7 @@ def main(arguments: list[str] | None = None) -> int:
     for each in chosen:
         axis = each.axis.removesuffix("-fine").removesuffix("-coarse")
         groups.setdefault(axis or each.name, []).append(each)
-    job = partial(made, seed=options.seed, out=options.out, means=options.means)
+    job = partial(made, seed=options.seed, out=options.out)
     number = failed = 0
     with ProcessPoolExecutor(options.jobs, initializer=os.nice, initargs=(10,)) as pool:
         for done in pool.map(job, groups.values()):

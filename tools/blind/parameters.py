@@ -13,10 +13,10 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+from support.hidden.site import ARCSEC_PER_RAD
 
 Data = Mapping[str, Any]
 Values = dict[str, float]
-ARCSEC_PER_RAD = 180.0 * 3600.0 / math.pi
 FINE = 1024
 """Number of angles per turn, or per line, for the separation of orders."""
 TWINS = {"motor_order": "motor_encoder_eccentricity", "motor_encoder_eccentricity": "motor_order"}
@@ -49,10 +49,9 @@ class Secret:
         return self.truth.get("load", {})
 
     @property
-    def stiffness(self) -> float | None:
+    def stiffness(self) -> float:
         """Stiffness at the load, Nm/rad."""
-        value = self.gear.get("stiffness_nm_per_rad")
-        return None if value is None else float(value)
+        return float(self.gear["stiffness_nm_per_rad"])
 
 
 def _phasor(amplitude: float, phase_deg: float) -> complex:
@@ -106,9 +105,6 @@ def _read_by(disc: Data, teeth: dict[float, complex], ratio: float) -> dict[floa
 
 def _motor_orders(secret: Secret) -> Values:
     """Returns the change against model.yaml: the hidden cause plus the calibration's error of that order."""
-    if not secret.truth:
-        order = secret.parameters.get("order", 1.0)
-        return {f"order_{order:.0f}_amplitude_arcsec": float(secret.parameters["amplitude_arcsec"])}
     total = _sum_of(secret.gear.get("motor_orders"))
     disc = secret.truth["motor"]["encoder"].get("disc")
     if disc:
@@ -142,10 +138,6 @@ def _load_orders(secret: Secret) -> Values:
     if disc:
         for order, value in _disc(disc, ARCSEC_PER_RAD).items():
             total[order] = total.get(order, 0j) + value
-    if not total:
-        pairs = zip((1, 2), ("amplitude_arcsec", "second_arcsec"), strict=True)
-        sizes = {order: float(secret.parameters.get(name, 0.0)) for order, name in pairs}
-        return {f"order_{order}_amplitude_arcsec": size for order, size in sizes.items() if size}
     return {name: value for order, each in total.items() for name, value in _polar(order, each).items()}
 
 
@@ -153,13 +145,11 @@ def _compliance(secret: Secret) -> Values:
     """The softness and the ends of each stage; of a finding without stages, the wind-up under the highest
     torque by that torque, which is the softer the more a cause hidden later has softened the spring.
     """
-    stiffness = secret.stiffness or secret.parameters.get("stiffness_nm_per_rad")
-    if stiffness is None:
-        return {}
-    first = ARCSEC_PER_RAD / float(stiffness)
+    stiffness = secret.stiffness
+    first = ARCSEC_PER_RAD / stiffness
     stages = secret.gear.get("stiffening")
     if "torque1_nm" not in secret.found or not stages:
-        softer = float(secret.parameters.get("stiffness_nm_per_rad", stiffness)) / float(stiffness)
+        softer = float(secret.parameters.get("stiffness_nm_per_rad", stiffness)) / stiffness
         return {"c1_arcsec_per_nm": softer * float(secret.parameters.get("compliance_arcsec_per_nm", first))}
     return {
         "c1_arcsec_per_nm": first,
@@ -172,9 +162,6 @@ def _compliance(secret: Secret) -> Values:
 
 def _inertial(secret: Secret) -> Values:
     """Returns J / K of the load on the gear plus that of the encoder on its coupling."""
-    if secret.stiffness is None:
-        value = secret.parameters.get("seconds_squared")
-        return {} if value is None else {"inertia_over_stiffness_s2": float(value)}
     gravity = secret.load.get("gravity") or {}
     inertia = secret.load["inertia_kg_m2"] + gravity.get("mass_kg", 0.0) * gravity.get("arm_m", 0.0) ** 2
     coupling = secret.load.get("encoder", {}).get("coupling")
@@ -184,10 +171,8 @@ def _inertial(secret: Secret) -> Values:
 
 def _velocity(secret: Secret) -> Values:
     """Returns the dry part. The viscous slope at rest would extrapolate another law of thinning."""
-    stiffness, dry = secret.stiffness, secret.parameters.get("coulomb_nm")
-    if stiffness is None or not dry:
-        return {}
-    return {"coulomb_arcsec": float(dry) / stiffness * ARCSEC_PER_RAD}
+    dry = secret.parameters.get("coulomb_nm")
+    return {"coulomb_arcsec": float(dry) / secret.stiffness * ARCSEC_PER_RAD} if dry else {}
 
 
 def _loop_height(secret: Secret) -> Values:

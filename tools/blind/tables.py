@@ -8,34 +8,25 @@ import statistics
 from collections.abc import Callable, Iterable, Sequence
 
 from blind.verdict import Verdict
+from proportions import proportion
 
 BINS = (0.0, 0.5, 0.8, 0.9, 0.95, 0.99, 1.0001)
 NEAR = 0.05
 """Relative tolerance within which a claimed gain holds."""
-Z95 = 1.959964
 EFFECTS = ((0.0, 0.3), (0.3, 1.0), (1.0, 3.0), (3.0, math.inf))
 """Bin edges: rms of a cause over the noise of a reading."""
 LONG = 30_000
 """Number of samples from which the program start is a negligible part of the run time."""
+CALIBRATION = ("stated probability", "mean", "right")
+"""Head of the table of `calibration`."""
 Test = Callable[[Verdict], bool]
-
-
-def wilson(hits: int, number: int) -> tuple[float, float]:
-    """Returns Wilson's 95 % interval of a share."""
-    share, square = hits / number, Z95**2 / number
-    middle = (share + 0.5 * square) / (1.0 + square)
-    half = Z95 * math.sqrt(share * (1.0 - share) / number + 0.25 * square / number) / (1.0 + square)
-    return max(middle - half, 0.0), min(middle + half, 1.0)
+Pair = tuple[float, bool]
 
 
 def rate(hits: Iterable[bool]) -> str:
     """``hits / all (per cent; 95 % interval)``; a dash for none."""
     every = list(hits)
-    if not every:
-        return "-"
-    number = len(every)
-    low, high = wilson(sum(every), number)
-    return f"{sum(every)} / {number} ({100 * sum(every) / number:.1f} %; {100 * low:.1f} to {100 * high:.1f})"
+    return proportion(sum(every), len(every))
 
 
 def wrong_first(verdict: Verdict) -> bool:
@@ -148,7 +139,7 @@ def _several(kind: str, verdicts: Sequence[Verdict], goal: str) -> list[tuple[st
 def common(verdicts: Sequence[Verdict]) -> list[tuple[str, str, str]]:
     """Returns the figures of every suite: (what, figure, goal)."""
     compared = [each for verdict in verdicts for each in verdict.compared]
-    pairs = [pair for each in verdicts for pair in each.probabilities]
+    pairs = probabilities(verdicts)
     sure = [right for chance, right in pairs if chance >= 0.95]
     gains = [each.fresh_gain for each in verdicts if each.fresh_gain is not None]
     left = [each.fresh_left for each in verdicts if each.fresh_left is not None]
@@ -173,11 +164,21 @@ def common(verdicts: Sequence[Verdict]) -> list[tuple[str, str, str]]:
         ),
     ]
     if pairs:
-        brier = statistics.fmean((chance - right) ** 2 for chance, right in pairs)
-        base = statistics.fmean(right for _, right in pairs)
-        words = f"Brier score of the names; {base * (1.0 - base):.3f} if all had the same probability"
-        rows.insert(3, (words, f"{brier:.3f} of {len(pairs)}", ""))
+        rows.insert(3, (*brier(pairs), ""))
     return rows
+
+
+def probabilities(verdicts: Sequence[Verdict]) -> list[Pair]:
+    """Returns each name's stated probability, and True if the name was right."""
+    return [pair for each in verdicts for pair in each.probabilities]
+
+
+def brier(pairs: Sequence[Pair]) -> tuple[str, str]:
+    """Returns the Brier score of the names: (what, figure)."""
+    score = statistics.fmean((chance - right) ** 2 for chance, right in pairs)
+    base = statistics.fmean(right for _, right in pairs)
+    words = f"Brier score of the names; {base * (1.0 - base):.3f} if all had the same probability"
+    return words, f"{score:.3f} of {len(pairs)}"
 
 
 def _median(values: Iterable[float | None]) -> str:
@@ -185,52 +186,14 @@ def _median(values: Iterable[float | None]) -> str:
     return f"{statistics.median(there):.3g} of {len(there)}" if there else "-"
 
 
-def calibration(verdicts: Sequence[Verdict]) -> list[tuple[str, str, str]]:
+def calibration(pairs: Sequence[Pair]) -> list[tuple[str, str, str]]:
     """Returns probabilities by bin: (bin, mean probability, share that was right)."""
-    pairs = [pair for each in verdicts for pair in each.probabilities]
     rows = []
     for low, high in itertools.pairwise(BINS):
         inside = [(chance, right) for chance, right in pairs if low <= chance < high]
         if inside:
             mean = statistics.fmean(chance for chance, _ in inside)
             rows.append((f"{low:g} to {min(high, 1.0):g}", f"{mean:.3f}", rate(hit for _, hit in inside)))
-    return rows
-
-
-def _speed(verdict: Verdict) -> str:
-    edges = ((30.0, "to 30 Hz"), (100.0, "30 to 100 Hz"), (300.0, "100 to 300 Hz"))
-    return next((words for edge, words in edges if verdict.rate_hz <= edge), "above 300 Hz")
-
-
-def _encoder(verdict: Verdict) -> str:
-    size = "up to 20,000 counts" if verdict.counts_per_turn <= 20_000 else "65,536 counts and more"
-    return f"{size}, flickering" if verdict.flicker_counts else size
-
-
-CATEGORIES: tuple[tuple[str, Callable[[Verdict], str]], ...] = (
-    ("motion", lambda each: each.motion),
-    ("rate", _speed),
-    ("motor encoder", _encoder),
-)
-
-
-def by_category(verdicts: Sequence[Verdict]) -> list[list[str]]:
-    """Tabulates everyday records by category: healthy, and with one fault."""
-    rows = []
-    for category, of in CATEGORIES:
-        for value in sorted({of(each) for each in verdicts}):
-            mine = [each for each in verdicts if of(each) == value]
-            healthy = [each for each in mine if each.sort == "healthy"]
-            faults = [each for each in mine if each.sort == "fault"]
-            rows.append(
-                [
-                    f"{category}: {value}",
-                    rate(map(false_name, healthy)),
-                    rate(map(unexplained_first, healthy)),
-                    rate(right_first(each) for each in faults if each.detectable),
-                    rate(map(wrong_first, faults)),
-                ]
-            )
     return rows
 
 
@@ -272,17 +235,9 @@ def page(verdicts: Sequence[Verdict], seed: int, cases: bool = False) -> str:
             continue
         rows = [row for row in (*figures(mine), *common(mine)) if row[1] != "-"]
         parts += [f"## {family.capitalize()}", table(("figure", "", "goal"), rows)]
-        chances = calibration(mine)
-        if chances:
-            parts.append(table(("stated probability", "mean", "right"), chances))
+        if chances := calibration(probabilities(mine)):
+            parts.append(table(CALIBRATION, chances))
         if family == "everyday":
-            head = (
-                "healthy: false name",
-                "unexplained leads",
-                "fault, detectable: right first",
-                "wrong first",
-            )
-            parts.append(table(("category", *head), by_category(mine)))
             head = ("reported detectable", "right first", "wrong first")
             parts.append(table(("fault's rms over noise", *head), by_effect(mine)))
         elif powers := power(mine):

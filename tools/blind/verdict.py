@@ -82,9 +82,6 @@ class Verdict:
     family: str
     sort: str
     pair: str
-    motion: str
-    rate_hz: float
-    counts_per_turn: int
     flicker_counts: float
     samples: int
     over_noise: float | None
@@ -147,9 +144,6 @@ def judged(secret: Data, answer: Answer, model: Data | None = None) -> Verdict:
         family=secret["family"],
         sort=sort,
         pair=secret.get("pair", ""),
-        motion=secret["motion"],
-        rate_hz=secret["rate_hz"],
-        counts_per_turn=secret["counts_per_turn"],
         flicker_counts=secret.get("flicker_counts", 0.0),
         samples=secret["samples"],
         over_noise=secret.get("over_noise"),
