@@ -1,42 +1,40 @@
 """Temperature dependence of ripple and friction."""
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
-from typing import Annotated, Any, ClassVar, Self
+from collections.abc import Iterator, Sequence
+from typing import Annotated, Self
 
 import numpy as np
 from pydantic import Field
 
-from hdbridge.axis.effects.base import (
-    Cause,
-    Channel,
-    Compensable,
-    Effect,
-    FloatArray,
-    Linear,
-    Moment,
-    Motion,
-    Observations,
-    Part,
-    Start,
-    Tracker,
+from hdbridge.axis.effects.base import Effect
+from hdbridge.axis.effects.carried import (
+    Loop,
+    Modulating,
+    has_loop,
+    has_orders,
+    loop_of,
+    orders_of,
 )
-from hdbridge.axis.effects.carried import Loop, growth_of, has_loop, has_orders, loop_of, orders_of
+from hdbridge.axis.effects.described import Cause, Compensable, Part
+from hdbridge.axis.effects.motion import Channel, FloatArray, Moment, Motion, Start
 from hdbridge.axis.effects.motor_order import MotorOrders
+from hdbridge.axis.effects.observations import Observations
 from hdbridge.axis.effects.orders import RAD_PER_DEG, Orders, OrderTracker, phasors, ripple
 from hdbridge.axis.effects.reference import REACH_K, Told, nearest
 from hdbridge.axis.effects.torque import TorqueGrowth
+from hdbridge.axis.effects.tracker import Tracker
 from hdbridge.axis.effects.warmth import Warmed, WarmthState
 
 
-class AmplitudeDrift(Linear, Warmed):
+class AmplitudeDrift(Modulating, Warmed):
     """w (ripple S(theta_M) + friction H): the model's ripple and loop change with the gear's warmth w.
 
     Growth of the ripple with torque is the same warm or cold: the torque-dependent part is scaled as well.
     """
 
-    name: ClassVar[str] = "amplitude_drift"
-    about: ClassVar[Cause] = Cause(
+    name = "amplitude_drift"
+    about = Cause(
         title="ripple and friction change with temperature",
         subject="drift",
         equation="w (ripple S + friction H), S the model's orders (times 1 + growth tau where they grow with "
@@ -50,16 +48,16 @@ class AmplitudeDrift(Linear, Warmed):
         source="first-order dependence on temperature with a first-order lag",
         size="10-30 % over the warm-up",
     )
-    compensable: ClassVar[Compensable] = Compensable(
+    compensable = Compensable(
         True, "if the temperature is measured on line; driven by time only after a cold start"
     )
-    carries: ClassVar[Mapping[Part, str]] = {
+    carries = {
         Part.ORDERS: "orders",
         Part.LOOP: "loop",
         Part.GROWTH: "under_load",
     }
-    linear: ClassVar[tuple[str, ...]] = ("ripple_percent_per_k", "friction_percent_per_k")
-    typical: ClassVar[Mapping[str, Any]] = {
+    linear = ("ripple_percent_per_k", "friction_percent_per_k")
+    typical = {
         "ripple_percent_per_k": 0.5,
         "friction_percent_per_k": -0.5,
         "tau_s": 1800.0,
@@ -174,10 +172,6 @@ class AmplitudeDrift(Linear, Warmed):
 
     def _most(self) -> float:
         return 1.0 if self.under_load is None else 1.0 + self.under_load.most()
-
-    @classmethod
-    def _carried(cls, base: Sequence[Effect]) -> dict[str, Any]:
-        return {"orders": orders_of(base), "loop": loop_of(base), "under_load": growth_of(base)}
 
 
 class _Tracker(Tracker):

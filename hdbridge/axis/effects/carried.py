@@ -5,12 +5,13 @@ tracked and read on its own, it carries a copy of the part that it modulates, ta
 created; `combine.refreshed` keeps the copy up to date.
 """
 
-from collections.abc import Iterable
-from typing import Annotated
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Annotated, Any
 
 from pydantic import Field
 
-from hdbridge.axis.effects.base import Effect, Part
+from hdbridge.axis.effects.base import Effect, Linear
+from hdbridge.axis.effects.described import Part
 from hdbridge.axis.effects.hysteresis import Hysteresis
 from hdbridge.axis.effects.hysteresis_memory import HysteresisMemory
 from hdbridge.axis.effects.orders import MotorOrder
@@ -74,3 +75,16 @@ def growth_of(base: Iterable[Effect]) -> TorqueGrowth | None:
             values = {name: getattr(each, name) for name in TorqueGrowth.model_fields}
             return TorqueGrowth.model_construct(**values)
     return None
+
+
+class Modulating(Linear):
+    """Base class of effects that scale parts of a model, of which they carry copies."""
+
+    @classmethod
+    def _carried(cls, base: Sequence[Effect]) -> dict[str, Any]:
+        parts: Mapping[Part, Callable[[Sequence[Effect]], Any]] = {
+            Part.ORDERS: orders_of,
+            Part.LOOP: loop_of,
+            Part.GROWTH: growth_of,
+        }
+        return {field: parts[part](base) for part, field in cls.carries.items()}

@@ -14,22 +14,17 @@ input: one encoder count of chatter is several arcseconds. Drive it with the com
 """
 
 from collections.abc import Iterator, Sequence
-from typing import ClassVar, Self
+from typing import Self
 
 import numpy as np
 
-from hdbridge.axis.effects.base import (
-    Cause,
-    Effect,
-    FloatArray,
-    Moment,
-    Observations,
-    Part,
-    Start,
-    Tracker,
-)
+from hdbridge.axis.effects.base import Effect
+from hdbridge.axis.effects.described import Cause, Part
 from hdbridge.axis.effects.elastic_loop import ElasticLoop, rise, rise_at
+from hdbridge.axis.effects.motion import FloatArray, Moment, Start
+from hdbridge.axis.effects.observations import Observations
 from hdbridge.axis.effects.path import path_of
+from hdbridge.axis.effects.tracker import Tracker
 
 
 class Hysteresis(ElasticLoop):
@@ -37,8 +32,8 @@ class Hysteresis(ElasticLoop):
     to the offset.
     """
 
-    name: ClassVar[str] = "hysteresis"
-    about: ClassVar[Cause] = Cause(
+    name = "hysteresis"
+    about = Cause(
         title="nonlinear-elastic transmission error (hysteresis)",
         equation="theta_rev + sgn(omega) 2 offset g(xi), limited to sgn(omega) offset; "
         "xi = |theta_M - theta_M,rev| / width; offset > 0: the load leads, offset < 0: it lags",

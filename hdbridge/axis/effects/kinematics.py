@@ -16,7 +16,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from hdbridge.axis.effects.base import (
+from hdbridge.axis.effects.motion import (
     AT_REST,
     MEASURED,
     Channel,

@@ -11,10 +11,11 @@ from typing import Final
 
 import numpy as np
 
-from hdbridge.axis.effects.base import Effect, FloatArray
+from hdbridge.axis.effects.base import Effect
 from hdbridge.axis.effects.carried import Loop
 from hdbridge.axis.effects.hysteresis import Hysteresis
 from hdbridge.axis.effects.hysteresis_memory import HysteresisMemory
+from hdbridge.axis.effects.motion import FloatArray
 from hdbridge.axis.effects.orders import MotorOrder, coefficients_of
 from hdbridge.axis.effects.rate_dependence import RateDependence
 from hdbridge.axis.effects.synchronous import Synchronous

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import Field
 
-from hdbridge.axis.effects.base import SLOT, Channel, FloatArray, Moment, Motion
+from hdbridge.axis.effects.motion import SLOT, Channel, FloatArray, Moment, Motion
 from hdbridge.strictness import Strict
 
 TorqueChannel = Annotated[

@@ -1,6 +1,7 @@
 """On-line evaluation of an effect: queried at any angle any number of times, advanced once per cycle."""
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 
 from hdbridge.axis.effects.motion import Moment
 
@@ -32,11 +33,18 @@ class Tracker(ABC):
 
 
 class Memoryless(Tracker):
-    """Base class of trackers without state, for which `advance` equals `peek`."""
+    """Tracker without state, for which `advance` equals `peek`."""
+
+    def __init__(self, at: Callable[[float, Moment], float]) -> None:
+        """``at`` returns the error at a motor angle and a moment."""
+        self._at = at
+
+    def peek(self, motor_deg: float, moment: Moment) -> float:
+        return self._at(motor_deg, moment)
 
     def advance(self, motor_deg: float, moment: Moment) -> float:
         return self.peek(motor_deg, moment)
 
 
 class Level(Memoryless):
-    """Base class of trackers whose error is the same at every motor angle: the moment alone decides."""
+    """Tracker whose error is the same at every motor angle: the moment alone decides."""
