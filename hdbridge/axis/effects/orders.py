@@ -41,7 +41,7 @@ Orders = Annotated[
 ]
 
 
-class Harmonics(Effect):
+class HarmonicSum(Effect):
     """Sum of A_k cos(k angle + phi_k) over an angle that a subclass defines."""
 
     few: ClassVar[frozenset[int]] = frozenset()
@@ -99,8 +99,8 @@ class Harmonics(Effect):
         )
 
 
-class OrderSeries(Harmonics):
-    """Harmonics of an angle that turns with the motor, c times as fast."""
+class OrderSeries(HarmonicSum):
+    """HarmonicSum of an angle that turns with the motor, c times as fast."""
 
     usual = 2
     searched: ClassVar[Sequence[int]] = ()

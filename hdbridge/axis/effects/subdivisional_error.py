@@ -14,7 +14,7 @@ from hdbridge.axis.effects.motion import Channel, FloatArray, Motion, Start
 from hdbridge.axis.effects.observations import Observations
 from hdbridge.axis.effects.orders import (
     RAD_PER_DEG,
-    Harmonics,
+    HarmonicSum,
     horner,
     orders_from,
     phasors,
@@ -33,7 +33,7 @@ IN_STEP = 0.85
 explains its square, 0.72, of the line's."""
 
 
-class SubdivisionalError(Harmonics):
+class SubdivisionalError(HarmonicSum):
     """Sum over k = 1, 2, 4 of A_k cos(k lines theta_L + phi_k).
 
     The load angle must be the predicted one, error included. A line is often only a few hundred arcsec wide,
