@@ -17,9 +17,9 @@ from hdbridge.analysis.linear import side_by_side
 from hdbridge.analysis.prepared import Samples
 from hdbridge.analysis.regressors import Regressors
 from hdbridge.axis.effects import BoolArray, Effect, FloatArray, IntArray, Start
+from hdbridge.axis.effects.described import Memoryless
 from hdbridge.axis.effects.orders import waves
 from hdbridge.axis.effects.path import branches, since_reversal_deg
-from hdbridge.axis.effects.tracker import Memoryless
 from hdbridge.units import ARCSEC_PER_DEG
 
 TARGET_BLOCKS = 30_000

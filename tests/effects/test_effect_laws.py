@@ -21,7 +21,7 @@ from hdbridge.axis.effects import (
     readings,
     unmet,
 )
-from hdbridge.axis.effects.tracker import Level, Memoryless
+from hdbridge.axis.effects.described import Level, Memoryless
 from hdbridge.errors import InputError
 
 NAMES = sorted(CATALOGUE)

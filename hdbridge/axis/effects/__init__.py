@@ -3,14 +3,23 @@
 from hdbridge.axis.effects.amplitude_drift import AmplitudeDrift
 from hdbridge.axis.effects.backlash import Backlash
 from hdbridge.axis.effects.base import Effect, unmet
-from hdbridge.axis.effects.basic import BASIC, USUAL_LOOP, is_ripple, ripple
-from hdbridge.axis.effects.carried import Loop
+from hdbridge.axis.effects.carried import BASIC, USUAL_LOOP, Loop, is_ripple, ripple
 from hdbridge.axis.effects.channel_skew import ChannelSkew
 from hdbridge.axis.effects.combine import compensable, conflicts, extended, fall_bound, in_place, refreshed
 from hdbridge.axis.effects.compliance import Compliance
 from hdbridge.axis.effects.count_loss import CountLoss, Step
 from hdbridge.axis.effects.creep import Creep, Relaxation
-from hdbridge.axis.effects.described import Cause, Compensable, Experiment, Moves, Part, Shape, Sought
+from hdbridge.axis.effects.described import (
+    Cause,
+    Compensable,
+    Experiment,
+    Moves,
+    Observations,
+    Part,
+    Shape,
+    Sought,
+    Tracker,
+)
 from hdbridge.axis.effects.direction_phase import DirectionPhase
 from hdbridge.axis.effects.flexspline_order import FlexsplineOrders
 from hdbridge.axis.effects.hysteresis import Hysteresis
@@ -33,7 +42,6 @@ from hdbridge.axis.effects.motion import (
 )
 from hdbridge.axis.effects.motor_encoder_eccentricity import MotorEncoderEccentricity
 from hdbridge.axis.effects.motor_order import MotorOrders
-from hdbridge.axis.effects.observations import Observations
 from hdbridge.axis.effects.orders import MotorOrder
 from hdbridge.axis.effects.rate_dependence import RateDependence
 from hdbridge.axis.effects.ratio_error import RatioError
@@ -41,7 +49,6 @@ from hdbridge.axis.effects.subdivisional_error import SubdivisionalError
 from hdbridge.axis.effects.synchronous import Synchronous
 from hdbridge.axis.effects.torque import TorqueGrowth
 from hdbridge.axis.effects.torque_modulation import TorqueModulation
-from hdbridge.axis.effects.tracker import Tracker
 from hdbridge.axis.effects.velocity_windup import VelocityWindup
 from hdbridge.axis.effects.vibration import Vibration
 from hdbridge.axis.effects.wear import Wear

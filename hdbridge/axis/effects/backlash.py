@@ -7,11 +7,9 @@ import numpy as np
 from pydantic import Field
 
 from hdbridge.axis.effects.base import Effect, Linear
-from hdbridge.axis.effects.described import Cause, Compensable, Experiment, Shape
+from hdbridge.axis.effects.described import Cause, Compensable, Experiment, Observations, Shape, Tracker
 from hdbridge.axis.effects.motion import FloatArray, Moment, Motion, Start
-from hdbridge.axis.effects.observations import Observations
 from hdbridge.axis.effects.play import Stop, stop
-from hdbridge.axis.effects.tracker import Tracker
 from hdbridge.units import ARCSEC_PER_DEG
 
 _SOFTNESS = 1.25

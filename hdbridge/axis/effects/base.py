@@ -29,22 +29,17 @@ from hdbridge.axis.effects.described import (
     Cause,
     Coefficient,
     Compensable,
+    Level,
+    Memoryless,
     Moves,
+    Observations,
     Part,
     Shape,
     Sought,
     Stretch,
+    Tracker,
 )
-from hdbridge.axis.effects.motion import (
-    MEASURED,
-    Channel,
-    FloatArray,
-    Moment,
-    Motion,
-    Start,
-)
-from hdbridge.axis.effects.observations import Observations
-from hdbridge.axis.effects.tracker import Level, Memoryless, Tracker
+from hdbridge.axis.effects.motion import MEASURED, Channel, FloatArray, Moment, Motion, Start
 from hdbridge.strictness import Strict
 
 GRID: Final[Mapping[int, int]] = {1: 6, 2: 4, 3: 3}

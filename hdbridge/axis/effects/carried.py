@@ -6,7 +6,7 @@ created; `combine.refreshed` keeps the copy up to date.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import Annotated, Any
+from typing import Annotated, Any, Final
 
 from pydantic import Field
 
@@ -14,7 +14,7 @@ from hdbridge.axis.effects.base import Effect, Linear
 from hdbridge.axis.effects.described import Part
 from hdbridge.axis.effects.hysteresis import Hysteresis
 from hdbridge.axis.effects.hysteresis_memory import HysteresisMemory
-from hdbridge.axis.effects.orders import MotorOrder
+from hdbridge.axis.effects.orders import MotorOrder, orders_from
 from hdbridge.axis.effects.synchronous import TYPICAL_ORDERS, Synchronous
 from hdbridge.axis.effects.torque import TorqueGrowth
 from hdbridge.strictness import Strict
@@ -40,6 +40,22 @@ class Loop(Strict):
 
 TYPICAL_LOOP = Loop(offset_arcsec=40.0, width_deg=20.0, exponent=1.6)
 """Loop of a published gear of ratio 50 (Table 2 of the article that hdbridge implements)."""
+
+
+BASIC: Final = frozenset({Synchronous.name, Hysteresis.name})
+"""Names of the two basic parts."""
+USUAL_LOOP: Final[Effect] = Hysteresis(offset_arcsec=40.0, width_deg=20.0, exponent=1.8)
+"""Initial loop for a fit."""
+
+
+def ripple(numbers: Iterable[int]) -> Effect:
+    """Returns a ripple with these motor orders at zero amplitude, as the start of a fit."""
+    return Synchronous(orders=orders_from(numbers, 0.0))
+
+
+def is_ripple(effect: Effect) -> bool:
+    """Returns True if an effect is the model's ripple rather than additional orders."""
+    return isinstance(effect, Synchronous)
 
 
 def loop_of(base: Iterable[Effect]) -> Loop:

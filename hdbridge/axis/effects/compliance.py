@@ -8,12 +8,11 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from hdbridge.axis.effects.base import Angleless, Effect, Linear
-from hdbridge.axis.effects.described import Cause, Compensable, Shape
+from hdbridge.axis.effects.described import Cause, Compensable, Observations, Shape
 from hdbridge.axis.effects.load_order import LoadOrders
 from hdbridge.axis.effects.motion import SLOT, Channel, FloatArray, Moment, Motion, Start
-from hdbridge.axis.effects.observations import Observations, top
 from hdbridge.axis.effects.orders import orders_from
-from hdbridge.axis.effects.torque import TorqueChannel, TorqueLimit
+from hdbridge.axis.effects.torque import TorqueChannel, TorqueLimit, top
 
 SOFTER = 1.05
 """Factor by which noise alone may make a zone softer than the one before it."""

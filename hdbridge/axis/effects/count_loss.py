@@ -7,9 +7,17 @@ import numpy as np
 from pydantic import Field
 
 from hdbridge.axis.effects.base import Angleless, Effect
-from hdbridge.axis.effects.described import Cause, Coefficient, Compensable, Moves, Shape, Sought, Stretch
+from hdbridge.axis.effects.described import (
+    Cause,
+    Coefficient,
+    Compensable,
+    Moves,
+    Observations,
+    Shape,
+    Sought,
+    Stretch,
+)
 from hdbridge.axis.effects.motion import Channel, FloatArray, Moment, Motion, Start
-from hdbridge.axis.effects.observations import Observations
 from hdbridge.axis.effects.path import away_from_reversals
 from hdbridge.strictness import Strict
 

@@ -10,13 +10,19 @@ from pydantic import Field
 from hdbridge.axis.effects import coordinate as over
 from hdbridge.axis.effects.base import Effect
 from hdbridge.axis.effects.coordinate import Coordinate
-from hdbridge.axis.effects.described import Cause, Coefficient, Compensable, Shape, Stretch
+from hdbridge.axis.effects.described import (
+    Cause,
+    Coefficient,
+    Compensable,
+    Observations,
+    Shape,
+    Stretch,
+    Tracker,
+)
 from hdbridge.axis.effects.kinematics import speed_of
 from hdbridge.axis.effects.motion import Channel, FloatArray, Moment, Motion, Start
-from hdbridge.axis.effects.observations import Observations, longest_rest_s
-from hdbridge.axis.effects.path import standing_s
+from hdbridge.axis.effects.path import longest_rest_s, standing_s
 from hdbridge.axis.effects.recurrence import recurrence
-from hdbridge.axis.effects.tracker import Tracker
 from hdbridge.strictness import Strict
 
 RESTS = 3.0

@@ -9,12 +9,10 @@ from pydantic import Field
 
 from hdbridge.axis.effects.base import Effect
 from hdbridge.axis.effects.carried import Modulating, has_orders, orders_of
-from hdbridge.axis.effects.described import Cause, Compensable, Part
+from hdbridge.axis.effects.described import Cause, Compensable, Memoryless, Observations, Part, Tracker
 from hdbridge.axis.effects.kinematics import direction_of
 from hdbridge.axis.effects.motion import Channel, FloatArray, Motion, Start
-from hdbridge.axis.effects.observations import Observations
 from hdbridge.axis.effects.orders import RAD_PER_DEG, Orders, OrderTracker, phasors, ripple
-from hdbridge.axis.effects.tracker import Memoryless, Tracker
 
 STEEPEST = 3.0
 """Limit of tan(k shift), reached at k shift = 72 deg; up to 108 deg the mean is under a third

@@ -18,10 +18,9 @@ import numpy as np
 from pydantic import Field
 
 from hdbridge.axis.effects.base import Effect
-from hdbridge.axis.effects.described import Coefficient, Compensable, Part, Shape
+from hdbridge.axis.effects.described import Coefficient, Compensable, Part, Shape, Tracker
 from hdbridge.axis.effects.motion import FloatArray, Motion, Start
 from hdbridge.axis.effects.path import once
-from hdbridge.axis.effects.tracker import Tracker
 
 
 def rise(xi: FloatArray, n: float) -> FloatArray:

@@ -19,12 +19,10 @@ from typing import Self
 import numpy as np
 
 from hdbridge.axis.effects.base import Effect
-from hdbridge.axis.effects.described import Cause, Part
+from hdbridge.axis.effects.described import Cause, Observations, Part, Tracker
 from hdbridge.axis.effects.elastic_loop import ElasticLoop, rise, rise_at
 from hdbridge.axis.effects.motion import FloatArray, Moment, Start
-from hdbridge.axis.effects.observations import Observations
 from hdbridge.axis.effects.path import path_of
-from hdbridge.axis.effects.tracker import Tracker
 
 
 class Hysteresis(ElasticLoop):

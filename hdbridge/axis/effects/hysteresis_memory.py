@@ -25,13 +25,11 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 
 from hdbridge.axis.effects.base import Effect
-from hdbridge.axis.effects.described import Cause, Part
+from hdbridge.axis.effects.described import Cause, Observations, Part, Tracker
 from hdbridge.axis.effects.elastic_loop import ElasticLoop, rise, rise_at
 from hdbridge.axis.effects.hysteresis import Hysteresis
 from hdbridge.axis.effects.motion import FloatArray, Moment, Start
-from hdbridge.axis.effects.observations import Observations
 from hdbridge.axis.effects.path import path_of
-from hdbridge.axis.effects.tracker import Tracker
 
 _DEPTH = 200
 """Number of remembered reversals; beyond it the innermost loop is forgotten early (a fraction

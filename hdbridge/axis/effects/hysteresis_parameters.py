@@ -9,11 +9,9 @@ from pydantic import Field
 
 from hdbridge.axis.effects.base import Effect
 from hdbridge.axis.effects.carried import Loop, loop_of
-from hdbridge.axis.effects.described import Cause, Compensable, Part
+from hdbridge.axis.effects.described import Cause, Compensable, Observations, Part, Tracker
 from hdbridge.axis.effects.hysteresis import Hysteresis
 from hdbridge.axis.effects.motion import FloatArray, Moment, Motion, Start
-from hdbridge.axis.effects.observations import Observations
-from hdbridge.axis.effects.tracker import Tracker
 
 
 class HysteresisParameters(Effect):

@@ -7,11 +7,10 @@ import numpy as np
 from pydantic import Field
 
 from hdbridge.axis.effects.base import Angleless, Effect, Linear
-from hdbridge.axis.effects.described import Cause, Compensable
+from hdbridge.axis.effects.described import Cause, Compensable, Observations
 from hdbridge.axis.effects.kinematics import acceleration_of
 from hdbridge.axis.effects.load_order import Ratio
 from hdbridge.axis.effects.motion import Channel, FloatArray, Moment, Motion, Start
-from hdbridge.axis.effects.observations import Observations
 from hdbridge.units import ARCSEC_PER_DEG
 
 

@@ -11,10 +11,9 @@ from pydantic import Field
 from hdbridge.axis.effects import coordinate as over
 from hdbridge.axis.effects.base import Effect, Linear, Momentary
 from hdbridge.axis.effects.coordinate import Coordinate
-from hdbridge.axis.effects.described import Cause, Compensable, Shape, Sought, Stretch
+from hdbridge.axis.effects.described import Cause, Compensable, Observations, Shape, Sought, Stretch
 from hdbridge.axis.effects.load_order import Ratio
 from hdbridge.axis.effects.motion import FloatArray, Moment, Motion, Start
-from hdbridge.axis.effects.observations import Observations
 from hdbridge.axis.effects.path import away_from_reversals
 from hdbridge.units import DEG_PER_TURN
 

@@ -4,8 +4,7 @@ from collections.abc import Iterator, Sequence
 from typing import Self
 
 from hdbridge.axis.effects.base import Effect
-from hdbridge.axis.effects.described import Cause, Compensable, Part
-from hdbridge.axis.effects.observations import Observations
+from hdbridge.axis.effects.described import Cause, Compensable, Observations, Part
 from hdbridge.axis.effects.orders import OrderSeries, orders_from
 
 

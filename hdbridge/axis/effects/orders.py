@@ -10,11 +10,9 @@ import numpy as np
 from pydantic import Field, field_validator
 
 from hdbridge.axis.effects.base import Effect
-from hdbridge.axis.effects.described import Coefficient, Stretch
+from hdbridge.axis.effects.described import Coefficient, Memoryless, Observations, Stretch, Tracker
 from hdbridge.axis.effects.motion import FloatArray, Moment, Motion, Start
-from hdbridge.axis.effects.observations import Observations
 from hdbridge.axis.effects.path import away_from_reversals, once
-from hdbridge.axis.effects.tracker import Memoryless, Tracker
 from hdbridge.strictness import Strict
 
 RAD_PER_DEG = math.pi / 180.0

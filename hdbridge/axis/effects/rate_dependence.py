@@ -10,11 +10,9 @@ from pydantic import Field
 from hdbridge.axis.effects.base import Effect
 from hdbridge.axis.effects.carried import Loop, Modulating, has_loop, loop_of
 from hdbridge.axis.effects.coordinate import Coordinate, Spacing
-from hdbridge.axis.effects.described import Cause, Compensable, Part, Shape
-from hdbridge.axis.effects.kinematics import speed_of
+from hdbridge.axis.effects.described import Cause, Compensable, Observations, Part, Shape, Tracker
+from hdbridge.axis.effects.kinematics import speed_of, top_speed_deg_s
 from hdbridge.axis.effects.motion import Channel, FloatArray, Moment, Motion, Start
-from hdbridge.axis.effects.observations import Observations, top_speed_deg_s
-from hdbridge.axis.effects.tracker import Tracker
 
 
 class RateDependence(Modulating):

@@ -9,9 +9,8 @@ from pydantic import Field
 from hdbridge.axis.effects import coordinate as over
 from hdbridge.axis.effects.base import Effect, Linear, Momentary
 from hdbridge.axis.effects.coordinate import Coordinate
-from hdbridge.axis.effects.described import Cause, Compensable
+from hdbridge.axis.effects.described import Cause, Compensable, Observations
 from hdbridge.axis.effects.motion import FloatArray, Moment, Motion, Start
-from hdbridge.axis.effects.observations import Observations
 from hdbridge.units import ARCSEC_PER_DEG, DEG_PER_TURN
 
 TEETH_PER_TURN = 2.0

@@ -9,17 +9,9 @@ from pydantic import Field
 
 from hdbridge.axis.effects.base import Effect
 from hdbridge.axis.effects.coordinate import Coordinate
-from hdbridge.axis.effects.described import Cause, Compensable, Sought
+from hdbridge.axis.effects.described import Cause, Compensable, Level, Observations, Sought, Tracker
 from hdbridge.axis.effects.motion import Channel, FloatArray, Motion, Start
-from hdbridge.axis.effects.observations import Observations
-from hdbridge.axis.effects.orders import (
-    RAD_PER_DEG,
-    HarmonicSum,
-    horner,
-    orders_from,
-    phasors,
-)
-from hdbridge.axis.effects.tracker import Level, Tracker
+from hdbridge.axis.effects.orders import RAD_PER_DEG, HarmonicSum, horner, orders_from, phasors
 from hdbridge.units import ARCSEC_PER_DEG, DEG_PER_TURN
 
 _HARMONICS = (1, 2, 4)

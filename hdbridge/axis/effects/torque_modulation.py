@@ -8,13 +8,19 @@ import numpy as np
 from hdbridge.axis.effects.base import Effect
 from hdbridge.axis.effects.carried import Modulating, has_orders, orders_of
 from hdbridge.axis.effects.coordinate import Coordinate, Spacing
-from hdbridge.axis.effects.described import Cause, Compensable, Experiment, Part
+from hdbridge.axis.effects.described import (
+    Cause,
+    Compensable,
+    Experiment,
+    Memoryless,
+    Observations,
+    Part,
+    Tracker,
+)
 from hdbridge.axis.effects.motion import Channel, FloatArray, Motion, Start
 from hdbridge.axis.effects.motor_order import MotorOrders
-from hdbridge.axis.effects.observations import Observations, top
 from hdbridge.axis.effects.orders import RAD_PER_DEG, Orders, OrderTracker, phasors, ripple
-from hdbridge.axis.effects.torque import TorqueGrowth
-from hdbridge.axis.effects.tracker import Memoryless, Tracker
+from hdbridge.axis.effects.torque import TorqueGrowth, top
 
 
 class TorqueModulation(TorqueGrowth, Modulating):

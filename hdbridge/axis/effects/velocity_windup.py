@@ -8,10 +8,9 @@ import numpy as np
 from pydantic import Field
 
 from hdbridge.axis.effects.base import Angleless, Effect, Linear
-from hdbridge.axis.effects.described import Cause, Compensable, Shape
-from hdbridge.axis.effects.kinematics import speed_of
+from hdbridge.axis.effects.described import Cause, Compensable, Observations, Shape
+from hdbridge.axis.effects.kinematics import speed_of, top_speed_deg_s
 from hdbridge.axis.effects.motion import Channel, FloatArray, Moment, Motion, Start
-from hdbridge.axis.effects.observations import Observations, top_speed_deg_s
 
 STRAIGHT = 20.0
 """Ratio of shear speed to top speed above which the drag deviates from a straight line by less than 1/20."""

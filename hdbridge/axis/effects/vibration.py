@@ -9,9 +9,16 @@ from pydantic import Field
 
 from hdbridge.axis.effects.base import Angleless, Effect
 from hdbridge.axis.effects.coordinate import Coordinate
-from hdbridge.axis.effects.described import Cause, Coefficient, Compensable, Experiment, Shape, Sought
+from hdbridge.axis.effects.described import (
+    Cause,
+    Coefficient,
+    Compensable,
+    Experiment,
+    Observations,
+    Shape,
+    Sought,
+)
 from hdbridge.axis.effects.motion import Channel, FloatArray, Moment, Motion, Start
-from hdbridge.axis.effects.observations import Observations
 from hdbridge.axis.effects.orders import cosines_and_sines
 
 

@@ -8,9 +8,9 @@ import numpy as np
 from pydantic import Field
 
 from hdbridge.axis.effects.base import Effect
-from hdbridge.axis.effects.described import Shape
+from hdbridge.axis.effects.described import Observations, Shape
+from hdbridge.axis.effects.kinematics import duration_s
 from hdbridge.axis.effects.motion import SLOT, Channel, FloatArray, Moment, Motion
-from hdbridge.axis.effects.observations import Observations, duration_s
 from hdbridge.axis.effects.recurrence import lagged
 
 VARIES_K: Final = 0.3

@@ -9,12 +9,10 @@ from pydantic import Field
 
 from hdbridge.axis.effects.base import Effect, Linear
 from hdbridge.axis.effects.coordinate import Coordinate
-from hdbridge.axis.effects.described import Cause, Compensable, Shape
+from hdbridge.axis.effects.described import Cause, Compensable, Observations, Shape, Tracker
 from hdbridge.axis.effects.motion import FloatArray, Moment, Motion, Start
-from hdbridge.axis.effects.observations import Observations
 from hdbridge.axis.effects.path import once
 from hdbridge.axis.effects.play import stop
-from hdbridge.axis.effects.tracker import Tracker
 from hdbridge.units import DEG_PER_TURN
 
 

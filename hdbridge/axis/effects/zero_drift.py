@@ -9,10 +9,8 @@ from pydantic import Field
 from hdbridge.axis.effects import coordinate as over
 from hdbridge.axis.effects.base import Effect, Linear
 from hdbridge.axis.effects.coordinate import Coordinate
-from hdbridge.axis.effects.described import Cause, Compensable, Experiment
+from hdbridge.axis.effects.described import Cause, Compensable, Experiment, Observations, Tracker
 from hdbridge.axis.effects.motion import FloatArray, Moment, Motion, Start
-from hdbridge.axis.effects.observations import Observations
-from hdbridge.axis.effects.tracker import Tracker
 from hdbridge.axis.effects.warmth import Warmed, WarmthState
 
 

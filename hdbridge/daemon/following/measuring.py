@@ -33,9 +33,9 @@ from hdbridge.axis.effects import (
     readings,
     refreshed,
 )
+from hdbridge.axis.effects.described import Memoryless
 from hdbridge.axis.effects.kinematics import Observer
 from hdbridge.axis.effects.orders import cosines_and_sines
-from hdbridge.axis.effects.tracker import Memoryless
 from hdbridge.axis.model import TransmissionModel
 from hdbridge.errors import InputError
 from hdbridge.files.expectation import nearest
