@@ -17,7 +17,7 @@ from hdbridge.analysis.linear import side_by_side
 from hdbridge.analysis.prepared import Samples
 from hdbridge.analysis.regressors import Regressors
 from hdbridge.axis.effects import BoolArray, Effect, FloatArray, IntArray, Start
-from hdbridge.axis.effects.base import Memoryless
+from hdbridge.axis.effects.described import Memoryless
 from hdbridge.axis.effects.orders import waves
 from hdbridge.axis.effects.path import branches, since_reversal_deg
 from hdbridge.units import ARCSEC_PER_DEG

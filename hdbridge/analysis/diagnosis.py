@@ -48,8 +48,8 @@ from hdbridge.analysis.unexplained import (
     unfitted,
 )
 from hdbridge.axis.effects import Channel, Effect, FloatArray, Part, Start, unmet
-from hdbridge.axis.effects.base import missing_error
 from hdbridge.axis.effects.kinematics import direction_of
+from hdbridge.axis.effects.motion import missing_error
 from hdbridge.axis.effects.torque import beyond_limit
 from hdbridge.axis.model import TransmissionModel
 from hdbridge.records.given import Given, agreed_ratio, by_name

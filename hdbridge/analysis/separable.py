@@ -15,8 +15,7 @@ import numpy as np
 
 from hdbridge.analysis.linear import FREE, Column, Columns, Effort, Terms, side_by_side, solve_symmetric
 from hdbridge.axis.effects import BoolArray, Effect, FloatArray, refreshed
-from hdbridge.axis.effects.base import Shape
-from hdbridge.axis.effects.described import Moves
+from hdbridge.axis.effects.described import Moves, Shape
 
 LOGARITHM = 0.7
 RANGE = 0.15

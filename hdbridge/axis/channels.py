@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Final, Literal, NamedTuple, Self
 
 from pydantic import Field, create_model, model_validator
 
-from hdbridge.axis.effects.base import MEASURED
+from hdbridge.axis.effects.motion import MEASURED
 from hdbridge.files.yamlfile import wrong
 from hdbridge.strictness import Strict
 

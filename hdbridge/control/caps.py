@@ -8,7 +8,7 @@ import numpy as np
 
 from hdbridge.axis import AxisConfig
 from hdbridge.axis.effects import Motion, compensable
-from hdbridge.axis.effects.base import MEASURED
+from hdbridge.axis.effects.motion import MEASURED
 from hdbridge.axis.model import TransmissionModel
 
 _POINTS = 20_000

@@ -28,7 +28,8 @@ from collections import deque
 from dataclasses import dataclass, replace
 
 from hdbridge.axis.effects import Channel, Effect, Moment, Start, Tracker, compensable, fall_bound
-from hdbridge.axis.effects.base import MEASURED, Level, Memoryless
+from hdbridge.axis.effects.described import Level, Memoryless
+from hdbridge.axis.effects.motion import MEASURED
 from hdbridge.axis.model import ModelTracker, TransmissionModel
 from hdbridge.axis.model.response import LeadFilter, Response
 from hdbridge.control.prefilter import Prefilter

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from hdbridge.axis.channels import BY_KEY
-from hdbridge.axis.effects.base import AT_REST, SLOT, Channel
+from hdbridge.axis.effects.motion import AT_REST, SLOT, Channel
 
 if TYPE_CHECKING:
     from hdbridge.axis import AxisConfig

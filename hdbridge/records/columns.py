@@ -15,7 +15,7 @@ from typing import Final, NamedTuple, Self
 import numpy as np
 
 from hdbridge.axis.effects import FloatArray
-from hdbridge.axis.effects.base import MEASURED
+from hdbridge.axis.effects.motion import MEASURED
 from hdbridge.errors import InputError
 from hdbridge.files.csvfile import Column, CsvFile
 from hdbridge.files.expectation import nearest, one_line

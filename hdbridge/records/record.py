@@ -13,7 +13,7 @@ from typing import Any, Final, Self
 import numpy as np
 
 from hdbridge.axis.effects import Channel, FloatArray, Motion
-from hdbridge.axis.effects.base import MEASURED
+from hdbridge.axis.effects.motion import MEASURED
 from hdbridge.errors import InputError
 from hdbridge.files.csvfile import Column, CsvFile, write_columns
 from hdbridge.records.columns import CHANNELS, OPTIONAL, REQUIRED, CsvColumns, Origin, Said, read

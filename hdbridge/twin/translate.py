@@ -22,9 +22,9 @@ import numpy as np
 from pydantic import ValidationError
 
 from hdbridge.axis import AxisConfig, effects
-from hdbridge.axis.effects.base import FloatArray
 from hdbridge.axis.effects.direction_phase import STEEPEST
 from hdbridge.axis.effects.elastic_loop import rise
+from hdbridge.axis.effects.motion import FloatArray
 from hdbridge.axis.effects.warmth import Warmed
 from hdbridge.axis.model import TransmissionModel
 from hdbridge.errors import InputError

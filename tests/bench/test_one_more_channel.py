@@ -20,7 +20,9 @@ from hdbridge.axis.channels import BY_KEY
 from hdbridge.control.bench import Bench, compensation_for
 from hdbridge.drive.drive import Drive
 from hdbridge.axis.effects import Channel
-from hdbridge.axis.effects.base import Compensable, Linear, Memoryless, SLOT
+from hdbridge.axis.effects.base import Angleless, Linear
+from hdbridge.axis.effects.described import Compensable
+from hdbridge.axis.effects.motion import SLOT
 from hdbridge.errors import InputError
 from hdbridge.files.bundled import bundled_profile
 from hdbridge.axis.model import TransmissionModel
@@ -30,28 +32,21 @@ from hdbridge.sim.lockstep import simulated_bench
 from hdbridge.sim.truth import Truth
 
 
-class Swelling(Linear):
-    name: ClassVar = "swelling"
-    linear: ClassVar = ("swelling_arcsec_per_percent",)
-    channels: ClassVar = frozenset({Channel.HUMIDITY})
-    compensable: ClassVar = Compensable(True, "the load moves")
+class Swelling(Angleless, Linear):
+    name = "swelling"
+    linear = ("swelling_arcsec_per_percent",)
+    channels = frozenset({Channel.HUMIDITY})
+    compensable = Compensable(True, "the load moves")
     swelling_arcsec_per_percent: float
 
     def columns(self, motion, start=None):
         return motion.channel(Channel.HUMIDITY, self.name)[:, None]
 
-    def tracker(self, start=None):
-        class Follower(Memoryless):
-            def peek(_, motor_deg, moment):
-                return self.swelling_arcsec_per_percent * moment.measured[SLOT[Channel.HUMIDITY]]
-
-        return Follower()
+    def at(self, motor_deg, moment):
+        return self.swelling_arcsec_per_percent * moment.measured[SLOT[Channel.HUMIDITY]]
 
     def bound_arcsec(self):
         return 100.0 * abs(self.swelling_arcsec_per_percent)
-
-    def slope_bound_arcsec_per_deg(self):
-        return 0.0
 
 
 file = bundled_profile("article") / "axis.yaml"

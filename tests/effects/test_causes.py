@@ -138,7 +138,7 @@ def test_wind_up_stiffens_at_two_torques():
     error = effect.predict(Motion(np.zeros(7), measured={Channel.LOAD_TORQUE: torque}))
     at = [0, 15.9, 111.3, 111.3 + 3 * 11.5, 111.3 + 18 * 11.5, 111.3 + 18 * 11.5 + 5 * 9]
     np.testing.assert_allclose(error, [*at, -at[3]])
-    assert effect.stiffness_nm_per_rad()[0] == pytest.approx(1.3e4, rel=0.01)
+    assert 206265.0 / effect.c1_arcsec_per_nm == pytest.approx(1.3e4, rel=0.01)
 
 
 def test_a_torque_of_the_other_sign_convention_turns_the_sense_not_the_stiffness():
@@ -163,7 +163,9 @@ def test_skew_is_what_a_late_sample_shows_also_while_it_accelerates():
         motor_acceleration_deg_s2=-27000 * np.sin(3 * time_s),
     )  # fmt: skip
     measured = (late - angle) / 50 * 3600
-    np.testing.assert_allclose(ChannelSkew.of_delay(2.0, 50.0).predict(motion), measured, atol=0.01)
+    np.testing.assert_allclose(
+        ChannelSkew(ratio=50.0, delay_ms=2.0, second_order_ms2=4.0).predict(motion), measured, atol=0.01
+    )
     assert np.ptp(measured) > 1000
 
 
@@ -219,7 +221,7 @@ def test_a_defect_is_met_once_per_load_turn_and_nowhere_else():
 
 
 def test_the_load_rests_while_the_motor_crosses_an_ideal_gap():
-    effect = Backlash.of_gap(36.0, 50.0, softness=1.0)
+    effect = Backlash(gap_arcsec=36.0, crossing_deg=0.5)
     assert effect.crossing_deg == pytest.approx(0.5)
     angle = np.array([0.0, 10.0, 9.9, 9.7, 9.5, 9.4])
     load = angle / 50 * 3600 + effect.predict(Motion(angle))

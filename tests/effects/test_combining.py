@@ -72,9 +72,9 @@ def test_changed_parameters_go_into_the_models_own_loop(law):
 
 
 def test_new_causes_are_added_and_known_ones_updated():
-    once = extended(BASE, Backlash.of_gap(10.0, RATIO))
+    once = extended(BASE, Backlash(gap_arcsec=10.0, crossing_deg=0.2))
     assert names(once) == ["synchronous", "hysteresis", "backlash"]
-    twice = extended(once, Backlash.of_gap(5.0, RATIO))
+    twice = extended(once, Backlash(gap_arcsec=5.0, crossing_deg=0.1))
     assert names(twice) == names(once)
     assert twice[2].gap_arcsec == 5.0
 

@@ -21,7 +21,7 @@ from hdbridge.axis.effects import (
     readings,
     unmet,
 )
-from hdbridge.axis.effects.base import Level
+from hdbridge.axis.effects.described import Level, Memoryless
 from hdbridge.errors import InputError
 
 NAMES = sorted(CATALOGUE)
@@ -142,6 +142,8 @@ def nothing_moved_and_nothing_recorded_is_no_trouble(effect):
 def test_memory_of_a_tracker_does_not_grow(name):
     """Not with time, and not with ever smaller loops within loops, each of them worth remembering."""
     tracker = CATALOGUE[name].candidate(50.0, BASE).tracker()
+    if isinstance(tracker, Memoryless):
+        return
     sizes = []
     for i in range(2000):
         angle = (-1) ** i * (2000 - i) * 0.0049

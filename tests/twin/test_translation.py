@@ -147,8 +147,12 @@ CASES = {
         several_speeds,
         left=0.05,
     ),
-    "channel_skew": Case((*BASIC, effects.ChannelSkew.of_delay(2.0, N)), several_speeds, floor_arcsec=2.0),
-    "backlash": Case((*BASIC, effects.Backlash.of_gap(40.0, N, softness=1.0)), left=0.15),
+    "channel_skew": Case(
+        (*BASIC, effects.ChannelSkew(ratio=N, delay_ms=2.0, second_order_ms2=4.0)),
+        several_speeds,
+        floor_arcsec=2.0,
+    ),
+    "backlash": Case((*BASIC, effects.Backlash(gap_arcsec=40.0, crossing_deg=40.0 * N / 3600.0)), left=0.15),
     "hysteresis_memory": Case((BASIC[0], effects.HysteresisMemory(**LOOP)), nested, in_python=True),
     "hysteresis_parameters": Case(
         (

@@ -2,32 +2,24 @@
 
 from hdbridge.axis.effects.amplitude_drift import AmplitudeDrift
 from hdbridge.axis.effects.backlash import Backlash
-from hdbridge.axis.effects.base import (
-    MEASURED,
-    Cause,
-    Channel,
-    Compensable,
-    Effect,
-    Experiment,
-    FloatArray,
-    Moment,
-    Motion,
-    Moves,
-    Observations,
-    Part,
-    Shape,
-    Sought,
-    Start,
-    Tracker,
-    unmet,
-)
-from hdbridge.axis.effects.basic import BASIC, USUAL_LOOP, is_ripple, ripple
-from hdbridge.axis.effects.carried import Loop
+from hdbridge.axis.effects.base import Effect, unmet
+from hdbridge.axis.effects.carried import BASIC, USUAL_LOOP, Loop, is_ripple, ripple
 from hdbridge.axis.effects.channel_skew import ChannelSkew
 from hdbridge.axis.effects.combine import compensable, conflicts, extended, fall_bound, in_place, refreshed
 from hdbridge.axis.effects.compliance import Compliance
 from hdbridge.axis.effects.count_loss import CountLoss, Step
 from hdbridge.axis.effects.creep import Creep, Relaxation
+from hdbridge.axis.effects.described import (
+    Cause,
+    Compensable,
+    Experiment,
+    Moves,
+    Observations,
+    Part,
+    Shape,
+    Sought,
+    Tracker,
+)
 from hdbridge.axis.effects.direction_phase import DirectionPhase
 from hdbridge.axis.effects.flexspline_order import FlexsplineOrders
 from hdbridge.axis.effects.hysteresis import Hysteresis
@@ -37,7 +29,17 @@ from hdbridge.axis.effects.inertial_windup import InertialWindup
 from hdbridge.axis.effects.kinematics import Observer, moments
 from hdbridge.axis.effects.load_order import LoadOrders
 from hdbridge.axis.effects.local_defect import LocalDefect
-from hdbridge.axis.effects.motion import BoolArray, IntArray, readings
+from hdbridge.axis.effects.motion import (
+    MEASURED,
+    BoolArray,
+    Channel,
+    FloatArray,
+    IntArray,
+    Moment,
+    Motion,
+    Start,
+    readings,
+)
 from hdbridge.axis.effects.motor_encoder_eccentricity import MotorEncoderEccentricity
 from hdbridge.axis.effects.motor_order import MotorOrders
 from hdbridge.axis.effects.orders import MotorOrder
@@ -53,36 +55,13 @@ from hdbridge.axis.effects.wear import Wear
 from hdbridge.axis.effects.zero_drift import ZeroDrift
 from hdbridge.errors import InputError
 
-CATALOGUE: dict[str, type[Effect]] = {
-    each.name: each
-    for each in (
-        Synchronous,
-        Hysteresis,
-        MotorOrders,
-        MotorEncoderEccentricity,
-        LoadOrders,
-        FlexsplineOrders,
-        DirectionPhase,
-        TorqueModulation,
-        Compliance,
-        InertialWindup,
-        VelocityWindup,
-        ChannelSkew,
-        Backlash,
-        HysteresisMemory,
-        HysteresisParameters,
-        RateDependence,
-        SubdivisionalError,
-        ZeroDrift,
-        AmplitudeDrift,
-        Wear,
-        Creep,
-        RatioError,
-        CountLoss,
-        Vibration,
-        LocalDefect,
-    )
-}
+_KINDS: tuple[type[Effect], ...] = (
+    Synchronous, Hysteresis, MotorOrders, MotorEncoderEccentricity, LoadOrders, FlexsplineOrders,
+    DirectionPhase, TorqueModulation, Compliance, InertialWindup, VelocityWindup, ChannelSkew, Backlash,
+    HysteresisMemory, HysteresisParameters, RateDependence, SubdivisionalError, ZeroDrift,
+    AmplitudeDrift, Wear, Creep, RatioError, CountLoss, Vibration, LocalDefect,
+)  # fmt: skip
+CATALOGUE = {each.name: each for each in _KINDS}
 """All effects by canonical name."""
 
 
@@ -120,70 +99,14 @@ def aliases_of(name: str) -> tuple[str, ...]:
 
 
 __all__ = [
-    "CATALOGUE",
-    "MEASURED",
-    "USUAL_LOOP",
-    "AmplitudeDrift",
-    "Backlash",
-    "BoolArray",
-    "Cause",
-    "Channel",
-    "ChannelSkew",
-    "Compensable",
-    "Compliance",
-    "CountLoss",
-    "Creep",
-    "DirectionPhase",
-    "Effect",
-    "Experiment",
-    "FlexsplineOrders",
-    "FloatArray",
-    "Hysteresis",
-    "HysteresisMemory",
-    "HysteresisParameters",
-    "InertialWindup",
-    "IntArray",
-    "LoadOrders",
-    "LocalDefect",
-    "Loop",
-    "Moment",
-    "Motion",
-    "MotorEncoderEccentricity",
-    "MotorOrder",
-    "MotorOrders",
-    "Moves",
-    "Observations",
-    "Observer",
-    "Part",
-    "RateDependence",
-    "RatioError",
-    "Relaxation",
-    "Shape",
-    "Sought",
-    "Start",
-    "Step",
-    "SubdivisionalError",
-    "Synchronous",
-    "TorqueGrowth",
-    "TorqueModulation",
-    "Tracker",
-    "VelocityWindup",
-    "Vibration",
-    "Wear",
-    "ZeroDrift",
-    "aliases_of",
-    "causes",
-    "compensable",
-    "conflicts",
-    "extended",
-    "fall_bound",
-    "in_place",
-    "is_ripple",
-    "moments",
-    "readings",
-    "refreshed",
-    "register",
-    "ripple",
-    "unmet",
-    "withdraw",
-]
+    "CATALOGUE", "MEASURED", "USUAL_LOOP", "AmplitudeDrift", "Backlash", "BoolArray", "Cause",
+    "Channel", "ChannelSkew", "Compensable", "Compliance", "CountLoss", "Creep", "DirectionPhase",
+    "Effect", "Experiment", "FlexsplineOrders", "FloatArray", "Hysteresis", "HysteresisMemory",
+    "HysteresisParameters", "InertialWindup", "IntArray", "LoadOrders", "LocalDefect", "Loop", "Moment",
+    "Motion", "MotorEncoderEccentricity", "MotorOrder", "MotorOrders", "Moves", "Observations",
+    "Observer", "Part", "RateDependence", "RatioError", "Relaxation", "Shape", "Sought", "Start",
+    "Step", "SubdivisionalError", "Synchronous", "TorqueGrowth", "TorqueModulation", "Tracker",
+    "VelocityWindup", "Vibration", "Wear", "ZeroDrift", "aliases_of", "causes", "compensable",
+    "conflicts", "extended", "fall_bound", "in_place", "is_ripple", "moments", "readings", "refreshed",
+    "register", "ripple", "unmet", "withdraw",
+]  # fmt: skip

@@ -1,42 +1,117 @@
-"""Temperature dependence of ripple and friction."""
+"""Temperature dependence of ripple and friction.
+
+Ripple and loop that grow with warmth can be expressed at any reference temperature: amplitudes and growth
+differ, and the sum is the same. The reference is chosen so that the amplitudes are those of the model. At any
+other temperature the drift would come with an apparent change of the model's own orders or loop.
+"""
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
-from typing import Annotated, Any, ClassVar, Self
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Annotated, Final, Self
 
 import numpy as np
 from pydantic import Field
 
-from hdbridge.axis.effects.base import (
-    Cause,
-    Channel,
-    Compensable,
-    Effect,
-    FloatArray,
-    Linear,
-    Moment,
-    Motion,
-    Observations,
-    Part,
-    Start,
-    Tracker,
-)
-from hdbridge.axis.effects.carried import Loop, growth_of, has_loop, has_orders, loop_of, orders_of
+from hdbridge.axis.effects.base import Effect
+from hdbridge.axis.effects.carried import Loop, Modulating, has_loop, has_orders, loop_of, orders_of
+from hdbridge.axis.effects.described import Cause, Compensable, Observations, Part, Tracker
+from hdbridge.axis.effects.hysteresis import Hysteresis
+from hdbridge.axis.effects.hysteresis_memory import HysteresisMemory
+from hdbridge.axis.effects.motion import Channel, FloatArray, Moment, Motion, Start
 from hdbridge.axis.effects.motor_order import MotorOrders
-from hdbridge.axis.effects.orders import RAD_PER_DEG, Orders, OrderTracker, phasors, ripple
-from hdbridge.axis.effects.reference import REACH_K, Told, nearest
+from hdbridge.axis.effects.orders import (
+    RAD_PER_DEG,
+    MotorOrder,
+    Orders,
+    OrderTracker,
+    coefficients_of,
+    phasors,
+    ripple,
+)
+from hdbridge.axis.effects.rate_dependence import RateDependence
+from hdbridge.axis.effects.synchronous import Synchronous
 from hdbridge.axis.effects.torque import TorqueGrowth
 from hdbridge.axis.effects.warmth import Warmed, WarmthState
 
+REACH_K: Final = 30.0
+"""Maximum difference between the temperature of the model's calibration and those of the record; K."""
 
-class AmplitudeDrift(Linear, Warmed):
+
+@dataclass(frozen=True, slots=True)
+class Reparametrised:
+    """A model re-expressed at another reference temperature."""
+
+    warmer_k: float
+    """Temperature above the former reference, K."""
+    orders: FloatArray
+    """Cosines and sines, arcsec."""
+    offsets: FloatArray
+    """Offsets of its loops, arcsec."""
+    per_ripple: float
+    per_loop: float
+    """Factors that convert a share of the former ripple or loop into a share of the present one."""
+
+    def counted(self, effect: Effect) -> Effect:
+        """Re-expresses an effect of the model, or one that is given as a share of it."""
+        if isinstance(effect, Synchronous):
+            return effect.fitted(self.orders)
+        if isinstance(effect, Hysteresis | HysteresisMemory):
+            return effect.model_copy(update={"offset_arcsec": float(self.offsets[0])})
+        if isinstance(effect, RateDependence):
+            return effect.model_copy(update={"growth_percent": effect.growth_percent * self.per_loop})
+        return effect
+
+
+def nearest(
+    carried: Iterable[MotorOrder],
+    loop: Loop,
+    growth_percent: tuple[float, float],
+    now: Sequence[Effect],
+    given: Sequence[Effect],
+) -> Reparametrised | None:
+    """Returns ``now`` re-expressed at the temperature at which it is nearest to ``given``; None if
+    impossible.
+
+    ``growth_percent`` is the growth of ripple and of loop per kelvin.
+    """
+    numbers = {order.order for each in now if isinstance(each, Synchronous) for order in each.orders}
+    # A fit that has not settled may carry other orders than the model has: growth refers to the carried ones.
+    ripple = coefficients_of(each for each in carried if each.order in numbers)
+    loops = np.full(len(_offsets(now)), loop.offset_arcsec)
+    if len(ripple) != len(_orders(now)):
+        return None
+    growth = 0.01 * np.concatenate([growth_percent[0] * ripple, growth_percent[1] * loops])
+    if not np.any(growth):
+        return None
+    change = np.concatenate([_orders(given) - _orders(now), _offsets(given) - _offsets(now)])
+    warmer_k = float(change @ growth) / float(growth @ growth)
+    orders = _orders(now) + warmer_k * growth[: len(ripple)]
+    offsets = _offsets(now) + warmer_k * growth[len(ripple) :]
+    return Reparametrised(warmer_k, orders, offsets, _ratio(ripple, orders), _ratio(loops, offsets))
+
+
+def _ratio(former: FloatArray, present: FloatArray) -> float:
+    return float(np.linalg.norm(former)) / max(float(np.linalg.norm(present)), 1e-9) if len(former) else 1.0
+
+
+def _orders(base: Sequence[Effect]) -> FloatArray:
+    given = [coefficients_of(each.orders) for each in base if isinstance(each, Synchronous)]
+    return np.concatenate(given) if given else np.empty(0)
+
+
+def _offsets(base: Sequence[Effect]) -> FloatArray:
+    return np.array([each.offset_arcsec for each in base if isinstance(each, Hysteresis | HysteresisMemory)])
+
+
+class AmplitudeDrift(Modulating, Warmed):
     """w (ripple S(theta_M) + friction H): the model's ripple and loop change with the gear's warmth w.
 
     Growth of the ripple with torque is the same warm or cold: the torque-dependent part is scaled as well.
     """
 
-    name: ClassVar[str] = "amplitude_drift"
-    about: ClassVar[Cause] = Cause(
+    name = "amplitude_drift"
+    about = Cause(
         title="ripple and friction change with temperature",
         subject="drift",
         equation="w (ripple S + friction H), S the model's orders (times 1 + growth tau where they grow with "
@@ -50,16 +125,16 @@ class AmplitudeDrift(Linear, Warmed):
         source="first-order dependence on temperature with a first-order lag",
         size="10-30 % over the warm-up",
     )
-    compensable: ClassVar[Compensable] = Compensable(
+    compensable = Compensable(
         True, "if the temperature is measured on line; driven by time only after a cold start"
     )
-    carries: ClassVar[Mapping[Part, str]] = {
+    carries = {
         Part.ORDERS: "orders",
         Part.LOOP: "loop",
         Part.GROWTH: "under_load",
     }
-    linear: ClassVar[tuple[str, ...]] = ("ripple_percent_per_k", "friction_percent_per_k")
-    typical: ClassVar[Mapping[str, Any]] = {
+    linear = ("ripple_percent_per_k", "friction_percent_per_k")
+    typical = {
         "ripple_percent_per_k": 0.5,
         "friction_percent_per_k": -0.5,
         "tau_s": 1800.0,
@@ -114,7 +189,7 @@ class AmplitudeDrift(Linear, Warmed):
             each._counted(told) if isinstance(each, AmplitudeDrift) else told.counted(each) for each in now
         )
 
-    def _counted(self, told: Told) -> Self:
+    def _counted(self, told: Reparametrised) -> Self:
         return self.model_copy(
             update={
                 "ripple_percent_per_k": self.ripple_percent_per_k * told.per_ripple,
@@ -174,10 +249,6 @@ class AmplitudeDrift(Linear, Warmed):
 
     def _most(self) -> float:
         return 1.0 if self.under_load is None else 1.0 + self.under_load.most()
-
-    @classmethod
-    def _carried(cls, base: Sequence[Effect]) -> dict[str, Any]:
-        return {"orders": orders_of(base), "loop": loop_of(base), "under_load": growth_of(base)}
 
 
 class _Tracker(Tracker):

@@ -1,29 +1,19 @@
 """Dead zone behind the gear: a loose key, a worn coupling, a gear stage on the output."""
 
 from collections.abc import Iterator, Sequence
-from typing import Annotated, ClassVar, Self
+from typing import Annotated, Self
 
 import numpy as np
 from pydantic import Field
 
-from hdbridge.axis.effects.base import (
-    Cause,
-    Compensable,
-    Effect,
-    Experiment,
-    FloatArray,
-    Linear,
-    Moment,
-    Motion,
-    Observations,
-    Shape,
-    Start,
-    Tracker,
-)
+from hdbridge.axis.effects.base import Effect, Linear
+from hdbridge.axis.effects.described import Cause, Compensable, Experiment, Observations, Shape, Tracker
+from hdbridge.axis.effects.motion import FloatArray, Moment, Motion, Start
 from hdbridge.axis.effects.play import Stop, stop
 from hdbridge.units import ARCSEC_PER_DEG
 
 _SOFTNESS = 1.25
+"""Crossing angle of a gap that an inverse needs, relative to the ideal one."""
 
 
 class Backlash(Linear):
@@ -35,8 +25,8 @@ class Backlash(Linear):
     the motor jump most of the gap at once.
     """
 
-    name: ClassVar[str] = "backlash"
-    about: ClassVar[Cause] = Cause(
+    name = "backlash"
+    about = Cause(
         title="backlash behind the gear",
         equation="-(gap / 2) s, s = clip(s_before + 2 d theta_M / crossing, -1, 1)",
         signature="after each reversal the load rests, then follows: a loop opposite in sense to the "
@@ -56,25 +46,21 @@ class Backlash(Linear):
             ),
         },
     )
-    compensable: ClassVar[Compensable] = Compensable(
+    compensable = Compensable(
         True,
         "while friction holds the load against one side; leave it out if the load swings freely, because the "
         "motor has to cross the gap at each reversal",
     )
-    shape: ClassVar[tuple[Shape, ...]] = (Shape("crossing_deg", 0.02, 20.0, logarithmic=True),)
-    ordinary_arcsec: ClassVar[float] = 1.0
+    shape = (Shape("crossing_deg", 0.02, 20.0, logarithmic=True),)
+    ordinary_arcsec = 1.0
     """Half a gap of 2 arcsec, as much as an elastic loop of another shape can leave as a residual."""
-    linear: ClassVar[tuple[str, ...]] = ("gap_arcsec",)
+    linear = ("gap_arcsec",)
+    typical = {"gap_arcsec": 10.0, "crossing_deg": 0.02}
 
     gap_arcsec: Annotated[float, Field(ge=0, le=3600, description="width of the dead zone, at the load")]
     crossing_deg: Annotated[
         float, Field(gt=0, le=360, description="motor angle that crosses it; at least gap N / 3600")
     ]
-
-    @classmethod
-    def of_gap(cls, gap_arcsec: float, ratio: float, softness: float = _SOFTNESS) -> Self:
-        """Returns a gap with a crossing of ``softness`` times the ideal angle; invertible from 1.25 on."""
-        return cls(gap_arcsec=gap_arcsec, crossing_deg=_crossing_deg(gap_arcsec, ratio, softness))
 
     @classmethod
     def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[Self]:
@@ -91,8 +77,8 @@ class Backlash(Linear):
         The load stands still while the motor crosses, but noise lets a fit return a smaller angle than is
         possible.
         """
-        crossing = _crossing_deg(self.gap_arcsec, ratio)
-        return self.fitted(self.coefficients(), {"crossing_deg": max(crossing, self.crossing_deg)})
+        crossing = _SOFTNESS * self.gap_arcsec * ratio / ARCSEC_PER_DEG
+        return self.model_copy(update={"crossing_deg": max(crossing, self.crossing_deg)})
 
     def columns(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
         """Returns the effect of a gap of 1 arcsec, shape (n, 1)."""
@@ -110,15 +96,6 @@ class Backlash(Linear):
 
     def slope_bound_arcsec_per_deg(self) -> float:
         return self.gap_arcsec / self.crossing_deg
-
-    @classmethod
-    def candidate(cls, ratio: float, base: Sequence[Effect] = ()) -> Self:
-        return cls.of_gap(10.0, ratio)
-
-
-def _crossing_deg(gap_arcsec: float, ratio: float, softness: float = _SOFTNESS) -> float:
-    """Returns the crossing angle of a gap, ``softness`` times the ideal one; motor degrees."""
-    return max(softness * gap_arcsec * ratio / ARCSEC_PER_DEG, 1e-6)
 
 
 class _Tracker(Tracker):

@@ -29,64 +29,25 @@ from hdbridge.axis.effects.described import (
     Cause,
     Coefficient,
     Compensable,
-    Experiment,
+    Level,
+    Memoryless,
     Moves,
+    Observations,
     Part,
     Shape,
     Sought,
     Stretch,
+    Tracker,
 )
-from hdbridge.axis.effects.motion import (
-    AT_REST,
-    MEASURED,
-    SLOT,
-    Channel,
-    FloatArray,
-    Moment,
-    Motion,
-    Start,
-    missing_error,
-)
-from hdbridge.axis.effects.observations import Observations
-from hdbridge.axis.effects.tracker import Level, Memoryless, Tracker
+from hdbridge.axis.effects.motion import MEASURED, Channel, FloatArray, Moment, Motion, Start
 from hdbridge.strictness import Strict
-
-__all__ = [
-    "AT_REST",
-    "MEASURED",
-    "SLOT",
-    "Angleless",
-    "Cause",
-    "Channel",
-    "Coefficient",
-    "Compensable",
-    "Coordinate",
-    "Effect",
-    "Experiment",
-    "FloatArray",
-    "Level",
-    "Linear",
-    "Memoryless",
-    "Moment",
-    "Motion",
-    "Moves",
-    "Observations",
-    "Part",
-    "Shape",
-    "Sought",
-    "Start",
-    "Stretch",
-    "Tracker",
-    "missing_error",
-    "unmet",
-]
 
 GRID: Final[Mapping[int, int]] = {1: 6, 2: 4, 3: 3}
 """Grid points per shape parameter in the default proposals, by the number of shape parameters."""
 
 
-class Effect(Strict, ABC):
-    """A cause of transmission error with its parameters."""
+class Law(Strict, ABC):
+    """What every model needs of an effect: its equation, on a record and on line, and its bounds."""
 
     name: ClassVar[str]
     """Canonical name, used in model files, findings and tests."""
@@ -95,44 +56,8 @@ class Effect(Strict, ABC):
     """Channels usually needed in addition to the motor angle; `needs` gives those of an instance."""
     compensable: ClassVar[Compensable]
     """Decision to compensate it or not, with the reason; see `is_compensable`."""
-    replaces: ClassVar[str] = ""
-    """Name of the effect that it replaces in a model, if it does not add to the others."""
-    part: ClassVar[Part | None] = None
-    """Part of a model that it constitutes."""
-    changes: ClassVar[Part | None] = None
-    """Part of a model that it modifies, if it is not an addition."""
-    carries: ClassVar[Mapping[Part, str]] = {}
-    """Parts that it carries a copy of, because it scales them, and the field that holds each."""
-    usual: ClassVar[int] = 1
-    """Maximum number of similar instances on one axis; more point to a single cause outside the catalogue. At
-    1 there is never a second.
-    """
-    nonnegative: ClassVar[bool] = False
-    """True if no coefficient can be negative."""
-    curved: ClassVar[bool] = False
-    """True if its columns depend on its coefficients, so that a linear fit must be iterated."""
-    sought: ClassVar[Sought | None] = None
-    """Form for a matched-filter search over its first shape parameters, if no grid covers the possible
-    locations.
-    """
-    ordinary_arcsec: ClassVar[float] = 0.0
-    """Peak amplitude on a healthy axis, of this cause or an indistinguishable one.
-    """
-    incidental: ClassVar[frozenset[str]] = frozenset()
-    """Names of coefficients that are no evidence for the cause, because they are also non-zero without it."""
-    inexact: ClassVar[float] = 0.0
-    """Tolerance for deviations from this effect's law: share of its power that may appear as a smaller
-    instance.
-    """
     shape: ClassVar[tuple[Shape, ...]] = ()
     """Non-linear parameters; `columns` covers all others."""
-    typical: ClassVar[Mapping[str, Any]] = {}
-    """Typical parameters, for `candidate`."""
-    drifting: ClassVar[tuple[str, ...]] = ()
-    """Parameters that wear and temperature change over months and that no load encoder fault alone imitates.
-
-    Either all parameters that `columns` covers, or none.
-    """
 
     def predict(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
         """Returns the error at the load for each sample, arcsec, shape (n,)."""
@@ -177,6 +102,56 @@ class Effect(Strict, ABC):
         """
         return None
 
+    def parameters(self) -> dict[str, Any]:
+        """Returns the parameters as stored in the model file."""
+        return self.model_dump(mode="json")
+
+    def needs(self) -> frozenset[Channel]:
+        """Returns the channels that this instance needs, given its parameters."""
+        return self.channels
+
+    def is_compensable(self) -> bool:
+        """Returns True if the compensation should correct this instance."""
+        return self.compensable.possible
+
+
+class Effect(Law):
+    """A cause of transmission error: its law, and hints for a diagnosis, each of which has a default."""
+
+    part: ClassVar[Part | None] = None
+    """Part of a model that it constitutes."""
+    changes: ClassVar[Part | None] = None
+    """Part of a model that it modifies, if it is not an addition."""
+    replaces: ClassVar[str] = ""
+    """Name of the effect that it replaces in a model, if it does not add to the others."""
+    carries: ClassVar[Mapping[Part, str]] = {}
+    """Parts that it carries a copy of, because it scales them, and the field that holds each."""
+    typical: ClassVar[Mapping[str, Any]] = {}
+    """Typical parameters, for `candidate`."""
+    usual: ClassVar[int] = 1
+    """Maximum number of similar instances on one axis; more point to a single cause outside the catalogue. At
+    1 there is never a second.
+    """
+    nonnegative: ClassVar[bool] = False
+    """True if no coefficient can be negative."""
+    curved: ClassVar[bool] = False
+    """True if its columns depend on its coefficients, so that a linear fit must be iterated."""
+    sought: ClassVar[Sought | None] = None
+    """Form for a matched-filter search over its first shape parameters, if no grid covers the possible
+    locations.
+    """
+    ordinary_arcsec: ClassVar[float] = 0.0
+    """Peak amplitude on a healthy axis, of this cause or an indistinguishable one."""
+    incidental: ClassVar[frozenset[str]] = frozenset()
+    """Names of coefficients that are no evidence for the cause, because they are also non-zero without it."""
+    inexact: ClassVar[float] = 0.0
+    """Share of its power that may appear as a smaller instance: a real effect deviates from its law."""
+    drifting: ClassVar[tuple[str, ...]] = ()
+    """Parameters that wear and temperature change over months and that no load encoder fault alone imitates.
+
+    Either all parameters that `columns` covers, or none.
+    """
+
     @classmethod
     def candidate(cls, ratio: float, base: Sequence[Effect] = ()) -> Self:
         """Returns an effect of typical size for a gear ratio, as the start of a fit or a plan.
@@ -187,14 +162,12 @@ class Effect(Strict, ABC):
         values = {**cls.typical, **cls._carried(base)}
         if "ratio" in cls.model_fields:
             values["ratio"] = ratio
-        return cls(**values)
+        return cls(**values).tidied(ratio)
 
     @classmethod
     def _carried(cls, base: Sequence[Effect]) -> dict[str, Any]:
         """Returns the parameters that are copies of parts of a model."""
         return {}
-
-    # --- properties in a record
 
     @classmethod
     def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[Self]:
@@ -332,20 +305,6 @@ class Effect(Strict, ABC):
         """
         return np.empty((len(motion), 0))
 
-    # --- file representation
-
-    def parameters(self) -> dict[str, Any]:
-        """Returns the parameters as stored in the model file."""
-        return self.model_dump(mode="json")
-
-    def needs(self) -> frozenset[Channel]:
-        """Returns the channels that this instance needs, given its parameters."""
-        return self.channels
-
-    def is_compensable(self) -> bool:
-        """Returns True if the compensation should correct this instance."""
-        return self.compensable.possible
-
     def violations(self) -> list[str]:
         """Describes the parameters outside their physical ranges, which `fitted` does not refuse."""
         try:
@@ -382,8 +341,22 @@ class Linear(Effect):
         return self.model_copy(update={**values, **dict(shape or {})})
 
 
-class Angleless(Effect):
+class Momentary(Effect):
+    """Base class of effects without state: angle and moment alone decide."""
+
+    @abstractmethod
+    def at(self, motor_deg: float, moment: Moment) -> float:
+        """Returns the error at the load at one moment, arcsec, in plain floats for the control loop."""
+
+    def tracker(self, start: Start = Start.VIRGIN) -> Tracker:
+        return Memoryless(self.at)
+
+
+class Angleless(Momentary):
     """Base class of effects that depend on the moment alone, not on the motor angle."""
+
+    def tracker(self, start: Start = Start.VIRGIN) -> Tracker:
+        return Level(self.at)
 
     def slope_bound_arcsec_per_deg(self) -> float:
         return 0.0

@@ -5,15 +5,16 @@ tracked and read on its own, it carries a copy of the part that it modulates, ta
 created; `combine.refreshed` keeps the copy up to date.
 """
 
-from collections.abc import Iterable
-from typing import Annotated
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Annotated, Any, Final
 
 from pydantic import Field
 
-from hdbridge.axis.effects.base import Effect, Part
+from hdbridge.axis.effects.base import Effect, Linear
+from hdbridge.axis.effects.described import Part
 from hdbridge.axis.effects.hysteresis import Hysteresis
 from hdbridge.axis.effects.hysteresis_memory import HysteresisMemory
-from hdbridge.axis.effects.orders import MotorOrder
+from hdbridge.axis.effects.orders import MotorOrder, orders_from
 from hdbridge.axis.effects.synchronous import TYPICAL_ORDERS, Synchronous
 from hdbridge.axis.effects.torque import TorqueGrowth
 from hdbridge.strictness import Strict
@@ -39,6 +40,22 @@ class Loop(Strict):
 
 TYPICAL_LOOP = Loop(offset_arcsec=40.0, width_deg=20.0, exponent=1.6)
 """Loop of a published gear of ratio 50 (Table 2 of the article that hdbridge implements)."""
+
+
+BASIC: Final = frozenset({Synchronous.name, Hysteresis.name})
+"""Names of the two basic parts."""
+USUAL_LOOP: Final[Effect] = Hysteresis(offset_arcsec=40.0, width_deg=20.0, exponent=1.8)
+"""Initial loop for a fit."""
+
+
+def ripple(numbers: Iterable[int]) -> Effect:
+    """Returns a ripple with these motor orders at zero amplitude, as the start of a fit."""
+    return Synchronous(orders=orders_from(numbers, 0.0))
+
+
+def is_ripple(effect: Effect) -> bool:
+    """Returns True if an effect is the model's ripple rather than additional orders."""
+    return isinstance(effect, Synchronous)
 
 
 def loop_of(base: Iterable[Effect]) -> Loop:
@@ -74,3 +91,16 @@ def growth_of(base: Iterable[Effect]) -> TorqueGrowth | None:
             values = {name: getattr(each, name) for name in TorqueGrowth.model_fields}
             return TorqueGrowth.model_construct(**values)
     return None
+
+
+class Modulating(Linear):
+    """Base class of effects that scale parts of a model, of which they carry copies."""
+
+    @classmethod
+    def _carried(cls, base: Sequence[Effect]) -> dict[str, Any]:
+        parts: Mapping[Part, Callable[[Sequence[Effect]], Any]] = {
+            Part.ORDERS: orders_of,
+            Part.LOOP: loop_of,
+            Part.GROWTH: growth_of,
+        }
+        return {field: parts[part](base) for part, field in cls.carries.items()}

@@ -1,29 +1,16 @@
 """Time skew between the samples of the two encoders."""
 
-from collections.abc import Iterator, Mapping, Sequence
-from typing import Annotated, Any, ClassVar, Self
+from collections.abc import Iterator, Sequence
+from typing import Annotated, Self
 
 import numpy as np
 from pydantic import Field
 
-from hdbridge.axis.effects.base import (
-    Angleless,
-    Cause,
-    Channel,
-    Compensable,
-    Effect,
-    Experiment,
-    FloatArray,
-    Linear,
-    Memoryless,
-    Moment,
-    Motion,
-    Observations,
-    Start,
-    Tracker,
-)
+from hdbridge.axis.effects.base import Angleless, Effect, Linear
+from hdbridge.axis.effects.described import Cause, Compensable, Experiment, Observations
 from hdbridge.axis.effects.kinematics import acceleration_of, speed_of
 from hdbridge.axis.effects.load_order import Ratio
+from hdbridge.axis.effects.motion import Channel, FloatArray, Moment, Motion, Start
 from hdbridge.units import ARCSEC_PER_DEG
 
 
@@ -35,9 +22,9 @@ class ChannelSkew(Angleless, Linear):
     would be attributed to inertial wind-up.
     """
 
-    name: ClassVar[str] = "channel_skew"
-    channels: ClassVar[frozenset[Channel]] = frozenset({Channel.SPEED, Channel.ACCELERATION})
-    about: ClassVar[Cause] = Cause(
+    name = "channel_skew"
+    channels = frozenset({Channel.SPEED, Channel.ACCELERATION})
+    about = Cause(
         title="delay between the two encoder samples",
         subject="delays",
         equation="delay omega_L + second alpha_L / 2; omega_L, alpha_L = commanded motor speed and "
@@ -58,13 +45,13 @@ class ChannelSkew(Angleless, Linear):
             ),
         },
     )
-    compensable: ClassVar[Compensable] = Compensable(False, "it is an error of the measurement")
-    ordinary_arcsec: ClassVar[float] = 1.0
+    compensable = Compensable(False, "it is an error of the measurement")
+    ordinary_arcsec = 1.0
     """Usual skew, because no two encoders are sampled at exactly the same instant."""
-    incidental: ClassVar[frozenset[str]] = frozenset({"second_order_ms2"})
+    incidental = frozenset({"second_order_ms2"})
     """Includes the load's own wind-up."""
-    linear: ClassVar[tuple[str, ...]] = ("delay_ms", "second_order_ms2")
-    typical: ClassVar[Mapping[str, Any]] = {"delay_ms": 0.5, "second_order_ms2": 0.25}
+    linear = ("delay_ms", "second_order_ms2")
+    typical = {"delay_ms": 0.5, "second_order_ms2": 0.25}
 
     ratio: Ratio
     delay_ms: Annotated[
@@ -87,11 +74,6 @@ class ChannelSkew(Angleless, Linear):
     ] = 1e6
 
     @classmethod
-    def of_delay(cls, delay_ms: float, ratio: float) -> Self:
-        """Returns a pure delay."""
-        return cls(ratio=ratio, delay_ms=delay_ms, second_order_ms2=delay_ms * delay_ms)
-
-    @classmethod
     def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[Self]:
         yield cls(ratio=observations.ratio, delay_ms=1.0, second_order_ms2=1.0)
 
@@ -102,24 +84,13 @@ class ChannelSkew(Angleless, Linear):
         gain = ARCSEC_PER_DEG / self.ratio
         return np.column_stack([1e-3 * gain * speed, 0.5e-6 * gain * acceleration])
 
-    def tracker(self, start: Start = Start.VIRGIN) -> Tracker:
-        return _Tracker(self)
+    def at(self, motor_deg: float, moment: Moment) -> float:
+        speed = min(max(moment.motor_speed_deg_s, -self.limit_deg_s), self.limit_deg_s)
+        acceleration = min(max(moment.motor_acceleration_deg_s2, -self.limit_deg_s2), self.limit_deg_s2)
+        skew_deg = 1e-3 * self.delay_ms * speed + 0.5e-6 * self.second_order_ms2 * acceleration
+        return ARCSEC_PER_DEG / self.ratio * skew_deg
 
     def bound_arcsec(self) -> float:
         speed = 1e-3 * abs(self.delay_ms) * self.limit_deg_s
         acceleration = 0.5e-6 * abs(self.second_order_ms2) * self.limit_deg_s2
         return ARCSEC_PER_DEG / self.ratio * (speed + acceleration)
-
-
-class _Tracker(Memoryless):
-    def __init__(self, effect: ChannelSkew) -> None:
-        gain = ARCSEC_PER_DEG / effect.ratio
-        self._first = 1e-3 * gain * effect.delay_ms
-        self._second = 0.5e-6 * gain * effect.second_order_ms2
-        self._limit = effect.limit_deg_s
-        self._limit2 = effect.limit_deg_s2
-
-    def peek(self, motor_deg: float, moment: Moment) -> float:
-        speed = min(max(moment.motor_speed_deg_s, -self._limit), self._limit)
-        acceleration = min(max(moment.motor_acceleration_deg_s2, -self._limit2), self._limit2)
-        return self._first * speed + self._second * acceleration

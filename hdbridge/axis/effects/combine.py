@@ -6,8 +6,9 @@ import math
 from collections.abc import Iterable
 
 from hdbridge.axis.effects.amplitude_drift import AmplitudeDrift
-from hdbridge.axis.effects.base import Effect, Part
+from hdbridge.axis.effects.base import Effect
 from hdbridge.axis.effects.carried import Loop, growth_of, loop_of
+from hdbridge.axis.effects.described import Part
 from hdbridge.axis.effects.hysteresis import Hysteresis
 from hdbridge.axis.effects.hysteresis_memory import HysteresisMemory
 from hdbridge.axis.effects.hysteresis_parameters import HysteresisParameters

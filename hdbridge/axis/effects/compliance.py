@@ -2,35 +2,17 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import pairwise
-from typing import Annotated, Any, ClassVar, Literal, Self
+from typing import Annotated, Literal, Self
 
 import numpy as np
 from pydantic import Field, model_validator
 
-from hdbridge.axis.effects.base import (
-    SLOT,
-    Angleless,
-    Cause,
-    Channel,
-    Compensable,
-    Effect,
-    FloatArray,
-    Linear,
-    Memoryless,
-    Moment,
-    Motion,
-    Observations,
-    Shape,
-    Start,
-    Tracker,
-)
+from hdbridge.axis.effects.base import Angleless, Effect, Linear
+from hdbridge.axis.effects.described import Cause, Compensable, Observations, Shape
 from hdbridge.axis.effects.load_order import LoadOrders
-from hdbridge.axis.effects.observations import top
+from hdbridge.axis.effects.motion import SLOT, Channel, FloatArray, Moment, Motion, Start
 from hdbridge.axis.effects.orders import orders_from
-from hdbridge.axis.effects.torque import TorqueChannel, TorqueLimit
-
-ARCSEC_PER_RAD = 648_000.0 / np.pi
-"""Conversion constant: a stiffness of K Nm/rad is a compliance of ARCSEC_PER_RAD / K arcsec/Nm."""
+from hdbridge.axis.effects.torque import TorqueChannel, TorqueLimit, top
 
 SOFTER = 1.05
 """Factor by which noise alone may make a zone softer than the one before it."""
@@ -44,9 +26,9 @@ class Compliance(Angleless, Linear):
     Written in compliances, because the error is linear in them: c1 = 206265 / K1 arcsec/Nm with K1 in Nm/rad.
     """
 
-    name: ClassVar[str] = "compliance"
-    channels: ClassVar[frozenset[Channel]] = frozenset({Channel.LOAD_TORQUE})
-    about: ClassVar[Cause] = Cause(
+    name = "compliance"
+    channels = frozenset({Channel.LOAD_TORQUE})
+    about = Cause(
         title="wind-up by the load torque",
         subject="effects of torque",
         equation="sense sgn(T) (c1 min(|T|, T1) + c2 (|T| between T1 and T2) + c3 (|T| beyond T2)), c = "
@@ -59,17 +41,17 @@ class Compliance(Angleless, Linear):
         source="catalogue stiffness K1, K2, K3 of strain wave gears with torques T1, T2",
         size="about 16 arcsec/Nm in a size 20; 10-100 arcsec",
     )
-    compensable: ClassVar[Compensable] = Compensable(
+    compensable = Compensable(
         True,
         "the load really moves so, where the torque is known on line (a torque sensor, or gravity from a "
         "model)",
     )
-    shape: ClassVar[tuple[Shape, ...]] = (
+    shape = (
         Shape("torque1_nm", 0.1, 1e5, logarithmic=True),
         Shape("torque2_nm", 0.2, 1e5, logarithmic=True),
     )
-    linear: ClassVar[tuple[str, ...]] = ("c1_arcsec_per_nm", "c2_arcsec_per_nm", "c3_arcsec_per_nm")
-    typical: ClassVar[Mapping[str, Any]] = {
+    linear = ("c1_arcsec_per_nm", "c2_arcsec_per_nm", "c3_arcsec_per_nm")
+    typical = {
         "c1_arcsec_per_nm": 15.9,
         "c2_arcsec_per_nm": 11.5,
         "c3_arcsec_per_nm": 9.0,
@@ -151,8 +133,19 @@ class Compliance(Angleless, Linear):
         effect = super().fitted(-values if turned else values, shape)
         return effect.model_copy(update={"sense": -self.sense}) if turned else effect
 
-    def tracker(self, start: Start = Start.VIRGIN) -> Tracker:
-        return _Tracker(self)
+    def at(self, motor_deg: float, moment: Moment) -> float:
+        given = moment.measured[SLOT[Channel(self.torque)]]
+        error = self._wind_up(min(abs(given), self.limit_nm))
+        return self.sense * error if given >= 0.0 else -self.sense * error
+
+    def _wind_up(self, torque: float) -> float:
+        """Returns the wind-up at a torque of at least zero, arcsec."""
+        error = self.c1_arcsec_per_nm * min(torque, self.torque1_nm)
+        if torque > self.torque1_nm:
+            error += self.c2_arcsec_per_nm * min(torque - self.torque1_nm, self.torque2_nm - self.torque1_nm)
+        if torque > self.torque2_nm:
+            error += self.c3_arcsec_per_nm * (torque - self.torque2_nm)
+        return error
 
     def bound_arcsec(self) -> float:
         low, high, most = self.torque1_nm, self.torque2_nm, self.limit_nm
@@ -161,29 +154,3 @@ class Compliance(Angleless, Linear):
             + abs(self.c2_arcsec_per_nm) * min(max(most - low, 0.0), high - low)
             + abs(self.c3_arcsec_per_nm) * max(most - high, 0.0)
         )
-
-    def stiffness_nm_per_rad(self) -> tuple[float, float, float]:
-        """Returns K1, K2, K3 as in catalogues; infinite for a compliance of zero."""
-        first, second, third = (ARCSEC_PER_RAD / each if each else np.inf for each in self.coefficients())
-        return float(first), float(second), float(third)
-
-
-class _Tracker(Memoryless):
-    def __init__(self, effect: Compliance) -> None:
-        self._c = (effect.c1_arcsec_per_nm, effect.c2_arcsec_per_nm, effect.c3_arcsec_per_nm)
-        self._low = effect.torque1_nm
-        self._high = effect.torque2_nm
-        self._limit = effect.limit_nm
-        self._sense = effect.sense
-        self._slot = SLOT[Channel(effect.torque)]
-
-    def peek(self, motor_deg: float, moment: Moment) -> float:
-        given = moment.measured[self._slot]
-        torque = min(abs(given), self._limit)
-        first, second, third = self._c
-        error = first * min(torque, self._low)
-        if torque > self._low:
-            error += second * min(torque - self._low, self._high - self._low)
-            if torque > self._high:
-                error += third * (torque - self._high)
-        return self._sense * error if given >= 0.0 else -self._sense * error

@@ -1,30 +1,23 @@
 """Counts lost by an encoder, or a tooth jumped: a persistent step at one time."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Annotated, Any, ClassVar, Self
+from typing import Annotated, Self
 
 import numpy as np
 from pydantic import Field
 
-from hdbridge.axis.effects.base import (
-    Angleless,
+from hdbridge.axis.effects.base import Angleless, Effect
+from hdbridge.axis.effects.described import (
     Cause,
-    Channel,
     Coefficient,
     Compensable,
-    Effect,
-    FloatArray,
-    Memoryless,
-    Moment,
-    Motion,
     Moves,
     Observations,
     Shape,
     Sought,
-    Start,
     Stretch,
-    Tracker,
 )
+from hdbridge.axis.effects.motion import Channel, FloatArray, Moment, Motion, Start
 from hdbridge.axis.effects.path import away_from_reversals
 from hdbridge.strictness import Strict
 
@@ -42,9 +35,9 @@ class Step(Strict):
 class CountLoss(Angleless):
     """Sum of size_j for all steps with time_j <= t."""
 
-    name: ClassVar[str] = "count_loss"
-    channels: ClassVar[frozenset[Channel]] = frozenset({Channel.TIME})
-    about: ClassVar[Cause] = Cause(
+    name = "count_loss"
+    channels = frozenset({Channel.TIME})
+    about = Cause(
         title="lasting step",
         subject="lost counts",
         equation="sum of size_j over the steps with t >= t_j",
@@ -57,17 +50,17 @@ class CountLoss(Angleless):
         source="kinematics",
         size="from one motor count (3 arcsec)",
     )
-    compensable: ClassVar[Compensable] = Compensable(
+    compensable = Compensable(
         False,
         "it cannot be predicted and ends with homing; a loss in the load encoder is an error of the "
         "measurement",
     )
-    shape: ClassVar[tuple[Shape, ...]] = (Shape("time_s", -1e10, 1e10, moves=Moves.NEVER),)
-    usual: ClassVar[int] = 2
-    sought: ClassVar[Sought | None] = Sought.STEP
-    inexact: ClassVar[float] = 0.03
+    shape = (Shape("time_s", -1e10, 1e10, moves=Moves.NEVER),)
+    usual = 2
+    sought = Sought.STEP
+    inexact = 0.03
     """Slow effects leave small steps next to a large one."""
-    typical: ClassVar[Mapping[str, Any]] = {"steps": (Step(time_s=0.0, size_arcsec=10.0),)}
+    typical = {"steps": (Step(time_s=0.0, size_arcsec=10.0),)}
     """One step of 10 arcsec at time zero."""
 
     steps: Annotated[
@@ -116,8 +109,9 @@ class CountLoss(Angleless):
             for i in range(len(self.steps))
         )
 
-    def tracker(self, start: Start = Start.VIRGIN) -> Tracker:
-        return _Tracker([(each.time_s, each.size_arcsec) for each in self.steps])
+    def at(self, motor_deg: float, moment: Moment) -> float:
+        now = moment.time_s
+        return sum((each.size_arcsec for each in self.steps if now >= each.time_s), 0.0)
 
     def columns(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
         """Returns a unit step per loss, shape (n, steps)."""
@@ -140,12 +134,3 @@ class CountLoss(Angleless):
 
     def bound_arcsec(self) -> float:
         return sum(abs(each.size_arcsec) for each in self.steps)
-
-
-class _Tracker(Memoryless):
-    def __init__(self, steps: list[tuple[float, float]]) -> None:
-        self._steps = steps
-
-    def peek(self, motor_deg: float, moment: Moment) -> float:
-        now = moment.time_s
-        return sum((size for time_s, size in self._steps if now >= time_s), 0.0)

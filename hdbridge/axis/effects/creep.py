@@ -2,32 +2,26 @@
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Annotated, Any, ClassVar, Self
+from typing import Annotated, Self
 
 import numpy as np
 from pydantic import Field
 
 from hdbridge.axis.effects import coordinate as over
-from hdbridge.axis.effects.base import (
-    Angleless,
+from hdbridge.axis.effects.base import Effect
+from hdbridge.axis.effects.coordinate import Coordinate
+from hdbridge.axis.effects.described import (
     Cause,
-    Channel,
     Coefficient,
     Compensable,
-    Coordinate,
-    Effect,
-    FloatArray,
-    Moment,
-    Motion,
     Observations,
     Shape,
-    Start,
     Stretch,
     Tracker,
 )
 from hdbridge.axis.effects.kinematics import speed_of
-from hdbridge.axis.effects.observations import longest_rest_s
-from hdbridge.axis.effects.path import standing_s
+from hdbridge.axis.effects.motion import Channel, FloatArray, Moment, Motion, Start
+from hdbridge.axis.effects.path import longest_rest_s, standing_s
 from hdbridge.axis.effects.recurrence import recurrence
 from hdbridge.strictness import Strict
 
@@ -44,7 +38,7 @@ class Relaxation(Strict):
     tau_s: Annotated[float, Field(gt=0, le=1e6, description="time constant at rest")]
 
 
-class Creep(Angleless):
+class Creep(Effect):
     """Sum of A_j y_j; y_j approaches the direction in motion, and zero at rest.
 
     In motion the time constant is ``build_up`` tau_j. A value of 1 is a linear viscoelastic element (short
@@ -52,9 +46,9 @@ class Creep(Angleless):
     / tau_j).
     """
 
-    name: ClassVar[str] = "creep"
-    channels: ClassVar[frozenset[Channel]] = frozenset({Channel.TIME, Channel.SPEED})
-    about: ClassVar[Cause] = Cause(
+    name = "creep"
+    channels = frozenset({Channel.TIME, Channel.SPEED})
+    about = Cause(
         title="relaxation after a stop",
         equation="sum of A_j y_j; tau_j dy_j/dt = -y_j at rest, build_up tau_j dy_j/dt = sgn(v) - y_j in "
         "motion",
@@ -66,18 +60,16 @@ class Creep(Angleless):
         source="generalised Kelvin-Voigt element: a sum of exponentials",
         size="1-10 arcsec",
     )
-    compensable: ClassVar[Compensable] = Compensable(
-        True, "the load really moves so, and the command says when it stopped"
-    )
-    shape: ClassVar[tuple[Shape, ...]] = (
+    compensable = Compensable(True, "the load really moves so, and the command says when it stopped")
+    shape = (
         Shape("tau_s", 0.05, 3600.0, logarithmic=True),
         Shape("build_up", 0.01, 1.0, logarithmic=True),
     )
     """Time constant of the first exponential; the others keep their ratio to it."""
 
-    usual: ClassVar[int] = 8
+    usual = 8
     """A real relaxation is a sum of exponentials."""
-    typical: ClassVar[Mapping[str, Any]] = {
+    typical = {
         "parts": tuple(Relaxation(amplitude_arcsec=2.0, tau_s=tau_s) for tau_s in (2.0, 20.0)),
         "build_up": 0.1,
     }
@@ -161,6 +153,9 @@ class Creep(Angleless):
 
     def bound_arcsec(self) -> float:
         return sum(abs(each.amplitude_arcsec) for each in self.parts)
+
+    def slope_bound_arcsec_per_deg(self) -> float:
+        return 0.0
 
 
 class _Tracker(Tracker):

@@ -1,12 +1,13 @@
-"""Descriptive tables of an effect: texts, shape parameters, and its part in a model."""
+"""Terms in which an effect is described: texts, shape parameters, its part in a model, on-line tracker."""
 
 import math
-from collections.abc import Mapping
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from enum import Enum
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
-from hdbridge.axis.effects.motion import BoolArray
+from hdbridge.axis.effects.motion import BoolArray, Moment, Motion
 
 
 class Part(Enum):
@@ -132,3 +133,76 @@ class Stretch:
     """Mask of the samples, shape (n,)."""
     otherwise: str
     """Reason to reject the effect if it is not visible there, for messages."""
+
+
+class Observations(Protocol):
+    """A record as seen by an effect."""
+
+    @property
+    def motion(self) -> Motion:
+        """Motion of the axis."""
+        ...
+
+    @property
+    def ratio(self) -> float:
+        """Motor turns per turn of the load."""
+        ...
+
+    @property
+    def period_s(self) -> float:
+        """Median time between samples, s."""
+        ...
+
+    @property
+    def reversals(self) -> int:
+        """Number of motor reversals with travel on both sides."""
+        ...
+
+    @property
+    def motor_count_arcsec(self) -> float:
+        """One count of the motor encoder at the load, arcsec."""
+        ...
+
+
+class Tracker(ABC):
+    """On-line state of an effect.
+
+    `peek` returns the error at a motor angle reached from the present state, as often as it is called. Only
+    `advance` changes the state.
+    """
+
+    @property
+    def memory_deg(self) -> float:
+        """Motor angle that, run in one direction, makes the state independent of the start.
+
+        0 if the path is not remembered at all. Memory in time (creep, warmth) does not count.
+        """
+        return 0.0
+
+    @abstractmethod
+    def peek(self, motor_deg: float, moment: Moment) -> float:
+        """Returns the error at the load if the motor moved straight to ``motor_deg``, arcsec; changes
+        nothing.
+        """
+
+    @abstractmethod
+    def advance(self, motor_deg: float, moment: Moment) -> float:
+        """Moves to ``motor_deg``, keeps the new state and returns the error at the load, arcsec."""
+
+
+class Memoryless(Tracker):
+    """Tracker without state, for which `advance` equals `peek`."""
+
+    def __init__(self, at: Callable[[float, Moment], float]) -> None:
+        """``at`` returns the error at a motor angle and a moment."""
+        self._at = at
+
+    def peek(self, motor_deg: float, moment: Moment) -> float:
+        return self._at(motor_deg, moment)
+
+    def advance(self, motor_deg: float, moment: Moment) -> float:
+        return self.peek(motor_deg, moment)
+
+
+class Level(Memoryless):
+    """Tracker whose error is the same at every motor angle: the moment alone decides."""

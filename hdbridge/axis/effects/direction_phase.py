@@ -1,30 +1,18 @@
 """Shift of the synchronous part with the direction of travel, because other tooth flanks carry."""
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
-from typing import Annotated, Any, ClassVar, Self
+from collections.abc import Iterator, Sequence
+from typing import Annotated, Self
 
 import numpy as np
 from pydantic import Field
 
-from hdbridge.axis.effects.base import (
-    Cause,
-    Channel,
-    Compensable,
-    Effect,
-    FloatArray,
-    Linear,
-    Memoryless,
-    Moment,
-    Motion,
-    Observations,
-    Part,
-    Start,
-    Tracker,
-)
-from hdbridge.axis.effects.carried import has_orders, orders_of
+from hdbridge.axis.effects.base import Effect
+from hdbridge.axis.effects.carried import Modulating, has_orders, orders_of
+from hdbridge.axis.effects.described import Cause, Compensable, Memoryless, Observations, Part, Tracker
 from hdbridge.axis.effects.kinematics import direction_of
-from hdbridge.axis.effects.orders import RAD_PER_DEG, Orders, horner, phasors, ripple
+from hdbridge.axis.effects.motion import Channel, FloatArray, Motion, Start
+from hdbridge.axis.effects.orders import RAD_PER_DEG, Orders, OrderTracker, phasors, ripple
 
 STEEPEST = 3.0
 """Limit of tan(k shift), reached at k shift = 72 deg; up to 108 deg the mean is under a third
@@ -32,7 +20,7 @@ of the order.
 """
 
 
-class DirectionPhase(Linear):
+class DirectionPhase(Modulating):
     """Direction-odd part of a tooth error T(theta_M + d shift), S being the mean over both flanks.
 
     An order A_k of the tooth error appears as A_k cos(k shift) in the mean, which is the model's synchronous
@@ -42,9 +30,9 @@ class DirectionPhase(Linear):
     free amplitude per order would be many parameters for one cause.
     """
 
-    name: ClassVar[str] = "direction_phase"
-    channels: ClassVar[frozenset[Channel]] = frozenset({Channel.DIRECTION})
-    about: ClassVar[Cause] = Cause(
+    name = "direction_phase"
+    channels = frozenset({Channel.DIRECTION})
+    about = Cause(
         title="synchronous part shifted with the direction",
         equation="d times the sum over k of -A_k tan(k shift) sin(k theta_M + phi_k), A_k and phi_k the "
         "synchronous part's, d the direction held at rest",
@@ -56,13 +44,11 @@ class DirectionPhase(Linear):
         source="phase of the kinematic error differs between the tooth flanks that carry",
         size="1-5 arcsec",
     )
-    compensable: ClassVar[Compensable] = Compensable(
-        True, "the load really moves so; the direction is commanded"
-    )
-    carries: ClassVar[Mapping[Part, str]] = {Part.ORDERS: "orders"}
-    curved: ClassVar[bool] = True
-    linear: ClassVar[tuple[str, ...]] = ("shift_deg",)
-    typical: ClassVar[Mapping[str, Any]] = {"shift_deg": 1.0}
+    compensable = Compensable(True, "the load really moves so; the direction is commanded")
+    carries = {Part.ORDERS: "orders"}
+    curved = True
+    linear = ("shift_deg",)
+    typical = {"shift_deg": 1.0}
     """A shift of 1 degree of the base's orders."""
 
     orders: Orders
@@ -82,7 +68,9 @@ class DirectionPhase(Linear):
         return math.cos(order * math.radians(self.shift_deg))
 
     def tracker(self, start: Start = Start.VIRGIN) -> Tracker:
-        return _Tracker(tuple(self.shift_deg * each for each in self._odd()), start.value)
+        orders = OrderTracker(tuple(self.shift_deg * each for each in self._odd()))
+        before = start.value
+        return Memoryless(lambda motor_deg, now: (now.direction or before) * orders.peek(motor_deg, now))
 
     def columns(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
         """Returns the effect per degree of shift *at the present shift*, shape (n, 1); nearly linear, so
@@ -98,10 +86,6 @@ class DirectionPhase(Linear):
         steepness = sum(k * abs(each) for k, each in enumerate(reversed(self._odd())))
         return RAD_PER_DEG * abs(self.shift_deg) * steepness
 
-    @classmethod
-    def _carried(cls, base: Sequence[Effect]) -> dict[str, Any]:
-        return {"orders": orders_of(base)}
-
     def _odd(self) -> tuple[complex, ...]:
         """Returns the phasors of the odd part per degree of shift: j A_k tan(k shift) / shift
         exp(j phi_k).
@@ -115,14 +99,3 @@ class DirectionPhase(Linear):
             return order * RAD_PER_DEG
         tangent = math.tan(order * RAD_PER_DEG * self.shift_deg)
         return min(max(tangent, -STEEPEST), STEEPEST) / self.shift_deg
-
-
-class _Tracker(Memoryless):
-    def __init__(self, amplitudes: tuple[complex, ...], start: int) -> None:
-        self._phasors = amplitudes
-        self._start = start
-
-    def peek(self, motor_deg: float, moment: Moment) -> float:
-        angle = RAD_PER_DEG * motor_deg
-        error = horner(self._phasors, complex(math.cos(angle), math.sin(angle))).real
-        return (moment.direction or self._start) * error

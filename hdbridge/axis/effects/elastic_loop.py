@@ -12,22 +12,14 @@ inverse uses a slope that it can invert (`gentle_tracker`).
 import math
 from abc import abstractmethod
 from collections.abc import Mapping
-from typing import Annotated, Any, ClassVar, Self
+from typing import Annotated, Self
 
 import numpy as np
 from pydantic import Field
 
-from hdbridge.axis.effects.base import (
-    Coefficient,
-    Compensable,
-    Effect,
-    FloatArray,
-    Motion,
-    Part,
-    Shape,
-    Start,
-    Tracker,
-)
+from hdbridge.axis.effects.base import Effect
+from hdbridge.axis.effects.described import Coefficient, Compensable, Part, Shape, Tracker
+from hdbridge.axis.effects.motion import FloatArray, Motion, Start
 from hdbridge.axis.effects.path import once
 
 
@@ -64,17 +56,15 @@ def rise_at(xi: float, n: float, steepest: float = math.inf) -> float:
 class ElasticLoop(Effect):
     """Base class of laws of a loop between plus and minus the offset, proportional to the offset."""
 
-    compensable: ClassVar[Compensable] = Compensable(
-        True, "the load really moves so, and the command says where it reverses"
-    )
-    shape: ClassVar[tuple[Shape, ...]] = (
+    compensable = Compensable(True, "the load really moves so, and the command says where it reverses")
+    shape = (
         Shape("width_deg", 0.5, 120.0, logarithmic=True),
         Shape("exponent", 1.02, 4.0),
     )
-    typical: ClassVar[Mapping[str, Any]] = {"offset_arcsec": 40.0, "width_deg": 20.0, "exponent": 1.6}
+    typical = {"offset_arcsec": 40.0, "width_deg": 20.0, "exponent": 1.6}
     """A published gear of ratio 50."""
-    part: ClassVar[Part | None] = Part.LOOP
-    drifting: ClassVar[tuple[str, ...]] = ("offset_arcsec",)
+    part = Part.LOOP
+    drifting = ("offset_arcsec",)
     """The offset, because preload settles and friction changes; width and exponent stay."""
 
     offset_arcsec: Annotated[

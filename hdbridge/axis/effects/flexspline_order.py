@@ -1,21 +1,20 @@
 """Orders of the wave generator relative to the flexspline, which turns backwards."""
 
-from collections.abc import Iterator, Mapping, Sequence
-from typing import Any, ClassVar, Self
-
 import numpy as np
 
-from hdbridge.axis.effects.base import Cause, Compensable, Coordinate, Effect, Motion, Observations
+from hdbridge.axis.effects.coordinate import Coordinate
+from hdbridge.axis.effects.described import Cause, Compensable
 from hdbridge.axis.effects.load_order import Ratio
-from hdbridge.axis.effects.orders import OrderSeries, missing_orders, orders_from
+from hdbridge.axis.effects.motion import Motion
+from hdbridge.axis.effects.orders import OrderSeries, orders_from
 from hdbridge.units import DEG_PER_TURN
 
 
 class FlexsplineOrders(OrderSeries):
     """Sum of A_k cos(k (1 + 1/N) theta_M + phi_k)."""
 
-    name: ClassVar[str] = "flexspline_order"
-    about: ClassVar[Cause] = Cause(
+    name = "flexspline_order"
+    about = Cause(
         title="order of the wave generator relative to the flexspline",
         subject="orders",
         equation="sum over k of A_k cos(k (1 + 1/N) theta_M + phi_k)",
@@ -29,18 +28,11 @@ class FlexsplineOrders(OrderSeries):
         "generator",
         size="1-10 arcsec",
     )
-    compensable: ClassVar[Compensable] = Compensable(True, "the load really moves so, and it repeats")
-    typical: ClassVar[Mapping[str, Any]] = {"orders": orders_from((1, 2, 4), 2.0)}
-    """Orders 1, 2 and 4."""
+    compensable = Compensable(True, "the load really moves so, and it repeats")
+    typical = {"orders": orders_from((1, 2, 4), 2.0)}
+    searched = range(1, 9)
 
     ratio: Ratio
-
-    @classmethod
-    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[Self]:
-        """Yields orders 1 to 8 one by one; those found are combined afterwards."""
-        ratio = observations.ratio
-        for number in missing_orders(cls(ratio=ratio, orders=orders_from(range(1, 9))), base):
-            yield cls(ratio=ratio, orders=orders_from([number]))
 
     def coordinate(self, motion: Motion, ratio: float) -> Coordinate:
         """Returns the wave generator's angle relative to the flexspline."""

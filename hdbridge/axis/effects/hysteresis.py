@@ -14,21 +14,14 @@ input: one encoder count of chatter is several arcseconds. Drive it with the com
 """
 
 from collections.abc import Iterator, Sequence
-from typing import ClassVar, Self
+from typing import Self
 
 import numpy as np
 
-from hdbridge.axis.effects.base import (
-    Cause,
-    Effect,
-    FloatArray,
-    Moment,
-    Observations,
-    Part,
-    Start,
-    Tracker,
-)
+from hdbridge.axis.effects.base import Effect
+from hdbridge.axis.effects.described import Cause, Observations, Part, Tracker
 from hdbridge.axis.effects.elastic_loop import ElasticLoop, rise, rise_at
+from hdbridge.axis.effects.motion import FloatArray, Moment, Start
 from hdbridge.axis.effects.path import path_of
 
 
@@ -37,8 +30,8 @@ class Hysteresis(ElasticLoop):
     to the offset.
     """
 
-    name: ClassVar[str] = "hysteresis"
-    about: ClassVar[Cause] = Cause(
+    name = "hysteresis"
+    about = Cause(
         title="nonlinear-elastic transmission error (hysteresis)",
         equation="theta_rev + sgn(omega) 2 offset g(xi), limited to sgn(omega) offset; "
         "xi = |theta_M - theta_M,rev| / width; offset > 0: the load leads, offset < 0: it lags",

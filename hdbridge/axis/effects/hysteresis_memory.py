@@ -20,13 +20,15 @@ infinitely steeply where the plain law rises, and would have to repeat the plain
 import math
 from bisect import bisect_left
 from collections.abc import Iterator, Sequence
-from typing import Any, ClassVar, NamedTuple, Self
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 
-from hdbridge.axis.effects.base import Cause, Effect, FloatArray, Moment, Observations, Part, Start, Tracker
+from hdbridge.axis.effects.base import Effect
+from hdbridge.axis.effects.described import Cause, Observations, Part, Tracker
 from hdbridge.axis.effects.elastic_loop import ElasticLoop, rise, rise_at
 from hdbridge.axis.effects.hysteresis import Hysteresis
+from hdbridge.axis.effects.motion import FloatArray, Moment, Start
 from hdbridge.axis.effects.path import path_of
 
 _DEPTH = 200
@@ -38,10 +40,10 @@ of its height).
 class HysteresisMemory(ElasticLoop):
     """Masing's rules over the branch of `Hysteresis`; replaces it in a model."""
 
-    name: ClassVar[str] = "hysteresis_memory"
-    replaces: ClassVar[str] = "hysteresis"
-    changes: ClassVar[Part | None] = Part.LOOP
-    about: ClassVar[Cause] = Cause(
+    name = "hysteresis_memory"
+    replaces = "hysteresis"
+    changes = Part.LOOP
+    about = Cause(
         title="hysteresis with return-point memory",
         subject="hysteresis",
         equation="theta_rev + sgn(omega) 2 offset g(|theta_M - theta_M,rev| / width) from each reversal; "

@@ -2,26 +2,16 @@
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Annotated, Any, ClassVar, Self
+from typing import Annotated, Any, Self
 
 import numpy as np
 from pydantic import Field
 
-from hdbridge.axis.effects.base import (
-    Cause,
-    Compensable,
-    Effect,
-    FloatArray,
-    Moment,
-    Motion,
-    Observations,
-    Part,
-    Shape,
-    Start,
-    Tracker,
-)
+from hdbridge.axis.effects.base import Effect
 from hdbridge.axis.effects.carried import Loop, loop_of
+from hdbridge.axis.effects.described import Cause, Compensable, Observations, Part, Tracker
 from hdbridge.axis.effects.hysteresis import Hysteresis
+from hdbridge.axis.effects.motion import FloatArray, Moment, Motion, Start
 
 
 class HysteresisParameters(Effect):
@@ -33,8 +23,8 @@ class HysteresisParameters(Effect):
     it.
     """
 
-    name: ClassVar[str] = "hysteresis_parameters"
-    about: ClassVar[Cause] = Cause(
+    name = "hysteresis_parameters"
+    about = Cause(
         title="changed hysteresis loop",
         subject="hysteresis",
         equation="H(offset, width, exponent) - H(the model's offset, width, exponent)",
@@ -48,9 +38,9 @@ class HysteresisParameters(Effect):
         source="the difference of two loops of one law",
         size="5-30 % of the offset",
     )
-    compensable: ClassVar[Compensable] = Compensable(True, "by new parameters of the model's loop")
-    changes: ClassVar[Part | None] = Part.LOOP
-    shape: ClassVar[tuple[Shape, ...]] = Hysteresis.shape
+    compensable = Compensable(True, "by new parameters of the model's loop")
+    changes = Part.LOOP
+    shape = Hysteresis.shape
 
     base: Annotated[Loop, Field(description="the model's loop")]
     offset_arcsec: Annotated[

@@ -1,37 +1,25 @@
 """Wind-up of the gear by the load's own inertia during acceleration."""
 
-from collections.abc import Iterator, Mapping, Sequence
-from typing import Annotated, Any, ClassVar, Self
+from collections.abc import Iterator, Sequence
+from typing import Annotated, Self
 
 import numpy as np
 from pydantic import Field
 
-from hdbridge.axis.effects.base import (
-    Angleless,
-    Cause,
-    Channel,
-    Compensable,
-    Effect,
-    FloatArray,
-    Level,
-    Linear,
-    Moment,
-    Motion,
-    Observations,
-    Start,
-    Tracker,
-)
+from hdbridge.axis.effects.base import Angleless, Effect, Linear
+from hdbridge.axis.effects.described import Cause, Compensable, Observations
 from hdbridge.axis.effects.kinematics import acceleration_of
 from hdbridge.axis.effects.load_order import Ratio
+from hdbridge.axis.effects.motion import Channel, FloatArray, Moment, Motion, Start
 from hdbridge.units import ARCSEC_PER_DEG
 
 
 class InertialWindup(Angleless, Linear):
     """-(J / K) alpha_L: the load lags while it is accelerated."""
 
-    name: ClassVar[str] = "inertial_windup"
-    channels: ClassVar[frozenset[Channel]] = frozenset({Channel.ACCELERATION})
-    about: ClassVar[Cause] = Cause(
+    name = "inertial_windup"
+    channels = frozenset({Channel.ACCELERATION})
+    about = Cause(
         title="wind-up by inertia",
         subject="wind-up",
         equation="-(J / K) alpha_L, alpha_L = commanded motor acceleration / N, limited to the limit / N",
@@ -44,13 +32,13 @@ class InertialWindup(Angleless, Linear):
         source="spring and inertia far below the resonance: J / K = 1 / (2 pi f)^2",
         size="7 arcsec at 200 deg/s^2 with a resonance at 50 Hz",
     )
-    compensable: ClassVar[Compensable] = Compensable(
+    compensable = Compensable(
         True, "the load really moves so and the acceleration is commanded; at rest it is nothing"
     )
-    ordinary_arcsec: ClassVar[float] = 1.5
+    ordinary_arcsec = 1.5
     """Wind-up of any axis in its fastest moves."""
-    linear: ClassVar[tuple[str, ...]] = ("inertia_over_stiffness_s2",)
-    typical: ClassVar[Mapping[str, Any]] = {"inertia_over_stiffness_s2": 1e-5}
+    linear = ("inertia_over_stiffness_s2",)
+    typical = {"inertia_over_stiffness_s2": 1e-5}
     """A resonance at 50 Hz."""
 
     ratio: Ratio
@@ -83,18 +71,9 @@ class InertialWindup(Angleless, Linear):
             beyond[1:-1] = self.inertia_over_stiffness_s2 * bend
         return beyond[:, np.newaxis]
 
-    def tracker(self, start: Start = Start.VIRGIN) -> Tracker:
-        gain = -ARCSEC_PER_DEG / self.ratio * self.inertia_over_stiffness_s2
-        return _Tracker(gain, self.limit_deg_s2)
+    def at(self, motor_deg: float, moment: Moment) -> float:
+        acceleration = min(max(moment.motor_acceleration_deg_s2, -self.limit_deg_s2), self.limit_deg_s2)
+        return -ARCSEC_PER_DEG / self.ratio * self.inertia_over_stiffness_s2 * acceleration
 
     def bound_arcsec(self) -> float:
         return ARCSEC_PER_DEG / self.ratio * abs(self.inertia_over_stiffness_s2) * self.limit_deg_s2
-
-
-class _Tracker(Level):
-    def __init__(self, gain: float, limit: float) -> None:
-        self._gain = gain
-        self._limit = limit
-
-    def peek(self, motor_deg: float, moment: Moment) -> float:
-        return self._gain * min(max(moment.motor_acceleration_deg_s2, -self._limit), self._limit)

@@ -16,7 +16,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from hdbridge.axis.effects.base import (
+from hdbridge.axis.effects.motion import (
     AT_REST,
     MEASURED,
     Channel,
@@ -125,3 +125,14 @@ def moments(motion: Motion) -> Iterator[Moment]:
 
 def _or(values: FloatArray | None, default: FloatArray) -> FloatArray:
     return default if values is None else values
+
+
+def top_speed_deg_s(motion: Motion) -> float:
+    """Returns the highest motor speed, ignoring outliers; one turn per second if the speed is not known."""
+    speed = motion.motor_speed_deg_s
+    return 360.0 if speed is None else float(np.quantile(np.abs(speed), 0.99))
+
+
+def duration_s(motion: Motion) -> float:
+    """Returns the time from the first to the last sample, s; 0 without a clock."""
+    return 0.0 if motion.time_s is None else float(np.ptp(motion.time_s))

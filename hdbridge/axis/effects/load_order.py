@@ -2,23 +2,16 @@
 the spline.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import Annotated, Any, ClassVar, Literal, Self
+from typing import Annotated, Literal
 
 from pydantic import Field
 
 from hdbridge.axis.effects import coordinate as over
-from hdbridge.axis.effects.base import (
-    Cause,
-    Compensable,
-    Coordinate,
-    Effect,
-    Experiment,
-    Motion,
-    Observations,
-)
-from hdbridge.axis.effects.orders import OrderSeries, missing_orders, orders_from
+from hdbridge.axis.effects.coordinate import Coordinate
+from hdbridge.axis.effects.described import Cause, Compensable, Experiment
+from hdbridge.axis.effects.motion import Motion
+from hdbridge.axis.effects.orders import OrderSeries, orders_from
 
 Ratio = Annotated[float, Field(gt=0, le=1000, description="N of the model: motor turns per load turn")]
 
@@ -26,8 +19,8 @@ Ratio = Annotated[float, Field(gt=0, le=1000, description="N of the model: motor
 class LoadOrders(OrderSeries):
     """Sum of A_k cos(k theta_M / N + phi_k)."""
 
-    name: ClassVar[str] = "load_order"
-    about: ClassVar[Cause] = Cause(
+    name = "load_order"
+    about = Cause(
         title="once or twice per load turn",
         subject="load orders",
         equation="sum over k of A_k cos(k theta_M / N + phi_k)",
@@ -51,26 +44,19 @@ class LoadOrders(OrderSeries):
             ),
         },
     )
-    compensable: ClassVar[Compensable] = Compensable(
+    compensable = Compensable(
         False,
         "no, unless its origin is known to be the gear, because the run-out of a load encoder is an error of "
         "the measurement",
     )
-    typical: ClassVar[Mapping[str, Any]] = {"orders": orders_from((1, 2), 10.0)}
-    """Orders 1 and 2."""
+    typical = {"orders": orders_from((1, 2), 10.0)}
+    searched = range(1, 5)
 
     ratio: Ratio
     origin: Annotated[
         Literal["unknown", "gear", "load_encoder"],
         Field(description="where it comes from; only the gear's is compensated"),
     ] = "unknown"
-
-    @classmethod
-    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[Self]:
-        """Yields orders 1 to 4 one by one; those found are combined afterwards."""
-        ratio = observations.ratio
-        for number in missing_orders(cls(ratio=ratio, orders=orders_from(range(1, 5))), base):
-            yield cls(ratio=ratio, orders=orders_from([number]))
 
     def coordinate(self, motion: Motion, ratio: float) -> Coordinate:
         return replace(over.load_angle(motion, ratio), bins=120)

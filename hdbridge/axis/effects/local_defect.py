@@ -1,32 +1,19 @@
 """Bump at one load angle: a damaged tooth."""
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from typing import Annotated, Any, ClassVar, Self
+from typing import Annotated, Self
 
 import numpy as np
 from pydantic import Field
 
 from hdbridge.axis.effects import coordinate as over
-from hdbridge.axis.effects.base import (
-    Cause,
-    Compensable,
-    Coordinate,
-    Effect,
-    FloatArray,
-    Linear,
-    Memoryless,
-    Moment,
-    Motion,
-    Observations,
-    Shape,
-    Sought,
-    Start,
-    Stretch,
-    Tracker,
-)
+from hdbridge.axis.effects.base import Effect, Linear, Momentary
+from hdbridge.axis.effects.coordinate import Coordinate
+from hdbridge.axis.effects.described import Cause, Compensable, Observations, Shape, Sought, Stretch
 from hdbridge.axis.effects.load_order import Ratio
+from hdbridge.axis.effects.motion import FloatArray, Moment, Motion, Start
 from hdbridge.axis.effects.path import away_from_reversals
 from hdbridge.units import DEG_PER_TURN
 
@@ -39,11 +26,11 @@ FORM = 0.07
 """Share of its height by which a real bump deviates from the formula."""
 
 
-class LocalDefect(Linear):
+class LocalDefect(Momentary, Linear):
     """height (1 + cos(pi u)) / 2 for |u| < 1, u = (theta_M / N - centre, wrapped) / half width."""
 
-    name: ClassVar[str] = "local_defect"
-    about: ClassVar[Cause] = Cause(
+    name = "local_defect"
+    about = Cause(
         title="bump at one load angle",
         subject="local defects",
         equation="height (1 + cos(pi u)) / 2 where |u| < 1, u = ((theta_M / N - centre) mod 360 deg) / "
@@ -58,19 +45,19 @@ class LocalDefect(Linear):
         source="raised cosine as a smooth bump of finite extent",
         size="1-20 arcsec",
     )
-    compensable: ClassVar[Compensable] = Compensable(
+    compensable = Compensable(
         True, "the load really moves so, if it is a tooth and not a mark on the encoder's disc"
     )
-    shape: ClassVar[tuple[Shape, ...]] = (
+    shape = (
         Shape("centre_deg", 0.0, 360.0),
         Shape("half_width_deg", 0.05, 30.0, logarithmic=True),
     )
-    usual: ClassVar[int] = 2
-    sought: ClassVar[Sought | None] = Sought.BUMP
-    inexact: ClassVar[float] = 0.15
+    usual = 2
+    sought = Sought.BUMP
+    inexact = 0.15
     """The bump of a real damaged tooth never has exactly this form."""
-    linear: ClassVar[tuple[str, ...]] = ("height_arcsec",)
-    typical: ClassVar[Mapping[str, Any]] = {"height_arcsec": 5.0, "centre_deg": 0.0, "half_width_deg": 3.6}
+    linear = ("height_arcsec",)
+    typical = {"height_arcsec": 5.0, "centre_deg": 0.0, "half_width_deg": 3.6}
     """Height of 5 arcsec, tooth half width of 3.6 degrees."""
 
     ratio: Ratio
@@ -142,8 +129,10 @@ class LocalDefect(Linear):
         bump[near] = 0.5 + 0.5 * np.cos((np.pi / half_width_deg) * away[near])
         return bump
 
-    def tracker(self, start: Start = Start.VIRGIN) -> Tracker:
-        return _Tracker(self)
+    def at(self, motor_deg: float, moment: Moment) -> float:
+        turns = (motor_deg / self.ratio - self.centre_deg) / DEG_PER_TURN
+        u = abs(turns - round(turns)) * DEG_PER_TURN / self.half_width_deg
+        return self.height_arcsec * (0.5 + 0.5 * math.cos(math.pi * u)) if u < 1.0 else 0.0
 
     def bound_arcsec(self) -> float:
         return abs(self.height_arcsec)
@@ -151,16 +140,3 @@ class LocalDefect(Linear):
     def slope_bound_arcsec_per_deg(self) -> float:
         """Slope at the steepest point of the flank."""
         return 0.5 * math.pi * abs(self.height_arcsec) / self.half_width_deg / self.ratio
-
-
-class _Tracker(Memoryless):
-    def __init__(self, effect: LocalDefect) -> None:
-        self._height = effect.height_arcsec
-        self._centre = effect.centre_deg
-        self._width = effect.half_width_deg
-        self._ratio = effect.ratio
-
-    def peek(self, motor_deg: float, moment: Moment) -> float:
-        turns = (motor_deg / self._ratio - self._centre) / DEG_PER_TURN
-        u = abs(turns - round(turns)) * DEG_PER_TURN / self._width
-        return self._height * (0.5 + 0.5 * math.cos(math.pi * u)) if u < 1.0 else 0.0

@@ -1,19 +1,20 @@
 """Eccentricity of the motor encoder disc, whose reading error becomes a real motor position error."""
 
-from collections.abc import Iterator, Mapping, Sequence
-from typing import Any, ClassVar, Self
+from collections.abc import Iterator, Sequence
+from typing import Self
 
-from hdbridge.axis.effects.base import Cause, Compensable, Effect, Observations, Part
+from hdbridge.axis.effects.base import Effect
+from hdbridge.axis.effects.described import Cause, Compensable, Observations, Part
 from hdbridge.axis.effects.orders import OrderSeries, orders_from
 
 
 class MotorEncoderEccentricity(OrderSeries):
     """A_1 cos(theta_M + phi_1) + A_2 cos(2 theta_M + phi_2), amplitudes at the load."""
 
-    name: ClassVar[str] = "motor_encoder_eccentricity"
-    changes: ClassVar[Part | None] = Part.ORDERS
-    few: ClassVar[frozenset[int]] = frozenset({1, 2})
-    about: ClassVar[Cause] = Cause(
+    name = "motor_encoder_eccentricity"
+    changes = Part.ORDERS
+    few = frozenset({1, 2})
+    about = Cause(
         title="eccentric motor encoder disc",
         subject="orders",
         equation="A_1 cos(theta_M + phi_1) + A_2 cos(2 theta_M + phi_2); A_1 = (e / r) / N for a disc of "
@@ -30,11 +31,10 @@ class MotorEncoderEccentricity(OrderSeries):
         source="geometry of an eccentric disc: reading error (e / r) sin(theta), first order in e / r",
         size="1-10 arcsec",
     )
-    compensable: ClassVar[Compensable] = Compensable(
+    compensable = Compensable(
         True, "the position loop is closed on this encoder, so its error becomes a real motion of the load"
     )
-    typical: ClassVar[Mapping[str, Any]] = {"orders": orders_from((1, 2), 3.0)}
-    """Eccentricity and tilt."""
+    typical = {"orders": orders_from((1, 2), 3.0)}
 
     @classmethod
     def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[Self]:
@@ -44,7 +44,3 @@ class MotorEncoderEccentricity(OrderSeries):
     @classmethod
     def of_change(cls, before: Effect, now: Effect) -> Self | None:
         return cls._change(before, now)
-
-    def turns_per_motor_turn(self) -> float:
-        """One, because the disc is on the motor shaft."""
-        return 1.0

@@ -1,17 +1,18 @@
 """Additional orders of the motor angle that the model's synchronous part lacks."""
 
-from collections.abc import Iterator, Sequence
-from typing import Any, ClassVar, Self
+from collections.abc import Sequence
+from typing import Any, Self
 
-from hdbridge.axis.effects.base import Cause, Compensable, Effect, Experiment, Observations, Part
-from hdbridge.axis.effects.orders import HIGHEST_MOTOR_ORDER, OrderSeries, missing_orders, orders_from
+from hdbridge.axis.effects.base import Effect
+from hdbridge.axis.effects.described import Cause, Compensable, Experiment, Part
+from hdbridge.axis.effects.orders import HIGHEST_MOTOR_ORDER, OrderSeries, orders_from
 
 
 class MotorOrders(OrderSeries):
     """Sum of A_k cos(k theta_M + phi_k) over orders that the model lacks."""
 
-    name: ClassVar[str] = "motor_order"
-    about: ClassVar[Cause] = Cause(
+    name = "motor_order"
+    about = Cause(
         title="motor order missing or wrong in the model",
         subject="orders",
         equation="sum over k of A_k cos(k theta_M + phi_k), k not among the synchronous part's orders",
@@ -30,22 +31,13 @@ class MotorOrders(OrderSeries):
             )
         },
     )
-    compensable: ClassVar[Compensable] = Compensable(True, "the load really moves so, and it repeats")
-    part: ClassVar[Part | None] = Part.ORDERS
-    usual: ClassVar[int] = 4
+    compensable = Compensable(True, "the load really moves so, and it repeats")
+    part = Part.ORDERS
+    searched = range(1, HIGHEST_MOTOR_ORDER + 1)
+    usual = 4
     """A worn wave generator bearing has several."""
-    drifting: ClassVar[tuple[str, ...]] = ("orders",)
+    drifting = ("orders",)
     """Orders, which change with the wear of teeth and bearing."""
-
-    def turns_per_motor_turn(self) -> float:
-        """One, because the orders refer to the motor angle itself."""
-        return 1.0
-
-    @classmethod
-    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[Self]:
-        """Yields single orders; those found are combined afterwards."""
-        for number in missing_orders(cls(orders=orders_from(range(1, HIGHEST_MOTOR_ORDER + 1))), base):
-            yield cls(orders=orders_from([number]))
 
     @classmethod
     def of_change(cls, before: Effect, now: Effect) -> Self | None:

@@ -9,17 +9,9 @@ from typing import Annotated, ClassVar, Final, Self, TypeVar, cast
 import numpy as np
 from pydantic import Field, field_validator
 
-from hdbridge.axis.effects.base import (
-    Coefficient,
-    Effect,
-    FloatArray,
-    Memoryless,
-    Moment,
-    Motion,
-    Start,
-    Stretch,
-    Tracker,
-)
+from hdbridge.axis.effects.base import Effect
+from hdbridge.axis.effects.described import Coefficient, Memoryless, Observations, Stretch, Tracker
+from hdbridge.axis.effects.motion import FloatArray, Moment, Motion, Start
 from hdbridge.axis.effects.path import away_from_reversals, once
 from hdbridge.strictness import Strict
 
@@ -47,10 +39,9 @@ Orders = Annotated[
 ]
 
 
-class OrderSeries(Effect):
-    """Sum of A_k cos(k c theta_M + phi_k), with c the turns of the reference angle per motor turn."""
+class HarmonicSum(Effect):
+    """Sum of A_k cos(k angle + phi_k) over an angle that a subclass defines."""
 
-    usual: ClassVar[int] = 2
     few: ClassVar[frozenset[int]] = frozenset()
     """Permitted orders, if only a few make physical sense."""
 
@@ -67,19 +58,16 @@ class OrderSeries(Effect):
         return orders
 
     @abstractmethod
-    def turns_per_motor_turn(self) -> float:
-        """Returns c, the periods of order 1 per motor turn."""
+    def _angle(self, motion: Motion) -> FloatArray:
+        """Returns the angle of order 1, radians, shape (n,)."""
 
     def predict(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
-        error: FloatArray = horner(phasors(self.orders), turn_of(self._scale() * motion.motor_deg)).real
+        error: FloatArray = horner(phasors(self.orders), turn_of(self._angle(motion))).real
         return error
-
-    def tracker(self, start: Start = Start.VIRGIN) -> Tracker:
-        return OrderTracker(phasors(self.orders), self._scale())
 
     def columns(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
         """Returns cosine and sine of each order, shape (n, 2 * orders)."""
-        return cosines_and_sines(self._scale() * motion.motor_deg, [each.order for each in self.orders])
+        return cosines_and_sines(self._angle(motion), [each.order for each in self.orders])
 
     def coefficients(self) -> FloatArray:
         """Returns A cos(phi) and -A sin(phi) of each order, arcsec."""
@@ -87,17 +75,53 @@ class OrderSeries(Effect):
 
     def fitted(self, coefficients: FloatArray, shape: Mapping[str, float] | None = None) -> Self:
         """Returns the same orders with amplitudes and phases from cosine and sine coefficients."""
-        return self.model_copy(update={"orders": orders_fitted(self.orders, coefficients)})
+        return self.model_copy(
+            update={"orders": orders_fitted(self.orders, coefficients), **dict(shape or {})}
+        )
 
     def bound_arcsec(self) -> float:
         return sum(each.amplitude_arcsec for each in self.orders)
 
-    def slope_bound_arcsec_per_deg(self) -> float:
-        return self._scale() * sum(each.order * each.amplitude_arcsec for each in self.orders)
-
     def shows(self, motion: Motion) -> Stretch | None:
         """Returns the samples away from reversals, where a loop of another shape leaves no periodic bumps."""
         return away_from_reversals(motion)
+
+    def largest_piece_arcsec(self) -> float:
+        """Returns the largest amplitude, because an order that is sampled in part shows only in part."""
+        return max((each.amplitude_arcsec for each in self.orders), default=0.0)
+
+    def named_coefficients(self) -> tuple[Coefficient, ...]:
+        return tuple(
+            Coefficient(f"order_{each.order}_", (2 * i, 2 * i + 1), ("orders", i))
+            for i, each in enumerate(self.orders)
+        )
+
+
+class OrderSeries(HarmonicSum):
+    """HarmonicSum of an angle that turns with the motor, c times as fast."""
+
+    usual = 2
+    searched: ClassVar[Sequence[int]] = ()
+    """Orders that a record is screened for, one by one."""
+
+    def turns_per_motor_turn(self) -> float:
+        """Returns c, the periods of order 1 per motor turn."""
+        return 1.0
+
+    @classmethod
+    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[Self]:
+        """Yields single orders that the model lacks; those found are combined afterwards."""
+        values = {"ratio": observations.ratio} if "ratio" in cls.model_fields else {}
+        turns = cls(orders=(), **values).turns_per_motor_turn()
+        present = _present(base, turns)
+        yield from (cls(orders=orders_from([each]), **values) for each in cls.searched if each not in present)
+
+    def tracker(self, start: Start = Start.VIRGIN) -> Tracker:
+        return OrderTracker(phasors(self.orders), RAD_PER_DEG * self.turns_per_motor_turn())
+
+    def slope_bound_arcsec_per_deg(self) -> float:
+        steepest = sum(each.order * each.amplitude_arcsec for each in self.orders)
+        return RAD_PER_DEG * self.turns_per_motor_turn() * steepest
 
     def pieces(self) -> tuple[Self, ...]:
         return tuple(self.model_copy(update={"orders": (each,)}) for each in self.orders)
@@ -110,16 +134,9 @@ class OrderSeries(Effect):
         orders = tuple(sorted((*self.orders, *new), key=lambda each: each.order))
         return self.model_copy(update={"orders": orders})
 
-    def largest_piece_arcsec(self) -> float:
-        """Returns the largest amplitude, because on an arc of its turn an order shows only in part."""
-        return max((each.amplitude_arcsec for each in self.orders), default=0.0)
-
     def waves(self) -> tuple[tuple[float, float, float], ...]:
         turns = self.turns_per_motor_turn()
         return tuple((each.order * turns, each.amplitude_arcsec, each.phase_deg) for each in self.orders)
-
-    def named_coefficients(self) -> tuple[Coefficient, ...]:
-        return named_orders(self.orders)
 
     def tidied(self, ratio: float) -> Self:
         """Removes orders without amplitude, whose phases have no meaning."""
@@ -139,28 +156,19 @@ class OrderSeries(Effect):
         change = orders_fitted(before.orders, now.coefficients() - before.coefficients())
         return cast("Self", cls.model_construct(orders=change))
 
-    def _scale(self) -> float:
-        return RAD_PER_DEG * self.turns_per_motor_turn()
+    def _angle(self, motion: Motion) -> FloatArray:
+        return RAD_PER_DEG * self.turns_per_motor_turn() * motion.motor_deg
 
 
-def missing_orders(series: OrderSeries, base: Iterable[Effect]) -> Iterable[int]:
-    """Returns the orders of a series that no series over the same angle in ``base`` has."""
-    turns = series.turns_per_motor_turn()
-    present = {
-        order.order
-        for each in base
-        if isinstance(each, OrderSeries) and each.turns_per_motor_turn() == turns
+def _present(base: Iterable[Effect], turns_per_motor_turn: float) -> dict[int, MotorOrder]:
+    """Returns the orders of a model over one reference angle, by number."""
+    series = [each for each in base if isinstance(each, OrderSeries)]
+    return {
+        order.order: order
+        for each in series
+        if each.turns_per_motor_turn() == turns_per_motor_turn
         for order in each.orders
     }
-    return [each.order for each in series.orders if each.order not in present]
-
-
-def named_orders(orders: Iterable[MotorOrder]) -> tuple[Coefficient, ...]:
-    """Returns the names of cosine and sine of each order."""
-    return tuple(
-        Coefficient(f"order_{each.order}_", (2 * i, 2 * i + 1), ("orders", i))
-        for i, each in enumerate(orders)
-    )
 
 
 def orders_from(numbers: Iterable[int], amplitude_arcsec: float = 1.0) -> tuple[MotorOrder, ...]:
@@ -258,12 +266,7 @@ def horner(amplitudes: tuple[complex, ...], turn: _Phasor) -> _Phasor:
 
 def compensated_orders(effects: Iterable[Effect]) -> list[MotorOrder]:
     """Returns the orders of the motor angle that a compensation corrects, by number."""
-    series = [
-        each
-        for each in effects
-        if isinstance(each, OrderSeries) and each.is_compensable() and each.turns_per_motor_turn() == 1.0
-    ]
-    found = {order.order: order for each in series for order in each.orders}
+    found = _present((each for each in effects if each.is_compensable()), 1.0)
     return [found[number] for number in sorted(found)]
 
 

@@ -130,3 +130,8 @@ def standing_s(motion: Motion) -> FloatArray:
     moving = motion.motor_speed_deg_s != 0.0
     last = np.maximum.accumulate(np.where(moving, np.arange(len(motion)), 0))
     return np.asarray(np.where(moving, 0.0, motion.time_s - motion.time_s[last]))
+
+
+def longest_rest_s(motion: Motion) -> float:
+    """Returns the duration of the longest standstill, s."""
+    return float(np.max(standing_s(motion), initial=0.0))

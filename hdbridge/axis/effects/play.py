@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from hdbridge.axis.effects.base import FloatArray, Start
+from hdbridge.axis.effects.motion import FloatArray, Start
 from hdbridge.axis.effects.path import path_of
 
 

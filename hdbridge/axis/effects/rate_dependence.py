@@ -1,40 +1,26 @@
 """Growth of the elastic loop with speed: friction rises with the logarithm of the sliding rate."""
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
-from typing import Annotated, Any, ClassVar, Self
+from collections.abc import Iterator, Sequence
+from typing import Annotated, Self
 
 import numpy as np
 from pydantic import Field
 
-from hdbridge.axis.effects.base import (
-    Cause,
-    Channel,
-    Compensable,
-    Coordinate,
-    Effect,
-    FloatArray,
-    Linear,
-    Moment,
-    Motion,
-    Observations,
-    Part,
-    Shape,
-    Start,
-    Tracker,
-)
-from hdbridge.axis.effects.carried import Loop, has_loop, loop_of
-from hdbridge.axis.effects.coordinate import Spacing
-from hdbridge.axis.effects.kinematics import speed_of
-from hdbridge.axis.effects.observations import top_speed_deg_s
+from hdbridge.axis.effects.base import Effect
+from hdbridge.axis.effects.carried import Loop, Modulating, has_loop, loop_of
+from hdbridge.axis.effects.coordinate import Coordinate, Spacing
+from hdbridge.axis.effects.described import Cause, Compensable, Observations, Part, Shape, Tracker
+from hdbridge.axis.effects.kinematics import speed_of, top_speed_deg_s
+from hdbridge.axis.effects.motion import Channel, FloatArray, Moment, Motion, Start
 
 
-class RateDependence(Linear):
+class RateDependence(Modulating):
     """growth log10(1 + |v| / reference) H: zero at rest, ``growth`` per decade above the reference."""
 
-    name: ClassVar[str] = "rate_dependence"
-    channels: ClassVar[frozenset[Channel]] = frozenset({Channel.SPEED})
-    about: ClassVar[Cause] = Cause(
+    name = "rate_dependence"
+    channels = frozenset({Channel.SPEED})
+    about = Cause(
         title="loop that grows with speed",
         equation="growth log10(1 + |v| / v_ref) H, H the model's loop, v the commanded motor speed, "
         "limited to v_limit",
@@ -46,11 +32,11 @@ class RateDependence(Linear):
         source="rate-dependent friction, logarithmic in the rate (rate-and-state laws)",
         size="5-30 % of the loop",
     )
-    compensable: ClassVar[Compensable] = Compensable(True, "the load really moves so; the speed is commanded")
-    shape: ClassVar[tuple[Shape, ...]] = (Shape("reference_deg_s", 1.0, 1000.0, logarithmic=True),)
-    carries: ClassVar[Mapping[Part, str]] = {Part.LOOP: "loop"}
-    linear: ClassVar[tuple[str, ...]] = ("growth_percent",)
-    typical: ClassVar[Mapping[str, Any]] = {"growth_percent": 10.0, "reference_deg_s": 30.0}
+    compensable = Compensable(True, "the load really moves so; the speed is commanded")
+    shape = (Shape("reference_deg_s", 1.0, 1000.0, logarithmic=True),)
+    carries = {Part.LOOP: "loop"}
+    linear = ("growth_percent",)
+    typical = {"growth_percent": 10.0, "reference_deg_s": 30.0}
     """10 % per decade."""
 
     loop: Annotated[Loop, Field(description="the model's loop")]
@@ -108,10 +94,6 @@ class RateDependence(Linear):
     def _most(self) -> float:
         """Returns the share of the loop at the highest speed."""
         return 0.01 * self.growth_percent * math.log10(1.0 + self.limit_deg_s / self.reference_deg_s)
-
-    @classmethod
-    def _carried(cls, base: Sequence[Effect]) -> dict[str, Any]:
-        return {"loop": loop_of(base)}
 
 
 class _Tracker(Tracker):

@@ -1,26 +1,16 @@
 """Gear ratio that differs from the model's."""
 
-from collections.abc import Iterator, Mapping, Sequence
-from typing import Annotated, Any, ClassVar, Self
+from collections.abc import Iterator, Sequence
+from typing import Annotated, Self
 
 import numpy as np
 from pydantic import Field
 
 from hdbridge.axis.effects import coordinate as over
-from hdbridge.axis.effects.base import (
-    Cause,
-    Compensable,
-    Coordinate,
-    Effect,
-    FloatArray,
-    Linear,
-    Memoryless,
-    Moment,
-    Motion,
-    Observations,
-    Start,
-    Tracker,
-)
+from hdbridge.axis.effects.base import Effect, Linear, Momentary
+from hdbridge.axis.effects.coordinate import Coordinate
+from hdbridge.axis.effects.described import Cause, Compensable, Observations
+from hdbridge.axis.effects.motion import FloatArray, Moment, Motion, Start
 from hdbridge.units import ARCSEC_PER_DEG, DEG_PER_TURN
 
 TEETH_PER_TURN = 2.0
@@ -32,11 +22,11 @@ SAME_TEETH = 1e-4
 """Accuracy of a ratio found from a ramp next to other causes, as a share of the ratio: a tenth of `SCALE`."""
 
 
-class RatioError(Linear):
+class RatioError(Momentary, Linear):
     """(1 / N_true - 1 / N) theta_M: a ramp in the motor angle."""
 
-    name: ClassVar[str] = "ratio_error"
-    about: ClassVar[Cause] = Cause(
+    name = "ratio_error"
+    about = Cause(
         title="wrong gear ratio or encoder scale",
         subject="ratio errors",
         equation="ramp theta_M, ramp = 3600 (1 / N_true - 1 / N), theta_M limited to +- limit",
@@ -48,13 +38,13 @@ class RatioError(Linear):
         source="kinematics",
         size="784 arcsec per 43.56 motor degrees between ratios 40 and 50",
     )
-    compensable: ClassVar[Compensable] = Compensable(
+    compensable = Compensable(
         True,
         "the load really moves so (unless the load encoder's scale is wrong), but correct the axis file "
         "instead",
     )
-    linear: ClassVar[tuple[str, ...]] = ("ramp_arcsec_per_turn",)
-    typical: ClassVar[Mapping[str, Any]] = {"ramp_arcsec_per_turn": 2.592}
+    linear = ("ramp_arcsec_per_turn",)
+    typical = {"ramp_arcsec_per_turn": 2.592}
     """0.01 % of a ratio of 50."""
 
     ramp_arcsec_per_turn: Annotated[float, Field(ge=-1e6, le=1e6, description="ramp per motor turn")]
@@ -100,20 +90,11 @@ class RatioError(Linear):
         angle = np.clip(motion.motor_deg, -self.limit_deg, self.limit_deg)
         return (angle / DEG_PER_TURN)[:, np.newaxis]
 
-    def tracker(self, start: Start = Start.VIRGIN) -> Tracker:
-        return _Tracker(self.ramp_arcsec_per_turn / DEG_PER_TURN, self.limit_deg)
+    def at(self, motor_deg: float, moment: Moment) -> float:
+        return self.ramp_arcsec_per_turn / DEG_PER_TURN * min(max(motor_deg, -self.limit_deg), self.limit_deg)
 
     def bound_arcsec(self) -> float:
         return abs(self.ramp_arcsec_per_turn) / DEG_PER_TURN * self.limit_deg
 
     def slope_bound_arcsec_per_deg(self) -> float:
         return max(-self.ramp_arcsec_per_turn, 0.0) / DEG_PER_TURN
-
-
-class _Tracker(Memoryless):
-    def __init__(self, slope: float, limit: float) -> None:
-        self._slope = slope
-        self._limit = limit
-
-    def peek(self, motor_deg: float, moment: Moment) -> float:
-        return self._slope * min(max(motor_deg, -self._limit), self._limit)

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from hdbridge.axis.effects.base import FloatArray
+from hdbridge.axis.effects.motion import FloatArray
 
 
 def recurrence(decay: FloatArray, drive: FloatArray, first: float) -> FloatArray:

@@ -1,44 +1,17 @@
 """Interpolation error of the load encoder, whose sine signals are not perfect sines."""
 
-import math
-from collections.abc import Iterator, Mapping, Sequence
-from typing import Annotated, Any, ClassVar, Self
+import cmath
+from collections.abc import Iterator, Sequence
+from typing import Annotated, Self
 
 import numpy as np
-from pydantic import Field, field_validator
+from pydantic import Field
 
-from hdbridge.axis.effects.base import (
-    Angleless,
-    Cause,
-    Channel,
-    Coefficient,
-    Compensable,
-    Coordinate,
-    Effect,
-    FloatArray,
-    Memoryless,
-    Moment,
-    Motion,
-    Observations,
-    Sought,
-    Start,
-    Stretch,
-    Tracker,
-)
-from hdbridge.axis.effects.orders import (
-    RAD_PER_DEG,
-    MotorOrder,
-    Orders,
-    coefficients_of,
-    cosines_and_sines,
-    horner,
-    named_orders,
-    orders_fitted,
-    orders_from,
-    phasors,
-    turn_of,
-)
-from hdbridge.axis.effects.path import away_from_reversals
+from hdbridge.axis.effects.base import Effect
+from hdbridge.axis.effects.coordinate import Coordinate
+from hdbridge.axis.effects.described import Cause, Compensable, Level, Observations, Sought, Tracker
+from hdbridge.axis.effects.motion import Channel, FloatArray, Motion, Start
+from hdbridge.axis.effects.orders import RAD_PER_DEG, HarmonicSum, horner, orders_from, phasors
 from hdbridge.units import ARCSEC_PER_DEG, DEG_PER_TURN
 
 _HARMONICS = (1, 2, 4)
@@ -52,16 +25,16 @@ IN_STEP = 0.85
 explains its square, 0.72, of the line's."""
 
 
-class SubdivisionalError(Angleless):
+class SubdivisionalError(HarmonicSum):
     """Sum over k = 1, 2, 4 of A_k cos(k lines theta_L + phi_k).
 
     The load angle must be the predicted one, error included. A line is often only a few hundred arcsec wide,
     so motor angle / N is not accurate enough, and the noise of the measured angle would imitate the effect.
     """
 
-    name: ClassVar[str] = "subdivisional_error"
-    channels: ClassVar[frozenset[Channel]] = frozenset({Channel.LOAD_ANGLE})
-    about: ClassVar[Cause] = Cause(
+    name = "subdivisional_error"
+    channels = frozenset({Channel.LOAD_ANGLE})
+    about = Cause(
         title="interpolation error of the load encoder",
         subject="interpolation errors",
         equation="sum over k of A_k cos(k lines theta_L + phi_k), k = 1 (offset), 2 (gain, phase), 4 "
@@ -75,25 +48,17 @@ class SubdivisionalError(Angleless):
         source="Lissajous errors of sine encoders (Heydemann)",
         size="0.1-2 arcsec",
     )
-    compensable: ClassVar[Compensable] = Compensable(
+    compensable = Compensable(
         False,
         "it is an error of the measurement",
     )
-    usual: ClassVar[int] = 2
-    sought: ClassVar[Sought | None] = Sought.LINE
-    typical: ClassVar[Mapping[str, Any]] = {"lines_per_turn": 9000, "orders": orders_from(_HARMONICS, 0.5)}
+    few = frozenset(_HARMONICS)
+    usual = 2
+    sought = Sought.LINE
+    typical = {"lines_per_turn": 9000, "orders": orders_from(_HARMONICS, 0.5)}
     """9000 lines, as an example; the real line count comes from a search or the data sheet."""
 
     lines_per_turn: Annotated[int, Field(ge=16, le=10_000_000, description="signal periods per load turn")]
-    orders: Orders
-
-    @field_validator("orders")
-    @classmethod
-    def _few(cls, orders: tuple[MotorOrder, ...]) -> tuple[MotorOrder, ...]:
-        numbers = [each.order for each in orders]
-        if len(set(numbers)) != len(numbers) or not set(numbers) <= set(_HARMONICS):
-            raise ValueError("orders of the line count are 1, 2 and 4, each once at most")
-        return orders
 
     @classmethod
     def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[Self]:
@@ -125,14 +90,6 @@ class SubdivisionalError(Angleless):
             return ""
         return "sampled in equal steps over many lines, which a slow wave explains as well"
 
-    def largest_piece_arcsec(self) -> float:
-        """Returns the largest amplitude, because in a coarsely sampled record an order shows only in part."""
-        return max((each.amplitude_arcsec for each in self.orders), default=0.0)
-
-    def shows(self, motion: Motion) -> Stretch | None:
-        """Returns the samples away from reversals, where a loop of another shape leaves no bumps."""
-        return away_from_reversals(motion)
-
     def coordinate(self, motion: Motion, ratio: float) -> Coordinate:
         """Returns the load angle within a line."""
         line_deg = DEG_PER_TURN / self.lines_per_turn
@@ -140,41 +97,12 @@ class SubdivisionalError(Angleless):
         name = f"load angle within a division of {line_deg * ARCSEC_PER_DEG:.4g} arcsec"
         return Coordinate(name, "arcsec", np.mod(load, line_deg) * ARCSEC_PER_DEG, bins=48)
 
-    def named_coefficients(self) -> tuple[Coefficient, ...]:
-        return named_orders(self.orders)
-
-    def predict(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
-        error: FloatArray = horner(phasors(self.orders), turn_of(self._angle(motion))).real
-        return error
-
     def tracker(self, start: Start = Start.VIRGIN) -> Tracker:
-        return _Tracker(phasors(self.orders), RAD_PER_DEG * self.lines_per_turn)
+        amplitudes, scale = phasors(self.orders), RAD_PER_DEG * self.lines_per_turn
+        return Level(lambda _, now: horner(amplitudes, cmath.rect(1.0, scale * now.load_deg)).real)
 
-    def columns(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
-        """Returns cosine and sine of each order, shape (n, 2 * orders)."""
-        return cosines_and_sines(self._angle(motion), [each.order for each in self.orders])
-
-    def coefficients(self) -> FloatArray:
-        """Returns A cos(phi) and -A sin(phi) of each order, arcsec."""
-        return coefficients_of(self.orders)
-
-    def fitted(self, coefficients: FloatArray, shape: Mapping[str, float] | None = None) -> Self:
-        """Returns other amplitudes and phases and, if given in ``shape``, another line count."""
-        update = {"orders": orders_fitted(self.orders, coefficients), **dict(shape or {})}
-        return self.model_copy(update=update)
-
-    def bound_arcsec(self) -> float:
-        return sum(each.amplitude_arcsec for each in self.orders)
+    def slope_bound_arcsec_per_deg(self) -> float:
+        return 0.0
 
     def _angle(self, motion: Motion) -> FloatArray:
         return (RAD_PER_DEG * self.lines_per_turn) * motion.channel(Channel.LOAD_ANGLE, self.name)
-
-
-class _Tracker(Memoryless):
-    def __init__(self, amplitudes: tuple[complex, ...], scale: float) -> None:
-        self._phasors = amplitudes
-        self._scale = scale
-
-    def peek(self, motor_deg: float, moment: Moment) -> float:
-        angle = self._scale * moment.load_deg
-        return horner(self._phasors, complex(math.cos(angle), math.sin(angle))).real

@@ -1,9 +1,6 @@
 """Synchronous part: errors that repeat with every turn of the motor (the wave generator)."""
 
-from collections.abc import Iterator, Mapping, Sequence
-from typing import Any, ClassVar, Self
-
-from hdbridge.axis.effects.base import Cause, Compensable, Effect, Observations, Part
+from hdbridge.axis.effects.described import Cause, Compensable, Part
 from hdbridge.axis.effects.orders import MotorOrder, OrderSeries
 
 TYPICAL_ORDERS = tuple(
@@ -19,8 +16,8 @@ TYPICAL_ORDERS = tuple(
 class Synchronous(OrderSeries):
     """Sum of A_k cos(k theta_M + phi_k) over orders k of the motor angle theta_M."""
 
-    name: ClassVar[str] = "synchronous"
-    about: ClassVar[Cause] = Cause(
+    name = "synchronous"
+    about = Cause(
         title="synchronous transmission error",
         equation="sum over k of A_k cos(k theta_M + phi_k)",
         signature="repeats with every motor turn, the same in both directions and at every load angle",
@@ -31,18 +28,9 @@ class Synchronous(OrderSeries):
         source="Fourier series over the wave generator's angle, the usual kinematic error model",
         size="20-60 arcsec peak to peak",
     )
-    compensable: ClassVar[Compensable] = Compensable(True, "the load really moves so, and it repeats")
-    typical: ClassVar[Mapping[str, Any]] = {"orders": TYPICAL_ORDERS}
+    compensable = Compensable(True, "the load really moves so, and it repeats")
+    typical = {"orders": TYPICAL_ORDERS}
     """The published gear."""
-    part: ClassVar[Part | None] = Part.ORDERS
-    drifting: ClassVar[tuple[str, ...]] = ("orders",)
+    part = Part.ORDERS
+    drifting = ("orders",)
     """Teeth and the wave generator's bearing wear."""
-
-    @classmethod
-    def proposals(cls, observations: Observations, base: Sequence[Effect]) -> Iterator[Self]:
-        """Yields none, because its orders are read from a spectrum."""
-        return iter(())
-
-    def turns_per_motor_turn(self) -> float:
-        """One, because the orders refer to the motor angle itself."""
-        return 1.0

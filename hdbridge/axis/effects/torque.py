@@ -1,12 +1,12 @@
 """Growth with torque: the torque channel, its limit, and the growth of the ripple."""
 
 from collections.abc import Iterable
-from typing import Annotated, Literal
+from typing import Annotated, Final, Literal
 
 import numpy as np
 from pydantic import Field
 
-from hdbridge.axis.effects.base import SLOT, Channel, FloatArray, Moment, Motion
+from hdbridge.axis.effects.motion import SLOT, Channel, FloatArray, Moment, Motion
 from hdbridge.strictness import Strict
 
 TorqueChannel = Annotated[
@@ -21,6 +21,18 @@ TorqueLimit = Annotated[
         gt=0, le=1e5, description="torque beyond which the effect is held: no sensor fault moves the axis far"
     ),
 ]
+
+
+TOP: Final = 0.98
+"""Quantile of a channel's magnitude that counts as its maximum, because single readings may be wrong."""
+
+
+def top(motion: Motion, channel: Channel) -> float:
+    """Returns the largest magnitude of a measured channel; 0 if it was not measured or never changes."""
+    values = motion.measured.get(channel)
+    if values is None or not float(np.ptp(values)) > 0.0:
+        return 0.0
+    return float(np.quantile(np.abs(values), TOP))
 
 
 def beyond_limit(effects: Iterable[object], motion: Motion) -> tuple[str, ...]:

@@ -1,41 +1,34 @@
 """Growth of the synchronous part with load, because the mesh deflects."""
 
-from collections.abc import Iterator, Mapping, Sequence
-from typing import Any, ClassVar, Self
+from collections.abc import Iterator, Sequence
+from typing import Self
 
 import numpy as np
 
-from hdbridge.axis.effects.base import (
+from hdbridge.axis.effects.base import Effect
+from hdbridge.axis.effects.carried import Modulating, has_orders, orders_of
+from hdbridge.axis.effects.coordinate import Coordinate, Spacing
+from hdbridge.axis.effects.described import (
     Cause,
-    Channel,
     Compensable,
-    Coordinate,
-    Effect,
     Experiment,
-    FloatArray,
-    Linear,
     Memoryless,
-    Moment,
-    Motion,
     Observations,
     Part,
-    Start,
     Tracker,
 )
-from hdbridge.axis.effects.carried import has_orders, orders_of
-from hdbridge.axis.effects.coordinate import Spacing
+from hdbridge.axis.effects.motion import Channel, FloatArray, Motion, Start
 from hdbridge.axis.effects.motor_order import MotorOrders
-from hdbridge.axis.effects.observations import top
 from hdbridge.axis.effects.orders import RAD_PER_DEG, Orders, OrderTracker, phasors, ripple
-from hdbridge.axis.effects.torque import TorqueGrowth
+from hdbridge.axis.effects.torque import TorqueGrowth, top
 
 
-class TorqueModulation(TorqueGrowth, Linear):
+class TorqueModulation(TorqueGrowth, Modulating):
     """growth |T| S(theta_M): all carried orders grow alike; to let fewer grow, carry fewer."""
 
-    name: ClassVar[str] = "torque_modulation"
-    channels: ClassVar[frozenset[Channel]] = frozenset({Channel.LOAD_TORQUE})
-    about: ClassVar[Cause] = Cause(
+    name = "torque_modulation"
+    channels = frozenset({Channel.LOAD_TORQUE})
+    about = Cause(
         title="ripple that grows with load",
         subject="effects of torque",
         equation="growth tau S(theta_M), S the carried orders, tau = |T| (or T where signed), limited to "
@@ -51,13 +44,11 @@ class TorqueModulation(TorqueGrowth, Linear):
             "amplitude_drift": Experiment(10, "the same motor turns under two torques at one temperature")
         },
     )
-    compensable: ClassVar[Compensable] = Compensable(
-        True, "the load really moves so, where the torque is known on line"
-    )
-    part: ClassVar[Part | None] = Part.GROWTH
-    carries: ClassVar[Mapping[Part, str]] = {Part.ORDERS: "orders"}
-    linear: ClassVar[tuple[str, ...]] = ("growth_percent_per_nm",)
-    typical: ClassVar[Mapping[str, Any]] = {"growth_percent_per_nm": 1.0}
+    compensable = Compensable(True, "the load really moves so, where the torque is known on line")
+    part = Part.GROWTH
+    carries = {Part.ORDERS: "orders"}
+    linear = ("growth_percent_per_nm",)
+    typical = {"growth_percent_per_nm": 1.0}
     """1 % per Nm for all orders."""
 
     orders: Orders
@@ -93,7 +84,8 @@ class TorqueModulation(TorqueGrowth, Linear):
         return column[:, np.newaxis]
 
     def tracker(self, start: Start = Start.VIRGIN) -> Tracker:
-        return _Tracker(self)
+        orders, gain = OrderTracker(phasors(self.orders)), 0.01 * self.growth_percent_per_nm
+        return Memoryless(lambda motor_deg, now: gain * self.load_at_nm(now) * orders.peek(motor_deg, now))
 
     def bound_arcsec(self) -> float:
         return self.most() * sum(each.amplitude_arcsec for each in self.orders)
@@ -101,17 +93,3 @@ class TorqueModulation(TorqueGrowth, Linear):
     def slope_bound_arcsec_per_deg(self) -> float:
         """Slope of the ripple's growth at the highest torque."""
         return self.most() * RAD_PER_DEG * sum(each.order * each.amplitude_arcsec for each in self.orders)
-
-    @classmethod
-    def _carried(cls, base: Sequence[Effect]) -> dict[str, Any]:
-        return {"orders": orders_of(base)}
-
-
-class _Tracker(Memoryless):
-    def __init__(self, effect: TorqueModulation) -> None:
-        self._orders = OrderTracker(phasors(effect.orders))
-        self._gain = 0.01 * effect.growth_percent_per_nm
-        self._load_nm = effect.load_at_nm
-
-    def peek(self, motor_deg: float, moment: Moment) -> float:
-        return self._gain * self._load_nm(moment) * self._orders.peek(motor_deg, moment)

@@ -1,30 +1,16 @@
 """Wind-up of the gear by drag on the output: seals, bearings, grease, a cable."""
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
-from typing import Annotated, Any, ClassVar, Self
+from collections.abc import Iterator, Sequence
+from typing import Annotated, Self
 
 import numpy as np
 from pydantic import Field
 
-from hdbridge.axis.effects.base import (
-    Angleless,
-    Cause,
-    Channel,
-    Compensable,
-    Effect,
-    FloatArray,
-    Level,
-    Linear,
-    Moment,
-    Motion,
-    Observations,
-    Shape,
-    Start,
-    Tracker,
-)
-from hdbridge.axis.effects.kinematics import speed_of
-from hdbridge.axis.effects.observations import top_speed_deg_s
+from hdbridge.axis.effects.base import Angleless, Effect, Linear
+from hdbridge.axis.effects.described import Cause, Compensable, Observations, Shape
+from hdbridge.axis.effects.kinematics import speed_of, top_speed_deg_s
+from hdbridge.axis.effects.motion import Channel, FloatArray, Moment, Motion, Start
 
 STRAIGHT = 20.0
 """Ratio of shear speed to top speed above which the drag deviates from a straight line by less than 1/20."""
@@ -45,9 +31,9 @@ class VelocityWindup(Angleless, Linear):
     shear speed it is half of the linear value, and far above it is constant.
     """
 
-    name: ClassVar[str] = "velocity_windup"
-    channels: ClassVar[frozenset[Channel]] = frozenset({Channel.SPEED})
-    about: ClassVar[Cause] = Cause(
+    name = "velocity_windup"
+    channels = frozenset({Channel.SPEED})
+    about = Cause(
         title="wind-up by drag on the output",
         subject="drag",
         equation="-(coulomb sgn(v) + viscous v / (1 + |v| / v_shear)), v the commanded motor speed, "
@@ -60,14 +46,12 @@ class VelocityWindup(Angleless, Linear):
         source="Coulomb and viscous friction with shear thinning, over the gear's stiffness",
         size="5-50 arcsec",
     )
-    compensable: ClassVar[Compensable] = Compensable(
-        True, "the load really lags and the speed is commanded; at rest it is nothing"
-    )
-    shape: ClassVar[tuple[Shape, ...]] = (Shape("shear_deg_s", 10.0, 100_000.0, logarithmic=True),)
-    nonnegative: ClassVar[bool] = True
+    compensable = Compensable(True, "the load really lags and the speed is commanded; at rest it is nothing")
+    shape = (Shape("shear_deg_s", 10.0, 100_000.0, logarithmic=True),)
+    nonnegative = True
     """A drag never pushes. An absent one would otherwise come out on either side of zero by chance."""
-    linear: ClassVar[tuple[str, ...]] = ("coulomb_arcsec", "viscous_arcsec_s_per_deg")
-    typical: ClassVar[Mapping[str, Any]] = {
+    linear = ("coulomb_arcsec", "viscous_arcsec_s_per_deg")
+    typical = {
         "coulomb_arcsec": 3.0,
         "viscous_arcsec_s_per_deg": 0.015,
         "shear_deg_s": 1000.0,
@@ -121,26 +105,13 @@ class VelocityWindup(Angleless, Linear):
         bent = share * np.log(np.maximum(share, 1e-300)) / (1.0 + share) ** 2
         return (EXPONENT * self.viscous_arcsec_s_per_deg * speed * bent)[:, np.newaxis]
 
-    def tracker(self, start: Start = Start.VIRGIN) -> Tracker:
-        return _Tracker(self)
+    def at(self, motor_deg: float, moment: Moment) -> float:
+        speed = min(max(moment.motor_speed_deg_s, -self.limit_deg_s), self.limit_deg_s)
+        if not speed:
+            return 0.0
+        viscous = self.viscous_arcsec_s_per_deg * speed / (1.0 + abs(speed) / self.shear_deg_s)
+        return -(self.coulomb_arcsec * math.copysign(1.0, speed) + viscous)
 
     def bound_arcsec(self) -> float:
         viscous = self.limit_deg_s / (1.0 + self.limit_deg_s / self.shear_deg_s)
         return abs(self.coulomb_arcsec) + abs(self.viscous_arcsec_s_per_deg) * viscous
-
-
-class _Tracker(Level):
-    def __init__(self, effect: VelocityWindup) -> None:
-        self._coulomb = effect.coulomb_arcsec
-        self._viscous = effect.viscous_arcsec_s_per_deg
-        self._shear = effect.shear_deg_s
-        self._limit = effect.limit_deg_s
-
-    def peek(self, motor_deg: float, moment: Moment) -> float:
-        speed = min(max(moment.motor_speed_deg_s, -self._limit), self._limit)
-        if not speed:
-            return 0.0
-        return -(
-            self._coulomb * math.copysign(1.0, speed)
-            + self._viscous * speed / (1.0 + abs(speed) / self._shear)
-        )

@@ -2,39 +2,32 @@
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Annotated, Any, ClassVar, Self
+from typing import Annotated, Self
 
 import numpy as np
 from pydantic import Field
 
-from hdbridge.axis.effects.base import (
-    Angleless,
+from hdbridge.axis.effects.base import Angleless, Effect
+from hdbridge.axis.effects.coordinate import Coordinate
+from hdbridge.axis.effects.described import (
     Cause,
-    Channel,
     Coefficient,
     Compensable,
-    Coordinate,
-    Effect,
     Experiment,
-    FloatArray,
-    Memoryless,
-    Moment,
-    Motion,
     Observations,
     Shape,
     Sought,
-    Start,
-    Tracker,
 )
+from hdbridge.axis.effects.motion import Channel, FloatArray, Moment, Motion, Start
 from hdbridge.axis.effects.orders import cosines_and_sines
 
 
 class Vibration(Angleless):
     """amplitude cos(2 pi f t + phase)."""
 
-    name: ClassVar[str] = "vibration"
-    channels: ClassVar[frozenset[Channel]] = frozenset({Channel.TIME})
-    about: ClassVar[Cause] = Cause(
+    name = "vibration"
+    channels = frozenset({Channel.TIME})
+    about = Cause(
         title="vibration at a fixed frequency",
         equation="A cos(2 pi f t + phase)",
         signature="the same frequency in hertz at every speed, and at rest",
@@ -51,19 +44,15 @@ class Vibration(Angleless):
             )
         },
     )
-    compensable: ClassVar[Compensable] = Compensable(
-        False, "its phase drifts unpredictably, and it is mostly faster than the axis"
-    )
-    shape: ClassVar[tuple[Shape, ...]] = (
-        Shape("frequency_hz", 0.05, 5000.0, logarithmic=True, is_frequency=True),
-    )
-    usual: ClassVar[int] = 2
-    sought: ClassVar[Sought | None] = Sought.TONE
-    inexact: ClassVar[float] = 0.03
+    compensable = Compensable(False, "its phase drifts unpredictably, and it is mostly faster than the axis")
+    shape = (Shape("frequency_hz", 0.05, 5000.0, logarithmic=True, is_frequency=True),)
+    usual = 2
+    sought = Sought.TONE
+    inexact = 0.03
     """No source keeps its frequency and amplitude exactly, and the gear's loop responds at
     other frequencies.
     """
-    typical: ClassVar[Mapping[str, Any]] = {"frequency_hz": 50.0, "amplitude_arcsec": 1.0, "phase_deg": 0.0}
+    typical = {"frequency_hz": 50.0, "amplitude_arcsec": 1.0, "phase_deg": 0.0}
     """1 arcsec at 50 Hz, as an example; the real frequency comes from a search."""
 
     frequency_hz: Annotated[float, Field(gt=0, le=1e5, description="frequency")]
@@ -90,8 +79,9 @@ class Vibration(Angleless):
         error: FloatArray = self.amplitude_arcsec * np.cos(self._angle(motion) + math.radians(self.phase_deg))
         return error
 
-    def tracker(self, start: Start = Start.VIRGIN) -> Tracker:
-        return _Tracker(self)
+    def at(self, motor_deg: float, moment: Moment) -> float:
+        angle = 2.0 * math.pi * self.frequency_hz * moment.time_s + math.radians(self.phase_deg)
+        return self.amplitude_arcsec * math.cos(angle)
 
     def columns(self, motion: Motion, start: Start = Start.VIRGIN) -> FloatArray:
         """Returns cosine and sine, shape (n, 2)."""
@@ -117,13 +107,3 @@ class Vibration(Angleless):
 
     def _angle(self, motion: Motion) -> FloatArray:
         return (2.0 * math.pi * self.frequency_hz) * motion.channel(Channel.TIME, self.name)
-
-
-class _Tracker(Memoryless):
-    def __init__(self, effect: Vibration) -> None:
-        self._amplitude = effect.amplitude_arcsec
-        self._omega = 2.0 * math.pi * effect.frequency_hz
-        self._phase = math.radians(effect.phase_deg)
-
-    def peek(self, motor_deg: float, moment: Moment) -> float:
-        return self._amplitude * math.cos(self._omega * moment.time_s + self._phase)

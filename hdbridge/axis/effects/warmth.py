@@ -2,22 +2,15 @@
 
 import math
 from collections.abc import Iterator
-from typing import Annotated, ClassVar, Final, Literal
+from typing import Annotated, Final, Literal
 
 import numpy as np
 from pydantic import Field
 
-from hdbridge.axis.effects.base import (
-    SLOT,
-    Channel,
-    Effect,
-    FloatArray,
-    Moment,
-    Motion,
-    Observations,
-    Shape,
-)
-from hdbridge.axis.effects.observations import duration_s
+from hdbridge.axis.effects.base import Effect
+from hdbridge.axis.effects.described import Observations, Shape
+from hdbridge.axis.effects.kinematics import duration_s
+from hdbridge.axis.effects.motion import SLOT, Channel, FloatArray, Moment, Motion
 from hdbridge.axis.effects.recurrence import lagged
 
 VARIES_K: Final = 0.3
@@ -36,8 +29,8 @@ class Warmed(Effect):
     warms up from a cold start at the first sample, finally by ``warm_up_k``.
     """
 
-    channels: ClassVar[frozenset[Channel]] = frozenset({Channel.TIME})
-    shape: ClassVar[tuple[Shape, ...]] = (Shape("tau_s", 2.0, 3 * 3600.0, logarithmic=True),)
+    channels = frozenset({Channel.TIME})
+    shape = (Shape("tau_s", 2.0, 3 * 3600.0, logarithmic=True),)
 
     tau_s: Annotated[float, Field(gt=0, le=1e6, description="time constant of the gear's temperature")]
     driven_by: Annotated[

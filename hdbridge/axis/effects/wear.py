@@ -1,26 +1,16 @@
 """Lost motion that grows with the distance run."""
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
-from typing import Annotated, Any, ClassVar, Self
+from collections.abc import Iterator, Sequence
+from typing import Annotated, Self
 
 import numpy as np
 from pydantic import Field
 
-from hdbridge.axis.effects.base import (
-    Cause,
-    Compensable,
-    Coordinate,
-    Effect,
-    FloatArray,
-    Linear,
-    Moment,
-    Motion,
-    Observations,
-    Shape,
-    Start,
-    Tracker,
-)
+from hdbridge.axis.effects.base import Effect, Linear
+from hdbridge.axis.effects.coordinate import Coordinate
+from hdbridge.axis.effects.described import Cause, Compensable, Observations, Shape, Tracker
+from hdbridge.axis.effects.motion import FloatArray, Moment, Motion, Start
 from hdbridge.axis.effects.path import once
 from hdbridge.axis.effects.play import stop
 from hdbridge.units import DEG_PER_TURN
@@ -34,8 +24,8 @@ class Wear(Linear):
     1. Within the first turn the height grows linearly, because no power law holds there.
     """
 
-    name: ClassVar[str] = "wear"
-    about: ClassVar[Cause] = Cause(
+    name = "wear"
+    about = Cause(
         title="growing lost motion",
         equation="(growth / 2) (run / 1000)^exponent s, run = turns_before + sum |d theta_M| / 360, "
         "s = clip(s_before + 2 d theta_M / width, -1, 1)",
@@ -48,15 +38,13 @@ class Wear(Linear):
         source="lost motion proportional to sliding distance (Archard's law), slowing down while it runs in",
         size="0.1-10 arcsec per 1000 motor turns in a fast test",
     )
-    compensable: ClassVar[Compensable] = Compensable(
-        True, "the turns run must be carried over in turns_before"
-    )
-    shape: ClassVar[tuple[Shape, ...]] = (
+    compensable = Compensable(True, "the turns run must be carried over in turns_before")
+    shape = (
         Shape("width_deg", 0.05, 60.0, logarithmic=True),
         Shape("exponent", 0.3, 1.5),
     )
-    linear: ClassVar[tuple[str, ...]] = ("growth_arcsec_per_kiloturn",)
-    typical: ClassVar[Mapping[str, Any]] = {"growth_arcsec_per_kiloturn": 1.0, "width_deg": 2.0}
+    linear = ("growth_arcsec_per_kiloturn",)
+    typical = {"growth_arcsec_per_kiloturn": 1.0, "width_deg": 2.0}
     """1 arcsec per thousand turns, crossed in 2 degrees."""
 
     growth_arcsec_per_kiloturn: Annotated[

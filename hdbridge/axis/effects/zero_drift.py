@@ -1,35 +1,24 @@
 """Zero shift with temperature, because housing, encoder mount and gear expand differently."""
 
-from collections.abc import Iterator, Mapping, Sequence
-from typing import Annotated, Any, ClassVar, Self
+from collections.abc import Iterator, Sequence
+from typing import Annotated, Self
 
 import numpy as np
 from pydantic import Field
 
 from hdbridge.axis.effects import coordinate as over
-from hdbridge.axis.effects.base import (
-    Angleless,
-    Cause,
-    Compensable,
-    Coordinate,
-    Effect,
-    Experiment,
-    FloatArray,
-    Linear,
-    Moment,
-    Motion,
-    Observations,
-    Start,
-    Tracker,
-)
+from hdbridge.axis.effects.base import Effect, Linear
+from hdbridge.axis.effects.coordinate import Coordinate
+from hdbridge.axis.effects.described import Cause, Compensable, Experiment, Observations, Tracker
+from hdbridge.axis.effects.motion import FloatArray, Moment, Motion, Start
 from hdbridge.axis.effects.warmth import Warmed, WarmthState
 
 
-class ZeroDrift(Angleless, Linear, Warmed):
+class ZeroDrift(Linear, Warmed):
     """drift times the gear's warmth."""
 
-    name: ClassVar[str] = "zero_drift"
-    about: ClassVar[Cause] = Cause(
+    name = "zero_drift"
+    about = Cause(
         title="zero moves with temperature",
         subject="drift",
         equation="drift w, w = u - reference, tau du/dt = temperature - u "
@@ -58,11 +47,11 @@ class ZeroDrift(Angleless, Linear, Warmed):
             ),
         },
     )
-    compensable: ClassVar[Compensable] = Compensable(
+    compensable = Compensable(
         True, "if the temperature is measured on line; driven by time only after a cold start"
     )
-    linear: ClassVar[tuple[str, ...]] = ("drift_arcsec_per_k",)
-    typical: ClassVar[Mapping[str, Any]] = {"drift_arcsec_per_k": 1.0, "tau_s": 1800.0}
+    linear = ("drift_arcsec_per_k",)
+    typical = {"drift_arcsec_per_k": 1.0, "tau_s": 1800.0}
     """1 arcsec per kelvin, with a time constant of half an hour."""
 
     drift_arcsec_per_k: Annotated[float, Field(ge=-1000, le=1000, description="shift per kelvin")]
@@ -86,6 +75,9 @@ class ZeroDrift(Angleless, Linear, Warmed):
 
     def bound_arcsec(self) -> float:
         return abs(self.drift_arcsec_per_k) * self.limit_k
+
+    def slope_bound_arcsec_per_deg(self) -> float:
+        return 0.0
 
 
 class _Tracker(Tracker):

@@ -1,8 +1,8 @@
 """Model file: schema, reading with errors that give the place, and writing."""
 
 import math
-from collections.abc import Mapping, Sequence
-from typing import Any, Literal, NamedTuple
+from collections.abc import Mapping
+from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -55,19 +55,11 @@ class ModelFile(BaseModel):
     response: Response | None = Field(None, description="response of the axis to the correction in motion")
 
 
-class Content(NamedTuple):
-    """Validated content of a model file."""
+def effects_of(document: Document, file: ModelFile) -> tuple[tuple[Effect, ...], dict[str, dict[str, Any]]]:
+    """Returns the effects of a model file and their uncertainties, by name.
 
-    ratio: float
-    effects: tuple[Effect, ...]
-    uncertainty: dict[str, dict[str, Any]]
-    provenance: dict[str, Any]
-    response: Response | None = None
-
-
-def content_of(document: Document) -> Content:
-    """Reads a model file's document; raises `InputError` with file:line:column and the nearest valid name."""
-    file = document.validate(ModelFile)
+    Raises `InputError` with file:line:column and the nearest valid name.
+    """
     effects: list[Effect] = []
     uncertainty: dict[str, dict[str, Any]] = {}
     for number, entry in enumerate(file.effects):
@@ -77,29 +69,7 @@ def content_of(document: Document) -> Content:
             uncertainty[effect.name] = entry.uncertainty
     for conflict in conflicts(effects, file.ratio):
         raise document.error(("effects",), conflict)
-    provenance = document.data.get("provenance") or {}
-    return Content(file.ratio, tuple(effects), uncertainty, provenance, file.response)
-
-
-def document_of(
-    ratio: float,
-    effects: Sequence[Effect],
-    uncertainty: Mapping[str, Mapping[str, Any]],
-    provenance: Mapping[str, Any],
-    response: Response | None = None,
-) -> dict[str, Any]:
-    """Returns the content of a model file as plain data."""
-    entries = [
-        {"effect": each.name, "parameters": each.parameters()}
-        | ({"uncertainty": dict(uncertainty[each.name])} if uncertainty.get(each.name) else {})
-        for each in effects
-    ]
-    data: dict[str, Any] = {"schema": "hdbridge.model/1", "ratio": ratio, "effects": entries}
-    if provenance:
-        data["provenance"] = dict(provenance)
-    if response is not None:
-        data["response"] = response.model_dump(mode="json")
-    return data
+    return tuple(effects), uncertainty
 
 
 def text_of(document: Mapping[str, Any]) -> str:
@@ -110,21 +80,6 @@ def text_of(document: Mapping[str, Any]) -> str:
     if "response" in data:
         data["response"] = _in_lines(data["response"])
     return _HEADER + dump_yaml(data)
-
-
-def content_of_document(data: Mapping[str, Any]) -> Content:
-    """Reads the result of `document_of`, fast enough for the control loop.
-
-    Raises `KeyError` or `ValueError` for anything else.
-    """
-    entries = data["effects"]
-    return Content(
-        float(data["ratio"]),
-        tuple(CATALOGUE[each["effect"]].model_validate(each["parameters"]) for each in entries),
-        {each["effect"]: each["uncertainty"] for each in entries if "uncertainty" in each},
-        data.get("provenance", {}),
-        Response.model_validate(data["response"]) if "response" in data else None,
-    )
 
 
 def _effect(document: Document, number: int, entry: EffectEntry, before: list[str]) -> Effect:

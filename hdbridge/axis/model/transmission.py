@@ -11,9 +11,9 @@ from typing import Any, Self
 import numpy as np
 
 from hdbridge.axis import AxisConfig, Identity
-from hdbridge.axis.effects import Effect, FloatArray, Moment, Motion, Start, Tracker
+from hdbridge.axis.effects import CATALOGUE, Effect, FloatArray, Moment, Motion, Start, Tracker
 from hdbridge.axis.model.binding import binding, check_binding
-from hdbridge.axis.model.file import content_of, content_of_document, document_of, text_of
+from hdbridge.axis.model.file import ModelFile, effects_of, text_of
 from hdbridge.axis.model.response import Response
 from hdbridge.errors import InputError
 from hdbridge.files.yamlfile import Document, document_from_text, read_yaml, write_atomically
@@ -71,17 +71,39 @@ class TransmissionModel:
 
     @classmethod
     def _from_document(cls, document: Document) -> Self:
-        content = content_of(document)
-        return cls(*content, path=document.path)
+        file = document.validate(ModelFile)
+        provenance = document.data.get("provenance") or {}
+        return cls(file.ratio, *effects_of(document, file), provenance, file.response, document.path)
 
     @classmethod
     def from_document(cls, data: Mapping[str, Any], path: Path | None = None) -> Self:
-        """Reads the result of `document`; raises `KeyError` or `ValueError` for anything else."""
-        return cls(*content_of_document(data), path=path)
+        """Reads the result of `document`, fast enough for the control loop.
+
+        Raises `KeyError` or `ValueError` for anything else.
+        """
+        entries = data["effects"]
+        return cls(
+            float(data["ratio"]),
+            tuple(CATALOGUE[each["effect"]].model_validate(each["parameters"]) for each in entries),
+            {each["effect"]: each["uncertainty"] for each in entries if "uncertainty" in each},
+            data.get("provenance", {}),
+            Response.model_validate(data["response"]) if "response" in data else None,
+            path,
+        )
 
     def document(self) -> dict[str, Any]:
         """Returns the content of the model file as plain data, ready for JSON."""
-        return document_of(self.ratio, self.effects, self.uncertainty, self.provenance, self.response)
+        entries = [
+            {"effect": each.name, "parameters": each.parameters()}
+            | ({"uncertainty": dict(known)} if (known := self.uncertainty.get(each.name)) else {})
+            for each in self.effects
+        ]
+        data: dict[str, Any] = {"schema": "hdbridge.model/1", "ratio": self.ratio, "effects": entries}
+        if self.provenance:
+            data["provenance"] = dict(self.provenance)
+        if self.response is not None:
+            data["response"] = self.response.model_dump(mode="json")
+        return data
 
     def dump(self) -> str:
         """Returns the model file's text, which reads back exactly."""
@@ -108,12 +130,7 @@ class TransmissionModel:
             )
 
     def check_bound_to(self, axis: AxisConfig, identity: Identity | None = None) -> None:
-        """Raises `InputError` if the model belongs to another drive, axis or gear.
-
-        ``identity`` is the one read from the drive, by default that of the axis file. Values that the model
-        or the drive leaves open are not compared, and neither is the revision, because new firmware does not
-        change a gear.
-        """
+        """Raises `InputError` if the model belongs to another drive, axis or gear; see `check_binding`."""
         self.check_ratio(axis)
         check_binding(self.provenance, axis, identity, self._name(), "model", "calibrate it")
 

@@ -33,7 +33,7 @@ from hdbridge.axis.effects import (
     readings,
     refreshed,
 )
-from hdbridge.axis.effects.base import Memoryless
+from hdbridge.axis.effects.described import Memoryless
 from hdbridge.axis.effects.kinematics import Observer
 from hdbridge.axis.effects.orders import cosines_and_sines
 from hdbridge.axis.model import TransmissionModel
