@@ -17,17 +17,17 @@ from hdbridge.axis.model import TransmissionModel
 from hdbridge.commissioning.evaluation.stepping import Scheme
 from hdbridge.control.bench import compensation_for
 from hdbridge.control.busroutes import conflict
-from hdbridge.daemon.following.settings import AdaptationSettings
 from hdbridge.daemon.machinefile import (
+    AdaptationSettings,
     ApiSettings,
     AxisEntry,
     GatewaySettings,
     LimitSettings,
     LoadLoopSettings,
     MachineFile,
+    RecorderSettings,
     token_complaint,
 )
-from hdbridge.daemon.recorder.settings import RecorderSettings
 from hdbridge.drive import plan
 from hdbridge.drive.busload import check_bus_load
 from hdbridge.drive.link import unknown_interface

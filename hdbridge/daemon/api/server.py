@@ -20,9 +20,8 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
 
 from hdbridge.daemon.api.app import create_app
-from hdbridge.daemon.api.guard import Guard, Traffic
+from hdbridge.daemon.api.guard import BODY_MAXIMUM, Guard, Policy, Traffic
 from hdbridge.daemon.api.metrics import Metrics
-from hdbridge.daemon.api.policy import BODY_MAXIMUM, Policy
 from hdbridge.daemon.api.sockets import BACKLOG, peer_of
 from hdbridge.daemon.service.bridge import ServiceBridge
 

@@ -29,7 +29,7 @@ from hdbridge.daemon.following.estimator import (
     partial_fit,
 )
 from hdbridge.daemon.following.measuring import DriftModel, Observation, reversals, turns
-from hdbridge.daemon.following.settings import AdaptationSettings, Mode
+from hdbridge.daemon.machinefile import AdaptationSettings, Mode
 from hdbridge.errors import InputError
 
 ONE_WAY_TURNS = 4.0

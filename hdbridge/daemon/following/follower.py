@@ -23,9 +23,9 @@ from hdbridge.daemon.following.health import DRIVEN, EncoderHealth, EncoderStatu
 from hdbridge.daemon.following.judging import Raised, Verdict, Watch
 from hdbridge.daemon.following.measuring import DriftModel, Measuring
 from hdbridge.daemon.following.servo import ServoWatch
-from hdbridge.daemon.following.settings import AdaptationSettings, Mode
 from hdbridge.daemon.following.statefile import AdaptationFiles
 from hdbridge.daemon.loop.states import AxisState
+from hdbridge.daemon.machinefile import AdaptationSettings, Mode
 from hdbridge.daemon.memory import NO_FAULT, SampleArray, SampleFlag, joined_samples
 from hdbridge.errors import InputError
 

@@ -37,7 +37,7 @@ from hdbridge.axis.model import TransmissionModel
 from hdbridge.daemon.following.estimator import bounds_arcsec, calibrated_estimator, changes_between
 from hdbridge.daemon.following.health import EncoderStatus
 from hdbridge.daemon.following.measuring import DriftModel, Observation, Term
-from hdbridge.daemon.following.settings import AdaptationSettings
+from hdbridge.daemon.machinefile import AdaptationSettings
 
 DAY_S: Final = 86_400.0
 FALSE_ALARMS_PER_DAY: Final = 1.0 / 365.0

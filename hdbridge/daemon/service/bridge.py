@@ -32,10 +32,10 @@ from hdbridge.daemon.loop.states import STOPPED, UNKNOWN
 from hdbridge.daemon.memory import Cell, CommandKind, EventKind
 from hdbridge.daemon.service import reports
 from hdbridge.daemon.service.axis import ServiceAxis
-from hdbridge.daemon.service.coordination import run_together
 from hdbridge.daemon.service.core import ANSWER_S, Core
 from hdbridge.daemon.service.eventlog import Entry
 from hdbridge.daemon.service.lending import Lending
+from hdbridge.daemon.service.moves import run_together
 from hdbridge.daemon.service.observer import PERIOD_S, Subscription
 from hdbridge.daemon.service.outermaster import Latency, OuterMaster
 from hdbridge.daemon.service.timing import Timing

@@ -5,16 +5,7 @@ from typing import Annotated
 from fastapi import APIRouter, Query, Request
 
 from hdbridge.client import messages
-from hdbridge.daemon.api.routes.parts import (
-    MOVING,
-    STOPPING,
-    Bridge,
-    Caller,
-    Holder,
-    port,
-    refusals,
-    stopped,
-)
+from hdbridge.daemon.api.routes.parts import MOVING, STOPPING, Bridge, Caller, Holder, port, refusals, stopped
 from hdbridge.drive.interfacelock import user_name
 
 routes = APIRouter()
