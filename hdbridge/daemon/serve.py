@@ -21,8 +21,8 @@ from hdbridge.daemon.api.sockets import file_of, unix_socket
 from hdbridge.daemon.logs import begin_log
 from hdbridge.daemon.machine import Machine
 from hdbridge.daemon.memory import Cell, Memory
-from hdbridge.daemon.recorder.about import About, AxisAbout
 from hdbridge.daemon.recorder.autodiagnosis import AutoDiagnosis
+from hdbridge.daemon.recorder.flightfile import About, AxisAbout
 from hdbridge.daemon.recorder.recorder import FlightRecorder
 from hdbridge.daemon.service.bridge import ServiceBridge
 from hdbridge.daemon.service.eventlog import Journal
@@ -95,10 +95,10 @@ async def serve(start: Start, memory: Memory) -> None:
 
 
 def follow(
-    machine: Machine, bridge: ServiceBridge, recorder: FlightRecorder, stack: AsyncExitStack
+    machine: Machine, bridge: ServiceBridge, recorder: FlightRecorder | None, stack: AsyncExitStack
 ) -> list[Following]:
     """Follows all axes, each in a thread of its own; bad verdicts are diagnosed if flights are recorded."""
-    diagnosis = AutoDiagnosis(recorder.folder) if recorder.flight is not None else None
+    diagnosis = AutoDiagnosis(recorder.folder) if recorder is not None and recorder.flight else None
     if diagnosis is not None:
         stack.callback(diagnosis.close)
     following: list[Following] = []

@@ -6,8 +6,8 @@ from support.gateway import COUNTS_PER_DEG, gateway_bench, swing
 from support.service import play
 
 from hdbridge.daemon.machinefile import RecorderSettings
-from hdbridge.daemon.recorder.about import About, AxisAbout
 from hdbridge.daemon.recorder.export import exported
+from hdbridge.daemon.recorder.flightfile import About, AxisAbout
 from hdbridge.daemon.recorder.flightlog import Batch, FlightLog
 from hdbridge.daemon.recorder.reading import flight_files, read
 

@@ -8,7 +8,7 @@ import numpy as np
 from hdbridge.axis import AxisConfig
 from hdbridge.daemon.machinefile import RecorderSettings
 from hdbridge.daemon.memory import AXIS_SAMPLE, Event, EventKind, sample_dtype
-from hdbridge.daemon.recorder.about import About, AxisAbout
+from hdbridge.daemon.recorder.flightfile import About, AxisAbout
 from hdbridge.daemon.recorder.flightlog import FlightLog
 
 AXIS = AxisConfig.load("profiles/demo")

@@ -22,7 +22,7 @@ from mcap.writer import CompressionType, Writer
 
 from hdbridge.daemon.machinefile import RecorderSettings
 from hdbridge.daemon.memory import AXIS_SAMPLE, sample_dtype
-from hdbridge.daemon.recorder.about import About, AxisAbout
+from hdbridge.daemon.recorder.flightfile import About, AxisAbout
 from hdbridge.daemon.recorder.flightlog import Batch, FlightLog
 from hdbridge.daemon.recorder.reading import read
 

@@ -81,7 +81,12 @@ class AxisLoop:
         self._faults = FaultLog(self.supervision, tell, config.drive.cycle_s)
         self._period_s = config.drive.cycle_s
         self._follow = self.follower.follow
-        self._sampler = AxisSampler(self.cycle, self.follower, self._outer, outer)
+        self._outer_cells = outer
+        self._motor_deg = config.motor_encoder.degrees(1)
+        encoder = config.load_encoder
+        self._load_deg = math.nan if encoder.is_motor_encoder else encoder.degrees(1)
+        self._limited = 0
+        """Cycles in which the correction was limited, when the last sample was taken."""
         self._changing = self._underrun = self._unfed = False
         self._doubt = ""
         """Last reported states of the compensation change, the stream underrun and the load loop."""
@@ -474,33 +479,14 @@ class AxisLoop:
         stop = self.cycle.stopped
         return str(stop) if stop is not None else self._why
 
+    # ---------------------------------------------------------------- the sample of a turn
+
     def sample(self) -> tuple[float, ...]:
         """Returns the fields of `layout.Axis` for the turn that has just ended."""
-        return self._sampler.take(self.state, changing=self._changing, underrun=self._underrun)
-
-
-class AxisSampler:
-    """Collects the sample of one axis in each turn."""
-
-    def __init__(
-        self, cycle: AxisCycle, follower: Follower, outer_feed: OuterFeed, outer: OuterCells
-    ) -> None:
-        self._outer_feed, self._outer = outer_feed, outer
-        self._cycle, self._follower = cycle, follower
-        self._image, self._supervision = cycle.image, cycle.supervision
-        axis = cycle.image.axis
-        self._ratio = axis.gear.ratio
-        self._motor_deg = axis.motor_encoder.degrees(1)
-        encoder = axis.load_encoder
-        self._load_deg = math.nan if encoder.is_motor_encoder else encoder.degrees(1)
-        self._limited = 0
-
-    def take(self, state: AxisState, *, changing: bool, underrun: bool) -> tuple[float, ...]:
-        """Returns the fields of `layout.Axis` for the turn that has just ended."""
-        image, feedback, follower = self._image, self._cycle.feedback, self._follower
-        set_point, motor_deg = follower.set_point, self._motor_deg
+        image, feedback, follower = self.image, self.cycle.feedback, self.follower
+        state, set_point, motor_deg = self.state, self.set_point, self._motor_deg
         position_deg = motor_deg * feedback.motor_counts
-        stop = self._supervision.stop
+        stop = self.supervision.stop
         flags = _FRESH if feedback.fresh else 0
         reading0 = reading1 = received_s = math.nan
         if feedback.readings:
@@ -519,17 +505,17 @@ class AxisSampler:
                 flags |= _MEMORY_KNOWN
             if set_point.at_rest:
                 flags |= _AT_REST
-            if changing:
+            if self._changing:
                 flags |= _CHANGING
-            if underrun:
+            if self._underrun:
                 flags |= _UNDERRUN
             if follower.loop_doubt:
                 flags |= _DOUBTED
             if set_point.mode is _FOLLOW:
-                received_s = self._outer_feed.received_s
+                received_s = self._outer.received_s
         else:
             flags |= _AT_REST
-            target_deg = position_deg / self._ratio
+            target_deg = position_deg / self.config.gear.ratio
             correction_arcsec = predicted_arcsec = weight = loop_arcsec = 0.0
         return (
             state, set_point.mode, _POWER_INDEX[image.power.state],
@@ -539,8 +525,8 @@ class AxisSampler:
             self._load_deg * feedback.load_counts,
             feedback.torque_permille * follower.sensed.torque_nm, set_point.velocity_deg_s,
             correction_arcsec, predicted_arcsec, loop_arcsec, weight, reading0, reading1,
-            math.nan if self._cycle.silent else motor_deg * image.target_counts,
-            received_s, *self._outer.values(),
+            math.nan if self.cycle.silent else motor_deg * image.target_counts,
+            received_s, *self._outer_cells.values(),
         )  # fmt: skip
 
 

@@ -8,8 +8,7 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, nullcontext, suppress
-from types import TracebackType
-from typing import Final, Self
+from typing import Final
 
 from hdbridge.axis import AxisConfig, BusConfig
 from hdbridge.axis.model import TransmissionModel
@@ -34,17 +33,17 @@ AT_ONCE: Final = 2
 SIMULATED_BITRATE_BPS: Final = 1_000_000
 
 
-class Interface:
+class Interface(ExitStack):
     """Opens the bus of a machine file. The interface's lock is held by the keeper, which outlives this."""
 
     def __init__(self, settings: BusConfig, clock: Clock) -> None:
+        super().__init__()
         self._settings, self._clock = settings, clock
-        self._stack = ExitStack()
 
     def open(self) -> Link:
         """Opens the bus and returns a link; raises BusError if that fails."""
         self.close()
-        bus = self._stack.enter_context(open_bus(self._settings, shared=True))
+        bus = self.enter_context(open_bus(self._settings, shared=True))
         return Link(bus, self._clock)
 
     def reopen(self) -> Link | None:
@@ -65,17 +64,7 @@ class Interface:
     def close(self) -> None:
         """Closes the bus."""
         with suppress(HdbridgeError):
-            self._stack.close()
-
-    def __enter__(self) -> Self:
-        """Returns itself; opens nothing yet."""
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        """Calls `close`."""
-        self.close()
+            super().close()
 
 
 def listen(link: Link, axes: tuple[AxisConfig, ...]) -> None:

@@ -26,8 +26,7 @@ from typing import Final, NamedTuple
 
 from hdbridge.daemon.machinefile import RecorderSettings
 from hdbridge.daemon.memory import Event, EventKind, SampleArray
-from hdbridge.daemon.recorder.about import About
-from hdbridge.daemon.recorder.flightfile import KEPT, PART, FlightFile
+from hdbridge.daemon.recorder.flightfile import KEPT, PART, About, FlightFile
 from hdbridge.daemon.recorder.mend import mend_folder
 from hdbridge.daemon.recorder.reading import SUFFIX, overview
 from hdbridge.errors import InputError

@@ -20,8 +20,7 @@ from mcap.stream_reader import StreamReader
 from numpy.typing import NDArray
 from zstandard import ZstdError
 
-from hdbridge.daemon.recorder.about import About
-from hdbridge.daemon.recorder.flightfile import EVENTS, KEPT, MACHINE_TOPIC, MODEL, PART, axis_topic
+from hdbridge.daemon.recorder.flightfile import EVENTS, KEPT, MACHINE_TOPIC, MODEL, PART, About, axis_topic
 from hdbridge.daemon.recorder.wire import AXIS, MACHINE
 from hdbridge.errors import InputError
 from hdbridge.files.regular import open_regular

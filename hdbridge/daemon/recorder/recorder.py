@@ -16,7 +16,7 @@ from typing import Final
 from hdbridge.client import messages
 from hdbridge.daemon.machinefile import RecorderSettings
 from hdbridge.daemon.memory import Event, SampleArray
-from hdbridge.daemon.recorder.about import About
+from hdbridge.daemon.recorder.flightfile import About
 from hdbridge.daemon.recorder.flightlog import MARK, Batch, FlightLog, Item, ModelUse, Note, free_bytes
 from hdbridge.daemon.setting import CompensationSetting
 
