@@ -13,7 +13,7 @@ from hdbridge.cli.options import need_extra
 from hdbridge.errors import InputError
 
 if TYPE_CHECKING:
-    from hdbridge.daemon.recorder.reading import Flight, ModelUsed, Overview
+    from hdbridge.daemon.recorder.reading import Flight, ModelUsed
     from hdbridge.records.recording import Recording
 
 _EXTRA = ("mcap", "google.protobuf")
@@ -95,7 +95,7 @@ def need_reader() -> None:
     need_extra("flight recordings need", _EXTRA, "daemon")
 
 
-def _outside(about: Overview, begin_ns: int | None, end_ns: int | None) -> bool:
+def _outside(about: Flight, begin_ns: int | None, end_ns: int | None) -> bool:
     return (begin_ns is not None and about.last_ns < begin_ns) or (
         end_ns is not None and about.first_ns > end_ns
     )

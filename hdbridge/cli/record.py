@@ -18,7 +18,7 @@ from hdbridge.files.outputs import Kind
 from hdbridge.files.profile import Profile
 
 if TYPE_CHECKING:
-    from hdbridge.daemon.recorder.reading import Overview
+    from hdbridge.daemon.recorder.reading import Flight
     from hdbridge.records.recording import Recording
 
 _NS = 10**9
@@ -259,7 +259,7 @@ def _date(time_ns: int) -> datetime:
     return datetime.fromtimestamp(time_ns / _NS, UTC)
 
 
-def _overview(each: Overview) -> dict[str, Any]:
+def _overview(each: Flight) -> dict[str, Any]:
     return {
         "file": str(each.path),
         "machine": each.about.machine,

@@ -15,23 +15,36 @@ holds it already. Every error is one of `hdbridge.errors`.
 from __future__ import annotations
 
 import asyncio
+import ssl
 import time
 from collections.abc import AsyncGenerator, AsyncIterator, Iterable, Mapping, Sequence
 from contextlib import AsyncExitStack, asynccontextmanager, nullcontext, suppress
 from pathlib import Path
-from typing import Any, Final, Self
+from typing import Any, Final, Self, TypeVar
 from urllib.parse import quote
 
 import httpx
-from pydantic import BaseModel
+from pydantic import BaseModel, ValidationError
 from websockets.asyncio.client import ClientConnection, connect, unix_connect
+from websockets.exceptions import ConnectionClosed, InvalidHandshake, InvalidStatus
 
-from hdbridge.client import messages, transport
+from hdbridge.client import messages
 from hdbridge.client.address import Address, find
-from hdbridge.client.messages import AxisState, LeaseGrant, LeaseState, MachineState, SdoValue
-from hdbridge.client.transport import M
-from hdbridge.errors import DaemonError, LeaseError, SafetyStop
+from hdbridge.client.messages import (
+    CONTENT_TYPE,
+    AxisState,
+    LeaseGrant,
+    LeaseState,
+    MachineState,
+    Problem,
+    SdoValue,
+)
+from hdbridge.errors import DaemonError, HdbridgeError, LeaseError, SafetyStop
 
+M = TypeVar("M", bound=BaseModel)
+PREFIX: Final = "/api/v1"
+FAILURES: Final = (OSError, EOFError, ConnectionClosed, InvalidHandshake)
+"""Exceptions of a WebSocket."""
 POLL_S: Final = 0.1
 JOG_S: Final = 0.5
 """Time-out of a jog after the last request of its client."""
@@ -68,14 +81,11 @@ class AsyncClient:
         self._holding = 0
         self._grant: LeaseGrant | None = None
         self._uds = None if self.address.socket is None else str(self.address.socket)
-        self._tls = transport.tls_context(self.address)
+        self._tls = ssl.create_default_context() if self.address.url.startswith("https") else None
         # Without TLS it loads no certificates.
         under = httpx.AsyncHTTPTransport(uds=self._uds, verify=False if self._tls is None else self._tls)
         self._http = httpx.AsyncClient(
-            transport=under,
-            base_url=self.address.url + transport.PREFIX,
-            headers=self.address.headers,
-            trust_env=False,
+            transport=under, base_url=self.address.url + PREFIX, headers=self.address.headers, trust_env=False
         )
 
     async def __aenter__(self) -> Self:
@@ -173,17 +183,17 @@ class AsyncClient:
             "close_timeout": CLOSE_S,
             "compression": None,
         }
-        url = f"{address.websocket_url}{transport.PREFIX}{path}"
+        url = f"{address.websocket_url}{PREFIX}{path}"
         async with AsyncExitStack() as stack:
-            transport.check(address)
+            _check(address)
             try:
                 connection: ClientConnection = await stack.enter_async_context(
                     connect(url, **options, ssl=self._tls, proxy=None)
                     if self._uds is None
                     else unix_connect(self._uds, url, **options)
                 )
-            except transport.FAILURES as problem:
-                raise transport.disconnected(address, problem) from None
+            except FAILURES as problem:
+                raise _disconnected(address, problem) from None
             yield AsyncLink(connection, address)
 
     async def ask(
@@ -208,17 +218,17 @@ class AsyncClient:
         async with self._held() if moving else nullcontext():
             if self._grant is not None:
                 headers["X-Lease"] = self._grant.token
-            transport.check(self.address)
+            _check(self.address)
             try:
                 response = await self._http.request(
                     method, path, content=content, headers=headers, params=query, timeout=timeout
                 )
             except httpx.TransportError as problem:
-                raise transport.unreachable(self.address, problem) from None
+                raise _unreachable(self.address, problem) from None
         if response.is_error:
             kind = response.headers.get("content-type", "")
-            raise transport.refused(response.status_code, kind, response.content)
-        return transport.read(answer, response.content, f"{method} {path}")
+            raise _refused(response.status_code, kind, response.content)
+        return _read(answer, response.content, f"{method} {path}")
 
     @asynccontextmanager
     async def _held(self, force: bool = False) -> AsyncIterator[LeaseGrant]:
@@ -456,13 +466,65 @@ class AsyncLink:
         """Sends a message."""
         try:
             await self._connection.send(message.model_dump_json())
-        except transport.FAILURES as problem:
-            raise transport.disconnected(self._address, problem) from None
+        except FAILURES as problem:
+            raise _disconnected(self._address, problem) from None
 
     async def receive(self, kind: type[M]) -> M:
         """Receives the next message."""
         try:
             text = await self._connection.recv()
-        except transport.FAILURES as problem:
-            raise transport.disconnected(self._address, problem) from None
-        return transport.read(kind, text, kind.__name__)
+        except FAILURES as problem:
+            raise _disconnected(self._address, problem) from None
+        return _read(kind, text, kind.__name__)
+
+
+def _check(address: Address) -> None:
+    """Raises DaemonError if the socket does not exist, with the same message for all requests."""
+    if address.socket is not None and not address.socket.is_socket():
+        raise DaemonError(f"{address}: there is no such socket; start the daemon with 'hdbridge run'")
+
+
+def _read(kind: type[M], content: str | bytes, what: str) -> M:
+    """Parses an answer to ``what``; raises DaemonError if it is another message."""
+    try:
+        return kind.model_validate_json(content)
+    except ValidationError as problem:
+        first = problem.errors(include_input=False, include_url=False)[0]
+        raise DaemonError(
+            f"{what}: the answer is not what this version of hdbridge expects "
+            f"({'.'.join(map(str, first['loc']))}: {first['msg']}); use the same version at both ends"
+        ) from None
+
+
+def _refused(status: int, kind: str, content: bytes) -> HdbridgeError:
+    """Returns the daemon's error from an answer of status 400 or above."""
+    if kind.startswith(CONTENT_TYPE):
+        try:
+            return Problem.model_validate_json(content).error()
+        except ValidationError:
+            pass
+    return DaemonError(
+        f"HTTP {status}, which is not an answer of hdbridge: is another server at this address?"
+    )
+
+
+def _unreachable(address: Address, problem: Exception) -> DaemonError:
+    """Returns the error for a daemon that cannot be reached or has disconnected."""
+    if isinstance(problem, httpx.ConnectError):
+        return DaemonError(f"{address}: no daemon answers ({problem}); start it with 'hdbridge run'")
+    what = "did not answer in time" if isinstance(problem, httpx.TimeoutException) else "went away"
+    return DaemonError(
+        f"{address}: the daemon {what} ({problem or type(problem).__name__}); whether it was done is not "
+        "known: look at the state first"
+    )
+
+
+def _disconnected(address: Address, problem: Exception) -> HdbridgeError:
+    """Returns the error for a failure of a WebSocket."""
+    if isinstance(problem, InvalidStatus):
+        response = problem.response
+        kind = response.headers.get("Content-Type", "")
+        return _refused(response.status_code, kind, bytes(response.body or b""))
+    if isinstance(problem, ConnectionClosed) and problem.rcvd is not None and problem.rcvd.reason:
+        return DaemonError(problem.rcvd.reason)
+    return DaemonError(f"{address}: the connection is gone ({problem or type(problem).__name__})")

@@ -17,17 +17,17 @@ from hdbridge.axis.model import TransmissionModel
 from hdbridge.commissioning.evaluation.stepping import Scheme
 from hdbridge.control.bench import compensation_for
 from hdbridge.control.busroutes import conflict
-from hdbridge.daemon.following.settings import AdaptationSettings
 from hdbridge.daemon.machinefile import (
+    AdaptationSettings,
     ApiSettings,
     AxisEntry,
     GatewaySettings,
     LimitSettings,
     LoadLoopSettings,
     MachineFile,
+    RecorderSettings,
     token_complaint,
 )
-from hdbridge.daemon.recorder.settings import RecorderSettings
 from hdbridge.drive import plan
 from hdbridge.drive.busload import check_bus_load
 from hdbridge.drive.link import unknown_interface
@@ -174,8 +174,7 @@ class Machine:
             replace(axis, config=axis.config.model_copy(update={"bus": bus, "realtime": realtime}))
             for axis in axes
         ]
-        _check_together(axes, places)
-        _check_load([axis.config for axis in axes], bus, places)
+        _check_together(axes, bus, places)
         _check_tcp(file, places)
         _check_interfaces(file, places)
         _check_gateway(file, axes, bus, places)
@@ -270,8 +269,8 @@ def _agreed(axes: Sequence[Axis], ask: Callable[[AxisConfig], T], places: _Place
     return first
 
 
-def _check_together(axes: Sequence[Axis], places: _Places) -> None:
-    """Checks that the names are unique, and that the axes can share a bus."""
+def _check_together(axes: Sequence[Axis], bus: BusConfig, places: _Places) -> None:
+    """Checks that the names are unique, and that the axes can share a bus, whose cycle takes their frames."""
     names: dict[str, int] = {}
     for number, axis in enumerate(axes):
         if (other := names.setdefault(axis.name, number)) != number:
@@ -280,14 +279,11 @@ def _check_together(axes: Sequence[Axis], places: _Places) -> None:
                 f"an axis '{axis.name}' stands in {places.where(('axes', other))} already; expected another "
                 f"name in {axis.config.where('name')}",
             )
-    if (found := conflict([axis.config for axis in axes])) is not None:
+    configs = [axis.config for axis in axes]
+    if (found := conflict(configs)) is not None:
         raise places.error(("axes", found[0], "profile"), found[1])
-
-
-def _check_load(axes: Sequence[AxisConfig], bus: BusConfig, places: _Places) -> None:
-    """Checks that the frames of a cycle fit into it."""
     try:
-        check_bus_load(axes, bus.bitrate_bps)
+        check_bus_load(configs, bus.bitrate_bps)
     except InputError as problem:
         raise places.error(("axes",), str(problem)) from None
 

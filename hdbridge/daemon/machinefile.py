@@ -1,4 +1,4 @@
-"""Schema of the machine file: axes, bus, access, recorder.
+"""Schema of the machine file: axes, bus, access, recorder, adaptation.
 
 A user writes ``machine.yaml``; the program never changes it. `hdbridge.daemon.machine` reads it together with
 the profiles that it names.
@@ -12,14 +12,82 @@ from pydantic import Field
 
 from hdbridge.axis import BusConfig, RealtimeConfig
 from hdbridge.commissioning.evaluation.stepping import Scheme
-from hdbridge.daemon.following.settings import AdaptationSettings, Mode
 from hdbridge.daemon.memory.layout import AXES_AT_MOST
-from hdbridge.daemon.recorder.settings import RecorderSettings
 from hdbridge.strictness import Strict
 
 NAME = r"^[A-Za-z0-9][A-Za-z0-9._-]*$"
 """Pattern of a machine's name, which is also the name of its socket and service."""
 _TOKEN = re.compile(r"[A-Za-z0-9._~-]{16,200}")
+Mode = Literal["off", "observe", "on"]
+Parameter = Annotated[str, Field(pattern=r"^[a-z_]+\.[a-z_]+$")]
+
+
+class RecorderSettings(Strict):
+    """Settings of the ring on disk and of the recordings kept aside."""
+
+    folder: str | None = Field(
+        None,
+        min_length=1,
+        description="folder of the recordings; by default recordings/daemon next to this file, or in the "
+        "state folder of the service",
+    )
+    size_mb: float = Field(2000.0, ge=1, le=1e7, description="size of the ring")
+    age_days: float = Field(30.0, gt=0, le=36_500, description="age at which a file of the ring is removed")
+    file_mb: float = Field(64.0, ge=0.1, le=4000, description="size at which the next file begins")
+    file_s: float = Field(300.0, ge=5, le=86_400, description="time after which the next file begins")
+    before_s: float = Field(60.0, ge=0, le=86_400, description="time before each fault that is kept")
+    after_s: float = Field(30.0, ge=0, le=86_400, description="time after each fault that is kept")
+    kept_mb: float = Field(1000.0, ge=1, le=1e7, description="size of the recordings kept for faults")
+    free_mb: float = Field(100.0, ge=0, le=1e7, description="free disk space below which nothing is recorded")
+
+
+class Excitation(Strict):
+    """Motion required between two updates of the estimate."""
+
+    turns: float = Field(
+        2.0, ge=0.5, le=1000, description="motor turns, both directions together, for the motor orders"
+    )
+    reversals: int = Field(2, ge=1, le=1000, description="reversals, to separate the loop from the zero")
+    samples: int = Field(10, ge=2, le=10_000, description="standstills and stretches of slow motion")
+
+
+class AdaptationSettings(Strict):
+    """Settings of the adaptation. Rates are per hour of axis time, bounds relative to the committed model."""
+
+    mode: Mode = Field("off", description="observe only reports what would change")
+    parameters: tuple[Parameter, ...] | None = Field(
+        None,
+        description="adapted parameters, as EFFECT.PARAMETER; by default all that wear or temperature move",
+    )
+    rate_arcsec_per_hour: float = Field(
+        30.0, gt=0, le=36_000, description="fastest change of any coefficient of the model"
+    )
+    zero_rate_arcsec_per_hour: float = Field(
+        60.0, gt=0, le=36_000, description="fastest plausible change of the zero (reported, never applied)"
+    )
+    bound_share: float = Field(
+        0.5, gt=0, le=1, description="largest deviation of a coefficient, as a share of the committed one"
+    )
+    least_bound_arcsec: float = Field(
+        5.0, ge=0, le=3600, description="largest deviation, if that share is smaller"
+    )
+    zero_bound_arcsec: float = Field(60.0, gt=0, le=3600, description="largest plausible change of the zero")
+    half_life_turns: float = Field(
+        40.0, ge=1, le=1e6, description="motor turns after which older observations count half"
+    )
+    excitation: Excitation = Field(default_factory=Excitation, description="motion required for an update")
+    slow_deg_s: float = Field(0.5, gt=0, le=100, description="highest load speed at which motion is used")
+    interval_s: float = Field(
+        60.0, ge=1, le=86_400, description="minimum time between changes of the model in use"
+    )
+    smallest_arcsec: float = Field(
+        0.1, ge=0, le=100, description="smallest change of a coefficient that is applied"
+    )
+    folder: str | None = Field(
+        None,
+        min_length=1,
+        description="folder of AXIS.json and AXIS.log.jsonl; by default 'adaptation' next to the axis file",
+    )
 
 
 class _Part(Strict):
@@ -44,8 +112,7 @@ class AxisEntry(_Part):
         description="folder with axis.yaml or axis file, relative to this file, or a bundled profile",
     )
     compensation: Scheme = Field(
-        Scheme.EXTENDED,
-        description="part of the active model that compensates; extended is the whole model",
+        Scheme.EXTENDED, description="part of the active model that compensates; extended is the whole model"
     )
     adapt: Mode | None = Field(None, description="adaptation mode of this axis; by default adaptation.mode")
     load_loop: LoadLoopSettings | None = Field(
@@ -60,19 +127,14 @@ class TcpSettings(_Part):
     names: tuple[Annotated[str, Field(pattern=r"^[A-Za-z0-9.-]+$")], ...] = Field(
         (), description="host names of a reverse proxy on this machine"
     )
-    token_file: str = Field(
-        min_length=1,
-        description="file with the clients' token, mode 600",
-    )
+    token_file: str = Field(min_length=1, description="file with the clients' token, mode 600")
 
 
 class ApiSettings(_Part):
     """Access of clients to the daemon."""
 
     socket: str | None = Field(
-        None,
-        min_length=1,
-        description="Unix socket; by default NAME.sock in the runtime folder",
+        None, min_length=1, description="Unix socket; by default NAME.sock in the runtime folder"
     )
     group: str | None = Field(
         None, min_length=1, description="group whose members may use the socket; by default the daemon's"
@@ -88,10 +150,7 @@ class GatewaySettings(_Part):
         min_length=1, description="node id on that bus of each axis, by its name"
     )
     counts_per_turn: int = Field(
-        12_960_000,
-        ge=3600,
-        le=1 << 28,
-        description="increments per load turn (default 0.1 arcsec each)",
+        12_960_000, ge=3600, le=1 << 28, description="increments per load turn (default 0.1 arcsec each)"
     )
     timeout_ms: float = Field(
         100.0,
@@ -128,10 +187,7 @@ class MachineFile(_Part):
         10.0, description="time after which an unrenewed lease expires"
     )
     limits: LimitSettings = Field(default_factory=LimitSettings, description="limits of the daemon")
-    recorder: RecorderSettings = Field(
-        default_factory=RecorderSettings,
-        description="flight recorder",
-    )
+    recorder: RecorderSettings = Field(default_factory=RecorderSettings, description="flight recorder")
     gateway: GatewaySettings | None = Field(
         None, description="axes as drives of another master; by default none"
     )
@@ -139,8 +195,7 @@ class MachineFile(_Part):
         default_factory=AdaptationSettings, description="adaptation of model parameters to the load encoder"
     )
     realtime: RealtimeConfig | None = Field(
-        None,
-        description="scheduling; by default that of the axis files, which must agree",
+        None, description="scheduling; by default that of the axis files, which must agree"
     )
 
 

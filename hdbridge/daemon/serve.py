@@ -14,20 +14,20 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import AsyncExitStack, suppress
 from typing import Final
 
+from hdbridge.daemon.api.guard import Policy
 from hdbridge.daemon.api.metrics import Metrics
-from hdbridge.daemon.api.policy import Policy
 from hdbridge.daemon.api.server import ApiServer, Listener
 from hdbridge.daemon.api.sockets import file_of, unix_socket
 from hdbridge.daemon.logs import begin_log
 from hdbridge.daemon.machine import Machine
 from hdbridge.daemon.memory import Cell, Memory
 from hdbridge.daemon.recorder.autodiagnosis import AutoDiagnosis
+from hdbridge.daemon.recorder.flightfile import About, AxisAbout
 from hdbridge.daemon.recorder.recorder import FlightRecorder
 from hdbridge.daemon.service.bridge import ServiceBridge
+from hdbridge.daemon.service.eventlog import Journal
 from hdbridge.daemon.service.following import Following
-from hdbridge.daemon.service.journal import Journal
 from hdbridge.daemon.service.observer import Sink
-from hdbridge.daemon.service.recording import Recording
 from hdbridge.daemon.service.timing import SimulatedClock, Timing
 from hdbridge.daemon.start import Start, run_child, runtime_folder
 from hdbridge.errors import HdbridgeError
@@ -62,10 +62,20 @@ async def serve(start: Start, memory: Memory) -> None:
         stack.callback(timing.close)
         bridge = ServiceBridge(machine, memory, timing, simulated=simulated, forced=start.force)
         metrics = Metrics()
-        recording = Recording(machine, bridge)
-        stack.callback(recording.close)
-        following = follow(machine, bridge, recording.recorder, stack)
-        sinks: list[Sink] = [Journal([*bridge.axes]), metrics, recording, *following]
+        recorder = FlightRecorder(
+            machine.recorder_folder(),
+            About.of(
+                machine.name, tuple(AxisAbout.of(each.config) for each in machine.axes), machine.cycle_s
+            ),
+            machine.recorder,
+            tell=bridge.core.log.note,
+            in_use=lambda: {name: axis.models.in_use for name, axis in bridge.axes.items()},
+        )
+        bridge.recorder = recorder.state
+        bridge.marks.append(recorder.mark)
+        stack.callback(recorder.close)
+        following = follow(machine, bridge, recorder, stack)
+        sinks: list[Sink] = [Journal([*bridge.axes]), metrics, recorder, *following]
         for sink in sinks:
             bridge.core.observer.add(sink)
         await stack.enter_async_context(bridge)
@@ -87,8 +97,8 @@ async def serve(start: Start, memory: Memory) -> None:
 def follow(
     machine: Machine, bridge: ServiceBridge, recorder: FlightRecorder | None, stack: AsyncExitStack
 ) -> list[Following]:
-    """Follows all axes, each in a thread of its own; with a recorder, bad verdicts are diagnosed."""
-    diagnosis = AutoDiagnosis(recorder.folder) if recorder is not None else None
+    """Follows all axes, each in a thread of its own; bad verdicts are diagnosed if flights are recorded."""
+    diagnosis = AutoDiagnosis(recorder.folder) if recorder is not None and recorder.flight else None
     if diagnosis is not None:
         stack.callback(diagnosis.close)
     following: list[Following] = []

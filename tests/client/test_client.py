@@ -166,10 +166,7 @@ def test_a_path_is_streamed_and_the_lease_released(client, api):
 
 
 def test_a_refused_point_or_an_error_ends_the_stream(client, api):
-    with (
-        pytest.raises(InputError, match="-180 to 180"),
-        client.axis("joint-1").stream() as stream,
-    ):
+    with pytest.raises(InputError, match="-180 to 180"), client.axis("joint-1").stream() as stream:
         stream.put([(0.0, 999.0)])
     with pytest.raises(OSError, match="mine"), client.axis("joint-1").stream():
         raise OSError("mine")

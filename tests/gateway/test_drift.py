@@ -6,7 +6,7 @@ from random import Random
 
 import pytest
 
-from hdbridge.daemon.loop.outerfeed import OuterFeed
+from hdbridge.daemon.loop.feeds import OuterFeed
 from hdbridge.daemon.memory.layout import OuterKnot
 from hdbridge.device.syncclock import SyncClock
 

@@ -69,10 +69,7 @@ async def reset(bench):
     assert plc.emergencies == []
 
 
-@pytest.mark.parametrize(
-    ("period_ms", "drift_ppm"),
-    [(1, 200), (2, -200), (4, 0), (5, 200), (20, -200)],
-)
+@pytest.mark.parametrize(("period_ms", "drift_ppm"), [(1, 200), (2, -200), (4, 0), (5, 200), (20, -200)])
 def test_the_set_point_is_that_of_a_drive_one_cycle_later(tmp_path, period_ms, drift_ppm):
     """No set-point is lost, at any outer cycle and with 200 ppm of drift."""
 

@@ -5,12 +5,11 @@ import pytest
 from support.gateway import COUNTS_PER_DEG, gateway_bench, swing
 from support.service import play
 
-from hdbridge.daemon.recorder.about import About, AxisAbout
+from hdbridge.daemon.machinefile import RecorderSettings
 from hdbridge.daemon.recorder.export import exported
+from hdbridge.daemon.recorder.flightfile import About, AxisAbout
 from hdbridge.daemon.recorder.flightlog import Batch, FlightLog
 from hdbridge.daemon.recorder.reading import flight_files, read
-from hdbridge.daemon.recorder.settings import RecorderSettings
-from hdbridge.daemon.recorder.store import Store
 
 
 def test_a_recording_has_the_targets_and_the_words_of_the_other_master(tmp_path):
@@ -37,7 +36,7 @@ def test_a_recording_has_the_targets_and_the_words_of_the_other_master(tmp_path)
         sent, samples = play(scenario(bench))
         period_s = bench.daemon.period_s
         about = About.of("cell", (AxisAbout.of(bench.daemon.axes[0].config),), period_s)
-    log = FlightLog(Store(tmp_path / "flights", RecorderSettings()), about)
+    log = FlightLog(tmp_path / "flights", RecorderSettings(), about)
     log.put(Batch(samples))
     log.close()
     flights = [read(each) for each in flight_files([tmp_path / "flights"])]

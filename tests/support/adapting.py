@@ -19,8 +19,8 @@ from hdbridge.control.bench import Bench
 from hdbridge.daemon.following.adaptation import Adaptation, Entry, Learned
 from hdbridge.daemon.following.follower import Follower
 from hdbridge.daemon.following.measuring import DriftModel
-from hdbridge.daemon.following.settings import AdaptationSettings
 from hdbridge.daemon.loop.states import AxisState
+from hdbridge.daemon.machinefile import AdaptationSettings
 from hdbridge.daemon.memory import AXIS_SAMPLE, NO_FAULT, SampleArray, SampleFlag, sample_dtype
 from hdbridge.device.node import DriveNode
 from hdbridge.drive import Drive

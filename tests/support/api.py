@@ -9,8 +9,8 @@ from pathlib import Path
 
 import httpx
 
+from hdbridge.daemon.api.guard import Policy
 from hdbridge.daemon.api.metrics import Metrics
-from hdbridge.daemon.api.policy import Policy
 from hdbridge.daemon.api.server import ApiServer, Listener
 from hdbridge.daemon.api.sockets import tcp_socket, unix_socket
 from hdbridge.daemon.service.bridge import ServiceBridge

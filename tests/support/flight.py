@@ -6,11 +6,10 @@ from typing import Any
 import numpy as np
 
 from hdbridge.axis import AxisConfig
+from hdbridge.daemon.machinefile import RecorderSettings
 from hdbridge.daemon.memory import AXIS_SAMPLE, Event, EventKind, sample_dtype
-from hdbridge.daemon.recorder.about import About, AxisAbout
+from hdbridge.daemon.recorder.flightfile import About, AxisAbout
 from hdbridge.daemon.recorder.flightlog import FlightLog
-from hdbridge.daemon.recorder.settings import RecorderSettings
-from hdbridge.daemon.recorder.store import Store
 
 AXIS = AxisConfig.load("profiles/demo")
 PERIOD_S = 0.004
@@ -69,6 +68,6 @@ def flight_log(folder: Path, told: list[str] | None = None, free: Any = None, ax
     """Returns the recorder without its thread, and its clock."""
     clock = Clock()
     settings = RecorderSettings(**{"free_mb": 0.0, **limits})
-    store = Store(folder, settings, free or (lambda _: ROOM))
     tell = told.append if told is not None else (lambda _: None)
-    return FlightLog(store, about(axes), tell=tell, wall_ns=clock), clock
+    free = free or (lambda _: ROOM)
+    return FlightLog(folder, settings, about(axes), tell=tell, wall_ns=clock, free=free), clock

@@ -18,7 +18,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "tests"))
 
 from support.adapting import FAULTS, FLOOR_ARCSEC, Work, at_work, truth_of
 
-from hdbridge.daemon.following.settings import AdaptationSettings
+from hdbridge.daemon.machinefile import AdaptationSettings
 
 NEIGHBOURS = 8
 ON = AdaptationSettings(mode="on")

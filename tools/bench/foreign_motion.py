@@ -53,7 +53,7 @@ from hdbridge.axis.model import TransmissionModel
 from hdbridge.commissioning.calibration import Calibration, calibrate, start_journal
 from hdbridge.commissioning.calibration.motion import MotionTest, motion_test
 from hdbridge.control.bench import compensation_for
-from hdbridge.daemon.following.settings import AdaptationSettings
+from hdbridge.daemon.machinefile import AdaptationSettings
 from hdbridge.errors import HdbridgeError
 from hdbridge.motion.procedures.even_speed import EvenRun, EvenSpeed
 from hdbridge.motion.procedures.plan import Plan

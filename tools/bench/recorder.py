@@ -17,12 +17,11 @@ from typing import Any
 import numpy as np
 from harness import keep, parser
 
+from hdbridge.daemon.machinefile import RecorderSettings
 from hdbridge.daemon.memory import sample_dtype
-from hdbridge.daemon.recorder.about import About, AxisAbout
+from hdbridge.daemon.recorder.flightfile import About, AxisAbout
 from hdbridge.daemon.recorder.flightlog import Batch, FlightLog
 from hdbridge.daemon.recorder.reading import read
-from hdbridge.daemon.recorder.settings import RecorderSettings
-from hdbridge.daemon.recorder.store import Store
 
 RATIO = 50.0
 MOTOR_COUNTS, LOAD_COUNTS = 8_000, 2_880_000
@@ -70,7 +69,7 @@ def as_recorded(samples: Any, rate: int, folder: Path) -> tuple[float, int]:
     axes = samples["axes"].shape[1]
     about = About.of("bench", tuple(AxisAbout(f"axis{each}", RATIO) for each in range(axes)), 1.0 / rate)
     settings = RecorderSettings(free_mb=0.0, file_s=86_400.0, file_mb=4000.0)
-    log = FlightLog(Store(folder, settings), about)
+    log = FlightLog(folder, settings, about)
     begun = time.thread_time()
     batch = max(rate // 50, 1)
     for first in range(0, len(samples), rate):

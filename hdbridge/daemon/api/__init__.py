@@ -1,8 +1,7 @@
 """HTTP and WebSocket API over a Unix socket, and over TCP if the machine file says so.
 
 sockets.py   creates the listening sockets
-policy.py    rules for the requests to one listener
-guard.py     applies the policy before a request reaches a route
+guard.py     the policy of a listener, applied before a request reaches a route
 app.py       the application, its description, metrics and health
 routes/      the requests of the API
 server.py    uvicorn with limits

@@ -13,7 +13,7 @@ from prometheus_client import CollectorRegistry, generate_latest
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, HistogramMetricFamily, Metric
 from prometheus_client.registry import Collector
 
-from hdbridge.client.messages import ControlState, MachineState
+from hdbridge.client.messages import ControlState
 from hdbridge.daemon.api.guard import Traffic
 from hdbridge.daemon.loop.faultlog import fault_of
 from hdbridge.daemon.memory import EventKind
@@ -76,99 +76,82 @@ def exposition(bridge: ServiceBridge, metrics: Metrics, traffic: Traffic) -> byt
     return generate_latest(registry)
 
 
+_AXIS: Final = (
+    ("load_target_degrees", "Load target.", "load_target_deg"),
+    ("load_position_degrees", "Load encoder.", "load_position_deg"),
+    ("motor_position_degrees", "Motor encoder.", "motor_position_deg"),
+    ("load_error_arcsec", "Load encoder minus load target.", "error_arcsec"),
+    ("correction_arcsec", "Correction by the compensation.", "correction_arcsec"),
+    ("predicted_error_arcsec", "Transmission error predicted by the model.", "predicted_arcsec"),
+    ("motor_torque_newton_metres", "Torque of the motor.", "motor_torque_nm"),
+    ("queued_points", "Waiting way points.", "queued"),
+    ("model_age_seconds", "Age of the model in use.", "model.age_s"),
+    ("outer_statusword", "6041h as the other master sees it.", "outer.statusword"),
+    ("outer_nmt_state", "NMT state on the other master's bus.", "outer.nmt"),
+    ("outer_sync_period_seconds", "Period of the other master's SYNC.", "outer.period_s"),
+    (
+        "outer_sync_jitter_seconds",
+        "Mean deviation of the other master's SYNC from its regular time.",
+        "outer.jitter_s",
+    ),
+    (
+        "outer_latency_median_seconds",
+        "Time from the other master's SYNC to the drive's first frame with its target, median.",
+        "outer.latency_s",
+    ),
+    ("outer_latency_99_seconds", "The same, 99 % of them are not longer.", "outer.latency_99_s"),
+)
+"""Name, description and field of each metric of an axis."""
+
+
 class _Scrape(Collector):
     """Collector of one scrape."""
 
     def __init__(self, bridge: ServiceBridge, metrics: Metrics, traffic: Traffic) -> None:
-        self._bridge, self._metrics, self._traffic = bridge, metrics, traffic
+        self._state, self._metrics, self._traffic = bridge.state(), metrics, traffic
 
     def collect(self) -> Iterator[Metric]:
         """Yields the metrics of loop, faults, axes and API."""
-        state = self._bridge.state()
-        metrics = self._metrics
+        state, metrics, traffic = self._state, self._metrics, self._traffic
         yield metrics.late.family("cycle_late_seconds", "Delay of the start of cycles.")
         yield metrics.busy.family("cycle_busy_seconds", "Duration of cycles.")
-        yield from _machine(state)
+        yield _gauge("info", "1.", [((state.name, state.version), 1)], ("machine", "version"))
+        yield _gauge("loop_alive", "1 if the control loop turns.", [((), state.cycle.alive)])
+        yield _gauge("cycle_period_seconds", "Period of the cycle.", [((), state.cycle.period_s)])
+        skipped = [((), state.cycle.skipped)]
+        yield _counter("cycles_skipped", "Periods skipped because the loop was late.", skipped)
+        yield _gauge("bus_up", "1 if the CAN interface is up.", [((), state.bus.up)])
+        if state.bus.load is not None:
+            yield _gauge("bus_load_ratio", "Bus load.", [((), state.bus.load)])
+        dropped = [((), state.recorder.dropped)]
+        yield _counter("recorder_dropped", "Samples that the recorder dropped.", dropped)
+        yield _gauge("lease_held", "1 if a client holds the lease.", [((), state.lease.held)])
         yield _counter("samples_lost", "Cycles lost because the service was too slow.", [((), metrics.lost)])
         names = [each.name for each in state.axes]
         faults = [
             ((names[axis] if 0 <= axis < len(names) else "", fault), count)
             for (axis, fault), count in sorted(metrics.faults.items())
         ]
-        yield _counter(
-            "faults", "Faults by axis; without an axis those of the machine.", faults, ("axis", "fault")
-        )
-        for name, about, of in (*_AXIS, *_OUTER):
-            rows = [((each.name,), value) for each in state.axes if (value := of(each)) is not None]
-            yield _gauge(name, about, rows, ("axis",))
+        about = "Faults by axis; without an axis those of the machine."
+        yield _counter("faults", about, faults, ("axis", "fault"))
+        for name, about, field in _AXIS:
+            values = [((each.name,), _field(each, field)) for each in state.axes]
+            yield _gauge(name, about, [row for row in values if row[1] is not None], ("axis",))
         states = [((each.name, one.value), each.state is one) for each in state.axes for one in ControlState]
         yield _gauge("axis_state", "1 for the present state of an axis.", states, ("axis", "state"))
         latched = [((each.name,), each.fault is not None) for each in state.axes]
         yield _gauge("axis_fault_latched", "1 if a stop is latched.", latched, ("axis",))
-        yield from _api(self._traffic)
+        answered = [((method, str(status)), n) for (method, status), n in sorted(traffic.answered.items())]
+        yield _counter("api_requests", "Requests answered.", answered, ("method", "status"))
+        open_now = [((kind,), traffic.open[kind]) for kind in ("http", "websocket")]
+        yield _gauge("api_clients", "Requests and WebSockets under way.", open_now, ("kind",))
 
 
-_OUTER: Final[Sequence[tuple[str, str, Any]]] = (
-    ("outer_statusword", "6041h as the other master sees it.", lambda a: a.outer and a.outer.statusword),
-    ("outer_nmt_state", "NMT state on the other master's bus.", lambda a: a.outer and a.outer.nmt),
-    (
-        "outer_sync_period_seconds",
-        "Period of the other master's SYNC.",
-        lambda a: a.outer and a.outer.period_s,
-    ),
-    (
-        "outer_sync_jitter_seconds",
-        "Mean deviation of the other master's SYNC from its regular time.",
-        lambda a: a.outer and a.outer.jitter_s,
-    ),
-    (
-        "outer_latency_median_seconds",
-        "Time from the other master's SYNC to the drive's first frame with its target, median.",
-        lambda a: a.outer and a.outer.latency_s,
-    ),
-    (
-        "outer_latency_99_seconds",
-        "The same, 99 % of them are not longer.",
-        lambda a: a.outer and a.outer.latency_99_s,
-    ),
-)
-_AXIS: Final[Sequence[tuple[str, str, Any]]] = (
-    ("load_target_degrees", "Load target.", lambda a: a.load_target_deg),
-    ("load_position_degrees", "Load encoder.", lambda a: a.load_position_deg),
-    ("motor_position_degrees", "Motor encoder.", lambda a: a.motor_position_deg),
-    ("load_error_arcsec", "Load encoder minus load target.", lambda a: a.error_arcsec),
-    ("correction_arcsec", "Correction by the compensation.", lambda a: a.correction_arcsec),
-    ("predicted_error_arcsec", "Transmission error predicted by the model.", lambda a: a.predicted_arcsec),
-    ("motor_torque_newton_metres", "Torque of the motor.", lambda a: a.motor_torque_nm),
-    ("queued_points", "Waiting way points.", lambda a: a.queued),
-    ("model_age_seconds", "Age of the model in use.", lambda a: a.model and a.model.age_s),
-)
-"""Name, description and value of each metric of an axis."""
-
-
-def _machine(state: MachineState) -> Iterator[Metric]:
-    info = GaugeMetricFamily(_PREFIX + "info", "1.", labels=("machine", "version"))
-    info.add_metric((state.name, state.version), 1)
-    yield info
-    yield _gauge("loop_alive", "1 if the control loop turns.", [((), state.cycle.alive)])
-    yield _gauge("cycle_period_seconds", "Period of the cycle.", [((), state.cycle.period_s)])
-    yield _counter(
-        "cycles_skipped", "Periods skipped because the loop was late.", [((), state.cycle.skipped)]
-    )
-    yield _gauge("bus_up", "1 if the CAN interface is up.", [((), state.bus.up)])
-    if state.bus.load is not None:
-        yield _gauge("bus_load_ratio", "Bus load.", [((), state.bus.load)])
-    yield _counter("recorder_dropped", "Samples that the recorder dropped.", [((), state.recorder.dropped)])
-    yield _gauge("lease_held", "1 if a client holds the lease.", [((), state.lease.held)])
-
-
-def _api(traffic: Traffic) -> Iterator[Metric]:
-    answered = [
-        ((method, str(status)), count) for (method, status), count in sorted(traffic.answered.items())
-    ]
-    yield _counter("api_requests", "Requests answered.", answered, ("method", "status"))
-    open_now = [((kind,), traffic.open[kind]) for kind in ("http", "websocket")]
-    yield _gauge("api_clients", "Requests and WebSockets under way.", open_now, ("kind",))
+def _field(state: Any, path: str) -> Any:
+    """Returns a field of a state, such as ``model.age_s``; None if there is none."""
+    for name in path.split("."):
+        state = getattr(state, name, None)
+    return state
 
 
 _Rows = Iterable[tuple[tuple[str, ...], float]]

@@ -20,9 +20,8 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
 
 from hdbridge.daemon.api.app import create_app
-from hdbridge.daemon.api.guard import Guard, Traffic
+from hdbridge.daemon.api.guard import BODY_MAXIMUM, Guard, Policy, Traffic
 from hdbridge.daemon.api.metrics import Metrics
-from hdbridge.daemon.api.policy import BODY_MAXIMUM, Policy
 from hdbridge.daemon.api.sockets import BACKLOG, peer_of
 from hdbridge.daemon.service.bridge import ServiceBridge
 
@@ -111,19 +110,38 @@ class _Server(uvicorn.Server):
             each.transport.abort()
 
 
-class _Connection(H11Protocol):
-    """HTTP connection that identifies its peer by the kernel and closes stalled connections."""
+class _Watched(asyncio.Protocol):
+    """Connection that identifies its peer by the kernel, and is checked every `HEAD_S`."""
 
+    client: tuple[str, int] | None
+    loop: asyncio.AbstractEventLoop
     _watch: asyncio.TimerHandle | None = None
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        super().connection_made(transport)
+        self.client = _client(transport) or self.client
+        self._watch = self.loop.call_later(HEAD_S, self._check)
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        if self._watch is not None:
+            self._watch.cancel()
+        super().connection_lost(exc)
+
+    def _check(self) -> None:
+        """Closes a stalled connection."""
+        self._watch = self.loop.call_later(HEAD_S, self._check)
+
+
+class _Connection(_Watched, H11Protocol):
+    """HTTP connection, one of at most `CONNECTIONS_MAXIMUM`."""
+
     _idle_since_s = 0.0
     _unsent = 0
     """Unsent bytes at the last check."""
 
-    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
         super().connection_made(transport)
-        self.client = _client(transport) or self.client
         self._idle_since_s = self.loop.time()
-        self._watch = self.loop.call_later(HEAD_S, self._check)
         others = [
             each
             for each in self.connections
@@ -142,11 +160,6 @@ class _Connection(H11Protocol):
         self._idle_since_s = self.loop.time()
         super().on_response_complete()
 
-    def connection_lost(self, exc: Exception | None) -> None:
-        if self._watch is not None:
-            self._watch.cancel()
-        super().connection_lost(exc)
-
     def _check(self) -> None:
         """Closes a connection without a complete head in time, or whose peer does not read."""
         if self.transport.get_protocol() is not self:  # upgraded to a WebSocket, which has pings
@@ -158,30 +171,18 @@ class _Connection(H11Protocol):
         idle = self.cycle is None or self.cycle.response_complete
         if idle and (self.cycle is None or self.conn.trailing_data[0]):
             self.transport.close()
-        self._watch = self.loop.call_later(HEAD_S, self._check)
+        super()._check()
 
 
-class _WebSocket(WebSocketsSansIOProtocol):
-    """WebSocket connection that does the same; its pings detect dead peers."""
-
-    _watch: asyncio.TimerHandle | None = None
-
-    def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        super().connection_made(transport)
-        self.client = _client(transport) or self.client
-        self._watch = self.loop.call_later(HEAD_S, self._check)
-
-    def connection_lost(self, exc: Exception | None) -> None:
-        if self._watch is not None:
-            self._watch.cancel()
-        super().connection_lost(exc)
+class _WebSocket(_Watched, WebSocketsSansIOProtocol):
+    """WebSocket connection; its pings detect dead peers."""
 
     def _check(self) -> None:
         """Aborts a closing connection whose peer does not read."""
         if self.transport.is_closing():
             self.transport.abort()
         else:
-            self._watch = self.loop.call_later(HEAD_S, self._check)
+            super()._check()
 
 
 def _worth_telling(record: logging.LogRecord) -> bool:

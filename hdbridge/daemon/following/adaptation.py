@@ -1,8 +1,9 @@
 """Adaptation of one axis: observations update an estimate, and the model in use follows it within bounds.
 
 A window of observations is complete once the axis has moved enough (`Excitation`). It is rejected as a whole
-if neither wear nor temperature can cause it. Then learning is frozen until the cause ends, and the updates by
-the last windows before it are reverted. Pure: observations contain the time.
+if neither wear nor temperature can cause it, because both are slow and alike everywhere. Then learning is
+frozen until the cause ends, and the updates by the last windows before it are reverted. `EncoderHealth`
+judges every sample; the tests here need the estimate. Pure: observations contain the time.
 """
 
 import math
@@ -12,6 +13,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from pydantic import Field
 
 from hdbridge.analysis.intervals import difference
 from hdbridge.axis.effects import FloatArray
@@ -21,7 +23,6 @@ from hdbridge.control.compensation import Inverse
 from hdbridge.daemon.following.estimator import (
     ZERO_ARCSEC,
     Change,
-    Partial,
     bounds_arcsec,
     calibrated_estimator,
     changes_between,
@@ -29,8 +30,9 @@ from hdbridge.daemon.following.estimator import (
     partial_fit,
 )
 from hdbridge.daemon.following.measuring import DriftModel, Observation, reversals, turns
-from hdbridge.daemon.following.settings import AdaptationSettings, Mode
+from hdbridge.daemon.machinefile import AdaptationSettings, Mode
 from hdbridge.errors import InputError
+from hdbridge.strictness import Strict
 
 ONE_WAY_TURNS = 4.0
 """Multiple of the turns of `Excitation` after which a window without reversals updates the memoryless
@@ -44,10 +46,6 @@ RATE_INTERVALS = 2.0
 LEAST_SHARE = 0.99
 """Share of the change permitted per interval that is applied however small it is."""
 GATE_SIGMAS = 6.0
-SCATTER_RATIO = 4.0
-"""Ratio of the scatter of standstills to its usual value above which it is noise."""
-SCATTER_WEIGHT = 0.02
-"""Weight of one window in the usual scatter."""
 TREND_FREE = 4
 """Degrees of freedom required to fit a trend in a window."""
 DRIFT_S = 120.0
@@ -83,14 +81,13 @@ class Proposal:
     """Axis time."""
 
 
-@dataclass(frozen=True, slots=True)
-class Learned:
+class Learned(Strict):
     """State that survives a restart of the service."""
 
     estimate: tuple[float, ...]
     covariance: tuple[tuple[float, ...], ...]
     applied: tuple[float, ...]
-    windows: int
+    windows: int = Field(ge=0)
     response: Response | None = None
     """Refined response in motion; None if it is that of the committed model."""
 
@@ -103,7 +100,6 @@ class Adaptation:
         whole: DriftModel,
         settings: AdaptationSettings,
         sigma_arcsec: float,
-        load_count_arcsec: float,
         log: Callable[[Entry], None] = lambda _: None,
         learned: Learned | None = None,
     ) -> None:
@@ -129,7 +125,8 @@ class Adaptation:
         self._nuisances = drift.has_memory.copy()
         self._nuisances[drift.zero :] = True
         """Columns that may not be mistaken for a drift: the loop, the zero, the load encoder's disc."""
-        self._plausibility = _Plausibility(settings.zero_rate_arcsec_per_hour, load_count_arcsec)
+        self._zeros: deque[tuple[float, float]] = deque(maxlen=MAX_DRIFT_WINDOWS)
+        """Time and zero of the last windows."""
         self._window: list[Observation] = []
         self._zero_arcsec: float | None = None
         """Zero when it was taken."""
@@ -283,11 +280,11 @@ class Adaptation:
         """Returns the state to keep over a restart."""
         estimator = self._estimator
         return Learned(
-            tuple(estimator.estimate.tolist()),
-            tuple(tuple(row) for row in estimator.covariance.tolist()),
-            tuple(self._used.tolist()),
-            self.windows,
-            None if self.model.response is self.committed.response else self.model.response,
+            estimate=tuple(estimator.estimate.tolist()),
+            covariance=tuple(tuple(row) for row in estimator.covariance.tolist()),
+            applied=tuple(self._used.tolist()),
+            windows=self.windows,
+            response=None if self.model.response is self.committed.response else self.model.response,
         )
 
     def _restore(self, learned: Learned) -> None:
@@ -325,7 +322,10 @@ class Adaptation:
         residual = observed - rows @ self._estimator.estimate
         variance = np.einsum("ij,jk,ik->i", rows, self._estimator.covariance, rows)
         sigma = np.sqrt(variance + self._sigma_arcsec**2) + self._rate_allowance_arcsec(window, rows)
-        found = self._plausibility.test(window, residual, sigma, rows[:, self._nuisances])
+        time_s = np.array([each.time_s for each in window])
+        found = _shift(residual, GATE_SIGMAS * sigma)
+        if found is None and len(window) > np.count_nonzero(self._nuisances) + TREND_FREE:
+            found = self._drift_of(time_s, rows[:, self._nuisances], residual, GATE_SIGMAS, lasting=False)
         self._window_s = window[-1].time_s
         if found is not None:
             self.freeze(found)
@@ -337,7 +337,7 @@ class Adaptation:
             self._unfreeze("the load encoder agrees with the model again")
         self._learn(window, rows, observed)
         own_zero = self._zero + float(np.mean(observed - rows @ self._estimator.estimate))
-        found = self._plausibility.follow(window, own_zero) or self._zero_out_of_bound()
+        found = self._zero_drifts(window[-1].time_s, own_zero) or self._zero_out_of_bound()
         if found is not None:
             self.freeze(found)
 
@@ -395,7 +395,7 @@ class Adaptation:
         self._zero_arcsec = None
         self._window.clear()
         self._earlier.clear()
-        self._plausibility.restart()
+        self._zeros.clear()
 
     def _set_zero_sigma(self, sigma_arcsec: float) -> None:
         at = self._drift.zero
@@ -403,6 +403,33 @@ class Adaptation:
         covariance[at, :] = covariance[:, at] = 0.0
         covariance[at, at] = sigma_arcsec**2
         self._estimator.covariance = covariance
+
+    def _zero_drifts(self, time_s: float, zero_arcsec: float) -> Freeze | None:
+        """Takes the zero of a window; tests if the last zeros together drift faster than a gear's."""
+        self._zeros.append((time_s, zero_arcsec))
+        while self._zeros[0][0] < time_s - DRIFT_S:
+            self._zeros.popleft()
+        if len(self._zeros) < DRIFT_WINDOWS:
+            return None
+        times_s, zeros = np.array(self._zeros).T
+        return self._drift_of(times_s, np.ones((len(zeros), 1)), zeros, DRIFT_SIGMAS, lasting=True)
+
+    def _drift_of(
+        self, time_s: FloatArray, others: FloatArray, values: FloatArray, sigmas: float, *, lasting: bool
+    ) -> Freeze | None:
+        """Tests if values (n,) drift faster than a gear's zero may.
+
+        ``others`` (n, m) are columns that may not be mistaken for a drift.
+        """
+        drift = partial_fit((time_s - float(np.mean(time_s))) / 3600.0, others, values)
+        most = self.settings.zero_rate_arcsec_per_hour
+        if abs(drift.value) - sigmas * drift.error <= most:
+            return None
+        return Freeze(
+            f"the zero moves by {drift.value:+.0f} arcsec per hour, faster than wear and temperature may "
+            f"({most:.0f}): the load encoder slips or drifts",
+            lasting=lasting,
+        )
 
     def _zero_out_of_bound(self) -> Freeze | None:
         moved, most = self.zero_moved_arcsec, self.settings.zero_bound_arcsec
@@ -469,97 +496,20 @@ def _changes_json(changes: Sequence[Change]) -> dict[str, dict[str, float]]:
     }
 
 
-class _Plausibility:
-    """Tests if wear or temperature can explain a window of observations.
-
-    Both are slow, so sudden or inconsistent changes have another cause. `EncoderHealth` judges every sample;
-    the tests here need the estimate. A shift common to all observations, or a zero that moves too fast, does
-    not end automatically (`Freeze.lasting`).
-    """
-
-    def __init__(self, zero_rate_arcsec_per_hour: float, count_arcsec: float) -> None:
-        """Takes the fastest drift of a zero, and one count of the load encoder, a permitted scatter."""
-        self._zero_rate_arcsec_s = zero_rate_arcsec_per_hour / 3600.0
-        self._count_arcsec = count_arcsec
-        self._usual_arcsec: float | None = None
-        """Usual scatter of a standstill."""
-        self._zeros: deque[tuple[float, float]] = deque(maxlen=MAX_DRIFT_WINDOWS)
-
-    def restart(self) -> None:
-        """Forgets the zeros of earlier windows."""
-        self._zeros.clear()
-
-    def test(
-        self,
-        window: Sequence[Observation],
-        residual_arcsec: FloatArray,
-        sigma_arcsec: FloatArray,
-        others: FloatArray,
-    ) -> Freeze | None:
-        """Returns the reason for a freeze, or None for a plausible window.
-
-        ``residual_arcsec`` are the residuals by the present estimate, ``sigma_arcsec`` their permitted
-        standard deviations, both of shape (n,). ``others`` (n, m) are columns that may not be mistaken for a
-        drift: the zero, the loop, the load encoder's disc.
-        """
-        scatter, usual = _scatter_arcsec(window), self._usual_arcsec
-        allowed = math.inf if usual is None else SCATTER_RATIO * max(usual, self._count_arcsec)
-        if scatter is not None and scatter > allowed:
-            return Freeze(
-                f"at rest the load encoder scatters by {scatter:.1f} arcsec, usually by {usual:.1f}: noise"
-            )
-        shift = self._shift(residual_arcsec, GATE_SIGMAS * sigma_arcsec)
-        if shift is not None or len(window) < others.shape[1] + 1 + TREND_FREE:
-            return shift
-        time_s = np.array([each.time_s for each in window])
-        trend = partial_fit(time_s - np.mean(time_s), others, residual_arcsec)
-        return self._too_fast(trend, GATE_SIGMAS, lasting=False)
-
-    def follow(self, window: Sequence[Observation], zero_arcsec: float) -> Freeze | None:
-        """Takes the zero of a plausible window; tests if the last zeros together drift too fast."""
-        scatter = _scatter_arcsec(window)
-        if scatter is not None:
-            usual = self._usual_arcsec
-            self._usual_arcsec = scatter if usual is None else usual + SCATTER_WEIGHT * (scatter - usual)
-        now_s = window[-1].time_s
-        self._zeros.append((now_s, zero_arcsec))
-        while self._zeros[0][0] < now_s - DRIFT_S:
-            self._zeros.popleft()
-        if len(self._zeros) < DRIFT_WINDOWS:
-            return None
-        time_s, zero = np.array(self._zeros).T
-        drift = partial_fit(time_s - now_s, np.ones((len(zero), 1)), zero)
-        return self._too_fast(drift, DRIFT_SIGMAS, lasting=True)
-
-    @staticmethod
-    def _shift(residual_arcsec: FloatArray, gate_arcsec: FloatArray) -> Freeze | None:
-        if np.all(np.abs(residual_arcsec) <= gate_arcsec):
-            return None
-        shift = float(np.median(residual_arcsec))
-        common = np.all(np.abs(residual_arcsec - shift) <= gate_arcsec)
-        if common and abs(shift) > float(np.median(gate_arcsec)):
-            return Freeze(
-                f"the load encoder reads {shift:+.1f} arcsec off all at once, alike in both directions: "
-                "a scale or coupling that slipped, or a lost zero",
-                lasting=True,
-            )
-        worst = float(np.max(np.abs(residual_arcsec)))
+def _shift(residual_arcsec: FloatArray, gate_arcsec: FloatArray) -> Freeze | None:
+    """Tests if a window's residuals are within the gate, both (n,), which wear and warmth permit."""
+    if np.all(np.abs(residual_arcsec) <= gate_arcsec):
+        return None
+    shift = float(np.median(residual_arcsec))
+    common = np.all(np.abs(residual_arcsec - shift) <= gate_arcsec)
+    if common and abs(shift) > float(np.median(gate_arcsec)):
         return Freeze(
-            f"the load is read up to {worst:.1f} arcsec off what the model and its rates allow, not alike "
-            "at all places"
+            f"the load encoder reads {shift:+.1f} arcsec off all at once, alike in both directions: "
+            "a scale or coupling that slipped, or a lost zero",
+            lasting=True,
         )
-
-    def _too_fast(self, slope: Partial, sigmas: float, *, lasting: bool) -> Freeze | None:
-        if abs(slope.value) - sigmas * slope.error <= self._zero_rate_arcsec_s:
-            return None
-        return Freeze(
-            f"the zero moves by {3600.0 * slope.value:+.0f} arcsec per hour, faster than wear and "
-            f"temperature may ({3600.0 * self._zero_rate_arcsec_s:.0f}): the load encoder slips or drifts",
-            lasting=lasting,
-        )
-
-
-def _scatter_arcsec(window: Sequence[Observation]) -> float | None:
-    """Returns the median scatter of a window's standstills; None without any."""
-    scatters = [each.scatter_arcsec for each in window if not math.isnan(each.scatter_arcsec)]
-    return float(np.median(scatters)) if scatters else None
+    worst = float(np.max(np.abs(residual_arcsec)))
+    return Freeze(
+        f"the load is read up to {worst:.1f} arcsec off what the model and its rates allow, not alike at all "
+        "places"
+    )

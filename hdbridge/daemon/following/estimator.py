@@ -24,7 +24,7 @@ from hdbridge.analysis.linear import SEEN, Column, orthonormal
 from hdbridge.axis.effects import BoolArray, Effect, FloatArray
 from hdbridge.axis.model import TransmissionModel
 from hdbridge.daemon.following.measuring import DriftModel
-from hdbridge.daemon.following.settings import AdaptationSettings
+from hdbridge.daemon.machinefile import AdaptationSettings
 
 EXCITED = 1.0
 """Information of a batch along a direction, in units of 1 / scale^2, above which the direction is excited."""

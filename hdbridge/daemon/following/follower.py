@@ -23,9 +23,9 @@ from hdbridge.daemon.following.health import DRIVEN, EncoderHealth, EncoderStatu
 from hdbridge.daemon.following.judging import Raised, Verdict, Watch
 from hdbridge.daemon.following.measuring import DriftModel, Measuring
 from hdbridge.daemon.following.servo import ServoWatch
-from hdbridge.daemon.following.settings import AdaptationSettings, Mode
 from hdbridge.daemon.following.statefile import AdaptationFiles
 from hdbridge.daemon.loop.states import AxisState
+from hdbridge.daemon.machinefile import AdaptationSettings, Mode
 from hdbridge.daemon.memory import NO_FAULT, SampleArray, SampleFlag, joined_samples
 from hdbridge.errors import InputError
 
@@ -79,8 +79,8 @@ class Follower:
         self._settings = settings or AdaptationSettings()
         self._drift = DriftModel(model)
         motor_count = axis.motor_encoder.resolution_arcsec / axis.gear.ratio
-        self._load_count = axis.load_encoder.resolution_arcsec
-        self._sigma_arcsec = observation_sigma_arcsec(axis)
+        self._sigma_arcsec = math.hypot(motor_count, axis.load_encoder.resolution_arcsec) / UNIFORM
+        """Standard deviation of an observation due to quantisation by the encoders' counts."""
         noise = max(held_out_arcsec(model), motor_count / UNIFORM)
         self.watch = Watch(axis.name, self._drift, noise)
         channels = tuple(BY_KEY[key] for key in axis.channels)
@@ -108,7 +108,7 @@ class Follower:
             settings = self._settings.model_copy(update={"mode": mode})
             learned = files.load() if files is not None else None
             self.adaptation = Adaptation(
-                self._drift, settings, self._sigma_arcsec, self._load_count, self._entries.append, learned
+                self._drift, settings, self._sigma_arcsec, self._entries.append, learned
             )
             self._files = files
         else:
@@ -243,9 +243,3 @@ class Follower:
         if not proposal.changes:
             self._refined_at = self.updated
         self.save()
-
-
-def observation_sigma_arcsec(axis: AxisConfig) -> float:
-    """Returns the standard deviation of an observation due to quantisation by the encoders' counts."""
-    motor_count = axis.motor_encoder.resolution_arcsec / axis.gear.ratio
-    return math.hypot(motor_count, axis.load_encoder.resolution_arcsec) / UNIFORM

@@ -37,7 +37,7 @@ from hdbridge.axis.model import TransmissionModel
 from hdbridge.daemon.following.estimator import bounds_arcsec, calibrated_estimator, changes_between
 from hdbridge.daemon.following.health import EncoderStatus
 from hdbridge.daemon.following.measuring import DriftModel, Observation, Term
-from hdbridge.daemon.following.settings import AdaptationSettings
+from hdbridge.daemon.machinefile import AdaptationSettings
 
 DAY_S: Final = 86_400.0
 FALSE_ALARMS_PER_DAY: Final = 1.0 / 365.0
@@ -285,28 +285,6 @@ def _places(observations: Sequence[Observation]) -> tuple[FloatArray, FloatArray
     return means / count[:, np.newaxis], np.bincount(place, error) / count
 
 
-class Debounced:
-    """Verdict that changes only when another one has persisted."""
-
-    def __init__(self) -> None:
-        self.verdict = Verdict.HOLDS
-        self._other = Verdict.HOLDS
-        self._lasted_s = 0.0
-
-    def take(self, verdict: Verdict, passed_s: float) -> bool:
-        """Takes the present verdict and the time since the last; returns True when it is adopted."""
-        if verdict is self.verdict or verdict is not self._other:
-            self._other, self._lasted_s = verdict, 0.0
-        if verdict is self.verdict:
-            return False
-        self._lasted_s += passed_s
-        needed = WITHDRAW_S if verdict is Verdict.HOLDS else RAISE_S
-        if self._lasted_s < needed:
-            return False
-        self.verdict, self._lasted_s = verdict, 0.0
-        return True
-
-
 class Watch:
     """Verdicts on one axis and its model."""
 
@@ -317,7 +295,9 @@ class Watch:
         self._axis = axis
         self._calibrated = bool(drift.model.effects)
         self._judge = Judge(drift, noise_arcsec)
-        self._debounced = Debounced()
+        self._adopted = self._other = Verdict.HOLDS
+        """Verdict on the gear, and another one that must persist before it is adopted."""
+        self._lasted_s = 0.0
         self._faulty = False
         self._observations: deque[Observation] = deque(maxlen=MAX_OBSERVATIONS)
         self._new = False
@@ -327,7 +307,7 @@ class Watch:
     @property
     def verdict(self) -> Verdict:
         """Present verdict."""
-        return Verdict.ENCODER if self._faulty else self._debounced.verdict
+        return Verdict.ENCODER if self._faulty else self._adopted
 
     def take(self, observations: Sequence[Observation], status: EncoderStatus, now_s: float) -> list[Raised]:
         """Takes observations and the state of the load encoder; returns new verdicts."""
@@ -362,4 +342,16 @@ class Watch:
         self.evidence = evidence
         if self._zero is None and not evidence.unexplained:
             self._zero = evidence.zero
-        return self._debounced.take(evidence.verdict(self._debounced.verdict), passed_s)
+        return self._adopts(evidence.verdict(self._adopted), passed_s)
+
+    def _adopts(self, verdict: Verdict, passed_s: float) -> bool:
+        """Takes the present verdict and the time since the last; returns True when it has persisted."""
+        if verdict is self._adopted or verdict is not self._other:
+            self._other, self._lasted_s = verdict, 0.0
+        if verdict is self._adopted:
+            return False
+        self._lasted_s += passed_s
+        if self._lasted_s < (WITHDRAW_S if verdict is Verdict.HOLDS else RAISE_S):
+            return False
+        self._adopted, self._lasted_s = verdict, 0.0
+        return True

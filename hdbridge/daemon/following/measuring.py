@@ -208,8 +208,6 @@ class Observation(NamedTuple):
     """Total travel of the motor since the last observation."""
     reversals: int
     """Reversals of the motor since the last observation."""
-    scatter_arcsec: float
-    """Standard deviation of its samples; NaN in motion."""
 
 
 class _Reading(NamedTuple):
@@ -357,7 +355,6 @@ class Measuring:
             row=np.mean(rows, axis=0),
             travel_deg=self._travel_deg,
             reversals=self._reversals,
-            scatter_arcsec=float(np.std(error)) if self._standing else math.nan,
         )
         self._collected = []
         self._travel_deg, self._reversals = 0.0, 0

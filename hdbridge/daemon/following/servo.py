@@ -11,14 +11,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from hdbridge.analysis.response import (
-    DIFFERENT,
-    Answers,
-    Limits,
-    lags_agree,
-    motor_orders,
-    samples_needed,
-)
+from hdbridge.analysis.response import DIFFERENT, Answers, Limits, lags_agree, motor_orders, samples_needed
 from hdbridge.axis import AxisConfig
 from hdbridge.axis.model import TransmissionModel
 from hdbridge.axis.model.response import Response

@@ -9,7 +9,7 @@ import json
 import logging
 import os
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, replace
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Literal
@@ -17,28 +17,21 @@ from typing import Literal
 from pydantic import Field, ValidationError
 
 from hdbridge.axis.model import TransmissionModel
-from hdbridge.axis.model.response import Response
 from hdbridge.daemon.following.adaptation import Entry, Learned
 from hdbridge.errors import OutputError
 from hdbridge.files.atomic import make_folder, write_atomically
-from hdbridge.strictness import Strict
 
 SCHEMA = "hdbridge.adaptation/1"
 _log = logging.getLogger(__name__)
 
 
-class _State(Strict):
+class _State(Learned):
     """Content of ``AXIS.json``."""
 
     schema_: Literal["hdbridge.adaptation/1"] = Field(alias="schema")
     model: str
     """Fingerprint of the committed model and the adapted parameters."""
     saved: datetime
-    estimate: tuple[float, ...]
-    covariance: tuple[tuple[float, ...], ...]
-    applied: tuple[float, ...]
-    windows: int = Field(ge=0)
-    response: Response | None = None
 
 
 class AdaptationFiles:
@@ -81,14 +74,14 @@ class AdaptationFiles:
             self._append({"event": "began anew", "reason": "another model was committed"})
             return None
         self._append({"event": "restored", "windows": file.windows, "saved": file.saved.isoformat()})
-        return Learned(file.estimate, file.covariance, file.applied, file.windows, file.response)
+        return file
 
     def write(self, entries: Sequence[Entry], learned: Learned) -> None:
         """Appends lines to the history and stores the state; an error is logged once."""
         try:
             for entry in entries:
                 self._append(entry)
-            file = _State(schema=SCHEMA, model=self._fingerprint, saved=self.now(), **asdict(learned))
+            file = _State(schema=SCHEMA, model=self._fingerprint, saved=self.now(), **dict(learned))
             write_atomically(self._state, file.model_dump_json(by_alias=True))
             self.problem = ""
         except OutputError as problem:

@@ -10,15 +10,21 @@ from collections.abc import Callable
 from typing import Final
 
 from hdbridge.control.axiscycle import STILL_CYCLES, AxisCycle
-from hdbridge.daemon.loop.axissample import AxisSampler
 from hdbridge.daemon.loop.faultlog import FAULT_INDEX, FaultLog, Tell
+from hdbridge.daemon.loop.feeds import KnotFeed, OuterFeed
 from hdbridge.daemon.loop.follower import AxisSetup, Follower
-from hdbridge.daemon.loop.knotfeed import KnotFeed
-from hdbridge.daemon.loop.outerfeed import OuterFeed
 from hdbridge.daemon.loop.states import MAY_MOVE, STOPPED, AxisState, Cause, Happening, refusal, target_of
 from hdbridge.daemon.memory.cells import OuterCells, SettingSlot
 from hdbridge.daemon.memory.channels import Queue
-from hdbridge.daemon.memory.layout import NO_FAULT, Command, CommandKind, EventKind, Knot, OuterKnot
+from hdbridge.daemon.memory.layout import (
+    NO_FAULT,
+    Command,
+    CommandKind,
+    EventKind,
+    Knot,
+    OuterKnot,
+    SampleFlag,
+)
 from hdbridge.daemon.setting import CompensationSetting
 from hdbridge.drive.feedback import Feedback
 from hdbridge.drive.image import ProcessImage
@@ -29,6 +35,12 @@ from hdbridge.errors import RESET, HdbridgeError, InputError, TransitionError
 from hdbridge.motion import MotionMode
 
 _OFF: Final = (State.SWITCH_ON_DISABLED, State.FAULT, State.NOT_READY_TO_SWITCH_ON)
+_FOLLOW: Final = MotionMode.FOLLOW
+_POWER_INDEX: Final = {state: place for place, state in enumerate(State)}
+# Plain integers: combining enum flags would cost more than the rest of the sample.
+_FRESH, _COMPENSATING, _LIMITED, _MEMORY_KNOWN, _CHANGING, _AT_REST, _UNDERRUN, _DOUBTED, _KNOWN0, _KNOWN1 = (
+    map(int, SampleFlag)
+)
 
 
 class AxisLoop:
@@ -69,7 +81,12 @@ class AxisLoop:
         self._faults = FaultLog(self.supervision, tell, config.drive.cycle_s)
         self._period_s = config.drive.cycle_s
         self._follow = self.follower.follow
-        self._sampler = AxisSampler(self.cycle, self.follower, self._outer, outer)
+        self._outer_cells = outer
+        self._motor_deg = config.motor_encoder.degrees(1)
+        encoder = config.load_encoder
+        self._load_deg = math.nan if encoder.is_motor_encoder else encoder.degrees(1)
+        self._limited = 0
+        """Cycles in which the correction was limited, when the last sample was taken."""
         self._changing = self._underrun = self._unfed = False
         self._doubt = ""
         """Last reported states of the compensation change, the stream underrun and the load loop."""
@@ -462,6 +479,61 @@ class AxisLoop:
         stop = self.cycle.stopped
         return str(stop) if stop is not None else self._why
 
+    # ---------------------------------------------------------------- the sample of a turn
+
     def sample(self) -> tuple[float, ...]:
         """Returns the fields of `layout.Axis` for the turn that has just ended."""
-        return self._sampler.take(self.state, changing=self._changing, underrun=self._underrun)
+        image, feedback, follower = self.image, self.cycle.feedback, self.follower
+        state, set_point, motor_deg = self.state, self.set_point, self._motor_deg
+        position_deg = motor_deg * feedback.motor_counts
+        stop = self.supervision.stop
+        flags = _FRESH if feedback.fresh else 0
+        reading0 = reading1 = received_s = math.nan
+        if feedback.readings:
+            flags, reading0, reading1 = _readings(flags, feedback.readings)
+        if state is AxisState.ENABLED or state is AxisState.STOPPING:
+            correction = follower.correction
+            correction_arcsec, predicted_arcsec = correction.correction_arcsec, correction.predicted_arcsec
+            target_deg, weight, loop_arcsec = follower.target_deg, correction.weight, follower.loop_arcsec
+            limited = correction.limited
+            if limited != self._limited:
+                self._limited = limited
+                flags |= _LIMITED
+            if follower.compensating:
+                flags |= _COMPENSATING
+            if correction.memory_known:
+                flags |= _MEMORY_KNOWN
+            if set_point.at_rest:
+                flags |= _AT_REST
+            if self._changing:
+                flags |= _CHANGING
+            if self._underrun:
+                flags |= _UNDERRUN
+            if follower.loop_doubt:
+                flags |= _DOUBTED
+            if set_point.mode is _FOLLOW:
+                received_s = self._outer.received_s
+        else:
+            flags |= _AT_REST
+            target_deg = position_deg / self.config.gear.ratio
+            correction_arcsec = predicted_arcsec = weight = loop_arcsec = 0.0
+        return (
+            state, set_point.mode, _POWER_INDEX[image.power.state],
+            NO_FAULT if stop is None else FAULT_INDEX[stop.fault],
+            feedback.statusword, flags,
+            target_deg, motor_deg * feedback.demand_counts, position_deg,
+            self._load_deg * feedback.load_counts,
+            feedback.torque_permille * follower.sensed.torque_nm, set_point.velocity_deg_s,
+            correction_arcsec, predicted_arcsec, loop_arcsec, weight, reading0, reading1,
+            math.nan if self.cycle.silent else motor_deg * image.target_counts,
+            received_s, *self._outer_cells.values(),
+        )  # fmt: skip
+
+
+def _readings(flags: int, readings: tuple[float | None, ...]) -> tuple[int, float, float]:
+    """Returns the flags with those of the known channels added, and both readings (NaN if unknown)."""
+    known = [each if each is not None else math.nan for each in (*readings, None)[:2]]
+    for value, bit in zip(known, (_KNOWN0, _KNOWN1), strict=True):
+        if not math.isnan(value):
+            flags |= bit
+    return flags, known[0], known[1]

@@ -9,6 +9,7 @@ compensation, runs after the RPDOs of one cycle and before the wait for the next
 import os
 import time
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from functools import partial
 from typing import Final
 
@@ -207,14 +208,11 @@ class Controller:
         refusal = why_refused(can_id, data, states)
         if refusal is None:
             return can_id, data
-        self._refuse_frame(refusal)
-        return None
-
-    def _refuse_frame(self, why: str) -> None:
         second = round(1.0 / self.cycle.period_s)
         if self.cycle.count - self._refusals > second // REFUSALS_A_SECOND:
             self._refusals = self.cycle.count
-            self._tell(_ALL, EventKind.REFUSED, 0, 0, why)
+            self._tell(_ALL, EventKind.REFUSED, 0, 0, refusal)
+        return None
 
     # ---------------------------------------------------------------- the bus
 
@@ -235,16 +233,10 @@ class Controller:
         self._reopen_in -= 1
         if self._reopen_in <= 0:
             self._reopen_in = round(REOPEN_EVERY_S / cycle.period_s)
-            self._try_to_reopen()
-
-    def _try_to_reopen(self) -> None:
-        # No axis communicates while the bus is down, so reopening may take longer than a cycle.
-        try:
-            link = self._reopen()
-        except BusError:
-            return
-        if link is not None:
-            self.cycle.relink(link)
+            # No axis communicates while the bus is down, so reopening may take longer than a cycle.
+            with suppress(BusError):
+                if (link := self._reopen()) is not None:
+                    cycle.relink(link)
 
     # ---------------------------------------------------------------- the end
 
@@ -270,7 +262,7 @@ class Controller:
 
     def _order(self, axis: AxisLoop, kind: CommandKind) -> None:
         if axis.state not in _AT_REST:
-            axis.command(Command(0, kind, axis.index, 0.0, 0.0, 0.0, 0.0, 0, 0, 0))
+            axis.command(Command(0, kind, axis.index))
 
     def _go_on_ending(self) -> None:
         self._ending_left -= 1

@@ -7,9 +7,10 @@ loop runs, the process opens no files, writes no log and makes no SDO transfers 
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import ExitStack, contextmanager, nullcontext, suppress
 from typing import Final
 
+from hdbridge.axis import AxisConfig, BusConfig
 from hdbridge.axis.model import TransmissionModel
 from hdbridge.clock import Clock, MonotonicClock
 from hdbridge.control.bench import compensation_for
@@ -18,15 +19,65 @@ from hdbridge.control.realtime import prepare_realtime
 from hdbridge.daemon.logs import log_once
 from hdbridge.daemon.loop.controller import Controller
 from hdbridge.daemon.loop.follower import AxisSetup
-from hdbridge.daemon.loop.interface import Interface, listen
 from hdbridge.daemon.machine import Axis, Machine
 from hdbridge.daemon.memory import Cell, Memory
 from hdbridge.daemon.start import Simulation, Start, run_child, when_terminated
-from hdbridge.drive.link import Link
+from hdbridge.drive.link import Link, open_bus
+from hdbridge.drive.manners import USUAL_MASTER, Ear, listening_s
+from hdbridge.errors import BusError, HdbridgeError
 
+_POLLS: Final = 256
+"""Frames read to test whether an opened interface works."""
 AT_ONCE: Final = 2
 """Value of ``STOP_ASKED`` that requests an end by quick stop."""
 SIMULATED_BITRATE_BPS: Final = 1_000_000
+
+
+class Interface(ExitStack):
+    """Opens the bus of a machine file. The interface's lock is held by the keeper, which outlives this."""
+
+    def __init__(self, settings: BusConfig, clock: Clock) -> None:
+        super().__init__()
+        self._settings, self._clock = settings, clock
+
+    def open(self) -> Link:
+        """Opens the bus and returns a link; raises BusError if that fails."""
+        self.close()
+        bus = self.enter_context(open_bus(self._settings, shared=True))
+        return Link(bus, self._clock)
+
+    def reopen(self) -> Link | None:
+        """Reopens the bus after a failure; returns a link, or None if the interface does not work yet.
+
+        An interface that is down can be opened; only the first read fails.
+        """
+        try:
+            link = self.open()
+            for _ in range(_POLLS):
+                if link.recv(self._clock.now()) is None:
+                    break
+        except BusError:
+            self.close()
+            return None
+        return link
+
+    def close(self) -> None:
+        """Closes the bus."""
+        with suppress(HdbridgeError):
+            super().close()
+
+
+def listen(link: Link, axes: tuple[AxisConfig, ...]) -> None:
+    """Listens for another master before the first SYNC; raises BusInUseError if there is one."""
+    if link.private:
+        return
+    masters = {axis.drive.master_node_id for axis in axes} | {USUAL_MASTER}
+    drives = {axis.drive.node_id for axis in axes}
+    encoders = {node for axis in axes if (node := axis.load_encoder.source.node) is not None}
+    duration_s = listening_s(max(axis.drive.heartbeat_ms for axis in axes))
+    ear = Ear(drives, masters, drives | encoders)
+    ear.listen(link, duration_s)
+    ear.refuse(link.name, duration_s)
 
 
 def run(start: Start) -> None:

@@ -1,15 +1,62 @@
-"""Numbers that one process writes and others monitor, and the compensation setting of an axis."""
+"""Shared memory, the numbers in it that one process writes and others monitor, and an axis's setting."""
 
+import fcntl
+import mmap
+import os
 import threading
 import zlib
 from enum import IntEnum
-from typing import Final
+from typing import Final, Self
 
 from hdbridge.daemon.memory.layout import LINE, OUTER_VIEW, STATUS_OFFSET, OuterCell, OuterView, Place
-from hdbridge.daemon.memory.region import Region
 from hdbridge.errors import InputError
 
 _STRIDE: Final = LINE // 8
+
+
+class Region:
+    """A mapped memfd, as bytes and as cells.
+
+    It has no name in any file system: no other process can open it, and it is freed with the last process
+    that holds it, however that one dies. It is sealed against shrinking, so that no access can fail later.
+    """
+
+    def __init__(self, fd: int, size: int, *, checked: bool) -> None:
+        self.fd = fd
+        """Descriptor to pass to another process."""
+        self.checked = checked
+        """True if slots have checksums."""
+        self._map = mmap.mmap(fd, size)
+        self.view = memoryview(self._map)
+        self._cells = self.view.cast("q")
+
+    @classmethod
+    def create(cls, size: int, *, checked: bool) -> Self:
+        """Creates a region, all zero."""
+        fd = os.memfd_create("hdbridge", os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
+        try:
+            os.ftruncate(fd, size)
+            fcntl.fcntl(fd, fcntl.F_ADD_SEALS, fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW | fcntl.F_SEAL_SEAL)
+            return cls(fd, size, checked=checked)
+        except OSError:
+            os.close(fd)
+            raise
+
+    def cells(self, offset: int, count: int) -> memoryview:
+        """Returns ``count`` aligned int64 cells, which are read and written atomically."""
+        return self._cells[offset // 8 : offset // 8 + count]
+
+    def close(self) -> None:
+        """Unmaps the memory, unless arrays of samples still refer to it, and closes the descriptor."""
+        try:
+            self._cells.release()
+            self.view.release()
+            self._map.close()
+        except BufferError:
+            pass  # the last reference unmaps it
+        if self.fd >= 0:
+            os.close(self.fd)
+            self.fd = -1
 
 
 class Cell(IntEnum):

@@ -18,6 +18,7 @@ from typing import Any, Final, Generic, NamedTuple, TypeVar
 import numpy as np
 import numpy.typing as npt
 
+from hdbridge.daemon.memory.cells import Region
 from hdbridge.daemon.memory.layout import (
     COMMAND,
     COMMAND_SLOTS,
@@ -38,7 +39,6 @@ from hdbridge.daemon.memory.layout import (
     sample_dtype,
     sample_struct,
 )
-from hdbridge.daemon.memory.region import Region
 from hdbridge.errors import HdbridgeError
 
 SampleArray = npt.NDArray[np.void]

@@ -5,7 +5,7 @@ import platform
 import zlib
 from typing import Final, Self
 
-from hdbridge.daemon.memory.cells import OuterCells, SettingSlot, Status
+from hdbridge.daemon.memory.cells import OuterCells, Region, SettingSlot, Status
 from hdbridge.daemon.memory.channels import (
     COMMANDS,
     EVENTS,
@@ -29,7 +29,6 @@ from hdbridge.daemon.memory.layout import (
     Layout,
     RelayedFrame,
 )
-from hdbridge.daemon.memory.region import Region
 from hdbridge.errors import InputError
 
 _STRONGLY_ORDERED: Final = frozenset({"x86_64", "amd64", "i386", "i586", "i686"})

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from hdbridge.daemon.loop.states import AxisState
 from hdbridge.daemon.memory import SampleFlag
-from hdbridge.daemon.recorder.about import About, AxisAbout
+from hdbridge.daemon.recorder.flightfile import About, AxisAbout
 from hdbridge.daemon.recorder.reading import Flight, ModelUsed
 from hdbridge.errors import InputError
 from hdbridge.records.record import Record, concatenate

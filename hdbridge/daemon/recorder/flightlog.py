@@ -1,5 +1,11 @@
 """The flight recorder without its thread: files, limits and retention.
 
+    FOLDER/DATE-MACHINE.mcap.part    being written
+    FOLDER/DATE-MACHINE.mcap         the ring, limited by size and age; the oldest file is removed first
+    FOLDER/kept/DATE-MACHINE.mcap    kept because it contains, or is close to, a fault
+
+Names begin with the date in UTC, so they sort by time.
+
 Once a second, new data is written as one chunk and synced, so a kill loses at most the last second. Free
 space is checked first: while the disk is full, data is dropped and counted, and the begin and end of this
 are reported. A fault or a client's mark moves the files around its time aside, where the ring does not
@@ -7,19 +13,22 @@ remove them.
 """
 
 import logging
+import os
+import shutil
 import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from itertools import chain, count
 from pathlib import Path
 from typing import Final, NamedTuple
 
+from hdbridge.daemon.machinefile import RecorderSettings
 from hdbridge.daemon.memory import Event, EventKind, SampleArray
-from hdbridge.daemon.recorder.about import About
-from hdbridge.daemon.recorder.flightfile import FlightFile
+from hdbridge.daemon.recorder.flightfile import KEPT, PART, About, FlightFile
 from hdbridge.daemon.recorder.mend import mend_folder
-from hdbridge.daemon.recorder.reading import overview
-from hdbridge.daemon.recorder.store import Store
+from hdbridge.daemon.recorder.reading import SUFFIX, overview
 from hdbridge.errors import InputError
 
 MESSAGE_BYTES: Final = 256
@@ -28,6 +37,8 @@ KEPT_FOR: Final = frozenset({EventKind.STOPPED, EventKind.BUS_DOWN, EventKind.UN
 """Events that count as a fault."""
 MARK: Final = "MARK"
 _KEPT_NAMES: Final = frozenset({each.name for each in KEPT_FOR} | {MARK})
+_MB: Final = 1e6
+_DAY_S: Final = 86_400.0
 _NS: Final = 1_000_000_000
 
 
@@ -71,11 +82,9 @@ class Counts:
     """Cycles not written because the disk was full."""
 
 
-class _Span(NamedTuple):
-    """Time span around a fault; ns of the samples' clock."""
-
-    begin_ns: int
-    end_ns: int
+def free_bytes(folder: Path) -> int:
+    """Returns the free bytes on the disk of ``folder``."""
+    return shutil.disk_usage(folder).free
 
 
 class FlightLog:
@@ -83,22 +92,27 @@ class FlightLog:
 
     def __init__(
         self,
-        store: Store,
+        folder: Path,
+        settings: RecorderSettings,
         about: About,
         *,
         tell: Callable[[str], None] = lambda _: None,
         wall_ns: Callable[[], int] = time.time_ns,
+        free: Callable[[Path], int] = free_bytes,
     ) -> None:
-        """``tell`` reports events of the recording to the user; ``wall_ns`` returns the time of day."""
-        self._store = store
-        self._about = about
+        """``tell`` reports events of the recording to the user; ``wall_ns`` returns the time of day.
+
+        Raises OSError if the folder cannot be created.
+        """
+        self.folder, self._settings, self._about, self._free = folder, settings, about, free
         self._tell = tell
         self._wall_ns = wall_ns
         self._file: FlightFile | None = None
         self._begun_ns = 0
         self._files: list[tuple[Path, int, int]] = []
         """Finished files of the ring, with their time spans, that a fault may still require."""
-        self._spans: list[_Span] = []
+        self._spans: list[tuple[int, int]] = []
+        """Time spans around faults; ns of the samples' clock."""
         self._models: dict[str, ModelUse] = {}
         self._waiting: list[Item] = []
         self._newest_ns = 0
@@ -107,21 +121,16 @@ class FlightLog:
         self._behind = 0
         """Cycles in a chunk that is not yet on the disk."""
         self.counts = Counts()
-        store.folder.mkdir(parents=True, exist_ok=True)
-
-    @property
-    def folder(self) -> Path:
-        """Folder of the recordings."""
-        return self._store.folder
+        folder.mkdir(parents=True, exist_ok=True)
 
     def mend(self) -> None:
         """Mends files of a process that died, and keeps those that contain a fault."""
-        for path in mend_folder(self._store.folder, self._tell):
+        for path in mend_folder(self.folder, self._tell):
             self._tell(f"{path.name}: was not finished; it is whole up to its last second")
             with suppress(InputError, OSError):
                 if any(each.kind in _KEPT_NAMES for each in overview(path).events):
-                    self._store.keep(path)
-        self._store.trim(self._wall_ns())
+                    self._move_aside(path)
+        self._remove_old()
 
     def put(self, item: Item) -> None:
         """Takes an item; it is on the disk after the next `flush`."""
@@ -142,8 +151,8 @@ class FlightLog:
         )
         size = cycles * (1 + len(self._about.axes)) * MESSAGE_BYTES
         try:
-            if not self._store.room_for(size):
-                raise OSError(f"less than {self._store.settings.free_mb:g} MB are free")
+            if self._free(self.folder) < size + self._settings.free_mb * _MB:
+                raise OSError(f"less than {self._settings.free_mb:g} MB are free")
             if self._file is not None and self._file.behind:
                 self._file.flush()
             begins = self._file is None
@@ -172,7 +181,7 @@ class FlightLog:
         batches = [each.samples for each in items if isinstance(each, Batch) and each.samples is not None]
         now_ns = self._wall_ns()
         self._about = replace(self._about, offset_ns=now_ns - self._newest_ns)
-        file = FlightFile(self._store.new_path(self._about.machine, now_ns), self._about)
+        file = FlightFile(self._new_path(now_ns), self._about)
         self._file = file
         self._begun_ns = int(batches[0]["time_ns"][0]) if batches else self._newest_ns
         for each in self._models.values():
@@ -205,15 +214,13 @@ class FlightLog:
         self._refused_now += cycles
         words = problem.strerror or str(problem)
         if not self._trouble:
-            self._tell(f"{self._store.folder}: nothing is recorded: {words}; free some space")
+            self._tell(f"{self.folder}: nothing is recorded: {words}; free some space")
         self._trouble = words
 
     def _recovered(self) -> None:
         if not self._trouble:
             return
-        self._tell(
-            f"{self._store.folder}: recorded again; {self._refused_now} cycles were not ({self._trouble})"
-        )
+        self._tell(f"{self.folder}: recorded again; {self._refused_now} cycles were not ({self._trouble})")
         if self._file is not None:
             self._file.note(
                 self._newest_ns,
@@ -225,7 +232,7 @@ class FlightLog:
 
     def _note_spans(self, items: Sequence[Item]) -> None:
         """Notes the time spans to keep."""
-        settings = self._store.settings
+        settings = self._settings
         for item in items:
             times = []
             if isinstance(item, Note) and item.kind == MARK:
@@ -233,21 +240,20 @@ class FlightLog:
             elif isinstance(item, Batch):
                 times += [each.time_ns for each in item.events if each.kind in KEPT_FOR]
             self._spans += [
-                _Span(each - int(settings.before_s * _NS), each + int(settings.after_s * _NS))
-                for each in times
+                (each - int(settings.before_s * _NS), each + int(settings.after_s * _NS)) for each in times
             ]
 
     def _cut(self) -> None:
         """Begins another file once this one is large or old enough, or a span to keep is over."""
-        file, settings = self._file, self._store.settings
+        file, settings = self._file, self._settings
         if file is None:
             return
         old_s = (self._newest_ns - self._begun_ns) / _NS
-        over = any(each.end_ns <= self._newest_ns for each in self._spans)
-        if over or old_s >= settings.file_s or file.size >= settings.file_mb * 1e6:
+        over = any(end_ns <= self._newest_ns for _, end_ns in self._spans)
+        if over or old_s >= settings.file_s or file.size >= settings.file_mb * _MB:
             self._end()
         else:
-            self._trim(file.size)
+            self._remove_old(file.size)
 
     def _end(self) -> None:
         file, self._file = self._file, None
@@ -260,25 +266,65 @@ class FlightLog:
             return
         self._files.append((file.path, self._begun_ns, self._newest_ns))
         self._keep()
-        self._trim(0)
+        self._remove_old()
 
     def _keep(self) -> None:
         """Moves files aside that a fault requires, and forgets those that none can require any more."""
-        horizon_ns = self._newest_ns - int(self._store.settings.before_s * _NS)
+        horizon_ns = self._newest_ns - int(self._settings.before_s * _NS)
         left = []
         for path, begin_ns, end_ns in self._files:
-            if any(begin_ns <= each.end_ns and end_ns >= each.begin_ns for each in self._spans):
+            if any(begin_ns <= until_ns and end_ns >= since_ns for since_ns, until_ns in self._spans):
                 with suppress(FileNotFoundError):  # removed by a user
-                    self._store.keep(path)
+                    self._move_aside(path)
             elif end_ns >= horizon_ns:
                 left.append((path, begin_ns, end_ns))
         self._files = left
-        self._spans = [each for each in self._spans if each.end_ns > self._newest_ns]
+        self._spans = [each for each in self._spans if each[1] > self._newest_ns]
 
-    def _trim(self, writing: int) -> None:
-        gone = self._store.trim(self._wall_ns(), writing)
+    # ------------------------------------------------------------------ the folder
+
+    def _new_path(self, now_ns: int) -> Path:
+        """Returns an unused name for the next file."""
+        date = datetime.fromtimestamp(now_ns / _NS, UTC).strftime("%Y%m%dT%H%M%SZ")
+        folders = (self.folder, self.folder / KEPT)
+        stems = chain([date], (f"{date}-{number}" for number in count(2)))
+        names = (f"{stem}-{self._about.machine}{SUFFIX}" for stem in stems)
+        return self.folder / next(
+            name
+            for name in names
+            if not any((folder / each).exists() for folder in folders for each in (name, name + PART))
+        )
+
+    def _move_aside(self, path: Path) -> None:
+        """Moves a finished file to the kept ones."""
+        kept = self.folder / KEPT
+        kept.mkdir(exist_ok=True)
+        path.rename(kept / path.name)
+
+    def _remove_old(self, writing: int = 0) -> None:
+        """Removes files over the limits; ``writing`` is the size of the file being written."""
+        limits, now_s = self._settings, self._wall_ns() / _NS
+        _trim(self.folder, limits.size_mb * _MB - writing, now_s - limits.age_days * _DAY_S)
+        gone = _trim(self.folder / KEPT, limits.kept_mb * _MB, -1.0)
         if gone:
             self._tell(
-                f"{self._store.folder}: what is kept of faults is over {self._store.settings.kept_mb:g} MB; "
-                f"removed: {', '.join(each.name for each in gone)}"
+                f"{self.folder}: what is kept of faults is over {limits.kept_mb:g} MB; removed: "
+                f"{', '.join(each.name for each in gone)}"
             )
+
+
+def _trim(folder: Path, most: float, oldest_s: float) -> list[Path]:
+    """Removes files beyond ``most`` bytes in all or older than ``oldest_s``, oldest first; returns them."""
+    files: list[tuple[Path, os.stat_result]] = []
+    for path in sorted(folder.glob(f"*{SUFFIX}")):
+        with suppress(FileNotFoundError):  # removed by a user
+            files.append((path, path.stat()))
+    left = sum(status.st_size for _, status in files)
+    gone = []
+    for path, status in files:
+        if left <= most and status.st_mtime >= oldest_s:
+            continue
+        path.unlink(missing_ok=True)
+        left -= status.st_size
+        gone.append(path)
+    return gone

@@ -9,7 +9,7 @@ import os
 import struct
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, BinaryIO, Final, NamedTuple, TypeVar
 
@@ -20,8 +20,7 @@ from mcap.stream_reader import StreamReader
 from numpy.typing import NDArray
 from zstandard import ZstdError
 
-from hdbridge.daemon.recorder.about import About
-from hdbridge.daemon.recorder.flightfile import EVENTS, KEPT, MACHINE_TOPIC, MODEL, PART, axis_topic
+from hdbridge.daemon.recorder.flightfile import EVENTS, KEPT, MACHINE_TOPIC, MODEL, PART, About, axis_topic
 from hdbridge.daemon.recorder.wire import AXIS, MACHINE
 from hdbridge.errors import InputError
 from hdbridge.files.regular import open_regular
@@ -58,19 +57,23 @@ class ModelUsed(NamedTuple):
 
 @dataclass(eq=False)
 class Flight:
-    """Content of one file."""
+    """Content of one file, or its summary."""
 
     path: Path
+    """Its present name."""
     about: About
     finished: bool
     """True if it has its index; else it was cut off or is being written."""
     first_ns: int
     """Times of day of the first and the last message, ns."""
     last_ns: int
+    size: int
+    """Bytes."""
+    cycles: int
+    events: tuple[Told, ...]
     axes: Mapping[str, Mapping[str, NDArray[Any]]] = field(default_factory=dict)
     """Requested sample fields as columns, by axis."""
     machine: Mapping[str, NDArray[Any]] = field(default_factory=dict)
-    events: tuple[Told, ...] = ()
     models: tuple[ModelUsed, ...] = ()
 
 
@@ -153,6 +156,7 @@ def read(path: Path, axes: tuple[str, ...] | None = None) -> Flight:
     wanted = None if axes is None else {MACHINE_TOPIC, *map(axis_topic, axes)}
     path, opened = _opened(path)
     with opened as file:
+        size = os.fstat(file.fileno()).st_size
         for record in records_of(file, path):
             if isinstance(record, Message):
                 topic = topics.get(record.channel_id, "")
@@ -172,33 +176,20 @@ def read(path: Path, axes: tuple[str, ...] | None = None) -> Flight:
     try:
         about = About.from_metadata(metadata)
         chosen = [each.name for each in about.axes if axes is None or each.name in axes]
+        machine = MACHINE.decode(messages[MACHINE_TOPIC])
         return Flight(
-            path, about, finished, min(times, default=0), max(times, default=0),
-            {name: AXIS.decode(messages[axis_topic(name)]) for name in chosen},
-            MACHINE.decode(messages[MACHINE_TOPIC]), tuple(events), tuple(models),
+            path, about, finished, min(times, default=0), max(times, default=0), size, len(machine["cycle"]),
+            tuple(events), {name: AXIS.decode(messages[axis_topic(name)]) for name in chosen}, machine,
+            tuple(models),
         )  # fmt: skip
     except InputError as problem:
         raise InputError(f"{path}: {problem}") from None
 
 
-class Overview(NamedTuple):
-    """Summary of a file from its index."""
-
-    path: Path
-    about: About
-    finished: bool
-    first_ns: int
-    last_ns: int
-    size: int
-    events: tuple[Told, ...]
-    cycles: int
-
-
-def overview(path: Path) -> Overview:
+def overview(path: Path) -> Flight:
     """Returns the summary of a finished file without reading its samples; reads an unfinished one in full."""
     path, opened = _opened(path)
     with opened as file:
-        size = os.fstat(file.fileno()).st_size
         try:
             reader = SeekingReader(file)
             summary = reader.get_summary()
@@ -206,24 +197,18 @@ def overview(path: Path) -> Overview:
                 raise EndOfFile
             metadata = {each.name: each.metadata for each in reader.iter_metadata()}
             events = tuple(_told(message) for _, _, message in reader.iter_messages(EVENTS))
-            counted = summary.statistics
-            cycles = sum(
-                counted.channel_message_counts.get(number, 0)
-                for number, each in summary.channels.items()
-                if each.topic == MACHINE_TOPIC
-            )
         except (*TORN, OSError):
-            flight = read(path, ())
-            cycles = len(flight.machine["cycle"])
-            return Overview(
-                path, flight.about, False, flight.first_ns, flight.last_ns, size, flight.events, cycles
-            )  # fmt: skip
+            return replace(read(path, ()), finished=False)
+        size = os.fstat(file.fileno()).st_size
     try:
         about = About.from_metadata(metadata)
     except InputError as problem:
         raise InputError(f"{path}: {problem}") from None
-    return Overview(
-        path, about, True, counted.message_start_time, counted.message_end_time, size, events, cycles
+    counted = summary.statistics
+    (machine,) = (number for number, each in summary.channels.items() if each.topic == MACHINE_TOPIC)
+    cycles = counted.channel_message_counts.get(machine, 0)
+    return Flight(
+        path, about, True, counted.message_start_time, counted.message_end_time, size, cycles, events
     )
 
 

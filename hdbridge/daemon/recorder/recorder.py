@@ -8,17 +8,17 @@ import logging
 import queue
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
+from hdbridge.client import messages
+from hdbridge.daemon.machinefile import RecorderSettings
 from hdbridge.daemon.memory import Event, SampleArray
-from hdbridge.daemon.recorder.about import About
-from hdbridge.daemon.recorder.flightlog import MARK, Batch, Counts, FlightLog, Item, ModelUse, Note
-from hdbridge.daemon.recorder.settings import RecorderSettings
-from hdbridge.daemon.recorder.store import Store, free_bytes
+from hdbridge.daemon.recorder.flightfile import About
+from hdbridge.daemon.recorder.flightlog import MARK, Batch, FlightLog, Item, ModelUse, Note, free_bytes
+from hdbridge.daemon.setting import CompensationSetting
 
 FLUSH_S: Final = 1.0
 QUEUE_BATCHES: Final = 500
@@ -27,7 +27,10 @@ _log = logging.getLogger(__name__)
 
 
 class FlightRecorder:
-    """Sink that passes everything to its thread; another thread mends files of earlier processes."""
+    """Sink that passes everything to its thread; another thread mends files of earlier processes.
+
+    If the folder cannot be created, it records nothing and reports that.
+    """
 
     def __init__(
         self,
@@ -36,63 +39,83 @@ class FlightRecorder:
         settings: RecorderSettings | None = None,
         *,
         tell: Callable[[str], None] = lambda _: None,
-        wall_ns: Callable[[], int] = time.time_ns,
+        in_use: Callable[[], Mapping[str, CompensationSetting]] = dict,
         free: Callable[[Path], int] = free_bytes,
     ) -> None:
-        """The recorder's thread calls ``tell``. Raises OSError if the folder cannot be created."""
-        self._flight = FlightLog(
-            Store(folder, settings or RecorderSettings(), free), about, tell=tell, wall_ns=wall_ns
-        )
+        """``in_use`` returns the setting that compensates each axis. The recorder's threads call ``tell``."""
+        self.folder = folder
+        self.flight: FlightLog | None = None
+        """None if the folder could not be created."""
+        self._tell_user, self._in_use = tell, in_use
+        self._note: str | None = None
+        self._told: dict[str, CompensationSetting] = {}
         self._queue: queue.SimpleQueue[Item | None] = queue.SimpleQueue()
-        self._tell = tell
-        self._dropped = 0
-        self._thread = threading.Thread(target=self._run, name="recorder", daemon=True)
-        self._thread.start()
-        # Its duration does not matter: each file is mended completely or not at all.
-        self._mender = threading.Thread(target=self._mend, name="recorder-mend", daemon=True)
-        self._mender.start()
-
-    @property
-    def folder(self) -> Path:
-        """Folder of the recordings."""
-        return self._flight.folder
-
-    @property
-    def counts(self) -> Counts:
-        """Counts of cycles so far."""
-        return replace(self._flight.counts, dropped=self._dropped)
+        self._threads: list[threading.Thread] = []
+        try:
+            flight = FlightLog(folder, settings or RecorderSettings(), about, tell=self._tell, free=free)
+        except OSError as problem:
+            self._tell(f"{folder}: cannot be made: {problem.strerror}; nothing is recorded")
+            return
+        self.flight = flight
+        # The duration of the mending does not matter: each file is mended completely or not at all.
+        for name, run in (("recorder", self._run), ("recorder-mend", self._mend)):
+            thread = threading.Thread(target=run, args=(flight,), name=name, daemon=True)
+            thread.start()
+            self._threads.append(thread)
 
     def take(self, samples: SampleArray, events: Sequence[Event], lost: int) -> None:
         """Takes samples and events from the observer; never waits."""
+        for axis, setting in self._in_use().items():
+            if self._told.get(axis) is not setting:
+                self._told[axis] = setting
+                version = str(setting.version) if setting.version is not None else ""
+                self.put(ModelUse(axis, version, setting.compensating.dump()))
+        if self.flight is None:
+            return
         if self._queue.qsize() < QUEUE_BATCHES:
             self._queue.put(Batch(samples if len(samples) else None, tuple(events), lost))
             return
-        if not self._dropped:
+        if not self.flight.counts.dropped:
             self._tell("the recorder is too slow: cycles are dropped")
-        self._dropped += len(samples)
+        self.flight.counts.dropped += len(samples)
 
     def put(self, item: ModelUse | Note) -> None:
         """Records a change of model or a note. They are rare, and never dropped."""
-        self._queue.put(item)
+        if self.flight is not None:
+            self._queue.put(item)
 
     def mark(self, text: str = "") -> None:
         """Records a mark and keeps the time around it, as around a fault."""
         self.put(Note(MARK, text))
 
+    def state(self) -> messages.RecorderState:
+        """Returns the state of the recorder for clients."""
+        counts = self.flight.counts if self.flight is not None else None
+        return messages.RecorderState(
+            on=counts is not None,
+            folder=str(self.folder),
+            dropped=counts.dropped + counts.refused if counts is not None else 0,
+            note=self._note,
+        )
+
     def close(self) -> None:
         """Finishes the file; returns when it is on the disk."""
         self._queue.put(None)
-        self._thread.join()
-        self._mender.join()
+        for thread in self._threads:
+            thread.join()
 
-    def _mend(self) -> None:
+    def _tell(self, text: str) -> None:
+        self._note = text
+        _log.warning("recorder", {"text": text})
+        self._tell_user(text)
+
+    def _mend(self, flight: FlightLog) -> None:
         try:
-            self._flight.mend()
+            flight.mend()
         except Exception:
             _log.exception("unfinished recordings could not be mended")
 
-    def _run(self) -> None:
-        flight = self._flight
+    def _run(self, flight: FlightLog) -> None:
         due_s = time.monotonic() + FLUSH_S
         told = 0
         going = True
@@ -103,11 +126,10 @@ class FlightRecorder:
                     going = False
                 else:
                     flight.put(item)
-            if self._dropped != told:
-                flight.put(
-                    Note("DROPPED", f"{self._dropped - told} cycles were dropped: the recorder was too slow")
-                )
-                told = self._dropped
+            dropped = flight.counts.dropped - told
+            if dropped:
+                flight.put(Note("DROPPED", f"{dropped} cycles were dropped: the recorder was too slow"))
+                told += dropped
             if time.monotonic() < due_s and going:
                 continue
             due_s = time.monotonic() + FLUSH_S

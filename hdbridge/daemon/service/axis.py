@@ -43,11 +43,7 @@ class ServiceAxis:
     """One axis of the machine. Methods that change it require the lease; stopping and reading do not."""
 
     def __init__(
-        self,
-        index: int,
-        axis: Axis,
-        core: Core,
-        report: Callable[[str], messages.AxisState],
+        self, index: int, axis: Axis, core: Core, report: Callable[[str], messages.AxisState]
     ) -> None:
         """``report`` returns the state of an axis."""
         self.axis = axis

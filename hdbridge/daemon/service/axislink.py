@@ -90,11 +90,7 @@ class AxisLink:
         load = (
             motor if encoder.is_motor_encoder else round(self.value("load_position_deg") / encoder.degrees(1))
         )
-        return Arguments(
-            i=motor,
-            j=load,
-            k=int(self.value("statusword")),
-        )
+        return Arguments(i=motor, j=load, k=int(self.value("statusword")))
 
     # ---------------------------------------------------------------- commands
 

@@ -22,7 +22,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import time
-from collections.abc import Callable, Coroutine, Mapping
+from collections.abc import Awaitable, Callable, Coroutine, Mapping, Sequence
 from datetime import UTC, datetime
 from importlib.metadata import version
 from typing import TYPE_CHECKING, Any, Final, Self
@@ -32,10 +32,10 @@ from hdbridge.daemon.loop.states import STOPPED, UNKNOWN
 from hdbridge.daemon.memory import Cell, CommandKind, EventKind
 from hdbridge.daemon.service import reports
 from hdbridge.daemon.service.axis import ServiceAxis
-from hdbridge.daemon.service.coordination import run_together
 from hdbridge.daemon.service.core import ANSWER_S, Core
 from hdbridge.daemon.service.eventlog import Entry
 from hdbridge.daemon.service.lending import Lending
+from hdbridge.daemon.service.moves import run_together
 from hdbridge.daemon.service.observer import PERIOD_S, Subscription
 from hdbridge.daemon.service.outermaster import Latency, OuterMaster
 from hdbridge.daemon.service.timing import Timing
@@ -49,8 +49,8 @@ if TYPE_CHECKING:
 
 VERIFY_AGAIN_S: Final = (0.0, 1.0, 2.0, 5.0, 10.0)
 """Pauses before each attempt to verify a drive that did not answer; the last one repeats."""
-SETTLE_AGAIN_S: Final = 0.5
-"""Pause before a compensation that was not acknowledged is sent again."""
+SETTLE_AGAIN_S: Final = (0.0, 0.5)
+"""Pauses before each attempt to send a compensation that is not acknowledged."""
 EVENTS_TOLD: Final = 1000
 _log = logging.getLogger(__name__)
 
@@ -96,8 +96,6 @@ class ServiceBridge:
         if machine.gateway is not None:
             self.core.observer.add(self._latency)
         self._tasks: set[asyncio.Task[None]] = set()
-        self._verifying: set[str] = set()
-        self._settling: set[str] = set()
         self.core.lease.doing = self._doing
 
     def _doing(self) -> str:
@@ -123,6 +121,8 @@ class ServiceBridge:
         self._start(self._watch())
         for axis in self.axes.values():
             self._start(self._take_over(axis))
+            self._start(self._settle(axis))
+            self._start(self._verify(axis))
         if (gateway := self.machine.gateway) is not None:
             master = OuterMaster(self.core, gateway, self.mark)
             self._start(master.keep())
@@ -145,7 +145,7 @@ class ServiceBridge:
             await axis.close()
 
     async def _watch(self) -> None:
-        """Reads events, checks the lease and verifies drives again, every `PERIOD_S`."""
+        """Reads events and checks the lease, every `PERIOD_S`."""
         core = self.core
         while True:
             core.observer.poll()
@@ -156,12 +156,6 @@ class ServiceBridge:
                     await axis.motion.end_without_lease()
                 except HdbridgeError as error:
                     core.log.note(f"could not be stopped: {error}", axis.link.index)
-                if axis.unsettled and axis.name not in self._settling:
-                    self._settling.add(axis.name)
-                    self._start(self._settle(axis))
-                if axis.link.state in UNKNOWN and self._bus_up and axis.name not in self._verifying:
-                    self._verifying.add(axis.name)
-                    self._start(self._verify(axis))
             await core.timing.sleep(PERIOD_S)
 
     def _look(self) -> None:
@@ -190,21 +184,43 @@ class ServiceBridge:
             self._loop_pid = pid
 
     async def _settle(self, axis: ServiceAxis) -> None:
-        """Sends the chosen compensation until the control process has acknowledged it."""
-        noted = ""
-        try:
-            while axis.unsettled:
-                try:
-                    await axis.settle()
-                except HdbridgeError as error:
-                    if str(error) != noted:
-                        noted = str(error)
-                        self.core.log.note(
-                            f"the compensation could not be put back: {error}", axis.link.index
-                        )
-                    await self.core.timing.sleep(SETTLE_AGAIN_S)
-        finally:
-            self._settling.discard(axis.name)
+        """Sends the chosen compensation whenever the control process does not use it."""
+        what = "the compensation could not be put back"
+        await self._persist(axis, lambda: axis.unsettled, axis.settle, SETTLE_AGAIN_S, what)
+
+    async def _verify(self, axis: ServiceAxis) -> None:
+        """Boots and verifies the drive whenever that is not done. The axis stays disabled."""
+
+        def is_due() -> bool:
+            return axis.link.state in UNKNOWN and self._bus_up
+
+        await self._persist(axis, is_due, axis.verify, VERIFY_AGAIN_S, "the drive could not be verified")
+
+    async def _persist(
+        self,
+        axis: ServiceAxis,
+        is_due: Callable[[], bool],
+        attempt: Callable[[], Awaitable[None]],
+        pauses_s: Sequence[float],
+        failure: str,
+    ) -> None:
+        """Repeats an attempt while it is due, until cancelled; notes an error when it is another one."""
+        timing, attempts, noted = self.core.timing, 0, ""
+        while True:
+            if not is_due():
+                attempts, noted = 0, ""
+                await timing.sleep(PERIOD_S)
+                continue
+            await timing.sleep(pauses_s[min(attempts, len(pauses_s) - 1)])
+            attempts += 1
+            try:
+                if is_due():
+                    await attempt()
+            except HdbridgeError as error:
+                if str(error) != noted:
+                    noted = str(error)
+                    self.core.log.note(f"{failure}: {error}", axis.link.index)
+                    _log.warning(failure, {"axis": axis.name, "why": noted})
 
     async def _take_over(self, axis: ServiceAxis) -> None:
         try:
@@ -213,24 +229,6 @@ class ServiceBridge:
             self.core.log.note(
                 f"the drive could not be compared with its axis file: {error}", axis.link.index
             )
-
-    async def _verify(self, axis: ServiceAxis) -> None:
-        """Boots and verifies a drive, repeatedly until it succeeds. The axis stays disabled."""
-        told = ""
-        try:
-            for attempt in range(1_000_000):
-                await self.core.timing.sleep(VERIFY_AGAIN_S[min(attempt, len(VERIFY_AGAIN_S) - 1)])
-                if axis.link.state not in UNKNOWN or not self._bus_up:
-                    return
-                try:
-                    await axis.verify()
-                except HdbridgeError as error:
-                    if str(error) != told:
-                        told = str(error)
-                        self.core.log.note(f"the drive could not be verified: {error}", axis.link.index)
-                        _log.warning("not verified", extra={"axis": axis.name, "why": told})
-        finally:
-            self._verifying.discard(axis.name)
 
     # ---------------------------------------------------------------- state
 

@@ -2,20 +2,27 @@
 
 One list has every entry, for the service itself. Clients see the other one, which omits routine entries
 (`_routine`): a calibration ends thousands of legs, which must not displace yesterday's stop. Each list has
-its own numbering.
+its own numbering. `Journal` writes the log lines of the control process, which writes none itself.
 """
 
+import logging
 import threading
 from collections import deque
+from collections.abc import Sequence
 from datetime import UTC, datetime
 from typing import NamedTuple
 
-from hdbridge.daemon.memory import Event, EventKind, RingReader
+from hdbridge.daemon.loop.faultlog import fault_of
+from hdbridge.daemon.loop.states import AxisState
+from hdbridge.daemon.memory import Event, EventKind, RingReader, SampleArray
+from hdbridge.daemon.memory.layout import LEVELS
+from hdbridge.drive.supervision import Reaction
 from hdbridge.motion import MotionMode
 
 KEPT = 4096
 ANSWERS_KEPT = 1024
 _ANSWERS = (EventKind.DONE, EventKind.REFUSED)
+_log = logging.getLogger(__name__)
 
 
 class Entry(NamedTuple):
@@ -109,3 +116,32 @@ def _routine(event: Event) -> bool:
     """Returns True for a completed command and the end of a stream, which only their client needs."""
     stream = event.kind is EventKind.MOTION_ENDED and event.code == MotionMode.STREAM
     return stream or event.kind is EventKind.DONE
+
+
+class Journal:
+    """A sink of the observer that logs one line per event, with the name of its axis."""
+
+    def __init__(self, names: Sequence[str]) -> None:
+        self._names = names
+
+    def take(self, samples: SampleArray, events: Sequence[Event], lost: int) -> None:
+        """Takes samples and events from the observer."""
+        if lost:
+            _log.warning("cycles lost", {"cycles": lost})
+        for event in events:
+            level = LEVELS.get(event.kind, logging.INFO)
+            if _log.isEnabledFor(level):
+                _log.log(level, event.kind.name.lower().replace("_", " "), self._facts(event))
+
+    def _facts(self, event: Event) -> dict[str, object]:
+        facts: dict[str, object] = {"cycle": event.cycle}
+        if 0 <= event.axis < len(self._names):
+            facts["axis"] = self._names[event.axis]
+        if event.kind is EventKind.STATE:
+            facts["state"] = AxisState(event.code).name.lower().replace("_", "-")
+        if event.kind is EventKind.FAULT and (fault := fault_of(event.code)) is not None:
+            facts["fault"] = fault.name
+            facts["reaction"] = Reaction(event.id).name.lower()
+        if event.text:
+            facts["text"] = event.text
+        return facts

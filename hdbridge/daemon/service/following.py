@@ -15,8 +15,8 @@ from hdbridge.axis.model import TransmissionModel
 from hdbridge.client import messages
 from hdbridge.daemon.following.follower import NOTHING, Follower, Outcome
 from hdbridge.daemon.following.judging import WINDOW_S, Raised, Verdict
-from hdbridge.daemon.following.settings import AdaptationSettings
 from hdbridge.daemon.following.statefile import AdaptationFiles
+from hdbridge.daemon.machinefile import AdaptationSettings
 from hdbridge.daemon.memory import Event, SampleArray
 from hdbridge.daemon.recorder.autodiagnosis import AutoDiagnosis
 from hdbridge.daemon.recorder.flightlog import Note

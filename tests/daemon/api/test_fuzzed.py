@@ -25,12 +25,7 @@ BRIDGE = FakeBridge()
 LIMIT_DEG = 180.0
 schema = schemathesis.openapi.from_asgi("/api/v1/openapi.json", create_app(BRIDGE, Metrics(), Traffic()))
 schema.config.phases.coverage.enabled = "FUZZ_EXAMPLES" in os.environ
-checks = [
-    not_a_server_error,
-    status_code_conformance,
-    content_type_conformance,
-    response_schema_conformance,
-]
+checks = [not_a_server_error, status_code_conformance, content_type_conformance, response_schema_conformance]
 # A bounded number of examples of each operation, the same in every run.
 most = int(os.environ.get("FUZZ_EXAMPLES", "3"))
 few = settings(max_examples=most, phases=[Phase.explicit, Phase.generate])

@@ -19,7 +19,7 @@ from support.fake_bridge import FakeBridge
 from support.patience import until
 
 from hdbridge import Client, DaemonError
-from hdbridge.daemon.api.policy import Policy
+from hdbridge.daemon.api.guard import Policy
 from hdbridge.daemon.api.server import ApiServer, Listener
 from hdbridge.daemon.api.sockets import tcp_socket
 

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from support.api import TOKEN
 
-from hdbridge.daemon.api.policy import DEPTH_MAXIMUM, Policy, too_deep
+from hdbridge.daemon.api.guard import DEPTH_MAXIMUM, Policy, too_deep
 from hdbridge.daemon.api.sockets import unix_socket
 from hdbridge.errors import DaemonError, InputError
 

@@ -104,11 +104,7 @@ def test_a_stop_does_not_wait_for_its_body(api, length):
     [
         ("socket", "POST /api/v1/mark HTTP/1.1\r\nHost: localhost\r\nContent-Length: 99999999\r\n", b"413"),
         ("tcp", "POST /api/v1/mark HTTP/1.1\r\nHost: localhost\r\nContent-Length: 99999999\r\n", b"401"),
-        (
-            "socket",
-            "POST /api/v1/mark HTTP/1.1\r\nHost: evil.org\r\nContent-Length: 99999999\r\n",
-            b"421",
-        ),
+        ("socket", "POST /api/v1/mark HTTP/1.1\r\nHost: evil.org\r\nContent-Length: 99999999\r\n", b"421"),
         ("socket", "POST /api/v1/mark HTTP/1.1\r\nHost: localhost\r\nTransfer-Encoding: chunked\r\n", b"413"),
     ],
 )

@@ -10,8 +10,8 @@ from support.adapting import AXIS, MODEL, PERIOD_S, History, packed, wandering, 
 
 from hdbridge.daemon.following.follower import Follower
 from hdbridge.daemon.following.health import EncoderFault, EncoderStatus
-from hdbridge.daemon.following.settings import AdaptationSettings
 from hdbridge.daemon.loop.states import AxisState
+from hdbridge.daemon.machinefile import AdaptationSettings
 from hdbridge.daemon.memory import SampleFlag
 
 QUICK = AdaptationSettings(mode="on", interval_s=2.0, rate_arcsec_per_hour=3600.0, half_life_turns=10.0)

@@ -6,7 +6,7 @@ The change of an hour is packed into minutes, with rates and intervals to match;
 import pytest
 from support.adapting import FAULTS, FLOOR_ARCSEC, at_work, truth_of
 
-from hdbridge.daemon.following.settings import AdaptationSettings
+from hdbridge.daemon.machinefile import AdaptationSettings
 
 QUICK = AdaptationSettings(mode="on", half_life_turns=5.0, rate_arcsec_per_hour=1200.0, interval_s=4.0)
 CHANGING = truth_of(130.0, growth=0.1, second_order_arcsec=1.5)

@@ -19,7 +19,7 @@ from hdbridge.client import messages
 from hdbridge.daemon.following.adaptation import Proposal
 from hdbridge.daemon.following.follower import Follower
 from hdbridge.daemon.following.judging import Verdict
-from hdbridge.daemon.following.settings import AdaptationSettings, Mode
+from hdbridge.daemon.machinefile import AdaptationSettings, Mode
 from hdbridge.daemon.memory import CommandKind
 from hdbridge.sim.truth import Truth
 

@@ -12,8 +12,8 @@ from support.adapting import AXIS, MODEL, PERIOD_S, packed, wandering, work, wor
 from hdbridge.client import messages
 from hdbridge.daemon.following.follower import Follower
 from hdbridge.daemon.following.health import EncoderStatus
-from hdbridge.daemon.following.settings import AdaptationSettings
 from hdbridge.daemon.following.statefile import AdaptationFiles
+from hdbridge.daemon.machinefile import AdaptationSettings
 
 SETTINGS = AdaptationSettings(mode="on", interval_s=2.0, rate_arcsec_per_hour=900.0, half_life_turns=10.0)
 NOON = datetime(2026, 3, 1, 12, tzinfo=UTC)

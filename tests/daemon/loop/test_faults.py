@@ -85,10 +85,7 @@ def every_tenth_tpdo_lost(daemon: SteppedDaemon) -> None:
     ],
 )
 def test_a_fault_is_one_event_and_not_one_per_cycle(
-    enabled: SteppedDaemon,
-    happens: Callable[[SteppedDaemon], None],
-    fault: Fault,
-    reactions: list[Reaction],
+    enabled: SteppedDaemon, happens: Callable[[SteppedDaemon], None], fault: Fault, reactions: list[Reaction]
 ) -> None:
     moving(enabled)
     happens(enabled)

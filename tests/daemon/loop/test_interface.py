@@ -9,8 +9,8 @@ from support.daemon import article_axes
 
 from hdbridge.axis import BusConfig
 from hdbridge.clock import MonotonicClock
-from hdbridge.daemon.loop import interface
-from hdbridge.daemon.loop.interface import Interface, listen
+from hdbridge.daemon.loop import process
+from hdbridge.daemon.loop.process import Interface, listen
 from hdbridge.drive.link import Link
 from hdbridge.errors import BusError, BusInUseError
 from hdbridge.sim.lockstep import LockstepBus, VirtualClock
@@ -90,7 +90,7 @@ def test_an_interface_that_is_down_is_not_used(monkeypatch: pytest.MonkeyPatch) 
     settings = BusConfig(interface="virtual", channel=str(uuid4()))
     with Interface(settings, MonotonicClock()) as there:
         there.open()
-        monkeypatch.setattr(interface, "Link", Down)
+        monkeypatch.setattr(process, "Link", Down)
         assert there.reopen() is None
         monkeypatch.undo()
         assert there.reopen() is not None

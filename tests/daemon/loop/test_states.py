@@ -4,14 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from hdbridge.daemon.loop.states import (
-    TRANSITIONS,
-    AxisState,
-    Happening,
-    mermaid,
-    refusal,
-    target_of,
-)
+from hdbridge.daemon.loop.states import TRANSITIONS, AxisState, Happening, mermaid, refusal, target_of
 from hdbridge.daemon.memory import CommandKind
 
 S = AxisState

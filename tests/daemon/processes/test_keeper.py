@@ -168,9 +168,7 @@ def test_a_lent_bus_returns_however_its_borrower_ends(keeper: Callable[..., Kept
     assert kept.until_ended() == 0
 
 
-def test_an_unused_lent_bus_returns_and_the_daemon_may_end_meanwhile(
-    keeper: Callable[..., Kept],
-) -> None:
+def test_an_unused_lent_bus_returns_and_the_daemon_may_end_meanwhile(keeper: Callable[..., Kept]) -> None:
     kept = keeper()
     kept.until_told("READY=1")
     os.kill(kept.until_begun("service"), signal.SIGUSR1)

@@ -141,16 +141,16 @@ def test_the_next_start_mends_files_and_keeps_those_with_faults(killed, tmp_path
     kept = [read(each) for each in flight_files([tmp_path / "kept"])]
     assert sorted(len(each.machine["cycle"]) for each in kept)[0] == 100
     assert len(kept) == 2
-    assert recorder.counts.recorded == 100
+    assert recorder.flight.counts.recorded == 100
 
 
 def test_the_recorder_never_blocks_its_caller(tmp_path, monkeypatch):
     """Its queue is full at once here: what does not fit is dropped and counted."""
     monkeypatch.setattr("hdbridge.daemon.recorder.recorder.QUEUE_BATCHES", 1)
-    monkeypatch.setattr(FlightRecorder, "_run", lambda self: None)
+    monkeypatch.setattr(FlightRecorder, "_run", lambda *_: None)
     said = []
     recorder = FlightRecorder(tmp_path, about(), tell=said.append)
     for each in range(4):
         recorder.take(samples(5, 1 + 5 * each), [], 0)
-    assert recorder.counts.dropped == 15
+    assert recorder.flight.counts.dropped == 15
     assert len(said) == 1

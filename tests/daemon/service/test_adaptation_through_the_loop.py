@@ -15,7 +15,7 @@ from support.service import AtOnce, Service, play, stepped_service, until
 from hdbridge.axis.effects import Hysteresis
 from hdbridge.client import messages
 from hdbridge.commissioning.evaluation.stepping import Scheme
-from hdbridge.daemon.following.settings import AdaptationSettings
+from hdbridge.daemon.machinefile import AdaptationSettings
 from hdbridge.daemon.memory import EventKind
 from hdbridge.daemon.service.bridge import ServiceBridge
 from hdbridge.daemon.service.following import Following

@@ -18,7 +18,7 @@ from hdbridge.axis.effects import Hysteresis
 from hdbridge.axis.model import TransmissionModel
 from hdbridge.client.messages import AdaptationMode
 from hdbridge.commissioning.evaluation.stepping import Scheme
-from hdbridge.daemon.following.settings import AdaptationSettings
+from hdbridge.daemon.machinefile import AdaptationSettings
 from hdbridge.daemon.memory import EventKind
 from hdbridge.daemon.recorder.flightlog import Note
 from hdbridge.daemon.serve import follow

@@ -176,9 +176,7 @@ async def choose(bridge: ServiceBridge, token: str) -> None:
         await bridge.axes[name].compensate(token, Scheme(scheme))
 
 
-async def test_each_axis_keeps_its_compensation_over_restarts_of_the_control_process(
-    pair: Service,
-) -> None:
+async def test_each_axis_keeps_its_compensation_over_restarts_of_the_control_process(pair: Service) -> None:
     async with pair.enabled() as (bridge, token):
         await choose(bridge, token)
         for _ in range(7):
@@ -236,9 +234,7 @@ async def test_a_new_service_reads_the_settings_in_use(pair: Service) -> None:
         assert used(pair) == [["synchronous"], ["hysteresis"]]
 
 
-async def test_a_half_written_setting_falls_back_to_the_machine_file(
-    pair: Service,
-) -> None:
+async def test_a_half_written_setting_falls_back_to_the_machine_file(pair: Service) -> None:
     async with pair.enabled() as (bridge, token):
         await choose(bridge, token)
     slot = pair.daemon.memory.settings[0]

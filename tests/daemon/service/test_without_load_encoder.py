@@ -9,8 +9,8 @@ from support.service import AtOnce, Service, play, stepped_service
 
 from hdbridge.client import messages
 from hdbridge.daemon.following.follower import NO_LOAD_ENCODER
-from hdbridge.daemon.following.settings import AdaptationSettings
 from hdbridge.daemon.machine import Machine
+from hdbridge.daemon.machinefile import AdaptationSettings
 from hdbridge.daemon.service.following import Following
 from hdbridge.errors import InputError
 from hdbridge.sim.truth import Truth

@@ -10,9 +10,9 @@ from hdbridge.daemon.api.routes.parts import (
     STOPPING,
     AxisName,
     Bridge,
-    Caller,
     FoundAxis,
     Holder,
+    KeptHolder,
     port,
     refusals,
     stopped,
@@ -29,23 +29,23 @@ async def get_axis(axis: FoundAxis) -> messages.AxisState:
 
 
 @routes.post("/enable", tags=["Power"], responses=refusals(MOVING))
-async def enable(axis: FoundAxis, caller: Caller) -> messages.AxisState:
+async def enable(axis: FoundAxis, holder: KeptHolder) -> messages.AxisState:
     """Switch power on at rest; the drive is booted and verified first if that was not done."""
-    await caller.waits(axis.enable(caller.holder))
+    await axis.enable(holder)
     return axis.state()
 
 
 @routes.post("/disable", tags=["Power"], responses=refusals(MOVING))
-async def disable(axis: FoundAxis, caller: Caller) -> messages.AxisState:
+async def disable(axis: FoundAxis, holder: KeptHolder) -> messages.AxisState:
     """Brake to rest, then switch power off. A suspended load needs a brake."""
-    await caller.waits(axis.disable(caller.holder))
+    await axis.disable(holder)
     return axis.state()
 
 
 @routes.post("/reset", tags=["Power"], responses=refusals(MOVING))
-async def reset(axis: FoundAxis, caller: Caller) -> messages.AxisState:
+async def reset(axis: FoundAxis, holder: KeptHolder) -> messages.AxisState:
     """Release a latched stop; the drive is verified again if necessary. It stays disabled."""
-    await caller.waits(axis.reset(caller.holder))
+    await axis.reset(holder)
     return axis.state()
 
 
@@ -65,16 +65,16 @@ async def stop(axis: FoundAxis) -> messages.AxisState:
 
 
 @routes.post("/home", tags=["Move"], responses=refusals(MOVING))
-async def home(axis: FoundAxis, home: messages.Home, caller: Caller) -> messages.AxisState:
+async def home(axis: FoundAxis, home: messages.Home, holder: KeptHolder) -> messages.AxisState:
     """Home by a method of the drive, disabled before and after."""
-    await caller.waits(axis.home(caller.holder, home))
+    await axis.home(holder, home)
     return axis.state()
 
 
 @routes.post("/move", tags=["Move"], responses=refusals(MOVING))
-async def move(axis: FoundAxis, move: messages.Move, caller: Caller) -> messages.AxisState:
+async def move(axis: FoundAxis, move: messages.Move, holder: KeptHolder) -> messages.AxisState:
     """Move to a load angle, jerk-limited; a present motion is redirected without a stop."""
-    await caller.waits(axis.motion.move(caller.holder, **move.model_dump()))
+    await axis.motion.move(holder, **move.model_dump())
     return axis.state()
 
 

@@ -9,8 +9,8 @@ from hdbridge.daemon.api.routes.parts import (
     MOVING,
     STOPPING,
     Bridge,
-    Caller,
     Holder,
+    KeptHolder,
     port,
     refusals,
     stopped,
@@ -90,22 +90,24 @@ async def stop_all(bridge: Bridge) -> messages.MachineState:
 
 
 @routes.post("/coordinated", tags=["Move"], responses=refusals(MOVING))
-async def coordinated(bridge: Bridge, moves: messages.Coordinated, caller: Caller) -> messages.MachineState:
+async def coordinated(
+    bridge: Bridge, moves: messages.Coordinated, holder: KeptHolder
+) -> messages.MachineState:
     """Move several axes so that all begin and end together."""
     for name in moves.targets_deg:
         port(bridge, name)
-    await caller.waits(bridge.coordinated(caller.holder, moves.targets_deg, moves.speed, moves.wait))
+    await bridge.coordinated(holder, moves.targets_deg, moves.speed, moves.wait)
     return bridge.state()
 
 
 @routes.post("/bus/lend", tags=["Move"], responses=refusals(MOVING))
-async def lend_bus(bridge: Bridge, caller: Caller) -> messages.MachineState:
+async def lend_bus(bridge: Bridge, holder: KeptHolder) -> messages.MachineState:
     """Stop all axes, switch them off, and release the bus to another program of the daemon's computer.
 
     Answers when the interface is free. The program has ten seconds to open it, and the daemon takes the
     bus back when the program has closed it or ended. The axes come back disabled.
     """
-    await caller.waits(bridge.lend_bus(caller.holder))
+    await bridge.lend_bus(holder)
     return bridge.state()
 
 

@@ -1,8 +1,9 @@
 """Shared parts of the routes: machine, axis and lease of a request, descriptions of errors."""
 
 import asyncio
-from collections.abc import Awaitable
-from typing import Annotated, Any, Final, TypeVar
+from collections.abc import AsyncIterator
+from contextlib import suppress
+from typing import Annotated, Any, Final
 
 from fastapi import Depends, Header, Path, Request
 from starlette.requests import HTTPConnection
@@ -13,7 +14,6 @@ from hdbridge.daemon.service.axis import ServiceAxis
 from hdbridge.daemon.service.bridge import ServiceBridge
 from hdbridge.errors import LeaseError
 
-T = TypeVar("T")
 RENEWALS: Final = 3
 """Lease renewals per time-out while a request of the lease holder is in progress."""
 
@@ -84,36 +84,23 @@ FoundAxis = Annotated[ServiceAxis, Depends(_found)]
 """Axis that the path names."""
 
 
-class _Caller:
-    """The lease of a request, which is kept while the request waits for a motion."""
+async def _kept(bridge: Bridge, request: Request, holder: Holder = "") -> AsyncIterator[str]:
+    """Renews the lease while the request is in progress, unless the client disconnects."""
 
-    def __init__(self, bridge: ServiceBridge, request: Request, holder: str) -> None:
-        self._lease, self._request, self.holder = bridge.lease, request, holder
+    async def renew() -> None:
+        with suppress(LeaseError):
+            while True:
+                await asyncio.sleep(bridge.lease.timeout_s / RENEWALS)
+                if await request.is_disconnected():
+                    return
+                bridge.lease.renew(holder)
 
-    async def waits(self, motion: Awaitable[T]) -> T:
-        """Waits for a motion and renews the lease meanwhile, unless the client disconnects.
-
-        The motion itself completes in any case.
-        """
-        renewing = asyncio.ensure_future(self._renew())
-        try:
-            return await motion
-        finally:
-            renewing.cancel()
-
-    async def _renew(self) -> None:
-        while True:
-            await asyncio.sleep(self._lease.timeout_s / RENEWALS)
-            if await self._request.is_disconnected():
-                return
-            try:
-                self._lease.renew(self.holder)
-            except LeaseError:
-                return
+    renewing = asyncio.ensure_future(renew())
+    try:
+        yield holder
+    finally:
+        renewing.cancel()
 
 
-async def _caller(bridge: Bridge, request: Request, holder: Holder = "") -> _Caller:
-    return _Caller(bridge, request, holder)
-
-
-Caller = Annotated[_Caller, Depends(_caller)]
+KeptHolder = Annotated[str, Depends(_kept)]
+"""Lease token of a request that waits for a motion, which completes in any case."""
