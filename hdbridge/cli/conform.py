@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
 from rich.table import Table
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from hdbridge.conformance import Check, Result
 
 
-def command(
+def conform(
     profile: Annotated[
         str | None,
         typer.Argument(
@@ -100,8 +100,8 @@ def command(
     Exit status 4 if a check failed, or the node does not answer or is under power.
     """  # fmt: skip
     from hdbridge.axis import BusConfig
-    from hdbridge.cli.gateway import eds_of, gateway_axis
-    from hdbridge.cli.interrupt import deferred_interrupt
+    from hdbridge.cli.machine import eds_of, gateway_axis
+    from hdbridge.cli.session import deferred_interrupt
     from hdbridge.conformance import NodeTester, checks, run
     from hdbridge.conformance.tester import StoppedError, Timing
     from hdbridge.daemon.machine import machine_file
@@ -240,3 +240,6 @@ def _print(results: Sequence[Result]) -> None:
             reasons[each.found] = reasons.get(each.found, 0) + 1
     for reason, count in reasons.items():
         note(f"not applicable, {count} check{'s' * (count > 1)}: {reason}")
+
+
+COMMANDS: Final = {"conform": conform}

@@ -12,7 +12,6 @@ from urllib.parse import unquote
 
 import typer
 
-from hdbridge.cli.interrupt import deferred_interrupt
 from hdbridge.cli.options import (
     JsonOption,
     need_extra,
@@ -24,6 +23,7 @@ from hdbridge.cli.options import (
     write_json,
     write_result,
 )
+from hdbridge.cli.session import deferred_interrupt
 from hdbridge.errors import InputError
 from hdbridge.files.expectation import nearest
 from hdbridge.files.outputs import Kind
@@ -387,4 +387,4 @@ def _check_memory(text: str) -> None:
         )
 
 
-COMMANDS: Final = {"run": run, "watch": watch, "report": report, "simulate": simulate}
+COMMANDS: Final = {"fleet": {"run": run, "watch": watch, "report": report, "simulate": simulate}}

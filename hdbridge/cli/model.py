@@ -194,10 +194,12 @@ def _version(each: Version[Any]) -> dict[str, Any]:
 
 
 COMMANDS: Final = {
-    "log": log,
-    "commit": commit,
-    "activate": activate,
-    "rollback": rollback,
-    "discard": discard,
-    "diff": compare,
+    "model": {
+        "log": log,
+        "commit": commit,
+        "activate": activate,
+        "rollback": rollback,
+        "discard": discard,
+        "diff": compare,
+    }
 }

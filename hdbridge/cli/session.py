@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import signal
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from types import FrameType
 from typing import TYPE_CHECKING
 
-from hdbridge.cli.interrupt import deferred_interrupt
 from hdbridge.cli.options import (
     BorrowOption,
     ChannelOption,
@@ -131,6 +132,33 @@ class Session:
 
 on_axis = taking(Session)
 """Gives a command the options of a `Session`, which it receives as its first argument."""
+
+
+@contextmanager
+def deferred_interrupt() -> Iterator[Callable[[], bool]]:
+    """Defers signals to end: within the block they only set a flag, which the yielded function reports.
+
+    A closed terminal (SIGHUP) or SIGQUIT thus also stops the axis in an orderly way. A signal that was
+    ignored from the start (`nohup`) stays ignored. The third signal interrupts at once.
+    """
+    wishes = 0
+
+    def note(_number: int, _frame: FrameType | None) -> None:
+        nonlocal wishes
+        wishes += 1
+        if wishes >= 3:  # the user insists: end even if something hangs
+            raise KeyboardInterrupt
+
+    before = {
+        each: signal.signal(each, note)
+        for each in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT)
+        if each is signal.SIGINT or signal.getsignal(each) is not signal.SIG_IGN
+    }
+    try:
+        yield lambda: wishes > 0
+    finally:
+        for each, handler in before.items():
+            signal.signal(each, handler)
 
 
 def check_bus_options(interface: str | None, channel: str | None, *, simulate: bool) -> None:

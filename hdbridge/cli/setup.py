@@ -47,7 +47,7 @@ _UP: Final = 1
 _REMEDY: Final = re.compile(r"axis\.yaml:\d+:\d+: ([a-z_.]+): found (\S+), expected (-?[\d.]+)\b")
 
 
-def command(
+def setup(
     folder: Annotated[
         Path, typer.Argument(metavar="NAME", help="Folder of the axis, new or from an earlier set-up.")
     ],
@@ -341,3 +341,6 @@ def _line(key: str) -> re.Pattern[str]:
         r"(?P<value>[^\n#]*)(?P<comment>[^\n]*)",
         re.MULTILINE,
     )
+
+
+COMMANDS: Final = {"setup": setup}

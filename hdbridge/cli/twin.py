@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
 from rich.table import Table
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from hdbridge.twin.translate import Translation
 
 
-def command(
+def twin(
     profile: ProfileArgument,
     recordings: Annotated[
         list[Path],
@@ -331,3 +331,6 @@ def print_report(report: TwinReport) -> None:
             say(estimate.text)
     for each in report.commands:
         say(f"  {each.line}   # {each.purpose}")
+
+
+COMMANDS: Final = {"twin": twin}
