@@ -59,7 +59,7 @@ PANELS: Final = {
         "model": "Manage the models of an axis: the active one, a pending one, and all earlier ones.",
     },
     "Many joints": {
-        "fleet": "Diagnose recordings of many joints on Dask; report which joints to look at first.",
+        "fleet": "Diagnose recordings of many joints on Dask; report which joints to look at first."
     },
     "Day and night": {
         "run": "Run the daemon: hold the drives of a machine and take load angles from clients.",

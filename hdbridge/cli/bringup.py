@@ -58,8 +58,7 @@ class Source(Enum):
 def new(
     name: Annotated[Path, typer.Argument(metavar="NAME", help="New folder; its name is the axis's.")],
     source: Annotated[
-        Source,
-        typer.Option("--from", help="Bundled profile to copy, or the drive that answers on a bus."),
+        Source, typer.Option("--from", help="Bundled profile to copy, or the drive that answers on a bus.")
     ] = Source.DEMO,
     interface: InterfaceOption = None,
     channel: ChannelOption = None,

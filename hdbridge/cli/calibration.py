@@ -49,8 +49,7 @@ if TYPE_CHECKING:
 # ---------------------------------------------------------------- measuring
 
 PlanOption = Annotated[
-    str,
-    typer.Option("--plan", metavar="quick|full|FILE", help="Bundled plan or plan file."),
+    str, typer.Option("--plan", metavar="quick|full|FILE", help="Bundled plan or plan file.")
 ]
 
 
@@ -77,8 +76,7 @@ class Measurement:
 
     @classmethod
     def asked(cls, axis: AxisConfig, plan: str, out: Path | None, resume: Path | None) -> Self:
-        """Creates the measurement from the options; raises `InputError` if they contradict each other or the
-        recording.
+        """Creates the measurement; raises `InputError` if options contradict each other or the recording.
 
         Also creates the folder, so that an unwritable location is refused before a drive is connected.
         """
@@ -270,9 +268,7 @@ def fit(
     active: Annotated[
         str | None,
         typer.Option(
-            "--model",
-            metavar="MODEL.yaml|PROFILE",
-            help="Model to compare with, and to fall back on.",
+            "--model", metavar="MODEL.yaml|PROFILE", help="Model to compare with, and to fall back on."
         ),
     ] = None,
     columns: ColumnsOption = None,
@@ -303,13 +299,7 @@ def fit(
     compared = TransmissionModel.load(model_file(active)) if active else None
     if compared and config:
         compared.check_bound_to(config)
-    found = fit(
-        loaded,
-        ratio=ratio,
-        axis=config,
-        active=compared,
-        independent_zeros=independent_zeros,
-    )
+    found = fit(loaded, ratio=ratio, axis=config, active=compared, independent_zeros=independent_zeros)
     held_out = found.fit.held_out
     refused = out is not None and held_out.worse and not force
     if out is not None and not refused:
@@ -353,9 +343,7 @@ def report(
 # ---------------------------------------------------------------- calibration_output
 
 TAKEN_OFF = 0.95
-"""Terms fitted in addition to the model (a delay, load orders) are reported if they reduce the residual to
-this share or less.
-"""
+"""Terms fitted in addition to the model are reported if they reduce the residual to this share or less."""
 
 
 def print_calibration(result: Calibration) -> None:

@@ -58,8 +58,7 @@ def conform(
     ] = None,
     axis: GatewayAxisOption = None,
     motion: Annotated[
-        bool,
-        typer.Option("--motion", help="Also switch power on and move the axis; else power stays off."),
+        bool, typer.Option("--motion", help="Also switch power on and move the axis; else power stays off.")
     ] = False,
     store: Annotated[
         bool,

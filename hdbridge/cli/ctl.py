@@ -66,21 +66,17 @@ AtOption = Annotated[
     ),
 ]
 OneAxisArgument = Annotated[
-    str | None,
-    typer.Argument(metavar="AXIS", help="Name of the axis; needed if there are several."),
+    str | None, typer.Argument(metavar="AXIS", help="Name of the axis; needed if there are several.")
 ]
 AxisArgument = Annotated[str, typer.Argument(metavar="AXIS", help="Name of the axis.")]
 AxesArgument = Annotated[list[str] | None, typer.Argument(metavar="AXIS...", help="Names of axes; else all.")]
 TakeOption = Annotated[
-    bool,
-    typer.Option("--force", help="Take the lease from its holder, whose motion is stopped."),
+    bool, typer.Option("--force", help="Take the lease from its holder, whose motion is stopped.")
 ]
 
 
 def connected(at: str | None, *, named: bool = True) -> Client:
-    """Returns the daemon's client, a context manager. ``named`` reports its machine if no
-    address was given.
-    """
+    """Returns the daemon's client; ``named`` reports its machine if no address was given."""
     from hdbridge.client import Client
 
     client = Client(at, name="hdbridge ctl")
@@ -116,9 +112,7 @@ def stopping(at: str | None) -> Iterator[Client]:
 
 
 def _who_holds(at: str | None) -> str:
-    """Describes the processes that hold an interface or listen at the daemon's socket, and how
-    to end them.
-    """
+    """Describes who holds an interface or listens at the daemon's socket, and how to end them."""
     from hdbridge.client.address import find
     from hdbridge.daemon.api.sockets import daemon_of
     from hdbridge.drive.interfacelock import holders, process_words
@@ -344,10 +338,7 @@ def _machine_lines(state: MachineState) -> list[str]:
     turning = "" if state.cycle.alive else ", which does NOT turn"
     skipped = f", {state.cycle.skipped} periods skipped" if state.cycle.skipped else ""
     cycle = f"cycle of {1e3 * state.cycle.period_s:g} ms{turning}{skipped}"
-    return [
-        f"machine '{state.name}'{simulated}; {bus}; {cycle}",
-        _lease_line(state.lease),
-    ]
+    return [f"machine '{state.name}'{simulated}; {bus}; {cycle}", _lease_line(state.lease)]
 
 
 def _all_concerns(state: MachineState) -> list[str]:
@@ -483,10 +474,7 @@ def move(
         for given_deg in angles_deg:
             before_deg = before_deg + given_deg if relative else given_deg
             state = moved.move(
-                before_deg,
-                velocity_deg_s=velocity_deg_s,
-                acceleration_deg_s2=acceleration_deg_s2,
-                wait=wait,
+                before_deg, velocity_deg_s=velocity_deg_s, acceleration_deg_s2=acceleration_deg_s2, wait=wait
             )
             tell(state, json_file if given_deg is angles_deg[-1] else None)
 
@@ -519,8 +507,7 @@ def queue(
     acceleration_deg_s2: AccelerationOption = None,
     dwell_s: Annotated[float, typer.Option("--dwell", min=0.0, max=86_400.0, help="Rest at each, s.")] = 0.0,
     clear: Annotated[
-        bool,
-        typer.Option("--clear", help="Remove the way points not yet begun; add none."),
+        bool, typer.Option("--clear", help="Remove the way points not yet begun; add none.")
     ] = False,
     at: AtOption = None,
     force: TakeOption = False,

@@ -319,8 +319,7 @@ def improve(
     units: UnitsOption = None,
     unwrap: UnwrapOption = None,
     auto: Annotated[
-        bool,
-        typer.Option("--auto", help="Run further experiments if causes cannot be separated."),
+        bool, typer.Option("--auto", help="Run further experiments if causes cannot be separated.")
     ] = False,
     rounds: Annotated[
         int, typer.Option("--rounds", min=1, max=20, help="With --auto: maximum number of experiments.")
@@ -370,13 +369,7 @@ def _conclude(
     result: Improvement, folder: Path, session: Session, json_file: Path | None, html_file: Path | None
 ) -> None:
     """Writes and prints the result and the next steps."""
-    from hdbridge.cli.calibration import (
-        print_next,
-        print_page,
-        print_stepping,
-        print_steps,
-        print_worse,
-    )
+    from hdbridge.cli.calibration import print_next, print_page, print_stepping, print_steps, print_worse
     from hdbridge.commissioning.calibration.validation import worse_ways
 
     page = html_file or (folder / "report.html" if folder.is_dir() else None)

@@ -30,10 +30,7 @@ if TYPE_CHECKING:
 
 
 @on_axis
-def reset(
-    session: Session,
-    json_file: JsonOption = None,
-) -> None:
+def reset(session: Session, json_file: JsonOption = None) -> None:
     """Reset a fault of the drive when its cause is gone; power stays off.
 
     Boots the drive, prints the error code and the last emergency, and resets the fault. Nothing moves. Exit
@@ -42,16 +39,13 @@ def reset(
     from hdbridge.drive.states import State
 
     axis = session.axis
-    with (
-        session.drive() as drive,
-    ):
+    with session.drive() as drive:
         drive.boot()
         faulty = drive.state() is State.FAULT
         fault = drive.fault_reset() if faulty else None
         state = drive.state()
     write_json(
-        json_file,
-        {"schema": "hdbridge.reset/1", "axis": axis.name, "fault": fault, "state": state.value},
+        json_file, {"schema": "hdbridge.reset/1", "axis": axis.name, "fault": fault, "state": state.value}
     )
     done = f"the fault is reset ({fault})" if faulty else "there is no fault to reset"
     say(f"{done}: the drive is in '{state.value}'")
@@ -107,11 +101,7 @@ def home(
 
 
 @on_axis
-def get(
-    session: Session,
-    object_: ObjectArgument,
-    json_file: JsonOption = None,
-) -> None:
+def get(session: Session, object_: ObjectArgument, json_file: JsonOption = None) -> None:
     """Read an object of the drive. The drive is neither booted nor enabled."""
     from hdbridge.drive.values import find_object
 
@@ -127,10 +117,7 @@ def get(
 
 @on_axis
 def put(
-    session: Session,
-    object_: ObjectArgument,
-    value: ValueArgument,
-    json_file: JsonOption = None,
+    session: Session, object_: ObjectArgument, value: ValueArgument, json_file: JsonOption = None
 ) -> None:
     """Write an object of the drive, and read it back. The drive is neither booted nor enabled.
 

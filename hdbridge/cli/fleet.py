@@ -65,8 +65,7 @@ ModelOption = Annotated[
     typer.Option("--model", metavar="MODEL.yaml", help="Model of joints without one of their own."),
 ]
 ModelsOption = Annotated[
-    Path | None,
-    typer.Option("--models", metavar="FOLDER", help="Folder with a model per joint, JOINT.yaml."),
+    Path | None, typer.Option("--models", metavar="FOLDER", help="Folder with a model per joint, JOINT.yaml.")
 ]
 SchedulerOption = Annotated[
     str | None,
@@ -77,8 +76,7 @@ WorkersOption = Annotated[
     typer.Option("--workers", min=1, max=1000, help="Processes on this computer; else one per core."),
 ]
 PagesOption = Annotated[
-    bool,
-    typer.Option("--pages", help="Also write the page of each listed joint, into OUT/pages."),
+    bool, typer.Option("--pages", help="Also write the page of each listed joint, into OUT/pages.")
 ]
 TimeoutOption = Annotated[
     float,
@@ -154,10 +152,7 @@ class Fleet:
         )
 
     def diagnose(
-        self,
-        found: Sequence[Source],
-        interrupted: Callable[[], bool],
-        retried: Collection[str] | None = None,
+        self, found: Sequence[Source], interrupted: Callable[[], bool], retried: Collection[str] | None = None
     ) -> None:
         """Runs over the recordings with a progress bar."""
         from hdbridge.fleet.engine import RETRIED, Cluster, Progress
@@ -260,8 +255,7 @@ def report(
     limit_arcsec: LimitOption = 10.0,
     pages: PagesOption = False,
     joints: Annotated[
-        list[str] | None,
-        typer.Option("--joint", metavar="NAME", help="Also write the page of this joint."),
+        list[str] | None, typer.Option("--joint", metavar="NAME", help="Also write the page of this joint.")
     ] = None,
 ) -> None:
     """Write the page of a run again, and print which joints to look at first."""
@@ -283,8 +277,7 @@ def simulate(
     ] = 4,
     seed: Annotated[int, typer.Option("--seed", help="Seed of the fleet.")] = 0,
 ) -> None:
-    """Make recordings of a simulated fleet: known causes that grow over a year, damaged files, exchanged
-    joints.
+    """Make recordings of a simulated fleet: growing known causes, damaged files, exchanged joints.
 
     FOLDER gets the recordings, `manifest.csv`, and the truth, `answers.json`.
     """

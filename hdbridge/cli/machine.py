@@ -369,14 +369,12 @@ def simulate(
     gateway: Annotated[
         bool,
         typer.Option(
-            "--gateway",
-            help="PROFILE is a machine: an ideal drive with the bus and objects of its gateway.",
+            "--gateway", help="PROFILE is a machine: an ideal drive with the bus and objects of its gateway."
         ),
     ] = False,
     axis: GatewayAxisOption = None,
     duration_s: Annotated[
-        float | None,
-        typer.Option("--duration", min=0.0, help="Stop after this time, s; else at Ctrl-C."),
+        float | None, typer.Option("--duration", min=0.0, help="Stop after this time, s; else at Ctrl-C.")
     ] = None,
 ) -> None:
     """Run the simulated drive of a profile on its bus, in real time, until Ctrl-C.

@@ -128,9 +128,7 @@ def _rows(before: Any, after: Any) -> list[Difference]:
 
 
 def _folder(profile: str) -> Path:
-    """Returns the folder with an axis's models; raises `InputError` unless it has an axis file,
-    valid or not.
-    """
+    """Returns the folder of an axis's models; raises `InputError` without an axis file, valid or not."""
     axis = Profile.find(profile).axis
     data = read_yaml(axis).data
     if not (isinstance(data, dict) and str(data.get("schema")).startswith("hdbridge.axis/")):

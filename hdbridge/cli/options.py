@@ -34,9 +34,7 @@ if TYPE_CHECKING:
 
 
 class _Console(Console):
-    """Console whose reader may close the pipe (`| head`): the command continues and its output
-    is discarded.
-    """
+    """Console that discards its output once the reader has closed the pipe (`| head`)."""
 
     def on_broken_pipe(self) -> None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), self.file.fileno())
@@ -70,8 +68,7 @@ ModelOption = Annotated[
     Path | None, typer.Option("--model", metavar="MODEL.yaml", help="Model file; else the profile's own.")
 ]
 SimulateOption = Annotated[
-    bool,
-    typer.Option("--simulate", help="Use a simulated drive in this process, faster than real time."),
+    bool, typer.Option("--simulate", help="Use a simulated drive in this process, faster than real time.")
 ]
 TruthOption = Annotated[
     Path | None,
@@ -87,8 +84,7 @@ InterfaceOption = Annotated[
 ]
 ChannelOption = Annotated[str | None, typer.Option("--channel", help="Channel, instead of the axis file's.")]
 ForceOption = Annotated[
-    bool,
-    typer.Option("--force", help="Send even if another master is heard on the bus or holds its lock."),
+    bool, typer.Option("--force", help="Send even if another master is heard on the bus or holds its lock.")
 ]
 BorrowOption = Annotated[
     bool,
@@ -175,9 +171,7 @@ JsonOption = Annotated[
     Kind.JSON,
 ]
 HtmlOption = Annotated[
-    Path | None,
-    typer.Option("--html", metavar="FILE", help="Write a self-contained HTML page."),
-    Kind.PAGE,
+    Path | None, typer.Option("--html", metavar="FILE", help="Write a self-contained HTML page."), Kind.PAGE
 ]
 
 ObjectArgument = Annotated[
@@ -334,9 +328,7 @@ def load_recordings(
     units: list[str] | None = None,
     unwrap: list[str] | None = None,
 ) -> dict[Path, Recording]:
-    """Loads recording folders and CSV files, by path; prints the assumptions about files of
-    other programs.
-    """
+    """Loads recordings and CSV files, by path; prints what was assumed about other programs' files."""
     from hdbridge.analysis.checks import check_once
     from hdbridge.records.recording import Recording
 

@@ -70,8 +70,7 @@ def move(
     ] = None,
     model: ModelOption = None,
     compensated: Annotated[
-        bool,
-        typer.Option("--compensated/--uncompensated", help="Use the active model, if there is one."),
+        bool, typer.Option("--compensated/--uncompensated", help="Use the active model, if there is one.")
     ] = True,
     json_file: JsonOption = None,
 ) -> None:
@@ -192,10 +191,7 @@ def step(
     model: ModelOption = None,
     scheme: Annotated[
         list[Scheme] | None,
-        typer.Option(
-            "--scheme",
-            help="Only this scheme; may be repeated. Else all of the model.",
-        ),
+        typer.Option("--scheme", help="Only this scheme; may be repeated. Else all of the model."),
     ] = None,
     count: Annotated[int, typer.Option("--count", min=2, max=100_000, help="Steps each way.")] = 240,
     step_deg: Annotated[float, typer.Option("--step-deg", help="Step, motor degrees.")] = 43.56,
@@ -249,8 +245,7 @@ def run_comparison(
     record: Path | None = None,
     tell: Callable[[Comparison], None],
 ) -> None:
-    """Connects, boots and compares, with a progress bar; keeps each scheme's record as soon as it is
-    complete.
+    """Connects, boots and compares; keeps each scheme's record as soon as it is complete.
 
     ``tell`` receives the result, also of an interrupted test: then that of the completed schemes.
     """
@@ -407,8 +402,7 @@ def motion(
         ),
     ] = True,
     propose: Annotated[
-        bool,
-        typer.Option("--propose", help="Keep the model with the measured response as pending."),
+        bool, typer.Option("--propose", help="Keep the model with the measured response as pending.")
     ] = False,
     json_file: JsonOption = None,
     html_file: HtmlOption = None,
@@ -429,10 +423,7 @@ def motion(
     used = TransmissionModel.load(chosen)
     used.check_bound_to(axis)
     note(f"motion test: {motion_test_s(axis) / 60.0:.1f} min at most")
-    with (
-        session.booted() as (drive, interrupted),
-        phases() as progress,
-    ):
+    with session.booted() as (drive, interrupted), phases() as progress:
         result = motion_test(drive, used, measure=measure, progress=progress, interrupted=interrupted)
         identity = drive.identity
     write_json(json_file, result.as_dict())
@@ -534,14 +525,7 @@ def demo(
         _write_stepping_page(folder / "stepping.html", axis, files.model, comparison, stepping, seed)
         _print_stepping(axis, comparison)
 
-    run_comparison(
-        session,
-        TransmissionModel.load(files.model),
-        stepping,
-        None,
-        record=folder,
-        tell=tell,
-    )
+    run_comparison(session, TransmissionModel.load(files.model), stepping, None, record=folder, tell=tell)
     say(f"\nopen {folder / 'stepping.html'} in a browser for the picture; next: docs/tutorial.md")
 
 

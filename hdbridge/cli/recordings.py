@@ -124,8 +124,7 @@ def _time_ns(text: str | None, option: str) -> int | None:
 _NS = 10**9
 
 FlightsArgument = Annotated[
-    list[Path],
-    typer.Argument(metavar="FILE.mcap|FOLDER...", help="Flight recordings, or folders of them."),
+    list[Path], typer.Argument(metavar="FILE.mcap|FOLDER...", help="Flight recordings, or folders of them.")
 ]
 OutOption = Annotated[
     Path | None,
@@ -285,8 +284,7 @@ def export(
 
 def import_(
     log: Annotated[
-        Path,
-        typer.Argument(metavar="LOG", help="Bus log: candump (.log), .asc, .blf, .trc, .mf4; also .gz."),
+        Path, typer.Argument(metavar="LOG", help="Bus log: candump (.log), .asc, .blf, .trc, .mf4; also .gz.")
     ],
     profile: Annotated[str, typer.Argument(metavar="PROFILE", help="Axis that was on the bus.")],
     out: OutOption = None,

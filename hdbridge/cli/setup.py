@@ -312,9 +312,7 @@ def _check_interface(interface: str, channel: str, bitrate_bps: int | None) -> N
 
 
 def value_of(text: str, key: str) -> tuple[str, bool] | None:
-    """Returns the value of ``section.key`` in the text of an axis file, and True if it is marked to be filled
-    in.
-    """
+    """Returns the value of ``section.key`` in an axis file's text, and True if it is to be filled in."""
     match = _line(key).search(text)
     if match is None:
         return None

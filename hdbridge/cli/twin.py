@@ -50,10 +50,7 @@ def twin(
         bool, typer.Option("--compare", help="Only compare the present simulation with the recordings.")
     ] = False,
     truth: TruthOption = None,
-    afresh: Annotated[
-        bool,
-        typer.Option("--afresh", help="Start from typical values."),
-    ] = False,
+    afresh: Annotated[bool, typer.Option("--afresh", help="Start from typical values.")] = False,
     columns: ColumnsOption = None,
     units: UnitsOption = None,
     unwrap: UnwrapOption = None,
@@ -229,9 +226,7 @@ def _joined(axis: AxisConfig, recordings: dict[Path, Recording]) -> Recording:
 
 
 def _beginning(files: Profile, axis: AxisConfig, truth: Path | None, *, afresh: bool) -> Translation:
-    """Returns the initial simulation: the profile's plant, with the transmission error of the
-    active model.
-    """
+    """Returns the initial simulation: the profile's plant with the active model's transmission error."""
     from hdbridge.axis.model import TransmissionModel
     from hdbridge.sim.truth import Truth
     from hdbridge.twin.translate import translate

@@ -22,8 +22,7 @@ _DESCRIPTOR = re.compile(r"/(?:dev|proc/self)/fd/(\d+)")
 
 
 def write_atomically(path: Path | str, content: str | bytes) -> None:
-    """Replaces a file's content (text as UTF-8): temporary file in the same folder, fsync, rename, fsync of
-    the folder.
+    """Replaces a file's content (text as UTF-8) by a temporary file, fsync, rename, and fsync of the folder.
 
     A reader, or a power cut, finds the old content or the new one. Pipes and character devices are written
     directly. Raises `OutputError` if the location cannot be written; the old file then remains.
@@ -93,9 +92,7 @@ def _try_out(target: Path) -> None:
 
 
 def descriptor_of(path: Path | str) -> int | None:
-    """Returns the number of this process's open file that a path like ``/dev/stdout`` or ``/dev/fd/3`` names,
-    or None.
-    """
+    """Returns the descriptor that a path like ``/dev/stdout`` or ``/dev/fd/3`` names; None for others."""
     if str(path) in _STANDARD:
         return _STANDARD.index(str(path))
     found = _DESCRIPTOR.fullmatch(str(path))
@@ -103,9 +100,7 @@ def descriptor_of(path: Path | str) -> int | None:
 
 
 def is_stream(path: Path | str) -> bool:
-    """Returns True if a path is written directly: a pipe, a character device, an open file of
-    this process.
-    """
+    """Returns True for what is written directly: a pipe, a character device, an open file of this process."""
     if descriptor_of(path) is not None:
         return True
     try:
@@ -141,9 +136,7 @@ def _write_all(descriptor: int, data: bytes) -> None:
 
 
 def make_folder(path: Path | str) -> Path:
-    """Creates a folder with its parents and returns it; raises `InputError` if it cannot be created or
-    written.
-    """
+    """Creates a folder with its parents and returns it; raises `InputError` if it cannot be written."""
     folder = Path(path)
     try:
         folder.mkdir(parents=True, exist_ok=True)

@@ -30,15 +30,12 @@ class Profile:
 
     @property
     def simulated(self) -> Path:
-        """File that describes the simulated drive of this axis: its twin if there is one, else the truth
-        file.
-        """
+        """File that describes the simulated drive: the axis's twin if there is one, else its truth file."""
         return self.twin if self.twin.is_file() else self.truth
 
     @classmethod
     def find(cls, text: str, base: Path = Path()) -> Self:
-        """Finds a profile by folder, axis file, or name of a bundled profile; raises `InputError` if there is
-        none.
+        """Finds a profile by folder, axis file or bundled name; raises `InputError` if there is none.
 
         ``base`` is the folder that a relative path starts from.
         """

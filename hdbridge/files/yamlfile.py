@@ -241,9 +241,7 @@ _Dumper.add_multi_representer(object, _plain)
 
 
 def dump_yaml(data: Any) -> str:
-    """Returns plain data (dicts, lists, scalars) as YAML: block style except for `Line`, in order, numbers
-    exact.
-    """
+    """Returns plain data as YAML: block style except for `Line`, in order, numbers exact."""
     text: str = yaml.dump(
         data, Dumper=_Dumper, sort_keys=False, allow_unicode=True, default_flow_style=False, width=100000
     )

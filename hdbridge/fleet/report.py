@@ -1,6 +1,4 @@
-"""The page of a fleet: joints to inspect first, causes by batch, mistaken and failed recordings, and the
-rates at which causes are named.
-"""
+"""Page of a fleet: joints to inspect first, causes by batch, wrong and failed recordings, rates."""
 
 import re
 import shlex

@@ -12,9 +12,7 @@ Given = Record | Recording | Sequence[Record | Recording] | Mapping[Path, Record
 
 
 def by_name(given: Given) -> dict[Path, Recording]:
-    """Returns the recordings by their name in messages: file or number. Raises `InputError` if
-    there is none.
-    """
+    """Returns the recordings by their name in messages, file or number; raises `InputError` for none."""
     if isinstance(given, Mapping):
         named = dict(given)
     else:

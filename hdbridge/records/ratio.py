@@ -7,9 +7,7 @@ from hdbridge.records.columns import UNITS, Origin, option
 from hdbridge.units import DEG_PER_TURN
 
 UNIT_SHARE: Final = 0.006
-"""Maximum deviation of a slope from that of another unit, as a share: the distance of the nearest common
-ratio.
-"""
+"""Maximum relative deviation of a slope from another unit's: the distance of the nearest common ratio."""
 LEAST_COUNTS: Final = 1000.0
 """Minimum counts per turn of an encoder."""
 STANDSTILL: Final = 0.01
@@ -60,9 +58,7 @@ def remedy(times: float, ratio: float, exact: float, origin: Origin | None) -> s
 
 
 def _other_units(origin: Origin | None) -> list[tuple[float, str, str]]:
-    """Returns for each other angle unit its effect on the load's relative travel, a
-    description, and advice.
-    """
+    """Returns factor on the load's relative travel, description and advice for each other angle unit."""
     found = []
     for channel, sense in (("load", 1.0), ("motor", -1.0)):
         unit = origin.units[channel] if origin else None

@@ -25,9 +25,7 @@ __all__ = ["MINIMUM_SAMPLES", "OPTIONAL", "REQUIRED", "Record", "concatenate", "
 MINIMUM_SAMPLES: Final = 2
 
 WRONG_RATIO: Final = 0.003
-"""Relative deviation of a ratio that indicates another gear; the closest pair of common ratios is 0.6 %
-apart.
-"""
+"""Relative deviation of a ratio that indicates another gear; the closest common ratios are 0.6 % apart."""
 WRONG_RATIO_ARCSEC: Final = 900.0
 """Minimum effect of such a deviation over the travel, several times the error of any gear; arcsec."""
 
@@ -154,9 +152,7 @@ class Record:
         return error
 
     def motion(self) -> Motion:
-        """Returns the motion of the axis for a model, with the commanded motor angle if there is one, else
-        the measured.
-        """
+        """Returns the motion for a model, with the commanded motor angle if there is one."""
         target = self.motor_target_deg
         return Motion(
             motor_deg=self.motor_position_deg if target is None else target,
@@ -165,9 +161,7 @@ class Record:
         )
 
     def load_turns_per_motor_turn(self) -> float | None:
-        """Returns the least-squares slope of the load angle over the motor angle; None if the motor stood
-        still.
-        """
+        """Returns the slope of the load angle over the motor angle; None if the motor stood still."""
         motor = self.motor_position_deg - np.mean(self.motor_position_deg)
         square = float(motor @ motor)
         return float(motor @ self.load_position_deg) / square if square else None

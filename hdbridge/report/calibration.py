@@ -118,9 +118,7 @@ def _verdict(result: Calibration) -> str:
 
 
 def _by_angle(traces: Traces, ratio: float) -> Iterator[Chart]:
-    """Yields charts over the motor angle with the model, and over the load angle with means of whole motor
-    turns.
-    """
+    """Yields charts over the motor angle with the model, and over the load angle with means of turns."""
     sweeps = _of_kind(traces, "sweep")
     chosen = (sweeps if np.any(sweeps) else np.ones_like(sweeps)) & (traces.direction != 0.0)
     if not np.any(chosen):
@@ -212,8 +210,7 @@ def _spectrum(result: Calibration) -> Chart:
 
 
 def _alone(traces: Traces) -> tuple[FloatArray, FloatArray]:
-    """Returns orders and amplitudes of the error averaged in even bins of the motor angle, by FFT; for
-    display.
+    """Returns orders and amplitudes of the error by FFT over even bins of the motor angle, for display.
 
     Empty bins count as zero; amplitudes are scaled by the share of filled bins.
     """

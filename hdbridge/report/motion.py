@@ -38,13 +38,7 @@ def motion_sections(result: MotionTest) -> list[Section]:
         ),
     ]
     if result.paths:
-        sections.append(
-            Section(
-                "Path error",
-                PATH_WORDS,
-                [Table([*PATH_COLUMNS], path_rows(result))],
-            )
-        )
+        sections.append(Section("Path error", PATH_WORDS, [Table([*PATH_COLUMNS], path_rows(result))]))
     if result.response is not None:
         sections.append(
             Section(

@@ -28,9 +28,7 @@ POINTS_MAXIMUM: Final = 4000
 """Maximum points of one series in a page; longer ones are thinned to keep a page below a megabyte."""
 _FIGURE: Final = re.compile(r"\(?[-+\N{MINUS SIGN}\N{PLUS-MINUS SIGN}]?\d[\d,.]*(e[-+]\d+)?\)?( ?%)?$")
 DIGITS: Final = 5
-"""Significant digits of a series' span: a hundredth of the screen resolution; more would only enlarge the
-page.
-"""
+"""Significant digits of a series' span, a hundredth of the screen resolution; more only enlarge the page."""
 
 
 class Mark(Enum):
@@ -243,9 +241,7 @@ def sampled(x: FloatArray, y: FloatArray, most: int = POINTS_MAXIMUM) -> tuple[F
 
 
 def _extremes(y: FloatArray, most: int) -> list[int] | None:
-    """Returns the indices of the least and greatest of each of ``most / 2`` runs; None if no thinning is
-    needed.
-    """
+    """Returns the indices of the extremes of ``most / 2`` runs; None if no thinning is needed."""
     if len(y) <= most:
         return None
     low, high = np.where(np.isnan(y), np.inf, y), np.where(np.isnan(y), -np.inf, y)

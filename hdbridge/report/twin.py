@@ -1,6 +1,4 @@
-"""Report page of a twin: measured and simulated signals, errors found, fitted values,
-unexplained residual.
-"""
+"""Report page of a twin: measured and simulated signals, errors found, fitted values."""
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
@@ -98,11 +96,7 @@ def twin_page(report: TwinReport) -> Page:
         sections.append(Section("What was wrong with the simulation", "", [Table(["cause", ""], rows)]))
     sections += [_pictures(name, report) for name in report.now.traces]
     sections.append(
-        Section(
-            "By kind of motion",
-            "The same figures, leg by leg of one kind.",
-            [_by_kind(report)],
-        )
+        Section("By kind of motion", "The same figures, leg by leg of one kind.", [_by_kind(report)])
     )
     if report.learned:
         sections.append(
@@ -112,7 +106,7 @@ def twin_page(report: TwinReport) -> Page:
                 if report.values == Values.AXIS
                 else "These values replay the recording. They are not the axis's, so they have no intervals.",
                 [_learned(report.learned)],
-            ),
+            )
         )
     if report.translated:
         rows = [[each.effect, each.counterpart or "none", each.note] for each in report.translated]

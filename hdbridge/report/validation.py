@@ -21,10 +21,7 @@ ISO_FIGURES: Final = (
 
 def stepping_sections(checked: Validation) -> list[Section]:
     """Returns the stepping test, and the ISO 230-2 figures if the plan had a positioning test."""
-    return [
-        Section("Stepping test", _stepping_text(checked), [*_stepping(checked)]),
-        *_iso_section(checked),
-    ]
+    return [Section("Stepping test", _stepping_text(checked), [*_stepping(checked)]), *_iso_section(checked)]
 
 
 def _stepping_text(checked: Validation) -> str:

@@ -108,9 +108,7 @@ class Line:
 
 @contextmanager
 def open_line(choice: BusChoice) -> Iterator[Line]:
-    """Yields a bus for drives, waiting for a bus of the computer to become free; raises `BusError` if it
-    cannot be opened.
-    """
+    """Yields a bus for drives, waiting until it is free; raises `BusError` if it cannot be opened."""
     if not choice.in_process:
         settings = BusConfig(interface=choice.interface, channel=choice.channel, bitrate_bps=None)
         with _turn(choice):
@@ -137,9 +135,7 @@ def open_line(choice: BusChoice) -> Iterator[Line]:
 
 @contextmanager
 def _turn(choice: BusChoice) -> Iterator[None]:
-    """Waits until no other test on this computer has a drive on the bus, because pytest-xdist workers share
-    it.
-    """
+    """Waits until no other test of this computer, such as one of pytest-xdist, has a drive on the bus."""
     name = str(choice)
     if _IN_USE.get(name) == threading.get_ident():
         raise InputError(

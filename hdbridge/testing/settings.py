@@ -37,9 +37,7 @@ class BusChoice:
 
     @classmethod
     def parse(cls, text: str) -> Self:
-        """Parses ``virtual``, ``lockstep`` or ``INTERFACE:CHANNEL``; raises `InputError` for
-        anything else.
-        """
+        """Parses ``virtual``, ``lockstep`` or ``INTERFACE:CHANNEL``; raises `InputError` for others."""
         interface, colon, channel = text.partition(":")
         known = [each.partition(":")[0] for each in EXAMPLES]
         if interface in (VIRTUAL, LOCKSTEP) and not colon:

@@ -201,9 +201,7 @@ class SimulatedDrive:
         self._check()
 
     def wait_until(self, condition: Callable[[], object], timeout_s: float = 5.0, what: str = "it") -> None:
-        """Runs the drive until a condition is true; raises `TimeoutError` with the log after
-        ``timeout_s``.
-        """
+        """Runs the drive until a condition is true; raises `TimeoutError` with the log."""
         __tracebackhide__ = True  # pytest shows the test's line
         end_s = self._clock.now() + timeout_s
         while not condition():

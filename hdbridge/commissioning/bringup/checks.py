@@ -27,9 +27,7 @@ class Verdict:
     measured: str
     """Measured result as text, with figures and units."""
     remedies: tuple[str, ...] = ()
-    """On failure: lines of the axis file to change (``file:line:column: key: found, expected``) or actions,
-    the likeliest first.
-    """
+    """On failure: lines of the axis file to change, or actions, the likeliest first."""
     figures: Mapping[str, Figure] = field(default_factory=dict)
     """Measured figures as data, with units in the names."""
     error: type[HdbridgeError] = DriveError

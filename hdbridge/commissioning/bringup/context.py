@@ -78,9 +78,7 @@ class BringUpContext(ExitStack):
         return self._drive
 
     def boot(self) -> Drive:
-        """Reboots the drive, leaves it switched off and resets a fault left by an earlier
-        check; returns it.
-        """
+        """Reboots the drive, resets a fault left by an earlier check, and returns it switched off."""
         report = self.drive.boot()
         if report.state in (State.FAULT, State.FAULT_REACTION_ACTIVE):
             self.drive.fault_reset()

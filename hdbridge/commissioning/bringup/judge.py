@@ -47,9 +47,7 @@ def judge_rest(axis: AxisConfig, motor: Sequence[int], load: Sequence[int]) -> V
 def judge_channels(
     axis: AxisConfig, readings: Mapping[str, float | None], waited_s: float, rest: Verdict
 ) -> Verdict:
-    """Extends the verdict on rest by the load torque and temperature channels; None means no plausible
-    reading.
-    """
+    """Adds load torque and temperature to the verdict on rest; None is no plausible reading."""
     text, figures, remedies = rest.measured, dict(rest.figures), list(rest.remedies)
     for key, value in readings.items():
         channel = axis.channels[key]

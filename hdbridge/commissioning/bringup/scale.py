@@ -53,9 +53,7 @@ class Accusation:
     why: str
 
     def text(self, axis: AxisConfig) -> str:
-        """For example ``axis.yaml:31:3: load_encoder.counts_per_turn: found 2880000, expected 11520000
-        (...)``.
-        """
+        """For example ``axis.yaml:31:3: gear.ratio: found 50, expected 51 (...)``."""
         where = axis.where(self.key)
         return f"{where}: found {_plain(self.found)}, expected {_plain(self.expected)} ({self.why})"
 

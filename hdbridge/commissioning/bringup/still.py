@@ -125,10 +125,7 @@ def eds(context: BringUpContext) -> Verdict:
                 raise
             wrong.append(str(error).split(";", 1)[0])
     information = drive.sdo.od.device_information
-    for name, address in (
-        ("vendor_number", objects.VENDOR_ID),
-        ("product_number", objects.PRODUCT_CODE),
-    ):
+    for name, address in (("vendor_number", objects.VENDOR_ID), ("product_number", objects.PRODUCT_CODE)):
         stated = getattr(information, name, None)
         found = drive.sdo.fetch(address)
         if isinstance(stated, int) and stated and stated != found:
@@ -205,9 +202,7 @@ def boot(context: BringUpContext) -> Verdict:
 
 
 def rest(context: BringUpContext) -> Verdict:
-    """Checks that both encoders arrive with every SYNC and stand still without power, and reads
-    the channels.
-    """
+    """Checks that both encoders come with every SYNC and stand still without power; reads the channels."""
     drive = context.drive
     with context.interruptible() as interrupted:
         positions = drive.read_positions()

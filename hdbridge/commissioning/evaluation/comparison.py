@@ -56,8 +56,7 @@ def compare_schemes(
     finished: Callable[[Scheme, Run[SteppingOutcome]], None] = lambda *_: None,
     stopped: Callable[[Scheme, Record], None] = lambda *_: None,
 ) -> Comparison:
-    """Runs the stepping test under each scheme on a booted drive, which is enabled for each and disabled
-    after it.
+    """Runs the stepping test under each scheme on a booted drive, which is disabled after each.
 
     ``progress`` receives the completed share of the present scheme, ``finished`` each completed run, and
     ``stopped`` the measurements of an interrupted one, so that nothing measured is lost.

@@ -40,9 +40,7 @@ class Scheme(Enum):
 
     @staticmethod
     def offered_by(model: TransmissionModel) -> tuple[Scheme, ...]:
-        """Returns the article's four schemes, and `EXTENDED` if the model has more than the two
-        basic parts.
-        """
+        """Returns the article's four schemes, and `EXTENDED` if the model has more than their two parts."""
         four = (Scheme.NONE, Scheme.SYNCHRONOUS, Scheme.HYSTERESIS, Scheme.BOTH)
         more = any(each.name not in {"synchronous", "hysteresis"} for each in model.effects)
         return (*four, Scheme.EXTENDED) if more else four
@@ -79,9 +77,7 @@ class SchemeResult:
         return cls(Scatter.of(cw), Scatter.of(ccw), Scatter.of(cw + ccw), outcome)
 
     def as_dict(self) -> dict[str, Any]:
-        """Returns the part of ``hdbridge step --json``; ``steps`` has each step's target and
-        error, in order.
-        """
+        """Returns its part of ``hdbridge step --json``, with target and error of each step in order."""
         scatter = {name: asdict(getattr(self, name)) for name in ("cw", "ccw", "pooled")}
         steps = {
             name: {
@@ -94,8 +90,7 @@ class SchemeResult:
 
 
 def quantisation_floor_arcsec(motor_counts_per_turn: float, ratio: float) -> float:
-    """Returns three sigma at the load of a motor target rounded to whole counts: a uniform error of one
-    count.
+    """Returns three sigma at the load of motor targets rounded to whole counts, a uniform error.
 
     No compensation by motor targets can be more accurate, however good its model.
     """

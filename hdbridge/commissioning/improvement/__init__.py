@@ -15,13 +15,4 @@ from hdbridge.commissioning.improvement.improve import Source, improve
 from hdbridge.commissioning.improvement.result import Improvement
 from hdbridge.commissioning.improvement.trial import Trial
 
-__all__ = [
-    "Choice",
-    "Improvement",
-    "Source",
-    "Trial",
-    "choose",
-    "extension_of",
-    "improve",
-    "unseparated",
-]
+__all__ = ["Choice", "Improvement", "Source", "Trial", "choose", "extension_of", "improve", "unseparated"]

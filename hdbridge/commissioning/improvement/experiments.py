@@ -54,18 +54,12 @@ _MACHINE: Final[dict[str, tuple[str, tuple[dict[str, Any], ...]]]] = {
         "stand still for a minute, then sweep eight motor turns at two speeds",
         (_stand(60), _sweep(0.3, motor_turns=8), _sweep(0.7, motor_turns=8)),
     ),
-    "reference-pose": (
-        "return to one reference pose every half minute",
-        (_stand(20),) * 8,
-    ),
+    "reference-pose": ("return to one reference pose every half minute", (_stand(20),) * 8),
     "load-turn-at-two-speeds": (
         "sweep a load turn both ways, then again at twice the speed",
         (_sweep(0.5, load_turns=1), _sweep(1.0, load_turns=1)),
     ),
-    "two-load-turns": (
-        "sweep two whole load turns both ways",
-        (_sweep(0.5, load_turns=2),),
-    ),
+    "two-load-turns": ("sweep two whole load turns both ways", (_sweep(0.5, load_turns=2),)),
     "long-standstill": (
         "stand still for five minutes, move, and stand for five minutes again",
         (_stand(300), _sweep(0.3, motor_turns=3), _stand(300)),

@@ -65,8 +65,7 @@ def choose(
     view: AxisView,
     done: Collection[str] = (),
 ) -> Choice | None:
-    """Returns the experiment, not ``done`` yet, predicted to separate most causes from their ``rivals``; of
-    several, the shortest.
+    """Returns the shortest experiment that separates most causes from their ``rivals`` and is not ``done``.
 
     If none does but something is unexplained: the experiment that investigates the coordinate it depends on.
     None if the axis cannot learn more on its own.

@@ -133,9 +133,7 @@ class _Bench:
 
 
 def _begin(source: Source, bench: _Bench) -> tuple[dict[Path, Recording], bool]:
-    """Returns the recordings to diagnose first, and True if an encoder may have lost its zero
-    between them.
-    """
+    """Returns the recordings to diagnose first, and True if an encoder may have lost its zero in between."""
     if source.journal is not None:
         apart = bench.run(source.journal)
         return {source.journal.folder: source.journal.recording()}, apart
