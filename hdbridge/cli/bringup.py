@@ -9,25 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
 
-from hdbridge.cli.options import (
-    BitrateOption,
-    BorrowOption,
-    ChannelOption,
-    EdsOption,
-    ForceOption,
-    InterfaceOption,
-    JsonOption,
-    ModelOption,
-    NodeOption,
-    SeedOption,
-    SimulateOption,
-    TruthOption,
-    console,
-    note,
-    progress_bar,
-    say,
-    write_json,
-)
+from hdbridge.cli import options as opt
+from hdbridge.cli.printing import console, note, progress_bar, say, write_json
 from hdbridge.cli.session import Session, bare_bus, deferred_interrupt, on_axis
 from hdbridge.clock import MonotonicClock
 from hdbridge.commissioning.bringup import ASK_TIMEOUT_S, LISTEN_S, TORQUE_PERCENT
@@ -60,12 +43,12 @@ def new(
     source: Annotated[
         Source, typer.Option("--from", help="Bundled profile to copy, or the drive that answers on a bus.")
     ] = Source.DEMO,
-    interface: InterfaceOption = None,
-    channel: ChannelOption = None,
-    bitrate_bps: BitrateOption = None,
-    node_id: NodeOption = None,
-    eds: EdsOption = None,
-    json_file: JsonOption = None,
+    interface: opt.Interface = None,
+    channel: opt.Channel = None,
+    bitrate_bps: opt.Bitrate = None,
+    node_id: opt.Node = None,
+    eds: opt.Eds = None,
+    json_file: opt.Json = None,
 ) -> None:
     """Make the folder of an axis: a copy of a bundled profile, or from the data of a drive on the bus.
 
@@ -138,7 +121,7 @@ CheckedArgument = Annotated[
 ]
 
 
-def check(profile: CheckedArgument, model: ModelOption = None, json_file: JsonOption = None) -> None:
+def check(profile: CheckedArgument, model: opt.Model = None, json_file: opt.Json = None) -> None:
     """Check the files of an axis or of a machine; report what they mean, or what is wrong and where."""
     from hdbridge.axis import AxisConfig
     from hdbridge.daemon.machine import Machine, machine_file
@@ -268,9 +251,6 @@ class _Report:
             note(self.remark)
 
 
-# ---------------------------------------------------------------- scan
-
-
 def scan(
     profile: Annotated[
         str | None,
@@ -280,11 +260,11 @@ def scan(
             "--channel.",
         ),
     ] = None,
-    interface: InterfaceOption = None,
-    channel: ChannelOption = None,
-    force: ForceOption = False,
-    borrow: BorrowOption = False,
-    bitrate_bps: BitrateOption = None,
+    interface: opt.Interface = None,
+    channel: opt.Channel = None,
+    force: opt.Force = False,
+    borrow: opt.Borrow = False,
+    bitrate_bps: opt.Bitrate = None,
     listen_s: Annotated[
         float,
         typer.Option("--listen", min=0.0, max=3600.0, help="Seconds to listen before asking; at least 0.51."),
@@ -292,10 +272,10 @@ def scan(
     timeout_ms: Annotated[
         float, typer.Option("--timeout-ms", min=1.0, max=5000.0, help="Time for each node id to answer.")
     ] = 1000.0 * ASK_TIMEOUT_S,
-    simulate: SimulateOption = False,
-    truth: TruthOption = None,
-    seed: SeedOption = 0,
-    json_file: JsonOption = None,
+    simulate: opt.Simulate = False,
+    truth: opt.Truth = None,
+    seed: opt.Seed = 0,
+    json_file: opt.Json = None,
 ) -> None:
     """List the nodes on a CAN bus: type, identity, state, and lines for an axis file.
 
@@ -457,7 +437,7 @@ def doctor(
             help="Also run at up to 64 % of the speed limit and compare the servo with the model's response.",
         ),
     ] = False,
-    json_file: JsonOption = None,
+    json_file: opt.Json = None,
 ) -> None:
     """Check an axis before its first long motion: files, bus, drive, encoders, directions, ratio, stops.
 
@@ -564,9 +544,6 @@ SERVO: Final[Check[Any]] = Check(
 )
 
 
-# ---------------------------------------------------------------- latency
-
-
 def latency(
     duration_s: Annotated[
         float, typer.Option("--duration", min=0.1, max=86_400, help="Seconds for each cycle time.")
@@ -578,7 +555,7 @@ def latency(
     realtime: Annotated[
         bool, typer.Option(help="Ask for real-time priority and locked memory, as the control loop does.")
     ] = True,
-    json_file: JsonOption = None,
+    json_file: opt.Json = None,
 ) -> None:
     """Measure timer latency; print its histogram and the shortest cycle that this computer sustains.
 

@@ -7,22 +7,13 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Final, Self
+from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
-from rich.markup import escape
-from rich.table import Table
 
-from hdbridge.cli.options import (
-    ColumnsOption,
-    HtmlOption,
-    IndependentZerosOption,
-    JsonOption,
-    UnitsOption,
-    UnwrapOption,
-    figures_table,
-    load_recordings,
-    model_file,
+from hdbridge.cli import options as opt
+from hdbridge.cli.options import taking
+from hdbridge.cli.printing import (
     note,
     print_table,
     progress_bar,
@@ -30,14 +21,13 @@ from hdbridge.cli.options import (
     write_json,
     write_result,
 )
-from hdbridge.cli.session import Session, on_axis
+from hdbridge.cli.session import Session, model_file
 from hdbridge.errors import InputError
 from hdbridge.files.atomic import make_folder, new_folder
 from hdbridge.files.outputs import Kind
 from hdbridge.files.profile import Profile
 
 if TYPE_CHECKING:
-    from hdbridge.axis import AxisConfig
     from hdbridge.cli.session import Session
     from hdbridge.commissioning.calibration import Calibration, Journal, Stepped, Validation
     from hdbridge.commissioning.calibration.result import Offer
@@ -46,37 +36,32 @@ if TYPE_CHECKING:
     from hdbridge.motion.procedures.plan import Plan
 
 
-# ---------------------------------------------------------------- measuring
+@dataclass(frozen=True)
+class Measured:
+    """Options of a command that measures by a plan."""
 
-PlanOption = Annotated[
-    str, typer.Option("--plan", metavar="quick|full|FILE", help="Bundled plan or plan file.")
-]
+    plan: Annotated[
+        str,
+        typer.Option(
+            "--plan",
+            metavar="quick|full|dynamics|FILE",
+            help="What is measured: a bundled plan, or a file. A twin needs dynamics, too.",
+        ),
+    ] = "quick"
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "--out", metavar="FOLDER", help="Where the recordings go; else recordings/AXIS-DATE-TIME."
+        ),
+        Kind.FOLDER,
+    ] = None
+    resume: Annotated[
+        Path | None,
+        typer.Option("--resume", metavar="FOLDER", help="Continue what was interrupted in this folder."),
+    ] = None
 
-
-def out_option(help_: str) -> Any:
-    """Returns the option `--out`, the folder of a new recording."""
-    return typer.Option("--out", metavar="FOLDER", help=f"{help_}; else recordings/AXIS-DATE-TIME.")
-
-
-def resume_option(help_: str) -> Any:
-    """Returns the option `--resume`, the recording to continue."""
-    return typer.Option("--resume", metavar="FOLDER", help=help_)
-
-
-@dataclass(frozen=True, slots=True)
-class Measurement:
-    """Plan to be measured into a folder, or the rest of one that was begun there."""
-
-    axis: AxisConfig
-    plan: Plan
-    folder: Path
-    date: datetime
-    journal: Journal | None
-    """Journal of the recording to continue; None for a new one."""
-
-    @classmethod
-    def asked(cls, axis: AxisConfig, plan: str, out: Path | None, resume: Path | None) -> Self:
-        """Creates the measurement; raises `InputError` if options contradict each other or the recording.
+    def of(self, session: Session) -> Measurement:
+        """Returns the measurement; raises `InputError` if options contradict each other or the recording.
 
         Also creates the folder, so that an unwritable location is refused before a drive is connected.
         """
@@ -84,24 +69,37 @@ class Measurement:
         from hdbridge.commissioning.calibration.measure import outlook
         from hdbridge.motion.procedures.plan import Plan
 
-        date = datetime.now().astimezone()
-        if resume is None:
-            loaded = Plan.load(plan)
-            outlook(loaded, axis)  # refused before a folder is made
+        axis, date = session.axis, datetime.now().astimezone()
+        if self.resume is None:
+            plan = Plan.load(self.plan)
+            outlook(plan, axis)  # refused before a folder is made
             default = Path("recordings") / f"{axis.name}-{date:%Y%m%d-%H%M%S}"
-            return cls(axis, loaded, make_folder(out) if out else new_folder(default), date, None)
-        if out is not None:
+            folder = make_folder(self.out) if self.out else new_folder(default)
+            return Measurement(session, plan, folder, date, None)
+        if self.out is not None:
             raise InputError("--resume continues in its own folder: leave out --out")
-        journal = Journal.open(resume)
+        journal = Journal.open(self.resume)
         journal.check_is_of(axis)
-        return cls(axis, journal.plan, resume, date, journal)
+        return Measurement(session, journal.plan, self.resume, date, journal)
+
+
+@dataclass(frozen=True, slots=True)
+class Measurement:
+    """Plan to be measured into a folder, or the rest of one that was begun there."""
+
+    session: Session
+    plan: Plan
+    folder: Path
+    date: datetime
+    journal: Journal | None
+    """Journal of the recording to continue; None for a new one."""
 
     def announce(self, after: str = "") -> None:
         """Prints what is left of the plan and its duration; ``after`` describes what follows."""
         from hdbridge.commissioning.calibration.measure import outlook
 
         done = self.journal.done if self.journal else ()
-        left = outlook(self.plan, self.axis, done)
+        left = outlook(self.plan, self.session.axis, done)
         for each in left.notes:
             note(f"plan '{self.plan.name}': {each}")
         there = f" ({len(done)} tasks are there already)" if self.journal else ""
@@ -110,36 +108,39 @@ class Measurement:
             f"axis{f', and {after}' if after else ''}"
         )
 
-    def begun(self, drive: Drive, simulated_seed: int | None) -> Journal:
+    def begun(self, drive: Drive) -> Journal:
         """Returns the journal to continue, else a new one for this booted drive."""
         from hdbridge.commissioning.calibration import start_journal
 
         if self.journal is not None:
             return self.journal
-        about = {} if simulated_seed is None else {"simulated": True, "seed": simulated_seed}
-        return start_journal(self.folder, self.axis, self.plan, self.date, drive.identity, about)
+        seed = self.session.simulated_seed
+        about = {} if seed is None else {"simulated": True, "seed": seed}
+        return start_journal(self.folder, self.session.axis, self.plan, self.date, drive.identity, about)
 
     @contextmanager
-    def booted(self, session: Session) -> Iterator[tuple[Drive, Callable[[], bool]]]:
-        """Yields the booted drive, and locks the axis against other measurements."""
+    def booted(self) -> Iterator[tuple[Drive, Callable[[str, float, float], None], Callable[[], bool]]]:
+        """Yields the booted drive, and functions that show progress and report a request to end.
+
+        Locks the axis against other measurements. If the measurement fails, the place of its record is
+        printed; an empty folder is removed.
+        """
         from hdbridge.axis.model.store import measuring
 
-        with _kept_in(self.folder), measuring(session.files.axis), session.booted() as ready:
-            yield ready
-
-
-@contextmanager
-def _kept_in(folder: Path) -> Iterator[None]:
-    """Prints the location of the record if the measurement fails; removes an empty folder."""
-    try:
-        yield
-    except BaseException:
-        if (folder / "recording.yaml").exists():
-            note(f"what was measured is kept; go on with --resume {folder}")
-        raise
-    finally:
-        with suppress(OSError):
-            folder.rmdir()
+        try:
+            with (
+                measuring(self.session.files.axis),
+                self.session.booted() as (drive, interrupted),
+                phases() as progress,
+            ):
+                yield drive, progress, interrupted
+        except BaseException:
+            if (self.folder / "recording.yaml").exists():
+                note(f"what was measured is kept; go on with --resume {self.folder}")
+            raise
+        finally:
+            with suppress(OSError):
+                self.folder.rmdir()
 
 
 @contextmanager
@@ -156,17 +157,9 @@ def phases() -> Iterator[Callable[[str, float, float], None]]:
         yield show
 
 
-# ---------------------------------------------------------------- calibrate
-
-
-@on_axis
+@taking(Session, Measured)
 def calibrate(
-    session: Session,
-    plan: PlanOption = "quick",
-    out: Annotated[Path | None, out_option("Where the recording goes"), Kind.FOLDER] = None,
-    resume: Annotated[Path | None, resume_option("Continue an interrupted calibration.")] = None,
-    json_file: JsonOption = None,
-    html_file: HtmlOption = None,
+    session: Session, measured: Measured, json_file: opt.Json = None, html_file: opt.Html = None
 ) -> None:
     """Measure an axis by a plan, fit its model, test it on the axis, and keep it as pending.
 
@@ -177,71 +170,57 @@ def calibrate(
     from hdbridge.commissioning.calibration.motion import motion_test_s
     from hdbridge.commissioning.calibration.validation import validation_s
 
-    files, axis = session.files, session.axis
-    work = Measurement.asked(axis, plan, out, resume)
+    work, axis = measured.of(session), session.axis
     test_s = validation_s(work.plan, axis)
     if work.plan.validation.motion:
         with suppress(InputError):  # too little travel: the calibration reports it and skips the test
             test_s += motion_test_s(axis)
     work.announce(f"{test_s / 60:.1f} min to test the model")
-    with work.booted(session) as (drive, interrupted):
-        journal = work.begun(drive, session.simulated_seed)
-        with phases() as progress:
-            result = calibrate(
-                drive,
-                journal,
-                files.axis.parent,
-                work.date,
-                progress=progress,
-                interrupted=interrupted,
-                tell=note,
-            )
-    _conclude(result, work.folder, session, json_file, html_file)
+    with work.booted() as (drive, progress, interrupted):
+        result = calibrate(
+            drive,
+            work.begun(drive),
+            session.files.folder,
+            work.date,
+            progress=progress,
+            interrupted=interrupted,
+            tell=note,
+        )
+    _conclude(result, work.folder, json_file, html_file, session)
 
 
 def _conclude(
-    result: Calibration, folder: Path, session: Session, json_file: Path | None, html_file: Path | None
+    result: Calibration,
+    folder: Path,
+    json_file: Path | None,
+    html_file: Path | None,
+    session: Session | None = None,
 ) -> None:
-    """Writes and prints the result and the next steps."""
+    """Writes and prints the result; for a measurement of a session, also the next steps."""
     page = html_file or folder / "report.html"
     write_json(json_file, result.as_dict())
     write_calibration_page(page, result)
     print_calibration(result)
-    say(f"\nrecording: {folder}")
-    print_page(page)
-    print_next(result.offer, session)
+    if session is not None:
+        say(f"\nrecording: {folder}")
+    say(f"report: {page}")
+    if session is not None:
+        print_next(result.offer, session)
 
 
-# ---------------------------------------------------------------- measure
-
-
-@on_axis
-def measure(
-    session: Session,
-    plan: Annotated[
-        str,
-        typer.Option(
-            "--plan",
-            metavar="quick|full|dynamics|FILE",
-            help="What is measured: a bundled plan, or a file. A twin needs dynamics, too.",
-        ),
-    ] = "quick",
-    out: Annotated[Path | None, out_option("Where the recording goes"), Kind.FOLDER] = None,
-    resume: Annotated[Path | None, resume_option("Continue an interrupted recording.")] = None,
-) -> None:
+@taking(Session, Measured)
+def measure(session: Session, measured: Measured) -> None:
     """Move an axis by a plan and keep the recording, for diagnose, twin and fit.
 
     The axis moves as in a calibration, without compensation. No model is fitted or changed.
     """
     from hdbridge.commissioning.calibration import measure
 
-    files, axis = session.files, session.axis
-    work = Measurement.asked(axis, plan, out, resume)
+    work, files = measured.of(session), session.files
     work.announce()
-    with work.booted(session) as (drive, interrupted):
-        journal = work.begun(drive, session.simulated_seed)
-        with phases() as progress:
-            measure(drive, journal, progress=progress, interrupted=interrupted)
+    with work.booted() as (drive, progress, interrupted):
+        journal = work.begun(drive)
+        measure(drive, journal, progress=progress, interrupted=interrupted)
     recording = journal.recording()
     say(f"recording: {work.folder}, {len(journal.done)} tasks, {len(recording.record)} samples")
     if files.model.exists():
@@ -249,10 +228,9 @@ def measure(
     say(f"what the simulated drive gets wrong: hdbridge twin {session.profile} {work.folder}")
 
 
-# ---------------------------------------------------------------- fit
-
-
+@taking(opt.CsvFormat)
 def fit(
+    csv: opt.CsvFormat,
     records: Annotated[
         list[Path],
         typer.Argument(metavar="RECORD...", help="Recording folders or CSV files, in order of time."),
@@ -271,18 +249,15 @@ def fit(
             "--model", metavar="MODEL.yaml|PROFILE", help="Model to compare with, and to fall back on."
         ),
     ] = None,
-    columns: ColumnsOption = None,
-    units: UnitsOption = None,
-    unwrap: UnwrapOption = None,
-    independent_zeros: IndependentZerosOption = False,
+    independent_zeros: opt.IndependentZeros = False,
     out: Annotated[
         Path | None, typer.Option("--out", metavar="MODEL.yaml", help="Write the model file."), Kind.MODEL
     ] = None,
     force: Annotated[
         bool, typer.Option("--force", help="Write the model even if it is worse on held-out data.")
     ] = False,
-    json_file: JsonOption = None,
-    html_file: HtmlOption = None,
+    json_file: opt.Json = None,
+    html_file: opt.Html = None,
 ) -> None:
     """Fit a model to recordings; report parameter intervals and what the data cannot determine.
 
@@ -295,7 +270,7 @@ def fit(
     from hdbridge.commissioning.calibration import fit
 
     config = AxisConfig.load(Profile.find(axis).axis) if axis else None
-    loaded = load_recordings(records, columns, units, unwrap)
+    loaded = csv.load(records)
     compared = TransmissionModel.load(model_file(active)) if active else None
     if compared and config:
         compared.check_bound_to(config)
@@ -311,7 +286,7 @@ def fit(
     if out is not None and not refused:
         say(f"model: {out}")
     if html_file is not None:
-        print_page(html_file)
+        say(f"report: {html_file}")
     if refused:
         raise InputError(
             f"{out}: not written: the model is worse on held-out data; it {held_out.text}; record more, or "
@@ -319,28 +294,18 @@ def fit(
         )
 
 
-# ---------------------------------------------------------------- report
-
-
 def report(
     recording: Annotated[
         Path, typer.Argument(metavar="RECORDING", help="Folder of a calibration's recording.")
     ],
-    json_file: JsonOption = None,
-    html_file: HtmlOption = None,
+    json_file: opt.Json = None,
+    html_file: opt.Html = None,
 ) -> None:
     """Fit a recording again and report the result; nothing moves."""
     from hdbridge.commissioning.calibration import concluded
 
-    result = concluded(recording)
-    page = html_file or recording / "report.html"
-    write_json(json_file, result.as_dict())
-    write_calibration_page(page, result)
-    print_calibration(result)
-    print_page(page)
+    _conclude(concluded(recording), recording, json_file, html_file)
 
-
-# ---------------------------------------------------------------- calibration_output
 
 TAKEN_OFF = 0.95
 """Terms fitted in addition to the model are reported if they reduce the residual to this share or less."""
@@ -357,24 +322,17 @@ def print_calibration(result: Calibration) -> None:
         if result.active
         else {}
     )
-    table = Table(title=_title(result), title_justify="left")
-    for name in ("effect", "parameter"):
-        table.add_column(name)
-    for name in ("value", "± 95 %", "was" if before else "unit"):
-        table.add_column(name, justify="right" if name != "unit" else "left")
+    rows = []
     for each in fit.intervals:
         was = before.get((each.effect, each.parameter))
         value, half_width = with_interval(each.value, each.half_width)
-        table.add_row(
-            each.effect,
-            escape(each.parameter),
-            *((value, half_width) if each.identifiable else (f"({figure(each.value)})", "not known")),
-            # With a previous model there is no space for the unit column; the names contain the units.
-            ("-" if was is None else with_interval(was, each.half_width)[0])
-            if before
-            else unit_of(each.parameter),
-        )
-    print_table(table)
+        known = (value, half_width) if each.identifiable else (f"({figure(each.value)})", "not known")
+        # With a previous model there is no space for the unit column; the names contain the units.
+        last = "-" if was is None else with_interval(was, each.half_width)[0]
+        rows.append((each.effect, each.parameter, *known, last if before else unit_of(each.parameter)))
+    axis = f"axis '{result.axis}'" if result.axis else ", ".join(result.recordings)
+    columns = ("effect", "parameter", "value", "± 95 %", "was" if before else "unit")
+    print_table(columns, rows, f"Model of {axis}, ratio {result.model.ratio:g}")
     noise = fit.noise
     standing = "not measured" if noise.standing_arcsec is None else f"{noise.standing_arcsec:.2f}"
     apart = ""
@@ -408,11 +366,6 @@ def write_calibration_page(path: Path, result: Calibration) -> None:
     write_result(path, render(calibration_page(result)))
 
 
-def print_page(path: Path) -> None:
-    """Prints the path of the page."""
-    say(f"report: {path}")
-
-
 def print_next(offer: Offer | None, session: Session) -> None:
     """Prints the commands for a pending model. The daemon that lent its bus commits it, and uses it."""
     if offer is not None and offer.made:
@@ -420,11 +373,6 @@ def print_next(offer: Offer | None, session: Session) -> None:
         daemon = f"hdbridge ctl model {session.axis.name} pending"
         use = daemon if session.borrow else f"hdbridge model commit {folder}"
         say(f"pending: {offer.pending}\nreview it: hdbridge model diff {folder}\nuse it: {use}")
-
-
-def _title(result: Calibration) -> str:
-    axis = f"axis '{result.axis}'" if result.axis else ", ".join(result.recordings)
-    return escape(f"Model of {axis}, ratio {result.model.ratio:g}")
 
 
 def print_stepping(checked: Validation) -> None:
@@ -457,27 +405,34 @@ def _print_accuracy(checked: Validation) -> None:
     rows = [(model, each) for model, each in found if each is not None]
     if not rows:
         return
-    table = figures_table(
+    figures = [
+        (
+            model,
+            *(
+                f"{value:z.2f}"
+                for value in (each.accuracy, each.repeatability, each.reversal, each.systematic, each.range)
+            ),
+        )
+        for model, each in rows
+    ]
+    print_table(
+        ("with", "accuracy\nA", "repeatability\nR", "reversal\nB", "systematic\nE", "range\nM"),
+        figures,
         f"Positioning test (ISO 230-2), arcsec: {rows[0][1].targets} targets, {rows[0][1].runs} "
         "approaches from each side",
-        "with",
-        *("accuracy\nA", "repeatability\nR", "reversal\nB", "systematic\nE", "range\nM"),
     )
-    for model, each in rows:
-        figures = (each.accuracy, each.repeatability, each.reversal, each.systematic, each.range)
-        table.add_row(model, *(f"{value:z.2f}" for value in figures))
-    print_table(table)
 
 
 def print_scatter(
     title: str, first: str, rows: Iterable[tuple[str, tuple[Scatter, Scatter, Scatter]]]
 ) -> None:
     """Prints a line for each test: its name in the column ``first``, then its CW, CCW and pooled figures."""
-    table = figures_table(title, first, *("CW 3σ", "mean", "CCW 3σ", "mean", "pooled 3σ", "mean"))
-    for name, parts in rows:
-        figures = (value for part in parts for value in (part.three_sigma_arcsec, part.mean_arcsec))
-        table.add_row(name, *(f"{value:z.2f}" for value in figures))
-    print_table(table)
+    columns = (first, "CW 3σ", "mean", "CCW 3σ", "mean", "pooled 3σ", "mean")
+    figures = [
+        (name, *(f"{value:z.2f}" for part in parts for value in (part.three_sigma_arcsec, part.mean_arcsec)))
+        for name, parts in rows
+    ]
+    print_table(columns, figures, title)
 
 
 COMMANDS: Final = {"calibrate": calibrate, "measure": measure, "fit": fit, "report": report}

@@ -10,37 +10,19 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
 from rich.console import Group
 from rich.live import Live
-from rich.markup import escape
-from rich.table import Table
 from rich.text import Text
 
-from hdbridge.cli.options import (
-    AccelerationOption,
-    AnglesArgument,
-    HomingMethodOption,
-    HomingTimeoutOption,
-    JsonOption,
-    ObjectArgument,
-    OffsetOption,
-    SwitchVelocityOption,
-    ValueArgument,
-    VelocityOption,
-    ZeroVelocityOption,
-    console,
-    fitted,
-    note,
-    note_clamped,
-    print_object,
-    print_table,
-    say,
-    write_json,
-)
+from hdbridge.cli import options as opt
+from hdbridge.cli.options import taking
+from hdbridge.cli.printing import console, note, print_object, print_table, say, tables, write_json
+from hdbridge.cli.session import note_clamped
 from hdbridge.client.messages import AdaptationMode, Scheme
 from hdbridge.errors import DaemonError, HdbridgeError, InputError
 
@@ -51,8 +33,6 @@ if TYPE_CHECKING:
     from hdbridge.client.messages import AxisState, Event, LeaseState, MachineState, OuterState, SdoValue
     from hdbridge.client.sync import Axis
 
-
-# ---------------------------------------------------------------- ctl/common
 
 STOP_S: Final = 3.0
 """Time-out of a stop command; s."""
@@ -70,9 +50,41 @@ OneAxisArgument = Annotated[
 ]
 AxisArgument = Annotated[str, typer.Argument(metavar="AXIS", help="Name of the axis.")]
 AxesArgument = Annotated[list[str] | None, typer.Argument(metavar="AXIS...", help="Names of axes; else all.")]
-TakeOption = Annotated[
-    bool, typer.Option("--force", help="Take the lease from its holder, whose motion is stopped.")
-]
+
+
+@dataclass(frozen=True)
+class Daemon:
+    """Options of a command that needs the right to move."""
+
+    at: AtOption = None
+    force: Annotated[
+        bool, typer.Option("--force", help="Take the lease from its holder, whose motion is stopped.")
+    ] = False
+    json_file: opt.Json = None
+
+    @contextmanager
+    def moving(self, name: str | None) -> Iterator[Axis]:
+        """Yields an axis with the lease to move it; Ctrl-C or another end of the command stops it.
+
+        Without a name it is the only axis; raises `InputError` if there are several.
+        """
+        with connected(self.at) as client:
+            if name is None:
+                names = [*client.axes]
+                if len(names) != 1:
+                    raise InputError(f"AXIS: is missing; expected one of: {', '.join(names)}")
+                name = names[0]
+            with client.lease(force=self.force), stopped_by_signals(client, name):
+                yield client.axis(name)
+
+    def tell(self, state: AxisState) -> None:
+        """Writes and prints the state of an axis after a command."""
+        write_json(self.json_file, document("ctl-axis", state))
+        tell(state)
+
+
+on_daemon = taking(Daemon)
+"""Gives a command the options of a `Daemon`, which it receives as its first argument."""
 
 
 def connected(at: str | None, *, named: bool = True) -> Client:
@@ -130,27 +142,8 @@ def _who_holds(at: str | None) -> str:
 
 
 @contextmanager
-def moving(at: str | None, name: str | None, *, force: bool = False) -> Iterator[Axis]:
-    """Yields an axis with the lease to move it; Ctrl-C or another end of the command stops it.
-
-    Without a name it is the only axis; raises `InputError` if there are several.
-    """
-    with connected(at) as client:
-        name = name or _only(client)
-        with client.lease(force=force), stopped_by_signals(client, name):
-            yield client.axis(name)
-
-
-def _only(client: Client) -> str:
-    names = list(client.axes)
-    if len(names) != 1:
-        raise InputError(f"AXIS: is missing; expected one of: {', '.join(names)}")
-    return names[0]
-
-
-@contextmanager
-def stopped_by_signals(client: Client, *names: str) -> Iterator[None]:
-    """Brakes these axes to rest if the block is interrupted; the interruption propagates."""
+def stopped_by_signals(client: Client, name: str) -> Iterator[None]:
+    """Brakes an axis to rest if the block is interrupted; the interruption propagates."""
 
     def interrupt(_number: int, _frame: FrameType | None) -> None:
         raise KeyboardInterrupt
@@ -163,19 +156,17 @@ def stopped_by_signals(client: Client, *names: str) -> Iterator[None]:
     try:
         yield
     except KeyboardInterrupt:
-        for name in names:
-            with suppress(HdbridgeError):  # the daemon's own supervision remains
-                client.axis(name).stop()
-                note(f"axis '{name}' is stopped; it stays enabled")
+        with suppress(HdbridgeError):  # the daemon's own supervision remains
+            client.axis(name).stop()
+            note(f"axis '{name}' is stopped; it stays enabled")
         raise
     finally:
         for each, handler in before.items():
             signal.signal(each, handler)
 
 
-def tell(state: AxisState, json_file: Path | None) -> None:
+def tell(state: AxisState) -> None:
     """Prints the state of an axis after a command."""
-    write_json(json_file, document("ctl-axis", state))
     load = "" if state.load_position_deg is None else f", load encoder {state.load_position_deg:.4f} deg"
     error = "" if state.error_arcsec is None else f", error {state.error_arcsec:+.2f} arcsec"
     target = "" if state.load_target_deg is None else f": target {state.load_target_deg:.4f} deg{load}{error}"
@@ -205,32 +196,42 @@ def document(kind: str, message: Any) -> dict[str, Any]:
     return {"schema": f"hdbridge.{kind}/1", **message.model_dump(mode="json")}
 
 
+AXES: Final = (
+    "axis",
+    "state",
+    "target, deg",
+    "load encoder, deg",
+    "error, arcsec",
+    "correction, arcsec",
+    "compensation",
+    "model",
+)
+
+
 def figure(value: float | None, digits: int) -> str:
     """Formats a number in a table; a dash if there is none."""
     return "-" if value is None else f"{value:z.{digits}f}"
 
 
-def axes_table(axes: list[AxisState]) -> Table:
-    """Returns a table with one row per axis."""
-    table = Table("axis", "state")
-    for name in ("target, deg", "load encoder, deg", "error, arcsec", "correction, arcsec"):
-        table.add_column(name, justify="right")
-    table.add_column("compensation")
-    table.add_column("model")
+def axes_rows(axes: list[AxisState]) -> list[tuple[str, ...]]:
+    """Returns a row of `AXES` for each axis."""
+    rows: list[tuple[str, ...]] = []
     for each in axes:
         moving = "" if each.mode == "hold" else f", {each.mode}"
         queued = f", {each.queued} wait" if each.queued else ""
-        table.add_row(
-            escape(each.name),
-            f"{each.state}{moving}{queued}",
-            figure(each.load_target_deg, 4),
-            figure(each.load_position_deg, 4),
-            figure(each.error_arcsec, 2),
-            figure(each.correction_arcsec, 2),
-            str(each.scheme),
-            _model(each),
+        rows.append(
+            (
+                each.name,
+                f"{each.state}{moving}{queued}",
+                figure(each.load_target_deg, 4),
+                figure(each.load_position_deg, 4),
+                figure(each.error_arcsec, 2),
+                figure(each.correction_arcsec, 2),
+                str(each.scheme),
+                _model(each),
+            )
         )
-    return table
+    return rows
 
 
 def _model(state: AxisState) -> str:
@@ -243,17 +244,17 @@ def _model(state: AxisState) -> str:
     return f"{name}, {days:.0f} days old" if days >= 2 else f"{name}, {state.model.age_s / 3600:.0f} h old"
 
 
-# ---------------------------------------------------------------- ctl/look
+# ---------------------------------------------------------------- looking
 
 
-def status(at: AtOption = None, json_file: JsonOption = None) -> None:
+def status(at: AtOption = None, json_file: opt.Json = None) -> None:
     """Report the state of a machine and its axes."""
     with connected(at, named=False) as client:
         state = client.state()
     write_json(json_file, document("ctl-status", state))
     for line in _machine_lines(state):
         say(line)
-    print_table(axes_table(state.axes))
+    print_table(AXES, axes_rows(state.axes))
     for line in _all_concerns(state):
         say(line)
 
@@ -280,14 +281,14 @@ def watch(
             for _ in _looks(count, every_s):
                 state = client.state()
                 words = (Text(line) for line in (*_machine_lines(state), *_all_concerns(state)))
-                shown.update(Group(*words, *fitted(axes_table(state.axes))), refresh=True)
+                shown.update(Group(*words, *tables(AXES, axes_rows(state.axes))), refresh=True)
 
 
 def events(
     at: AtOption = None,
     since: Annotated[int, typer.Option("--since", min=0, help="Only events after this number.")] = 0,
     follow: Annotated[bool, typer.Option("--follow", "-f", help="Continue until Ctrl-C.")] = False,
-    json_file: JsonOption = None,
+    json_file: opt.Json = None,
 ) -> None:
     """List faults, states, refused commands and remarks; oldest first."""
     with connected(at) as client:
@@ -305,14 +306,15 @@ def events(
             found = client.events(found.newest)
 
 
-def lease(at: AtOption = None, force: TakeOption = False, json_file: JsonOption = None) -> None:
+@on_daemon
+def lease(daemon: Daemon) -> None:
     """Report who has the right to move; with --force take it from its holder, and release it."""
-    with connected(at) as client:
-        if force:
+    with connected(daemon.at) as client:
+        if daemon.force:
             with client.lease(force=True):
                 pass
         state = client.lease_state()
-    write_json(json_file, document("ctl-lease", state))
+    write_json(daemon.json_file, document("ctl-lease", state))
     say(_lease_line(state))
 
 
@@ -378,56 +380,35 @@ def _event_line(event: Event) -> str:
     return f"{event.sequence:6d}  {date:%Y-%m-%d %H:%M:%S}{axis}  {event.kind}  {event.text}{hint}".rstrip()
 
 
-# ---------------------------------------------------------------- ctl/motion
+# ---------------------------------------------------------------- power and motion
 
 
-def enable(
-    axis: OneAxisArgument = None, at: AtOption = None, force: TakeOption = False, json_file: JsonOption = None
-) -> None:
+@on_daemon
+def enable(daemon: Daemon, axis: OneAxisArgument = None) -> None:
     """Switch power on at standstill; boots and verifies the drive first if necessary."""
-    with moving(at, axis, force=force) as moved:
-        tell(moved.enable(), json_file)
+    with daemon.moving(axis) as moved:
+        daemon.tell(moved.enable())
 
 
-def disable(
-    axis: OneAxisArgument = None, at: AtOption = None, force: TakeOption = False, json_file: JsonOption = None
-) -> None:
+@on_daemon
+def disable(daemon: Daemon, axis: OneAxisArgument = None) -> None:
     """Brake to rest, then switch power off. A suspended load needs a brake."""
-    with moving(at, axis, force=force) as moved:
-        tell(moved.disable(), json_file)
+    with daemon.moving(axis) as moved:
+        daemon.tell(moved.disable())
 
 
-def reset(
-    axis: OneAxisArgument = None, at: AtOption = None, force: TakeOption = False, json_file: JsonOption = None
-) -> None:
+@on_daemon
+def reset(daemon: Daemon, axis: OneAxisArgument = None) -> None:
     """Release a latched stop when its cause is gone; the axis stays disabled."""
-    with moving(at, axis, force=force) as moved:
-        tell(moved.reset(), json_file)
+    with daemon.moving(axis) as moved:
+        daemon.tell(moved.reset())
 
 
-def home(
-    method: HomingMethodOption,
-    axis: OneAxisArgument = None,
-    switch_velocity_deg_s: SwitchVelocityOption = None,
-    zero_velocity_deg_s: ZeroVelocityOption = None,
-    acceleration_deg_s2: AccelerationOption = None,
-    offset_deg: OffsetOption = 0.0,
-    timeout_s: HomingTimeoutOption = 60.0,
-    at: AtOption = None,
-    force: TakeOption = False,
-    json_file: JsonOption = None,
-) -> None:
+@taking(Daemon, opt.Homing)
+def home(daemon: Daemon, homing: opt.Homing, axis: OneAxisArgument = None) -> None:
     """Home by one of the drive's own methods; the axis is disabled before and after."""
-    with moving(at, axis, force=force) as moved:
-        done = moved.home(
-            method,
-            switch_velocity_deg_s=switch_velocity_deg_s,
-            zero_velocity_deg_s=zero_velocity_deg_s,
-            acceleration_deg_s2=acceleration_deg_s2,
-            offset_deg=offset_deg,
-            timeout_s=timeout_s,
-        )
-        tell(done, json_file)
+    with daemon.moving(axis) as moved:
+        daemon.tell(moved.home(**vars(homing)))
 
 
 def stop(axes: AxesArgument = None, at: AtOption = None) -> None:
@@ -435,7 +416,7 @@ def stop(axes: AxesArgument = None, at: AtOption = None) -> None:
     with stopping(at) as client:
         states = [client.axis(each).stop() for each in axes] if axes else client.stop().axes
     for each in states:
-        tell(each, None)
+        tell(each)
 
 
 def quick_stop(axes: AxesArgument = None, at: AtOption = None) -> None:
@@ -443,23 +424,22 @@ def quick_stop(axes: AxesArgument = None, at: AtOption = None) -> None:
     with stopping(at) as client:
         states = [client.axis(each).quick_stop() for each in axes] if axes else client.quick_stop().axes
     for each in states:
-        tell(each, None)
+        tell(each)
 
 
+@on_daemon
 def move(
+    daemon: Daemon,
     axis: AxisArgument,
-    angles_deg: AnglesArgument,
+    angles_deg: opt.Angles,
     relative: Annotated[
         bool, typer.Option("--relative", help="Each angle is relative to the previous target.")
     ] = False,
-    velocity_deg_s: VelocityOption = None,
-    acceleration_deg_s2: AccelerationOption = None,
+    velocity_deg_s: opt.Velocity = None,
+    acceleration_deg_s2: opt.Acceleration = None,
     wait: Annotated[
         bool, typer.Option("--wait/--no-wait", help="Wait until the axis rests there; else return at once.")
     ] = True,
-    at: AtOption = None,
-    force: TakeOption = False,
-    json_file: JsonOption = None,
 ) -> None:
     """Move the load to one angle or to several, and hold the last.
 
@@ -467,7 +447,7 @@ def move(
     """
     if not wait and len(angles_deg) > 1:
         raise InputError("--no-wait goes to one angle: give one, or use 'hdbridge ctl queue'")
-    with moving(at, axis, force=force) as moved:
+    with daemon.moving(axis) as moved:
         state = moved.state()
         note_clamped(state.limits, velocity_deg_s=velocity_deg_s, acceleration_deg_s2=acceleration_deg_s2)
         before_deg = state.load_target_deg or 0.0
@@ -476,10 +456,12 @@ def move(
             state = moved.move(
                 before_deg, velocity_deg_s=velocity_deg_s, acceleration_deg_s2=acceleration_deg_s2, wait=wait
             )
-            tell(state, json_file if given_deg is angles_deg[-1] else None)
+            (daemon.tell if given_deg is angles_deg[-1] else tell)(state)
 
 
+@on_daemon
 def jog(
+    daemon: Daemon,
     axis: AxisArgument,
     velocity_deg_s: Annotated[
         float, typer.Argument(metavar="SPEED", help="Speed of the load, deg/s, with sign.")
@@ -487,67 +469,60 @@ def jog(
     duration_s: Annotated[
         float, typer.Option("--for", min=0.05, max=86_400.0, help="Time, s; Ctrl-C ends it earlier.")
     ] = 1.0,
-    at: AtOption = None,
-    force: TakeOption = False,
-    json_file: JsonOption = None,
 ) -> None:
     """Turn an axis at a speed for a time, then brake to rest; also if this command is killed."""
-    with moving(at, axis, force=force) as moved:
+    with daemon.moving(axis) as moved:
         note_clamped(moved.state().limits, velocity_deg_s=velocity_deg_s)
         moved.jog(velocity_deg_s, duration_s)
-        tell(moved.rest(), json_file)
+        daemon.tell(moved.rest())
 
 
+@on_daemon
 def queue(
+    daemon: Daemon,
     axis: AxisArgument,
     angles_deg: Annotated[
         list[float] | None, typer.Argument(metavar="ANGLE...", help="Load angles in degrees.")
     ] = None,
-    velocity_deg_s: VelocityOption = None,
-    acceleration_deg_s2: AccelerationOption = None,
+    velocity_deg_s: opt.Velocity = None,
+    acceleration_deg_s2: opt.Acceleration = None,
     dwell_s: Annotated[float, typer.Option("--dwell", min=0.0, max=86_400.0, help="Rest at each, s.")] = 0.0,
     clear: Annotated[
         bool, typer.Option("--clear", help="Remove the way points not yet begun; add none.")
     ] = False,
-    at: AtOption = None,
-    force: TakeOption = False,
-    json_file: JsonOption = None,
 ) -> None:
     """Append way points, and wait until the last one is reached. Ctrl-C stops the axis."""
     from hdbridge.client.messages import QueueItem
 
     if clear == bool(angles_deg):
         raise InputError("expected either angles or --clear")
-    if clear:
-        with connected(at) as client, client.lease(force=force):
-            tell(client.axis(axis).clear_queue(), json_file)
-        return
     limits = {"velocity_deg_s": velocity_deg_s, "acceleration_deg_s2": acceleration_deg_s2}
     points = [QueueItem.given(target_deg=each, dwell_s=dwell_s, **limits) for each in angles_deg or ()]
-    with connected(at) as client, client.lease(force=force), stopped_by_signals(client, axis):
-        note_clamped(client.axis(axis).state().limits, **limits)
-        tell(client.axis(axis).queue(points), json_file)
+    with daemon.moving(axis) as moved:
+        note_clamped(moved.state().limits, **limits)
+        daemon.tell(moved.clear_queue() if clear else moved.queue(points))
 
 
-# ---------------------------------------------------------------- ctl/model
+# ---------------------------------------------------------------- compensation and models
 
 
+@on_daemon
 def compensate(
+    daemon: Daemon,
     axis: AxisArgument,
     scheme: Annotated[Scheme, typer.Argument(metavar="SCHEME", help="`none` switches it off.")],
-    at: AtOption = None,
-    force: TakeOption = False,
-    json_file: JsonOption = None,
 ) -> None:
     """Select the part of the model that compensates: none, synchronous, hysteresis, both or extended.
 
     The change is ramped, also in motion.
     """
-    with moving(at, axis, force=force) as moved:
-        tell(moved.compensate(scheme.value), json_file)
+    with daemon.moving(axis) as moved:
+        daemon.tell(moved.compensate(scheme.value))
 
 
+@on_daemon
 def model(
+    daemon: Daemon,
     axis: AxisArgument,
     version: Annotated[
         str,
@@ -556,69 +531,56 @@ def model(
             help="Number in `hdbridge model log`; `pending` commits that one, `active` reads it again.",
         ),
     ],
-    at: AtOption = None,
-    force: TakeOption = False,
-    json_file: JsonOption = None,
 ) -> None:
     """Make another model of an axis the active one; the change is ramped, also in motion."""
     if version not in {"pending", "active"} and not (version.isascii() and version.isdigit()):
         raise InputError(f"VERSION: found {version!r}; expected a number, pending or active")
-    with moving(at, axis, force=force) as moved:
-        tell(moved.activate_model(int(version) if version.isdigit() else version), json_file)
+    with daemon.moving(axis) as moved:
+        daemon.tell(moved.activate_model(int(version) if version.isdigit() else version))
 
 
+@on_daemon
 def adapt(
+    daemon: Daemon,
     axis: AxisArgument,
     mode: Annotated[
         AdaptationMode | None,
         typer.Argument(metavar="MODE", help="`off`, `observe` (report what would change) or `on`."),
     ] = None,
     back: Annotated[bool, typer.Option("--back", help="Return to the committed model.")] = False,
-    at: AtOption = None,
-    force: TakeOption = False,
-    json_file: JsonOption = None,
 ) -> None:
     """Set the adaptation of model parameters to the load encoder."""
     if back == (mode is not None):
         raise InputError("expected either a mode or --back")
-    with moving(at, axis, force=force) as moved:
-        tell(moved.adaptation_back() if mode is None else moved.adapt(mode.value), json_file)
+    with daemon.moving(axis) as moved:
+        daemon.tell(moved.adaptation_back() if mode is None else moved.adapt(mode.value))
 
 
+@on_daemon
 def load_loop(
+    daemon: Daemon,
     axis: AxisArgument,
     on: Annotated[bool, typer.Option("--on/--off", help="Switch it on or off.")],
-    at: AtOption = None,
-    force: TakeOption = False,
-    json_file: JsonOption = None,
 ) -> None:
     """Switch the slow integral of the load error on or off, if the machine file has one."""
-    with moving(at, axis, force=force) as moved:
-        tell(moved.load_loop(on), json_file)
+    with daemon.moving(axis) as moved:
+        daemon.tell(moved.load_loop(on))
 
 
-# ---------------------------------------------------------------- ctl/objects
+# ---------------------------------------------------------------- objects of the drive
 
 
-def get(
-    axis: AxisArgument, object_: ObjectArgument, at: AtOption = None, json_file: JsonOption = None
-) -> None:
+def get(axis: AxisArgument, object_: opt.Object, at: AtOption = None, json_file: opt.Json = None) -> None:
     """Read an object of the drive by SDO, between the cycles."""
     with connected(at) as client:
         _print_object(client.axis(axis).read(object_), json_file)
 
 
-def put(
-    axis: AxisArgument,
-    object_: ObjectArgument,
-    value: ValueArgument,
-    at: AtOption = None,
-    force: TakeOption = False,
-    json_file: JsonOption = None,
-) -> None:
+@on_daemon
+def put(daemon: Daemon, axis: AxisArgument, object_: opt.Object, value: opt.Value) -> None:
     """Write an object of the drive by SDO, and read it back; refused while the axis is enabled."""
-    with moving(at, axis, force=force) as moved:
-        _print_object(moved.write(object_, value), json_file)
+    with daemon.moving(axis) as moved:
+        _print_object(moved.write(object_, value), daemon.json_file)
 
 
 def _print_object(found: SdoValue, json_file: Path | None) -> None:

@@ -4,21 +4,9 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final
 
-from hdbridge.cli.options import (
-    AccelerationOption,
-    HomingMethodOption,
-    HomingTimeoutOption,
-    JsonOption,
-    ObjectArgument,
-    OffsetOption,
-    SwitchVelocityOption,
-    ValueArgument,
-    ZeroVelocityOption,
-    note,
-    print_object,
-    say,
-    write_json,
-)
+from hdbridge.cli import options as opt
+from hdbridge.cli.options import taking
+from hdbridge.cli.printing import note, print_object, say, write_json
 from hdbridge.cli.session import Session, on_axis
 from hdbridge.errors import InputError
 
@@ -26,11 +14,8 @@ if TYPE_CHECKING:
     from hdbridge.drive.values import Object, Value
 
 
-# ---------------------------------------------------------------- reset
-
-
 @on_axis
-def reset(session: Session, json_file: JsonOption = None) -> None:
+def reset(session: Session, json_file: opt.Json = None) -> None:
     """Reset a fault of the drive when its cause is gone; power stays off.
 
     Boots the drive, prints the error code and the last emergency, and resets the fault. Nothing moves. Exit
@@ -51,20 +36,8 @@ def reset(session: Session, json_file: JsonOption = None) -> None:
     say(f"{done}: the drive is in '{state.value}'")
 
 
-# ---------------------------------------------------------------- home
-
-
-@on_axis
-def home(
-    session: Session,
-    method: HomingMethodOption,
-    switch_velocity_deg_s: SwitchVelocityOption = None,
-    zero_velocity_deg_s: ZeroVelocityOption = None,
-    acceleration_deg_s2: AccelerationOption = None,
-    offset_deg: OffsetOption = 0.0,
-    timeout_s: HomingTimeoutOption = 60.0,
-    json_file: JsonOption = None,
-) -> None:
+@taking(Session, opt.Homing)
+def home(session: Session, homing: opt.Homing, json_file: opt.Json = None) -> None:
     """Home the drive by one of its own methods (CiA 402, mode HM); print the position of the axis.
 
     Ctrl-C stops it (exit status 130). A model belongs to the zero of its calibration. An absolute encoder
@@ -73,35 +46,31 @@ def home(
     from hdbridge.drive.modes import Homing
 
     axis = session.axis
-    wanted = (method, switch_velocity_deg_s, zero_velocity_deg_s, acceleration_deg_s2, offset_deg, timeout_s)
-    Homing.checked(axis, *wanted)  # refused before anything is connected
+    Homing.checked(axis, **vars(homing))  # refused before anything is connected
     with session.drive() as drive:
         drive.boot()
         note(f"booted node {axis.drive.node_id} over {drive.link.name}")
-        at = drive.home(*wanted)
+        at = drive.home(**vars(homing))
     load_by_motor_deg = at.motor_deg / axis.gear.ratio
     write_json(
         json_file,
         {
             "schema": "hdbridge.home/1",
             "axis": axis.name,
-            "method": method,
+            "method": homing.method,
             "motor_position_deg": at.motor_deg,
             "load_position_by_motor_deg": load_by_motor_deg,
             "load_position_deg": at.load_deg,
         },
     )
     say(
-        f"homed by method {method}: the load is at {load_by_motor_deg:.4f} deg by the motor encoder, "
+        f"homed by method {homing.method}: the load is at {load_by_motor_deg:.4f} deg by the motor encoder, "
         f"{at.load_deg:.4f} deg by its own; power is off"
     )
 
 
-# ---------------------------------------------------------------- sdo
-
-
 @on_axis
-def get(session: Session, object_: ObjectArgument, json_file: JsonOption = None) -> None:
+def get(session: Session, object_: opt.Object, json_file: opt.Json = None) -> None:
     """Read an object of the drive. The drive is neither booted nor enabled."""
     from hdbridge.drive.values import find_object
 
@@ -116,9 +85,7 @@ def get(session: Session, object_: ObjectArgument, json_file: JsonOption = None)
 
 
 @on_axis
-def put(
-    session: Session, object_: ObjectArgument, value: ValueArgument, json_file: JsonOption = None
-) -> None:
+def put(session: Session, object_: opt.Object, value: opt.Value, json_file: opt.Json = None) -> None:
     """Write an object of the drive, and read it back. The drive is neither booted nor enabled.
 
     A value outside the object's type or range is refused. Careful: 6040h moves an axis. The value lasts

@@ -12,17 +12,9 @@ from urllib.parse import unquote
 
 import typer
 
-from hdbridge.cli.options import (
-    JsonOption,
-    need_extra,
-    note,
-    print_table,
-    progress_bar,
-    say,
-    taking,
-    write_json,
-    write_result,
-)
+from hdbridge.cli import options as opt
+from hdbridge.cli.options import need_extra, taking
+from hdbridge.cli.printing import note, print_table, progress_bar, say, write_json, write_result
 from hdbridge.cli.session import deferred_interrupt
 from hdbridge.errors import InputError
 from hdbridge.files.expectation import nearest
@@ -251,7 +243,7 @@ def report(
         typer.Option("--html", metavar="PAGE", help="Write the page here; else OUT/fleet.html."),
         Kind.PAGE,
     ] = None,
-    json_file: JsonOption = None,
+    json_file: opt.Json = None,
     limit_arcsec: LimitOption = 10.0,
     pages: PagesOption = False,
     joints: Annotated[
@@ -299,8 +291,6 @@ def _summarise(
     joints: Sequence[str] = (),
 ) -> Summary:
     """Prints, writes and returns the summary; writes the pages of these joints and of all listed ones."""
-    from rich.table import Table
-
     from hdbridge.fleet.pages import shown
     from hdbridge.fleet.prior import write_prior
     from hdbridge.fleet.report import ROWS, fleet_page, hours_words
@@ -321,17 +311,18 @@ def _summarise(
     write_prior(dataset.folder / PRIOR_NAME, rows)
     listed = [each.joint for each in summary.first[:ROWS]] if pages else []
     found = _with_pages(dataset.folder, latest, dict.fromkeys([*joints, *listed]))
-    table = Table("joint", "cause", "probability", "peak, arcsec", "hours to the limit")
-    for each in summary.first:
-        table.add_row(
-            each.joint,
-            each.cause,
-            f"{each.probability:.2f}",
-            f"{each.peak_arcsec:.1f}",
-            hours_words(each.remaining),
-        )
     if summary.first:
-        print_table(table)
+        first = [
+            (
+                each.joint,
+                each.cause,
+                f"{each.probability:.2f}",
+                f"{each.peak_arcsec:.1f}",
+                hours_words(each.remaining),
+            )
+            for each in summary.first
+        ]
+        print_table(("joint", "cause", "probability", "peak, arcsec", "hours to the limit"), first)
     else:
         say("No joint stands out." if latest else "No recording has a diagnosis.")
     for line in summary.lines():

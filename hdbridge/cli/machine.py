@@ -11,21 +11,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 import typer
 
 from hdbridge.cli import eventlog
-from hdbridge.cli.options import (
-    ChannelOption,
-    ForceOption,
-    GatewayAxisOption,
-    InterfaceOption,
-    JsonOption,
-    MachineArgument,
-    ProfileArgument,
-    SeedOption,
-    TruthOption,
-    need_extra,
-    note,
-    say,
-    write_json,
-)
+from hdbridge.cli import options as opt
+from hdbridge.cli.options import need_extra
+from hdbridge.cli.printing import note, say, write_json
 from hdbridge.cli.session import Session, check_bus_options, deferred_interrupt, simulated_by
 from hdbridge.clock import Clock, MonotonicClock
 from hdbridge.errors import BusInUseError, DriveError, InputError
@@ -53,7 +41,7 @@ _EXTRA = ("fastapi", "uvicorn", "websockets", "mcap", "prometheus_client")
 
 
 def run(
-    machine: MachineArgument,
+    machine: opt.Machine,
     simulate: Annotated[
         bool, typer.Option("--simulate", help="Hold simulated drives in place of the bus.")
     ] = False,
@@ -71,14 +59,14 @@ def run(
             help="Truth file of a simulated axis; once for each axis, in order.",
         ),
     ] = None,
-    seed: SeedOption = 0,
-    interface: InterfaceOption = None,
-    channel: ChannelOption = None,
+    seed: opt.Seed = 0,
+    interface: opt.Interface = None,
+    channel: opt.Channel = None,
     page: Annotated[
         bool, typer.Option("--page", help="Serve the live page to this computer and print its address.")
     ] = False,
     port: Annotated[int, typer.Option("--port", min=0, max=65_535, help="Port of --page; 0: any.")] = 8402,
-    force: ForceOption = False,
+    force: opt.Force = False,
 ) -> None:
     """Run the daemon: hold the drives of a machine and take load angles from clients.
 
@@ -137,11 +125,8 @@ def _check_real(machine: Machine, truths: list[Path], speed: float) -> None:
         )
 
 
-# ---------------------------------------------------------------- install_service
-
-
 def install_service(
-    machine: MachineArgument,
+    machine: opt.Machine,
     yes: Annotated[bool, typer.Option("--yes", help="Write the files; else they are only shown.")] = False,
     remove: Annotated[bool, typer.Option("--remove", help="Remove the files.")] = False,
     user: Annotated[bool, typer.Option("--user", help="For your own service manager, without root.")] = False,
@@ -223,10 +208,7 @@ def _tell_what_next(machine: Machine, files: list[ServiceFile], *, user: bool) -
         say("the CAN interface is set up by root: see docs/daemon.md")
 
 
-# ---------------------------------------------------------------- gateway
-
-
-def eds(machine: MachineArgument, axis: GatewayAxisOption = None) -> None:
+def eds(machine: opt.Machine, axis: opt.GatewayAxis = None) -> None:
     """Print the EDS of an axis on the gateway's bus, for the tool that configures the other master.
 
     hdbridge gateway eds cell > axis1.eds
@@ -237,8 +219,8 @@ def eds(machine: MachineArgument, axis: GatewayAxisOption = None) -> None:
 
 
 def doctor(
-    machine: MachineArgument,
-    axis: GatewayAxisOption = None,
+    machine: opt.Machine,
+    axis: opt.GatewayAxis = None,
     duration_s: Annotated[
         float,
         typer.Option("--duration", min=0.1, max=86_400.0, help="Time to listen, s; Ctrl-C ends it earlier."),
@@ -249,7 +231,7 @@ def doctor(
             "--log", metavar="FILE", help="Read a bus log (.log, .asc, .blf, .trc, .mf4) in place of the bus."
         ),
     ] = None,
-    json_file: JsonOption = None,
+    json_file: opt.Json = None,
 ) -> None:
     """Listen to the other master; report its configuration, its commands and its mistakes, with reasons.
 
@@ -357,22 +339,19 @@ def gateway_axis(machine: str, name: str | None) -> tuple[AxisConfig, GatewaySet
     return axis.config, found.gateway, axis.model()
 
 
-# ---------------------------------------------------------------- simulate
-
-
 def simulate(
-    profile: ProfileArgument,
-    truth: TruthOption = None,
-    seed: SeedOption = 0,
-    interface: InterfaceOption = None,
-    channel: ChannelOption = None,
+    profile: opt.Profile,
+    truth: opt.Truth = None,
+    seed: opt.Seed = 0,
+    interface: opt.Interface = None,
+    channel: opt.Channel = None,
     gateway: Annotated[
         bool,
         typer.Option(
             "--gateway", help="PROFILE is a machine: an ideal drive with the bus and objects of its gateway."
         ),
     ] = False,
-    axis: GatewayAxisOption = None,
+    axis: opt.GatewayAxis = None,
     duration_s: Annotated[
         float | None, typer.Option("--duration", min=0.0, help="Stop after this time, s; else at Ctrl-C.")
     ] = None,

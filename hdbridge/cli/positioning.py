@@ -10,25 +10,17 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
-from rich.table import Table
 
-from hdbridge.cli.options import (
-    AnglesArgument,
-    HtmlOption,
-    JsonOption,
-    ModelOption,
-    VelocityOption,
-    compensating_model,
-    figures_table,
+from hdbridge.cli import options as opt
+from hdbridge.cli.printing import (
     note,
-    note_clamped,
     print_table,
     progress_bar,
     say,
     write_json,
     write_result,
 )
-from hdbridge.cli.session import Session, on_axis
+from hdbridge.cli.session import Session, compensating_model, note_clamped, on_axis
 from hdbridge.commissioning.evaluation.stepping import Scheme
 from hdbridge.errors import HdbridgeError, InputError
 from hdbridge.files.atomic import make_folder, new_folder
@@ -55,11 +47,11 @@ KEPT_S = 60.0
 @on_axis
 def move(
     session: Session,
-    angles_deg: AnglesArgument,
+    angles_deg: opt.Angles,
     relative: Annotated[
         bool, typer.Option("--relative", help="Each angle is relative to the previous position.")
     ] = False,
-    velocity_deg_s: VelocityOption = None,
+    velocity_deg_s: opt.Velocity = None,
     hold_s: Annotated[
         float | None,
         typer.Option(
@@ -68,11 +60,11 @@ def move(
             help="Seconds to hold the last angle; else until Ctrl-C (a simulated axis: not at all).",
         ),
     ] = None,
-    model: ModelOption = None,
+    model: opt.Model = None,
     compensated: Annotated[
         bool, typer.Option("--compensated/--uncompensated", help="Use the active model, if there is one.")
     ] = True,
-    json_file: JsonOption = None,
+    json_file: opt.Json = None,
 ) -> None:
     """Move the load to one angle or to several, compensated by the active model, and hold the last.
 
@@ -167,28 +159,25 @@ def _move_document(axis: str, model: TransmissionModel, stands: tuple[Standing, 
 
 
 def _print_move(axis: str, model: TransmissionModel, stands: tuple[Standing, ...]) -> None:
-    table = Table(title=f"Axis '{axis}' at rest", title_justify="left")
-    for name in ("target, deg", "load encoder, deg", "error, arcsec", "settled in, s"):
-        table.add_column(name, justify="right")
-    for each in stands:
-        table.add_row(
+    rows = [
+        (
             f"{each.target_deg:.4f}",
             f"{each.load_deg:.4f}",
             f"{each.error_arcsec:z.2f}",
             f"{each.settle_s:.2f}",
         )
-    print_table(table)
+        for each in stands
+    ]
+    columns = ("target, deg", "load encoder, deg", "error, arcsec", "settled in, s")
+    print_table(columns, rows, f"Axis '{axis}' at rest")
     how = f"compensated by {model.path}" if model.effects else "not compensated"
     say(f"{how}; power is off")
-
-
-# ---------------------------------------------------------------- step
 
 
 @on_axis
 def step(
     session: Session,
-    model: ModelOption = None,
+    model: opt.Model = None,
     scheme: Annotated[
         list[Scheme] | None,
         typer.Option("--scheme", help="Only this scheme; may be repeated. Else all of the model."),
@@ -196,8 +185,8 @@ def step(
     count: Annotated[int, typer.Option("--count", min=2, max=100_000, help="Steps each way.")] = 240,
     step_deg: Annotated[float, typer.Option("--step-deg", help="Step, motor degrees.")] = 43.56,
     start_deg: Annotated[float, typer.Option("--start-deg", help="Load angle of the start, deg.")] = 0.0,
-    json_file: JsonOption = None,
-    html_file: HtmlOption = None,
+    json_file: opt.Json = None,
+    html_file: opt.Html = None,
     record: Annotated[
         Path | None,
         typer.Option("--record", metavar="FOLDER", help="Keep what was measured: one CSV file per scheme."),
@@ -387,13 +376,10 @@ def _write_stepping_page(
     write_result(path, render(page))
 
 
-# ---------------------------------------------------------------- motion
-
-
 @on_axis
 def motion(
     session: Session,
-    model: ModelOption = None,
+    model: opt.Model = None,
     measure: Annotated[
         bool,
         typer.Option(
@@ -404,8 +390,8 @@ def motion(
     propose: Annotated[
         bool, typer.Option("--propose", help="Keep the model with the measured response as pending.")
     ] = False,
-    json_file: JsonOption = None,
-    html_file: HtmlOption = None,
+    json_file: opt.Json = None,
+    html_file: opt.Html = None,
 ) -> None:
     """Run the axis at several speeds; print the ripple of the load without and with compensation.
 
@@ -446,35 +432,22 @@ def motion(
 
 def print_motion(result: MotionTest) -> None:
     """Prints the result."""
-    table = Table(title="Ripple of the load at constant speed, rms arcsec", title_justify="left")
-    for name in ("deg/s", "none", "static", "removed", "filtered", "removed", "orders faded out"):
-        table.add_column(name, justify="left" if "orders" in name else "right")
-    for each in result.ripples:
-        table.add_row(
-            f"{each.speed_deg_s:g}",
-            f"{each.none_arcsec:.2f}",
-            _figure(each.static_arcsec),
-            _percent(each.removed_static_percent),
-            _figure(each.filtered_arcsec),
-            _percent(each.removed_percent),
-            " ".join(map(str, each.faded_orders)),
-        )
-    print_table(table)
-    fastest = result.ripples[-1]
-    table = Table(title=f"Motor orders at {fastest.speed_deg_s:g} deg/s, arcsec", title_justify="left")
-    for name in ("order", "Hz", "none", "static", "filtered"):
-        table.add_column(name, justify="right")
-    for order in fastest.orders:
-        figures = (order.none_arcsec, order.static_arcsec, order.filtered_arcsec)
-        table.add_row(str(order.order), f"{order.frequency_hz:.0f}", *map(_figure, figures))
-    print_table(table)
-    if result.paths:
-        from hdbridge.report.motion import PATH_COLUMNS, path_rows
+    from hdbridge.report.motion import PATH_COLUMNS, RIPPLE_COLUMNS, figure, path_rows, ripple_rows
 
-        paths = figures_table("Errors on a path, rms arcsec", *PATH_COLUMNS)
-        for row in path_rows(result):
-            paths.add_row(*row)
-        print_table(paths)
+    print_table(RIPPLE_COLUMNS, ripple_rows(result), "Ripple of the load at constant speed, rms arcsec")
+    fastest = result.ripples[-1]
+    orders = [
+        (
+            str(each.order),
+            f"{each.frequency_hz:.0f}",
+            *map(figure, (each.none_arcsec, each.static_arcsec, each.filtered_arcsec)),
+        )
+        for each in fastest.orders
+    ]
+    columns = ("order", "Hz", "none", "static", "filtered")
+    print_table(columns, orders, f"Motor orders at {fastest.speed_deg_s:g} deg/s, arcsec")
+    if result.paths:
+        print_table(PATH_COLUMNS, path_rows(result), "Errors on a path, rms arcsec")
     if result.response is not None:
         say(
             f"response known up to {result.response.known_to_hz:.0f} Hz, "
@@ -486,17 +459,6 @@ def print_motion(result: MotionTest) -> None:
         say(f"the compensation removes half of the ripple or more up to {reached:g} deg/s")
     for line in result.remarks:
         say(f"note: {line}")
-
-
-def _figure(value: float | None) -> str:
-    return "" if value is None else f"{value:.2f}"
-
-
-def _percent(value: float | None) -> str:
-    return "" if value is None else f"{value:.0f} %"
-
-
-# ---------------------------------------------------------------- demo
 
 
 def demo(

@@ -11,16 +11,8 @@ from typing import Annotated, Any, Final
 
 import typer
 
-from hdbridge.cli.options import (
-    BitrateOption,
-    ChannelOption,
-    EdsOption,
-    InterfaceOption,
-    NodeOption,
-    SeedOption,
-    note,
-    say,
-)
+from hdbridge.cli import options as opt
+from hdbridge.cli.printing import note, say
 from hdbridge.errors import BusError, DriveError, HdbridgeError, InputError
 from hdbridge.files.atomic import write_atomically
 
@@ -51,18 +43,18 @@ def setup(
     folder: Annotated[
         Path, typer.Argument(metavar="NAME", help="Folder of the axis, new or from an earlier set-up.")
     ],
-    interface: InterfaceOption = None,
-    channel: ChannelOption = None,
-    bitrate_bps: BitrateOption = None,
-    node_id: NodeOption = None,
-    eds: EdsOption = None,
+    interface: opt.Interface = None,
+    channel: opt.Channel = None,
+    bitrate_bps: opt.Bitrate = None,
+    node_id: opt.Node = None,
+    eds: opt.Eds = None,
     plan: Annotated[
         str, typer.Option("--plan", metavar="quick|full|FILE", help="Plan of the calibration.")
     ] = "quick",
     simulate: Annotated[
         bool, typer.Option("--simulate", help="Set up a simulated axis, a copy of the profile demo.")
     ] = False,
-    seed: SeedOption = 0,
+    seed: opt.Seed = 0,
     yes: Annotated[
         bool, typer.Option("--yes", help="Answer every yes-or-no question with yes; the axis moves.")
     ] = False,
