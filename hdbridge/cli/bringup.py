@@ -20,8 +20,7 @@ from hdbridge.files.profile import Profile
 
 if TYPE_CHECKING:
     from hdbridge.axis import AxisConfig, BusConfig
-    from hdbridge.commissioning.bringup.checks import Row
-    from hdbridge.commissioning.bringup.context import BringUpContext
+    from hdbridge.commissioning.bringup.checks import BringUpContext, Row
     from hdbridge.commissioning.bringup.scan import Node, Scan
     from hdbridge.control.latency import Measurement
     from hdbridge.daemon.machine import Machine
@@ -285,8 +284,7 @@ def scan(
     Exit status 4 if no node was found, or PROFILE's drive is missing.
     """
     from hdbridge.axis import BusConfig
-    from hdbridge.commissioning.bringup.match import compare
-    from hdbridge.commissioning.bringup.scan import scan_bus
+    from hdbridge.commissioning.bringup.scan import compare, scan_bus
     from hdbridge.drive.link import Link
 
     axis = None
@@ -320,7 +318,7 @@ def scan(
 
 
 def _print_scan(name: str, found: Scan) -> None:
-    from hdbridge.commissioning.bringup.match import axis_lines
+    from hdbridge.commissioning.bringup.scan import axis_lines
 
     count = len(found.nodes)
     say(f"{name}: {count} node{'' if count == 1 else 's'}")
@@ -368,7 +366,7 @@ def _judge_scan(name: str, found: Scan, axis: AxisConfig | None, matches: bool) 
 
 
 def _scan_document(name: str, found: Scan) -> dict[str, Any]:
-    from hdbridge.commissioning.bringup.match import axis_lines
+    from hdbridge.commissioning.bringup.scan import axis_lines
 
     return {
         "schema": "hdbridge.scan/1",
@@ -446,8 +444,7 @@ def doctor(
     Exit status 0 if all checks passed, 4 if one failed or motion was not confirmed, 2 if the first failure
     is a file, 3 if it is the bus. This is not a safety function: the emergency stop must be in hardware.
     """
-    from hdbridge.commissioning.bringup.checks import run_checks
-    from hdbridge.commissioning.bringup.context import BringUpContext
+    from hdbridge.commissioning.bringup.checks import BringUpContext, run_checks
     from hdbridge.commissioning.bringup.doctor import CHECKS
 
     files = session.files

@@ -29,9 +29,9 @@ from hdbridge.files.profile import Profile
 
 if TYPE_CHECKING:
     from hdbridge.cli.session import Session
-    from hdbridge.commissioning.calibration import Calibration, Journal, Stepped, Validation
-    from hdbridge.commissioning.calibration.result import Offer
-    from hdbridge.commissioning.evaluation.stepping import Scatter
+    from hdbridge.commissioning.calibration import Calibration, Journal, Validation
+    from hdbridge.commissioning.calibration.pipeline import Offer
+    from hdbridge.commissioning.evaluation.stepping import Stepped
     from hdbridge.drive.drive import Drive
     from hdbridge.motion.procedures.plan import Plan
 
@@ -389,9 +389,15 @@ def print_stepping(checked: Validation) -> None:
     )
 
 
-def print_steps(title: str, tests: Iterable[Stepped]) -> None:
-    """Prints scatter and mean of stepping tests, one line each."""
-    print_scatter(title, "with", ((each.model, (each.cw, each.ccw, each.pooled)) for each in tests))
+def print_steps(title: str, tests: Iterable[Stepped], first: str = "with") -> None:
+    """Prints scatter and mean of stepping tests, one line each; ``first`` heads the column of their names."""
+    columns = (first, "CW 3σ", "mean", "CCW 3σ", "mean", "pooled 3σ", "mean")
+    rows = []
+    for test in tests:
+        parts = (test.cw, test.ccw, test.pooled)
+        figures = (value for part in parts for value in (part.three_sigma_arcsec, part.mean_arcsec))
+        rows.append((test.model, *(f"{value:z.2f}" for value in figures)))
+    print_table(columns, rows, title)
 
 
 def print_worse(test: str, ways: Iterable[str]) -> None:
@@ -421,18 +427,6 @@ def _print_accuracy(checked: Validation) -> None:
         f"Positioning test (ISO 230-2), arcsec: {rows[0][1].targets} targets, {rows[0][1].runs} "
         "approaches from each side",
     )
-
-
-def print_scatter(
-    title: str, first: str, rows: Iterable[tuple[str, tuple[Scatter, Scatter, Scatter]]]
-) -> None:
-    """Prints a line for each test: its name in the column ``first``, then its CW, CCW and pooled figures."""
-    columns = (first, "CW 3σ", "mean", "CCW 3σ", "mean", "pooled 3σ", "mean")
-    figures = [
-        (name, *(f"{value:z.2f}" for part in parts for value in (part.three_sigma_arcsec, part.mean_arcsec)))
-        for name, parts in rows
-    ]
-    print_table(columns, figures, title)
 
 
 COMMANDS: Final = {"calibrate": calibrate, "measure": measure, "fit": fit, "report": report}

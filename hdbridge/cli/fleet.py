@@ -291,9 +291,8 @@ def _summarise(
     joints: Sequence[str] = (),
 ) -> Summary:
     """Prints, writes and returns the summary; writes the pages of these joints and of all listed ones."""
-    from hdbridge.fleet.pages import shown
     from hdbridge.fleet.prior import write_prior
-    from hdbridge.fleet.report import ROWS, fleet_page, hours_words
+    from hdbridge.fleet.report import ROWS, fleet_page, hours_words, shown
     from hdbridge.fleet.summary import summarise
     from hdbridge.report.page import render
 
@@ -339,7 +338,7 @@ def _summarise(
 
 def _with_pages(folder: Path, latest: Mapping[str, Row], wanted: Collection[str]) -> dict[str, str]:
     """Writes the wanted pages of joints that are missing; returns the addresses of all that are there."""
-    from hdbridge.fleet.pages import links, write_page
+    from hdbridge.fleet.report import links, write_page
 
     there = links(folder, latest)
     missing = [each for each in wanted if each not in there]

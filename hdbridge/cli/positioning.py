@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 import typer
 
 from hdbridge.cli import options as opt
+from hdbridge.cli.calibration import phases, print_steps
 from hdbridge.cli.printing import (
     note,
     print_table,
@@ -319,13 +320,8 @@ def _told_when_stopped(
 
 def _print_stepping(axis: AxisConfig, comparison: Comparison) -> None:
     """Prints the result."""
-    from hdbridge.cli.calibration import print_scatter
-
-    print_scatter(
-        f"Load error at rest, arcsec: axis '{axis.name}'",
-        "compensation",
-        ((scheme.value, (each.cw, each.ccw, each.pooled)) for scheme, each in comparison.results.items()),
-    )
+    title = f"Load error at rest, arcsec: axis '{axis.name}'"
+    print_steps(title, comparison.results.values(), "compensation")
     for line in comparison.survived:
         say(f"note: {line}")
     best, result = min(comparison.results.items(), key=lambda item: item[1].pooled.three_sigma_arcsec)
@@ -399,7 +395,6 @@ def motion(
     """
     from hdbridge.axis.model import TransmissionModel
     from hdbridge.axis.model.store import propose as keep
-    from hdbridge.cli.calibration import phases
     from hdbridge.commissioning.calibration.motion import motion_test, motion_test_s
 
     files, axis = session.files, session.axis

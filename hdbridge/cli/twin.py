@@ -278,8 +278,8 @@ def as_dict(report: TwinReport) -> dict[str, Any]:
 
 def print_report(report: TwinReport) -> None:
     """Prints the verdict, the figures of the whole record, and the findings."""
+    from hdbridge.report.page import sentence
     from hdbridge.report.twin import figures, verdict
-    from hdbridge.report.words import sentence
     from hdbridge.twin.misfit import Values
 
     for effect in report.translated:

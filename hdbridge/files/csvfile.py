@@ -23,9 +23,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hdbridge.errors import InputError
-from hdbridge.files.atomic import write_atomically
+from hdbridge.files.atomic import open_regular, write_atomically
 from hdbridge.files.expectation import one_line
-from hdbridge.files.regular import open_regular
 
 FloatArray = NDArray[np.float64]
 Column = NDArray[Any]

@@ -16,7 +16,7 @@ from canopen.objectdictionary import ObjectDictionary, datatypes
 from canopen.objectdictionary.eds import import_eds
 
 from hdbridge.errors import InputError
-from hdbridge.files.regular import open_regular
+from hdbridge.files.atomic import open_regular
 
 MAX_BYTES: Final = 16 << 20
 _MOST_OBJECTS: Final = 100_000

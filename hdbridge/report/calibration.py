@@ -14,6 +14,7 @@ from hdbridge.axis.model.difference import diff
 from hdbridge.commissioning.calibration import Calibration
 from hdbridge.report.motion import motion_sections
 from hdbridge.report.page import (
+    SIGMA,
     Block,
     Chart,
     Command,
@@ -25,11 +26,12 @@ from hdbridge.report.page import (
     Series,
     Status,
     Table,
+    figure,
     histogram,
+    sentence,
+    with_interval,
 )
-from hdbridge.report.validation import stepping_sections
-from hdbridge.report.verdict import of_offer
-from hdbridge.report.words import SIGMA, figure, sentence, with_interval
+from hdbridge.report.stepping import of_offer, stepping_sections
 from hdbridge.units import DEG_PER_TURN, unit_of, without_unit
 
 BoolArray = np.ndarray[Any, np.dtype[np.bool_]]

@@ -22,8 +22,9 @@ from hdbridge.report.page import (
     Series,
     Status,
     Table,
+    figure,
+    sentence,
 )
-from hdbridge.report.words import figure, sentence
 from hdbridge.twin.compare import ALL, TITLES, UNITS, Comparison, Row, Spectrum, Trace
 from hdbridge.twin.misfit import Left, Values
 from hdbridge.twin.naming import Alike, Finding

@@ -12,10 +12,8 @@ import can
 from hdbridge.clock import Clock
 from hdbridge.errors import HdbridgeError, InputError
 from hdbridge.testing.faulttable import FAULTS, Reach, find
-from hdbridge.testing.history import Event, Frame, TrueState
-from hdbridge.testing.line import Line, open_line
-from hdbridge.testing.settings import LOCKSTEP, Settings
-from hdbridge.testing.watched import Fault, WatchedDrive, When, words
+from hdbridge.testing.line import LOCKSTEP, Line, Settings, open_line
+from hdbridge.testing.watched import Event, Fault, Frame, TrueState, WatchedDrive, When, words
 
 POLL_S: Final = 0.005
 

@@ -22,7 +22,7 @@ from hdbridge.drive.drive import Drive
 from hdbridge.axis.effects import Channel
 from hdbridge.axis.effects.base import Compensable, Linear, Memoryless, SLOT
 from hdbridge.errors import InputError
-from hdbridge.files.bundled import bundled_profile
+from hdbridge.files.profile import bundled_profile
 from hdbridge.axis.model import TransmissionModel
 from hdbridge.motion.procedures.stepping import Stepping
 from hdbridge.records.record import Record

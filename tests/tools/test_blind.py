@@ -15,7 +15,7 @@ from blind.plant import PlantRig
 from blind.verdict import Answer, Verdict, judged
 
 from hdbridge import AxisConfig, Bench, Recording, Stepping, TransmissionModel, simulated
-from hdbridge.files.bundled import bundled_profile
+from hdbridge.files.profile import bundled_profile
 from hdbridge.sim.truth import Truth
 
 PLAN = """

@@ -16,7 +16,7 @@ import can
 
 from hdbridge.axis import AxisConfig
 from hdbridge.clock import Clock
-from hdbridge.commissioning.bringup.scale import Turned
+from hdbridge.commissioning.bringup.judge import Turned
 from hdbridge.control.cycle import Cycle, Feedback
 from hdbridge.drive import objects
 from hdbridge.drive.drive import Drive

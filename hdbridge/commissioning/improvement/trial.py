@@ -15,11 +15,11 @@ from hdbridge.commissioning.calibration.measure import Pace
 from hdbridge.commissioning.calibration.validation import (
     CHANCE,
     Floor,
-    Stepped,
     Validation,
     record_kept,
     worse_ways,
 )
+from hdbridge.commissioning.evaluation.stepping import Stepped
 from hdbridge.control.bench import axis_view, compensation_for
 from hdbridge.control.rig import Rig, bench_on
 from hdbridge.control.survived import Survived, lines
